@@ -1,0 +1,150 @@
+"""The one exception tree of the tool.
+
+Every error that a user can meet is a :class:`TedsProvisionError`. Its class fixes the exit code of the command line
+(table "exit" of the command-line contract) and the stable word that ``--json`` reports as ``code``; the instance
+carries a one-sentence message (what happened and why) and a hint (what to do next). A foreign exception that escapes
+is a bug and ends with exit 1.
+
+This module stands below every room and imports nothing.
+"""
+
+from __future__ import annotations
+
+from typing import ClassVar
+
+
+class TedsProvisionError(Exception):
+    """Root of the tree; raised itself only for failures that fit nothing below (exit 1)."""
+
+    exit_code: ClassVar[int] = 1
+    code: ClassVar[str] = "failed"
+
+    def __init__(self, message: str, *, hint: str = "") -> None:
+        super().__init__(message)
+        self.message = message
+        self.hint = hint
+
+
+class UsageFailure(TedsProvisionError):
+    """The command line itself is wrong (exit 2)."""
+
+    exit_code = 2
+    code = "usage"
+
+
+class NotFound(TedsProvisionError):
+    """No such UUID, profile, station or file (exit 3)."""
+
+    exit_code = 3
+    code = "not-found"
+
+
+class NotAuthentic(TedsProvisionError):
+    """A signature, tag, digest or sender is not what it claims to be (exit 4)."""
+
+    exit_code = 4
+    code = "not-authentic"
+
+
+class LinkFailure(TedsProvisionError):
+    """The way to the node failed: no reader, no node, unplugged, garbled, bus-off (exit 5)."""
+
+    exit_code = 5
+    code = "link"
+
+
+class NoReader(LinkFailure):
+    """The reader or the CAN adapter cannot be opened."""
+
+    code = "no-reader"
+
+
+class NoNode(LinkFailure):
+    """Nothing that answers as a node came within the time allowed."""
+
+    code = "no-node"
+
+
+class NodeSilent(LinkFailure):
+    """A node that was there does not answer any more (moved away, time-out, power lost)."""
+
+    code = "node-silent"
+
+
+class Garbled(LinkFailure):
+    """What came over the link is torn, corrupt or breaks the wire format."""
+
+    code = "garbled"
+
+
+class AddressConflict(LinkFailure):
+    """Two nodes answer under one CAN address."""
+
+    code = "address-conflict"
+
+
+class PolicyRefused(TedsProvisionError):
+    """Refused by policy: not whitelisted, other key, weak algorithm, stale, expired, replayed (exit 6)."""
+
+    exit_code = 6
+    code = "refused"
+
+
+class NotWhitelisted(PolicyRefused):
+    """The node is not on the whitelist."""
+
+    code = "not-whitelisted"
+
+
+class OtherKey(PolicyRefused):
+    """A known UUID came with another identity key than the pinned one."""
+
+    code = "other-key"
+
+
+class NodeRefused(PolicyRefused):
+    """The node refused a command; ``reason`` is the u8 of security-teds.md section 4."""
+
+    code = "node-refused"
+
+    def __init__(self, message: str, *, reason: int, hint: str = "") -> None:
+        super().__init__(message, hint=hint)
+        self.reason = reason
+
+
+class StoreFailure(TedsProvisionError):
+    """Store or vault: locked, corrupt, missing (exit 7)."""
+
+    exit_code = 7
+    code = "store"
+
+
+class StoreLocked(StoreFailure):
+    """Another process holds the store."""
+
+    code = "store-locked"
+
+
+class VaultFailure(StoreFailure):
+    """The keyring, token or passphrase file cannot give what it should."""
+
+    code = "vault"
+
+
+class NoKeyring(VaultFailure):
+    """This machine has no keyring that may hold a secret."""
+
+    code = "no-keyring"
+
+
+class WrongPassphrase(VaultFailure):
+    """The passphrase or PIN does not open the vault."""
+
+    code = "wrong-passphrase"
+
+
+class BadData(TedsProvisionError):
+    """TEDS, profile, calibration, image or bundle that does not parse or does not add up (exit 8)."""
+
+    exit_code = 8
+    code = "bad-data"

@@ -1,0 +1,112 @@
+"""The interface of every link, and the one function that opens a port from the user's link options."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from typing import Literal, Protocol
+
+from teds_provision.errors import UsageFailure
+from teds_provision.protocol.identity import Identity
+
+NoticeKind = Literal["waiting", "foreign-tag", "reader-ready", "reader-lost", "node-left", "conflict", "retry"]
+
+
+@dataclass(frozen=True)
+class Notice:
+    """Something a person should see while a port works: what is waited for, or what came by that is not a node.
+
+    Units: ``seconds`` is how long this wait may still last, None for as long as it takes.
+    """
+
+    kind: NoticeKind
+    text: str
+    seconds: float | None = None
+
+
+NoticeSink = Callable[[Notice], None]
+
+
+class Link(Protocol):
+    """One node's line: one request, its one reply, in order."""
+
+    @property
+    def via(self) -> str:
+        """``nfc`` or ``can``."""
+
+    def exchange(self, frame: bytes) -> bytes:
+        """Send one whole command frame and return the whole reply frame that belongs to it.
+
+        Repeats as wire.md allows (at most twice, within 15 s). Raises NodeSilent, Garbled, AddressConflict or
+        another LinkFailure; never returns a reply of another transaction.
+        """
+
+    def close(self) -> None:
+        """Leave the node in peace (NFC: deselect the service); never raises."""
+
+
+@dataclass(frozen=True)
+class Contact:
+    """A node that was found: its unauthenticated Identify, its link, and where it was found."""
+
+    identity: Identity
+    link: Link
+    tag_uid: bytes | None = None
+    address: int | None = None
+
+
+class Port(Protocol):
+    """A reader or a bus on which nodes are found. Used from one thread."""
+
+    @property
+    def via(self) -> str:
+        """``nfc`` or ``can``."""
+
+    def find(
+        self, wanted: Callable[[Identity], bool], *, seconds: float, notice: NoticeSink, address: int | None = None
+    ) -> Contact:
+        """Wait until a node for which ``wanted`` is true is tapped or answers on the bus.
+
+        ``address`` is a known CAN address to try first (ignored by NFC). Raises NoNode after ``seconds``.
+        Foreign tags and unwanted nodes are reported through ``notice`` and waited past.
+        """
+
+    def watch(self, *, stop: threading.Event, notice: NoticeSink) -> Iterator[Contact]:
+        """Yield every node as it comes, once per visit (debounced), until ``stop`` is set; survives unplugging.
+
+        A node counts as gone when it was removed (NFC) or stayed silent (CAN); the consumer closes the link.
+        """
+
+    def close(self) -> None:
+        """Release the reader or the bus; never raises."""
+
+
+@dataclass(frozen=True)
+class LinkSettings:
+    """The user's link options, unparsed: ``--via``, ``--nfc``, ``--can``, ``--ble``, ``--timeout`` (seconds)."""
+
+    via: str = "nfc"
+    nfc: str | None = None
+    can: str | None = None
+    ble: str | None = None
+    timeout: float = 60.0
+
+
+def open_port(settings: LinkSettings) -> Port:
+    """Open the reader or bus that ``settings`` name; raises NoReader with the cure, or UsageFailure."""
+    if settings.via == "nfc":
+        from teds_provision.links.nfc.reader import NfcPort
+
+        return NfcPort(settings.nfc or "usb")
+    if settings.via == "can":
+        from teds_provision.links.can.port import CanPort
+
+        if not settings.can:
+            raise UsageFailure(
+                "--via can needs to know the bus.", hint="Add --can, e.g. --can socketcan:can0?bitrate=500000."
+            )
+        return CanPort(settings.can)
+    raise UsageFailure(
+        f"The link {settings.via!r} is not part of this version.", hint="Use --via nfc or --via can."
+    )

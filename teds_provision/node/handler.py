@@ -1,0 +1,25 @@
+"""What a node's link servers (NFC tag, CAN) need from the node behind them."""
+
+from __future__ import annotations
+
+from typing import Protocol
+
+
+class NodeHandler(Protocol):
+    """The node as its links see it. Thread-safe: each link server runs in its own thread."""
+
+    def request(self, link: str, frame: bytes, *, tapped: bool) -> bytes:
+        """Run one whole command frame that arrived on ``link``; always returns a whole reply frame.
+
+        ``link`` names the line (``"nfc"``, ``"can:f1"``): sessions and half-open Opens belong to it.
+        ``tapped`` is true when the frame itself arrived over NFC. It may take long (``--crypto-delay``).
+        """
+
+    def lost(self, link: str) -> None:
+        """The field or link is gone: its session, half-open Open and pending agreement end."""
+
+    def identify(self) -> bytes:
+        """Return the 23 octets of Identify as they are now (renewed into the NFC id record)."""
+
+    def can_address(self) -> int:
+        """Return the node's present CAN address, 1 to 239."""

@@ -1,0 +1,39 @@
+"""Repetition on a link: an octet-equal request gets its stored reply, nothing is run twice (wire.md, "Repetition").
+
+The node keeps, for each link, the last request and its reply for 20 s. Commands that change nothing (Identify, Prove,
+List, Query, Read, outside Sealed) are always run anew.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+KEEP_SECONDS = 20.0
+_IDEMPOTENT = {(128, 7), (128, 8), (128, 11), (1, 1), (1, 2)}
+
+
+class Repetition:
+    """The stored last request and reply of one link, node side."""
+
+    def __init__(self) -> None:
+        self._request: tuple[int, bytes] | None = None
+        self._reply = b""
+        self._at = 0.0
+
+    def answer(self, transaction: int, frame: bytes, run: Callable[[bytes], bytes], *, now: float) -> bytes:
+        """Return the stored reply to an octet-equal repetition, else run the command and store its reply.
+
+        ``now`` is a monotonic time in seconds.
+        """
+        if len(frame) >= 4 and (frame[2], frame[3]) in _IDEMPOTENT:
+            reply = run(frame)
+        elif self._request == (transaction, frame) and now - self._at < KEEP_SECONDS:
+            return self._reply
+        else:
+            reply = run(frame)
+        self._request, self._reply, self._at = (transaction, frame), reply, now
+        return reply
+
+    def forget(self) -> None:
+        """Loss of the field or link, bus-off or restart."""
+        self._request, self._reply = None, b""
