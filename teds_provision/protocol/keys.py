@@ -1,0 +1,166 @@
+"""P-256 keys: points, fingerprints, the profile's signatures and ECDH (security-teds profile, introduction; SEC 1).
+
+A private key is anything that can sign and agree: a key in software, in the OS keyring or in a token. Everything above
+uses :class:`PrivateKey` alone.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from typing import Protocol
+
+from cryptography.exceptions import InvalidSignature
+from cryptography.hazmat.primitives import hashes
+from cryptography.hazmat.primitives.asymmetric import ec
+from cryptography.hazmat.primitives.asymmetric.utils import decode_dss_signature, encode_dss_signature
+from cryptography.hazmat.primitives.serialization import Encoding, PublicFormat, load_pem_public_key
+
+from teds_provision.errors import BadData
+
+POINT_OCTETS = 65
+SIGNATURE_OCTETS = 64
+# Order of the group P-256, SP 800-186 table 1.
+GROUP_ORDER = 0xFFFFFFFF00000000FFFFFFFFFFFFFFFFBCE6FAADA7179E84F3B9CAC2FC632551
+_HALF_ORDER = GROUP_ORDER // 2
+
+
+class PrivateKey(Protocol):
+    """A P-256 private key, wherever it lies."""
+
+    @property
+    def point(self) -> bytes:
+        """P(x): the uncompressed SEC 1 point of the public key, 65 octets."""
+
+    def sign(self, message: bytes) -> bytes:
+        """SIG(key, message): ECDSA with SHA-256, r ‖ s, 64 octets, s in the lower half of the group order."""
+
+    def ecdh(self, peer: bytes) -> bytes:
+        """x-coordinate (32 octets) of the ECC CDH with the 65-octet point ``peer``."""
+
+
+class SoftwareKey:
+    """A P-256 private key in this process's memory; signs deterministically (RFC 6979)."""
+
+    def __init__(self, secret: int) -> None:
+        self._key = ec.derive_private_key(secret, ec.SECP256R1())
+        self.point: bytes = self._key.public_key().public_bytes(Encoding.X962, PublicFormat.UncompressedPoint)
+
+    @classmethod
+    def generate(cls) -> SoftwareKey:
+        """Make a new random key."""
+        return cls(ec.generate_private_key(ec.SECP256R1()).private_numbers().private_value)
+
+    @classmethod
+    def from_secret(cls, octets: bytes) -> SoftwareKey:
+        """Make the key of a 32-octet scalar as :meth:`secret` gives it; raises BadData."""
+        value = int.from_bytes(octets, "big")
+        if len(octets) != 32 or not 0 < value < GROUP_ORDER:
+            raise BadData("A P-256 private key is 32 octets between 1 and the group order.")
+        return cls(value)
+
+    def secret(self) -> bytes:
+        """Return the scalar, 32 octets. Whoever calls this must seal what it gives."""
+        return self._key.private_numbers().private_value.to_bytes(32, "big")
+
+    def sign(self, message: bytes) -> bytes:
+        """SIG(key, message), see :class:`PrivateKey`."""
+        der = self._key.sign(message, ec.ECDSA(hashes.SHA256(), deterministic_signing=True))
+        return raw_signature(der)
+
+    def ecdh(self, peer: bytes) -> bytes:
+        """x-coordinate of the ECDH, see :class:`PrivateKey`."""
+        return self._key.exchange(ec.ECDH(), public_key(peer))
+
+    def __repr__(self) -> str:
+        return f"SoftwareKey({fingerprint(self.point)[:16]})"
+
+
+def raw_signature(der: bytes) -> bytes:
+    """Turn a DER ECDSA signature into r ‖ s with s in the lower half, 64 octets."""
+    r, s = decode_dss_signature(der)
+    return r.to_bytes(32, "big") + min(s, GROUP_ORDER - s).to_bytes(32, "big")
+
+
+def normalise_signature(raw: bytes) -> bytes:
+    """Bring s of an r ‖ s signature into the lower half of the group order (tokens use their own k)."""
+    s = int.from_bytes(raw[32:], "big")
+    return raw[:32] + min(s, GROUP_ORDER - s).to_bytes(32, "big")
+
+
+def public_key(point: bytes) -> ec.EllipticCurvePublicKey:
+    """Read a 65-octet point strictly: uncompressed, on the curve, not infinity. Raises BadData."""
+    if len(point) != POINT_OCTETS or point[0] != 0x04:
+        raise BadData("A public key is an uncompressed P-256 point of 65 octets that starts with 04.")
+    try:
+        return ec.EllipticCurvePublicKey.from_encoded_point(ec.SECP256R1(), point)
+    except ValueError as error:
+        raise BadData("A public key is not a point of the curve P-256.") from error
+
+
+def is_point(point: bytes) -> bool:
+    """Say whether 65 octets are a valid uncompressed P-256 point."""
+    try:
+        public_key(point)
+    except BadData:
+        return False
+    return True
+
+
+def verify(point: bytes, message: bytes, signature: bytes) -> bool:
+    """Say whether ``signature`` (64 octets) is SIG(point, message); a high s is refused."""
+    if len(signature) != SIGNATURE_OCTETS:
+        return False
+    r, s = int.from_bytes(signature[:32], "big"), int.from_bytes(signature[32:], "big")
+    if not 0 < r < GROUP_ORDER or not 0 < s <= _HALF_ORDER:
+        return False
+    try:
+        public_key(point).verify(encode_dss_signature(r, s), message, ec.ECDSA(hashes.SHA256()))
+    except (InvalidSignature, BadData):
+        return False
+    return True
+
+
+def fingerprint(point: bytes) -> str:
+    """SHA-256(P(x)), 64 hex digits; people are shown the first 16."""
+    return hashlib.sha256(point).hexdigest()
+
+
+def to_pem(point: bytes) -> str:
+    """SubjectPublicKeyInfo PEM of a point."""
+    return public_key(point).public_bytes(Encoding.PEM, PublicFormat.SubjectPublicKeyInfo).decode()
+
+
+def from_pem(text: bytes) -> bytes:
+    """Point (65 octets) of a P-256 public key in PEM; raises BadData, by name for private and foreign keys."""
+    if b"PRIVATE KEY" in text:
+        raise BadData("This file holds a private key where a public one belongs.")
+    try:
+        key = load_pem_public_key(text)
+    except ValueError as error:
+        raise BadData("This file holds no public key in PEM form.") from error
+    if not isinstance(key, ec.EllipticCurvePublicKey) or not isinstance(key.curve, ec.SECP256R1):
+        raise BadData("This is not a P-256 key; stations and CAs have P-256 keys.")
+    return key.public_bytes(Encoding.X962, PublicFormat.UncompressedPoint)
+
+
+# Labelled messages of the profile. Labels of signatures end in 00.
+
+
+def node_key_message(uuid: bytes, node: bytes) -> bytes:
+    """What field 102 signs."""
+    return b"TEDS1 node key\0" + uuid + node
+
+
+def station_key_message(station: bytes) -> bytes:
+    """What field 104 (SIG104) signs."""
+    return b"TEDS1 station key\0" + station
+
+
+def prove_message(uuid: bytes, challenge: bytes) -> bytes:
+    """What the reply to Prove signs."""
+    return b"TEDS1 prove\0" + uuid + challenge
+
+
+def reset_message(uuid: bytes, epoch: int, challenge: bytes) -> bytes:
+    """What the reply to Reset signs."""
+    return b"TEDS1 reset\0" + uuid + epoch.to_bytes(4, "big") + challenge

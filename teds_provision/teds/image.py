@@ -1,0 +1,96 @@
+"""The image file: all TEDS of one node in one JSON document (command-line contract, "Image file")."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
+
+from teds_provision.errors import BadData
+
+FORMAT = "teds-image/1"
+SECURITY = (0, 128)
+
+BlockId = tuple[int, int]
+"""(TransducerChannel, access code), the order in which blocks are listed and signed."""
+
+
+@dataclass(frozen=True)
+class Image:
+    """UUID (10 octets) and framed TEDS by (channel, access code)."""
+
+    uuid: bytes
+    blocks: Mapping[BlockId, bytes] = field(default_factory=dict)
+
+    def __iter__(self) -> Iterator[BlockId]:
+        return iter(sorted(self.blocks))
+
+    @property
+    def security(self) -> bytes | None:
+        """The Security TEDS of the profile (access code 128, channel 0), if there is one."""
+        return self.blocks.get(SECURITY)
+
+    def unsigned_blocks(self) -> dict[BlockId, bytes]:
+        """Every block but the Security TEDS, ascending."""
+        return {key: self.blocks[key] for key in self if key != SECURITY}
+
+    def with_block(self, key: BlockId, teds: bytes) -> Image:
+        """Return this image with one block put in."""
+        return Image(self.uuid, {**self.blocks, key: teds})
+
+    def digest(self) -> str:
+        """SHA-256 over all blocks with their ids and lengths, 64 hex digits."""
+        whole = hashlib.sha256(self.uuid)
+        for channel, access_code in self:
+            teds = self.blocks[channel, access_code]
+            whole.update(channel.to_bytes(2, "big") + bytes([access_code]) + len(teds).to_bytes(4, "big") + teds)
+        return whole.hexdigest()
+
+    def to_json(self) -> str:
+        """Return the image file's text."""
+        blocks = [{"access_code": a, "channel": c, "teds": self.blocks[c, a].hex()} for c, a in self]
+        return json.dumps({"format": FORMAT, "uuid": self.uuid.hex(), "blocks": blocks}, indent=1) + "\n"
+
+    @classmethod
+    def from_json(cls, text: str | bytes) -> Image:
+        """Read an image file strictly; raises BadData naming what is wrong."""
+        try:
+            data = json.loads(text)
+        except (ValueError, RecursionError) as error:
+            raise BadData("This is not a TEDS image: it is not JSON.") from error
+        if not isinstance(data, dict) or data.get("format") != FORMAT:
+            raise BadData(f'This is not a TEDS image: "format" is not "{FORMAT}".')
+        uuid = _hex(data.get("uuid"), "uuid")
+        if len(uuid) != 10:
+            raise BadData(f'"uuid" of the image has {len(uuid)} octets, a UUID has 10.')
+        entries = data.get("blocks")
+        if not isinstance(entries, list):
+            raise BadData('"blocks" of the image is not a list.')
+        blocks: dict[BlockId, bytes] = {}
+        for number, entry in enumerate(entries):
+            key, teds = _block(entry, number)
+            if key in blocks:
+                raise BadData(f"Block {number} of the image repeats access code {key[1]} on channel {key[0]}.")
+            blocks[key] = teds
+        return cls(uuid, blocks)
+
+
+def _block(entry: object, number: int) -> tuple[BlockId, bytes]:
+    if not isinstance(entry, dict):
+        raise BadData(f"Block {number} of the image is not an object.")
+    access_code, channel = entry.get("access_code"), entry.get("channel")
+    if type(access_code) is not int or not 0 <= access_code <= 255:
+        raise BadData(f'"access_code" of block {number} is not a number from 0 to 255.')
+    if type(channel) is not int or not 0 <= channel <= 0xFFFF:
+        raise BadData(f'"channel" of block {number} is not a number from 0 to 65535.')
+    return (channel, access_code), _hex(entry.get("teds"), f"teds of block {number}")
+
+
+def _hex(value: object, name: str) -> bytes:
+    if not isinstance(value, str):
+        raise BadData(f'"{name}" is not a string of hex digits.')
+    try:
+        return bytes.fromhex(value)
+    except ValueError as error:
+        raise BadData(f'"{name}" is not a string of hex digits.') from error
