@@ -1,0 +1,118 @@
+"""What decoding gives: fields in wire order, findings, and one verdict (words of the vectors' index)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import StrEnum
+from fractions import Fraction
+from typing import Literal
+
+Edition = Literal[2007, 2024]
+Severity = Literal["error", "warning", "note"]
+
+
+class Verdict(StrEnum):
+    """How far octets keep to the standard; framed TEDS, bare data blocks and messages are told apart."""
+
+    CLEAN = "clean"
+    FRAME_BAD = "frame-bad"
+    CONTENT_NONCONFORMANT = "content-nonconformant"
+    FRAME_AND_CONTENT_BAD = "frame-and-content-bad"
+    MALFORMED = "malformed"
+    BLOCK_CLEAN = "block-clean"
+    BLOCK_NONCONFORMANT = "block-nonconformant"
+    MESSAGE = "message"
+
+
+@dataclass(frozen=True)
+class Finding:
+    """One deviation: where it stands, what the standard asks, what stands there.
+
+    ``offset`` counts octets from the first octet given to the decoder; ``field`` is the field's name or ''.
+    """
+
+    severity: Severity
+    code: str
+    message: str
+    offset: int | None = None
+    field: str = ""
+    asked: str = ""
+    found: str = ""
+
+
+@dataclass(frozen=True)
+class Units:
+    """Physical units (types 12, 46): interpretation 0 to 5 and exponents of rad, sr, m, kg, s, A, K, mol, cd.
+
+    Exponents are multiples of 1/2; on the wire each is 2 × exponent + 128. ``extension`` is the access code of a Units
+    Extension TEDS, 0 for none (ieee-1451.0.md section 4.3).
+    """
+
+    interpretation: int = 0
+    radians: Fraction = Fraction(0)
+    steradians: Fraction = Fraction(0)
+    meters: Fraction = Fraction(0)
+    kilograms: Fraction = Fraction(0)
+    seconds: Fraction = Fraction(0)
+    amperes: Fraction = Fraction(0)
+    kelvins: Fraction = Fraction(0)
+    moles: Fraction = Fraction(0)
+    candelas: Fraction = Fraction(0)
+    extension: int = 0
+
+
+@dataclass(frozen=True)
+class TimeInstance:
+    """Seconds and nanoseconds since 1970-01-01, sign of the whole value apart (ieee-1451.0.md section 5)."""
+
+    seconds: int
+    nanoseconds: int = 0
+    negative: bool = False
+
+
+Value = int | float | str | bytes | Units | TimeInstance | tuple[int, ...] | tuple[float, ...] | None
+
+
+@dataclass(frozen=True)
+class Field:
+    """One tuple: its type, name ('' when unknown), decoded value (None when nested or unknown), raw value octets.
+
+    ``offset`` is that of the Type octet; ``children`` are the tuples of a nested structure.
+    """
+
+    type: int
+    name: str
+    value: Value
+    raw: bytes
+    offset: int
+    children: tuple[Field, ...] = ()
+
+
+@dataclass(frozen=True)
+class Decoded:
+    """A decoded TEDS: never raised away, always with a verdict and the octets it came from."""
+
+    octets: bytes
+    framed: bool
+    edition: Edition | None
+    access_code: int | None
+    name: str
+    fields: tuple[Field, ...]
+    findings: tuple[Finding, ...]
+    verdict: Verdict
+    text: tuple[bytes, ...] = ()
+
+    def get(self, name: str) -> Value:
+        """Value of the first field of that name at any depth, None when absent."""
+        found = self.field(name)
+        return None if found is None else found.value
+
+    def field(self, name: str) -> Field | None:
+        """First field of that name, depth first."""
+        pending = list(self.fields)
+        while pending:
+            first = pending.pop(0)
+            if first.name == name:
+                return first
+            pending = [*first.children, *pending]
+        return None
