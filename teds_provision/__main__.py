@@ -1,0 +1,21 @@
+"""Entry point: answers ``--version`` before anything heavy is imported, everything else goes to the command line."""
+
+from __future__ import annotations
+
+import sys
+
+
+def main() -> None:
+    """Run the command line and exit with the codes of the contract."""
+    if sys.argv[1:] == ["--version"]:
+        from teds_provision import __version__
+
+        print(f"teds-provision {__version__}")
+        return
+    from teds_provision.cli.main import run
+
+    sys.exit(run(sys.argv[1:]))
+
+
+if __name__ == "__main__":
+    main()

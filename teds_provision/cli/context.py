@@ -1,0 +1,152 @@
+"""What every command gets: the global options, the way results are told, and the station's store and vault."""
+
+from __future__ import annotations
+
+import json
+import os
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, ClassVar
+
+import click
+
+from teds_provision.errors import UsageFailure, WrongPassphrase
+
+if TYPE_CHECKING:
+    from rich.console import Console, RenderableType
+
+    from teds_provision.workflow.station import Station
+
+
+class App:
+    """One run of the command line. Results go to stdout, everything else to stderr."""
+
+    current: ClassVar[App | None] = None
+
+    def __init__(
+        self,
+        *,
+        home: Path | None = None,
+        as_json: bool = False,
+        verbose: int = 0,
+        quiet: bool = False,
+        debug: bool = False,
+        no_input: bool = False,
+        passphrase_fd: int | None = None,
+    ) -> None:
+        self.home = self.home_of(home)
+        self.json, self.verbose, self.quiet, self.debug = as_json, verbose, quiet, debug
+        self.no_input = no_input or as_json
+        self._passphrase_fd = passphrase_fd
+        self._passphrase: str | None = None
+        self._closers: list[Callable[[], None]] = []
+        App.current = self
+
+    @staticmethod
+    def home_of(home: Path | None) -> Path:
+        """Folder of the store: the option's, else the platform's user data folder."""
+        if home is not None:
+            return home.expanduser()
+        from platformdirs import user_data_path
+
+        return user_data_path("teds-provision")
+
+    # -- telling ---------------------------------------------------------------------------------------------------
+
+    def emit(self, result: dict[str, Any], human: Callable[[Console], None] | RenderableType | None = None) -> None:
+        """Tell a command's result: one JSON object on one line with --json, else what ``human`` prints on stdout.
+
+        ``human`` is a rich renderable (or a str), or a function that is given the console.
+        """
+        if self.json:
+            print(json.dumps(result, ensure_ascii=False), flush=True)
+        elif human is not None:
+            console = self.console()
+            if callable(human):
+                human(console)
+            else:
+                console.print(human)
+
+    def console(self, *, stderr: bool = False) -> Console:
+        """Return a rich console; colour yields to NO_COLOR and to a pipe, long lines are not broken in a pipe."""
+        from rich.console import Console
+
+        stream = sys.stderr if stderr else sys.stdout
+        return Console(stderr=stderr, highlight=False, soft_wrap=not stream.isatty())
+
+    def note(self, text: str, *, level: int = 0) -> None:
+        """Say something on stderr, unless --quiet (or fewer ``-v`` than ``level``); not with --json."""
+        if not self.quiet and not self.json and self.verbose >= level:
+            print(text, file=sys.stderr, flush=True)
+
+    def warn(self, text: str) -> None:
+        """Warn on stderr, also with --json; only --quiet silences it."""
+        if not self.quiet:
+            print(f"Warning: {text}", file=sys.stderr, flush=True)
+
+    # -- asking ----------------------------------------------------------------------------------------------------
+
+    @property
+    def interactive(self) -> bool:
+        """Whether a person can be asked: a terminal, and neither --no-input nor --json."""
+        return not self.no_input and sys.stdin.isatty()
+
+    def confirm(self, question: str, *, yes: bool) -> None:
+        """Ask before something that cannot be undone; ``yes`` is the command's --yes. Aborts on "no" (exit 130)."""
+        if yes:
+            return
+        if not self.interactive:
+            raise UsageFailure(
+                "This needs a confirmation and nobody can be asked.", hint="Add --yes, or --dry-run to see the plan."
+            )
+        click.confirm(question, abort=True, err=True)
+
+    def ask_secret(self, prompt: str, confirm: bool = False) -> str:
+        """Get a passphrase or PIN: from --passphrase-fd (one line, read once), else from the terminal."""
+        if self._passphrase_fd is not None:
+            if self._passphrase is None:
+                self._passphrase = _read_line(self._passphrase_fd)
+            return self._passphrase
+        if self.no_input or not sys.stdin.isatty():
+            raise WrongPassphrase(
+                f"{prompt.rstrip(': ')} is needed and nobody can be asked.",
+                hint="Give it through a file descriptor: --passphrase-fd 3 3<FILE.",
+            )
+        answer: str = click.prompt(prompt, hide_input=True, confirmation_prompt=confirm, err=True)
+        return answer
+
+    # -- the station -----------------------------------------------------------------------------------------------
+
+    def station(self) -> Station:
+        """Open this base station (store now, vault when a key is first needed); NotFound says to run init."""
+        from teds_provision.workflow.station import Station
+
+        station = Station.open(self.home, ask=self.ask_secret)
+        self.closing(station.close)
+        return station
+
+    def closing(self, close: Callable[[], None]) -> None:
+        """Register what is to be closed when the command ends, however it ends."""
+        self._closers.append(close)
+
+    def close(self) -> None:
+        """Close everything that was registered, last first."""
+        while self._closers:
+            self._closers.pop()()
+        App.current = None
+
+
+def _read_line(descriptor: int) -> str:
+    try:
+        with os.fdopen(os.dup(descriptor), "rb") as stream:
+            line = stream.readline(4096)
+    except OSError as error:
+        raise UsageFailure(f"--passphrase-fd {descriptor} cannot be read: {error.strerror}.") from error
+    text = line.decode(errors="strict").rstrip("\r\n")
+    if not text:
+        raise WrongPassphrase(f"--passphrase-fd {descriptor} gave an empty line.")
+    return text
+
+
+pass_app = click.make_pass_decorator(App)

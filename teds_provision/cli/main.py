@@ -1,0 +1,176 @@
+"""The command line: global options, lazy commands, and the one place where errors become exit codes."""
+
+from __future__ import annotations
+
+import importlib
+import json
+import sys
+from pathlib import Path
+from typing import Any
+
+import click
+
+from teds_provision import __version__
+from teds_provision.cli.context import App
+from teds_provision.cli.table import COMMANDS, SECTIONS
+from teds_provision.errors import BadData, TedsProvisionError
+
+ENVIRONMENT_PREFIX = "TEDS_PROVISION"
+INTERRUPTED = 130
+
+
+class LazyGroup(click.Group):
+    """The top group: commands are imported when they are called, help comes from the table."""
+
+    def list_commands(self, ctx: click.Context) -> list[str]:
+        """Names in the order of the table."""
+        return list(COMMANDS)
+
+    def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
+        """Import the command's module."""
+        entry = COMMANDS.get(cmd_name)
+        if entry is None:
+            return None
+        module = importlib.import_module(f"teds_provision.cli.{entry.module}")
+        command = getattr(module, entry.attribute)
+        assert isinstance(command, click.Command)
+        return command
+
+    def resolve_command(
+        self, ctx: click.Context, args: list[str]
+    ) -> tuple[str | None, click.Command | None, list[str]]:
+        """Suggest the nearest command where there is none of that name."""
+        try:
+            return super().resolve_command(ctx, args)
+        except click.UsageError as error:
+            from difflib import get_close_matches
+
+            near = get_close_matches(args[0], COMMANDS, n=1)
+            if near:
+                error.message += f" Did you mean {near[0]!r}?"
+            raise
+
+    def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
+        """Write the sections of the table."""
+        width = max(map(len, COMMANDS))
+        for title, entries in SECTIONS.items():
+            with formatter.section(title):
+                formatter.write_dl([(name.ljust(width), entry.help) for name, entry in entries.items()])
+
+
+class FlatDefaults(dict[str, Any]):
+    """Values of config.toml: one flat table serves every command; a table named like a command goes before it."""
+
+    def get(self, key: str, default: Any = None) -> Any:
+        """Return the defaults of command ``key``, or the value of option ``key``."""
+        if key in COMMANDS:
+            own = super().get(key)
+            return FlatDefaults({**self, **(own if isinstance(own, dict) else {})})
+        return super().get(key, default)
+
+
+def _read_config(ctx: click.Context, _parameter: click.Parameter, home: Path | None) -> Path | None:
+    path = App.home_of(home) / "config.toml"
+    if path.is_file():
+        import tomllib
+
+        try:
+            values = tomllib.loads(path.read_text())
+        except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+            raise BadData(f"{path} is not valid TOML: {error}.", hint="Mend or remove the file.") from error
+        ctx.default_map = FlatDefaults({name.replace("-", "_"): value for name, value in values.items()})
+    return home
+
+
+@click.group(
+    cls=LazyGroup,
+    context_settings={
+        "help_option_names": ["-h", "--help"],
+        "auto_envvar_prefix": ENVIRONMENT_PREFIX,
+        "max_content_width": 100,
+    },
+    epilog="Start with: teds-provision demo",
+)
+@click.option(
+    "--home",
+    type=click.Path(path_type=Path, file_okay=False),
+    is_eager=True,
+    callback=_read_config,
+    help="Folder of the store (default: the platform's user data folder).",
+)
+@click.option("--json", "as_json", envvar=f"{ENVIRONMENT_PREFIX}_JSON", is_flag=True, help="One JSON object on stdout.")
+@click.option("--verbose", "-v", count=True, help="Say more on stderr; twice for every frame's name and size.")
+@click.option("--quiet", "-q", is_flag=True, help="Say nothing but results and errors.")
+@click.option("--debug", is_flag=True, help="Show tracebacks and library logs.")
+@click.option("--no-input", is_flag=True, help="Never prompt; fail where a prompt would be needed.")
+@click.option("--passphrase-fd", type=int, metavar="N", help="Read the passphrase or PIN from this file descriptor.")
+@click.version_option(__version__, prog_name="teds-provision", message="%(prog)s %(version)s")
+@click.pass_context
+def cli(ctx: click.Context, as_json: bool, **options: Any) -> None:
+    """Prove which transducer it is, give it a key, write its datasheet.
+
+    Identify, key, sign and write the IEEE 1451.0 TEDS of smart transducers over NFC and CAN.
+    """
+    ctx.obj = App(as_json=as_json, **options)
+
+
+def run(arguments: list[str]) -> int:
+    """Run one command line; returns the exit code. Every error is told in at most three lines."""
+    app: App | None = None
+    try:
+        with cli.make_context("teds-provision", list(arguments)) as ctx:
+            cli.invoke(ctx)
+        return 0
+    except click.exceptions.Exit as finished:
+        return finished.exit_code
+    except (click.Abort, KeyboardInterrupt):
+        _say("Interrupted: the same command carries on from here.")
+        return INTERRUPTED
+    except click.ClickException as error:
+        return _fail(arguments, 2, "usage", _usage(error), "")
+    except TedsProvisionError as error:
+        _traceback(arguments)
+        return _fail(arguments, error.exit_code, error.code, error.message, error.hint)
+    except BrokenPipeError:
+        sys.stderr.close()
+        return 1
+    except Exception as error:  # noqa: BLE001 - the last line of defence: a foreign exception is a bug of ours
+        _traceback(arguments)
+        hint = "This is a bug: please report it with what --debug prints."
+        return _fail(arguments, 1, "bug", f"Unexpected {type(error).__name__}.", hint)
+    finally:
+        app = App.current
+        if app is not None:
+            app.close()
+
+
+def _usage(error: click.ClickException) -> str:
+    text = error.format_message()
+    if isinstance(error, click.UsageError) and error.ctx is not None:
+        text += f" (see: {error.ctx.command_path} --help)"
+    return text
+
+
+def _wants(arguments: list[str], option: str) -> bool:
+    return option in arguments or bool(App.current and getattr(App.current, option.strip("-"), False))
+
+
+def _traceback(arguments: list[str]) -> None:
+    if _wants(arguments, "--debug"):
+        import traceback
+
+        traceback.print_exc()
+
+
+def _fail(arguments: list[str], exit_code: int, code: str, message: str, hint: str) -> int:
+    if _wants(arguments, "--json"):
+        print(json.dumps({"error": {"code": code, "message": message, "hint": hint}}), flush=True)
+    else:
+        _say(f"Error: {message}")
+        if hint:
+            _say(f"  → {hint}")
+    return exit_code
+
+
+def _say(text: str) -> None:
+    print(text, file=sys.stderr, flush=True)

@@ -1,0 +1,60 @@
+"""Options that several commands share."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, TypeVar
+
+import click
+
+from teds_provision.links import LinkSettings
+
+Function = TypeVar("Function", bound=Callable[..., Any])
+
+COMMAND_SETTINGS: dict[str, Any] = {"auto_envvar_prefix": "TEDS_PROVISION"}
+"""context_settings of every command: each option also reads TEDS_PROVISION_<NAME>."""
+
+
+def command(name: str | None = None, **attributes: Any) -> Callable[[Callable[..., Any]], click.Command]:
+    """Make a click command whose options read TEDS_PROVISION_<NAME>; the docstring holds an Examples paragraph."""
+    return click.command(name, context_settings=COMMAND_SETTINGS, **attributes)
+
+
+def link_options(function: Function) -> Function:
+    """Add --via, --nfc, --can, --ble, --timeout; the command gets them as one ``links: LinkSettings``."""
+    from functools import wraps
+
+    @wraps(function)
+    def with_links(
+        *args: Any, via: str, nfc: str | None, can: str | None, ble: str | None, timeout: float, **rest: Any
+    ) -> Any:
+        return function(*args, links=LinkSettings(via, nfc, can, ble, timeout), **rest)
+
+    options = [
+        click.option("--via", type=click.Choice(["nfc", "can", "ble"]), default="nfc", show_default=True, help="Link."),
+        click.option("--nfc", metavar="PATH", help="Reader: usb, usb:072f:2200, tty:USB0:pn532, udp:localhost:54321."),
+        click.option("--can", metavar="INTERFACE:CHANNEL", help="Bus: socketcan:can0, udp_multicast:239.74.163.2, …"),
+        click.option("--ble", metavar="ADAPTER", help="Not in this version."),
+        click.option(
+            "--timeout",
+            type=click.FloatRange(min=0.1),
+            default=60.0,
+            show_default=True,
+            metavar="SECONDS",
+            help="How long to wait for the node.",
+        ),
+    ]
+    wrapped: Any = with_links
+    for option in reversed(options):
+        wrapped = option(wrapped)
+    return wrapped  # type: ignore[no-any-return]
+
+
+def yes_option(function: Function) -> Function:
+    """Add --yes: no question is asked."""
+    return click.option("--yes", "-y", is_flag=True, help="Do not ask.")(function)
+
+
+def dry_run_option(function: Function) -> Function:
+    """Add --dry-run: print the plan, change nothing."""
+    return click.option("--dry-run", is_flag=True, help="Print the plan and change nothing.")(function)
