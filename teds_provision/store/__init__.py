@@ -1,0 +1,37 @@
+"""What a station remembers: whitelist, nodes, wrapped keys, journal, trust and the audit log, in one SQLite file."""
+
+from teds_provision.store.audit import AuditEntry, AuditLog, AuditVerdict
+from teds_provision.store.lock import StoreLock
+from teds_provision.store.records import (
+    Draft,
+    Handover,
+    Holder,
+    KeyRecord,
+    NodeRecord,
+    Revocation,
+    Step,
+    Tombstone,
+    TrustRecord,
+    WhitelistEntry,
+    utc_now,
+)
+from teds_provision.store.store import Store
+
+__all__ = [
+    "AuditEntry",
+    "AuditLog",
+    "AuditVerdict",
+    "Draft",
+    "Handover",
+    "Holder",
+    "KeyRecord",
+    "NodeRecord",
+    "Revocation",
+    "Step",
+    "Store",
+    "StoreLock",
+    "Tombstone",
+    "TrustRecord",
+    "WhitelistEntry",
+    "utc_now",
+]

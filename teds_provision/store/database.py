@@ -1,0 +1,213 @@
+"""The SQLite file under the store: opened safely, written durably, and never a foreign exception.
+
+Write-ahead log with ``synchronous=FULL``: a commit that returned has reached the disk, and a process killed at any
+instant leaves the last commit. ``secure_delete`` overwrites what is deleted.
+"""
+
+from __future__ import annotations
+
+import errno
+import os
+import sqlite3
+import stat
+import threading
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from typing import Any, NoReturn
+
+from teds_provision.errors import BadData, StoreFailure, StoreLocked
+from teds_provision.store.schema import APPLICATION_ID, SCHEMA_VERSION, STEPS_TO
+
+FILE_NAME = "store.sqlite3"
+BUSY_SECONDS = 10.0
+_RESTORE = "Restore a backup (teds-provision restore), or move the file away and run teds-provision init."
+
+_FULL = ("there is no space left on the disk", "Free some space and run the same command again; nothing is lost.")
+_READ_ONLY = (
+    "it cannot be written",
+    "Check the owner and mode of the home directory and whether the disk is read-only.",
+)
+_CAUSES: dict[int, tuple[str, str]] = {
+    sqlite3.SQLITE_FULL: _FULL,
+    sqlite3.SQLITE_READONLY: _READ_ONLY,
+    sqlite3.SQLITE_PERM: _READ_ONLY,
+    sqlite3.SQLITE_CANTOPEN: ("it cannot be opened", _READ_ONLY[1]),
+    sqlite3.SQLITE_IOERR: (
+        "the disk failed or is full",
+        "Check the disk (space, quota, kernel log), then run the same command again.",
+    ),
+    sqlite3.SQLITE_CORRUPT: ("it is damaged", _RESTORE),
+    sqlite3.SQLITE_NOTADB: ("it is damaged or no store of this tool", _RESTORE),
+    sqlite3.SQLITE_CONSTRAINT: ("the entry breaks a rule of the store", "Nothing was changed; please report this."),
+}
+_OS_CAUSES: dict[int, tuple[str, str]] = {
+    errno.ENOSPC: _FULL,
+    errno.EDQUOT: _FULL,
+    errno.EROFS: _READ_ONLY,
+    errno.EACCES: _READ_ONLY,
+    errno.EPERM: _READ_ONLY,
+}
+
+
+def as_store_failure(error: sqlite3.Error | OSError, path: Path) -> StoreFailure:
+    """Say in the words of the tool why SQLite or the system refused; cause and cure, no octet of the contents."""
+    if isinstance(error, OSError):
+        cause, cure = _OS_CAUSES.get(error.errno or 0, (error.strerror or type(error).__name__, "Check that path."))
+        return StoreFailure(f"The store {path} cannot be used: {cause}.", hint=cure)
+    primary = getattr(error, "sqlite_errorcode", 0) & 0xFF
+    if primary in (sqlite3.SQLITE_BUSY, sqlite3.SQLITE_LOCKED):
+        return StoreLocked(
+            f"The store {path} was kept busy by another process for {BUSY_SECONDS:.0f} s.",
+            hint="Wait until the other command has ended, then run this one again.",
+        )
+    cause, cure = _CAUSES.get(primary, (f"SQLite says: {error}", "Run teds-provision doctor."))
+    return StoreFailure(f"The store {path} cannot be used: {cause}.", hint=cure)
+
+
+class Database:
+    """One connection: statements, re-entrant transactions, errors translated. Safe to share between threads."""
+
+    def __init__(self, path: Path, connection: sqlite3.Connection) -> None:
+        self.path = path
+        self._connection = connection
+        self._lock = threading.RLock()
+        self._depth = 0
+
+    @classmethod
+    def open(cls, home: Path, *, create: bool) -> Database:
+        """Open ``home``/store.sqlite3, making it (0600, in a directory of 0700) if ``create``.
+
+        Raises StoreFailure: missing, damaged, of a newer version, foreign, no permission, no space.
+        """
+        path = home / FILE_NAME
+        try:
+            _prepare_home(home, create=create)
+            _prepare_file(path, create=create)
+        except OSError as error:
+            raise as_store_failure(error, path) from error
+        try:
+            connection = sqlite3.connect(path, timeout=BUSY_SECONDS, isolation_level=None, check_same_thread=False)
+        except sqlite3.Error as error:
+            raise as_store_failure(error, path) from error
+        database = cls(path, connection)
+        try:
+            database._set_up(create=create)
+        except BaseException:
+            connection.close()
+            raise
+        return database
+
+    def close(self) -> None:
+        """Close the connection; a second call does nothing."""
+        with self._lock, suppress(sqlite3.Error):
+            self._connection.close()
+
+    def execute(self, statement: str, values: Sequence[Any] = ()) -> list[tuple[Any, ...]]:
+        """Run one statement and return all its rows; raises StoreFailure."""
+        with self._lock:
+            try:
+                return self._connection.execute(statement, values).fetchall()
+            except (sqlite3.Error, OSError) as error:
+                self._fail(error)
+            except UnicodeEncodeError as error:  # a name from a command line that is not UTF-8
+                raise BadData("A name or text is not valid UTF-8.", hint="Give it in UTF-8.") from error
+
+    def change(self, statement: str, values: Sequence[Any] = ()) -> int:
+        """Run one statement and return how many rows it changed; raises StoreFailure."""
+        with self._lock:
+            try:
+                return self._connection.execute(statement, values).rowcount
+            except (sqlite3.Error, OSError) as error:
+                self._fail(error)
+            except UnicodeEncodeError as error:  # a name from a command line that is not UTF-8
+                raise BadData("A name or text is not valid UTF-8.", hint="Give it in UTF-8.") from error
+
+    def one(self, statement: str, values: Sequence[Any] = ()) -> tuple[Any, ...] | None:
+        """Return the first row, None if there is none; raises StoreFailure."""
+        rows = self.execute(statement, values)
+        return rows[0] if rows else None
+
+    @contextmanager
+    def transaction(self) -> Iterator[None]:
+        """All or nothing: BEGIN IMMEDIATE, COMMIT, or ROLLBACK when anything is raised; inside another, a savepoint."""
+        with self._lock:
+            level = self._depth
+            begin, commit, rollback = (
+                ("BEGIN IMMEDIATE", "COMMIT", ("ROLLBACK",))
+                if level == 0
+                else (f"SAVEPOINT s{level}", f"RELEASE s{level}", (f"ROLLBACK TO s{level}", f"RELEASE s{level}"))
+            )
+            self.execute(begin)
+            self._depth += 1
+            try:
+                yield
+                self.execute(commit)
+            except BaseException:
+                for statement in rollback:
+                    with suppress(sqlite3.Error):  # SQLite may have rolled back by itself (disk full)
+                        self._connection.execute(statement)
+                raise
+            finally:
+                self._depth -= 1
+
+    def _fail(self, error: sqlite3.Error | OSError) -> NoReturn:
+        raise as_store_failure(error, self.path) from error
+
+    def _set_up(self, *, create: bool) -> None:
+        for pragma in ("trusted_schema=OFF", "foreign_keys=ON", "secure_delete=ON", "synchronous=FULL"):
+            self.execute(f"PRAGMA {pragma}")
+        version = self._version()
+        if version == 0 and not create:
+            raise StoreFailure(f"The store {self.path} is empty.", hint="Run teds-provision init.")
+        self.execute("PRAGMA journal_mode=WAL")
+        if version < SCHEMA_VERSION:
+            with self.transaction():
+                for step in range(self._version() + 1, SCHEMA_VERSION + 1):
+                    for statement in STEPS_TO[step]:
+                        self.execute(statement)
+                self.execute(f"PRAGMA application_id={APPLICATION_ID}")
+                self.execute(f"PRAGMA user_version={SCHEMA_VERSION}")
+
+    def _version(self) -> int:
+        (mark,), (version,) = self.execute("PRAGMA application_id")[0], self.execute("PRAGMA user_version")[0]
+        tables = self.execute("SELECT count(*) FROM sqlite_schema")[0][0]
+        if (version or tables) and mark != APPLICATION_ID:
+            raise StoreFailure(f"{self.path} is a database of another program.", hint="Choose another --home.")
+        if version > SCHEMA_VERSION:
+            raise StoreFailure(
+                f"The store {self.path} has schema {version}; this version of the tool knows up to {SCHEMA_VERSION}.",
+                hint="Use the newer version of teds-provision that made it.",
+            )
+        return int(version)
+
+
+def _prepare_home(home: Path, *, create: bool) -> None:
+    """Make the directory with mode 0700; refuse one in which others may write."""
+    if create:
+        home.parent.mkdir(parents=True, exist_ok=True)
+        with suppress(FileExistsError):
+            home.mkdir(mode=0o700)
+            home.chmod(0o700)  # whatever the umask said
+    try:
+        status = home.stat()
+    except FileNotFoundError:
+        raise StoreFailure(f"There is no store in {home}.", hint="Run teds-provision init.") from None
+    if not stat.S_ISDIR(status.st_mode):
+        raise StoreFailure(f"{home} is not a directory.", hint="Choose another --home.")
+    private = not status.st_mode & 0o077
+    if create and not private and status.st_uid == os.geteuid() and not any(home.iterdir()):
+        home.chmod(0o700)
+    elif status.st_mode & 0o022:
+        raise StoreFailure(f"Others may write in {home}.", hint=f"Run: chmod 700 {home}, or choose another --home.")
+
+
+def _prepare_file(path: Path, *, create: bool) -> None:
+    """Make the file with mode 0600 before SQLite would make it wider; its -wal and -shm follow its mode."""
+    if create:
+        with suppress(FileExistsError):
+            os.close(os.open(path, os.O_CREAT | os.O_EXCL | os.O_RDWR | os.O_NOFOLLOW, 0o600))
+    elif not path.exists():
+        raise StoreFailure(f"There is no store in {path.parent}.", hint="Run teds-provision init.")
+    if path.stat().st_mode & 0o077:
+        path.chmod(0o600)

@@ -1,0 +1,157 @@
+"""Who is trusted, and what was handed over (profile: security-teds.md sections 2 and 6)."""
+
+from __future__ import annotations
+
+import json
+import re
+from dataclasses import replace
+from typing import Any
+
+from teds_provision.errors import PolicyRefused, UsageFailure
+from teds_provision.store.database import Database
+from teds_provision.store.records import Direction, Handover, Holder, Revocation, Tombstone, TrustRecord
+
+_MIN_FINGERPRINT_PREFIX = 16  # what people are shown
+
+
+class HandoverTables:
+    """The part of the store that is about other stations; see :class:`teds_provision.store.Store`."""
+
+    _database: Database
+
+    def trusted(self) -> list[TrustRecord]:
+        """Return every trusted station and CA, by name."""
+        return [TrustRecord(*row) for row in self._database.execute("SELECT * FROM trust ORDER BY name")]
+
+    def put_trust(self, record: TrustRecord) -> None:
+        """Trust a key under a name; the same key and role under another name is renamed.
+
+        Raises PolicyRefused if the name stands for another key or role: it must be removed first.
+        """
+        with self._database.transaction():
+            row = self._database.one("SELECT fingerprint, role FROM trust WHERE name = ?", (record.name,))
+            if row and row != (record.fingerprint, record.role):
+                raise PolicyRefused(
+                    f"The name {record.name!r} already stands for the {row[1]} {row[0][:16]}.",
+                    hint=f"Choose another name, or run teds-provision trust remove {record.name} first.",
+                )
+            self._database.execute(
+                "DELETE FROM trust WHERE fingerprint = ? AND role = ?", (record.fingerprint, record.role)
+            )
+            self._database.execute(
+                "INSERT INTO trust VALUES(?, ?, ?, ?, ?)",
+                (record.name, record.role, record.point, record.fingerprint, record.added),
+            )
+
+    def remove_trust(self, name_or_fingerprint: str) -> bool:
+        """Trust a key no more, by its name, fingerprint, or at least 16 digits of it; False if none fits.
+
+        Raises UsageFailure if the digits fit several keys.
+        """
+        digits = name_or_fingerprint.strip().lower()
+        with self._database.transaction():
+            if self._database.change("DELETE FROM trust WHERE name = ?", (name_or_fingerprint,)):
+                return True
+            if not re.fullmatch(f"[0-9a-f]{{{_MIN_FINGERPRINT_PREFIX},64}}", digits):
+                return False
+            found = self._database.execute(
+                "SELECT DISTINCT fingerprint FROM trust WHERE substr(fingerprint, 1, ?) = ?", (len(digits), digits)
+            )
+            if len(found) > 1:
+                raise UsageFailure(f"{digits} fits {len(found)} trusted keys.", hint="Give the whole fingerprint.")
+            return bool(found) and self._database.change("DELETE FROM trust WHERE fingerprint = ?", found[0]) > 0
+
+    def handovers(self) -> list[Handover]:
+        """Return every bundle that left or came, oldest first."""
+        return [_handover(row) for row in self._database.execute("SELECT * FROM handovers ORDER BY created, id")]
+
+    def handover(self, handover_id: str, direction: Direction) -> Handover | None:
+        """Return one bundle."""
+        row = self._database.one("SELECT * FROM handovers WHERE id = ? AND direction = ?", (handover_id, direction))
+        return _handover(row) if row else None
+
+    def put_handover(self, handover: Handover) -> None:
+        """Add or replace a bundle."""
+        self._database.execute(
+            "INSERT OR REPLACE INTO handovers VALUES(?, ?, ?, ?, ?, ?, ?, ?, ?)",
+            (
+                handover.id,
+                handover.direction,
+                handover.mode,
+                json.dumps(list(handover.peers)),
+                handover.state,
+                handover.nodes,
+                handover.bundle_sha256,
+                handover.receipt,
+                handover.created,
+            ),
+        )
+
+    def remove_handover(self, handover_id: str, direction: Direction) -> bool:
+        """Forget a bundle; False if there is none."""
+        statement = "DELETE FROM handovers WHERE id = ? AND direction = ?"
+        return self._database.change(statement, (handover_id, direction)) > 0
+
+    def tombstones(self) -> list[Tombstone]:
+        """Return every node that was given away, by UUID."""
+        return [Tombstone(*row) for row in self._database.execute("SELECT * FROM tombstones ORDER BY uuid")]
+
+    def tombstone(self, uuid: bytes) -> Tombstone | None:
+        """Return where this node was given, None if it was not."""
+        row = self._database.one("SELECT * FROM tombstones WHERE uuid = ?", (uuid,))
+        return Tombstone(*row) if row else None
+
+    def put_tombstone(self, tombstone: Tombstone) -> None:
+        """Note that a node was given away."""
+        self._database.execute(
+            "INSERT OR REPLACE INTO tombstones VALUES(?, ?, ?, ?)",
+            (tombstone.uuid, tombstone.to_fingerprint, tombstone.handover_id, tombstone.created),
+        )
+
+    def remove_tombstone(self, uuid: bytes) -> bool:
+        """Take a tombstone away (an undone move); False if there is none."""
+        return self._database.change("DELETE FROM tombstones WHERE uuid = ?", (uuid,)) > 0
+
+    def holders(self, uuid: bytes | None = None) -> list[Holder]:
+        """Return who else holds keys: of this node, or of all."""
+        rows = self._database.execute(
+            "SELECT * FROM holders WHERE ?1 IS NULL OR uuid = ?1 ORDER BY uuid, since, fingerprint", (uuid,)
+        )
+        return [Holder(*row) for row in rows]
+
+    def put_holder(self, holder: Holder) -> None:
+        """Note that another station holds a key of this node."""
+        self._database.execute(
+            "INSERT OR REPLACE INTO holders VALUES(?, ?, ?, ?)",
+            (holder.uuid, holder.fingerprint, holder.since, holder.mode),
+        )
+
+    def remove_holder(self, uuid: bytes, fingerprint: str) -> bool:
+        """Note that a station holds it no more (a rotation); False if it was not noted."""
+        statement = "DELETE FROM holders WHERE uuid = ? AND fingerprint = ?"
+        return self._database.change(statement, (uuid, fingerprint)) > 0
+
+    def revocations(self) -> list[Revocation]:
+        """Return the deny list, by UUID."""
+        return [Revocation(*row) for row in self._database.execute("SELECT * FROM revocations ORDER BY uuid")]
+
+    def revocation(self, uuid: bytes) -> Revocation | None:
+        """Return why this node is denied, None if it is not."""
+        row = self._database.one("SELECT * FROM revocations WHERE uuid = ?", (uuid,))
+        return Revocation(*row) if row else None
+
+    def put_revocation(self, revocation: Revocation) -> None:
+        """Deny a node."""
+        self._database.execute(
+            "INSERT OR REPLACE INTO revocations VALUES(?, ?, ?, ?, ?)",
+            (revocation.uuid, revocation.fingerprint, revocation.why, revocation.statement, revocation.created),
+        )
+
+    def remove_revocation(self, uuid: bytes) -> bool:
+        """Deny a node no more; False if it was not denied."""
+        return self._database.change("DELETE FROM revocations WHERE uuid = ?", (uuid,)) > 0
+
+
+def _handover(row: tuple[Any, ...]) -> Handover:
+    handover = Handover(*row)
+    return replace(handover, peers=tuple(json.loads(row[3])))

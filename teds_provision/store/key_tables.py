@@ -1,0 +1,94 @@
+"""The wrapped link keys: pending ones beside the active one (profile: security-teds.md section 3, loss-table)."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+
+from teds_provision.errors import NotFound
+from teds_provision.store.database import Database
+from teds_provision.store.records import KeyRecord
+
+_COLUMNS = "uuid, epoch, key_id, state, slot, wrapped, source, created, seq"
+_PAGE = 500
+
+
+class KeyTables:
+    """The part of the store that is about link keys; see :class:`teds_provision.store.Store`."""
+
+    _database: Database
+
+    def keys(self, uuid: bytes) -> list[KeyRecord]:
+        """Return the keys of a node in the order to try them: newest pending first, the active one last."""
+        rows = self._database.execute(
+            f"SELECT {_COLUMNS} FROM keys WHERE uuid = ? ORDER BY state = 'active', seq DESC", (uuid,)
+        )
+        return [KeyRecord(*row) for row in rows]
+
+    def next_slot(self, uuid: bytes) -> int:
+        """Return a slot number that this node never had; to be asked before wrapping a new key."""
+        rows = self._database.execute(
+            "INSERT INTO key_slots VALUES(?, 1) ON CONFLICT(uuid) DO UPDATE SET last = last + 1 RETURNING last", (uuid,)
+        )
+        return int(rows[0][0])
+
+    def add_key(self, record: KeyRecord) -> None:
+        """Keep a key durably before returning; one that is there already (same node and key id) stays as it is.
+
+        ``record.seq`` is ignored, the store gives the next. Raises StoreFailure, also for a second active key.
+        """
+        with self._database.transaction():
+            self._database.execute(
+                "INSERT INTO key_slots VALUES(?, ?) ON CONFLICT(uuid) DO UPDATE SET last = max(last, excluded.last)",
+                (record.uuid, record.slot),
+            )
+            self._database.execute(
+                "INSERT INTO keys(uuid, epoch, key_id, state, slot, wrapped, source, created) VALUES(?,?,?,?,?,?,?,?)"
+                " ON CONFLICT(uuid, key_id) DO NOTHING",
+                (
+                    record.uuid,
+                    record.epoch,
+                    record.key_id,
+                    record.state,
+                    record.slot,
+                    record.wrapped,
+                    record.source,
+                    record.created,
+                ),
+            )
+
+    def promote_key(self, uuid: bytes, key_id: str) -> None:
+        """Make this key the active one and delete all others of the node, in one transaction.
+
+        To be called only when an Open under it has shown a good node tag. Raises NotFound for an unknown key.
+        """
+        with self._database.transaction():
+            if not self._database.one("SELECT 1 FROM keys WHERE uuid = ? AND key_id = ?", (uuid, key_id)):
+                raise NotFound(f"The store has no key {key_id} of node {uuid.hex()}.")
+            self._database.execute("DELETE FROM keys WHERE uuid = ? AND key_id <> ?", (uuid, key_id))
+            self._database.execute("UPDATE keys SET state = 'active' WHERE uuid = ? AND state <> 'active'", (uuid,))
+
+    def remove_keys(self, uuid: bytes) -> int:
+        """Delete every key of a node (decommission); returns how many there were."""
+        return self._database.change("DELETE FROM keys WHERE uuid = ?", (uuid,))
+
+    def all_keys(self) -> Iterator[KeyRecord]:
+        """Give every key of every node, in the order they came, a page at a time."""
+        after = 0
+        while rows := self._database.execute(
+            f"SELECT {_COLUMNS} FROM keys WHERE seq > ? ORDER BY seq LIMIT ?", (after, _PAGE)
+        ):
+            for row in rows:
+                yield KeyRecord(*row)
+            after = rows[-1][-1]
+
+    def replace_keys(self, rewrap: Callable[[KeyRecord], bytes]) -> int:
+        """Wrap every key anew (a change of the master key), all or none; returns how many.
+
+        ``rewrap`` gets each record and returns the new wrapped octets; whatever it raises leaves all as it was.
+        """
+        count = 0
+        with self._database.transaction():
+            for record in self.all_keys():
+                self._database.execute("UPDATE keys SET wrapped = ? WHERE seq = ?", (rewrap(record), record.seq))
+                count += 1
+        return count

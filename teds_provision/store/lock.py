@@ -1,0 +1,96 @@
+"""One command at a time changes a store: an advisory lock (flock) that names its holder.
+
+The kernel releases it when the holder ends, however it ends; what the file says of its holder counts only while the
+lock is held.
+"""
+
+from __future__ import annotations
+
+import fcntl
+import json
+import os
+import time
+from collections.abc import Callable
+from contextlib import suppress
+from pathlib import Path
+from types import TracebackType
+
+from teds_provision.errors import StoreLocked
+from teds_provision.store.database import as_store_failure
+from teds_provision.store.records import utc_now
+
+FILE_NAME = "store.lock"
+_POLL_SECONDS = 0.05
+
+
+class StoreLock:
+    """``with StoreLock(home, command="provision"):`` holds the store of ``home`` for one command.
+
+    Waits up to ``wait`` seconds; ``notice`` is told once, in one sentence, whom it waits for. Raises StoreLocked after
+    that, StoreFailure where the file cannot be made. Not re-entrant: take it once, at the outside.
+    """
+
+    def __init__(
+        self, home: Path, *, command: str, wait: float = 10.0, notice: Callable[[str], object] | None = None
+    ) -> None:
+        self._path = home / FILE_NAME
+        self._command = command
+        self._wait = wait
+        self._notice = notice
+        self._descriptor: int | None = None
+
+    def __enter__(self) -> StoreLock:
+        try:
+            descriptor = os.open(self._path, os.O_CREAT | os.O_RDWR | os.O_NOFOLLOW, 0o600)
+        except OSError as error:
+            raise as_store_failure(error, self._path) from error
+        try:
+            self._acquire(descriptor)
+            self._sign(descriptor)
+        except BaseException:
+            os.close(descriptor)
+            raise
+        self._descriptor = descriptor
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        if self._descriptor is not None:
+            with suppress(OSError):
+                os.ftruncate(self._descriptor, 0)
+            os.close(self._descriptor)
+            self._descriptor = None
+
+    def _acquire(self, descriptor: int) -> None:
+        until = time.monotonic() + self._wait
+        told = False
+        while True:
+            try:
+                fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except BlockingIOError:
+                pass
+            except OSError as error:
+                raise as_store_failure(error, self._path) from error
+            else:
+                return
+            holder = self._holder(descriptor)
+            if time.monotonic() >= until:
+                raise StoreLocked(f"The store is held by {holder}.", hint="Wait until it has ended, or end it.")
+            if not told and self._notice is not None:
+                self._notice(f"Waiting for the store, held by {holder}.")
+                told = True
+            time.sleep(_POLL_SECONDS)
+
+    def _sign(self, descriptor: int) -> None:
+        text = json.dumps({"pid": os.getpid(), "command": self._command, "since": utc_now()})
+        with suppress(OSError):  # a full disk must not hide the store's own, better message
+            os.ftruncate(descriptor, 0)
+            os.pwrite(descriptor, text.encode(), 0)
+
+    def _holder(self, descriptor: int) -> str:
+        try:
+            said = json.loads(os.pread(descriptor, 4096, 0))
+            return f"pid {int(said['pid'])} ({said['command']}) since {said['since']}"
+        except (OSError, ValueError, KeyError, TypeError):
+            return "another process"

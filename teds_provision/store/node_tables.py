@@ -1,0 +1,175 @@
+"""Whitelist, nodes, names, drafts and the journal of steps."""
+
+from __future__ import annotations
+
+import json
+import re
+from dataclasses import fields
+from typing import Any
+
+from teds_provision.errors import NotFound, OtherKey, UsageFailure
+from teds_provision.store.database import Database
+from teds_provision.store.records import UUID_OCTETS, Draft, NodeRecord, Step, WhitelistEntry, utc_now
+
+_UUID_DIGITS = 2 * UUID_OCTETS
+_MIN_PREFIX = 4
+_SHOWN_CANDIDATES = 5
+_NODE_COLUMNS = ", ".join(column.name for column in fields(NodeRecord))
+
+
+class NodeTables:
+    """The part of the store that is about nodes; see :class:`teds_provision.store.Store`."""
+
+    _database: Database
+
+    def whitelist(self) -> list[WhitelistEntry]:
+        """Return all entries, by UUID."""
+        return [WhitelistEntry(*row) for row in self._database.execute("SELECT * FROM whitelist ORDER BY uuid")]
+
+    def whitelisted(self, uuid: bytes) -> WhitelistEntry | None:
+        """Return the entry of this node, None if it is not whitelisted."""
+        row = self._database.one("SELECT * FROM whitelist WHERE uuid = ?", (uuid,))
+        return WhitelistEntry(*row) if row else None
+
+    def put_whitelist(self, entry: WhitelistEntry) -> None:
+        """Add or replace the entry of a node; policy (a pinned key stays) is the caller's."""
+        self._database.execute(
+            "INSERT OR REPLACE INTO whitelist VALUES(?, ?, ?, ?, ?)",
+            (entry.uuid, entry.fingerprint, entry.added, entry.assurance, entry.name),
+        )
+
+    def remove_whitelist(self, uuid: bytes) -> bool:
+        """Take a node off the whitelist; False if it was not on it."""
+        return self._database.change("DELETE FROM whitelist WHERE uuid = ?", (uuid,)) > 0
+
+    def nodes(self) -> list[NodeRecord]:
+        """Return all nodes, by UUID."""
+        return [_node(row) for row in self._database.execute(f"SELECT {_NODE_COLUMNS} FROM nodes ORDER BY uuid")]
+
+    def node(self, uuid: bytes) -> NodeRecord | None:
+        """Return what is known of this node."""
+        row = self._database.one(f"SELECT {_NODE_COLUMNS} FROM nodes WHERE uuid = ?", (uuid,))
+        return _node(row) if row else None
+
+    def put_node(self, record: NodeRecord) -> None:
+        """Add or replace a node. Epoch and sequence never go back; a known identity key stays.
+
+        Raises OtherKey if the record brings another identity key than the stored one.
+        """
+        with self._database.transaction():
+            known = self.node(record.uuid)
+            if known and known.point and record.point and known.point != record.point:
+                raise OtherKey(
+                    f"Node {record.uuid.hex()} is known with another identity key than the one it shows now.",
+                    hint="Do not trust this node. If its chip was really replaced, it needs a new UUID.",
+                )
+            values: dict[str, Any] = {column.name: getattr(record, column.name) for column in fields(NodeRecord)}
+            values["groups"] = json.dumps(list(record.groups))
+            if known:
+                values["point"] = record.point or known.point
+                values["epoch"] = max(record.epoch, known.epoch)
+                values["sequence"] = max(record.sequence, known.sequence)
+            marks = ", ".join("?" * len(values))
+            self._database.execute(
+                f"INSERT OR REPLACE INTO nodes({_NODE_COLUMNS}) VALUES({marks})", tuple(values.values())
+            )
+
+    def unpin_node(self, uuid: bytes) -> None:
+        """Forget the identity key of a node on its owner's explicit order; epoch and sequence stay."""
+        self._database.execute("UPDATE nodes SET point = NULL WHERE uuid = ?", (uuid,))
+
+    def resolve(self, text: str) -> bytes:
+        """Return the UUID that ``text`` means, looking at nodes and whitelist.
+
+        ``text`` is a UUID of 20 hex digits (returned even if unknown), a prefix of four or more, either with or
+        without ``0x`` and in any case, or a name. Raises NotFound, or UsageFailure when several nodes fit.
+        """
+        asked = text.strip()
+        digits = asked.removeprefix("0x").removeprefix("0X").lower()
+        is_hex = re.fullmatch("[0-9a-f]+", digits) is not None
+        if is_hex and len(digits) == _UUID_DIGITS:
+            return bytes.fromhex(digits)
+        found = set(self._database.execute(*_by_name(asked)))
+        if is_hex and _MIN_PREFIX <= len(digits) < _UUID_DIGITS:
+            found.update(self._database.execute(*_by_prefix(digits)))
+        candidates = sorted(uuid for (uuid,) in found)
+        if not candidates:
+            raise NotFound(
+                f"No node is known as {asked!r}.",
+                hint="Give a UUID (20 hex digits, or its first four or more) or a name; see teds-provision nodes.",
+            )
+        if len(candidates) > 1:
+            shown = ", ".join(uuid.hex() for uuid in candidates[:_SHOWN_CANDIDATES])
+            more = f" and {len(candidates) - _SHOWN_CANDIDATES} more" if len(candidates) > _SHOWN_CANDIDATES else ""
+            raise UsageFailure(f"{asked!r} fits several nodes: {shown}{more}.", hint="Give more digits of the UUID.")
+        return bytes(candidates[0])
+
+    def draft(self, uuid: bytes) -> Draft | None:
+        """Return the image that this node is being given."""
+        row = self._database.one("SELECT * FROM drafts WHERE uuid = ?", (uuid,))
+        return Draft(*row) if row else None
+
+    def put_draft(self, draft: Draft) -> None:
+        """Keep an image for a node, in place of the one before."""
+        self._database.execute(
+            "INSERT OR REPLACE INTO drafts VALUES(?, ?, ?, ?, ?)",
+            (draft.uuid, draft.image, draft.stage, draft.profile, draft.created),
+        )
+
+    def drop_draft(self, uuid: bytes) -> None:
+        """Forget the image of a node, if there is one."""
+        self._database.execute("DELETE FROM drafts WHERE uuid = ?", (uuid,))
+
+    def begin_step(self, uuid: bytes | None, step: str) -> int:
+        """Note that a step begins and return its row; an open one of this name is closed as ``interrupted``."""
+        with self._database.transaction():
+            self._database.execute(
+                "DELETE FROM steps WHERE uuid IS ? AND step = ? AND result IS NOT NULL", (uuid, step)
+            )
+            self._database.execute(
+                "UPDATE steps SET ended = ?, result = 'interrupted' WHERE uuid IS ? AND step = ?",
+                (utc_now(), uuid, step),
+            )
+            rows = self._database.execute(
+                "INSERT INTO steps(uuid, step, started) VALUES(?, ?, ?) RETURNING row", (uuid, step, utc_now())
+            )
+        return int(rows[0][0])
+
+    def end_step(self, row: int, result: str) -> None:
+        """Note how a step ended."""
+        self._database.execute("UPDATE steps SET ended = ?, result = ? WHERE row = ?", (utc_now(), result, row))
+
+    def open_steps(self, uuid: bytes | None) -> list[Step]:
+        """Return the steps that began and did not end, oldest first."""
+        return [step for step in self.steps(uuid) if step.result is None]
+
+    def close_steps(self, uuid: bytes | None, result: str) -> int:
+        """End every open step of a node at once; returns how many there were."""
+        return self._database.change(
+            "UPDATE steps SET ended = ?, result = ? WHERE uuid IS ? AND result IS NULL", (utc_now(), result, uuid)
+        )
+
+    def steps(self, uuid: bytes | None) -> list[Step]:
+        """Return the latest rows of each step of a node, oldest first."""
+        return [
+            Step(*row) for row in self._database.execute("SELECT * FROM steps WHERE uuid IS ? ORDER BY row", (uuid,))
+        ]
+
+
+def _node(row: tuple[Any, ...]) -> NodeRecord:
+    values = dict(zip((column.name for column in fields(NodeRecord)), row, strict=True))
+    values["groups"] = tuple(json.loads(values["groups"]))
+    return NodeRecord(**values)
+
+
+def _by_name(name: str) -> tuple[str, tuple[str, str]]:
+    return "SELECT uuid FROM nodes WHERE name = ? UNION SELECT uuid FROM whitelist WHERE name = ?", (name, name)
+
+
+def _by_prefix(digits: str) -> tuple[str, tuple[bytes, bytes, bytes, bytes]]:
+    low = bytes.fromhex(digits.ljust(_UUID_DIGITS, "0"))
+    high = bytes.fromhex(digits.ljust(_UUID_DIGITS, "f"))
+    statement = (
+        "SELECT uuid FROM nodes WHERE uuid BETWEEN ? AND ? UNION SELECT uuid FROM whitelist WHERE uuid BETWEEN ? AND ?"
+    )
+    return statement, (low, high, low, high)

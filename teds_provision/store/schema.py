@@ -1,0 +1,70 @@
+"""The tables of ``store.sqlite3``, by schema version.
+
+``PRAGMA application_id`` marks the file as ours, ``PRAGMA user_version`` tells the schema. A store of a newer schema
+is refused, never guessed at; an older one is brought forward one version at a time, in one transaction.
+"""
+
+from __future__ import annotations
+
+from typing import Final
+
+APPLICATION_ID: Final = 0x54454453  # "TEDS"
+SCHEMA_VERSION: Final = 1
+
+_VERSION_1: Final = (
+    "CREATE TABLE meta(name TEXT PRIMARY KEY, value TEXT NOT NULL) STRICT, WITHOUT ROWID",
+    """CREATE TABLE whitelist(
+        uuid BLOB PRIMARY KEY CHECK(length(uuid) = 10), fingerprint TEXT, added TEXT NOT NULL, assurance TEXT NOT NULL,
+        name TEXT) STRICT, WITHOUT ROWID""",
+    """CREATE TABLE nodes(
+        uuid BLOB PRIMARY KEY CHECK(length(uuid) = 10), point BLOB CHECK(point IS NULL OR length(point) = 65),
+        name TEXT, profile TEXT, state INTEGER NOT NULL, epoch INTEGER NOT NULL, sequence INTEGER NOT NULL,
+        can_address INTEGER NOT NULL, groups TEXT NOT NULL, teds_sha256 TEXT, verdict TEXT, last_seen TEXT,
+        channels INTEGER NOT NULL) STRICT, WITHOUT ROWID""",
+    """CREATE TABLE keys(
+        seq INTEGER PRIMARY KEY AUTOINCREMENT, uuid BLOB NOT NULL CHECK(length(uuid) = 10), epoch INTEGER NOT NULL,
+        key_id TEXT NOT NULL CHECK(length(key_id) = 16), state TEXT NOT NULL CHECK(state IN ('pending', 'active')),
+        slot INTEGER NOT NULL, wrapped BLOB NOT NULL, source TEXT NOT NULL, created TEXT NOT NULL,
+        UNIQUE(uuid, key_id), UNIQUE(uuid, epoch, slot)) STRICT""",
+    "CREATE UNIQUE INDEX one_active_key ON keys(uuid) WHERE state = 'active'",
+    "CREATE TABLE key_slots(uuid BLOB PRIMARY KEY, last INTEGER NOT NULL) STRICT, WITHOUT ROWID",
+    """CREATE TABLE drafts(
+        uuid BLOB PRIMARY KEY CHECK(length(uuid) = 10), image TEXT NOT NULL,
+        stage TEXT NOT NULL CHECK(stage IN ('built', 'signed')), profile TEXT, created TEXT NOT NULL)
+        STRICT, WITHOUT ROWID""",
+    """CREATE TABLE steps(
+        row INTEGER PRIMARY KEY AUTOINCREMENT, uuid BLOB, step TEXT NOT NULL, started TEXT NOT NULL, ended TEXT,
+        result TEXT) STRICT""",
+    "CREATE INDEX steps_of_node ON steps(uuid, step)",
+    """CREATE TABLE trust(
+        name TEXT PRIMARY KEY, role TEXT NOT NULL CHECK(role IN ('station', 'ca')),
+        point BLOB NOT NULL CHECK(length(point) = 65), fingerprint TEXT NOT NULL CHECK(length(fingerprint) = 64),
+        added TEXT NOT NULL, UNIQUE(fingerprint, role)) STRICT, WITHOUT ROWID""",
+    """CREATE TABLE handovers(
+        id TEXT NOT NULL, direction TEXT NOT NULL CHECK(direction IN ('out', 'in')),
+        mode TEXT NOT NULL CHECK(mode IN ('copy', 'move')), peers TEXT NOT NULL, state TEXT NOT NULL,
+        nodes TEXT NOT NULL, bundle_sha256 TEXT, receipt TEXT, created TEXT NOT NULL, PRIMARY KEY(id, direction))
+        STRICT, WITHOUT ROWID""",
+    """CREATE TABLE tombstones(
+        uuid BLOB PRIMARY KEY CHECK(length(uuid) = 10), to_fingerprint TEXT NOT NULL, handover_id TEXT NOT NULL,
+        created TEXT NOT NULL) STRICT, WITHOUT ROWID""",
+    """CREATE TABLE holders(
+        uuid BLOB NOT NULL CHECK(length(uuid) = 10), fingerprint TEXT NOT NULL, since TEXT NOT NULL,
+        mode TEXT NOT NULL, PRIMARY KEY(uuid, fingerprint)) STRICT, WITHOUT ROWID""",
+    """CREATE TABLE revocations(
+        uuid BLOB PRIMARY KEY CHECK(length(uuid) = 10), fingerprint TEXT, why TEXT NOT NULL, statement TEXT NOT NULL,
+        created TEXT NOT NULL) STRICT, WITHOUT ROWID""",
+    """CREATE TABLE audit(
+        seq INTEGER PRIMARY KEY, at TEXT NOT NULL, who TEXT NOT NULL, act TEXT NOT NULL, uuid BLOB,
+        outcome TEXT NOT NULL, detail TEXT NOT NULL, hash BLOB NOT NULL CHECK(length(hash) = 32)) STRICT""",
+    """CREATE TRIGGER audit_is_never_changed BEFORE UPDATE ON audit
+        BEGIN SELECT RAISE(ABORT, 'the audit log is append-only'); END""",
+    """CREATE TRIGGER audit_is_never_shortened BEFORE DELETE ON audit
+        BEGIN SELECT RAISE(ABORT, 'the audit log is append-only'); END""",
+    """CREATE TRIGGER audit_only_grows BEFORE INSERT ON audit
+        WHEN NEW.seq IS NOT (SELECT coalesce(max(seq), 0) + 1 FROM audit)
+        BEGIN SELECT RAISE(ABORT, 'the audit log is append-only'); END""",
+)
+
+# STEPS_TO[n] are the statements that bring a store of version n - 1 to version n.
+STEPS_TO: Final[dict[int, tuple[str, ...]]] = {1: _VERSION_1}

@@ -1,0 +1,96 @@
+"""The store of one station: one SQLite file in its home directory, the only durable state besides the vault."""
+
+from __future__ import annotations
+
+import secrets
+from contextlib import AbstractContextManager
+from pathlib import Path
+from types import TracebackType
+
+from teds_provision.errors import StoreFailure
+from teds_provision.store.audit import AuditLog
+from teds_provision.store.database import Database
+from teds_provision.store.handover_tables import HandoverTables
+from teds_provision.store.key_tables import KeyTables
+from teds_provision.store.node_tables import NodeTables
+
+_ID_OCTETS = 16
+
+
+class Store(NodeTables, KeyTables, HandoverTables):
+    """Whitelist, nodes, wrapped keys, drafts, journal, trust, handovers and the audit log of one station.
+
+    Every method is durable when it returns, and all of them raise StoreFailure (or StoreLocked) where the file cannot
+    give or take what they ask. Several processes may have it open; a command that changes it holds a StoreLock.
+    """
+
+    id: str
+    audit: AuditLog
+
+    def __init__(self, database: Database) -> None:
+        self._database = database
+
+    @classmethod
+    def open(cls, home: Path, *, create: bool = False) -> Store:
+        """Open the store of ``home``; ``create`` makes it (and the directory) where it is missing.
+
+        Raises StoreFailure: missing, damaged, of a newer version, not ours, no permission, no space.
+        """
+        database = Database.open(home, create=create)
+        store = cls(database)
+        try:
+            store.id = store._identifier(create=create)
+        except BaseException:
+            database.close()
+            raise
+        store.audit = AuditLog(database, store.id)
+        return store
+
+    @property
+    def home(self) -> Path:
+        """The directory that the store lies in."""
+        return self._database.path.parent
+
+    def close(self) -> None:
+        """Close the file; a second call does nothing."""
+        self._database.close()
+
+    def __enter__(self) -> Store:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+    def transaction(self) -> AbstractContextManager[None]:
+        """All of the block or nothing of it; may stand inside another one."""
+        return self._database.transaction()
+
+    def setting(self, name: str) -> str | None:
+        """Return a named setting, None if it was never set."""
+        row = self._database.one("SELECT value FROM meta WHERE name = ?", (f"setting:{name}",))
+        return None if row is None else str(row[0])
+
+    def set_setting(self, name: str, value: str) -> None:
+        """Keep a named setting; never a secret."""
+        self._database.execute("INSERT OR REPLACE INTO meta VALUES(?, ?)", (f"setting:{name}", value))
+
+    def damage(self) -> str | None:
+        """Return what SQLite's quick check finds wrong with the file, None if nothing (for doctor)."""
+        try:
+            found = str(self._database.execute("PRAGMA quick_check(1)")[0][0])
+        except StoreFailure as failure:
+            return failure.message
+        return None if found == "ok" else found
+
+    def _identifier(self, *, create: bool) -> str:
+        row = self._database.one("SELECT value FROM meta WHERE name = 'id'")
+        if row is None and create:
+            with self.transaction():  # OR IGNORE: another process may have been first
+                fresh = secrets.token_hex(_ID_OCTETS)
+                self._database.execute("INSERT OR IGNORE INTO meta VALUES('id', ?)", (fresh,))
+                row = self._database.one("SELECT value FROM meta WHERE name = 'id'")
+        if row is None:
+            raise StoreFailure(f"The store {self._database.path} has no identifier.", hint="Run teds-provision init.")
+        return str(row[0])
