@@ -132,7 +132,7 @@ class VaultFailure(StoreFailure):
 
 
 class NoKeyring(VaultFailure):
-    """This machine has no keyring that may hold a secret."""
+    """No keyring of the machine may hold a secret."""
 
     code = "no-keyring"
 

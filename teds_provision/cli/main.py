@@ -47,7 +47,7 @@ class LazyGroup(click.Group):
 
             near = get_close_matches(args[0], COMMANDS, n=1)
             if near:
-                error.message += f" Did you mean {near[0]!r}?"
+                raise click.UsageError(f"{error.message} Did you mean {near[0]!r}?", ctx) from None
             raise
 
     def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
@@ -106,7 +106,7 @@ def _read_config(ctx: click.Context, _parameter: click.Parameter, home: Path | N
 @click.option("--passphrase-fd", type=int, metavar="N", help="Read the passphrase or PIN from this file descriptor.")
 @click.version_option(__version__, prog_name="teds-provision", message="%(prog)s %(version)s")
 @click.pass_context
-def cli(ctx: click.Context, as_json: bool, **options: Any) -> None:
+def cli(ctx: click.Context, /, as_json: bool, **options: Any) -> None:
     """Prove which transducer it is, give it a key, write its datasheet.
 
     Identify, key, sign and write the IEEE 1451.0 TEDS of smart transducers over NFC and CAN.

@@ -1,0 +1,1 @@
+"""The virtual transducer: flash in a file, TIM server, both links."""

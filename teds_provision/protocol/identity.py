@@ -37,9 +37,7 @@ class Identity:
 
     def encode(self) -> bytes:
         """Return the 23 octets: version ‖ UUID ‖ state ‖ epoch ‖ sequence ‖ maxMessage ‖ canAddress."""
-        return _LAYOUT.pack(
-            1, self.uuid, self.state, self.epoch, self.sequence, self.max_message, self.can_address
-        )
+        return _LAYOUT.pack(1, self.uuid, self.state, self.epoch, self.sequence, self.max_message, self.can_address)
 
     @classmethod
     def decode(cls, octets: bytes) -> Identity:

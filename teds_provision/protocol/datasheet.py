@@ -1,0 +1,98 @@
+"""The signed datasheet: making field 100, and the checks that node and reader share (profile sections 1 and 5)."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+from teds_provision.errors import BadData
+from teds_provision.protocol.agreement import Credentials
+from teds_provision.protocol.keys import is_point, station_key_message, verify
+from teds_provision.teds import frame, security
+from teds_provision.teds.image import BlockId
+from teds_provision.teds.security import SecurityTeds
+
+META = 1
+UUID_FIELD = 4
+SEQUENCE_WINDOW = 65536
+STORED_CODES = frozenset({*range(1, 18), *range(128, 136)})
+LAST_CHANNEL = 255
+
+
+@dataclass(frozen=True)
+class NodeKeys:
+    """Fields 101 and 102 of a node: its key and the key's signature over itself, for one UUID."""
+
+    uuid: bytes
+    key: bytes
+    signature: bytes
+
+
+def can_be_stored(block: BlockId) -> bool:
+    """Whether a node may hold this TEDS at all: access codes 1 to 17 and 128 to 135, channels 0 to 255."""
+    return 0 <= block[0] <= LAST_CHANNEL and block[1] in STORED_CODES
+
+
+def digests(blocks: Mapping[BlockId, bytes]) -> dict[BlockId, bytes]:
+    """SHA-256 of every TEDS (Length to Checksum inclusive), the Security TEDS left out."""
+    return {key: hashlib.sha256(teds).digest() for key, teds in blocks.items() if key != (0, security.ACCESS_CODE)}
+
+
+def unsigned_datasheet(
+    node: NodeKeys, station: bytes, station_signature: bytes, listed: Mapping[BlockId, bytes], **values: object
+) -> SecurityTeds:
+    """Fill in everything but field 100; ``values`` are ca, last_modified, sequence, key_epoch."""
+    return SecurityTeds(
+        node_key=node.key,
+        node_key_signature=node.signature,
+        station_key=station,
+        station_key_signature=station_signature,
+        signed_blocks=dict(sorted(listed.items())),
+        **values,  # type: ignore[arg-type]
+    )
+
+
+def sign_datasheet(teds: SecurityTeds, uuid: bytes, credentials: Credentials) -> bytes:
+    """Sign a filled-in Security TEDS; returns the framed TEDS."""
+    signature = credentials.key.sign(security.tbs(uuid, teds.encode()))
+    return teds.with_signature(signature).encode()
+
+
+def passes_own_check(block: BlockId, teds: bytes) -> bool:
+    """Length and Checksum are right and the TEDSID's class is the access code."""
+    try:
+        return frame.teds_class(frame.unframe(teds)) == block[1]
+    except BadData:
+        return False
+
+
+def own_values(teds: SecurityTeds) -> bool:
+    """Whether 1 to 4, 105, 109 and 110 are the values of this profile."""
+    return teds.values == security.OUR_VALUES
+
+
+def station_signature_good(teds: SecurityTeds, ca: bytes) -> bool:
+    """Whether 104 is the CA's signature over 103, and 103 a point."""
+    if teds.station_key is None or teds.station_key_signature is None or not is_point(teds.station_key):
+        return False
+    return verify(ca, station_key_message(teds.station_key), teds.station_key_signature)
+
+
+def signature_good(teds: SecurityTeds, octets: bytes, uuid: bytes) -> bool:
+    """Whether 100 verifies under 103 over the octets as they are."""
+    if teds.station_key is None or teds.signature is None:
+        return False
+    return verify(teds.station_key, security.tbs(uuid, octets), teds.signature)
+
+
+def meta_names(teds: bytes, uuid: bytes) -> bool:
+    """Whether field 4 of a Meta-TEDS of the 2007 form is ``uuid``; other forms are not compared (True)."""
+    try:
+        block = frame.unframe(teds)
+        if block[:2] != b"\x03\x04":
+            return True
+        width = block[5] if len(block) > 5 else 1
+        return any(part.type == UUID_FIELD and part.value == uuid for part in frame.tuples(block, width=width or 1))
+    except BadData:
+        return False

@@ -1,0 +1,68 @@
+"""What a node keeps through power cuts, and the one way to change it: a whole new state in one transaction."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Protocol
+
+from teds_provision.protocol.identity import NodeState
+from teds_provision.teds import security
+from teds_provision.teds.image import SECURITY, BlockId
+
+
+class FlashFailure(Exception):
+    """Raised by a :class:`Flash` whose commit did not happen; the old state stands (reason 11)."""
+
+
+@dataclass(frozen=True)
+class Flash:
+    """A node's durable state.
+
+    ``blocks`` holds every stored TEDS but the initial Security TEDS, which is made from the keys whenever
+    ``provisioned`` is false. ``key``, ``station`` and ``ca`` are None in factory state.
+    """
+
+    uuid: bytes
+    node_key: bytes
+    node_key_signature: bytes
+    blocks: Mapping[BlockId, bytes] = field(default_factory=dict)
+    read_only: frozenset[BlockId] = frozenset()
+    epoch: int = 0
+    sequence: int = 0
+    key: bytes | None = field(default=None, repr=False)
+    station: bytes | None = None
+    ca: bytes | None = None
+    provisioned: bool = False
+    can_address: int = 0
+
+    @property
+    def state(self) -> NodeState:
+        """Factory, keyed or provisioned."""
+        if self.key is None:
+            return NodeState.FACTORY
+        return NodeState.PROVISIONED if self.provisioned else NodeState.KEYED
+
+    def security_teds(self) -> bytes:
+        """The Security TEDS that the node shows now."""
+        if self.provisioned:
+            return self.blocks[SECURITY]
+        return security.initial(self.node_key, self.node_key_signature, sequence=self.sequence, key_epoch=self.epoch)
+
+    def teds(self, block: BlockId) -> bytes | None:
+        """The stored TEDS, None where there is none."""
+        return self.security_teds() if block == SECURITY else self.blocks.get(block)
+
+    def present(self) -> list[BlockId]:
+        """Every TEDS on the node, ascending."""
+        return sorted({*self.blocks, SECURITY})
+
+
+class FlashMemory(Protocol):
+    """Where the state lies. ``commit`` either puts the whole new state or leaves the whole old one."""
+
+    def load(self) -> Flash:
+        """Return the state as it is."""
+
+    def commit(self, state: Flash) -> None:
+        """Replace the state durably in one transaction; raises FlashFailure."""

@@ -1,0 +1,29 @@
+"""A flash in RAM that can lose power: before or after any commit."""
+
+from __future__ import annotations
+
+from teds_provision.protocol.flash import Flash, FlashFailure
+
+
+class PowerCut(Exception):
+    """The node died; what it had in RAM is gone."""
+
+
+class RamFlash:
+    """Keeps the last committed state; ``die_before``/``die_after`` cut power at a commit, ``fail`` refuses one."""
+
+    def __init__(self, state: Flash) -> None:
+        self.state = state
+        self.die_before = self.die_after = self.fail = False
+
+    def load(self) -> Flash:
+        return self.state
+
+    def commit(self, state: Flash) -> None:
+        if self.fail:
+            raise FlashFailure
+        if self.die_before:
+            raise PowerCut
+        self.state = state
+        if self.die_after:
+            raise PowerCut

@@ -1,0 +1,108 @@
+"""Every value of the profile's known-answer vectors, from both roles."""
+
+from __future__ import annotations
+
+import zlib
+
+import pytest
+
+from teds_provision.protocol import keys
+from teds_provision.protocol.agreement import Credentials, StationAgreement
+from teds_provision.protocol.datasheet import NodeKeys, sign_datasheet, unsigned_datasheet
+from teds_provision.protocol.flash import Flash
+from teds_provision.protocol.frames import Command, decode_reply
+from teds_provision.protocol.session import StationSession, pad
+from teds_provision.protocol.tim import Tim
+from teds_provision.teds import security
+
+from .kat import KAT, UUID, key, octets
+from .memory import RamFlash
+
+CREDENTIALS = Credentials(key("station"), octets("sig104", "signature"), key("ca").point)
+
+
+@pytest.mark.parametrize("name", ["node", "station", "ca", "one_time"])
+def test_points_and_fingerprints_are_those_of_the_vectors(name: str) -> None:
+    assert key(name).point == octets(name, "P")
+    if "fingerprint" in KAT[name]:
+        assert keys.fingerprint(key(name).point) == KAT[name]["fingerprint"]
+
+
+@pytest.mark.parametrize(
+    ("entry", "signer", "message"),
+    [
+        ("sig102", "node", keys.node_key_message(UUID, key("node").point)),
+        ("sig104", "ca", keys.station_key_message(key("station").point)),
+        ("prove", "node", keys.prove_message(UUID, octets("prove", "challenge"))),
+        ("reset", "node", keys.reset_message(UUID, KAT["reset"]["epoch"], octets("reset", "challenge"))),
+    ],
+)
+def test_signatures_are_deterministic_and_labelled(entry: str, signer: str, message: bytes) -> None:
+    assert message == octets(entry, "message")
+    assert key(signer).sign(message) == octets(entry, "signature")
+    assert keys.verify(key(signer).point, message, octets(entry, "signature"))
+
+
+def test_a_high_s_is_refused() -> None:
+    signature = octets("prove", "signature")
+    high = keys.GROUP_ORDER - int.from_bytes(signature[32:], "big")
+    forged = signature[:32] + high.to_bytes(32, "big")
+    assert not keys.verify(key("node").point, octets("prove", "message"), forged)
+    assert keys.normalise_signature(forged) == signature
+
+
+def test_the_default_can_address_follows_from_the_uuid() -> None:
+    assert 1 + zlib.crc32(UUID) % 239 == KAT["default_can_address"]
+
+
+def new_node(**state: object) -> Tim:
+    """The vectors' node in factory state, with the vectors' nonces in their order of use."""
+    nonces = iter([octets("agreement", "nonceN"), octets("session", "nonceN")])
+    flash = Flash(UUID, key("node").point, octets("sig102", "signature"), can_address=KAT["default_can_address"])
+    return Tim(key("node"), RamFlash(flash), clock=lambda: 0.0, max_message=2048, random=lambda n: next(nonces))
+
+
+def test_agreement_and_session_from_both_roles_give_the_vectors_frames() -> None:
+    node = new_node()
+    assert node.flash.security_teds() == octets("initial_security_teds")
+    agreement = StationAgreement(CREDENTIALS, UUID, one_time=key("one_time"))
+    assert agreement.request().encode() == octets("agreement", "request_frame")
+    reply = node.handle(agreement.request().encode(), link="nfc", tapped=True)
+    assert reply == octets("agreement", "reply_frame")
+    agreed = agreement.accept(decode_reply(reply).payload, pinned=keys.fingerprint(key("node").point), epoch=0)
+    assert (agreed.key, agreed.epoch) == (octets("agreement", "K"), 1)
+    assert agreed.confirm.encode() == octets("agreement", "confirm_frame")
+    assert node.handle(agreed.confirm.encode(), link="nfc", tapped=True) == octets("agreement", "confirm_reply")
+
+    session = StationSession(agreed.key, UUID, nonce=octets("session", "nonceS"))
+    assert session.open().encode() == octets("session", "open_frame")
+    reply = node.handle(session.open().encode(), link="nfc", tapped=True)
+    assert reply == octets("session", "open_reply")
+    session.accept(decode_reply(reply).payload)
+    for sealed in KAT["sealed"]:
+        inner = bytes.fromhex(sealed["inner"])
+        assert pad(inner).hex() == sealed["padded"]
+        frame = session.seal(Command(int.from_bytes(inner[:2], "big"), inner[2], inner[3], inner[6:])).encode()
+        assert frame.hex() == sealed["frame"]
+        reply = node.handle(frame, link="nfc", tapped=True)
+        assert reply.hex() == sealed["reply_frame"]
+        assert session.unseal(decode_reply(reply).payload).encode().hex() == sealed["inner_reply"]
+
+
+def test_the_signed_datasheet_is_the_vectors() -> None:
+    sheet = KAT["datasheet"]
+    listed = {(b["channel"], b["access_code"]): bytes.fromhex(b["sha256"]) for b in sheet["blocks"]}
+    unsigned = unsigned_datasheet(
+        NodeKeys(UUID, key("node").point, octets("sig102", "signature")),
+        key("station").point,
+        octets("sig104", "signature"),
+        listed,
+        ca=security.ca_hint("peer", keys.fingerprint(key("ca").point)),
+        last_modified=bytes.fromhex(sheet["last_modified"]),
+        sequence=sheet["sequence"],
+        key_epoch=sheet["epoch"],
+    )
+    signed = sign_datasheet(unsigned, UUID, CREDENTIALS)
+    assert security.tbs(UUID, signed).hex() == sheet["tbs"]
+    assert signed.hex() == sheet["security_teds"]
+    assert security.decode(signed).encode() == signed
