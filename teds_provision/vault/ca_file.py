@@ -1,0 +1,116 @@
+"""The CA key as a file to keep away: PKCS #8 in PEM, encrypted (RFC 5958, RFC 8018 PBES2).
+
+PBKDF2-HMAC-SHA-256 with 600,000 rounds and AES-256-CBC: any OpenSSL opens it. The number of rounds is why it is put
+together here: the library's own writer takes 2,048.
+"""
+
+from __future__ import annotations
+
+import base64
+import os
+from contextlib import suppress
+from pathlib import Path
+from textwrap import wrap
+from typing import Final
+
+from teds_provision.errors import NotFound, VaultFailure, WrongPassphrase
+from teds_provision.vault.passphrase import check_new
+
+ROUNDS: Final = 600_000
+_MAX_OCTETS: Final = 16 * 1024
+_LABEL: Final = "ENCRYPTED PRIVATE KEY"
+# DER of the object identifiers, tag and length included (RFC 8018 appendix C, RFC 3565).
+_PBES2: Final = bytes.fromhex("06092a864886f70d01050d")
+_PBKDF2: Final = bytes.fromhex("06092a864886f70d01050c")
+_HMAC_SHA256: Final = bytes.fromhex("06082a864886f70d0209") + b"\x05\x00"
+_AES256_CBC: Final = bytes.fromhex("060960864801650304012a")
+_SEQUENCE, _INTEGER, _OCTETS = 0x30, 0x02, 0x04
+
+
+def write_ca(path: Path, secret: bytes, passphrase: str) -> None:
+    """Write the key of a 32-octet scalar, encrypted, into a new file of mode 0600.
+
+    Raises VaultFailure: passphrase too weak, the file exists, or cannot be written (then none is left behind).
+    """
+    check_new(passphrase)
+    pem = _encrypted_pem(_plain_der(secret), passphrase)
+    try:
+        descriptor = os.open(path, os.O_CREAT | os.O_EXCL | os.O_WRONLY | os.O_NOFOLLOW, 0o600)
+    except FileExistsError:
+        raise VaultFailure(f"{path} exists already and is not overwritten.", hint="Choose another name.") from None
+    except OSError as error:
+        raise VaultFailure(f"{path} cannot be written: {error.strerror}.", hint="Choose another place.") from error
+    try:
+        with open(descriptor, "wb") as file:
+            file.write(pem)
+            file.flush()
+            os.fsync(file.fileno())
+    except OSError as error:
+        with suppress(OSError):
+            path.unlink()
+        raise VaultFailure(f"{path} cannot be written: {error.strerror}.", hint="Check the space there.") from error
+
+
+def read_ca(path: Path, passphrase: str) -> bytes:
+    """Return the 32-octet scalar of an encrypted P-256 key in PEM.
+
+    Raises NotFound, WrongPassphrase, VaultFailure (not such a file).
+    """
+    from cryptography.hazmat.primitives.asymmetric import ec
+    from cryptography.hazmat.primitives.serialization import load_pem_private_key
+
+    try:
+        with path.open("rb") as file:
+            pem = file.read(_MAX_OCTETS)
+    except FileNotFoundError:
+        raise NotFound(f"There is no file {path}.") from None
+    except OSError as error:
+        raise VaultFailure(f"{path} cannot be read: {error.strerror}.", hint="Check its owner and mode.") from error
+    if _LABEL.encode() not in pem:
+        raise VaultFailure(f"{path} holds no encrypted private key in PEM.", hint="Give the file of the CA's export.")
+    try:
+        key = load_pem_private_key(pem, passphrase.encode("utf-8", "surrogateescape"))
+    except (ValueError, TypeError):  # a wrong passphrase and a damaged file look alike
+        raise WrongPassphrase(f"The passphrase does not open {path} (or it is damaged).", hint="Try again.") from None
+    except Exception as error:  # the library names unsupported ciphers and curves by many classes
+        raise VaultFailure(f"{path} holds a key of a kind that this tool does not read.") from error
+    if not isinstance(key, ec.EllipticCurvePrivateKey) or not isinstance(key.curve, ec.SECP256R1):
+        raise VaultFailure(f"{path} holds no P-256 key.", hint="Give the file of the CA's export.")
+    return key.private_numbers().private_value.to_bytes(32, "big")
+
+
+def _plain_der(secret: bytes) -> bytes:
+    from cryptography.hazmat.primitives.asymmetric import ec
+    from cryptography.hazmat.primitives.serialization import Encoding, NoEncryption, PrivateFormat
+
+    key = ec.derive_private_key(int.from_bytes(secret, "big"), ec.SECP256R1())
+    return key.private_bytes(Encoding.DER, PrivateFormat.PKCS8, NoEncryption())
+
+
+def _encrypted_pem(der: bytes, passphrase: str) -> bytes:
+    from cryptography.hazmat.primitives import hashes
+    from cryptography.hazmat.primitives.ciphers import Cipher, algorithms, modes
+    from cryptography.hazmat.primitives.kdf.pbkdf2 import PBKDF2HMAC
+    from cryptography.hazmat.primitives.padding import PKCS7
+
+    salt, iv = os.urandom(16), os.urandom(16)
+    key = PBKDF2HMAC(hashes.SHA256(), length=32, salt=salt, iterations=ROUNDS).derive(passphrase.encode())
+    padder, cipher = PKCS7(128).padder(), Cipher(algorithms.AES256(key), modes.CBC(iv)).encryptor()
+    ciphertext = cipher.update(padder.update(der) + padder.finalize()) + cipher.finalize()
+    derivation = _der(
+        _SEQUENCE,
+        _der(_OCTETS, salt) + _der(_INTEGER, ROUNDS.to_bytes(3, "big")) + _der(_SEQUENCE, _HMAC_SHA256),
+    )
+    scheme = _der(_SEQUENCE, _PBKDF2 + derivation) + _der(_SEQUENCE, _AES256_CBC + _der(_OCTETS, iv))
+    algorithm = _der(_SEQUENCE, _PBES2 + _der(_SEQUENCE, scheme))
+    text = base64.b64encode(_der(_SEQUENCE, algorithm + _der(_OCTETS, ciphertext))).decode()
+    return "\n".join([f"-----BEGIN {_LABEL}-----", *wrap(text, 64), f"-----END {_LABEL}-----", ""]).encode()
+
+
+def _der(tag: int, content: bytes) -> bytes:
+    """Encode one element; lengths up to 65,535."""
+    length = len(content)
+    if length < 0x80:
+        return bytes([tag, length]) + content
+    octets = length.to_bytes((length.bit_length() + 7) // 8, "big")
+    return bytes([tag, 0x80 | len(octets)]) + octets + content

@@ -1,0 +1,89 @@
+"""Which vault a station has: chosen once at ``init``, opened once per process."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from teds_provision.errors import UsageFailure, VaultFailure
+from teds_provision.vault.base import Ask, Vault
+from teds_provision.vault.file_vault import FILE_NAME, FileVault, stamp
+from teds_provision.vault.passphrase import PRODUCT, Costs
+
+_opened: dict[tuple[Path, str, str], Vault] = {}
+
+
+def create_vault(
+    home: Path,
+    store_id: str,
+    keystore: str | None,
+    ask: Ask,
+    *,
+    costs: Costs = PRODUCT,
+    restored: str | None = None,
+) -> tuple[Vault, str]:
+    """Make the vault of a station, or open the one that an earlier run made; return it and why it was chosen.
+
+    ``keystore`` is ``keyring``, ``file``, ``pkcs11:…`` (RFC 7512) or None: then the keyring if one works (proven by a
+    set, a read back and a delete), else a passphrase file. ``costs`` are those of a new passphrase file, ``restored``
+    the secret material of a backup. Raises VaultFailure and its leaves, UsageFailure.
+    """
+    vault, why = _create(home, store_id, keystore, ask, costs, restored)
+    _opened[home.resolve(), store_id, keystore if keystore and vault.kind == "pkcs11" else vault.kind] = vault
+    return vault, why
+
+
+def open_vault(home: Path, store_id: str, keystore: str, ask: Ask) -> Vault:
+    """Open the vault of a station; a second call in one process gives the same, without asking again.
+
+    Raises VaultFailure and its leaves: locked, missing, damaged, wrong passphrase.
+    """
+    place = (home.resolve(), store_id, keystore)
+    vault = _opened.get(place)
+    if vault is None or (isinstance(vault, FileVault) and vault.stamp != stamp(home / FILE_NAME)):
+        _opened[place] = vault = _open(home, store_id, keystore, ask)
+    return vault
+
+
+def forget_vaults() -> None:
+    """Drop every vault that this process has unlocked."""
+    _opened.clear()
+
+
+def _create(
+    home: Path, store_id: str, keystore: str | None, ask: Ask, costs: Costs, restored: str | None
+) -> tuple[Vault, str]:
+    from teds_provision.vault.keyring_vault import KeyringVault
+
+    if keystore is not None and keystore.startswith("pkcs11:"):
+        from teds_provision.vault.pkcs11 import Pkcs11Vault
+
+        return Pkcs11Vault.create(home, keystore, ask), "the token was asked for"
+    if keystore == "keyring":
+        return KeyringVault.create(store_id, restored=restored), "the keyring was asked for"
+    if keystore == "file":
+        vault = FileVault.create(home, store_id, ask, costs=costs, restored=restored)
+        return vault, "the passphrase file was asked for"
+    if keystore is not None:
+        raise UsageFailure(f"There is no keystore {keystore!r}.", hint="Give keyring, file or pkcs11:URI.")
+    if (home / FILE_NAME).exists():
+        vault = FileVault.create(home, store_id, ask, restored=restored)
+        return vault, "the passphrase file is already there"
+    try:
+        return KeyringVault.create(store_id, restored=restored), "a keyring works here"
+    except VaultFailure as failure:
+        why = f"no keyring can be used: {failure.message}"
+    return FileVault.create(home, store_id, ask, costs=costs, restored=restored), why
+
+
+def _open(home: Path, store_id: str, keystore: str, ask: Ask) -> Vault:
+    if keystore == "file":
+        return FileVault.open(home, store_id, ask)
+    if keystore == "keyring":
+        from teds_provision.vault.keyring_vault import KeyringVault
+
+        return KeyringVault.open(store_id)
+    if keystore.startswith("pkcs11:"):
+        from teds_provision.vault.pkcs11 import Pkcs11Vault
+
+        return Pkcs11Vault.open(home, keystore, ask)
+    raise UsageFailure(f"There is no keystore {keystore!r}.", hint="Give keyring, file or pkcs11:URI.")

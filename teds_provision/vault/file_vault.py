@@ -1,0 +1,151 @@
+"""The vault for machines without a keyring: ``vault.json`` in the home directory, sealed under a passphrase."""
+
+from __future__ import annotations
+
+import json
+import os
+import secrets
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
+
+from teds_provision.errors import VaultFailure
+from teds_provision.vault.base import Ask
+from teds_provision.vault.master import Material
+from teds_provision.vault.passphrase import PRODUCT, Costs, SealingKey, check_new, unseal
+from teds_provision.vault.software import SoftwareVault, settle
+
+FILE_NAME = "vault.json"
+_FORMAT = "teds-provision-vault/1"
+_MAX_OCTETS = 64 * 1024
+Stamp = tuple[int, int, int]
+
+
+class FileVault(SoftwareVault):
+    """The station's keys in one file of mode 0600: Argon2id and AES-256-GCM, bound to the store's id."""
+
+    kind = "file"
+
+    def __init__(self, path: Path, store_id: str, material: Material, key: SealingKey) -> None:
+        super().__init__(material)
+        self.description = f"passphrase file {path}"
+        self._path = path
+        self._store_id = store_id
+        self._key = key
+        self.stamp = stamp(path)
+
+    @classmethod
+    def create(
+        cls, home: Path, store_id: str, ask: Ask, *, costs: Costs = PRODUCT, restored: str | None = None
+    ) -> FileVault:
+        """Make the vault, or open the one that is there (it is never overwritten).
+
+        ``ask`` is called once: for a new passphrase (with confirmation) or for that of the existing file.
+        ``restored`` is the secret material of a backup. Raises VaultFailure, WrongPassphrase.
+        """
+        path = home / FILE_NAME
+        if path.exists():
+            vault = cls.open(home, store_id, ask)
+            if restored is not None:
+                vault._replace(settle(vault._material, restored))
+            return vault
+        passphrase = ask("New passphrase for this station's keys", True)
+        check_new(passphrase)
+        material = settle(None, restored)
+        key = SealingKey.derive(passphrase, costs=costs)
+        _write(path, _sealed(store_id, material, key), replace=False)
+        return cls(path, store_id, material, key)
+
+    @classmethod
+    def open(cls, home: Path, store_id: str, ask: Ask) -> FileVault:
+        """Open the vault with the passphrase that ``ask`` gives.
+
+        Raises VaultFailure (missing, damaged, of another store), WrongPassphrase.
+        """
+        path = home / FILE_NAME
+        content = _read(path)
+        if content.get("store") != store_id:
+            raise VaultFailure(f"{path} belongs to another store.", hint="Restore the backup that holds both.")
+        passphrase = ask("Passphrase of this station's keys", False)
+        plaintext, key = unseal(passphrase, content, context=_context(store_id))
+        return cls(path, store_id, Material.decode(plaintext.decode("ascii", "replace")), key)
+
+    def change_passphrase(self, ask: Ask, *, costs: Costs = PRODUCT) -> None:
+        """Seal the same keys under a new passphrase."""
+        passphrase = ask("New passphrase for this station's keys", True)
+        check_new(passphrase)
+        key = SealingKey.derive(passphrase, costs=costs)
+        _write(self._path, _sealed(self._store_id, self._material, key), replace=True)
+        self._key = key
+        self.stamp = stamp(self._path)
+
+    def _save(self, material: Material) -> None:
+        _write(self._path, _sealed(self._store_id, material, self._key), replace=True)
+        self.stamp = stamp(self._path)
+
+
+def stamp(path: Path) -> Stamp | None:
+    """Return what changes when the file is replaced, None if it is not there."""
+    try:
+        status = path.stat()
+    except OSError:
+        return None
+    return status.st_ino, status.st_mtime_ns, status.st_size
+
+
+def _context(store_id: str) -> bytes:
+    return f"{_FORMAT}\0{store_id}".encode()
+
+
+def _sealed(store_id: str, material: Material, key: SealingKey) -> bytes:
+    sealed = key.seal(material.encode().encode(), context=_context(store_id))
+    return json.dumps({"format": _FORMAT, "store": store_id, **sealed}, indent=1).encode() + b"\n"
+
+
+def _read(path: Path) -> dict[str, Any]:
+    try:
+        with open(os.open(path, os.O_RDONLY | os.O_NOFOLLOW), "rb") as file:
+            octets = file.read(_MAX_OCTETS + 1)
+    except FileNotFoundError:
+        raise VaultFailure(
+            f"The passphrase file {path} is missing.", hint="Restore a backup of this station (teds-provision restore)."
+        ) from None
+    except OSError as error:
+        raise VaultFailure(f"{path} cannot be read: {error.strerror}.", hint="Check its owner and mode.") from error
+    try:
+        content = json.loads(octets)
+        if len(octets) > _MAX_OCTETS or not isinstance(content, dict) or content.get("format") != _FORMAT:
+            raise ValueError
+    except (ValueError, RecursionError):
+        raise VaultFailure(
+            f"{path} is damaged or not a vault of this version.", hint="Restore a backup (teds-provision restore)."
+        ) from None
+    return content
+
+
+def _write(path: Path, content: bytes, *, replace: bool) -> None:
+    """Write whole or not at all: a new file (O_EXCL, 0600), fsync, then link or rename, then fsync the directory."""
+    fresh = path.with_name(f"{path.name}.{secrets.token_hex(4)}.new")
+    try:
+        with open(os.open(fresh, os.O_CREAT | os.O_EXCL | os.O_WRONLY | os.O_NOFOLLOW, 0o600), "wb") as file:
+            file.write(content)
+            file.flush()
+            os.fsync(file.fileno())
+        if replace:
+            os.replace(fresh, path)
+        else:
+            os.link(fresh, path)  # fails if the name is taken, unlike a rename
+        directory = os.open(path.parent, os.O_RDONLY)
+        try:
+            os.fsync(directory)
+        finally:
+            os.close(directory)
+    except FileExistsError:
+        raise VaultFailure(f"{path} exists already and is not overwritten.", hint="Run the command again.") from None
+    except OSError as error:
+        raise VaultFailure(
+            f"{path} cannot be written: {error.strerror}.", hint="Check space and permissions, then run it again."
+        ) from error
+    finally:
+        with suppress(OSError):
+            fresh.unlink()

@@ -1,0 +1,130 @@
+"""The master key that wraps node keys, and the one secret that a software vault keeps.
+
+A wrapped key is version u8 (1) ‖ number of the master key u32 ‖ nonce (12) ‖ ciphertext and tag (16), AES-256-GCM with
+the first five octets and the context as associated data. Numbers let a new master key come in before the old one goes:
+add it, wrap every key anew in one transaction of the store, retire the old.
+"""
+
+from __future__ import annotations
+
+import base64
+import binascii
+import json
+import os
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+from teds_provision.errors import VaultFailure
+
+MASTER_OCTETS = 32
+_SECRET_OCTETS = 32
+_VERSION = 1
+_HEAD_OCTETS = 5
+_NONCE_OCTETS = 12
+_PREFIX = "teds1:"
+_DAMAGED = "Restore a backup of this station (teds-provision restore)."
+
+
+@dataclass(frozen=True)
+class MasterKeys:
+    """Numbered master keys; the highest number wraps, all of them unwrap."""
+
+    keys: dict[int, bytes] = field(repr=False)
+
+    @classmethod
+    def generate(cls) -> MasterKeys:
+        """Make the first master key, from the operating system's random source."""
+        return cls({1: os.urandom(MASTER_OCTETS)})
+
+    @property
+    def current(self) -> int:
+        """Number of the key that wraps."""
+        return max(self.keys)
+
+    def with_new(self) -> MasterKeys:
+        """Return the same keys and a new one, which wraps from now on."""
+        return MasterKeys({**self.keys, self.current + 1: os.urandom(MASTER_OCTETS)})
+
+    def newest_only(self) -> MasterKeys:
+        """Return only the key that wraps."""
+        return MasterKeys({self.current: self.keys[self.current]})
+
+    def wrap(self, key: bytes, *, context: bytes) -> bytes:
+        """Seal ``key`` and bind it to ``context``."""
+        from cryptography.hazmat.primitives.ciphers.aead import AESGCM
+
+        head = bytes([_VERSION]) + self.current.to_bytes(4, "big")
+        nonce = os.urandom(_NONCE_OCTETS)
+        return head + nonce + AESGCM(self.keys[self.current]).encrypt(nonce, key, head + context)
+
+    def unwrap(self, wrapped: bytes, *, context: bytes) -> bytes:
+        """Open a wrapped key; raises VaultFailure if it is damaged, moved, or of another master key."""
+        from cryptography.exceptions import InvalidTag
+        from cryptography.hazmat.primitives.ciphers.aead import AESGCM
+
+        head, nonce, sealed = wrapped[:_HEAD_OCTETS], wrapped[_HEAD_OCTETS:][:_NONCE_OCTETS], wrapped[17:]
+        if len(sealed) < 16 or head[0] != _VERSION:
+            raise VaultFailure("A wrapped key in the store is damaged.", hint=_DAMAGED)
+        master = self.keys.get(int.from_bytes(head[1:], "big"))
+        if master is None:
+            raise VaultFailure("A key in the store is wrapped under a master key that the vault lacks.", hint=_DAMAGED)
+        try:
+            return AESGCM(master).decrypt(nonce, sealed, head + context)
+        except InvalidTag:
+            raise VaultFailure(
+                "A wrapped key in the store does not belong to this vault, node, epoch or slot.", hint=_DAMAGED
+            ) from None
+
+
+@dataclass(frozen=True)
+class Material:
+    """Everything secret of a station that keeps its keys in software; 32 octets each, never in a repr."""
+
+    identity: bytes = field(repr=False)
+    ca: bytes | None = field(repr=False)
+    masters: MasterKeys = field(repr=False)
+
+    @classmethod
+    def generate(cls) -> Material:
+        """Make a station key, a CA key and a master key."""
+        from teds_provision.protocol.keys import SoftwareKey
+
+        return cls(SoftwareKey.generate().secret(), SoftwareKey.generate().secret(), MasterKeys.generate())
+
+    def with_ca(self, secret: bytes | None) -> Material:
+        """Return the same with another CA key, or without one."""
+        return replace(self, ca=secret)
+
+    def encode(self) -> str:
+        """Return one line of ASCII, far below the 1280 characters that every keyring can hold."""
+        content: dict[str, Any] = {
+            "identity": _text(self.identity),
+            "ca": None if self.ca is None else _text(self.ca),
+            "masters": {str(number): _text(key) for number, key in self.masters.keys.items()},
+        }
+        return _PREFIX + _text(json.dumps(content, separators=(",", ":")).encode())
+
+    @classmethod
+    def decode(cls, line: str) -> Material:
+        """Read what :meth:`encode` gave; raises VaultFailure, without a word of the content."""
+        try:
+            if not line.startswith(_PREFIX):
+                raise ValueError
+            content = json.loads(_octets(line.removeprefix(_PREFIX)))
+            masters = {int(number): _octets(key) for number, key in content["masters"].items()}
+            ca = None if content["ca"] is None else _octets(content["ca"])
+            material = cls(_octets(content["identity"]), ca, MasterKeys(masters))
+        except (ValueError, KeyError, TypeError, AttributeError, binascii.Error):
+            raise VaultFailure("The vault holds something that is not a station's keys.", hint=_DAMAGED) from None
+        secrets = [material.identity, *masters.values(), *([] if ca is None else [ca])]
+        if not masters or any(len(secret) != _SECRET_OCTETS for secret in secrets):
+            raise VaultFailure("The vault holds a station's keys in a damaged form.", hint=_DAMAGED)
+        return material
+
+
+def _text(octets: bytes) -> str:
+    return base64.b64encode(octets).decode()
+
+
+def _octets(text: str) -> bytes:
+    return base64.b64decode(text, validate=True)

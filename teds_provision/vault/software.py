@@ -1,0 +1,114 @@
+"""What the keyring vault and the passphrase file share: the keys are in memory once unlocked."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from pathlib import Path
+
+from teds_provision.errors import VaultFailure
+from teds_provision.protocol.keys import PrivateKey, SoftwareKey, fingerprint
+from teds_provision.vault.master import MasterKeys, Material
+
+
+class SoftwareVault(ABC):
+    """A vault whose secrets are one :class:`Material`, read once and kept for the life of the process.
+
+    Python cannot wipe memory reliably: while the process lives, the keys are in it.
+    """
+
+    kind: str
+    description: str
+
+    def __init__(self, material: Material) -> None:
+        self._material = material
+        self._identity = SoftwareKey.from_secret(material.identity)
+
+    def __repr__(self) -> str:
+        return f"{type(self).__name__}({self.description}, station {fingerprint(self._identity.point)[:16]})"
+
+    def identity(self) -> PrivateKey:
+        """Return the station's identity key."""
+        return self._identity
+
+    def ca(self) -> PrivateKey | None:
+        """Return the CA key, None if it is kept elsewhere."""
+        return None if self._material.ca is None else SoftwareKey.from_secret(self._material.ca)
+
+    def wrap(self, key: bytes, *, context: bytes) -> bytes:
+        """Seal a node key under the newest master key, bound to ``context``."""
+        return self._material.masters.wrap(key, context=context)
+
+    def unwrap(self, wrapped: bytes, *, context: bytes) -> bytes:
+        """Open a wrapped node key; raises VaultFailure if it is damaged or belongs elsewhere."""
+        return self._material.masters.unwrap(wrapped, context=context)
+
+    def export_ca(self, path: Path, passphrase: str) -> None:
+        """Write the CA key to ``path`` as an encrypted PKCS #8 PEM; the vault keeps it until :meth:`drop_ca`.
+
+        Raises VaultFailure: no CA key here, passphrase too weak, the file exists or cannot be written.
+        """
+        from teds_provision.vault.ca_file import write_ca
+
+        if self._material.ca is None:
+            raise VaultFailure("This vault holds no CA key.", hint="It was exported and dropped, or never made here.")
+        write_ca(path, self._material.ca, passphrase)
+
+    def drop_ca(self) -> bool:
+        """Take the CA key out of the vault for good; False if there is none. Export it first."""
+        if self._material.ca is None:
+            return False
+        self._replace(self._material.with_ca(None))
+        return True
+
+    def import_ca(self, path: Path, passphrase: str) -> PrivateKey:
+        """Take in the CA key that :meth:`export_ca` wrote, and return it.
+
+        Raises WrongPassphrase, VaultFailure (not such a file, or another CA key is here), NotFound.
+        """
+        from teds_provision.vault.ca_file import read_ca
+
+        secret = read_ca(path, passphrase)
+        if self._material.ca not in (None, secret):
+            raise VaultFailure("This vault holds another CA key.", hint="Export and drop that one first.")
+        if self._material.ca is None:
+            self._replace(self._material.with_ca(secret))
+        return SoftwareKey.from_secret(secret)
+
+    def add_master(self) -> None:
+        """Add a master key, which wraps from now on; the old ones still unwrap. First step of a change."""
+        material = self._material
+        self._replace(Material(material.identity, material.ca, material.masters.with_new()))
+
+    def retire_masters(self) -> None:
+        """Forget all master keys but the newest: the last step of a change, once every key is wrapped anew."""
+        material = self._material
+        if len(material.masters.keys) > 1:
+            self._replace(Material(material.identity, material.ca, material.masters.newest_only()))
+
+    def secret_material(self) -> str:
+        """Return everything secret as one line of text, for a sealed backup. Whoever calls this must seal it."""
+        return self._material.encode()
+
+    def _replace(self, material: Material) -> None:
+        self._save(material)
+        self._material = material
+
+    @abstractmethod
+    def _save(self, material: Material) -> None:
+        """Write ``material`` durably in place of the old one, or raise VaultFailure and keep the old."""
+
+
+def settle(existing: Material | None, restored: str | None) -> Material:
+    """Return the keys a vault shall hold: what is there, joined with what a backup brings, or new ones.
+
+    Raises VaultFailure if the backup is of another station than what is there.
+    """
+    if restored is None:
+        return existing or Material.generate()
+    material = Material.decode(restored)
+    if existing is None:
+        return material
+    here, there = existing.masters.keys, material.masters.keys
+    if existing.identity != material.identity or any(here[number] != there[number] for number in here.keys() & there):
+        raise VaultFailure("The vault holds the keys of another station.", hint="Restore into another --home.")
+    return Material(existing.identity, existing.ca or material.ca, MasterKeys({**there, **here}))
