@@ -1,0 +1,163 @@
+"""The virtual transducer's flash: one file, replaced whole at every commit, so that a power cut leaves old or new."""
+
+from __future__ import annotations
+
+import fcntl
+import json
+import os
+import secrets
+import time
+import zlib
+from pathlib import Path
+from typing import Any
+
+from teds_provision.errors import BadData, NotFound, StoreLocked, UsageFailure
+from teds_provision.protocol.flash import Flash, FlashFailure
+from teds_provision.protocol.keys import SoftwareKey, node_key_message
+from teds_provision.teds.image import BlockId
+
+FORMAT = "teds-virtual-node/1"
+FILE = "flash.json"
+
+
+def default_can_address(uuid: bytes) -> int:
+    """A node's own default address: 1 + CRC-32(UUID) mod 239 (profile: wire)."""
+    return 1 + zlib.crc32(uuid) % 239
+
+
+class FlashFile:
+    """Flash and identity key of one virtual node in ``folder/flash.json`` (mode 0600); ``delay`` seconds a commit."""
+
+    def __init__(self, folder: Path, *, delay: float = 0.0) -> None:
+        self.path = folder / FILE
+        self._delay = delay
+        self._document = self._read()
+        self._lock: int | None = None
+
+    @classmethod
+    def create(cls, folder: Path, *, uuid: bytes | None = None, name: str = "", max_message: int = 2048) -> FlashFile:
+        """Make a node in factory state with its own key; an existing one of that UUID is opened instead."""
+        if (folder / FILE).exists():
+            existing = cls(folder)
+            if uuid not in (None, existing.load().uuid):
+                raise UsageFailure(f"{folder} already holds another node.", hint="Choose another folder.")
+            return existing
+        folder.mkdir(parents=True, exist_ok=True, mode=0o700)
+        uuid = secrets.token_bytes(10) if uuid is None else uuid
+        key = SoftwareKey.generate()
+        flash = Flash(
+            uuid,
+            key.point,
+            key.sign(node_key_message(uuid, key.point)),
+            can_address=default_can_address(uuid),
+        )
+        head = {"format": FORMAT, "name": name, "max_message": max_message, "key": key.secret().hex()}
+        _replace(folder / FILE, head | {"flash": _flash_to_json(flash)})
+        return cls(folder)
+
+    @property
+    def key(self) -> SoftwareKey:
+        """The node's identity key."""
+        return SoftwareKey.from_secret(bytes.fromhex(self._document["key"]))
+
+    @property
+    def name(self) -> str:
+        """What its maker called it."""
+        return str(self._document["name"])
+
+    @property
+    def max_message(self) -> int:
+        """maxMessage of this node, octets."""
+        return int(self._document["max_message"])
+
+    def load(self) -> Flash:
+        """Return the committed state."""
+        return _flash_from_json(self._document["flash"])
+
+    def commit(self, state: Flash) -> None:
+        """Replace the file in one atomic step (write, fsync, rename, fsync of the folder)."""
+        time.sleep(self._delay)
+        document = {**self._document, "flash": _flash_to_json(state)}
+        try:
+            _replace(self.path, document)
+        except OSError as error:
+            raise FlashFailure from error
+        self._document = document
+
+    def hold(self) -> None:
+        """Take the node for this process until it ends; raises StoreLocked where it runs already."""
+        self._lock = os.open(self.path.with_name("lock"), os.O_CREAT | os.O_RDWR | os.O_CLOEXEC, 0o600)
+        try:
+            fcntl.flock(self._lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            raise StoreLocked(f"The node in {self.path.parent} is already running.") from None
+
+    def _read(self) -> dict[str, Any]:
+        try:
+            document = json.loads(self.path.read_text())
+        except FileNotFoundError:
+            raise NotFound(
+                f"There is no virtual node in {self.path.parent}.",
+                hint=f"Make one: teds-provision node create {self.path.parent}",
+            ) from None
+        except ValueError as error:
+            raise BadData(f"{self.path} is not a virtual node's flash.") from error
+        if not isinstance(document, dict) or document.get("format") != FORMAT:
+            raise BadData(f"{self.path} is not a virtual node's flash.")
+        return document
+
+
+def _flash_to_json(flash: Flash) -> dict[str, Any]:
+    def text(octets: bytes | None) -> str | None:
+        return None if octets is None else octets.hex()
+
+    return {
+        "uuid": flash.uuid.hex(),
+        "node_key": flash.node_key.hex(),
+        "node_key_signature": flash.node_key_signature.hex(),
+        "blocks": [[channel, code, flash.blocks[channel, code].hex()] for channel, code in sorted(flash.blocks)],
+        "read_only": sorted(map(list, flash.read_only)),
+        "epoch": flash.epoch,
+        "sequence": flash.sequence,
+        "key": text(flash.key),
+        "station": text(flash.station),
+        "ca": text(flash.ca),
+        "provisioned": flash.provisioned,
+        "can_address": flash.can_address,
+    }
+
+
+def _flash_from_json(data: dict[str, Any]) -> Flash:
+    def octets(text: str | None) -> bytes | None:
+        return None if text is None else bytes.fromhex(text)
+
+    blocks: dict[BlockId, bytes] = {(channel, code): bytes.fromhex(teds) for channel, code, teds in data["blocks"]}
+    return Flash(
+        uuid=bytes.fromhex(data["uuid"]),
+        node_key=bytes.fromhex(data["node_key"]),
+        node_key_signature=bytes.fromhex(data["node_key_signature"]),
+        blocks=blocks,
+        read_only=frozenset((channel, code) for channel, code in data["read_only"]),
+        epoch=data["epoch"],
+        sequence=data["sequence"],
+        key=octets(data["key"]),
+        station=octets(data["station"]),
+        ca=octets(data["ca"]),
+        provisioned=data["provisioned"],
+        can_address=data["can_address"],
+    )
+
+
+def _replace(path: Path, document: dict[str, Any]) -> None:
+    temporary = path.with_suffix(".new")
+    descriptor = os.open(temporary, os.O_WRONLY | os.O_CREAT | os.O_TRUNC | os.O_CLOEXEC, 0o600)
+    with os.fdopen(descriptor, "w") as stream:
+        json.dump(document, stream)
+        stream.flush()
+        os.fsync(stream.fileno())
+    os.replace(temporary, path)
+    folder = os.open(path.parent, os.O_RDONLY | os.O_DIRECTORY)
+    try:
+        os.fsync(folder)
+    finally:
+        os.close(folder)
