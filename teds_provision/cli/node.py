@@ -10,19 +10,19 @@ from typing import Any
 import click
 
 from teds_provision.cli.context import App, pass_app
-from teds_provision.cli.options import COMMAND_SETTINGS
+from teds_provision.cli.options import COMMAND_SETTINGS, examples
 from teds_provision.errors import UsageFailure
 
 
-@click.group(context_settings=COMMAND_SETTINGS)
+@click.group(
+    context_settings=COMMAND_SETTINGS,
+    epilog=examples(
+        "teds-provision node create bench/finger",
+        "teds-provision node run bench/finger --nfc udp:localhost:54321 --can udp_multicast:239.74.163.2",
+    ),
+)
 def node() -> None:
-    """A virtual transducer: the whole node half of the profile, its flash in a file.
-
-    \b
-    Examples:
-      teds-provision node create bench/finger
-      teds-provision node run bench/finger --nfc udp:localhost:54321 --can udp_multicast:239.74.163.2
-    """
+    """A virtual transducer: the whole node half of the profile, its flash in a file."""
 
 
 def _uuid(_ctx: click.Context, _parameter: click.Parameter, text: str | None) -> bytes | None:

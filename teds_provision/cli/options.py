@@ -15,9 +15,14 @@ COMMAND_SETTINGS: dict[str, Any] = {"auto_envvar_prefix": "TEDS_PROVISION"}
 """context_settings of every command: each option also reads TEDS_PROVISION_<NAME>."""
 
 
-def command(name: str | None = None, **attributes: Any) -> Callable[[Callable[..., Any]], click.Command]:
-    """Make a click command whose options read TEDS_PROVISION_<NAME>; the docstring holds an Examples paragraph."""
-    return click.command(name, context_settings=COMMAND_SETTINGS, **attributes)
+def examples(*lines: str) -> str:
+    """Epilog of a command's help: lines that were run as they stand."""
+    return "\b\nExamples:\n" + "\n".join(f"  {line}" for line in lines)
+
+
+def command(*lines: str, **attributes: Any) -> Callable[[Callable[..., Any]], click.Command]:
+    """Make a click command whose options read TEDS_PROVISION_<NAME>; ``lines`` are the examples of its help."""
+    return click.command(context_settings=COMMAND_SETTINGS, epilog=examples(*lines), **attributes)
 
 
 def link_options(function: Function) -> Function:

@@ -67,7 +67,7 @@ class FlashFile:
 
     @property
     def max_message(self) -> int:
-        """maxMessage of this node, octets."""
+        """Octets of the longest frame that this node handles."""
         return int(self._document["max_message"])
 
     def load(self) -> Flash:

@@ -120,6 +120,15 @@ class NodeTables:
         """Forget the image of a node, if there is one."""
         self._database.execute("DELETE FROM drafts WHERE uuid = ?", (uuid,))
 
+    def node_image(self, uuid: bytes) -> str | None:
+        """Return the image (JSON) that this node had when it was last read, None if it never was."""
+        row = self._database.one("SELECT image FROM node_images WHERE uuid = ?", (uuid,))
+        return None if row is None else str(row[0])
+
+    def put_node_image(self, uuid: bytes, image: str) -> None:
+        """Remember what a node has: every TEDS as it was read."""
+        self._database.execute("INSERT OR REPLACE INTO node_images VALUES(?, ?, ?)", (uuid, image, utc_now()))
+
     def begin_step(self, uuid: bytes | None, step: str) -> int:
         """Note that a step begins and return its row; an open one of this name is closed as ``interrupted``."""
         with self._database.transaction():

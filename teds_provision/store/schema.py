@@ -32,6 +32,9 @@ _VERSION_1: Final = (
         uuid BLOB PRIMARY KEY CHECK(length(uuid) = 10), image TEXT NOT NULL,
         stage TEXT NOT NULL CHECK(stage IN ('built', 'signed')), profile TEXT, created TEXT NOT NULL)
         STRICT, WITHOUT ROWID""",
+    """CREATE TABLE node_images(
+        uuid BLOB PRIMARY KEY CHECK(length(uuid) = 10), image TEXT NOT NULL, seen TEXT NOT NULL)
+        STRICT, WITHOUT ROWID""",
     """CREATE TABLE steps(
         row INTEGER PRIMARY KEY AUTOINCREMENT, uuid BLOB, step TEXT NOT NULL, started TEXT NOT NULL, ended TEXT,
         result TEXT) STRICT""",
