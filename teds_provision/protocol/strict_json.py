@@ -1,0 +1,80 @@
+"""JSON and base64url as signed data needs them: one reading, or none (RFC 8259, RFC 4648, RFC 7515 section 2).
+
+Readers that disagree about a duplicate name, a padded string or a spare bit are how signed documents get two meanings.
+Everything here either reads one way or raises :class:`BadData`; nothing else comes out, whatever the octets.
+"""
+
+from __future__ import annotations
+
+import binascii
+import json
+from base64 import b64encode
+from typing import Any
+
+from teds_provision.errors import BadData
+
+_TO_URL = bytes.maketrans(b"+/", b"-_")
+# The two characters of plain base64 and the padding become one that no alphabet holds.
+_FROM_URL = bytes.maketrans(b"-_+/=", b"+/***")
+
+
+def encode_base64url(octets: bytes) -> str:
+    """Return base64url without padding."""
+    return b64encode(octets).translate(_TO_URL).rstrip(b"=").decode("ascii")
+
+
+def decode_base64url(text: object, what: str) -> bytes:
+    """Read base64url without padding and with spare bits zero; raises BadData that names ``what``."""
+    if not isinstance(text, str):
+        raise BadData(f"{what} is not a base64url string.")
+    try:
+        octets = text.encode("ascii").translate(_FROM_URL)
+        plain = binascii.a2b_base64(octets + b"=" * (-len(octets) % 4), strict_mode=True)
+    except ValueError as error:
+        raise BadData(f"{what} is not base64url without padding.") from error
+    if len(octets) % 4 and not _ends_clean(octets, plain):
+        raise BadData(f"{what} has spare bits set in its last base64url character.")
+    return plain
+
+
+def _ends_clean(octets: bytes, plain: bytes) -> bool:
+    """Whether the last, incomplete group of ``octets`` is the one that an encoder makes."""
+    tail = len(octets) % 4
+    return b64encode(plain[-(tail - 1) :])[:tail] == octets[-tail:]
+
+
+def dump(value: object) -> bytes:
+    """Return compact JSON in UTF-8."""
+    return json.dumps(value, separators=(",", ":"), ensure_ascii=False, allow_nan=False).encode()
+
+
+def load_object(octets: bytes, what: str) -> dict[str, Any]:
+    """Read one JSON object; refuses other encodings than UTF-8, duplicate names, NaN and what is nested too deeply.
+
+    The caller has bounded the size. Raises BadData that names ``what``.
+    """
+    try:
+        value = json.loads(octets.decode("utf-8"), object_pairs_hook=_unique, parse_constant=_refuse_constant)
+    except RecursionError as error:
+        raise BadData(f"{what} is nested too deeply.") from error
+    except ValueError as error:
+        detail = error.args[0] if isinstance(error, _DuplicateName) else "it is damaged or something else"
+        raise BadData(f"{what} is not the JSON that it should be: {detail}.") from error
+    if not isinstance(value, dict):
+        raise BadData(f"{what} is JSON, but not an object.")
+    return value
+
+
+class _DuplicateName(ValueError):
+    """Two members of one object have the same name."""
+
+
+def _unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    members = dict(pairs)
+    if len(members) != len(pairs):
+        raise _DuplicateName("an object names a member twice")
+    return members
+
+
+def _refuse_constant(name: str) -> Any:
+    raise ValueError(f"{name} is not JSON")
