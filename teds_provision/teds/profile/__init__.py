@@ -1,0 +1,40 @@
+"""Profiles: one TOML file per transducer type, inherited, checked, and built into the TEDS of a node.
+
+Pure but for reading the files themselves. ``load_profile`` finds and checks, :meth:`Profile.build` makes the TEDS.
+"""
+
+from teds_provision.teds.profile.load import (
+    Listed,
+    check,
+    default_folders,
+    find_profile,
+    list_profiles,
+    load_profile,
+    shipped_profiles,
+)
+from teds_provision.teds.profile.model import (
+    BuiltDatasheet,
+    CalibrationDemand,
+    ChannelProfile,
+    Profile,
+    TextProfile,
+)
+from teds_provision.teds.profile.reader import Problem
+from teds_provision.teds.profile.template import template
+
+__all__ = [
+    "BuiltDatasheet",
+    "CalibrationDemand",
+    "ChannelProfile",
+    "Listed",
+    "Problem",
+    "Profile",
+    "TextProfile",
+    "check",
+    "default_folders",
+    "find_profile",
+    "list_profiles",
+    "load_profile",
+    "shipped_profiles",
+    "template",
+]

@@ -1,0 +1,149 @@
+"""Finding profiles in their folders, and their inheritance."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from difflib import get_close_matches
+from pathlib import Path
+from typing import Final
+
+from teds_provision.errors import BadData, NotFound
+from teds_provision.teds.profile.interpret import interpret
+from teds_provision.teds.profile.model import Profile
+from teds_provision.teds.profile.reader import Problem, Problems
+from teds_provision.teds.profile.source import Table, Where, parse, read_text
+
+_NAME: Final = re.compile(r"[a-z0-9][a-z0-9._-]{0,63}\Z")
+MAXIMUM_DEPTH: Final = 16
+
+
+@dataclass(frozen=True)
+class Listed:
+    """A profile as it stands in a folder; ``error`` says why it cannot be used."""
+
+    name: str
+    path: Path
+    profile: Profile | None
+    error: str = ""
+
+
+def shipped_profiles() -> Path:
+    """Folder of the profiles that come with the tool: inside the installed package, or of the checkout."""
+    package = Path(__file__).resolve().parents[2]
+    installed = package / "shipped_profiles"
+    return installed if installed.is_dir() else package.parent / "profiles"
+
+
+def default_folders(home: Path | None = None) -> tuple[Path, ...]:
+    """Where profiles are looked for, the first wins: ./profiles, <home>/profiles, the shipped ones."""
+    folders = [Path("profiles"), *([home / "profiles"] if home else []), shipped_profiles()]
+    unique: dict[Path, Path] = {}
+    for folder in folders:
+        unique.setdefault(folder.resolve(), folder)
+    return tuple(unique.values())
+
+
+def load_profile(name_or_path: str | Path, folders: Sequence[Path] | None = None) -> Profile:
+    """Read and check a profile by name (looked for in the folders) or by the path of its file.
+
+    Raises NotFound (unknown name; lists the known ones), BadData (file, line, field and what is wrong there).
+    """
+    profile, problems = check(name_or_path, folders)
+    name = profile.name if profile else str(name_or_path)
+    found = Problems(list(problems))
+    found.raise_errors(name)
+    if profile is None:  # no error and no profile cannot be
+        raise BadData(f"The profile {name} cannot be read.")
+    return profile
+
+
+def check(name_or_path: str | Path, folders: Sequence[Path] | None = None) -> tuple[Profile | None, list[Problem]]:
+    """All problems of a profile, errors and warnings; the profile itself where there is no error.
+
+    Raises NotFound and, for a file that is not TOML or inherits in a circle, BadData.
+    """
+    path = find_profile(name_or_path, folders)
+    places = default_folders() if folders is None else tuple(folders)
+    table, lineage = _merged(path, places, ())
+    problems = Problems()
+    profile = interpret(table, path.stem, str(path), lineage, problems)
+    return profile, problems.found
+
+
+def find_profile(name_or_path: str | Path, folders: Sequence[Path] | None = None) -> Path:
+    """File of a profile; raises NotFound."""
+    text = str(name_or_path)
+    path = Path(text)
+    if isinstance(name_or_path, Path) or path.suffix == ".toml" or path.parent != Path():
+        if not path.is_file():
+            raise NotFound(f"There is no profile file {path}.")
+        return path
+    return _by_name(text, default_folders() if folders is None else folders)
+
+
+def _by_name(name: str, folders: Sequence[Path], besides: Sequence[Path] = ()) -> Path:
+    if _NAME.match(name):
+        for folder in folders:
+            path = folder / f"{name}.toml"
+            if path.is_file() and path.resolve() not in besides:
+                return path
+    known = sorted({path.stem for path in _files(folders)})
+    near = get_close_matches(name, known, n=1, cutoff=0.5)
+    guess = f'Did you mean "{near[0]}"? ' if near else ""
+    raise NotFound(
+        f'There is no profile "{name}".',
+        hint=f"{guess}Known are: {', '.join(known) or 'none'}. Make one with: teds-provision profile new NAME",
+    )
+
+
+def _files(folders: Sequence[Path]) -> Iterator[Path]:
+    for folder in folders:
+        if folder.is_dir():
+            yield from sorted(path for path in folder.glob("*.toml") if path.is_file())
+
+
+def list_profiles(folders: Sequence[Path] | None = None) -> list[Listed]:
+    """Every profile of the folders by name; one that hides another of the same name comes alone."""
+    found: dict[str, Listed] = {}
+    places = default_folders() if folders is None else folders
+    for path in _files(places):
+        if path.stem in found:
+            continue
+        try:
+            profile, error = load_profile(path, places), ""
+        except (BadData, NotFound) as failure:
+            profile, error = None, failure.message
+        found[path.stem] = Listed(path.stem, path, profile, error)
+    return [found[name] for name in sorted(found)]
+
+
+def _merged(path: Path, folders: Sequence[Path], chain: tuple[Path, ...]) -> tuple[Table, tuple[str, ...]]:
+    """Table of a profile laid over those it extends, and their names from this one up."""
+    resolved = path.resolve()
+    table = parse(read_text(path), str(path))
+    entry = table.entries.get("extends")
+    if entry is None:
+        return table, (path.stem,)
+    where = entry.where
+    if isinstance(entry, Table) or not isinstance(entry.value, str):
+        raise BadData(f'{where}: extends: the name of one profile is expected, like extends = "smart-sensor".')
+    chain = (*chain, resolved)
+    base = _base(entry.value, where, path, folders, chain)
+    if len(chain) > MAXIMUM_DEPTH:
+        raise BadData(f"{where}: extends: more than {MAXIMUM_DEPTH} profiles extend each other.")
+    below, lineage = _merged(base, folders, chain)
+    inherited = {key: value for key, value in below.entries.items() if key not in ("abstract", "extends")}
+    return Table(inherited, below.where).merged(table), (path.stem, *lineage)
+
+
+def _base(name: str, where: Where, path: Path, folders: Sequence[Path], chain: Sequence[Path]) -> Path:
+    places = list(dict.fromkeys((path.parent, *folders)))
+    try:
+        return _by_name(name, places, chain)
+    except NotFound as error:
+        if any((folder / f"{name}.toml").resolve() in chain for folder in places):
+            circle = " -> ".join([*(one.stem for one in chain), name])
+            raise BadData(f"{where}: extends: the profiles extend each other in a circle: {circle}.") from error
+        raise BadData(f"{where}: extends: {error.message}", hint=error.hint) from error

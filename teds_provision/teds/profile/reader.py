@@ -1,0 +1,282 @@
+"""Reading the tables of a profile by their key tables, with every problem collected and placed."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, field
+from difflib import get_close_matches
+
+from teds_provision.errors import BadData
+from teds_provision.teds.profile.keys import Key, Kind, Need
+from teds_provision.teds.profile.source import Item, Table, Where
+from teds_provision.teds.units import WrittenUnit, parse_seconds, parse_unit
+
+_LIMITS = {Kind.U8: 0xFF, Kind.U16: 0xFFFF, Kind.U32: 0xFFFF_FFFF}
+FLOAT32_MAXIMUM = 3.4028234663852886e38
+
+
+@dataclass(frozen=True)
+class Problem:
+    """One thing wrong with a profile; ``field`` is the dotted path of the key."""
+
+    where: Where
+    field: str
+    message: str
+    severity: str = "error"
+
+    def __str__(self) -> str:
+        place = f"{self.where}: " if self.field == "" else f"{self.where}: {self.field}: "
+        return place + self.message
+
+
+class _Wrong(Exception):
+    """A value cannot be read; the text says why."""
+
+
+@dataclass
+class Problems:
+    """All problems of one profile, in the order in which they were found."""
+
+    found: list[Problem] = field(default_factory=list)
+
+    def error(self, where: Where, path: str, message: str) -> None:
+        """Add an error."""
+        self.found.append(Problem(where, path, message))
+
+    def warning(self, where: Where, path: str, message: str) -> None:
+        """Add a warning."""
+        self.found.append(Problem(where, path, message, "warning"))
+
+    @property
+    def errors(self) -> list[Problem]:
+        """The errors alone."""
+        return [problem for problem in self.found if problem.severity == "error"]
+
+    def raise_errors(self, name: str) -> None:
+        """Raise BadData with the first error and the number of the others."""
+        errors = self.errors
+        if errors:
+            more = f" ({len(errors) - 1} more)" if len(errors) > 1 else ""
+            raise BadData(f"{errors[0]}{more}", hint=f"See all of them with: teds-provision profile check {name}")
+
+
+class Section:
+    """One table being read: keys are taken one by one, what is left at ``finish`` is unknown."""
+
+    def __init__(self, table: Table, problems: Problems, unit: WrittenUnit | None = None) -> None:
+        self.table = table
+        self.problems = problems
+        self.unit = unit
+        self._known: set[str] = set()
+
+    def path(self, key: str) -> str:
+        """Dotted path of a key."""
+        return f"{self.table.path}.{key}" if self.table.path else key
+
+    def where(self, key: str) -> Where:
+        """Place of a key, or of the table where the key is missing."""
+        entry = self.table.entries.get(key)
+        return self.table.where if entry is None else entry.where
+
+    def error(self, key: str, message: str) -> None:
+        """Report an error at a key."""
+        self.problems.error(self.where(key), self.path(key), message)
+
+    def warning(self, key: str, message: str) -> None:
+        """Report a warning at a key."""
+        self.problems.warning(self.where(key), self.path(key), message)
+
+    def item(self, key: str) -> object:
+        """Value of a key, None where it is absent; a table there is an error."""
+        self._known.add(key)
+        entry = self.table.entries.get(key)
+        if isinstance(entry, Table):
+            self.error(key, "a value is expected here, not a table.")
+            return None
+        return None if entry is None else entry.value
+
+    def text(self, key: str, default: str = "") -> str:
+        """Text of a key."""
+        value = self.item(key)
+        if value is None:
+            return default
+        if not isinstance(value, str):
+            self.error(key, f"a text in quotes is expected, not {value!r}.")
+            return default
+        return value
+
+    def texts(self, key: str) -> tuple[str, ...]:
+        """List of texts of a key."""
+        value = self.item(key)
+        if value is None:
+            return ()
+        if not isinstance(value, list) or not all(isinstance(part, str) for part in value):
+            self.error(key, f'a list of texts is expected, like ["nfc", "can"], not {value!r}.')
+            return ()
+        return tuple(value)
+
+    def flag(self, key: str, default: bool = False) -> bool:
+        """Truth value of a key."""
+        value = self.item(key)
+        if value is None:
+            return default
+        if not isinstance(value, bool):
+            self.error(key, f"true or false is expected, not {value!r}.")
+            return default
+        return value
+
+    def section(self, key: str) -> Section | None:
+        """The table under a key."""
+        self._known.add(key)
+        entry = self.table.entries.get(key)
+        if isinstance(entry, Item):
+            self.error(key, f"a table [{self.path(key)}] is expected, not {entry.value!r}.")
+            return None
+        return None if entry is None else Section(entry, self.problems, self.unit)
+
+    def sections(self, key: str) -> list[Section]:
+        """The tables of an array [[key]]."""
+        self._known.add(key)
+        entry = self.table.entries.get(key)
+        if entry is None:
+            return []
+        if isinstance(entry, Item) and isinstance(entry.value, tuple):
+            return [Section(table, self.problems, self.unit) for table in entry.value]
+        if isinstance(entry, Item) and entry.value == []:
+            return []
+        self.error(key, f"tables [[{self.path(key)}]] are expected.")
+        return []
+
+    def read(self, key: Key) -> object:
+        """Value of a key as its table says, converted to SI units; None where absent or wrong (reported)."""
+        value = self.item(key.key)
+        if value is None:
+            if key.key not in self.table.entries:
+                self._missing(key)
+            return None
+        try:
+            return self._convert(key, value)
+        except _Wrong as error:
+            self.error(key.key, str(error))
+        except BadData as error:
+            self.error(key.key, f"{error.message} {error.hint}".strip())
+        return None
+
+    def pairs(self, keys: Iterable[Key]) -> tuple[tuple[str, object], ...]:
+        """Field name and value of every key that is there."""
+        values = [(key.field, self.read(key)) for key in keys]
+        return tuple((name, value) for name, value in values if value is not None)
+
+    def finish(self, also: Sequence[str] = ()) -> None:
+        """Refuse the keys nobody asked for, suggesting the nearest."""
+        known = self._known | set(also)
+        for key in self.table.entries:
+            if key not in known:
+                near = get_close_matches(key, known, n=1, cutoff=0.6)
+                guess = f' Did you mean "{near[0]}"?' if near else f" Known here: {', '.join(sorted(known))}."
+                self.error(key, f"there is no such key.{guess}")
+
+    def _missing(self, key: Key) -> None:
+        if key.need is Need.OPTIONAL:
+            return
+        example = f" Write for example: {key.key} = {key.example}" if key.example else ""
+        message = f"missing ({key.help}).{example}"
+        report = self.error if key.need is Need.REQUIRED else self.warning
+        report(key.key, message)
+
+    def _convert(self, key: Key, value: object) -> object:
+        match key.kind:
+            case Kind.TIME:
+                return _not_negative(finite(parse_seconds(value)))
+            case Kind.VALUE:
+                return finite(self._quantity(value, difference=False))
+            case Kind.DIFFERENCE:
+                return _not_negative(finite(self._quantity(value, difference=True)))
+            case Kind.ANGLE:
+                return finite(_angle(value))
+            case Kind.NUMBER:
+                return finite(_number(value))
+            case Kind.FLAG:
+                if not isinstance(value, bool):
+                    raise _Wrong(f"true or false is expected, not {value!r}.")
+                return int(value)
+            case Kind.CHOICE:
+                return _choice(key, value)
+            case Kind.CHOICES:
+                return _list(key, value)
+            case Kind.U8 | Kind.U16 | Kind.U32:
+                return _integer(value, _LIMITS[key.kind])
+
+    def _quantity(self, value: object, *, difference: bool) -> float:
+        unit = self.unit or parse_unit("1")
+        if isinstance(value, str):
+            number, _, text = value.strip().partition(" ")
+            written = parse_unit(text.strip() or "1")
+            if written.units != unit.units:
+                raise _Wrong(f'"{value}" is not in a unit of this channel ({unit.text}).')
+            unit, value = written, _number_text(number)
+        number_value = _number(value)
+        return unit.difference_to_si(number_value) if difference else unit.to_si(number_value)
+
+
+def finite(value: float) -> float:
+    """Return the value if a Float32 can hold it."""
+    if not math.isfinite(value) or abs(value) > FLOAT32_MAXIMUM:
+        raise _Wrong(f"{value} does not fit a Float32.")
+    return value
+
+
+def _not_negative(value: float) -> float:
+    if value < 0:
+        raise _Wrong("it must not be negative.")
+    return value
+
+
+def _number(value: object) -> float:
+    if isinstance(value, bool) or not isinstance(value, (int, float)):
+        raise _Wrong(f"a number is expected, not {value!r}.")
+    return float(value)
+
+
+def _number_text(text: str) -> float:
+    try:
+        return float(text)
+    except ValueError:
+        raise _Wrong(f'a number and a unit are expected, like "10 mm"; "{text}" is no number.') from None
+
+
+def _angle(value: object) -> float:
+    if isinstance(value, str):
+        number, _, text = value.strip().partition(" ")
+        unit = parse_unit(text.strip() or "rad")
+        if unit.units != parse_unit("rad").units:
+            raise _Wrong(f'"{value}" is not an angle.')
+        return unit.to_si(_number_text(number))
+    return _number(value)
+
+
+def _integer(value: object, limit: int) -> int:
+    if isinstance(value, bool) or not isinstance(value, int) or not 0 <= value <= limit:
+        raise _Wrong(f"a whole number from 0 to {limit} is expected, not {value!r}.")
+    return value
+
+
+def _choice(key: Key, value: object) -> int:
+    if isinstance(value, str) and value in key.choices:
+        return key.choices[value]
+    if isinstance(value, int) and not isinstance(value, bool):
+        return _integer(value, 0xFF)
+    near = get_close_matches(str(value), key.choices, n=1, cutoff=0.6)
+    guess = f'Did you mean "{near[0]}"?' if near else f"One of {', '.join(key.choices)} is expected."
+    raise _Wrong(f"{value!r} is not known here. {guess}")
+
+
+def _list(key: Key, value: object) -> tuple[object, ...]:
+    if not isinstance(value, list) or not value:
+        raise _Wrong(f"a list is expected, like {key.example}, not {value!r}.")
+    if key.field == "DAngles":
+        if len(value) != 2:
+            raise _Wrong(f"two angles are expected, not {len(value)}.")
+        return tuple(finite(_angle(part)) for part in value)
+    return tuple(_integer(part, 0xFFFF) for part in value)
