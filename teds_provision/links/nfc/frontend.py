@@ -1,0 +1,141 @@
+"""Opening a reader, and what to tell a person when that fails."""
+
+from __future__ import annotations
+
+import errno
+import os
+import re
+from pathlib import Path
+from typing import Any
+
+from teds_provision.errors import NoReader, UsageFailure
+from teds_provision.links.nfc.library import nfc
+from teds_provision.links.nfc.tag import FieldLost, ReaderLost, ReaderTag, activate, translated
+from teds_provision.links.nfc.udp import ReaderDevice, address_of, frontend
+
+_PATH = re.compile(r"usb(:[0-9a-fA-F]{4}(:[0-9a-fA-F]{4})?|:\d{1,3}(:\d{1,3})?)?|(tty|com):[^:]+(:\w+)?")
+_HOPELESS = 10  # polls in a row that the reader answers with an error
+_NO_LIBUSB = "usb: paths need the C library libusb, which is not installed."
+
+
+class Reader:
+    """An opened reader. ``again`` is the path under which it will come back after it was unplugged."""
+
+    def __init__(self, clf: Any, *, again: str, simulated: bool) -> None:
+        self._clf = clf
+        self._failures = 0
+        self.again = again
+        self.name = str(clf.device)
+        technologies = ("106A",) if simulated else ("106A", "106B", "212F")
+        self._targets = [nfc.clf.RemoteTarget(technology) for technology in technologies]
+
+    def sense(self) -> ReaderTag | None:
+        """Poll the field once and activate what lies there; takes up to about 0.2 s. Raises ReaderLost."""
+        try:
+            with translated():
+                target = self._clf.sense(*self._targets, iterations=1)
+        except FieldLost as error:
+            self._failures += 1
+            if self._failures >= _HOPELESS:
+                raise ReaderLost(error.__cause__) from error
+            return None
+        self._failures = 0
+        return None if target is None else activate(self._clf, target)
+
+    def close(self) -> None:
+        """Switch the field off and release the device; never raises."""
+        try:
+            self._clf.close()
+        except Exception:  # noqa: BLE001  (nfcpy's drivers talk to the chip while closing: anything when it is gone)
+            self._clf.device = None
+
+
+def open_reader(path: str) -> Reader:
+    """Open the reader that ``path`` names: ``udp[:host][:port]`` or any path of nfcpy (``usb``, ``tty:USB0:pn532``).
+
+    Raises NoReader with the cause and its cure, UsageFailure for a path that is none.
+    """
+    if path.startswith("udp"):
+        device = ReaderDevice(*address_of(path))
+        return Reader(frontend(device, path), again=path, simulated=True)
+    if not _PATH.fullmatch(path):
+        raise UsageFailure(
+            f"{path!r} is not the path of a reader.",
+            hint="Write usb, usb:072f:2200, tty:USB0:pn532 or udp:localhost:54321.",
+        )
+    if path.startswith("usb"):
+        return _open_usb(path)
+    try:
+        return Reader(nfc.ContactlessFrontend(path), again=path, simulated=False)
+    except Exception as error:  # nfcpy and pyserial raise anything
+        raise _explained(path, error) from error
+
+
+def _open_usb(path: str) -> Reader:
+    """Open the first reader that can be opened, by its full path: a partial one hides why it fails."""
+    try:
+        seen = nfc.clf.transport.USB.find(path) or []
+    except FileNotFoundError as error:
+        raise NoReader(_NO_LIBUSB, hint="On Debian: sudo apt install libusb-1.0-0.") from error
+    except Exception as error:  # libusb1 raises its own tree
+        raise _explained(path, error) from error
+    failure: NoReader | None = None
+    for vendor, product, bus, number in seen:
+        if (vendor, product) not in nfc.clf.device.usb_device_map:
+            continue
+        try:
+            clf = nfc.ContactlessFrontend(f"usb:{int(bus):03}:{int(number):03}")
+        except Exception as error:  # noqa: BLE001  (nfcpy's drivers raise anything)
+            failure = failure or _explained(f"usb:{vendor:04x}:{product:04x}", error, vendor, product)
+            continue
+        return Reader(clf, again=f"usb:{vendor:04x}:{product:04x}", simulated=False)
+    raise failure or NoReader(f"No NFC reader was found on {path}.", hint=_candidates())
+
+
+def _explained(path: str, error: Exception, vendor: int = 0, product: int = 0) -> NoReader:
+    code = error.errno if isinstance(error, OSError) else None
+    if code == errno.EACCES and vendor:
+        rule = (
+            f'SUBSYSTEM=="usb", ATTRS{{idVendor}}=="{vendor:04x}", ATTRS{{idProduct}}=="{product:04x}", '
+            'TAG+="uaccess", GROUP="plugdev", MODE="0660"'
+        )
+        return NoReader(
+            f"This user may not open the reader {path}.",
+            hint=f"Put this line into /etc/udev/rules.d/70-nfc.rules and plug the reader in again: {rule}",
+        )
+    if code == errno.EBUSY and vendor:
+        driver = _kernel_driver(vendor, product)
+        return NoReader(
+            f"The reader {path} is held by {driver or 'another program'}.",
+            hint=f"sudo modprobe -r {driver}; echo blacklist {driver} | sudo tee /etc/modprobe.d/nfc-blacklist.conf"
+            if driver
+            else "Stop it (pcscd claims many readers: sudo systemctl stop pcscd.socket pcscd).",
+        )
+    if code == errno.EACCES:
+        return NoReader(
+            f"This user may not open {path}.", hint="Serial ports: sudo adduser $USER dialout, log in again."
+        )
+    if code in (errno.ENODEV, errno.ENOENT):
+        return NoReader(f"No NFC reader was found on {path}.", hint=_candidates())
+    return NoReader(f"The reader {path} cannot be opened: {error}.", hint="Unplug it, plug it in again.")
+
+
+def _kernel_driver(vendor: int, product: int) -> str:
+    """Return the kernel driver that holds the reader, "" for a program; where sysfs does not say, the usual one."""
+    for device in Path("/sys/bus/usb/devices").glob("*"):
+        try:
+            ids = [int((device / name).read_text(), 16) for name in ("idVendor", "idProduct")]
+        except (OSError, ValueError):
+            continue
+        if ids == [vendor, product]:
+            held = {os.path.basename(os.path.realpath(link)) for link in device.glob(f"{device.name}:*/driver")}
+            return "" if held == {"usbfs"} else next(iter(held - {"usbfs"}), "")
+    return "port100" if (vendor, product) in ((0x054C, 0x06C1), (0x054C, 0x06C3)) else "pn533_usb"
+
+
+def _candidates() -> str:
+    """Say what was looked for, and which serial ports could have a reader behind them."""
+    known = ", ".join(f"{vendor:04x}:{product:04x}" for vendor, product in nfc.clf.device.usb_device_map)
+    ports = sorted(path.name.removeprefix("tty") for path in Path("/dev").glob("tty[AU][CMS][AB]*"))
+    serial = f" Serial ports here: {', '.join(f'--nfc tty:{port}:pn532' for port in ports)}." if ports else ""
+    return f"Plug in a reader that nfcpy knows ({known}) and check with lsusb.{serial}"

@@ -1,0 +1,124 @@
+"""The station's half of TNEP: write a message, wait, read until the node has put its answer (wire, "NFC").
+
+Works on anything that reads and writes an NDEF message (:class:`Mailbox`), so that it runs in memory as well.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Sequence
+from typing import Protocol
+
+from teds_provision.errors import Garbled, NodeSilent
+from teds_provision.links.nfc import message, tnep
+from teds_provision.links.nfc.message import Record
+from teds_provision.links.nfc.pieces import Piece, Requester, room
+
+PATIENCE = 5.0  # seconds that a station goes on reading
+_REREADS = 3  # of a torn message
+_STATUS_OCTETS = len(message.encode([tnep.status(0)]))
+
+
+class Mailbox(Protocol):
+    """An NDEF message on a tag. Both methods raise NodeSilent when the tag is gone, Garbled when it is unreadable."""
+
+    def read(self) -> bytes:
+        """Return the message as it is now, empty when the tag has none."""
+
+    def write(self, octets: bytes) -> None:
+        """Replace the message."""
+
+
+class Poller:
+    """One activation of a node: selects the service when it is first needed and carries transactions."""
+
+    def __init__(
+        self,
+        mailbox: Mailbox,
+        service: tnep.ServiceParameters,
+        *,
+        clock: Callable[[], float] = time.monotonic,
+        sleep: Callable[[float], None] = time.sleep,
+    ) -> None:
+        self._mailbox = mailbox
+        self._service = service
+        self._clock = clock
+        self._sleep = sleep
+        self._selected = False
+
+    def transact(self, transaction: int, frame: bytes) -> bytes:
+        """Send one command frame and return its reply frame.
+
+        Raises NodeSilent when no answer came in time, Garbled when the node's messages stay unreadable or do not fit.
+        """
+        octets = room(self._service.max_ndef)
+        if room(self._service.max_ndef, _STATUS_OCTETS) < 1:
+            raise Garbled(
+                f"The node takes NDEF messages of at most {self._service.max_ndef} octets, too short for the profile."
+            )
+        self._select()
+        requester = Requester(transaction, frame, octets)
+        steps = 0
+        while (reply := requester.reply) is None:
+            if steps > requester.steps_allowed:
+                raise Garbled("The node asks for the same pieces again and again.")
+            steps += 1
+            request = message.encode([tnep.payload_record(requester.next().encode())])
+            self._exchange(request, lambda records: _take(records, requester))
+        return reply
+
+    def deselect(self) -> None:
+        """Leave the service; the node puts its initial message back and gives no answer."""
+        if self._selected:
+            self._selected = False
+            self._mailbox.write(message.encode([tnep.select(b"")]))
+
+    def restart(self) -> None:
+        """Select the service anew before the next transaction."""
+        self._selected = False
+
+    def _select(self) -> None:
+        if not self._selected:
+            self._exchange(message.encode([tnep.select(tnep.SERVICE)]), lambda records: True)
+            self._selected = True
+
+    def _exchange(self, octets: bytes, take: Callable[[Sequence[Record]], bool]) -> None:
+        """Write ``octets`` and read until ``take`` accepts an answer; our own message still there is "not yet"."""
+        if len(octets) > self._service.max_ndef:
+            raise Garbled(f"The node takes NDEF messages of at most {self._service.max_ndef} octets.")
+        self._mailbox.write(octets)
+        t_wait = self._service.t_wait
+        patience = max(PATIENCE, min((self._service.n_wait + 1) * t_wait, 3 * PATIENCE))
+        until, torn = self._clock() + patience, 0
+        self._sleep(min(t_wait, patience))
+        while True:
+            try:
+                answer = self._mailbox.read()
+                if answer and answer != octets and take(_successful(message.decode(answer))):
+                    return
+            except Garbled:
+                torn += 1
+                if torn > _REREADS:
+                    raise
+            left = until - self._clock()
+            if left <= 0:
+                raise NodeSilent(
+                    f"The node did not answer within {patience:.0f} s.", hint="Leave it on the reader and try again."
+                )
+            self._sleep(min(t_wait, left))
+
+
+def _take(records: Sequence[Record], requester: Requester) -> bool:
+    payload = tnep.external(records, tnep.TIM_TYPE)
+    if payload is None:
+        raise Garbled("The node answered without a payload record.")
+    return requester.take(Piece.decode(payload))
+
+
+def _successful(records: Sequence[Record]) -> Sequence[Record]:
+    code = tnep.status_of(records)
+    if code is None:
+        raise Garbled("The node answered without a TNEP status.")
+    if code != tnep.SUCCESS:
+        raise Garbled(f"The node answered with TNEP status 0x{code:02X}.")
+    return records

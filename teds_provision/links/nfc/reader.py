@@ -1,0 +1,247 @@
+"""NFC as a port: waits for taps on a reader and carries command frames to the node that lies there (wire, "NFC").
+
+nfcpy's ``connect`` is not used: it swallows OSError and Ctrl-C. One thread senses, activates and exchanges.
+"""
+
+from __future__ import annotations
+
+import secrets
+import threading
+import time
+from collections.abc import Callable, Iterator
+
+from teds_provision.errors import Garbled, LinkFailure, NodeSilent, NoNode, NoReader
+from teds_provision.links.nfc.frontend import Reader, open_reader
+from teds_provision.links.nfc.poller import Poller
+from teds_provision.links.nfc.tag import FieldLost, ReaderLost
+from teds_provision.links.nfc.visit import Foreign, Visit, look
+from teds_provision.links.ports import Contact, Notice, NoticeSink
+from teds_provision.protocol.identity import Identity
+
+REPEATS = 2  # of one transaction
+REPEAT_WITHIN = 15.0  # seconds
+RETURN_WITHIN = 3.0  # seconds that a node which slipped off has to come back in the middle of a transaction
+_PAUSE = 0.1  # seconds between two polls of the field
+_REOPEN = 1.0  # seconds between two tries to open a lost reader
+_DEBOUNCE = 0.7  # seconds: the same node back within them was never away
+_MISSES = 2  # presence checks in a row without an answer
+_LOOK_AGAIN = 1.0  # seconds until a tag that was not wanted is read anew
+
+
+class NfcPort:
+    """A reader, on which nodes are found by tapping them. Used from one thread.
+
+    ``path`` is ``udp:localhost:PORT`` or a path of nfcpy. Raises NoReader when the reader cannot be opened.
+    """
+
+    def __init__(self, path: str) -> None:
+        self._reader: Reader | None = open_reader(path)
+        self._again = self._reader.again
+        self._transaction = secrets.randbelow(0x10000)
+        self._lost = False
+
+    @property
+    def via(self) -> str:
+        """``nfc``."""
+        return "nfc"
+
+    def find(
+        self, wanted: Callable[[Identity], bool], *, seconds: float, notice: NoticeSink, address: int | None = None
+    ) -> Contact:
+        """Wait for the tap of a node for which ``wanted`` is true.
+
+        Tags that are no nodes and nodes that are not wanted are named once through ``notice`` and waited past.
+        Raises NoNode after ``seconds``, NoReader when the reader is gone by then. ``address`` is of no use here.
+        """
+        until, told, never = time.monotonic() + seconds, "", threading.Event()
+        waiting = False
+        while (left := until - time.monotonic()) > 0:
+            seen = self._look(notice, never)
+            if isinstance(seen, Visit) and wanted(seen.identity):
+                return self._contact(seen, notice)
+            if seen is not None:
+                told = _tell(seen, told, notice)
+                self._stay(seen, never, _LOOK_AGAIN)
+                continue
+            if not waiting:
+                waiting = True
+                notice(Notice("waiting", "Hold the node to the reader.", left))
+            time.sleep(_PAUSE)
+        if self._reader is None:
+            raise NoReader("The reader was unplugged and did not come back.", hint="Plug it in again.")
+        raise NoNode(
+            f"No node that is wanted was held to the reader within {seconds:.0f} s.",
+            hint="Hold the node's NFC antenna flat on the reader, or give it more time with --timeout.",
+        )
+
+    def watch(self, *, stop: threading.Event, notice: NoticeSink) -> Iterator[Contact]:
+        """Yield each node that is held to the reader, once per visit, until ``stop`` is set (within 0.3 s).
+
+        A reader that is unplugged is opened again when it is back. A node counts as gone when it did not answer for
+        0.7 s.
+        """
+        here: bytes | None = None  # the node of the visit that is not over yet
+        gone_at, told = 0.0, ""
+        while not stop.is_set():
+            seen = self._look(notice, stop)
+            same = isinstance(seen, Visit) and seen.identity.uuid == here
+            if here is not None and not same and (seen is not None or time.monotonic() - gone_at > _DEBOUNCE):
+                notice(Notice("node-left", f"Node {here.hex().upper()} was taken off the reader."))
+                here = None
+            if seen is None:
+                stop.wait(_PAUSE)
+                continue
+            if isinstance(seen, Foreign):
+                told = _tell(seen, told, notice)
+                self._stay(seen, stop, _LOOK_AGAIN)
+                continue
+            told = ""
+            if not same:
+                here = seen.identity.uuid
+                link = NfcLink(self, seen, notice)
+                yield Contact(seen.identity, link, tag_uid=seen.tag.uid)
+                link.close()
+                seen = link.visit
+            self._stay(seen, stop, None)
+            gone_at = time.monotonic()
+
+    def close(self) -> None:
+        """Switch the field off and release the reader; never raises."""
+        if self._reader is not None:
+            self._reader.close()
+            self._reader = None
+
+    def next_transaction(self) -> int:
+        """Return the next transaction number, u16; the first of a process is random."""
+        self._transaction = (self._transaction + 1) & 0xFFFF
+        return self._transaction
+
+    def back(self, uuid: bytes, seconds: float) -> Visit:
+        """Activate the node ``uuid`` anew; raises NodeSilent when it, or any node, is not there within ``seconds``."""
+        until = time.monotonic() + seconds
+        while True:
+            seen = self._sense_and_look()
+            if isinstance(seen, Visit) and seen.identity.uuid == uuid:
+                return seen
+            if isinstance(seen, Visit):
+                raise NodeSilent(
+                    f"The node moved away; another one ({seen.identity.uuid.hex().upper()}) lies on the reader.",
+                    hint=f"Put node {uuid.hex().upper()} back and run the command again.",
+                )
+            if time.monotonic() > until:
+                raise FieldLost
+            time.sleep(_PAUSE)
+
+    def lose_reader(self) -> None:
+        """Close a reader that failed, so that the next look opens it again."""
+        self.close()
+
+    def _contact(self, visit: Visit, notice: NoticeSink) -> Contact:
+        return Contact(visit.identity, NfcLink(self, visit, notice), tag_uid=visit.tag.uid)
+
+    def _look(self, notice: NoticeSink, stop: threading.Event) -> Visit | Foreign | None:
+        """Poll once; None when nothing lies there or the reader is away (which is told once)."""
+        try:
+            if self._reader is None:
+                self._reader = open_reader(self._again)
+            if self._lost:
+                self._lost = False
+                notice(Notice("reader-ready", f"The reader is back: {self._reader.name}."))
+            return self._sense_and_look()
+        except FieldLost:
+            return None
+        except NoReader as error:
+            self.lose_reader()
+            if not self._lost:
+                self._lost = True
+                notice(Notice("reader-lost", f"{error.message} Waiting for it."))
+            stop.wait(_REOPEN)
+            return None
+
+    def _sense_and_look(self) -> Visit | Foreign | None:
+        if self._reader is None:
+            raise ReaderLost("it was closed")
+        tag = self._reader.sense()
+        return None if tag is None else look(tag)
+
+    def _stay(self, seen: Visit | Foreign, stop: threading.Event, seconds: float | None) -> None:
+        """Wait until the tag is taken away, at most ``seconds``."""
+        until = None if seconds is None else time.monotonic() + seconds
+        misses = 0
+        while misses < _MISSES and not stop.is_set() and (until is None or time.monotonic() < until):
+            try:
+                misses = 0 if self._reader is not None and seen.tag.is_present else misses + 1
+            except ReaderLost:
+                return  # the next look finds out and says so
+            stop.wait(_PAUSE)
+
+
+class NfcLink:
+    """The line to one node that lies on the reader; selects the service when it is first used."""
+
+    def __init__(self, port: NfcPort, visit: Visit, notice: NoticeSink) -> None:
+        self._port = port
+        self._notice = notice
+        self._poller: Poller | None = Poller(visit.tag, visit.service)
+        self.visit = visit
+
+    @property
+    def via(self) -> str:
+        """``nfc``."""
+        return "nfc"
+
+    def exchange(self, frame: bytes) -> bytes:
+        """Send one whole command frame and return its whole reply frame.
+
+        A transaction that failed is repeated as it is, at most twice within 15 s; a node that left the field for a
+        moment is activated anew (its session is gone then, which the layer above notices by the reply). Raises
+        NodeSilent, Garbled or NoReader.
+        """
+        transaction, started = self._port.next_transaction(), time.monotonic()
+        for attempt in range(REPEATS + 1):
+            try:
+                return self._ready().transact(transaction, frame)
+            except NoReader:
+                self._poller = None
+                self._port.lose_reader()
+                raise
+            except (NodeSilent, Garbled) as error:
+                self._after(error)
+                if attempt == REPEATS or time.monotonic() - started > REPEAT_WITHIN:
+                    raise
+                self._notice(Notice("retry", f"{error.message} Trying again."))
+        raise AssertionError("unreachable")
+
+    def close(self) -> None:
+        """Deselect the service; never raises."""
+        try:
+            if self._poller is not None:
+                self._poller.deselect()
+        except LinkFailure:
+            self._poller = None
+
+    def _ready(self) -> Poller:
+        if self._poller is None:
+            self.visit = self._port.back(self.visit.identity.uuid, RETURN_WITHIN)
+            self._poller = Poller(self.visit.tag, self.visit.service)
+        return self._poller
+
+    def _after(self, error: LinkFailure) -> None:
+        """Choose how to go on: in the same activation while the tag still answers, else from a new one."""
+        if self._poller is not None and not isinstance(error, FieldLost) and self.visit.tag.is_present:
+            self._poller.restart()
+        else:
+            self._poller = None
+
+
+def _tell(seen: Visit | Foreign, told: str, notice: NoticeSink) -> str:
+    """Name a tag that is waited past, unless it was the last one named; return what was said."""
+    if isinstance(seen, Foreign):
+        text = seen.text
+        if text != told:
+            notice(Notice("foreign-tag", text))
+    else:
+        text = f"Node {seen.identity.uuid.hex().upper()} is not the one that is waited for."
+        if text != told:
+            notice(Notice("waiting", text))
+    return text

@@ -1,0 +1,132 @@
+"""A virtual transducer's NFC: an emulated tag that lies on a simulated reader (nfcpy's udp frames, loopback only)."""
+
+from __future__ import annotations
+
+import os
+import threading
+from collections.abc import Callable
+from typing import Any, Literal
+
+from teds_provision.errors import NoReader, UsageFailure
+from teds_provision.links.nfc.library import nfc
+from teds_provision.links.nfc.udp import NodeDevice, address_of, frontend
+from teds_provision.node import nfc_type2, nfc_type4
+from teds_provision.node.handler import NodeHandler
+from teds_provision.node.nfc_air import Air
+from teds_provision.node.nfc_tnep import TnepTag
+
+_LISTEN = 0.25  # seconds after which the server looks around: stop, renewal of the initial message
+_QUEUE = 0.2  # seconds between two tries to lie down on a reader on which another node lies
+_SENS_RES = {4: b"\x04\x00", 7: b"\x44\x00", 10: b"\x84\x00"}
+TYPE4_MAX_NDEF = 4160  # a frame of 4094 octets in one message
+
+_Respond = Callable[[bytes], bytes | None]
+
+
+class NfcServer:
+    """Serves ``handler`` on ``path`` (``udp:localhost:PORT``) as a Type 4 or a Type 2 tag, in its own thread.
+
+    ``uid`` has 4, 7 or 10 octets (Type 2: 7), random when None. ``wt_int`` (0 to 63) and ``n_wait`` (0 to 15) are
+    announced; ``max_ndef`` octets is the longest NDEF message, by default 4160 (Type 4) or 499 (Type 2, its most).
+    ``pace`` makes every frame last as long as on air at 106 kbit/s. Raises UsageFailure for what does not fit.
+    """
+
+    def __init__(
+        self,
+        path: str,
+        handler: NodeHandler,
+        *,
+        tag: Literal["4", "2"] = "4",
+        uid: bytes | None = None,
+        wt_int: int = 20,
+        n_wait: int = 15,
+        max_ndef: int | None = None,
+        pace: bool = False,
+    ) -> None:
+        self._path = path
+        self._device: Any = None
+        self._address = address_of(path)
+        self._uid = uid or (b"\x08" + os.urandom(3) if tag == "4" else b"\x02" + os.urandom(6))
+        if len(self._uid) not in ((7,) if tag == "2" else (4, 7, 10)):
+            raise UsageFailure(f"A Type {tag} tag cannot have a UID of {len(self._uid)} octets.")
+        self._type4, self._type2 = None, None
+        if tag == "4":
+            self._type4 = nfc_type4.Type4Memory(max_ndef or TYPE4_MAX_NDEF)
+        else:
+            self._type2 = nfc_type2.Type2Memory(self._uid, max_ndef or nfc_type2.MAX_NDEF)
+        self._tnep = TnepTag(self._type4 or self._memory2(), handler, wt_int=wt_int, n_wait=n_wait)
+        self._pace = pace
+        self._stop = threading.Event()
+        self._thread = threading.Thread(target=self._serve, name="nfc-tag", daemon=True)
+
+    def start(self) -> None:
+        """Lie down on the reader; while another node lies there, wait for it to leave. Raises NoReader."""
+        self._device = NodeDevice(*self._address)
+        if self._pace:
+            self._device.air = Air()
+        try:
+            self._device.bind()
+        except OSError as error:
+            raise NoReader(
+                f"The node cannot lie on {self._path}: {error.strerror}.", hint="Try another port."
+            ) from error
+        self._tnep.start()
+        self._thread.start()
+
+    def stop(self) -> None:
+        """Leave the reader, after the command that is being run."""
+        self._stop.set()
+        if self._device is not None:
+            self._device.wake()
+            self._thread.join()
+            self._tnep.stop()
+
+    def _memory2(self) -> nfc_type2.Type2Memory:
+        assert self._type2 is not None
+        return self._type2
+
+    def _serve(self) -> None:
+        clf = frontend(self._device, self._path)
+        sak = nfc_type2.SAK if self._type2 else nfc_type4.SAK
+        offer = nfc.clf.LocalTarget(
+            "106A",
+            sens_res=bytearray(_SENS_RES[len(self._uid)]),
+            sdd_res=bytearray(self._uid),
+            sel_res=bytearray((sak,)),
+        )
+        while not self._stop.is_set():
+            if not self._device.bind():
+                self._stop.wait(_QUEUE)
+                continue
+            target = clf.listen(offer, timeout=_LISTEN)
+            if target is None:
+                self._tnep.idle()
+            elif self._type2 is not None:
+                self._activation(clf, self._type2.answer, bytes(target.tt2_cmd), b"")
+            elif target.tt4_cmd:
+                application = nfc_type4.NdefApplication(self._memory4(), self._tnep.ready)
+                card = nfc_type4.IsoDepTag(bytes(target.tt4_cmd), application)
+                self._activation(clf, card.answer, b"", nfc_type4.ATS)
+        clf.close()
+
+    def _memory4(self) -> nfc_type4.Type4Memory:
+        assert self._type4 is not None
+        return self._type4
+
+    def _activation(self, clf: Any, respond: _Respond, command: bytes, answer: bytes | None) -> None:
+        """Serve one activation, from its first command (or the answer to it) until the field is gone."""
+        self._tnep.activated()
+        while not self._stop.is_set():
+            if command:
+                answer = respond(command)
+            command = b""
+            try:
+                command = bytes(clf.exchange(answer, _LISTEN) or b"")
+            except nfc.clf.TimeoutError:
+                self._tnep.idle()
+            except nfc.clf.BrokenLinkError:
+                break
+            except nfc.clf.CommunicationError:
+                pass
+            answer = None
+        self._tnep.lost()

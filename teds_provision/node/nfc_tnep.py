@@ -1,0 +1,147 @@
+"""The node's half of TNEP: initial message, service selection, answers (wire, "NFC").
+
+The frames' thread only empties the mailbox and hands the message over; a worker thread runs the command, however slow,
+and puts the answer, unless the reader wrote again or the field went in between.
+"""
+
+from __future__ import annotations
+
+import queue
+import threading
+import time
+from collections.abc import Callable
+from typing import Protocol
+
+from teds_provision.errors import Garbled
+from teds_provision.links.nfc import message, tnep
+from teds_provision.links.nfc.pieces import Piece, Responder, room
+from teds_provision.node.handler import NodeHandler
+from teds_provision.protocol.repetition import Repetition
+
+LINE = "nfc"
+_STATUS_OCTETS = len(message.encode([tnep.status(0)]))
+
+
+class Memory(Protocol):
+    """Where the NDEF message lies: a Type 4 file or a Type 2 SRAM."""
+
+    max_ndef: int
+    written: Callable[[bytes], None]
+
+    def put(self, octets: bytes) -> None:
+        """Replace the message."""
+
+
+class TnepTag:
+    """Serves one node's requests through the NDEF message of an emulated tag."""
+
+    def __init__(self, memory: Memory, handler: NodeHandler, *, wt_int: int, n_wait: int) -> None:
+        self._memory = memory
+        self._handler = handler
+        self._service = tnep.ServiceParameters(tnep.SERVICE, wt_int, n_wait, memory.max_ndef).record()
+        self._repetition = Repetition()
+        self._responder = Responder(self._run)
+        self._lock = threading.Lock()
+        self._serial = 0  # of the activation or message that the mailbox belongs to
+        self._selected = False
+        self._fresh = threading.Event()
+        self._jobs: queue.SimpleQueue[Callable[[], None] | None] = queue.SimpleQueue()
+        self._worker = threading.Thread(target=self._work, name="nfc-node", daemon=True)
+        self._initial = b""
+        memory.written = self._written
+
+    def start(self) -> None:
+        """Put the initial message and start the worker."""
+        self._initial = self._initial_message()
+        self._memory.put(self._initial)
+        self._worker.start()
+
+    def stop(self) -> None:
+        """End the worker after what it is doing."""
+        self._jobs.put(None)
+        self._worker.join()
+
+    def activated(self) -> None:
+        """A reader selected the tag: the initial message stands there again, and is renewed as soon as possible."""
+        with self._lock:
+            self._serial += 1
+            self._selected = False
+            self._memory.put(self._initial)
+            self._fresh.clear()
+            self._jobs.put(self._renew)
+
+    def lost(self) -> None:
+        """The field is gone: so are sessions, half requests and stored replies."""
+        with self._lock:
+            self._serial += 1
+            self._selected = False
+            self._jobs.put(self._forget)
+
+    def idle(self) -> None:
+        """Nothing happens on air: renew the initial message when Identify has changed meanwhile."""
+        if self._jobs.empty():
+            self._jobs.put(self._renew)
+
+    def ready(self, seconds: float) -> bool:
+        """Wait until the initial message is as new as the activation; False after ``seconds``."""
+        return self._fresh.wait(seconds)
+
+    def _written(self, octets: bytes) -> None:
+        """A reader completed a message: empty the mailbox at once ("need more time") and let the worker answer."""
+        with self._lock:
+            self._serial += 1
+            serial = self._serial
+            self._memory.put(b"")
+        self._jobs.put(lambda: self._serve(serial, octets))
+
+    def _work(self) -> None:
+        while (job := self._jobs.get()) is not None:
+            job()
+
+    def _serve(self, serial: int, octets: bytes) -> None:
+        if serial != self._serial:
+            return
+        answer = self._answer(serial, octets)
+        initial = self._initial_message()
+        with self._lock:
+            self._initial = initial
+            if serial == self._serial:
+                self._memory.put(initial if answer is None else answer)
+
+    def _answer(self, serial: int, octets: bytes) -> bytes | None:
+        """Return the message that answers ``octets``, None for the initial message."""
+        try:
+            records = message.decode(octets)
+            uri = tnep.selection(records)
+            if uri is not None:
+                with self._lock:
+                    self._selected = uri == tnep.SERVICE and serial == self._serial
+                return message.encode([tnep.status(tnep.SUCCESS)]) if uri == tnep.SERVICE else None
+            payload = tnep.external(records, tnep.TIM_TYPE)
+            if payload is None or not self._selected:
+                return message.encode([tnep.status(tnep.PROTOCOL_ERROR)])
+            piece = self._responder.answer(Piece.decode(payload), room(self._memory.max_ndef, _STATUS_OCTETS))
+        except Garbled:
+            return message.encode([tnep.status(tnep.GARBLED_REQUEST)])
+        return message.encode([tnep.status(tnep.SUCCESS), tnep.payload_record(piece.encode())])
+
+    def _run(self, transaction: int, frame: bytes) -> bytes:
+        return self._repetition.answer(
+            transaction, frame, lambda whole: self._handler.request(LINE, whole, tapped=True), now=time.monotonic()
+        )
+
+    def _renew(self) -> None:
+        initial = self._initial_message()
+        with self._lock:
+            changed, self._initial = initial != self._initial, initial
+            if changed and not self._selected and self._jobs.empty():
+                self._memory.put(initial)
+            self._fresh.set()
+
+    def _forget(self) -> None:
+        self._responder.forget()
+        self._repetition.forget()
+        self._handler.lost(LINE)
+
+    def _initial_message(self) -> bytes:
+        return message.encode([self._service, tnep.id_record(self._handler.identify())])
