@@ -15,14 +15,14 @@ import hashlib
 import json
 import os
 import socket
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any
 
 from teds_provision.store.database import Database
 from teds_provision.store.records import utc_now
 
-_PAGE = 500
+_PAGE_OF_ENTRIES = "SELECT * FROM audit WHERE seq > ? ORDER BY seq LIMIT ?"
 
 
 @dataclass(frozen=True)
@@ -61,7 +61,10 @@ class AuditLog:
         """Add one entry; ``detail`` holds JSON values only and never a secret. Raises StoreFailure."""
         text = _canonical(dict(detail or {}))
         with self._database.transaction():
-            count, previous = self._remembered()
+            last = self._database.one("SELECT seq, hash FROM audit ORDER BY seq DESC LIMIT 1")
+            count, previous = last or (0, self._root)
+            if self._remembered() != (count, previous):  # goes on, but the loss is never forgotten
+                self._database.execute("INSERT OR IGNORE INTO meta VALUES('audit-lost', ?)", (str(count + 1),))
             row = (count + 1, utc_now(), _who(), act, uuid, outcome, text)
             head = _chained(previous, row)
             self._database.execute("INSERT INTO audit VALUES(?, ?, ?, ?, ?, ?, ?, ?)", (*row, head))
@@ -69,45 +72,36 @@ class AuditLog:
 
     def entries(self, after: int = 0) -> Iterator[AuditEntry]:
         """Give the entries numbered above ``after``, oldest first; raises StoreFailure."""
-        for row in self._rows(after):
-            try:
-                detail = json.loads(row[6])
-            except ValueError:
-                detail = {"unreadable": row[6]}
-            if not isinstance(detail, dict):
-                detail = {"unreadable": row[6]}
-            seq, at, who, act, uuid, outcome, _, digest = row
-            yield AuditEntry(seq, at, who, act, uuid, outcome, detail, digest.hex())
+        return self._database.stream(_entry, _PAGE_OF_ENTRIES, after)
 
     def check(self) -> AuditVerdict:
         """Recompute the whole chain; raises StoreFailure only where the file itself cannot be read."""
         expected, previous = 0, self._root
-        for row in self._rows(0):
+        for seq, good, digest in self._database.stream(_linked, _PAGE_OF_ENTRIES):
             expected += 1
-            if row[0] != expected:
+            if seq != expected:
                 return self._broken(expected, expected - 1, previous, f"entry {expected} is missing")
-            if _chained(previous, row[:7]) != row[7]:
+            if good(previous) != digest:
                 return self._broken(expected, expected, previous, f"entry {expected} was changed, or the one before")
-            previous = row[7]
-        try:
-            count, head = self._remembered()
-        except ValueError:
-            count, head = -1, b""
-        if (count, head) != (expected, previous):
+            previous = digest
+        lost = self._database.one("SELECT value FROM meta WHERE name = 'audit-lost'")
+        if lost is not None:
+            first = int(lost[0]) if str(lost[0]).isdecimal() else 1
+            return self._broken(first, expected, previous, f"the log once ended before entry {first} and was cut there")
+        if self._remembered() != (expected, previous):
             return self._broken(expected + 1, expected, previous, "the end of the log was cut off or replaced")
         return AuditVerdict(True, None, expected, previous.hex())
 
-    def _rows(self, after: int) -> Iterator[tuple[Any, ...]]:
-        while rows := self._database.execute("SELECT * FROM audit WHERE seq > ? ORDER BY seq LIMIT ?", (after, _PAGE)):
-            yield from rows
-            after = rows[-1][0]
-
-    def _remembered(self) -> tuple[int, bytes]:
+    def _remembered(self) -> tuple[int, bytes] | None:
+        """Return the number of entries and the last hash, None where that note itself is damaged."""
         row = self._database.one("SELECT value FROM meta WHERE name = 'audit-head'")
         if row is None:
             return 0, self._root
-        count, head = row[0].split(":")
-        return int(count), bytes.fromhex(head)
+        count, _, head = str(row[0]).partition(":")
+        try:
+            return int(count), bytes.fromhex(head)
+        except ValueError:
+            return None
 
     def _remember(self, count: int, head: bytes) -> None:
         self._database.execute("INSERT OR REPLACE INTO meta VALUES('audit-head', ?)", (f"{count}:{head.hex()}",))
@@ -115,6 +109,30 @@ class AuditLog:
     @staticmethod
     def _broken(first_bad: int, count: int, head: bytes, why: str) -> AuditVerdict:
         return AuditVerdict(False, first_bad, count, head.hex(), why)
+
+
+def _entry(
+    seq: int, at: str, who: str, act: str, uuid: bytes | None, outcome: str, text: str, digest: bytes
+) -> AuditEntry:
+    try:
+        detail = json.loads(text)
+    except ValueError:
+        detail = None
+    if not isinstance(detail, dict):
+        detail = {"unreadable": text}
+    return AuditEntry(seq, at, who, act, uuid, outcome, detail, digest.hex())
+
+
+def _linked(*row: Any) -> tuple[int, Callable[[bytes], bytes], bytes]:
+    """Return number, the hash as a function of the one before, and the hash that stands there."""
+    texts, uuid, digest = (row[1], row[2], row[3], row[5], row[6]), row[4], row[7]
+    if (
+        not all(isinstance(text, str) for text in texts)
+        or not isinstance(uuid, bytes | None)
+        or type(digest) is not bytes
+    ):
+        raise TypeError
+    return row[0], lambda previous: _chained(previous, row[:7]), row[7]
 
 
 def _chained(previous: bytes, row: tuple[Any, ...]) -> bytes:

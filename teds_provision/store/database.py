@@ -11,16 +11,17 @@ import os
 import sqlite3
 import stat
 import threading
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import Any, TypeVar
 
 from teds_provision.errors import BadData, StoreFailure, StoreLocked
 from teds_provision.store.schema import APPLICATION_ID, SCHEMA_VERSION, STEPS_TO
 
 FILE_NAME = "store.sqlite3"
 BUSY_SECONDS = 10.0
+_PAGE = 500
 _RESTORE = "Restore a backup (teds-provision restore), or move the file away and run teds-provision init."
 
 _FULL = ("there is no space left on the disk", "Free some space and run the same command again; nothing is lost.")
@@ -41,6 +42,7 @@ _CAUSES: dict[int, tuple[str, str]] = {
     sqlite3.SQLITE_NOTADB: ("it is damaged or no store of this tool", _RESTORE),
     sqlite3.SQLITE_CONSTRAINT: ("the entry breaks a rule of the store", "Nothing was changed; please report this."),
 }
+_Record = TypeVar("_Record")
 _OS_CAUSES: dict[int, tuple[str, str]] = {
     errno.ENOSPC: _FULL,
     errno.EDQUOT: _FULL,
@@ -105,28 +107,48 @@ class Database:
 
     def execute(self, statement: str, values: Sequence[Any] = ()) -> list[tuple[Any, ...]]:
         """Run one statement and return all its rows; raises StoreFailure."""
-        with self._lock:
-            try:
-                return self._connection.execute(statement, values).fetchall()
-            except (sqlite3.Error, OSError) as error:
-                self._fail(error)
-            except UnicodeEncodeError as error:  # a name from a command line that is not UTF-8
-                raise BadData("A name or text is not valid UTF-8.", hint="Give it in UTF-8.") from error
+        with self._lock, self._translated():
+            return self._connection.execute(statement, values).fetchall()
 
     def change(self, statement: str, values: Sequence[Any] = ()) -> int:
         """Run one statement and return how many rows it changed; raises StoreFailure."""
-        with self._lock:
-            try:
-                return self._connection.execute(statement, values).rowcount
-            except (sqlite3.Error, OSError) as error:
-                self._fail(error)
-            except UnicodeEncodeError as error:  # a name from a command line that is not UTF-8
-                raise BadData("A name or text is not valid UTF-8.", hint="Give it in UTF-8.") from error
+        with self._lock, self._translated():
+            return self._connection.execute(statement, values).rowcount
 
     def one(self, statement: str, values: Sequence[Any] = ()) -> tuple[Any, ...] | None:
         """Return the first row, None if there is none; raises StoreFailure."""
         rows = self.execute(statement, values)
         return rows[0] if rows else None
+
+    def read(self, make: Callable[..., _Record], statement: str, values: Sequence[Any] = ()) -> list[_Record]:
+        """Make a record of every row; raises StoreFailure, also where a damaged row makes no record."""
+        rows = self.execute(statement, values)
+        try:
+            return [make(*row) for row in rows]
+        except (ValueError, TypeError, AttributeError) as error:
+            raise self._damaged() from error
+
+    def read_one(self, make: Callable[..., _Record], statement: str, values: Sequence[Any] = ()) -> _Record | None:
+        """Make a record of the first row, None if there is none; raises StoreFailure."""
+        records = self.read(make, statement, values)
+        return records[0] if records else None
+
+    def stream(self, make: Callable[..., _Record], statement: str, after: int = 0) -> Iterator[_Record]:
+        """Make records a page at a time, holding no lock between pages; raises StoreFailure.
+
+        The statement has two marks, for the number to go on after and for the page's length, and its first column is
+        that number, growing.
+        """
+        while rows := self.execute(statement, (after, _PAGE)):
+            for row in rows:
+                if not isinstance(row[0], int) or row[0] <= after:
+                    raise self._damaged()
+                after = row[0]
+                try:
+                    record = make(*row)
+                except (ValueError, TypeError, AttributeError) as error:
+                    raise self._damaged() from error
+                yield record
 
     @contextmanager
     def transaction(self) -> Iterator[None]:
@@ -151,8 +173,20 @@ class Database:
             finally:
                 self._depth -= 1
 
-    def _fail(self, error: sqlite3.Error | OSError) -> NoReturn:
-        raise as_store_failure(error, self.path) from error
+    def _damaged(self) -> StoreFailure:
+        cause, cure = _CAUSES[sqlite3.SQLITE_CORRUPT]
+        return StoreFailure(f"The store {self.path} cannot be used: {cause}.", hint=cure)
+
+    @contextmanager
+    def _translated(self) -> Iterator[None]:
+        try:
+            yield
+        except (sqlite3.Error, OSError) as error:
+            raise as_store_failure(error, self.path) from error
+        except UnicodeDecodeError as error:  # SQLite quotes what it found in a damaged file
+            raise self._damaged() from error
+        except UnicodeEncodeError as error:  # a name from a command line that is not UTF-8
+            raise BadData("A name or text is not valid UTF-8.", hint="Give it in UTF-8.") from error
 
     def _set_up(self, *, create: bool) -> None:
         for pragma in ("trusted_schema=OFF", "foreign_keys=ON", "secure_delete=ON", "synchronous=FULL"):

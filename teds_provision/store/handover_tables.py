@@ -21,7 +21,7 @@ class HandoverTables:
 
     def trusted(self) -> list[TrustRecord]:
         """Return every trusted station and CA, by name."""
-        return [TrustRecord(*row) for row in self._database.execute("SELECT * FROM trust ORDER BY name")]
+        return self._database.read(TrustRecord, "SELECT * FROM trust ORDER BY name")
 
     def put_trust(self, record: TrustRecord) -> None:
         """Trust a key under a name; the same key and role under another name is renamed.
@@ -63,12 +63,13 @@ class HandoverTables:
 
     def handovers(self) -> list[Handover]:
         """Return every bundle that left or came, oldest first."""
-        return [_handover(row) for row in self._database.execute("SELECT * FROM handovers ORDER BY created, id")]
+        return self._database.read(_handover, "SELECT * FROM handovers ORDER BY created, id")
 
     def handover(self, handover_id: str, direction: Direction) -> Handover | None:
         """Return one bundle."""
-        row = self._database.one("SELECT * FROM handovers WHERE id = ? AND direction = ?", (handover_id, direction))
-        return _handover(row) if row else None
+        return self._database.read_one(
+            _handover, "SELECT * FROM handovers WHERE id = ? AND direction = ?", (handover_id, direction)
+        )
 
     def put_handover(self, handover: Handover) -> None:
         """Add or replace a bundle."""
@@ -94,12 +95,11 @@ class HandoverTables:
 
     def tombstones(self) -> list[Tombstone]:
         """Return every node that was given away, by UUID."""
-        return [Tombstone(*row) for row in self._database.execute("SELECT * FROM tombstones ORDER BY uuid")]
+        return self._database.read(Tombstone, "SELECT * FROM tombstones ORDER BY uuid")
 
     def tombstone(self, uuid: bytes) -> Tombstone | None:
         """Return where this node was given, None if it was not."""
-        row = self._database.one("SELECT * FROM tombstones WHERE uuid = ?", (uuid,))
-        return Tombstone(*row) if row else None
+        return self._database.read_one(Tombstone, "SELECT * FROM tombstones WHERE uuid = ?", (uuid,))
 
     def put_tombstone(self, tombstone: Tombstone) -> None:
         """Note that a node was given away."""
@@ -114,10 +114,8 @@ class HandoverTables:
 
     def holders(self, uuid: bytes | None = None) -> list[Holder]:
         """Return who else holds keys: of this node, or of all."""
-        rows = self._database.execute(
-            "SELECT * FROM holders WHERE ?1 IS NULL OR uuid = ?1 ORDER BY uuid, since, fingerprint", (uuid,)
-        )
-        return [Holder(*row) for row in rows]
+        statement = "SELECT * FROM holders WHERE ?1 IS NULL OR uuid = ?1 ORDER BY uuid, since, fingerprint"
+        return self._database.read(Holder, statement, (uuid,))
 
     def put_holder(self, holder: Holder) -> None:
         """Note that another station holds a key of this node."""
@@ -133,12 +131,11 @@ class HandoverTables:
 
     def revocations(self) -> list[Revocation]:
         """Return the deny list, by UUID."""
-        return [Revocation(*row) for row in self._database.execute("SELECT * FROM revocations ORDER BY uuid")]
+        return self._database.read(Revocation, "SELECT * FROM revocations ORDER BY uuid")
 
     def revocation(self, uuid: bytes) -> Revocation | None:
         """Return why this node is denied, None if it is not."""
-        row = self._database.one("SELECT * FROM revocations WHERE uuid = ?", (uuid,))
-        return Revocation(*row) if row else None
+        return self._database.read_one(Revocation, "SELECT * FROM revocations WHERE uuid = ?", (uuid,))
 
     def put_revocation(self, revocation: Revocation) -> None:
         """Deny a node."""
@@ -152,6 +149,6 @@ class HandoverTables:
         return self._database.change("DELETE FROM revocations WHERE uuid = ?", (uuid,)) > 0
 
 
-def _handover(row: tuple[Any, ...]) -> Handover:
+def _handover(*row: Any) -> Handover:
     handover = Handover(*row)
     return replace(handover, peers=tuple(json.loads(row[3])))

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+from dataclasses import replace
+from typing import Any
 
 from teds_provision.errors import NotFound
 from teds_provision.store.database import Database
 from teds_provision.store.records import KeyRecord
 
-_COLUMNS = "uuid, epoch, key_id, state, slot, wrapped, source, created, seq"
-_PAGE = 500
+_COLUMNS = "seq, uuid, epoch, key_id, state, slot, wrapped, source, created"
 
 
 class KeyTables:
@@ -19,10 +20,8 @@ class KeyTables:
 
     def keys(self, uuid: bytes) -> list[KeyRecord]:
         """Return the keys of a node in the order to try them: newest pending first, the active one last."""
-        rows = self._database.execute(
-            f"SELECT {_COLUMNS} FROM keys WHERE uuid = ? ORDER BY state = 'active', seq DESC", (uuid,)
-        )
-        return [KeyRecord(*row) for row in rows]
+        statement = f"SELECT {_COLUMNS} FROM keys WHERE uuid = ? ORDER BY state = 'active', seq DESC"
+        return self._database.read(_key, statement, (uuid,))
 
     def next_slot(self, uuid: bytes) -> int:
         """Return a slot number that this node never had; to be asked before wrapping a new key."""
@@ -73,13 +72,7 @@ class KeyTables:
 
     def all_keys(self) -> Iterator[KeyRecord]:
         """Give every key of every node, in the order they came, a page at a time."""
-        after = 0
-        while rows := self._database.execute(
-            f"SELECT {_COLUMNS} FROM keys WHERE seq > ? ORDER BY seq LIMIT ?", (after, _PAGE)
-        ):
-            for row in rows:
-                yield KeyRecord(*row)
-            after = rows[-1][-1]
+        return self._database.stream(_key, f"SELECT {_COLUMNS} FROM keys WHERE seq > ? ORDER BY seq LIMIT ?")
 
     def replace_keys(self, rewrap: Callable[[KeyRecord], bytes]) -> int:
         """Wrap every key anew (a change of the master key), all or none; returns how many.
@@ -92,3 +85,7 @@ class KeyTables:
                 self._database.execute("UPDATE keys SET wrapped = ? WHERE seq = ?", (rewrap(record), record.seq))
                 count += 1
         return count
+
+
+def _key(seq: int, *row: Any) -> KeyRecord:
+    return replace(KeyRecord(*row), seq=seq)

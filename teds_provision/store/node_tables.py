@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import re
-from dataclasses import fields
+from dataclasses import fields, replace
 from typing import Any
 
 from teds_provision.errors import NotFound, OtherKey, UsageFailure
@@ -24,12 +24,11 @@ class NodeTables:
 
     def whitelist(self) -> list[WhitelistEntry]:
         """Return all entries, by UUID."""
-        return [WhitelistEntry(*row) for row in self._database.execute("SELECT * FROM whitelist ORDER BY uuid")]
+        return self._database.read(WhitelistEntry, "SELECT * FROM whitelist ORDER BY uuid")
 
     def whitelisted(self, uuid: bytes) -> WhitelistEntry | None:
         """Return the entry of this node, None if it is not whitelisted."""
-        row = self._database.one("SELECT * FROM whitelist WHERE uuid = ?", (uuid,))
-        return WhitelistEntry(*row) if row else None
+        return self._database.read_one(WhitelistEntry, "SELECT * FROM whitelist WHERE uuid = ?", (uuid,))
 
     def put_whitelist(self, entry: WhitelistEntry) -> None:
         """Add or replace the entry of a node; policy (a pinned key stays) is the caller's."""
@@ -44,12 +43,11 @@ class NodeTables:
 
     def nodes(self) -> list[NodeRecord]:
         """Return all nodes, by UUID."""
-        return [_node(row) for row in self._database.execute(f"SELECT {_NODE_COLUMNS} FROM nodes ORDER BY uuid")]
+        return self._database.read(_node, f"SELECT {_NODE_COLUMNS} FROM nodes ORDER BY uuid")
 
     def node(self, uuid: bytes) -> NodeRecord | None:
         """Return what is known of this node."""
-        row = self._database.one(f"SELECT {_NODE_COLUMNS} FROM nodes WHERE uuid = ?", (uuid,))
-        return _node(row) if row else None
+        return self._database.read_one(_node, f"SELECT {_NODE_COLUMNS} FROM nodes WHERE uuid = ?", (uuid,))
 
     def put_node(self, record: NodeRecord) -> None:
         """Add or replace a node. Epoch and sequence never go back; a known identity key stays.
@@ -106,8 +104,7 @@ class NodeTables:
 
     def draft(self, uuid: bytes) -> Draft | None:
         """Return the image that this node is being given."""
-        row = self._database.one("SELECT * FROM drafts WHERE uuid = ?", (uuid,))
-        return Draft(*row) if row else None
+        return self._database.read_one(Draft, "SELECT * FROM drafts WHERE uuid = ?", (uuid,))
 
     def put_draft(self, draft: Draft) -> None:
         """Keep an image for a node, in place of the one before."""
@@ -160,15 +157,12 @@ class NodeTables:
 
     def steps(self, uuid: bytes | None) -> list[Step]:
         """Return the latest rows of each step of a node, oldest first."""
-        return [
-            Step(*row) for row in self._database.execute("SELECT * FROM steps WHERE uuid IS ? ORDER BY row", (uuid,))
-        ]
+        return self._database.read(Step, "SELECT * FROM steps WHERE uuid IS ? ORDER BY row", (uuid,))
 
 
-def _node(row: tuple[Any, ...]) -> NodeRecord:
-    values = dict(zip((column.name for column in fields(NodeRecord)), row, strict=True))
-    values["groups"] = tuple(json.loads(values["groups"]))
-    return NodeRecord(**values)
+def _node(*row: Any) -> NodeRecord:
+    record = NodeRecord(*row)
+    return replace(record, groups=tuple(json.loads(str(record.groups))))
 
 
 def _by_name(name: str) -> tuple[str, tuple[str, str]]:

@@ -1,0 +1,86 @@
+"""One command at a time: who waits is told for whom, and a killed holder holds nothing."""
+
+from __future__ import annotations
+
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from teds_provision.errors import StoreFailure, StoreLocked
+from teds_provision.store import StoreLock
+
+HOLDER = """
+import sys, time
+from pathlib import Path
+from teds_provision.store import StoreLock
+with StoreLock(Path(sys.argv[1]), command="provision"):
+    print("held", flush=True)
+    time.sleep(60)
+"""
+
+
+@pytest.fixture
+def place(home: Path) -> Path:
+    home.mkdir(mode=0o700)
+    return home
+
+
+@pytest.fixture
+def holder(place: Path) -> Iterator[subprocess.Popen[str]]:
+    process = subprocess.Popen([sys.executable, "-c", HOLDER, str(place)], stdout=subprocess.PIPE, text=True)
+    assert process.stdout is not None
+    assert process.stdout.readline() == "held\n"
+    yield process
+    process.kill()
+    process.communicate()
+
+
+def test_the_second_process_is_told_who_holds_the_store(place: Path, holder: subprocess.Popen[str]) -> None:
+    notices: list[str] = []
+    begun = time.monotonic()
+    with pytest.raises(StoreLocked) as caught, StoreLock(place, command="write", wait=0.3, notice=notices.append):
+        pytest.fail("two hold one lock")
+    assert time.monotonic() - begun >= 0.3
+    assert f"pid {holder.pid} (provision) since 20" in caught.value.message
+    assert len(notices) == 1
+    assert f"pid {holder.pid} (provision)" in notices[0]
+
+
+def test_a_killed_holder_holds_nothing(place: Path, holder: subprocess.Popen[str]) -> None:
+    threading.Timer(0.2, holder.send_signal, (signal.SIGKILL,)).start()
+    with StoreLock(place, command="write", wait=10):
+        assert holder.wait(5) == -signal.SIGKILL
+
+
+def test_the_lock_is_free_after_use_and_after_an_error(place: Path) -> None:
+    with pytest.raises(ValueError, match="x"), StoreLock(place, command="write"):
+        raise ValueError("x")
+    with StoreLock(place, command="write", wait=0):
+        assert (place / "store.lock").stat().st_mode & 0o777 == 0o600
+    assert (place / "store.lock").read_bytes() == b""
+
+
+def test_an_unreadable_note_of_the_holder_is_no_obstacle(place: Path, holder: subprocess.Popen[str]) -> None:
+    (place / "store.lock").write_bytes(b'{"pid": "\xff')
+    with pytest.raises(StoreLocked, match="another process"), StoreLock(place, command="write", wait=0):
+        pytest.fail("two hold one lock")
+
+
+def test_a_home_that_is_not_there_is_a_store_failure(tmp_path: Path) -> None:
+    with pytest.raises(StoreFailure), StoreLock(tmp_path / "nowhere", command="write"):
+        pytest.fail("locked nothing")
+
+
+def test_a_link_in_place_of_the_lock_is_not_followed(place: Path, tmp_path: Path) -> None:
+    target = tmp_path / "precious"
+    target.write_text("text")
+    (place / "store.lock").symlink_to(target)
+    with pytest.raises(StoreFailure), StoreLock(place, command="write"):
+        pytest.fail("followed a link")
+    assert target.read_text() == "text"
