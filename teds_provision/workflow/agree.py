@@ -1,0 +1,127 @@
+"""Step 3: agree on a link key, or find that one is agreed (profile section 3). Lost messages heal here."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+from teds_provision.errors import NodeRefused, NotAuthentic, PolicyRefused
+from teds_provision.protocol.agreement import StationAgreement
+from teds_provision.protocol.frames import Reason
+from teds_provision.protocol.identity import NodeState
+from teds_provision.store import WhitelistEntry
+from teds_provision.workflow.conversation import Conversation, SessionLost
+from teds_provision.workflow.identify import Identified
+from teds_provision.workflow.reading import read_identity
+from teds_provision.workflow.station import NodeKey, Station
+
+
+@dataclass(frozen=True)
+class Agreed:
+    """The key that a session is open under now; ``fresh`` says whether this run agreed on it."""
+
+    epoch: int
+    key_id: str
+    fresh: bool
+
+
+def open_session(station: Station, node: Conversation) -> NodeKey | None:
+    """Open a session under the first key that the node knows, newest pending first; None where it knows none.
+
+    The key that worked becomes the active one and all others go: that is the only thing that ever deletes a key.
+    Raises PolicyRefused for a node that was moved away or revoked, LinkFailure.
+    """
+    for held in station.node_keys(node.uuid):
+        try:
+            node.open(held.key)
+        except NodeRefused as refusal:
+            if refusal.reason in (Reason.UNKNOWN_KEY, Reason.WRONG_STATE):
+                continue
+            raise
+        except NotAuthentic:
+            continue
+        if held.record.state == "pending" or len(station.store.keys(node.uuid)) > 1:
+            station.store.promote_key(node.uuid, held.record.key_id)
+            station.audit("key", node.uuid, "active", key_id=held.record.key_id, epoch=held.record.epoch)
+        return held
+    return None
+
+
+def require_session(station: Station, node: Conversation) -> NodeKey:
+    """Open a session or say why there is none: no key held (NotFound-like refusal), or the node has another."""
+    held = open_session(station, node)
+    if held is not None:
+        return held
+    if not station.has_keys(node.uuid):
+        raise PolicyRefused(
+            f"This station holds no key of node {node.uuid.hex()}.",
+            hint=f"Tap it and agree on one: teds-provision agree {node.uuid.hex()}",
+        )
+    raise unknown_key(node.uuid)
+
+
+def unknown_key(uuid: bytes) -> PolicyRefused:
+    """The error for a node that knows none of the keys held here: the operator decides, never the tool."""
+    return PolicyRefused(
+        f"Node {uuid.hex()} knows none of the keys that this station holds for it.",
+        hint=f"Another station may have rotated it, or it was reset. To take it: tap it, agree {uuid.hex()} --rotate.",
+    )
+
+
+def agree(station: Station, node: Conversation, who: Identified, *, rotate: bool = False) -> Agreed:
+    """End with a session open under an agreed key: the present one, or a new one.
+
+    ``rotate`` demands a new one: inside a session where a key is known, else by tap. Raises NotWhitelisted, OtherKey,
+    PolicyRefused, NodeRefused, NotAuthentic, LinkFailure; whatever is cut, the same call carries on.
+    """
+    entry = station.require_whitelisted(node.uuid)
+    held = open_session(station, node) if who.state != NodeState.FACTORY else None
+    if held is not None and not rotate:
+        return Agreed(held.record.epoch, held.record.key_id, fresh=False)
+    if held is None and who.state != NodeState.FACTORY and station.has_keys(node.uuid) and not rotate:
+        raise unknown_key(node.uuid)
+    pinned = _pin_for(entry, node, who)
+    try:
+        return _agree_anew(station, node, pinned)
+    except SessionLost as lost:
+        raise lost.cause from lost
+
+
+def _pin_for(entry: WhitelistEntry, node: Conversation, who: Identified) -> WhitelistEntry:
+    """The entry with its fingerprint, pinned now where this contact may pin: tapped, or the bus of a new CAN node."""
+    if entry.fingerprint is not None:
+        return entry
+    if node.tapped:
+        return replace(entry, fingerprint=who.fingerprint, assurance="tap")
+    if who.state == NodeState.FACTORY:
+        return replace(entry, fingerprint=who.fingerprint, assurance="bus")
+    raise PolicyRefused(
+        f"The whitelist knows node {node.uuid.hex()} by UUID alone; only a tap can pin its key.",
+        hint="Tap it once (--via nfc), or add the fingerprint: whitelist add UUID --fingerprint F.",
+    )
+
+
+def _agree_anew(station: Station, node: Conversation, entry: WhitelistEntry) -> Agreed:
+    uuid = node.uuid
+    agreement = StationAgreement(station.credentials(), uuid)
+    reply = node.send(agreement.request(), "the key agreement")
+    agreed = agreement.accept(reply, pinned=entry.fingerprint, epoch=station.active_epoch(uuid))
+    key_id = agreed.key_id.hex()
+    with station.store.transaction():
+        station.add_pending(uuid, key=agreed.key, key_id=agreed.key_id, epoch=agreed.epoch)
+        if entry != station.store.whitelisted(uuid):
+            station.store.put_whitelist(entry)
+        station.audit("agree", uuid, "pending", key_id=key_id, epoch=agreed.epoch, via=node.contact.link.via)
+    node.send(agreed.confirm, "the key confirmation")
+    node.forget()
+    node.open(agreed.key)
+    station.store.promote_key(uuid, key_id)
+    identity = read_identity(node)
+    station.remember(
+        uuid,
+        epoch=agreed.epoch,
+        sequence=identity.sequence,
+        state=int(identity.state),
+        can_address=identity.can_address,
+    )
+    station.audit("agree", uuid, "done", key_id=key_id, epoch=agreed.epoch)
+    return Agreed(agreed.epoch, key_id, fresh=True)

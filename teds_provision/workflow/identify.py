@@ -1,0 +1,106 @@
+"""Step 1: which node is this, which key does it hold, and can it prove it (Figure 3 of the paper, upper half)."""
+
+from __future__ import annotations
+
+import os
+from dataclasses import dataclass
+
+from teds_provision.errors import NodeRefused, NotAuthentic
+from teds_provision.protocol.frames import Function, security_command
+from teds_provision.protocol.identity import NodeState
+from teds_provision.protocol.keys import fingerprint, is_point, node_key_message, prove_message, verify
+from teds_provision.store import WhitelistEntry, utc_now
+from teds_provision.teds import security
+from teds_provision.teds.image import SECURITY
+from teds_provision.workflow.conversation import Conversation
+from teds_provision.workflow.reading import read_block
+from teds_provision.workflow.station import Station
+
+CHALLENGE_OCTETS = 32
+
+
+@dataclass(frozen=True)
+class Identified:
+    """A node that proved possession of the key that it shows."""
+
+    uuid: bytes
+    point: bytes
+    key_signature: bytes
+    state: NodeState
+    tag_uid: bytes | None
+    address: int | None
+    security_teds: bytes
+    whitelisted: WhitelistEntry | None
+
+    @property
+    def fingerprint(self) -> str:
+        """Fingerprint of the node's key."""
+        return fingerprint(self.point)
+
+
+def prove(node: Conversation, point: bytes) -> None:
+    """Have the node sign a fresh challenge (128.8); raises NotAuthentic where it cannot."""
+    challenge = os.urandom(CHALLENGE_OCTETS)
+    proof = node.ask(security_command(Function.PROVE, challenge), "to prove its key")
+    if not verify(point, prove_message(node.uuid, challenge), proof):
+        raise NotAuthentic(
+            f"The node does not hold the key {fingerprint(point)[:16]} that it shows.",
+            hint="This may be a copied tag. Do not use it.",
+        )
+
+
+def identify(station: Station, node: Conversation) -> Identified:
+    """Read UUID and key, demand the proof, and hold both against what this station knows.
+
+    Raises OtherKey (a known UUID with another key), NotAuthentic, BadData, LinkFailure. Records what was seen.
+    """
+    octets = read_block(node, SECURITY)
+    shown = security.decode(octets)
+    point = shown.node_key
+    if not is_point(point) or not verify(point, node_key_message(node.uuid, point), shown.node_key_signature):
+        raise NotAuthentic(f"The key that the node shows is not signed for UUID {node.uuid.hex()} (field 102).")
+    prove(node, point)
+    station.check_pin(node.uuid, point)
+    identity = node.identity
+    station.remember(
+        node.uuid,
+        point=point,
+        state=int(identity.state),
+        can_address=identity.can_address,
+        last_seen=utc_now(),
+    )
+    return Identified(
+        uuid=node.uuid,
+        point=point,
+        key_signature=shown.node_key_signature,
+        state=identity.state,
+        tag_uid=node.contact.tag_uid,
+        address=node.contact.address,
+        security_teds=octets,
+        whitelisted=station.store.whitelisted(node.uuid),
+    )
+
+
+@dataclass(frozen=True)
+class Description:
+    """What a node's own, so far unverified, datasheet says it is."""
+
+    name: str | None
+    channels: int
+
+
+def describe(node: Conversation) -> Description:
+    """Read name and number of channels from Meta-TEDS and XdcrName, where the node has them; nothing is verified."""
+    from teds_provision import teds
+
+    name: str | None = None
+    channels = 0
+    for block in ((0, 1), (0, 12)):
+        try:
+            decoded = teds.decode(read_block(node, block))
+        except NodeRefused:
+            continue
+        found, count = decoded.get("TCName"), decoded.get("MaxChan")
+        name = found if isinstance(found, str) else name
+        channels = count if isinstance(count, int) else channels
+    return Description(name, channels)

@@ -1,0 +1,74 @@
+"""What a workflow tells while it runs: steps with their time, and what is waited for."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from typing import Protocol
+
+from teds_provision.links import Notice
+
+NOTHING = "nothing to do"
+DONE = "done"
+
+
+@dataclass
+class StepResult:
+    """One step: ``result`` is "done" or "nothing to do"; ``detail`` one short sentence for people."""
+
+    name: str
+    result: str = DONE
+    seconds: float = 0.0
+    detail: str = ""
+
+
+class Reporter(Protocol):
+    """Where progress goes."""
+
+    def started(self, step: str) -> None:
+        """A step begins."""
+
+    def finished(self, step: StepResult) -> None:
+        """A step ended well."""
+
+    def notice(self, notice: Notice) -> None:
+        """Something is waited for, or came by."""
+
+    def written(self, octets: int, total: int) -> None:
+        """So many octets of the datasheet are staged."""
+
+
+class Silent:
+    """A reporter that tells nothing."""
+
+    def started(self, step: str) -> None:
+        """Say nothing."""
+
+    def finished(self, step: StepResult) -> None:
+        """Say nothing."""
+
+    def notice(self, notice: Notice) -> None:
+        """Say nothing."""
+
+    def written(self, octets: int, total: int) -> None:
+        """Say nothing."""
+
+
+@dataclass
+class Steps:
+    """The steps of one run, told as they happen."""
+
+    reporter: Reporter
+    done: list[StepResult] = field(default_factory=list)
+
+    @contextmanager
+    def step(self, name: str) -> Iterator[StepResult]:
+        """Run one step; what it found is put into the yielded result."""
+        self.reporter.started(name)
+        result, began = StepResult(name), time.monotonic()
+        yield result
+        result.seconds = round(time.monotonic() - began, 4)
+        self.done.append(result)
+        self.reporter.finished(result)

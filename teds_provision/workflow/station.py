@@ -1,0 +1,240 @@
+"""The base station on this machine: its names and public keys from the store, its secrets from the vault when they are needed."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from teds_provision.errors import NotFound, NotWhitelisted, PolicyRefused
+from teds_provision.protocol.agreement import Credentials, other_key
+from teds_provision.protocol.keys import fingerprint, station_key_message
+from teds_provision.store import KeyRecord, NodeRecord, Store, StoreLock, WhitelistEntry
+
+if TYPE_CHECKING:
+    from teds_provision.vault import Ask, Vault
+
+DEFAULT_NAME = "station"
+
+
+@dataclass(frozen=True)
+class NodeKey:
+    """One unwrapped link key that this station holds for a node."""
+
+    record: KeyRecord
+    key: bytes
+
+    def __repr__(self) -> str:
+        return f"NodeKey({self.record.key_id}, {self.record.state})"
+
+
+class Station:
+    """A base station (NCAP) on this machine. Opening it reads the store only; the vault opens at the first key."""
+
+    def __init__(self, store: Store, ask: Ask) -> None:
+        self.store = store
+        self._ask = ask
+        self._vault: Vault | None = None
+
+    @classmethod
+    def open(cls, home: Path, *, ask: Ask) -> Station:
+        """Open the station of ``home``; raises NotFound where init was never finished."""
+        if not (home / "store.sqlite3").exists():
+            raise not_initialised(home)
+        station = cls(Store.open(home), ask)
+        if station.store.setting("station_point") is None:
+            station.close()
+            raise not_initialised(home)
+        return station
+
+    def close(self) -> None:
+        """Close the store."""
+        self.store.close()
+
+    # -- public facts ----------------------------------------------------------------------------------------------
+
+    def _fact(self, name: str) -> str:
+        value = self.store.setting(name)
+        if value is None:
+            raise not_initialised(self.store.home)
+        return value
+
+    @property
+    def name(self) -> str:
+        """The station's name."""
+        return self._fact("station_name")
+
+    @property
+    def point(self) -> bytes:
+        """P(base station), 65 octets."""
+        return bytes.fromhex(self._fact("station_point"))
+
+    @property
+    def fingerprint(self) -> str:
+        """Fingerprint of the station's key."""
+        return fingerprint(self.point)
+
+    @property
+    def ca(self) -> bytes:
+        """P(CA) of the owner, 65 octets."""
+        return bytes.fromhex(self._fact("ca_point"))
+
+    @property
+    def station_signature(self) -> bytes:
+        """SIG104: the CA's signature over the station's key, 64 octets."""
+        return bytes.fromhex(self._fact("station_signature"))
+
+    @property
+    def keystore(self) -> str:
+        """Where the secrets lie: ``keyring``, ``file`` or a ``pkcs11:`` URI."""
+        return self._fact("keystore")
+
+    # -- secrets ---------------------------------------------------------------------------------------------------
+
+    @property
+    def vault(self) -> Vault:
+        """The vault, unlocked at first use."""
+        if self._vault is None:
+            from teds_provision.vault import open_vault
+
+            self._vault = open_vault(self.store.home, self.store.id, self.keystore, self._ask)
+        return self._vault
+
+    def credentials(self) -> Credentials:
+        """What the station shows and signs with."""
+        return Credentials(self.vault.identity(), self.station_signature, self.ca)
+
+    def certify(self, point: bytes) -> bytes:
+        """SIG104 of this owner's CA over another station's key; raises NotFound where the CA key is not here."""
+        ca = self.vault.ca()
+        if ca is None:
+            raise NotFound("The CA key is not in this vault.", hint="Do this where the CA key is kept.")
+        return ca.sign(station_key_message(point))
+
+    def node_keys(self, uuid: bytes) -> list[NodeKey]:
+        """Every key held for a node, in the order of trying: newest pending first, the active one last."""
+        return [NodeKey(record, self._unwrap(record)) for record in self.store.keys(uuid)]
+
+    def has_keys(self, uuid: bytes) -> bool:
+        """Whether any key is held for a node."""
+        return bool(self.store.keys(uuid))
+
+    def active_epoch(self, uuid: bytes) -> int:
+        """Epoch of the current (active) key of a node, 0 for none."""
+        return next((record.epoch for record in self.store.keys(uuid) if record.state == "active"), 0)
+
+    def add_pending(self, uuid: bytes, *, key: bytes, key_id: bytes, epoch: int, imported: bool = False) -> None:
+        """Store a new key durably as pending; nothing else is touched."""
+        from teds_provision.vault import node_key_context
+
+        with self.store.transaction():
+            slot = self.store.next_slot(uuid)
+            context = node_key_context(self.store.id, uuid, epoch, slot)
+            wrapped = self.vault.wrap(key, context=context)
+            source = "import" if imported else "agreement"
+            self.store.add_key(KeyRecord(uuid, epoch, key_id.hex(), "pending", slot, wrapped, source))  # type: ignore[arg-type]
+
+    def _unwrap(self, record: KeyRecord) -> bytes:
+        from teds_provision.vault import node_key_context
+
+        context = node_key_context(self.store.id, record.uuid, record.epoch, record.slot)
+        return self.vault.unwrap(record.wrapped, context=context)
+
+    # -- trust -----------------------------------------------------------------------------------------------------
+
+    def trusted_cas(self) -> list[bytes]:
+        """CA keys that count here: the owner's, and those added."""
+        return [self.ca, *(record.point for record in self.store.trusted() if record.role == "ca")]
+
+    def trusted_stations(self) -> list[bytes]:
+        """Station keys that count here: its own, and those added."""
+        return [self.point, *(record.point for record in self.store.trusted() if record.role == "station")]
+
+    def require_whitelisted(self, uuid: bytes) -> WhitelistEntry:
+        """Return the whitelist entry; raises NotWhitelisted, or PolicyRefused for a revoked node or one given away."""
+        revoked = self.store.revocation(uuid)
+        if revoked is not None:
+            raise PolicyRefused(f"Node {uuid.hex()} was revoked: {revoked.why}.")
+        tombstone = self.store.tombstone(uuid)
+        if tombstone is not None:
+            raise PolicyRefused(
+                f"Node {uuid.hex()} was moved to station {tombstone.to_fingerprint[:16]}; its key rests here.",
+                hint=f"Use it there, or: teds-provision handover undo {tombstone.handover_id}",
+            )
+        entry = self.store.whitelisted(uuid)
+        if entry is None:
+            raise NotWhitelisted(
+                f"Node {uuid.hex()} is not on the whitelist.", hint=f"Add it: teds-provision whitelist add {uuid.hex()}"
+            )
+        return entry
+
+    def check_pin(self, uuid: bytes, point: bytes) -> None:
+        """Raise OtherKey where this UUID is known with another key than ``point``."""
+        entry, node = self.store.whitelisted(uuid), self.store.node(uuid)
+        pinned = entry.fingerprint if entry is not None else None
+        if pinned is None and node is not None and node.point is not None:
+            pinned = fingerprint(node.point)
+        if pinned is not None and pinned != fingerprint(point):
+            self.audit("identify", uuid, "other key", shown=fingerprint(point), pinned=pinned)
+            raise other_key(pinned, point)
+
+    # -- what is known of nodes ------------------------------------------------------------------------------------
+
+    def remember(self, uuid: bytes, **facts: object) -> NodeRecord:
+        """Bring what is known of a node up to date and return it."""
+        known = self.store.node(uuid) or NodeRecord(uuid)
+        changed = replace(known, **facts)  # type: ignore[arg-type]
+        if changed != known or self.store.node(uuid) is None:
+            self.store.put_node(changed)
+        return changed
+
+    def audit(self, act: str, uuid: bytes | None, outcome: str, **detail: object) -> None:
+        """Append to the audit log: who did what to which node, with which outcome; never a secret."""
+        self.store.audit.append(act, uuid, outcome, detail)
+
+    def lock(self, command: str, notice: Callable[[str], object] | None = None) -> StoreLock:
+        """One changing command at a time; waits, then says who holds the store."""
+        return StoreLock(self.store.home, command=command, notice=notice)
+
+
+def not_initialised(home: Path) -> NotFound:
+    """The error for a home without a station."""
+    return NotFound(f"There is no base station in {home} yet.", hint="Make one: teds-provision init")
+
+
+def initialise(
+    home: Path, *, name: str | None, keystore: str | None, ask: Ask, costs: object | None = None
+) -> tuple[Station, str]:
+    """Make the station key and the CA key, or open what an earlier run made; returns it and why this keystore.
+
+    Each part is durable before the next begins, so that an interrupted init is carried on by the same command.
+    """
+    from teds_provision.vault import create_vault
+
+    store = Store.open(home, create=True)
+    station = Station(store, ask)
+    if store.setting("station_point") is not None:
+        return station, store.setting("keystore_why") or ""
+    with StoreLock(home, command="init"):
+        more = {} if costs is None else {"costs": costs}
+        vault, why = create_vault(home, store.id, keystore, ask, **more)  # type: ignore[arg-type]
+        identity, ca = vault.identity(), vault.ca()
+        if ca is None:
+            raise NotFound("The vault holds no CA key.", hint="Choose another keystore, or bring the CA key back.")
+        station._vault = vault
+        facts = {
+            "station_name": name or DEFAULT_NAME,
+            "station_point": identity.point.hex(),
+            "ca_point": ca.point.hex(),
+            "station_signature": ca.sign(station_key_message(identity.point)).hex(),
+            "keystore": keystore if keystore and keystore.startswith("pkcs11:") else vault.kind,
+            "keystore_why": why,
+        }
+        with store.transaction():
+            for fact, value in facts.items():
+                store.set_setting(fact, value)
+            store.audit.append(
+                "init", None, "done", {"fingerprint": fingerprint(identity.point), "keystore": vault.kind}
+            )
+    return station, why
