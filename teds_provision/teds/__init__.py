@@ -1,0 +1,72 @@
+"""IEEE 1451.0 TEDS: octets <-> datasheets, both editions, pure (no I/O, no third-party import at import time).
+
+``decode`` gives values, findings and a verdict and never raises; ``compose`` writes a TEDS from field names;
+``encode`` and ``recompose`` give a decoded one back; ``table`` and ``name_of`` show what is known of every class.
+"""
+
+from __future__ import annotations
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Final
+
+from teds_provision.teds.decode import decode
+from teds_provision.teds.encode import compose, encode, recompose
+from teds_provision.teds.model import (
+    Decoded,
+    Edition,
+    Field,
+    Finding,
+    Severity,
+    TimeInstance,
+    Units,
+    Value,
+    Verdict,
+)
+from teds_provision.teds.tables import FieldSpec, Table, name_of, table
+
+if TYPE_CHECKING:
+    from teds_provision.teds.editions import convert
+    from teds_provision.teds.keyforms import ReadKey, read_key
+    from teds_provision.teds.uuid import UuidParts, pack_uuid, unpack_uuid
+
+__all__ = [
+    "Decoded",
+    "Edition",
+    "Field",
+    "FieldSpec",
+    "Finding",
+    "ReadKey",
+    "Severity",
+    "Table",
+    "TimeInstance",
+    "Units",
+    "UuidParts",
+    "Value",
+    "Verdict",
+    "compose",
+    "convert",
+    "decode",
+    "encode",
+    "name_of",
+    "pack_uuid",
+    "read_key",
+    "recompose",
+    "table",
+    "unpack_uuid",
+]
+
+_LAZY: Final = {
+    "convert": "editions",
+    "ReadKey": "keyforms",
+    "read_key": "keyforms",
+    "UuidParts": "uuid",
+    "pack_uuid": "uuid",
+    "unpack_uuid": "uuid",
+}
+
+
+def __getattr__(name: str) -> object:
+    """Load what not everybody needs at its first use."""
+    if name not in _LAZY:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    return getattr(import_module(f"{__name__}.{_LAZY[name]}"), name)

@@ -57,8 +57,8 @@ def build(
     if profile.phy:
         blocks[0, PHY] = compose(PHY, profile.phy, edition=edition)
     for text in profile.texts:
-        value = (("language", text.language), ("text", text.text))
-        blocks[text.channel, text.access_code] = compose(text.access_code, value, edition=edition)
+        block = (("Text", {"LangCode": text.language, "Text": text.text}),)
+        blocks[text.channel, text.access_code] = compose(text.access_code, block, edition=edition)
     return BuiltDatasheet(dict(sorted(blocks.items())), tuple(warnings))
 
 

@@ -6,10 +6,10 @@ are those of ieee-1451.0.md sections 4.1, 4.2 and 4.5.
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Mapping
 from dataclasses import dataclass
 from enum import Enum
-from types import MappingProxyType
 from typing import Final
 
 
@@ -46,7 +46,7 @@ class Key:
     kind: Kind
     help: str
     need: Need = Need.OPTIONAL
-    choices: Mapping[str, int] = MappingProxyType({})
+    choices: Mapping[str, int] = dataclasses.field(default_factory=dict)
     example: str = ""
 
 

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Literal
 
-from teds_provision.teds.calibration.raw import raw_range
+from teds_provision.teds.calibration_raw import raw_range
 from teds_provision.teds.model import Edition, Units
 from teds_provision.teds.units import WrittenUnit
 
@@ -43,7 +43,7 @@ class CalibrationDemand:
 
 @dataclass(frozen=True)
 class ChannelProfile:
-    """One TransducerChannel; ``fields`` by TEDS name are ready to be composed (SI units), CalKey not among them."""
+    """One TransducerChannel; ``fields`` by TEDS name are ready to be composed (SI units); CalKey is not in it."""
 
     number: int
     name: str

@@ -37,7 +37,7 @@ def template(name: str) -> str:
             "[meta]                              # Meta-TEDS, access code 1; UUID and MaxChan are filled in",
             *_lines(META_KEYS),
             *_groups(),
-            "# Each channel is a TransducerChannel TEDS, access code 3; [channel.1-12] and [channel.all] say it for several.",
+            "# Each channel is a TransducerChannel TEDS, access code 3; [channel.1-12], [channel.all] say it for many.",
             "[channel.1]",
             'name = "channel 1"                  # {channel} stands for its number',
             'unit = "degree"                     # as people write it: N, mm, degC, m/s², mV/V, %, count, digital',
