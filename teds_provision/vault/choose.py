@@ -57,7 +57,7 @@ def _create(
     if keystore is not None and keystore.startswith("pkcs11:"):
         from teds_provision.vault.pkcs11 import Pkcs11Vault
 
-        return Pkcs11Vault.create(home, keystore, ask), "the token was asked for"
+        return Pkcs11Vault.create(home, store_id, keystore, ask), "the token was asked for"
     if keystore == "keyring":
         return KeyringVault.create(store_id, restored=restored), "the keyring was asked for"
     if keystore == "file":
@@ -85,5 +85,5 @@ def _open(home: Path, store_id: str, keystore: str, ask: Ask) -> Vault:
     if keystore.startswith("pkcs11:"):
         from teds_provision.vault.pkcs11 import Pkcs11Vault
 
-        return Pkcs11Vault.open(home, keystore, ask)
+        return Pkcs11Vault.open(home, store_id, keystore, ask)
     raise UsageFailure(f"There is no keystore {keystore!r}.", hint="Give keyring, file or pkcs11:URI.")

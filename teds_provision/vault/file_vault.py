@@ -53,7 +53,7 @@ class FileVault(SoftwareVault):
         check_new(passphrase)
         material = settle(None, restored)
         key = SealingKey.derive(passphrase, costs=costs)
-        _write(path, _sealed(store_id, material, key), replace=False)
+        write_whole(path, _sealed(store_id, material, key), replace=False)
         return cls(path, store_id, material, key)
 
     @classmethod
@@ -75,12 +75,12 @@ class FileVault(SoftwareVault):
         passphrase = ask("New passphrase for this station's keys", True)
         check_new(passphrase)
         key = SealingKey.derive(passphrase, costs=costs)
-        _write(self._path, _sealed(self._store_id, self._material, key), replace=True)
+        write_whole(self._path, _sealed(self._store_id, self._material, key), replace=True)
         self._key = key
         self.stamp = stamp(self._path)
 
     def _save(self, material: Material) -> None:
-        _write(self._path, _sealed(self._store_id, material, self._key), replace=True)
+        write_whole(self._path, _sealed(self._store_id, material, self._key), replace=True)
         self.stamp = stamp(self._path)
 
 
@@ -123,7 +123,7 @@ def _read(path: Path) -> dict[str, Any]:
     return content
 
 
-def _write(path: Path, content: bytes, *, replace: bool) -> None:
+def write_whole(path: Path, content: bytes, *, replace: bool) -> None:
     """Write whole or not at all: a new file (O_EXCL, 0600), fsync, then link or rename, then fsync the directory."""
     fresh = path.with_name(f"{path.name}.{secrets.token_hex(4)}.new")
     try:

@@ -1,0 +1,299 @@
+"""The vault whose station key and CA key lie in a PKCS #11 token (a smart card, an HSM, SoftHSM).
+
+The keys are made in the token and never leave it. Node keys are wrapped, as in every vault, under master keys; these
+are sealed to the station key in the file ``vault-pkcs11.json``: a one-time key agrees with the station key (ECDH in
+the token), HKDF-SHA-256 makes the sealing key, AES-256-GCM seals, and the station key signs the whole file. Opening it
+needs the token once per process; changing it unseen needs the token too. Node keys are in this process's memory while
+they are used: nothing else is promised, whatever the token.
+"""
+
+from __future__ import annotations
+
+import fcntl
+import hashlib
+import json
+import os
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+from teds_provision.errors import VaultFailure
+from teds_provision.protocol.keys import PrivateKey, SoftwareKey, fingerprint, verify
+from teds_provision.vault.base import Ask
+from teds_provision.vault.file_vault import write_whole
+from teds_provision.vault.master import MasterKeys
+from teds_provision.vault.pkcs11_token import TokenKey, TokenSession, ask_pin, find_token, log_in
+from teds_provision.vault.pkcs11_uri import Pkcs11Uri
+
+FILE_NAME = "vault-pkcs11.json"
+LOCK_NAME = "vault-pkcs11.lock"
+_FORMAT = "teds-vault-pkcs11/1"
+_LABEL = b"TEDS1 token vault\0"
+_MAX_OCTETS = 64 * 1024
+_NONCE_OCTETS = 12
+_LOCK_SECONDS = 30.0
+_DAMAGED = "Restore this file from a backup of this station; the keys are still in the token."
+
+
+class Pkcs11Vault:
+    """The station's keys in a token, its master keys in a file that only the token opens."""
+
+    kind = "pkcs11"
+
+    def __init__(self, home: Path, store_id: str, uri: Pkcs11Uri, session: TokenSession, content: _Content) -> None:
+        self.description = f"PKCS #11 token {session.label!r} by {uri.module_path}"
+        self._home, self._store_id, self._uri = home, store_id, uri
+        self._session, self._content = session, content
+
+    @classmethod
+    def create(cls, home: Path, store_id: str, uri: str, ask: Ask, *, with_ca: bool = True) -> Pkcs11Vault:
+        """Make the keys in the token that ``uri`` (RFC 7512) names, or take up what an earlier run made.
+
+        The URI's ``object`` and ``id`` name the station key; a key of that name which is in the token already is taken,
+        if it cannot leave it. ``with_ca`` False makes no CA key. ``ask`` is called once, for the PIN, unless the token
+        has a pad. Raises UsageFailure (URI), WrongPassphrase, VaultFailure.
+        """
+        if (home / FILE_NAME).exists():
+            return cls.open(home, store_id, uri, ask)
+        where = Pkcs11Uri.parse(uri)
+        session = _open_session(home, where, ask, write=True)
+        with _exclusive(home):
+            station = _find_or_make(session, store_id, where, "station")
+            ca = _find_or_make(session, store_id, where, "CA") if with_ca else None
+            content = _Content(station, ca, MasterKeys.generate())
+            _save(home, store_id, content, replace=False)
+        vault = cls(home, store_id, where, session, content)
+        if _load(home, store_id, session).masters != content.masters:
+            raise VaultFailure("The token does not open what was sealed to its key.", hint="Check the token's driver.")
+        return vault
+
+    @classmethod
+    def open(cls, home: Path, store_id: str, uri: str, ask: Ask) -> Pkcs11Vault:
+        """Open the vault with the PIN that ``ask`` gives.
+
+        Raises UsageFailure (URI), WrongPassphrase, VaultFailure (module, token, key or file missing or changed).
+        """
+        where = Pkcs11Uri.parse(uri)
+        _read(home, store_id)  # before anyone is asked for a PIN
+        session = _open_session(home, where, ask, write=False)
+        with _exclusive(home):
+            content = _load(home, store_id, session)
+        return cls(home, store_id, where, session, content)
+
+    def identity(self) -> PrivateKey:
+        """Return the station's identity key."""
+        return self._content.station
+
+    def ca(self) -> PrivateKey | None:
+        """Return the CA key, None if the token holds none."""
+        return self._content.ca
+
+    def wrap(self, key: bytes, *, context: bytes) -> bytes:
+        """Seal a node key under the newest master key, bound to ``context``."""
+        return self._content.masters.wrap(key, context=context)
+
+    def unwrap(self, wrapped: bytes, *, context: bytes) -> bytes:
+        """Open a wrapped node key; raises VaultFailure if it is damaged or belongs elsewhere."""
+        return self._content.masters.unwrap(wrapped, context=context)
+
+    def export_ca(self, path: Path, passphrase: str) -> None:
+        """Refuse: a key made in a token never leaves it. Raises VaultFailure always."""
+        raise VaultFailure(
+            "The CA key is in the token and cannot leave it.",
+            hint="Keep the token itself away, or make the CA in another home with --keystore file.",
+        )
+
+    def drop_ca(self, ask: Ask) -> bool:
+        """Destroy the CA key in the token for good; False if there is none. Asks for the PIN where it must."""
+        if self._content.ca is None:
+            return False
+        session = _open_session(self._home, self._uri, ask, write=True)
+        self._replace(_Content(self._content.station, None, self._content.masters), after=self._content.ca, on=session)
+        return True
+
+    def add_master(self) -> None:
+        """Add a master key, which wraps from now on; the old ones still unwrap. First step of a change."""
+        self._replace(_Content(self._content.station, self._content.ca, self._content.masters.with_new()))
+
+    def retire_masters(self) -> None:
+        """Forget all master keys but the newest: the last step of a change, once every key is wrapped anew."""
+        if len(self._content.masters.keys) > 1:
+            self._replace(_Content(self._content.station, self._content.ca, self._content.masters.newest_only()))
+
+    def close(self) -> None:
+        """End the session with the token."""
+        self._session.close()
+
+    def _replace(self, content: _Content, *, after: TokenKey | None = None, on: TokenSession | None = None) -> None:
+        with _exclusive(self._home):
+            _save(self._home, self._store_id, content, replace=True)
+            self._content = content
+            if after is not None and on is not None:
+                on.destroy(after)
+
+    def __repr__(self) -> str:
+        return f"Pkcs11Vault({self.description}, station {fingerprint(self._content.station.point)[:16]})"
+
+
+class _Content:
+    """What an open vault holds."""
+
+    def __init__(self, station: TokenKey, ca: TokenKey | None, masters: MasterKeys) -> None:
+        self.station, self.ca, self.masters = station, ca, masters
+
+
+def _open_session(home: Path, uri: Pkcs11Uri, ask: Ask, *, write: bool) -> TokenSession:
+    with _exclusive(home):
+        token = find_token(uri)
+    pin = ask_pin(token, uri, ask)
+    with _exclusive(home):
+        return log_in(token, uri, pin, write=write)
+
+
+def _find_or_make(session: TokenSession, store_id: str, uri: Pkcs11Uri, role: str) -> TokenKey:
+    """Name, CKA_ID and so the key itself follow from the URI and the store's id: a second run finds the first's."""
+    label = f"teds-provision {role}" if uri.object is None else uri.object if role == "station" else f"{uri.object} CA"
+    identifier = hashlib.sha256(_LABEL + f"{role}\0{store_id}".encode()).digest()[:16]
+    if uri.id is not None:
+        identifier = uri.id if role == "station" else uri.id + b"CA"
+    by_label = uri.object is not None or uri.id is None
+    by_id = uri.id is not None or uri.object is None
+    found = session.find(label=label if by_label else None, identifier=identifier if by_id else None)
+    return found or session.generate(label=label, identifier=identifier)
+
+
+def _save(home: Path, store_id: str, content: _Content, *, replace: bool) -> None:
+    """Seal the master keys to the station key, sign, write whole or not at all."""
+    from cryptography.hazmat.primitives.ciphers.aead import AESGCM
+
+    one_time, nonce = SoftwareKey.generate(), os.urandom(_NONCE_OCTETS)
+    members: dict[str, Any] = {
+        "format": _FORMAT,
+        "store": store_id,
+        "station": _described(content.station),
+        "ca": None if content.ca is None else _described(content.ca),
+        "one_time": one_time.point.hex(),
+        "nonce": nonce.hex(),
+    }
+    key = _sealing_key(one_time.ecdh(content.station.point), members)
+    masters = json.dumps({number: master.hex() for number, master in content.masters.keys.items()})
+    members["sealed"] = AESGCM(key).encrypt(nonce, masters.encode(), None).hex()
+    members["signature"] = content.station.sign(_signed(members)).hex()
+    write_whole(home / FILE_NAME, json.dumps(members, indent=1).encode() + b"\n", replace=replace)
+
+
+def _load(home: Path, store_id: str, session: TokenSession) -> _Content:
+    members = _read(home, store_id)
+    station = _held(session, members["station"], "station")
+    ca = None if members["ca"] is None else _held(session, members["ca"], "CA")
+    if not verify(station.point, _signed(members), _octets(members, "signature")):
+        raise VaultFailure(f"{home / FILE_NAME} was changed: its signature does not verify.", hint=_DAMAGED)
+    return _Content(station, ca, _unsealed(station, members))
+
+
+def _unsealed(station: TokenKey, members: dict[str, Any]) -> MasterKeys:
+    from cryptography.exceptions import InvalidTag
+    from cryptography.hazmat.primitives.ciphers.aead import AESGCM
+
+    key = _sealing_key(station.ecdh(_octets(members, "one_time")), members)
+    try:
+        plain = AESGCM(key).decrypt(_octets(members, "nonce"), _octets(members, "sealed"), None)
+    except (InvalidTag, ValueError):
+        raise VaultFailure(
+            "The token does not open what was sealed to its key.", hint="Check the token's driver."
+        ) from None
+    return MasterKeys({int(number): bytes.fromhex(master) for number, master in json.loads(plain).items()})
+
+
+def _sealing_key(shared: bytes, members: dict[str, Any]) -> bytes:
+    """HKDF-SHA-256 over x of the ECDH; bound to everything in the clear but the signature."""
+    from cryptography.hazmat.primitives import hashes
+    from cryptography.hazmat.primitives.kdf.hkdf import HKDF
+
+    clear = {name: value for name, value in members.items() if name not in ("sealed", "signature")}
+    return HKDF(hashes.SHA256(), 32, None, _LABEL + b"seal\0" + _canonical(clear)).derive(shared)
+
+
+def _signed(members: dict[str, Any]) -> bytes:
+    return _LABEL + b"file\0" + _canonical({name: value for name, value in members.items() if name != "signature"})
+
+
+def _canonical(members: dict[str, Any]) -> bytes:
+    return json.dumps(members, sort_keys=True, separators=(",", ":")).encode()
+
+
+def _described(key: TokenKey) -> dict[str, str]:
+    return {"label": key.label, "id": key.identifier.hex(), "point": key.point.hex()}
+
+
+def _held(session: TokenSession, described: Any, role: str) -> TokenKey:
+    """Return the key that the file names; it must still be the same."""
+    try:
+        label, identifier, point = str(described["label"]), bytes.fromhex(described["id"]), described["point"]
+    except (KeyError, TypeError, ValueError):
+        raise VaultFailure(f"{FILE_NAME} does not say which key is the {role} key.", hint=_DAMAGED) from None
+    key = session.find(label=label, identifier=identifier)
+    if key is None:
+        raise VaultFailure(
+            f"The token {session.label!r} does not hold the {role} key {label!r}.",
+            hint="Plug in the token that was used at init; a key that was deleted there cannot be had back.",
+        )
+    if key.point.hex() != point:
+        raise VaultFailure(
+            f"The {role} key {label!r} in the token {session.label!r} is another one than at init.",
+            hint="Plug in the token that was used at init.",
+        )
+    return key
+
+
+def _octets(members: dict[str, Any], name: str) -> bytes:
+    try:
+        return bytes.fromhex(members[name])
+    except (KeyError, TypeError, ValueError):
+        raise VaultFailure(f"{FILE_NAME} is damaged ({name}).", hint=_DAMAGED) from None
+
+
+def _read(home: Path, store_id: str) -> dict[str, Any]:
+    path = home / FILE_NAME
+    try:
+        with open(os.open(path, os.O_RDONLY | os.O_NOFOLLOW), "rb") as file:
+            octets = file.read(_MAX_OCTETS + 1)
+    except FileNotFoundError:
+        raise VaultFailure(f"{path} is missing.", hint=_DAMAGED) from None
+    except OSError as error:
+        raise VaultFailure(f"{path} cannot be read: {error.strerror}.", hint="Check its owner and mode.") from error
+    try:
+        members = json.loads(octets)
+    except (ValueError, RecursionError):
+        members = None
+    if len(octets) > _MAX_OCTETS or not isinstance(members, dict) or not {"station", "ca"} <= members.keys():
+        raise VaultFailure(f"{path} is damaged.", hint=_DAMAGED)
+    if members.get("format") != _FORMAT or members.get("store") != store_id:
+        raise VaultFailure(f"{path} is of another version or belongs to another store.", hint=_DAMAGED)
+    return members
+
+
+@contextmanager
+def _exclusive(home: Path) -> Iterator[None]:
+    """Keep other processes of this home off the token (SoftHSMv2#757: parallel processes can fail each other)."""
+    try:
+        descriptor = os.open(home / LOCK_NAME, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_CLOEXEC, 0o600)
+    except OSError as error:
+        raise VaultFailure(f"{home / LOCK_NAME} cannot be opened: {error.strerror}.", hint="Check its mode.") from error
+    try:
+        until = time.monotonic() + _LOCK_SECONDS
+        while True:
+            try:
+                fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                break
+            except BlockingIOError:
+                if time.monotonic() > until:
+                    raise VaultFailure(
+                        "Another teds-provision has been using the token for long.", hint="Wait for it, or end it."
+                    ) from None
+                time.sleep(0.05)
+        yield
+    finally:
+        os.close(descriptor)
