@@ -118,7 +118,7 @@ def seal_bundle(payload: Bundle, sender: PrivateKey, recipients: Sequence[bytes]
     for point in recipients:
         _station_signature(payload, point)
     signed = jose.sign_compact(dump(_to_json(payload)), sender, typ=TYPE)
-    sealed = jose.encrypt(signed.encode(), recipients, cty=CONTENT_TYPE)
+    sealed = jose.encrypt(signed, recipients, cty=CONTENT_TYPE)
     if len(sealed) > MAX_BUNDLE_OCTETS:
         raise BadData(f"{len(payload.nodes)} nodes are too many for one bundle.", hint="Export them in groups.")
     return sealed

@@ -56,7 +56,7 @@ def seal_receipt(receipt: Receipt, signer: PrivateKey) -> bytes:
         "refused": [{"uuid": node.uuid.hex(), "why": node.why} for node in receipt.refused],
         "created": time_text(receipt.created),
     }
-    return jose.sign_compact(dump(members), signer, typ=TYPE).encode()
+    return jose.sign_compact(dump(members), signer, typ=TYPE)
 
 
 def open_receipt(

@@ -49,7 +49,7 @@ def seal_revocation(signer: PrivateKey, *, uuid: bytes, node: str | None, why: s
         "created": time_text(created),
         "from": sender,
     }
-    statement = jose.sign_compact(dump(members), signer, typ=TYPE)
+    statement = jose.sign_compact(dump(members), signer, typ=TYPE).decode()
     return open_revocation(statement, lambda kid: signer.point if kid == sender else None)
 
 

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import binascii
 import json
-from base64 import b64encode
 from typing import Any
 
 from teds_provision.errors import BadData
@@ -16,31 +15,33 @@ from teds_provision.errors import BadData
 _TO_URL = bytes.maketrans(b"+/", b"-_")
 # The two characters of plain base64 and the padding become one that no alphabet holds.
 _FROM_URL = bytes.maketrans(b"-_+/=", b"+/***")
+_ALPHABET = b"ABCDEFGHIJKLMNOPQRSTUVWXYZabcdefghijklmnopqrstuvwxyz0123456789+/"
+# The last characters that leave no spare bit set, by how many characters the last group has (1 decodes to nothing).
+_LAST = (frozenset(_ALPHABET), frozenset[int](), frozenset(_ALPHABET[::16]), frozenset(_ALPHABET[::4]))
+
+
+def base64url(octets: bytes) -> bytes:
+    """Return base64url without padding, as ASCII octets."""
+    return binascii.b2a_base64(octets, newline=False).translate(_TO_URL).rstrip(b"=")
 
 
 def encode_base64url(octets: bytes) -> str:
-    """Return base64url without padding."""
-    return b64encode(octets).translate(_TO_URL).rstrip(b"=").decode("ascii")
+    """Return base64url without padding, as text."""
+    return base64url(octets).decode("ascii")
 
 
 def decode_base64url(text: object, what: str) -> bytes:
-    """Read base64url without padding and with spare bits zero; raises BadData that names ``what``."""
-    if not isinstance(text, str):
+    """Read base64url (text or ASCII octets) without padding, spare bits zero; raises BadData that names ``what``."""
+    if not isinstance(text, str | bytes):
         raise BadData(f"{what} is not a base64url string.")
     try:
-        octets = text.encode("ascii").translate(_FROM_URL)
+        octets = (text if isinstance(text, bytes) else text.encode("ascii")).translate(_FROM_URL)
         plain = binascii.a2b_base64(octets + b"=" * (-len(octets) % 4), strict_mode=True)
     except ValueError as error:
         raise BadData(f"{what} is not base64url without padding.") from error
-    if len(octets) % 4 and not _ends_clean(octets, plain):
+    if octets and octets[-1] not in _LAST[len(octets) % 4]:
         raise BadData(f"{what} has spare bits set in its last base64url character.")
     return plain
-
-
-def _ends_clean(octets: bytes, plain: bytes) -> bool:
-    """Whether the last, incomplete group of ``octets`` is the one that an encoder makes."""
-    tail = len(octets) % 4
-    return b64encode(plain[-(tail - 1) :])[:tail] == octets[-tail:]
 
 
 def dump(value: object) -> bytes:
