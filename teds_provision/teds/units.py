@@ -426,3 +426,21 @@ def parse_seconds(value: object) -> float:
     raise BadData(
         f'"{value}" is not a time: {text} is no unit of time.', hint='Write it like "100 us", "5 s" or "10 kHz".'
     )
+
+
+def recognize(units: Units, scale: float, offset: float) -> WrittenUnit:
+    """Unit of these exponents that converts into SI this way; one without a usual name is called after its scale."""
+
+    def close(one: float, other: float) -> bool:
+        return math.isclose(one, other, rel_tol=1e-6, abs_tol=1e-30)
+
+    if close(scale, 1.0) and offset == 0:
+        return WrittenUnit(format_units(units), units)
+    for texts, name, its_scale, its_offset in _ROWS:
+        if _NAMED[name] == units and close(scale, its_scale) and close(offset, its_offset):
+            return WrittenUnit(_SHORT.get(texts.split()[0], texts.split()[0]), units, its_scale, its_offset)
+    for texts, special, its_scale, its_offset in _SPECIAL_ROWS:
+        if special == units and close(scale, its_scale) and close(offset, its_offset):
+            return WrittenUnit(texts.split()[0], units, its_scale, its_offset)
+    name = f"× {scale:.7g} {format_units(units)}".strip()
+    return WrittenUnit(f"({name} + {offset:.7g})" if offset else f"({name})", units, scale, offset)

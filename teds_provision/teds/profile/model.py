@@ -27,8 +27,8 @@ class CalibrationDemand:
     """What the profile asks of a channel's calibration.
 
     ``raw_range`` is what the channel's electronics can deliver where that is less than its data model allows;
-    ``interval`` is in seconds; ``zero_offset`` says whether the node's user may adjust the offset; ``standard_deviation`` (in the
-    channel's unit, informative) is a figure that a TEDS has no field for.
+    ``interval`` is in seconds; ``zero_offset`` says whether the offset may be adjusted in use; ``standard_deviation``
+    (in the channel's unit, informative) is a figure that a TEDS has no field for.
     """
 
     required: bool = False

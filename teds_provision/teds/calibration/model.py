@@ -1,0 +1,209 @@
+"""The general calibration of IEEE 1451: a segmented multinomial over one or several inputs.
+
+``Y = Σi … Σp C[i, …, p] · (X1 - H1)^i · … · (Xn - Hn)^p`` with a coefficient set for every cell of the grid that the
+segment boundaries of the inputs span (ieee-1451.0.md section 6; the formula is certain, the field numbers are not).
+Coefficients stand cell after cell, the last input running fastest, and within a cell exponent after exponent, again the
+last input fastest; a value on a boundary belongs to the upper segment (both from memory); outside the outer boundaries
+the end segment holds and the result is flagged.
+"""
+
+from __future__ import annotations
+
+import math
+import struct
+from dataclasses import dataclass, replace
+from datetime import UTC, datetime, timedelta
+from typing import TYPE_CHECKING, Final, Generic, Literal, TypeVar, overload
+
+from teds_provision.errors import BadData
+from teds_provision.teds.model import Edition, TimeInstance
+from teds_provision.teds.units import WrittenUnit, parse_unit
+
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
+    from teds_provision.teds.calibration.fitting import Residuals
+
+Method = Literal["linear", "polynomial", "table", "steps"]
+METHODS: Final[tuple[Method, ...]] = ("linear", "polynomial", "table", "steps")
+"""Names of the codes of field 135 (house profile), in order."""
+
+PLAIN: Final = parse_unit("1")
+_Value = TypeVar("_Value")
+
+
+def float32(values: tuple[float, ...], name: str) -> tuple[float, ...]:
+    """Round to what a Float32 holds; raises BadData where one does not fit."""
+    try:
+        return struct.unpack(f">{len(values)}f", struct.pack(f">{len(values)}f", *values))
+    except (OverflowError, struct.error) as error:
+        raise BadData(f"{name} of the calibration hold a number that does not fit a Float32.") from error
+
+
+@dataclass(frozen=True)
+class CalibrationInput:
+    """One input of the formula: the channel it comes from, its degree, n + 1 boundaries and n offsets of n segments."""
+
+    channel: int
+    degree: int
+    boundaries: tuple[float, ...]
+    offsets: tuple[float, ...]
+    key: int = 0
+
+    def __post_init__(self) -> None:
+        if not 0 <= self.degree <= 255:
+            raise BadData(f"The degree of a calibration input goes from 0 to 255, not {self.degree}.")
+        if not self.offsets or len(self.boundaries) != len(self.offsets) + 1:
+            raise BadData(
+                f"A calibration input has {len(self.boundaries)} boundaries and {len(self.offsets)} offsets; "
+                "there is one boundary more than segments, and one offset for each."
+            )
+        object.__setattr__(self, "boundaries", float32(self.boundaries, "Boundaries"))
+        object.__setattr__(self, "offsets", float32(self.offsets, "Offsets"))
+
+    @property
+    def segments(self) -> int:
+        """Number of segments."""
+        return len(self.offsets)
+
+    @property
+    def ascending(self) -> bool:
+        """Whether the boundaries ascend strictly, as they must for the formula to mean anything."""
+        return all(low < high for low, high in zip(self.boundaries, self.boundaries[1:], strict=False))
+
+
+@dataclass(frozen=True)
+class Evaluation(Generic[_Value]):
+    """Result of the formula in calibrated units, and where an input lay outside its outer boundaries."""
+
+    value: _Value
+    outside: _Value
+
+
+@dataclass(frozen=True)
+class Calibration:
+    """Calibration of one channel; every number is rounded to what the TEDS will hold (Float32).
+
+    ``unit`` is the calibrated unit with its way into SI (SIConvrt); limits, uncertainty and zero offset are in it. For
+    an actuator the formula runs from calibrated units to raw, and the zero offset is raw. ``points`` are the (raw, value)
+    pairs that it was fitted to; they do not go into the TEDS. ``interval`` is in seconds.
+    """
+
+    channel: int
+    method: Method
+    inputs: tuple[CalibrationInput, ...]
+    coefficients: tuple[float, ...]
+    unit: WrittenUnit = PLAIN
+    zero_offset: float = 0.0
+    low_limit: float | None = None
+    high_limit: float | None = None
+    uncertainty: float | None = None
+    date: datetime | None = None
+    interval: float | None = None
+    actuator: bool = False
+    points: tuple[tuple[float, float], ...] = ()
+    by: str = ""
+
+    def __post_init__(self) -> None:
+        if not self.inputs:
+            raise BadData("A calibration has at least one input.")
+        cells = math.prod(part.segments for part in self.inputs)
+        each = math.prod(part.degree + 1 for part in self.inputs)
+        if len(self.coefficients) != cells * each:
+            raise BadData(
+                f"The calibration of channel {self.channel} has {len(self.coefficients)} coefficients; "
+                f"{cells} cells of {each} need {cells * each}."
+            )
+        object.__setattr__(self, "coefficients", float32(self.coefficients, "Coefficients"))
+        for name in ("zero_offset", "low_limit", "high_limit", "uncertainty"):
+            value = getattr(self, name)
+            if value is not None:
+                object.__setattr__(self, name, float32((value,), name)[0])
+
+    @overload
+    def evaluate(self, *inputs: float) -> Evaluation[float]: ...
+    @overload
+    def evaluate(self, *inputs: NDArray[np.float64]) -> Evaluation[NDArray[np.float64]]: ...
+    def evaluate(self, *inputs: object) -> object:
+        """Apply the formula and the zero offset to one value, or one array, per input.
+
+        Arrays are broadcast against each other; ``outside`` is then an array of the same shape (1 where an input lies
+        outside its boundaries or is NaN), else 0.0 or 1.0. Raises BadData for another number of inputs.
+        """
+        from teds_provision.teds.calibration.evaluate import evaluate
+
+        return evaluate(self, inputs)
+
+    def __call__(self, *inputs: float) -> float:
+        """Return the calibrated value of one reading per input."""
+        return self.evaluate(*inputs).value
+
+    def residuals(self) -> Residuals | None:
+        """Differences between the points and the curve as it will be written; None without points."""
+        from teds_provision.teds.calibration.fitting import residuals
+
+        return residuals(self) if self.points else None
+
+    @property
+    def due(self) -> datetime | None:
+        """When the next calibration is due; None without date or interval."""
+        if self.date is None or not self.interval:
+            return None
+        try:
+            return self.date + timedelta(seconds=self.interval)
+        except OverflowError:
+            return None
+
+    def overdue(self, now: datetime) -> bool:
+        """Whether the due date has passed."""
+        return self.due is not None and self.due < now
+
+    def date_warnings(self, now: datetime, demanded_interval: float | None = None) -> list[str]:
+        """What a person should know about the calibration's age, as sentences."""
+        if self.date is None:
+            return ["the calibration has no date." if demanded_interval is None else _undated(demanded_interval)]
+        out = []
+        if self.date > now + timedelta(days=1):
+            out.append(f"the calibration date {self.date:%Y-%m-%d} lies in the future.")
+        due = self.due
+        if due is None and demanded_interval:
+            due = replace(self, interval=demanded_interval).due
+        if due is not None and due < now:
+            late = (now - due).days
+            out.append(f"the calibration of {self.date:%Y-%m-%d} was due again on {due:%Y-%m-%d}, {late} days ago.")
+        if demanded_interval and self.interval and self.interval > demanded_interval * 1.001:
+            asked, given = demanded_interval / 86_400, self.interval / 86_400
+            out.append(f"its interval of {given:.0f} days is longer than the {asked:.0f} days that its type asks for.")
+        return out
+
+    def fields(self, edition: Edition = 2007) -> list[tuple[str, object]]:
+        """Fields of the Calibration TEDS (access code 5) by name, ready to be composed."""
+        out: list[tuple[str, object]] = []
+        if self.date is not None:
+            seconds = (self.date - datetime(1970, 1, 1, tzinfo=UTC)) // timedelta(seconds=1)
+            out.append(("LstCalDt", TimeInstance(abs(seconds), 0, seconds < 0)))
+        if self.interval is not None:
+            out.append(("CalInrvl", TimeInstance(round(self.interval))))
+        out.append(("SIConvrt", (("Slope", self.unit.scale), ("Intercept", self.unit.offset))))
+        for name, value in (("LowLimit", self.low_limit), ("HiLimit", self.high_limit), ("OError", self.uncertainty)):
+            if value is not None:
+                out.append((name, value))
+        for part in self.inputs:
+            inner = (
+                ("ChanNum", part.channel),
+                ("ChanKey", part.key),
+                ("Degree", part.degree),
+                ("Boundaries", part.boundaries),
+                ("Offsets", part.offsets),
+            )
+            out.append(("CalInput", inner))
+        out.append(("Coefs", self.coefficients))
+        out.append(("Method", METHODS.index(self.method)))
+        if self.zero_offset:
+            out.append(("ZeroOffset", self.zero_offset))
+        return out
+
+
+def _undated(interval: float) -> str:
+    return f"the calibration has no date, and is to be repeated every {interval / 86_400:.0f} days."
