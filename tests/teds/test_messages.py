@@ -1,0 +1,250 @@
+"""Messages: the collected and worked strings, both payload schools, the profile's class 128, and any octets at all."""
+
+import json
+from pathlib import Path
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from teds_provision.errors import BadData
+from teds_provision.teds.messages import (
+    compose_command,
+    compose_service,
+    decode_message,
+    looks_like_message,
+)
+from teds_provision.teds.messages.arguments import size_of, words
+from teds_provision.teds.messages.tables import COMMANDS, MESSAGE_TYPES, NETWORK
+from teds_provision.teds.model import TimeInstance
+
+VECTORS = Path(__file__).parent.parent / "vectors" / "ieee1451"
+INDEX = json.loads((VECTORS / "index.json").read_text())["vectors"]
+UBI_TIM = bytes.fromhex("86258A0B72F612D68707E8054911DCF0")
+
+
+def octets_of(name):
+    lines = (VECTORS / f"{name}.hex").read_text().splitlines()
+    return bytes.fromhex("".join(line.strip() for line in lines if not line.lstrip().startswith("#")))
+
+
+@pytest.mark.parametrize("entry", INDEX, ids=lambda entry: entry["name"])
+def test_messages_are_told_from_teds_in_every_given_string(entry):
+    assert looks_like_message(octets_of(entry["name"])) == (entry["verdict"] == "message")
+
+
+@pytest.mark.parametrize("entry", [e for e in INDEX if e["verdict"] == "message"], ids=lambda entry: entry["name"])
+def test_every_given_message_is_read_without_an_error(entry):
+    message = decode_message(octets_of(entry["name"]))
+    assert message.edition == int(entry["era"])
+    assert [finding for finding in message.findings if finding.severity == "error"] == []
+    assert b"".join(argument.raw for argument in message.arguments) == message.octets[_header(message) :]
+
+
+def _header(message):
+    return {"command": 6, "reply": 3, "network-service": 5}[message.kind]
+
+
+def test_read_teds_command_of_the_2024_edition_by_name():
+    message = decode_message(octets_of("m24_readteds_cmd_chan"))
+    assert (message.group_name, message.name) == ("TEDS access", "Read TEDS, command")
+    assert message.get("tim") == UBI_TIM
+    assert (message.channel, message.get("access_code"), message.get("timeout")) == (1, 3, 5.0)
+    assert next(a.meaning for a in message.arguments if a.name == "access_code") == "ChanTEDS"
+
+
+def test_read_teds_reply_carries_a_whole_teds_with_its_place():
+    message = decode_message(octets_of("m24_readteds_reply_name"))
+    ((offset, teds),) = message.teds
+    assert message.ok
+    assert message.octets[offset:] == teds
+    assert teds.endswith(b"TPM 36 UBI\xfc\x43")
+
+
+def test_discovery_replies_give_names_and_addresses():
+    ncap = decode_message(octets_of("m24_ncap_discovery_reply"))
+    assert (ncap.get("name"), ncap.get("address")) == ("UBI-NCAP1", bytes([114, 138, 134, 210]))
+    channels = decode_message(octets_of("m24_chan_discovery_reply"))
+    assert (channels.get("channels"), channels.get("names")) == ((1,), ("UBI-TRANSDUCERCHANNEL1",))
+
+
+def test_a_length_that_counts_one_too_few_is_tolerated_and_named():
+    octets = bytearray(octets_of("m24_readteds_cmd_chan"))
+    octets[4] -= 1
+    message = decode_message(bytes(octets))
+    assert message.get("access_code") == 3
+    assert [(f.severity, f.code) for f in message.findings] == [("warning", "message-length")]
+    octets[4] -= 1
+    assert not looks_like_message(bytes(octets))
+
+
+@pytest.mark.parametrize(
+    ("name", "expected"),
+    [
+        ("m07_query_teds_cmd", ("CommonCmd", "Query TEDS", 1)),
+        ("m07_operate_cmd", ("XdcrEither", "TransducerChannel Operate", 1)),
+        ("m07_reset_cmd", ("AnyState", "Reset", 0)),
+        ("m07_trigger_cmd", ("XdcrOperate", "Trigger", 1)),
+    ],
+)
+def test_commands_of_2007_by_name(name, expected):
+    message = decode_message(octets_of(name))
+    assert (message.group_name, message.name, message.channel) == expected
+
+
+def test_a_reply_is_read_for_what_it_is_with_its_request_and_guessed_without():
+    request = decode_message(octets_of("m07_read_data_cmd"))
+    reply = octets_of("m07_read_data_reply")
+    assert decode_message(reply, request=request).name == "Reply to Read data-set segment"
+    assert "reply-guessed" in {finding.code for finding in decode_message(reply).findings}
+    query = decode_message(octets_of("m07_query_teds_reply"))
+    assert (query.get("size"), query.get("checksum"), query.get("max_size")) == (29, 0xFAF5, 256)
+
+
+def test_tagged_arguments_are_recognised_and_never_written():
+    plain = compose_command(1, 1, 2, {"access_code": 3, "offset": 7})
+    assert plain.hex() == "00010102" + "0005" + "0300000007"
+    tagged = bytes.fromhex("00010102" + "000b" + "01000103" + "03000400000007")
+    message = decode_message(tagged)
+    assert message.school == "tagged"
+    assert (message.get("access_code"), message.get("offset")) == (3, 7)
+    assert [finding.code for finding in message.findings] == ["tagged-arguments"]
+    write = decode_message(bytes.fromhex("00010103" + "0010" + "0100010c" + "03000400000000" + "0700020304"))
+    assert (write.school, write.get("octets")) == ("tagged", b"\x03\x04")
+
+
+def test_a_segment_that_only_begins_like_tagged_arguments_is_plain():
+    octets = compose_command(1, 1, 3, {"access_code": 1, "offset": 0x00010C03, "octets": bytes(9)})
+    assert decode_message(octets).get("offset") == 0x00010C03
+
+
+@pytest.mark.parametrize(
+    ("function", "name", "octets"),
+    [
+        (1, "Request", 65 + 64 + 65 + 65),
+        (2, "Confirm", 16),
+        (3, "Open", 24),
+        (4, "Sealed", 30),
+        (5, "Close", 0),
+        (7, "Identify", 0),
+        (8, "Prove", 32),
+        (9, "Reset", 32),
+        (10, "Set CAN address", 1),
+        (11, "List", 0),
+    ],
+)
+def test_functions_of_the_profile_by_name(function, name, octets):
+    message = decode_message(bytes([0, 0, 128, function]) + octets.to_bytes(2, "big") + bytes(octets))
+    assert (message.name, message.findings) == (name, ())
+
+
+def test_identify_and_list_replies_of_the_profile():
+    request = decode_message(compose_command(0, 128, 7))
+    payload = bytes([1]) + bytes(range(10)) + bytes([2]) + bytes.fromhex("000000030000000908002a")
+    reply = decode_message(b"\x01\x00\x17" + payload, request=request)
+    assert (reply.get("node_uuid"), reply.get("key_epoch"), reply.get("can_address")) == (bytes(range(10)), 3, 42)
+    assert next(a.meaning for a in reply.arguments if a.name == "node_state") == "provisioned"
+    listed = decode_message(
+        b"\x01\x00\x06\x00\x00\x01\x00\x01\x03", request=decode_message(compose_command(0, 128, 11))
+    )
+    assert listed.get("blocks") == ((0, 1), (1, 3))
+
+
+@pytest.mark.parametrize(
+    ("reason", "meaning"), [(1, "unknown command"), (14, "untrusted station"), (200, "unknown reason")]
+)
+def test_refusals_say_their_reason(reason, meaning):
+    message = decode_message(bytes([0, 0, 1, reason]))
+    assert message.ok is False
+    assert message.arguments[0].meaning == meaning
+
+
+def test_reserved_functions_are_an_error_and_makers_own_a_note():
+    assert decode_message(bytes.fromhex("000101200000")).findings[0].severity == "error"
+    assert decode_message(bytes.fromhex("0001c8010000")).findings[0].severity == "note"
+
+
+def test_error_codes_of_replies_say_where_and_what():
+    octets = bytearray(octets_of("m24_readteds_reply_meta"))
+    octets[5:7] = (0x4000 | 3).to_bytes(2, "big")
+    message = decode_message(bytes(octets))
+    assert message.ok is False
+    assert message.arguments[0].meaning == "time-out (remote .X)"
+
+
+def test_composing_names_the_argument_at_fault():
+    with pytest.raises(BadData, match="'offset'"):
+        compose_command(1, 1, 2, {"access_code": 3})
+    with pytest.raises(BadData, match="'access_code'"):
+        compose_command(1, 1, 1, {"access_code": 300})
+    with pytest.raises(BadData, match="'colour'"):
+        compose_command(1, 1, 1, {"access_code": 3, "colour": 1})
+    with pytest.raises(BadData, match="no command 1.99"):
+        compose_command(1, 1, 99)
+
+
+@given(st.binary(max_size=300))
+def test_any_octets_decode_to_a_message_or_say_that_they_are_none(octets):
+    message = decode_message(octets)
+    assert message.octets == octets
+    assert looks_like_message(octets) <= (message.kind != "unknown")
+
+
+@given(st.sampled_from([e["name"] for e in INDEX if e["verdict"] == "message"]), st.data())
+def test_damaged_messages_never_raise(name, data):
+    octets = bytearray(octets_of(name))
+    position = data.draw(st.integers(0, len(octets) - 1))
+    octets[position] = data.draw(st.integers(0, 255))
+    request = decode_message(octets_of("m07_query_teds_cmd"))
+    for damaged in (bytes(octets), bytes(octets[:position])):
+        decode_message(damaged)
+        decode_message(damaged, request=request)
+
+
+def _value(kind, count):
+    text = st.text(st.characters(exclude_characters="\0", codec="utf-8"), max_size=12)
+    fixed = size_of(kind)
+    if kind == "bool":
+        return st.integers(0, 1)
+    if kind in {"u8", "u16", "u32"}:
+        return st.integers(0, 256**fixed - 1)
+    simple = {
+        "f32": st.floats(width=32, allow_nan=False),
+        "duration": st.integers(-(2**63), 2**63 - 1).map(lambda ticks: float(ticks // 2**30)),
+        "time": st.builds(TimeInstance, st.integers(0, 2**48 - 1), st.integers(0, 10**9 - 1)),
+        "text": text,
+        "texts": st.lists(text, min_size=count, max_size=count).map(tuple),
+        "u16s": st.lists(st.integers(0, 65535), min_size=count, max_size=count).map(tuple),
+        "uuids": st.lists(st.binary(min_size=16, max_size=16), min_size=count, max_size=count).map(tuple),
+        "blocks": st.lists(st.tuples(st.integers(0, 65535), st.integers(0, 255)), max_size=3).map(tuple),
+    }
+    if kind in simple:
+        return simple[kind]
+    return st.binary(min_size=fixed or 0, max_size=fixed if fixed is not None else 20)
+
+
+def _arguments(data, layout):
+    count = data.draw(st.integers(0, 3))
+    values = {}
+    for name, kind in words(layout):
+        values[name] = count if name == "count" else data.draw(_value(kind, count), label=name)
+    return values
+
+
+@given(st.sampled_from(sorted(COMMANDS)), st.integers(0, 65535), st.data())
+def test_every_command_comes_back_as_it_was_composed(number, channel, data):
+    values = _arguments(data, COMMANDS[number].arguments)
+    octets = compose_command(channel, *number, values)
+    message = decode_message(octets)
+    assert (message.channel, message.group, message.function) == (channel, *number)
+    if message.school == "concatenated":  # raw octets at the end may close as tagged arguments by chance
+        assert {a.name: a.value for a in message.arguments} == values
+
+
+@given(st.sampled_from(sorted(NETWORK)), st.sampled_from(sorted(MESSAGE_TYPES)), st.data())
+def test_every_network_service_comes_back_as_it_was_composed(number, message_type, data):
+    spec = NETWORK[number]
+    layout = spec.reply if message_type == 2 and spec.reply is not None else spec.arguments
+    values = _arguments(data, layout)
+    message = decode_message(compose_service(*number, message_type, values))
+    assert {a.name: a.value for a in message.arguments} == values
