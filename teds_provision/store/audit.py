@@ -14,7 +14,6 @@ import getpass
 import hashlib
 import json
 import os
-import socket
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any
@@ -158,4 +157,4 @@ def _who() -> str:
         user = getpass.getuser()
     except (KeyError, OSError):  # no entry in the user database, as in a container
         user = f"uid {os.getuid()}"
-    return f"{user}@{socket.gethostname()}"
+    return f"{user}@{os.uname().nodename}"

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Protocol
+from typing import TYPE_CHECKING, Protocol
 
-from teds_provision.protocol.keys import PrivateKey
+if TYPE_CHECKING:
+    from teds_provision.protocol.keys import PrivateKey
 
 Ask = Callable[[str, bool], str]
 """``ask(prompt, confirm)`` returns a passphrase or PIN; raises where nobody can be asked."""

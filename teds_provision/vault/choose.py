@@ -6,7 +6,6 @@ from pathlib import Path
 
 from teds_provision.errors import UsageFailure, VaultFailure
 from teds_provision.vault.base import Ask, Vault
-from teds_provision.vault.file_vault import FILE_NAME, FileVault, stamp
 from teds_provision.vault.passphrase import PRODUCT, Costs
 
 _opened: dict[tuple[Path, str, str], Vault] = {}
@@ -39,7 +38,7 @@ def open_vault(home: Path, store_id: str, keystore: str, ask: Ask) -> Vault:
     """
     place = (home.resolve(), store_id, keystore)
     vault = _opened.get(place)
-    if vault is None or (isinstance(vault, FileVault) and vault.stamp != stamp(home / FILE_NAME)):
+    if vault is None or _replaced(vault, home):
         _opened[place] = vault = _open(home, store_id, keystore, ask)
     return vault
 
@@ -49,9 +48,17 @@ def forget_vaults() -> None:
     _opened.clear()
 
 
+def _replaced(vault: Vault, home: Path) -> bool:
+    """Say whether another process has written the passphrase file since this one opened it."""
+    from teds_provision.vault.file_vault import FILE_NAME, FileVault, stamp
+
+    return isinstance(vault, FileVault) and vault.stamp != stamp(home / FILE_NAME)
+
+
 def _create(
     home: Path, store_id: str, keystore: str | None, ask: Ask, costs: Costs, restored: str | None
 ) -> tuple[Vault, str]:
+    from teds_provision.vault.file_vault import FILE_NAME, FileVault
     from teds_provision.vault.keyring_vault import KeyringVault
 
     if keystore is not None and keystore.startswith("pkcs11:"):
@@ -77,6 +84,8 @@ def _create(
 
 def _open(home: Path, store_id: str, keystore: str, ask: Ask) -> Vault:
     if keystore == "file":
+        from teds_provision.vault.file_vault import FileVault
+
         return FileVault.open(home, store_id, ask)
     if keystore == "keyring":
         from teds_provision.vault.keyring_vault import KeyringVault

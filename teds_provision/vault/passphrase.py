@@ -159,4 +159,7 @@ def _text(octets: bytes) -> str:
 
 
 def _octets(text: str) -> bytes:
-    return base64.b64decode(text, validate=True)
+    octets = base64.b64decode(text, validate=True)
+    if _text(octets) != text:  # spare bits that are not zero
+        raise ValueError
+    return octets

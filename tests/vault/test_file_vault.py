@@ -1,0 +1,449 @@
+"""The passphrase file: made once, never overwritten, changed atomically, opened with the right passphrase alone."""
+
+from __future__ import annotations
+
+import json
+import signal
+import stat
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from teds_provision.errors import NotFound, StoreFailure, UsageFailure, VaultFailure, WrongPassphrase
+from teds_provision.protocol.keys import SoftwareKey, verify
+from teds_provision.store import KeyRecord, Store
+from teds_provision.vault import create_vault, forget_vaults, node_key_context, open_vault
+from teds_provision.vault.file_vault import FileVault
+from teds_provision.vault.master import MasterKeys, Material
+from teds_provision.vault.passphrase import PRODUCT, THROWAWAY
+
+GOOD = "four random words here"
+STORE = "5e" * 16
+NODE = bytes(range(10))
+
+
+class Person:
+    """Someone at the terminal: answers with one passphrase and remembers what was asked."""
+
+    def __init__(self, passphrase: str = GOOD) -> None:
+        self.passphrase = passphrase
+        self.asked: list[tuple[str, bool]] = []
+
+    def __call__(self, prompt: str, confirm: bool) -> str:
+        self.asked.append((prompt, confirm))
+        return self.passphrase
+
+
+@pytest.fixture(autouse=True)
+def _locked_again() -> Iterator[None]:
+    forget_vaults()
+    yield
+    forget_vaults()
+
+
+@pytest.fixture
+def vault(tmp_path: Path) -> FileVault:
+    return FileVault.create(tmp_path, STORE, Person(), costs=THROWAWAY)
+
+
+def test_the_keys_come_back_with_the_passphrase(tmp_path: Path, vault: FileVault) -> None:
+    again = FileVault.open(tmp_path, STORE, Person())
+    assert again.identity().point == vault.identity().point
+    ours, theirs = vault.ca(), again.ca()
+    assert ours is not None
+    assert theirs is not None
+    assert theirs.point == ours.point != vault.identity().point
+    assert verify(vault.identity().point, b"m", again.identity().sign(b"m"))
+
+
+def test_the_product_pays_64_mib_and_says_so_in_the_file(tmp_path: Path) -> None:
+    vault, why = create_vault(tmp_path, STORE, "file", Person())
+    content = json.loads((tmp_path / "vault.json").read_text())
+    assert (vault.kind, why) == ("file", "the passphrase file was asked for")
+    assert (content["kdf"], content["memory_kib"], content["iterations"], content["lanes"]) == ("argon2id", 65536, 3, 4)
+    assert (PRODUCT.memory_kib, PRODUCT.iterations, PRODUCT.lanes) == (65536, 3, 4)
+
+
+def test_the_file_is_for_its_owner_alone_and_nothing_else_is_left(tmp_path: Path, vault: FileVault) -> None:
+    vault.drop_ca()
+    assert [path.name for path in tmp_path.iterdir()] == ["vault.json"]
+    assert stat.S_IMODE((tmp_path / "vault.json").stat().st_mode) == 0o600
+
+
+def test_no_secret_stands_in_the_file_or_in_a_repr(tmp_path: Path, vault: FileVault) -> None:
+    material = vault._material
+    text = (tmp_path / "vault.json").read_text() + repr(vault) + repr(material) + repr(vault._key) + str(vars(vault))
+    for secret in (material.identity, material.ca or b"", *material.masters.keys.values(), vault._key.key):
+        assert secret.hex() not in text
+        assert repr(secret) not in text
+    assert GOOD not in text
+    assert material.encode() not in text
+
+
+@pytest.mark.parametrize("wrong", ["", "four random words her", GOOD + " ", GOOD.upper(), "x" * 5000])
+def test_a_wrong_passphrase_is_told_apart_from_damage(tmp_path: Path, vault: FileVault, wrong: str) -> None:
+    with pytest.raises(VaultFailure) as caught:
+        FileVault.open(tmp_path, STORE, Person(wrong))
+    assert isinstance(caught.value, WrongPassphrase) or len(wrong) > 1024
+    assert caught.value.exit_code == 7
+    assert wrong == "" or wrong not in str(caught.value) + caught.value.hint
+
+
+def test_a_passphrase_typed_in_another_unicode_form_is_the_same(tmp_path: Path) -> None:
+    FileVault.create(tmp_path, STORE, Person("größe und länge"), costs=THROWAWAY)
+    decomposed = "gro\u0308ße und la\u0308nge"
+    FileVault.open(tmp_path, STORE, Person(decomposed))
+
+
+@pytest.mark.parametrize(
+    "weak",
+    ["", "short", "1234567", "aaaaaaaaaaaa", "line\nbreak here", "nul\0 in the middle", "\udce9" * 4 + "abcdefg"],
+)
+def test_a_weak_or_impossible_passphrase_makes_no_vault(tmp_path: Path, weak: str) -> None:
+    with pytest.raises(VaultFailure):
+        FileVault.create(tmp_path, STORE, Person(weak), costs=THROWAWAY)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_second_init_opens_the_vault_and_changes_nothing(tmp_path: Path, vault: FileVault) -> None:
+    before = (tmp_path / "vault.json").read_bytes()
+    person = Person()
+    again = FileVault.create(tmp_path, STORE, person, costs=THROWAWAY)
+    assert again.identity().point == vault.identity().point
+    assert [confirm for _, confirm in person.asked] == [False]
+    assert (tmp_path / "vault.json").read_bytes() == before
+    with pytest.raises(WrongPassphrase):
+        FileVault.create(tmp_path, STORE, Person("quite another one"))
+    assert (tmp_path / "vault.json").read_bytes() == before
+
+
+def test_the_vault_of_another_store_is_refused_before_anyone_is_asked(tmp_path: Path, vault: FileVault) -> None:
+    person = Person()
+    with pytest.raises(VaultFailure, match="another store"):
+        FileVault.open(tmp_path, "77" * 16, person)
+    assert person.asked == []
+    content = json.loads((tmp_path / "vault.json").read_text())
+    (tmp_path / "vault.json").write_text(json.dumps({**content, "store": "77" * 16}))
+    with pytest.raises(WrongPassphrase):
+        FileVault.open(tmp_path, "77" * 16, person)
+
+
+def test_a_missing_vault_names_the_cure(tmp_path: Path) -> None:
+    with pytest.raises(VaultFailure, match="missing") as caught:
+        FileVault.open(tmp_path, STORE, Person())
+    assert "restore" in caught.value.hint
+
+
+def test_a_process_unlocks_once(tmp_path: Path) -> None:
+    person = Person()
+    vault, _ = create_vault(tmp_path, STORE, "file", person, costs=THROWAWAY)
+    assert open_vault(tmp_path, STORE, "file", person) is vault
+    assert isinstance(vault, FileVault)
+    vault.drop_ca()
+    assert open_vault(tmp_path, STORE, "file", person) is vault
+    assert len(person.asked) == 1
+
+
+def test_a_vault_that_another_process_replaced_is_read_again(tmp_path: Path) -> None:
+    person = Person()
+    vault, _ = create_vault(tmp_path, STORE, "file", person, costs=THROWAWAY)
+    FileVault.open(tmp_path, STORE, person).drop_ca()
+    fresh = open_vault(tmp_path, STORE, "file", person)
+    assert fresh is not vault
+    assert fresh.ca() is None
+
+
+def test_a_new_passphrase_replaces_the_old(tmp_path: Path, vault: FileVault) -> None:
+    vault.change_passphrase(Person("another good passphrase"), costs=THROWAWAY)
+    with pytest.raises(WrongPassphrase):
+        FileVault.open(tmp_path, STORE, Person())
+    again = FileVault.open(tmp_path, STORE, Person("another good passphrase"))
+    assert again.identity().point == vault.identity().point
+
+
+def test_the_ca_key_can_be_kept_away_and_brought_back(tmp_path: Path, vault: FileVault) -> None:
+    ca = vault.ca()
+    assert ca is not None
+    away = tmp_path / "ca.pem"
+    vault.export_ca(away, "a passphrase for the safe")
+    assert stat.S_IMODE(away.stat().st_mode) == 0o600
+    assert vault.drop_ca()
+    assert not vault.drop_ca()
+    assert FileVault.open(tmp_path, STORE, Person()).ca() is None
+    with pytest.raises(VaultFailure, match="no CA key"):
+        vault.export_ca(tmp_path / "other.pem", "a passphrase for the safe")
+    with pytest.raises(WrongPassphrase):
+        vault.import_ca(away, "not that passphrase")
+    assert vault.ca() is None
+    assert vault.import_ca(away, "a passphrase for the safe").point == ca.point
+    reopened = FileVault.open(tmp_path, STORE, Person()).ca()
+    assert reopened is not None
+    assert reopened.point == ca.point
+
+
+def test_openssl_opens_the_exported_ca_key(tmp_path: Path, vault: FileVault) -> None:
+    away = tmp_path / "ca.pem"
+    vault.export_ca(away, "a passphrase for the safe")
+    command = ["openssl", "pkey", "-in", str(away), "-passin", "stdin", "-pubout", "-outform", "DER"]
+    try:
+        run = subprocess.run(command, input=b"a passphrase for the safe\n", capture_output=True, check=False)
+    except FileNotFoundError:
+        pytest.skip("no openssl on this machine")
+    ca = vault.ca()
+    assert ca is not None
+    assert run.stdout[-65:] == ca.point
+    wrong = subprocess.run(command, input=b"wrong\n", capture_output=True, check=False)
+    assert wrong.returncode != 0
+
+
+def test_an_export_never_overwrites_and_never_takes_a_weak_passphrase(tmp_path: Path, vault: FileVault) -> None:
+    taken = tmp_path / "ca.pem"
+    taken.write_text("precious")
+    with pytest.raises(VaultFailure, match="exists already"):
+        vault.export_ca(taken, "a passphrase for the safe")
+    assert taken.read_text() == "precious"
+    with pytest.raises(VaultFailure, match="too short"):
+        vault.export_ca(tmp_path / "new.pem", "short")
+    assert not (tmp_path / "new.pem").exists()
+
+
+def test_what_is_no_ca_file_is_refused(tmp_path: Path, vault: FileVault) -> None:
+    with pytest.raises(NotFound):
+        vault.import_ca(tmp_path / "nowhere.pem", GOOD)
+    (tmp_path / "letter.pem").write_text("dear aunt")
+    with pytest.raises(VaultFailure, match="no encrypted private key"):
+        vault.import_ca(tmp_path / "letter.pem", GOOD)
+    (tmp_path / "torn.pem").write_text(
+        "-----BEGIN ENCRYPTED PRIVATE KEY-----\nMIIB\n-----END ENCRYPTED PRIVATE KEY-----\n"
+    )
+    with pytest.raises(VaultFailure):
+        vault.import_ca(tmp_path / "torn.pem", GOOD)
+
+
+def test_another_ca_key_does_not_replace_the_one_that_is_there(tmp_path: Path, vault: FileVault) -> None:
+    other = tmp_path / "other"
+    other.mkdir()
+    FileVault.create(other, STORE, Person(), costs=THROWAWAY).export_ca(tmp_path / "ca.pem", GOOD)
+    before = vault.ca()
+    with pytest.raises(VaultFailure, match="another CA key"):
+        vault.import_ca(tmp_path / "ca.pem", GOOD)
+    after = vault.ca()
+    assert before is not None
+    assert after is not None
+    assert after.point == before.point
+
+
+def test_every_flipped_octet_of_the_file_is_noticed(tmp_path: Path, vault: FileVault) -> None:
+    path = tmp_path / "vault.json"
+    good = path.read_bytes()
+    point = vault.identity().point
+    silent = []
+    for place in range(len(good)):
+        path.write_bytes(good[:place] + bytes([good[place] ^ 1]) + good[place + 1 :])
+        try:
+            again = FileVault.open(tmp_path, STORE, Person())
+        except VaultFailure:
+            continue
+        silent.append((place, again.identity().point == point))
+    assert silent == []
+
+
+def test_forged_costs_cannot_exhaust_the_machine(tmp_path: Path, vault: FileVault) -> None:
+    content = json.loads((tmp_path / "vault.json").read_text())
+    for forged in (
+        {"memory_kib": 1 << 31},
+        {"iterations": 1 << 30},
+        {"lanes": 1 << 20},
+        {"lanes": 0},
+        {"memory_kib": -1},
+    ):
+        (tmp_path / "vault.json").write_text(json.dumps({**content, **forged}))
+        begun = time.monotonic()
+        with pytest.raises(VaultFailure):
+            FileVault.open(tmp_path, STORE, Person())
+        assert time.monotonic() - begun < 1
+
+
+@given(octets=st.binary(max_size=300) | st.text(max_size=100).map(lambda text: json.dumps({"format": text}).encode()))
+def test_no_file_raises_anything_foreign(tmp_path_factory: pytest.TempPathFactory, octets: bytes) -> None:
+    home = tmp_path_factory.mktemp("vault")
+    (home / "vault.json").write_bytes(octets)
+    with pytest.raises(VaultFailure):
+        FileVault.open(home, STORE, Person())
+
+
+def test_a_deep_json_is_damage(tmp_path: Path) -> None:
+    (tmp_path / "vault.json").write_text("[" * 60_000)
+    with pytest.raises(VaultFailure):
+        FileVault.open(tmp_path, STORE, Person())
+
+
+def test_init_killed_at_any_instant_can_be_run_again(tmp_path: Path) -> None:
+    code = (
+        "import sys; from pathlib import Path\n"
+        "from teds_provision.vault.file_vault import FileVault; from teds_provision.vault.passphrase import THROWAWAY\n"
+        "import teds_provision.protocol.keys, cryptography.hazmat.primitives.kdf.argon2\n"
+        "print('ready', flush=True)\n"
+        f"v = FileVault.create(Path(sys.argv[1]), {STORE!r}, lambda prompt, confirm: {GOOD!r}, costs=THROWAWAY)\n"
+        "print(v.identity().point.hex(), flush=True)"
+    )
+    for attempt in range(8):
+        home = tmp_path / str(attempt)
+        home.mkdir()
+        process = subprocess.Popen([sys.executable, "-c", code, str(home)], stdout=subprocess.PIPE, text=True)
+        assert process.stdout is not None
+        assert process.stdout.readline() == "ready\n"
+        time.sleep(attempt * 0.0007)
+        process.send_signal(signal.SIGKILL)
+        said, _ = process.communicate()
+        vault = FileVault.create(home, STORE, Person(), costs=THROWAWAY)
+        assert said in ("", vault.identity().point.hex() + "\n")
+
+
+def test_a_wrapped_key_opens_only_in_its_own_place(vault: FileVault) -> None:
+    key = bytes(range(16))
+    place = node_key_context(STORE, NODE, 3, 1)
+    wrapped = vault.wrap(key, context=place)
+    assert key not in wrapped
+    assert vault.unwrap(wrapped, context=place) == key
+    for moved in (
+        node_key_context("77" * 16, NODE, 3, 1),
+        node_key_context(STORE, bytes(10), 3, 1),
+        node_key_context(STORE, NODE, 4, 1),
+        node_key_context(STORE, NODE, 3, 2),
+        b"",
+    ):
+        with pytest.raises(VaultFailure):
+            vault.unwrap(wrapped, context=moved)
+
+
+def test_every_flipped_bit_of_a_wrapped_key_is_noticed(vault: FileVault) -> None:
+    wrapped = vault.wrap(bytes(16), context=b"c")
+    for bit in range(8 * len(wrapped)):
+        torn = bytearray(wrapped)
+        torn[bit // 8] ^= 1 << bit % 8
+        with pytest.raises(VaultFailure):
+            vault.unwrap(bytes(torn), context=b"c")
+    for length in range(len(wrapped)):
+        with pytest.raises(VaultFailure):
+            vault.unwrap(wrapped[:length], context=b"c")
+
+
+def test_the_same_key_is_never_wrapped_alike(vault: FileVault) -> None:
+    assert len({vault.wrap(bytes(16), context=b"c") for _ in range(100)}) == 100
+
+
+@given(key=st.binary(max_size=64), context=st.binary(max_size=64))
+def test_wrapping_goes_both_ways(key: bytes, context: bytes) -> None:
+    masters = MasterKeys.generate()
+    assert masters.unwrap(masters.wrap(key, context=context), context=context) == key
+    assert masters.with_new().unwrap(masters.wrap(key, context=context), context=context) == key
+
+
+@given(st.integers(0, 2**32 - 1), st.integers(0, 2**32 - 1), st.binary(min_size=10, max_size=10))
+def test_no_two_places_share_a_context(epoch: int, slot: int, uuid: bytes) -> None:
+    context = node_key_context(STORE, uuid, epoch, slot)
+    assert context.endswith(uuid + epoch.to_bytes(4, "big") + slot.to_bytes(4, "big"))
+    assert context != node_key_context(STORE + "0", uuid, epoch, slot)
+
+
+def test_a_master_change_cut_at_any_point_keeps_every_key(tmp_path: Path, vault: FileVault) -> None:
+    key = bytes(range(16))
+
+    def place(record: KeyRecord) -> bytes:
+        return node_key_context(STORE, record.uuid, record.epoch, record.slot)
+
+    with Store.open(tmp_path / "home", create=True) as store:
+        for number in range(3):
+            blank = KeyRecord(NODE, number, f"{number:016x}", "pending", number, b"")
+            store.add_key(
+                KeyRecord(NODE, number, f"{number:016x}", "pending", number, vault.wrap(key, context=place(blank)))
+            )
+
+        def all_open(with_vault: FileVault) -> bool:
+            return all(with_vault.unwrap(record.wrapped, context=place(record)) == key for record in store.all_keys())
+
+        def rewrap(record: KeyRecord) -> bytes:
+            opened = vault.unwrap(record.wrapped, context=place(record))
+            return vault.wrap(opened, context=place(record))
+
+        vault.add_master()
+        assert all_open(FileVault.open(tmp_path, STORE, Person()))
+        store.replace_keys(rewrap)
+        assert all_open(FileVault.open(tmp_path, STORE, Person()))
+        vault.retire_masters()
+        vault.retire_masters()
+        assert all_open(FileVault.open(tmp_path, STORE, Person()))
+        assert list(vault._material.masters.keys) == [2]
+
+
+def test_the_secret_line_fits_every_keyring_and_goes_both_ways() -> None:
+    material = Material.generate()
+    material = Material(material.identity, material.ca, material.masters.with_new().with_new())
+    line = material.encode()
+    assert line.isascii()
+    assert line.isprintable()
+    assert len(line) < 1280
+    assert Material.decode(line) == material
+    assert Material.decode(material.with_ca(None).encode()).ca is None
+
+
+@given(
+    st.text(max_size=200) | st.binary(max_size=100).map(lambda b: "teds1:" + __import__("base64").b64encode(b).decode())
+)
+def test_no_secret_line_raises_anything_foreign(line: str) -> None:
+    with pytest.raises(VaultFailure):
+        Material.decode(line)
+
+
+def test_a_backup_brings_the_station_to_another_home(tmp_path: Path, vault: FileVault) -> None:
+    wrapped = vault.wrap(b"k" * 16, context=b"c")
+    home = tmp_path / "elsewhere"
+    home.mkdir()
+    restored, _ = create_vault(home, STORE, "file", Person(), costs=THROWAWAY, restored=vault.secret_material())
+    assert restored.identity().point == vault.identity().point
+    assert restored.unwrap(wrapped, context=b"c") == b"k" * 16
+
+
+def test_a_backup_of_another_station_replaces_nothing(tmp_path: Path, vault: FileVault) -> None:
+    with pytest.raises(VaultFailure, match="another station"):
+        create_vault(tmp_path, STORE, "file", Person(), restored=Material.generate().encode())
+    assert FileVault.open(tmp_path, STORE, Person()).identity().point == vault.identity().point
+
+
+def test_an_older_backup_brings_back_old_master_keys_without_losing_the_new(tmp_path: Path, vault: FileVault) -> None:
+    backup = vault.secret_material()
+    old = vault.wrap(b"o" * 16, context=b"c")
+    vault.add_master()
+    vault.retire_masters()
+    new = vault.wrap(b"n" * 16, context=b"c")
+    restored, _ = create_vault(tmp_path, STORE, "file", Person(), restored=backup)
+    assert (restored.unwrap(old, context=b"c"), restored.unwrap(new, context=b"c")) == (b"o" * 16, b"n" * 16)
+
+
+def test_an_unknown_keystore_is_a_usage_error(tmp_path: Path) -> None:
+    with pytest.raises(UsageFailure):
+        create_vault(tmp_path, STORE, "floppy", Person())
+    with pytest.raises(UsageFailure):
+        open_vault(tmp_path, STORE, "floppy", Person())
+
+
+def test_nobody_to_ask_makes_nothing(tmp_path: Path) -> None:
+    def nobody(prompt: str, confirm: bool) -> str:
+        raise VaultFailure("No passphrase, and nobody may be asked.")
+
+    with pytest.raises(StoreFailure):
+        create_vault(tmp_path, STORE, "file", nobody)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_keys_made_here_are_different_every_time() -> None:
+    made = [Material.generate() for _ in range(5)]
+    points = {SoftwareKey.from_secret(secret).point for one in made for secret in (one.identity, one.ca or b"")}
+    assert len(points) == 10

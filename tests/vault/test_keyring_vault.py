@@ -1,0 +1,343 @@
+"""The keyring vault: what is refused, and a real gnome-keyring under its own D-Bus session."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import signal
+import subprocess
+import sys
+from collections.abc import Iterator
+from contextlib import suppress
+from pathlib import Path
+from textwrap import dedent
+from typing import Any
+
+import pytest
+
+from teds_provision.errors import NoKeyring, VaultFailure
+from teds_provision.vault import create_vault, forget_vaults, keyring_vault, open_vault
+from teds_provision.vault.keyring_vault import KeyringVault
+from teds_provision.vault.passphrase import THROWAWAY
+
+STORE = "5e" * 16
+GOOD = "four random words here"
+NOT_ALLOWED = [
+    "keyring.backends.null.Keyring",
+    "keyring.backends.fail.Keyring",
+    "keyrings.alt.file.PlaintextKeyring",
+    "keyrings.alt.file.EncryptedKeyring",
+    "keyrings.cryptfile.cryptfile.CryptFileKeyring",
+    "nonsense",
+]
+
+
+def ask(prompt: str, confirm: bool) -> str:
+    return GOOD
+
+
+def never(prompt: str, confirm: bool) -> str:
+    pytest.fail("a keyring needs no passphrase from us")
+
+
+@pytest.fixture(autouse=True)
+def _no_bus(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iterator[None]:
+    """Whatever keyring the person who runs the tests has, it is none of ours."""
+    forget_vaults()
+    monkeypatch.setenv("DBUS_SESSION_BUS_ADDRESS", f"unix:path={tmp_path}/no-bus")
+    monkeypatch.setenv("HOME", str(tmp_path))
+    for name in ("PYTHON_KEYRING_BACKEND", "XDG_CONFIG_HOME", "DISPLAY", "WAYLAND_DISPLAY"):
+        monkeypatch.delenv(name, raising=False)
+    yield
+    forget_vaults()
+
+
+@pytest.mark.parametrize("name", NOT_ALLOWED)
+def test_a_backend_that_may_not_hold_a_secret_is_refused(monkeypatch: pytest.MonkeyPatch, name: str) -> None:
+    monkeypatch.setenv("PYTHON_KEYRING_BACKEND", name)
+    with pytest.raises(NoKeyring, match=name.replace(".", r"\.")) as caught:
+        KeyringVault.create(STORE)
+    assert "--keystore file" in caught.value.hint
+    assert caught.value.exit_code == 7
+    with pytest.raises(NoKeyring):
+        open_vault(Path("unused"), STORE, "keyring", never)
+
+
+@pytest.mark.parametrize("name", NOT_ALLOWED)
+def test_the_same_backend_named_in_the_configuration_file_is_refused(tmp_path: Path, name: str) -> None:
+    place = tmp_path / ".config" / "python_keyring"
+    place.mkdir(parents=True)
+    (place / "keyringrc.cfg").write_text(f"[backend]\ndefault-keyring={name}\n")
+    with pytest.raises(NoKeyring, match=name.replace(".", r"\.")):
+        KeyringVault.create(STORE)
+
+
+def test_an_unreadable_configuration_file_is_not_ignored(tmp_path: Path) -> None:
+    place = tmp_path / ".config" / "python_keyring"
+    place.mkdir(parents=True)
+    (place / "keyringrc.cfg").write_bytes(b"default-keyring=\xff\xfe\n")
+    with pytest.raises(NoKeyring, match=r"keyringrc\.cfg"):
+        KeyringVault.create(STORE)
+
+
+@pytest.mark.parametrize("name", [None, "keyring.backends.chainer.ChainerBackend"])
+def test_a_machine_without_a_keyring_says_so(monkeypatch: pytest.MonkeyPatch, name: str | None) -> None:
+    if name:
+        monkeypatch.setenv("PYTHON_KEYRING_BACKEND", name)
+    with pytest.raises(NoKeyring, match="no keyring"):
+        KeyringVault.create(STORE)
+    with pytest.raises(NoKeyring, match="no keyring"):
+        KeyringVault.open(STORE)
+
+
+def test_a_backend_that_forgets_is_found_out_before_a_key_is_trusted_to_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    forgetful = "keyring.backends.null.Keyring"
+    monkeypatch.setenv("PYTHON_KEYRING_BACKEND", forgetful)
+    monkeypatch.setitem(keyring_vault.ALLOWED, forgetful, "forgetful")
+    monkeypatch.setattr("keyring.backends.null.Keyring.priority", 1)
+    with pytest.raises(VaultFailure, match="did not keep"):
+        KeyringVault.create(STORE)
+
+
+def test_without_a_keyring_init_takes_the_passphrase_file_and_says_why(tmp_path: Path) -> None:
+    vault, why = create_vault(tmp_path, STORE, None, ask, costs=THROWAWAY)
+    assert vault.kind == "file"
+    assert "no keyring can be used: This machine has no keyring" in why
+    again, why = create_vault(tmp_path, STORE, None, ask)
+    assert (again.identity().point, why) == (vault.identity().point, "the passphrase file is already there")
+
+
+def test_a_forbidden_backend_is_named_in_the_reason(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setenv("PYTHON_KEYRING_BACKEND", "keyring.backends.null.Keyring")
+    vault, why = create_vault(tmp_path, STORE, None, ask, costs=THROWAWAY)
+    assert vault.kind == "file"
+    assert "keyring.backends.null.Keyring" in why
+
+
+# From here on a real Secret Service.
+
+
+class Session:
+    """D-Bus sessions of one user: each runs a snippet, with gnome-keyring as its Secret Service."""
+
+    def __init__(self, home: Path) -> None:
+        self.home = home
+        (home / "run").mkdir(mode=0o700)
+        self.environment = {
+            "PATH": os.environ["PATH"],
+            "HOME": str(home),
+            "XDG_RUNTIME_DIR": str(home / "run"),
+            "XDG_DATA_HOME": str(home / "data"),
+            "LC_ALL": "C.UTF-8",
+        }
+
+    def run(self, snippet: str, *, password: str | None = "login", bus: tuple[str, ...] = ()) -> dict[str, Any]:
+        unlock = (
+            ""
+            if password is None
+            else ('gnome-keyring-daemon --unlock --components=secrets >"$HOME/daemon.log" 2>&1; ')
+        )
+        script = f'{unlock}exec "$@" </dev/null'
+        code = _PRELUDE + dedent(snippet)
+        process = subprocess.Popen(
+            ["dbus-run-session", *bus, "--", "sh", "-c", script, "sh", sys.executable, "-c", code, str(self.home)],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
+            env=self.environment,
+            start_new_session=True,
+        )
+        try:
+            output, errors = process.communicate(password or "", timeout=40)
+        finally:
+            with suppress(ProcessLookupError):
+                os.killpg(process.pid, signal.SIGKILL)
+            process.wait()
+        assert process.returncode == 0, errors
+        said: dict[str, Any] = json.loads(output)
+        return said
+
+
+_PRELUDE = """
+import json, sys
+from pathlib import Path
+from teds_provision.errors import TedsProvisionError
+from teds_provision.vault import create_vault, forget_vaults, open_vault
+from teds_provision.vault.keyring_vault import KeyringVault
+from teds_provision.vault.passphrase import THROWAWAY
+home, store = Path(sys.argv[1]), "5e" * 16
+def never(prompt, confirm): raise AssertionError("a keyring needs no passphrase from us")
+def ask(prompt, confirm): return "four random words here"
+def say(**what): print(json.dumps(what))
+def attempt(action):
+    try:
+        action()
+    except TedsProvisionError as error:
+        say(error=type(error).__name__, message=error.message, hint=error.hint)
+    else:
+        say(error=None)
+"""
+
+
+@pytest.fixture
+def session(tmp_path: Path) -> Session:
+    for program in ("dbus-run-session", "gnome-keyring-daemon"):
+        if shutil.which(program) is None:
+            pytest.skip(f"{program} is missing: scripts/install-test-packages installs it")
+    home = tmp_path / "user"
+    home.mkdir(mode=0o700)
+    return Session(home)
+
+
+MAKE = """
+    vault, why = create_vault(home, store, None, never)
+    say(kind=vault.kind, why=why, about=vault.description, point=vault.identity().point.hex(),
+        ca=vault.ca().point.hex(), wrapped=vault.wrap(b"k" * 16, context=b"c").hex())
+"""
+
+
+@pytest.mark.system
+def test_a_real_keyring_holds_the_keys_from_one_login_to_the_next(session: Session) -> None:
+    made = session.run(MAKE)
+    assert (made["kind"], made["why"]) == ("keyring", "a keyring works here")
+    assert "Secret Service" in made["about"]
+    assert not (session.home / "vault.json").exists()
+    later = session.run(f"""
+        vault = open_vault(home, store, "keyring", never)
+        assert open_vault(home, store, "keyring", never) is vault
+        key = vault.unwrap(bytes.fromhex({made["wrapped"]!r}), context=b"c")
+        say(point=vault.identity().point.hex(), ca=vault.ca().point.hex(), key=key.decode())
+    """)
+    assert later == {"point": made["point"], "ca": made["ca"], "key": "k" * 16}
+
+
+@pytest.mark.system
+def test_a_second_init_finds_the_same_keys_and_leaves_no_probe(session: Session) -> None:
+    made = session.run(MAKE)
+    again = session.run("""
+        import secretstorage
+        vault, why = create_vault(home, store, "keyring", never)
+        items = list(secretstorage.get_default_collection(secretstorage.dbus_init()).get_all_items())
+        entries = [item.get_attributes()["username"] for item in items]
+        secret = items[0].get_secret()
+        say(point=vault.identity().point.hex(), why=why, entries=entries, length=len(secret), ascii=secret.isascii(),
+            lines=len(secret.splitlines()))
+    """)
+    assert again.pop("length") < 1280
+    assert again == {
+        "point": made["point"],
+        "why": "the keyring was asked for",
+        "entries": [f"station/{STORE}"],
+        "ascii": True,
+        "lines": 1,
+    }
+
+
+@pytest.mark.system
+def test_the_ca_key_leaves_and_comes_back_and_the_master_key_changes(session: Session) -> None:
+    made = session.run(MAKE)
+    changed = session.run(f"""
+        vault = open_vault(home, store, "keyring", never)
+        vault.export_ca(home / "ca.pem", "a passphrase for the safe")
+        vault.drop_ca(); forget_vaults()
+        vault = open_vault(home, store, "keyring", never)
+        gone = vault.ca() is None
+        back = vault.import_ca(home / "ca.pem", "a passphrase for the safe").point.hex()
+        vault.add_master(); forget_vaults()
+        vault = open_vault(home, store, "keyring", never)
+        both = vault.unwrap(bytes.fromhex({made["wrapped"]!r}), context=b"c") == b"k" * 16
+        new = vault.wrap(b"n" * 16, context=b"c")
+        vault.retire_masters(); forget_vaults()
+        vault = open_vault(home, store, "keyring", never)
+        say(gone=gone, back=back, both=both, kept=vault.unwrap(new, context=b"c") == b"n" * 16,
+            point=vault.identity().point.hex())
+    """)
+    assert changed == {"gone": True, "back": made["ca"], "both": True, "kept": True, "point": made["point"]}
+
+
+@pytest.mark.system
+def test_the_keyring_of_another_user_has_no_entry(session: Session) -> None:
+    said = session.run('attempt(lambda: open_vault(home, store, "keyring", never))')
+    assert said["error"] == "VaultFailure"
+    assert "no entry" in said["message"]
+    assert "restore" in said["hint"]
+
+
+@pytest.mark.system
+def test_a_keyring_that_stays_locked_is_not_taken_and_not_waited_for(session: Session) -> None:
+    session.run(MAKE)
+    said = session.run('attempt(lambda: open_vault(home, store, "keyring", never))', password="another password")
+    assert said["error"] == "VaultFailure"
+    assert "locked" in said["message"]
+    assert "Unlock it" in said["hint"]
+    fallen = session.run(
+        'vault, why = create_vault(home, "77" * 16, None, ask, costs=THROWAWAY); say(kind=vault.kind, why=why)',
+        password="another password",
+    )
+    assert fallen["kind"] == "file"
+    assert "locked" in fallen["why"]
+
+
+@pytest.mark.system
+def test_a_secret_service_that_nobody_unlocked_is_locked(session: Session) -> None:
+    said = session.run('attempt(lambda: create_vault(home, store, "keyring", never))', password=None)
+    assert said["error"] in ("VaultFailure", "NoKeyring")
+    assert said["hint"]
+
+
+@pytest.mark.system
+def test_a_bus_without_a_secret_service_has_no_keyring(session: Session) -> None:
+    config = session.home / "bus.conf"
+    config.write_text(
+        "<busconfig><type>session</type>"
+        f"<listen>unix:tmpdir={session.home / 'run'}</listen>"
+        '<policy context="default"><allow send_destination="*" eavesdrop="true"/><allow eavesdrop="true"/>'
+        '<allow own="*"/></policy></busconfig>'
+    )
+    said = session.run(
+        'attempt(lambda: create_vault(home, store, "keyring", never))',
+        password=None,
+        bus=("--config-file", str(config)),
+    )
+    assert said["error"] == "NoKeyring"
+    assert "--keystore file" in said["hint"]
+
+
+@pytest.mark.system
+def test_an_entry_that_is_not_ours_is_damage_and_stays(session: Session) -> None:
+    said = session.run("""
+        import contextlib, io, keyring
+        keyring.set_password("teds-provision", f"station/{store}", "something else")
+        output = io.StringIO()
+        with contextlib.redirect_stdout(output):
+            attempt(lambda: create_vault(home, store, "keyring", never))
+        kept = keyring.get_password("teds-provision", f"station/{store}")
+        say(**json.loads(output.getvalue()), kept=kept)
+    """)
+    assert said["error"] == "VaultFailure"
+    assert said["kept"] == "something else"
+    assert "something else" not in said["message"] + said["hint"]
+
+
+@pytest.mark.system
+def test_a_service_that_dies_is_a_failure_with_a_cure(session: Session) -> None:
+    said = session.run("""
+        import os, signal, subprocess
+        vault, _ = create_vault(home, store, "keyring", never)
+        for name in os.listdir("/proc"):
+            if name.isdigit():
+                try:
+                    with open(f"/proc/{name}/environ", "rb") as file:
+                        ours = f"HOME={home}".encode() in file.read().split(b"\\0")
+                    with open(f"/proc/{name}/comm") as file:
+                        daemon = file.read().startswith("gnome-keyring-d")
+                except OSError:
+                    continue
+                if ours and daemon:
+                    os.kill(int(name), signal.SIGKILL)
+        attempt(vault.drop_ca)
+    """)
+    assert said["error"] in ("VaultFailure", "NoKeyring")
+    assert said["hint"]
