@@ -16,7 +16,7 @@ PROFILE_VERSION: Final = 105
 _CHANNEL, _CALIBRATION, _NAME, _SECURITY_2024, _SECURITY = 3, 5, 12, 16, 128
 # Octets that one sample of these data models must have; the other models take any number in their range.
 _MODEL_OCTETS: Final = {1: (4, 4), 2: (8, 8), 0: (0, 8), 7: (8, 8), 5: (9, 255), 6: (9, 255)}
-_TINY, _PLAUSIBLE = 1e-30, (1e-9, 1e12)
+_TINY, _HUGE, _PLAUSIBLE = 1e-30, 1e300, (1e-9, 1e12)
 
 
 def check(table: Table, fields: tuple[Field, ...], find: Find, octets: bytes, framed: bool) -> None:
@@ -43,7 +43,7 @@ def _values(fields: Iterable[Field], spec_of: Callable[[int], FieldSpec | None],
             if spec is not None:
                 _values(field.children, spec.by_type.get, table, find)
         elif value.__class__ is float:
-            if value != value or value - value or -_TINY < value < _TINY:  # noqa: PLR0124 - NaN, infinite, tiny
+            if not _TINY <= abs(value) <= _HUGE:  # NaN, infinite, tiny, zero
                 _float(field, find)
         elif value.__class__ is int:
             spec = spec_of(field.type) or table.inner.get(field.type)
@@ -156,8 +156,8 @@ def _level(fields: tuple[Field, ...], find: Find) -> None:
     from teds_provision.teds.tables_more import LEVELS
 
     for field in fields:
-        if field.name == "Level" and field.value not in LEVELS:
-            message = f"Level is {field.value!r}; A to E and N are known."
+        if field.name == "Level" and isinstance(field.value, str) and field.value not in LEVELS:
+            message = f"Level is {str(field.value)!r}; A to E and N are known."
             find("warning", "enumeration", message, field.offset, "Level", "A to E, N", field.value)
 
 

@@ -10,14 +10,14 @@ from teds_provision.teds import values
 from teds_provision.teds.frame import TEDSID, frame, raw_tuple
 from teds_provision.teds.model import Decoded, Edition, Field, Units
 from teds_provision.teds.tables import TEXT_BASED, FieldSpec, Table, table
-from teds_provision.teds.values import Fields, pairs_of
+from teds_provision.teds.values import pairs_of
 
 NO_SUBFAMILY: Final = 0xFF
 _VERSION: Final = {2007: 1, 2024: 2}
 _NOT_CONTENT: Final = frozenset({"TEDSID"})
 
 
-class _Wider(Exception):
+class Wider(Exception):
     """A value needs more length octets than tried."""
 
 
@@ -30,11 +30,11 @@ def compose(
 ) -> bytes:
     """Compose a framed TEDS from values by field name, in ascending order of types.
 
-    ``fields`` is a mapping, or a sequence of pairs where fields repeat; nested structures take either again. A key that
-    is a number is a field that the table does not know, its value octets. Units are spelled as nested tuples in the
-    2007 edition and packed in that of 2024. ``width`` is the number of length octets of every tuple (1 to 4); without it
-    1 is taken, or 2 where a field needs it. Text-based TEDS take ``("Text", {"LangCode", "Text", "Compress"})`` once per
-    language. Raises BadData naming the field.
+    ``fields`` is a mapping, or a sequence of pairs where fields repeat; nested structures take either again. A key
+    that is a number is a field that the table does not know, its value octets. Units are spelled as nested tuples in
+    the 2007 edition and packed in that of 2024. ``width`` is the number of length octets of every tuple (1 to 4);
+    without it 1 is taken, or 2 where a field needs it. Text-based TEDS take ``("Text", {"LangCode", "Text",
+    "Compress"})`` once per language. Raises BadData naming the field.
     """
     if not 1 <= access_code <= 255:
         raise BadData(f"An access code goes from 1 to 255, not {access_code}.")
@@ -45,13 +45,15 @@ def compose(
     pairs = pairs_of(f"The TEDS {access_code}", fields)
     for tried in (width,) if width is not None else (1, 2):
         try:
-            return frame(_Composer(table(access_code), edition, tried).block(pairs))
-        except _Wider as error:
+            return frame(Composer(table(access_code), edition, tried).block(pairs))
+        except Wider as error:
             reason = str(error)
     raise BadData(f"{reason} does not fit tuples of {tried} length octets.", hint="Give a greater width, up to 4.")
 
 
-class _Composer:
+class Composer:
+    """Writes the fields of one table in one edition and one tuple width."""
+
     def __init__(self, fields: Table, edition: Edition, width: int) -> None:
         self.table = fields
         self.edition = edition
@@ -125,7 +127,7 @@ class _Composer:
     def tuple(self, number: int, octets: bytes) -> bytes:
         """One tuple in this width."""
         if len(octets) >= 1 << 8 * self.width:
-            raise _Wider(f"Field {number} of {self.table.name} has {len(octets)} octets and")
+            raise Wider(f"Field {number} of {self.table.name} has {len(octets)} octets and")
         return raw_tuple(number, octets, width=self.width)
 
 
@@ -207,7 +209,7 @@ def _leaf(field: Field, spec: FieldSpec | None, edition: Edition) -> bytes:
         return field.raw
     form: Edition = 2024 if len(field.raw) == 10 else 2007 if spec.kind == "instant" else edition
     octets = values.write(spec, field.value, form)
-    return field.raw if octets != field.raw and field.value != field.value else octets  # noqa: PLR0124 - NaN
+    return field.raw if octets != field.raw and field.value != field.value else octets
 
 
 def _tail(decoded: Decoded) -> bytes:

@@ -36,9 +36,9 @@ def _is_message(octets: bytes) -> bool:
             return True
     if octets[:2] in _TEDSIDS:
         return False
-    if size >= 6 and octets[2] and (octets[2] <= 7 or octets[2] >= 128) and octets[3]:
-        if int.from_bytes(octets[4:6], "big") == size - 6:
-            return True
+    commanded = size >= 6 and octets[3] and (1 <= octets[2] <= 7 or octets[2] >= 128)
+    if commanded and int.from_bytes(octets[4:6], "big") == size - 6:
+        return True
     return size >= 3 and octets[0] <= 1 and int.from_bytes(octets[1:3], "big") == size - 3
 
 

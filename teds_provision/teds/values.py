@@ -111,9 +111,9 @@ READERS: Final[Mapping[str, Callable[[bytes], Value]]] = {
 @lru_cache(maxsize=1024)
 def units_of(packed: bytes) -> Units:
     """Units from the packed spelling: interpretation, nine exponents, and the extension octet if there is an 11th."""
-    exponents = [Fraction(octet - 128, 2) for octet in packed[1:10]]
+    rad, sr, m, kg, s, a, k, mol, cd = (Fraction(octet - 128, 2) for octet in packed[1:10])
     extension = packed[10] if len(packed) > 10 and packed[10] not in NO_EXTENSION else 0
-    return Units(packed[0], *exponents, extension)
+    return Units(packed[0], rad, sr, m, kg, s, a, k, mol, cd, extension)
 
 
 def is_packed_units(raw: bytes) -> bool:
@@ -159,9 +159,10 @@ def write_f32(spec: FieldSpec, value: object) -> bytes:
 
 def write_array(spec: FieldSpec, value: object) -> bytes:
     """Array of UInt16 or Float32; anything with an order and a length will do (list, tuple, numpy array)."""
-    if isinstance(value, str | bytes) or not hasattr(value, "__len__") or not hasattr(value, "__getitem__"):
+    plain: object = value.tolist() if hasattr(value, "tolist") else value
+    if not isinstance(plain, Sequence) or isinstance(plain, str | bytes):
         raise _refuse(spec.name, f"is a list of numbers, not {value!r}")
-    items: list[Any] = value.tolist() if hasattr(value, "tolist") else list(value)
+    items: list[Any] = list(plain)
     if spec.kind == "f32x2" and len(items) != 2:
         raise _refuse(spec.name, f"has two numbers, not {len(items)}")
     if spec.kind == "u16[]":
@@ -232,7 +233,9 @@ def as_units(spec: FieldSpec, value: object) -> Units:
         if unknown:
             raise _refuse(spec.name, f"has no part {sorted(map(str, unknown))[0]}")
         try:
-            parts = {key: Fraction(part) if key in _UNIT_PARTS else int(part) for key, part in value.items()}
+            parts: dict[str, Any] = {
+                key: Fraction(part) if key in _UNIT_PARTS else int(part) for key, part in value.items()
+            }
         except (TypeError, ValueError, OverflowError, ZeroDivisionError) as error:
             raise _refuse(spec.name, "holds something that is no number") from error
         return Units(**parts)
