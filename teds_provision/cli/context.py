@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 
 import click
 
-from teds_provision.errors import UsageFailure, WrongPassphrase
+from teds_provision.errors import TedsProvisionError, UsageFailure, WrongPassphrase
 
 if TYPE_CHECKING:
     from rich.console import Console, RenderableType
@@ -84,6 +84,16 @@ class App:
         """Warn on stderr, also with --json; only --quiet silences it."""
         if not self.quiet:
             print(f"Warning: {text}", file=sys.stderr, flush=True)
+
+    def fail_line(self, error: TedsProvisionError) -> None:
+        """Tell an error that does not end the command (``--watch``): one JSON object, or a line on stderr."""
+        if self.json:
+            told = {"code": error.code, "message": error.message, "hint": error.hint}
+            print(json.dumps({"error": told}, ensure_ascii=False), flush=True)
+        else:
+            print(
+                f"Error: {error.message}" + (f"\n  → {error.hint}" if error.hint else ""), file=sys.stderr, flush=True
+            )
 
     # -- asking ----------------------------------------------------------------------------------------------------
 

@@ -1,4 +1,4 @@
-"""The base station on this machine: its names and public keys from the store, its secrets from the vault when they are needed."""
+"""The base station on this machine: public facts from the store, secrets from the vault when they are needed."""
 
 from __future__ import annotations
 

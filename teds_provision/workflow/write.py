@@ -45,8 +45,10 @@ def write(
     signed = security.decode(image.blocks[SECURITY])
     if not signed.signed:
         raise BadData("The image is not signed.", hint="Sign it first: teds-provision sign UUID")
-    if read_block(node, SECURITY) == image.security and _same(read_image(node), image):
-        return Written(0, time.monotonic() - started, image)
+    if read_block(node, SECURITY) == image.security:
+        present = has or read_image(node)
+        if all(present.blocks.get(block) == image.blocks[block] for block in image):
+            return Written(0, time.monotonic() - started, present)
     identity = read_identity(node)
     if signed.sequence <= identity.sequence:
         raise PolicyRefused(
@@ -78,10 +80,6 @@ def write(
     seconds = time.monotonic() - started
     station.audit("write", image.uuid, "done", octets=octets, sequence=signed.sequence)
     return Written(octets, seconds, back)
-
-
-def _same(on_node: Image, image: Image) -> bool:
-    return all(on_node.blocks.get(block) == image.blocks[block] for block in image)
 
 
 def _commit(station: Station, node: Conversation, image: Image, has: Image | None, progress: Progress | None) -> int:

@@ -1,0 +1,118 @@
+"""Live progress on stderr: each step, what it waits for and until when, and the time it took."""
+
+from __future__ import annotations
+
+import sys
+import time
+from typing import TYPE_CHECKING
+
+from teds_provision.workflow.progress import NOTHING, Reporter, Silent, StepResult
+
+if TYPE_CHECKING:
+    from rich.console import RenderableType
+    from rich.live import Live
+
+    from teds_provision.cli.context import App
+    from teds_provision.links import Notice
+
+_FOREIGN_SHOWN = 3
+
+
+def reporter_for(app: App) -> Reporter:
+    """The reporter that suits this run: silent for --json and --quiet, lines in a pipe, live on a terminal."""
+    if app.json or app.quiet:
+        return Silent()
+    return LiveReporter(app) if sys.stderr.isatty() else LineReporter(app)
+
+
+class LineReporter:
+    """One plain line per step and per notice."""
+
+    def __init__(self, app: App) -> None:
+        self._app = app
+        self._last = ""
+
+    def started(self, step: str) -> None:
+        """Say nothing: a line comes when the step is done."""
+
+    def finished(self, step: StepResult) -> None:
+        """Tell the step in one line."""
+        self._app.note(line_of(step))
+
+    def notice(self, notice: Notice) -> None:
+        """Tell a notice once."""
+        if notice.text != self._last:
+            self._last = notice.text
+            until = f" (up to {notice.seconds:.0f} s)" if notice.seconds is not None else ""
+            self._app.note(f"… {notice.text}{until}")
+
+    def written(self, octets: int, total: int) -> None:
+        """Say nothing: too many lines."""
+
+
+def line_of(step: StepResult) -> str:
+    """``✓ agree      0.05 s  key epoch 1``."""
+    mark = "·" if step.result == NOTHING else "✓"
+    detail = step.detail if step.result != NOTHING else f"{NOTHING}{': ' if step.detail else ''}{step.detail}"
+    return f"{mark} {step.name:<10} {step.seconds:6.2f} s  {detail}".rstrip()
+
+
+class LiveReporter:
+    """Steps done above, and one live line: what runs, what it waits for, how long still."""
+
+    def __init__(self, app: App) -> None:
+        self._console = app.console(stderr=True)
+        self._live: Live | None = None
+        self._step = ""
+        self._what = ""
+        self._until: float | None = None
+
+    def started(self, step: str) -> None:
+        """Show the step as running."""
+        self._step, self._what, self._until = step, "", None
+        self._show()
+
+    def finished(self, step: StepResult) -> None:
+        """Put the step above the live line."""
+        self._stop()
+        style = "dim" if step.result == NOTHING else "green"
+        self._console.print(line_of(step), style=style, markup=False)
+
+    def notice(self, notice: Notice) -> None:
+        """Show what is waited for, or put what came by above the live line."""
+        if notice.kind in ("waiting", "retry"):
+            self._what = notice.text
+            self._until = None if notice.seconds is None else time.monotonic() + notice.seconds
+            self._show()
+        else:
+            self._stop()
+            self._console.print(f"… {notice.text}", style="yellow", markup=False)
+
+    def written(self, octets: int, total: int) -> None:
+        """Show how far the transfer is."""
+        self._what, self._until = f"{octets} of {total} octets", None
+        self._show()
+
+    def _show(self) -> None:
+        from rich.live import Live
+
+        if self._live is None:
+            self._live = Live(get_renderable=self._render, console=self._console, transient=True, refresh_per_second=8)
+            self._live.start()
+        self._live.refresh()
+
+    def _stop(self) -> None:
+        if self._live is not None:
+            self._live.stop()
+            self._live = None
+
+    def _render(self) -> RenderableType:
+        from rich.spinner import Spinner
+
+        left = "" if self._until is None else f" ({max(0.0, self._until - time.monotonic()):.0f} s left)"
+        what = f"  {self._what}{left}" if self._what else ""
+        return Spinner("dots", text=f"{self._step}{what}")
+
+    def close(self) -> None:
+        """Take the live line away."""
+        self._stop()

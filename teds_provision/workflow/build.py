@@ -1,0 +1,127 @@
+"""Step 4: the TEDS of a node from its profile and calibration, and the Security TEDS still unsigned."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from teds_provision.errors import NotFound, UsageFailure
+from teds_provision.store import Draft
+from teds_provision.teds.image import SECURITY, BlockId, Image
+from teds_provision.workflow.sign import known_image, known_node_keys, unsigned_security
+from teds_provision.workflow.station import Station
+
+if TYPE_CHECKING:
+    from teds_provision.teds.calibration import Calibration
+
+CALIBRATION = 5
+
+
+@dataclass(frozen=True)
+class BuildOrder:
+    """What the user asks for: profile (None: the one that the node had), calibration file, name, and overrides.
+
+    ``accept_calibration`` is the reason given for a calibration that the guard would refuse.
+    """
+
+    profile: str | None = None
+    calibration: Path | None = None
+    name: str | None = None
+    drop_calibration: bool = False
+    accept_calibration: str | None = None
+
+
+@dataclass(frozen=True)
+class Built:
+    """A built image (Security TEDS unsigned, or absent where the node's key is not known yet) and its warnings."""
+
+    image: Image
+    profile: str
+    warnings: tuple[str, ...]
+
+
+def build(
+    station: Station,
+    uuid: bytes,
+    order: BuildOrder,
+    *,
+    has: Image | None = None,
+    keep: Mapping[BlockId, bytes] | None = None,
+    edition: int = 2007,
+    keep_draft: bool = True,
+) -> Built:
+    """Build a node's datasheet.
+
+    ``has`` is what the node has now (else what it was last read to have): its calibration is kept where the order
+    brings none. ``keep`` are read-only TEDS of the node, to be signed as they are. ``keep_draft`` False changes nothing
+    in the store (dry run). Raises NotFound (profile, file),
+    BadData (profile or calibration with errors), PolicyRefused (a calibration that the guard refuses).
+    """
+    from teds_provision.teds.profile import default_folders, load_profile
+
+    record = station.store.node(uuid)
+    wanted = order.profile or (record.profile if record else None)
+    if wanted is None:
+        raise UsageFailure(f"No profile is known for node {uuid.hex()}.", hint="Add --profile; see: profile list")
+    profile = load_profile(wanted, default_folders(station.store.home))
+    has = has or known_image(station, uuid)
+    calibrations, warnings = _calibrations(order, profile, has)
+    name = order.name or (record.name if record else None)
+    made = profile.build(uuid, calibration=calibrations, name=name, edition=edition)  # type: ignore[arg-type]
+    image = Image(uuid, {**(keep or {}), **made.blocks})
+    warnings += made.warnings
+    warnings += guard(station, image, has, order.accept_calibration, profile=profile)
+    try:
+        image = image.with_block(SECURITY, unsigned_security(station, known_node_keys(station, uuid, has), image))
+    except NotFound:
+        warnings += ("The node's key is not known yet: the Security TEDS is added when it was identified.",)
+    if not keep_draft:
+        return Built(image, profile.name, warnings)
+    with station.store.transaction():
+        station.remember(uuid, profile=wanted, name=name)
+        station.store.put_draft(Draft(uuid, image.to_json(), "built", wanted))
+        station.audit("build", uuid, "done", profile=profile.name, teds=image.digest())
+    return Built(image, profile.name, warnings)
+
+
+def _calibrations(
+    order: BuildOrder, profile: object, has: Image | None
+) -> tuple[dict[int, Calibration], tuple[str, ...]]:
+    from teds_provision import teds
+    from teds_provision.teds.calibration import Calibration, load_calibrations
+
+    if order.calibration is not None:
+        if not order.calibration.is_file():
+            raise NotFound(f"There is no calibration file {order.calibration}.")
+        return load_calibrations(order.calibration, profile), ()  # type: ignore[arg-type]
+    if order.drop_calibration or has is None:
+        return {}, ()
+    kept: dict[int, Calibration] = {}
+    for channel, access_code in has:
+        if access_code == CALIBRATION and channel:
+            kept[channel] = Calibration.from_decoded(teds.decode(has.blocks[channel, access_code]))
+    numbers = ", ".join(map(str, kept))
+    return kept, (f"The calibration that the node has is kept (channel {numbers}).",) if kept else ()
+
+
+def guard(
+    station: Station, image: Image, has: Image | None, accepted: str | None, *, profile: object | None = None
+) -> tuple[str, ...]:
+    """Refuse a calibration that would hurt (exit 6), unless someone said why it is right; returns warnings."""
+    from teds_provision.errors import PolicyRefused
+    from teds_provision.teds.guard import check_calibration
+
+    old = has.unsigned_blocks() if has is not None else None
+    findings = check_calibration(image.unsigned_blocks(), old, profile=profile)  # type: ignore[arg-type]
+    errors = [f"channel {finding.channel}: {finding.message}" for finding in findings if finding.severity == "error"]
+    if errors and accepted is None:
+        more = f" (and {len(errors) - 1} more)" if len(errors) > 1 else ""
+        raise PolicyRefused(
+            f"The calibration is refused: {errors[0]}{more}.",
+            hint='Mend it; or, if it is right, say why: --accept-calibration "why".',
+        )
+    if errors:
+        station.audit("accept-calibration", image.uuid, "accepted", why=accepted, findings=errors)
+    return tuple(f"channel {finding.channel}: {finding.message}" for finding in findings)
