@@ -16,6 +16,7 @@ SAK: Final = 0x20
 _NDEF_APPLICATION = bytes.fromhex("D2760000850101")
 _CC_FILE, _NDEF_FILE = b"\xe1\x03", b"\xe1\x04"
 _FSD = (16, 24, 32, 40, 48, 64, 96, 128, 256)
+_LONGEST_APDU = 261  # a longer chain is cut, and so refused
 _WTX: Final = b"\xf2\x01"  # S(WTX), one more frame waiting time
 _OK, _WRONG_LENGTH, _NO_FILE, _NOT_ALLOWED = b"\x90\x00", b"\x67\x00", b"\x6a\x82", b"\x69\x86"
 _WRONG_OFFSET, _NO_SPACE, _NO_COMMAND = b"\x6b\x00", b"\x6a\x84", b"\x6d\x00"
@@ -145,7 +146,7 @@ class IsoDepTag:
 
     def _information_block(self, pcb: int, octets: bytes) -> bytes:
         self._number ^= 1
-        self._received += octets
+        self._received = (self._received + octets)[:_LONGEST_APDU]
         if pcb & 0x10:
             return self._kept(bytes((0xA2 | self._number,)))
         apdu, self._received = self._received, b""

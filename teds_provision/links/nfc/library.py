@@ -32,5 +32,6 @@ def _load() -> Any:
 
 nfc: Any = _load()
 UdpDevice: Any = nfc.clf.udp.Device
+Type2Tag: Any = nfc.tag.tt2.Type2Tag
 Type4ATag: Any = nfc.tag.tt4.Type4ATag
 Type4Ndef: Any = nfc.tag.tt4.Type4Tag.NDEF

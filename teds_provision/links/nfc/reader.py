@@ -120,7 +120,10 @@ class NfcPort:
         """Activate the node ``uuid`` anew; raises NodeSilent when it, or any node, is not there within ``seconds``."""
         until = time.monotonic() + seconds
         while True:
-            seen = self._sense_and_look()
+            try:
+                seen = self._sense_and_look()
+            except FieldLost:
+                seen = None
             if isinstance(seen, Visit) and seen.identity.uuid == uuid:
                 return seen
             if isinstance(seen, Visit):
@@ -200,20 +203,22 @@ class NfcLink:
         transaction, started = self._port.next_transaction(), time.monotonic()
         for attempt in range(REPEATS + 1):
             try:
-                return self._ready().transact(transaction, frame)
+                poller = self._ready()
+                try:
+                    return poller.transact(transaction, frame)
+                except (NodeSilent, Garbled) as error:
+                    self._after(error)
+                    if attempt == REPEATS or time.monotonic() - started > REPEAT_WITHIN:
+                        raise
+                    self._notice(Notice("retry", f"{error.message} Trying again."))
             except NoReader:
                 self._poller = None
                 self._port.lose_reader()
                 raise
-            except (NodeSilent, Garbled) as error:
-                self._after(error)
-                if attempt == REPEATS or time.monotonic() - started > REPEAT_WITHIN:
-                    raise
-                self._notice(Notice("retry", f"{error.message} Trying again."))
         raise AssertionError("unreachable")
 
     def close(self) -> None:
-        """Deselect the service; never raises."""
+        """Deselect the service, unless nothing was sent; never raises."""
         try:
             if self._poller is not None:
                 self._poller.deselect()

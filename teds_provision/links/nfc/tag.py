@@ -11,7 +11,7 @@ from contextlib import contextmanager
 from typing import Any
 
 from teds_provision.errors import Garbled, NodeSilent, NoReader
-from teds_provision.links.nfc.library import Type4ATag, Type4Ndef, nfc
+from teds_provision.links.nfc.library import Type2Tag, Type4ATag, Type4Ndef, nfc
 
 _TRIES = 3  # of a read, before the message counts as unreadable
 _PRESENCE_WAIT = 0.2  # seconds that a Type 4 tag gets to say that it is still there
@@ -93,6 +93,16 @@ class _Type4Tag(Type4ATag):  # type: ignore[misc]
         return True
 
 
+class _Type2Tag(Type2Tag):  # type: ignore[misc]
+    """Type 2, asked once whether it is still there (nfcpy asks three times)."""
+
+    def _is_present(self) -> bool:
+        try:
+            return len(self.transceive(b"\x30\x00", retries=0)) == 16
+        except nfc.tag.TagCommandError:
+            return False
+
+
 def _frame_limits(ats: bytes) -> tuple[int, int]:
     """Return FSCI and FWI of an answer to select; 2 and 4 where it does not say."""
     fsci, fwi = 2, 4
@@ -171,7 +181,7 @@ def activate(clf: Any, target: Any) -> ReaderTag | None:
             if target.brty == "106A" and target.sel_res and not target.sel_res[0] & 0x60:
                 plain = target.sel_res[0] == 0
                 return ReaderTag(
-                    nfc.tag.tt2.Type2Tag(clf, target), "Type 2" if plain else f"SAK {target.sel_res[0]:02X}h"
+                    _Type2Tag(clf, target), "Type 2" if plain else f"SAK {target.sel_res[0]:02X}h"
                 )
             tag = nfc.tag.activate(clf, target)
             return None if tag is None else ReaderTag(tag, str(tag.type).replace("Tag", "").replace("Type", "Type "))

@@ -1,0 +1,107 @@
+from __future__ import annotations
+
+import json
+import os
+import selectors
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[3]
+UUID = "0011223344556677AABB"
+
+
+class Process:
+    """A helper process whose lines of output are waited for."""
+
+    def __init__(self, module: str, argument: str) -> None:
+        self._process = subprocess.Popen(
+            [sys.executable, "-m", f"tests.links.nfc.{module}", argument], cwd=ROOT, stdout=subprocess.PIPE, bufsize=0
+        )
+        assert self._process.stdout is not None
+        self._out = self._process.stdout
+        os.set_blocking(self._out.fileno(), False)
+        self._lines: list[str] = []
+        self._rest = b""
+
+    def wait_for(self, start: str, seconds: float = 20.0) -> str:
+        """Return the next line that begins with ``start``."""
+        until = time.monotonic() + seconds
+        with selectors.DefaultSelector() as selector:
+            selector.register(self._out, selectors.EVENT_READ)
+            while True:
+                while self._lines:
+                    if (line := self._lines.pop(0)).startswith(start):
+                        return line
+                assert time.monotonic() < until, f"no line {start!r}"
+                if selector.select(0.2):
+                    chunk = self._out.read() or b""
+                    assert chunk or self._process.poll() is None, f"ended before {start!r}"
+                    *lines, self._rest = (self._rest + chunk).split(b"\n")
+                    self._lines += [line.decode() for line in lines]
+
+    def signal(self, number: int) -> None:
+        self._process.send_signal(number)
+
+    def wait(self, seconds: float = 10.0) -> int:
+        return self._process.wait(seconds)
+
+    def kill(self) -> None:
+        self._process.kill()
+        self._process.wait()
+
+    def end(self) -> None:
+        self._process.terminate()
+        self._process.wait(10)
+
+    def close(self) -> None:
+        if self._process.poll() is None:
+            self.kill()
+        self._out.close()
+
+
+StartNode = Callable[..., Process]
+
+
+def free_path() -> str:
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+        probe.bind(("127.0.0.1", 0))
+        return f"udp:localhost:{probe.getsockname()[1]}"
+
+
+@pytest.fixture
+def path() -> str:
+    """A simulated reader that nobody else uses."""
+    return free_path()
+
+
+@pytest.fixture
+def start() -> Iterator[Callable[[str, str], Process]]:
+    running: list[Process] = []
+
+    def run(module: str, argument: str) -> Process:
+        running.append(Process(module, argument))
+        return running[-1]
+
+    yield run
+    for process in running:
+        process.close()
+
+
+@pytest.fixture
+def start_node(start: Callable[[str, str], Process], path: str) -> StartNode:
+    """Start an echo node on ``path`` and wait until it lies there."""
+
+    def run(*, ready: bool = True, **options: Any) -> Process:
+        node = start("echo_node", json.dumps({"path": path, "uuid": UUID, **options}))
+        if ready:
+            node.wait_for("ready")
+        return node
+
+    return run

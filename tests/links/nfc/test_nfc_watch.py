@@ -1,0 +1,155 @@
+"""Watching for taps, two stations on one node, and what ends a wait."""
+
+from __future__ import annotations
+
+import signal
+import threading
+import time
+from collections.abc import Callable, Iterator
+
+import pytest
+
+from teds_provision.links import Contact, LinkSettings, Notice, Port, open_port
+
+from .conftest import UUID, Process, StartNode
+
+pytestmark = pytest.mark.link
+OTHER = "FFEEDDCCBBAA99887766"
+
+
+class Watch:
+    """A watch in a thread of its own; the nodes are processes."""
+
+    def __init__(self, port: Port, *, use: Callable[[Contact], None] = lambda contact: None) -> None:
+        self.stop = threading.Event()
+        self.visits: list[str] = []
+        self.notices: list[Notice] = []
+        self._port, self._use = port, use
+        self._thread = threading.Thread(target=self._run)
+        self._thread.start()
+
+    def _run(self) -> None:
+        for contact in self._port.watch(stop=self.stop, notice=self.notices.append):
+            self._use(contact)
+            contact.link.close()
+            self.visits.append(contact.identity.uuid.hex().upper())
+
+    def until(self, condition: Callable[[], bool], seconds: float = 8.0) -> None:
+        end = time.monotonic() + seconds
+        while not condition():
+            assert time.monotonic() < end, (self.visits, self.notices)
+            time.sleep(0.02)
+
+    def left(self, times: int) -> bool:
+        return [notice.kind for notice in self.notices].count("node-left") == times
+
+    def end(self) -> float:
+        began = time.monotonic()
+        self.stop.set()
+        self._thread.join(5)
+        assert not self._thread.is_alive()
+        return time.monotonic() - began
+
+
+@pytest.fixture
+def port(path: str) -> Iterator[Port]:
+    port = open_port(LinkSettings(nfc=path))
+    yield port
+    port.close()
+
+
+@pytest.mark.parametrize("tag", ["4", "2"])
+def test_each_visit_is_one_contact(start_node: StartNode, port: Port, tag: str) -> None:
+    watch = Watch(port, use=lambda contact: print(contact.link.exchange(b"\0\0\x80\x07\0\0")))
+    try:
+        for number, uuid in enumerate([UUID, OTHER, OTHER], start=1):
+            node = start_node(uuid=uuid, tag=tag)
+            watch.until(lambda number=number: len(watch.visits) == number)
+            time.sleep(0.5)  # it lies there: still one visit
+            node.end()
+            watch.until(lambda number=number: watch.left(number))
+    finally:
+        watch.end()
+    assert watch.visits == [UUID, OTHER, OTHER]
+
+
+def test_a_node_that_jitters_on_the_reader_is_one_visit(start_node: StartNode, port: Port) -> None:
+    first = start_node()
+    start_node(ready=False)  # the same node, queued: back within 0.2 s
+    watch = Watch(port)
+    try:
+        watch.until(lambda: watch.visits == [UUID])
+        first.kill()
+        time.sleep(1.5)
+        assert watch.visits == [UUID]
+        assert watch.left(0)
+    finally:
+        watch.end()
+
+
+@pytest.mark.parametrize("lying_there", [False, True])
+@pytest.mark.parametrize("tag", ["4", "2"])
+def test_stop_is_honoured_at_once(start_node: StartNode, port: Port, tag: str, lying_there: bool) -> None:
+    if lying_there:
+        start_node(tag=tag)
+    watch = Watch(port)
+    watch.until(lambda: not lying_there or watch.visits == [UUID])
+    time.sleep(0.2)
+    assert watch.end() < 0.35
+
+
+def test_a_reader_that_was_killed_leaves_the_node_to_the_next(
+    start_node: StartNode, start: Callable[[str, str], Process], path: str, port: Port
+) -> None:
+    node = start_node()
+    station = start("stations", f"hold {path}")
+    station.wait_for("holding")
+    station.kill()
+    began = time.monotonic()
+    contact = port.find(lambda identity: True, seconds=5, notice=lambda notice: None)
+    assert time.monotonic() - began < 0.5
+    node.wait_for("lost")
+    assert contact.link.exchange(b"\x05\x06\x07\x08") == b"\x01\x08\x07\x06\x05"
+
+
+def test_ctrl_c_ends_the_wait_for_a_tap(start: Callable[[str, str], Process], path: str) -> None:
+    station = start("stations", f"wait {path}")
+    station.wait_for("waiting")
+    began = time.monotonic()
+    station.signal(signal.SIGINT)
+    assert station.wait() == 130
+    assert time.monotonic() - began < 1.0
+
+
+@pytest.mark.parametrize(("tag", "kind", "capacity"), [("4", "Type4Tag", 4160), ("2", "Type2Tag", 876)])
+def test_any_other_reader_sees_who_the_node_is(
+    start_node: StartNode, start: Callable[[str, str], Process], path: str, tag: str, kind: str, capacity: int
+) -> None:
+    start_node(tag=tag)
+    phone = start("stations", f"stock {path}")
+    assert phone.wait_for("record").split()[1] == "urn:nfc:wkt:Tp"
+    name, payload = phone.wait_for("record").split()[1:]
+    assert name == "urn:nfc:ext:teds-provision:id"
+    assert payload.startswith("01" + UUID.lower())
+    assert phone.wait_for("tag").split()[1:] == [kind, str(capacity)]
+
+
+def test_the_import_of_nfcpy_leaves_the_program_as_it_was() -> None:
+    import subprocess
+    import sys
+
+    code = (
+        "import logging, warnings; shown = warnings.showwarning\n"
+        "import teds_provision.links.nfc.reader\n"
+        "assert warnings.showwarning is shown\n"
+        "assert not logging.getLogger('nfc').isEnabledFor(logging.ERROR)\n"
+    )
+    subprocess.run([sys.executable, "-c", code], check=True, timeout=30)
+
+
+def test_the_links_do_not_load_nfcpy_before_a_reader_is_opened() -> None:
+    import subprocess
+    import sys
+
+    code = "import sys, teds_provision.links, teds_provision.links.nfc.poller; assert 'nfc' not in sys.modules"
+    subprocess.run([sys.executable, "-c", code], check=True, timeout=30)
