@@ -21,7 +21,7 @@ from teds_provision.protocol import jose
 from teds_provision.protocol.agreement import key_id
 from teds_provision.protocol.jwk import link_key_jwk, link_key_of, point_of, public_jwk
 from teds_provision.protocol.keys import PrivateKey, fingerprint, is_point, station_key_message, verify
-from teds_provision.protocol.payload import Members, fingerprints, time_text
+from teds_provision.protocol.payload import LAST_U32, Members, fingerprints, is_label, time_text
 from teds_provision.protocol.revocation import Revocation, open_revocations
 from teds_provision.protocol.strict_json import decode_base64url, dump, encode_base64url, load_object
 
@@ -115,6 +115,8 @@ def seal_bundle(payload: Bundle, sender: PrivateKey, recipients: Sequence[bytes]
     if sorted(payload.to) != sorted(map(fingerprint, recipients)):
         raise BadData("The bundle names other recipients than the keys that it is sealed to.")
     _check_rules(payload)
+    for node in payload.nodes:
+        _check_writable(node)
     for point in recipients:
         _station_signature(payload, point)
     signed = jose.sign_compact(dump(_to_json(payload)), sender, typ=TYPE)
@@ -181,6 +183,18 @@ def _check_rules(bundle: Bundle) -> None:
         raise BadData("The bundle expires before it was made.")
     if len({node.uuid for node in bundle.nodes}) != len(bundle.nodes):
         raise BadData("The bundle names an UUID twice.")
+
+
+def _check_writable(node: BundledNode) -> None:
+    """Refuse to write what no reader would take."""
+    texts = (node.profile, node.name, *node.groups)
+    if not (
+        (len(node.uuid), len(node.node_key), len(node.key)) == (10, 65, 16)
+        and 0 < node.epoch <= LAST_U32
+        and 0 <= node.sequence <= LAST_U32
+        and all(text is None or is_label(text) for text in texts)
+    ):
+        raise BadData(f"The node {node.uuid.hex()} cannot be put into a bundle: a member is out of its range.")
 
 
 def _station_signature(bundle: Bundle, station: bytes) -> bytes | None:

@@ -95,7 +95,7 @@ class Members:
         return str(read)
 
     def _printable(self, name: str, value: object) -> str:
-        if not isinstance(value, str) or not value.isprintable() or len(value) > _MAX_TEXT:
+        if not isinstance(value, str) or not is_label(value):
             raise self._bad(name, "is no printable text")
         return value
 
@@ -107,6 +107,11 @@ class Members:
 
     def _bad(self, name: str, complaint: str) -> BadData:
         return BadData(f"{self._where}: {name} {complaint}.")
+
+
+def is_label(text: str) -> bool:
+    """Whether a text may stand where people read it: printable, at most 1,024 characters."""
+    return text.isprintable() and len(text) <= _MAX_TEXT
 
 
 def fingerprints(values: list[Any], what: str) -> tuple[str, ...]:
