@@ -11,6 +11,7 @@ import os
 import sqlite3
 import stat
 import threading
+import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -194,7 +195,7 @@ class Database:
         version = self._version()
         if version == 0 and not create:
             raise StoreFailure(f"The store {self.path} is empty.", hint="Run teds-provision init.")
-        self.execute("PRAGMA journal_mode=WAL")
+        self._write_ahead()
         if version < SCHEMA_VERSION:
             with self.transaction():
                 for step in range(self._version() + 1, SCHEMA_VERSION + 1):
@@ -202,6 +203,19 @@ class Database:
                         self.execute(statement)
                 self.execute(f"PRAGMA application_id={APPLICATION_ID}")
                 self.execute(f"PRAGMA user_version={SCHEMA_VERSION}")
+
+    def _write_ahead(self) -> None:
+        """Switch to the write-ahead log; SQLite does not wait by itself here when two processes open at once."""
+        until = time.monotonic() + BUSY_SECONDS
+        while True:
+            try:
+                self.execute("PRAGMA journal_mode=WAL")
+            except StoreLocked:
+                if time.monotonic() >= until:
+                    raise
+                time.sleep(0.01)
+            else:
+                return
 
     def _version(self) -> int:
         (mark,), (version,) = self.execute("PRAGMA application_id")[0], self.execute("PRAGMA user_version")[0]
