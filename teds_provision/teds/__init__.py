@@ -10,7 +10,6 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Final
 
 from teds_provision.teds.decode import decode
-from teds_provision.teds.encode import compose, encode, recompose
 from teds_provision.teds.model import (
     Decoded,
     Edition,
@@ -25,6 +24,7 @@ from teds_provision.teds.model import (
 from teds_provision.teds.tables import FieldSpec, Table, name_of, table
 
 if TYPE_CHECKING:
+    from teds_provision.teds.composer import compose, encode, recompose
     from teds_provision.teds.editions import convert
     from teds_provision.teds.keyforms import ReadKey, read_key
     from teds_provision.teds.uuid import UuidParts, pack_uuid, unpack_uuid
@@ -56,6 +56,9 @@ __all__ = [
 ]
 
 _LAZY: Final = {
+    "compose": "composer",
+    "encode": "composer",
+    "recompose": "composer",
     "convert": "editions",
     "ReadKey": "keyforms",
     "read_key": "keyforms",
@@ -69,4 +72,6 @@ def __getattr__(name: str) -> object:
     """Load what not everybody needs at its first use."""
     if name not in _LAZY:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    return getattr(import_module(f"{__name__}.{_LAZY[name]}"), name)
+    value: object = getattr(import_module(f"{__name__}.{_LAZY[name]}"), name)
+    globals()[name] = value
+    return value

@@ -145,7 +145,7 @@ def _sample(fields: tuple[Field, ...], find: Find) -> None:
         model, octets, bits = parts.get(40), parts.get(41), parts.get(42)
         low, high = _MODEL_OCTETS.get(model, (0, 255)) if isinstance(model, int) else (0, 255)
         if isinstance(octets, int) and not low <= octets <= high:
-            message = f"Sample has {octets} octets; data model {model} takes {low} to {high}."
+            message = f"Sample has {octets} octets; data model {model!r} takes {low} to {high}."
             find("warning", "sample", message, field.offset, "ModLenth", f"{low} to {high}", octets)
         elif isinstance(octets, int) and isinstance(bits, int) and model in (0, 3, 5, 6) and bits > 8 * octets:
             message = f"Sample claims {bits} significant bits in {octets} octets."

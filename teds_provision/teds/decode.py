@@ -10,15 +10,13 @@ from collections.abc import Mapping
 from typing import Final
 
 from teds_provision.errors import BadData
-from teds_provision.teds.frame import MINIMUM_OCTETS, TEDSID, checksum
-from teds_provision.teds.model import Decoded, Edition, Field, Finding, Severity, Value, Verdict
+from teds_provision.teds.frame import TEDSID
+from teds_provision.teds.head import MAX_TUPLES, Head
+from teds_provision.teds.model import Decoded, Field, Severity, Value, Verdict
 from teds_provision.teds.shape import shape_of, verdict_of
-from teds_provision.teds.tables import MANUFACTURER, TEXT_BASED, FieldSpec, Table, name_of, table
+from teds_provision.teds.tables import MANUFACTURER, TEXT_BASED, FieldSpec, Table, name_of
 from teds_provision.teds.values import READERS, is_packed_units, units_of
 
-MAX_OCTETS: Final = 16 << 20
-MAX_TUPLES: Final = 32768
-MAX_FINDINGS: Final = 1000
 SECURITY: Final = 128
 END_USER: Final = 7
 SUB_SUM: Final = 12
@@ -53,33 +51,8 @@ def _field(kind: int, name: str, value: Value, raw: bytes, offset: int, children
     return made
 
 
-class _Walk:
-    """One decoding: the octets, the table, and what was found on the way."""
-
-    def __init__(self, octets: bytes, *, framed: bool) -> None:
-        self.octets = octets
-        self.framed = framed
-        self.findings: list[Finding] = []
-        self.edition: Edition | None = None
-        self.access_code: int | None = None
-        self.table: Table | None = None
-        self.width = 1
-        self.left = MAX_TUPLES
-        self.text: tuple[bytes, ...] = ()
-        self.widened = False
-
-    def find(
-        self,
-        severity: Severity,
-        code: str,
-        message: str,
-        offset: int | None = None,
-        field: str = "",
-        asked: object = "",
-        found: object = "",
-    ) -> None:
-        if len(self.findings) < MAX_FINDINGS:
-            self.findings.append(Finding(severity, code, message, offset, field, str(asked), str(found)))
+class _Walk(Head):
+    """One decoding: what the head gave, then tuple for tuple."""
 
     def decode(self) -> Decoded:
         start, end = self.frame()
@@ -104,91 +77,6 @@ class _Walk:
             verdict_of(self.framed, findings),
             self.text,
         )
-
-    # --- frame and TEDSID ---
-
-    def frame(self) -> tuple[int, int]:
-        """Check Length and checksum; return start and end of the data block."""
-        octets, size = self.octets, len(self.octets)
-        if size > MAX_OCTETS:
-            self.find("error", "too-large", f"This has {size} octets; {MAX_OCTETS} are read at most.", 0)
-            return 0, 0
-        if not self.framed:
-            return 0, size
-        if size < MINIMUM_OCTETS - 6:
-            self.find("error", "too-short", f"A TEDS has {MINIMUM_OCTETS} octets or more, this one {size}.", 0)
-            return 0, 0
-        length = int.from_bytes(octets[:4], "big")
-        end = size - 2
-        if length != size - 4:
-            if self.trailing(length):
-                return 4, length + 2
-            message = f"Length says {length} octets follow, {size - 4} do."
-            self.find("error", "frame-length", message, 0, "Length", size - 4, length)
-        stated, right = int.from_bytes(octets[end:], "big"), checksum(octets[:end])
-        if stated != right:
-            message = f"The checksum is {stated:04X}, the octets give {right:04X}."
-            self.find("error", "frame-checksum", message, end, "Checksum", f"{right:04X}", f"{stated:04X}")
-        return 4, end
-
-    def trailing(self, length: int) -> bool:
-        """A whole TEDS with more octets behind it, as a dump of flash gives: decoded up to its checksum."""
-        end = length + 4
-        if not MINIMUM_OCTETS <= end < len(self.octets):
-            return False
-        if int.from_bytes(self.octets[end - 2 : end], "big") != checksum(self.octets[: end - 2]):
-            return False
-        more = len(self.octets) - end
-        self.find("error", "frame-trailing", f"{more} octets stand behind the checksum of this TEDS.", end, "", 0, more)
-        return True
-
-    def tedsid(self, start: int, end: int) -> None:
-        """Take edition, class and tuple width from the TEDSID, wherever it stands."""
-        at = start if self.octets[start] == TEDSID else self.search_tedsid(start, end)
-        if at != start:
-            found = "no TEDSID" if at is None else f"the TEDSID at octet {at}"
-            first = self.octets[start]
-            self.find(
-                "error", "tedsid-first", "The TEDSID tuple is not first.", start, "TEDSID", "type 3", f"type {first}"
-            )
-            if at is None:
-                self.find("note", "no-class", f"There is {found}: nothing says what the fields mean.", start)
-                return
-        size = self.octets[at + 1] if at + 1 < end else 0
-        if size not in (4, 5) or at + 2 + size > end:
-            if at + 2 + size <= end:
-                message = f"The TEDSID has {size} octets; 4 (2007) or 5 (2024) are known."
-                self.find("error", "tedsid-length", message, at, "TEDSID", "4 or 5", size)
-            return
-        value = self.octets[at + 2 : at + 2 + size]
-        self.edition = 2007 if size == 4 else 2024
-        family, self.access_code, version, width = value[0], value[-3], value[-2], value[-1]
-        self.table = table(self.access_code)
-        if 1 <= width <= 4:
-            self.width = width if at == start else 1
-        else:
-            message = f"The TEDSID asks for tuples of {width} length octets."
-            self.find("error", "tuple-width", message, at + 1 + size, "TEDSID", "1 to 4", width)
-        if family != self.table.family:
-            self.find(
-                "note", "family", f"The TEDSID names family {family}.", at + 2, "TEDSID", self.table.family, family
-            )
-        if version != (1 if size == 4 else 2):
-            what = "0 (prototype)" if version == 0 else str(version)
-            self.find(
-                "note", "version", f"The TEDSID names version {what}.", at + size, "TEDSID", 1 if size == 4 else 2, what
-            )
-
-    def search_tedsid(self, start: int, end: int) -> int | None:
-        """Offset of the first tuple of type 3 with 4 or 5 octets, tuples having one length octet."""
-        octets, at = self.octets, start
-        while at + 1 < end:
-            if octets[at] == TEDSID and octets[at + 1] in (4, 5):
-                return at
-            at += 2 + octets[at + 1]
-        return None
-
-    # --- tuples ---
 
     def block(self, start: int, end: int) -> tuple[Field, ...]:
         """Walk the data block; the first tuple of type 3 is the TEDSID."""

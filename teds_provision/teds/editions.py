@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from typing import Final
 
 from teds_provision.errors import BadData
-from teds_provision.teds.encode import NO_SUBFAMILY, Composer, recompose, tuple_width
+from teds_provision.teds.composer import NO_SUBFAMILY, Composer, recompose, tuple_width
 from teds_provision.teds.frame import TEDSID, frame, raw_tuple
 from teds_provision.teds.model import Decoded, Edition, Field, Finding, Severity, TimeInstance, Units
 from teds_provision.teds.tables import TEXT_BASED, FieldSpec, Table, table

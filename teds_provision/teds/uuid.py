@@ -3,8 +3,8 @@
 2007, 10 octets: north 1 bit, latitude 20 bits in arc seconds, east 1, longitude 20, manufacturer 4, year 12, time 22
 bits in units of 10 s since the start of that year (TAI). 2024, 16 octets: location 48 bits (1 + 23 + 1 + 23),
 manufacturer 24, year 16, time 40 bits; the unit of the location is open, that of the time (milliseconds) a guess from
-two examples. Many UUIDs in the field are random octets: whatever comes in is unpacked, and ``plausible`` says whether it
-can be meant.
+two examples. Many UUIDs in the field are random octets: whatever comes in is unpacked, and ``plausible`` says whether
+it can be meant.
 """
 
 from __future__ import annotations
