@@ -7,12 +7,12 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
-from teds_provision.teds.calibration.decoded import from_decoded
+from teds_provision.teds.calibration.decoded import calibrations_of, from_decoded
 from teds_provision.teds.calibration.model import METHODS, Calibration, CalibrationInput, Evaluation, Method
 
 if TYPE_CHECKING:
-    from teds_provision.teds.calibration.fitting import Residuals, fit
     from teds_provision.teds.calibration.files import load_calibrations, read_calibrations
+    from teds_provision.teds.calibration.fitting import Residuals, fit
 
 __all__ = [
     "METHODS",
@@ -21,6 +21,7 @@ __all__ = [
     "Evaluation",
     "Method",
     "Residuals",
+    "calibrations_of",
     "fit",
     "from_decoded",
     "load_calibrations",

@@ -3,29 +3,36 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from datetime import UTC, datetime, timedelta
 
 from teds_provision.errors import BadData
 from teds_provision.teds.calibration.model import METHODS, Calibration, CalibrationInput, Method
+from teds_provision.teds.image import BlockId
 from teds_provision.teds.model import Decoded, Field, TimeInstance, Units
 from teds_provision.teds.units import WrittenUnit, recognize
 
 
-def from_decoded(decoded: Decoded, *, channel: int, units: Units | None = None, actuator: bool = False) -> Calibration:
+def from_decoded(
+    decoded: Decoded, *, channel: int | None = None, units: Units | None = None, actuator: bool = False
+) -> Calibration:
     """Calibration of a decoded Calibration TEDS; ``units`` and ``actuator`` as the channel's own TEDS says.
+
+    Without ``channel`` it is that of the first input.
 
     Raises BadData where the TEDS has no coefficients of the general form, or they do not fit together.
     """
-    inputs = tuple(_input(field, channel) for field in decoded.fields if field.name == "CalInput")
+    number = channel or 0
+    inputs = tuple(_input(field, number) for field in decoded.fields if field.name == "CalInput")
     coefficients = _top(decoded, "Coefs")
     if not inputs or not isinstance(coefficients, tuple):
         raise BadData(
-            f"The Calibration TEDS of channel {channel} has no inputs and coefficients that are understood here.",
+            f"The Calibration TEDS of channel {number} has no inputs and coefficients that are understood here.",
             hint="Its field numbers are not those of docs/teds.md; the octets are kept as they are.",
         )
     method = _top(decoded, "Method")
     return Calibration(
-        channel,
+        inputs[0].channel if channel is None else channel,
         METHODS[method] if isinstance(method, int) and method < len(METHODS) else _guess(inputs),
         inputs,
         tuple(float(value) for value in coefficients),
@@ -38,6 +45,28 @@ def from_decoded(decoded: Decoded, *, channel: int, units: Units | None = None, 
         interval=_seconds(_top(decoded, "CalInrvl")),
         actuator=actuator,
     )
+
+
+def calibrations_of(blocks: Mapping[BlockId, bytes]) -> dict[int, Calibration]:
+    """Calibrations that framed TEDS of a node hold, with units and kind from the channels' own TEDS.
+
+    Channels whose calibration is not understood here are left out.
+    """
+    from teds_provision.teds.decode import decode
+
+    out: dict[int, Calibration] = {}
+    for (channel, access_code), octets in sorted(blocks.items()):
+        if access_code != 5:
+            continue
+        own = decode(blocks[channel, 3]) if (channel, 3) in blocks else None
+        units = own.get("PhyUnits") if own else None
+        actuator = own is not None and own.get("ChanType") == 1
+        try:
+            known = units if isinstance(units, Units) else None
+            out[channel] = from_decoded(decode(octets), channel=channel, units=known, actuator=actuator)
+        except BadData:
+            continue
+    return out
 
 
 def _guess(inputs: tuple[CalibrationInput, ...]) -> Method:

@@ -66,7 +66,7 @@ def fit(
 
     linear: least squares, C = [intercept, slope], H = 0. polynomial: least squares about the middle of the points
     (default degree: 3, or what the points allow). table: through every point, straight in between; points of the same
-    input are averaged. steps: the value of a point holds up to the next one. Raises BadData when the points are too few.
+    input are averaged. steps: the value of a point holds up to the next one. Raises BadData for too few points.
     """
     pairs = oriented(points, actuator=actuator)
     distinct = len({x for x, _ in pairs})

@@ -16,7 +16,7 @@ from datetime import UTC, datetime, timedelta
 from typing import TYPE_CHECKING, Final, Generic, Literal, TypeVar, overload
 
 from teds_provision.errors import BadData
-from teds_provision.teds.model import Edition, TimeInstance
+from teds_provision.teds.model import Decoded, Edition, TimeInstance, Units
 from teds_provision.teds.units import WrittenUnit, parse_unit
 
 if TYPE_CHECKING:
@@ -86,8 +86,8 @@ class Calibration:
     """Calibration of one channel; every number is rounded to what the TEDS will hold (Float32).
 
     ``unit`` is the calibrated unit with its way into SI (SIConvrt); limits, uncertainty and zero offset are in it. For
-    an actuator the formula runs from calibrated units to raw, and the zero offset is raw. ``points`` are the (raw, value)
-    pairs that it was fitted to; they do not go into the TEDS. ``interval`` is in seconds.
+    an actuator the formula runs from calibrated units to raw, and the zero offset is raw. ``points`` are the
+    (raw, value) pairs that it was fitted to; they do not go into the TEDS. ``interval`` is in seconds.
     """
 
     channel: int
@@ -120,6 +120,15 @@ class Calibration:
             value = getattr(self, name)
             if value is not None:
                 object.__setattr__(self, name, float32((value,), name)[0])
+
+    @classmethod
+    def from_decoded(
+        cls, decoded: Decoded, *, channel: int | None = None, units: Units | None = None, actuator: bool = False
+    ) -> Calibration:
+        """Return the calibration of a decoded Calibration TEDS, see :func:`from_decoded`."""
+        from teds_provision.teds.calibration.decoded import from_decoded
+
+        return from_decoded(decoded, channel=channel, units=units, actuator=actuator)
 
     @overload
     def evaluate(self, *inputs: float) -> Evaluation[float]: ...

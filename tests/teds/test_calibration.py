@@ -1,0 +1,418 @@
+"""Calibration: published check values, fits, files, and the way through the TEDS."""
+
+from __future__ import annotations
+
+import json
+import math
+from contextlib import suppress
+from dataclasses import replace
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from teds_provision import teds
+from teds_provision.errors import BadData, NotFound
+from teds_provision.teds.calibration import (
+    METHODS,
+    Calibration,
+    CalibrationInput,
+    calibrations_of,
+    fit,
+    from_decoded,
+    load_calibrations,
+    read_calibrations,
+)
+from teds_provision.teds.profile import Profile, load_profile
+from teds_provision.teds.units import parse_unit
+
+
+@pytest.fixture(scope="module")
+def magnetic() -> Profile:
+    return load_profile("magnetic-angular-position-sensor")
+
+
+@pytest.fixture(scope="module")
+def tactile() -> Profile:
+    return load_profile("tactile-finger-sensor")
+
+
+SPLINE = Calibration(
+    1,
+    "table",
+    (CalibrationInput(1, 1, (0, 512, 1024), (0, 512)),),
+    (233.15, 0.1, 284.35, 0.12),
+)
+TWO_INPUTS = Calibration(
+    1,
+    "polynomial",
+    (CalibrationInput(1, 1, (0, 200), (50,)), CalibrationInput(2, 1, (0, 40), (25,))),
+    (10, -0.01, 0.5, 0.002),
+)
+
+
+def test_the_published_check_value_of_one_input() -> None:
+    assert SPLINE(700) == pytest.approx(306.91, abs=1e-4)
+
+
+def test_the_published_check_value_of_two_inputs() -> None:
+    assert TWO_INPUTS(100, 20) == pytest.approx(34.55, abs=1e-5)
+
+
+def test_a_value_on_a_boundary_belongs_to_the_upper_segment() -> None:
+    steps = Calibration(1, "steps", (CalibrationInput(1, 0, (0, 10, 20), (0, 10)),), (1.0, 2.0))
+    assert [steps(x) for x in (0, 9.999, 10, 19, 20)] == [1, 1, 2, 2, 2]
+
+
+def test_outside_the_outer_boundaries_the_end_segment_holds_and_is_flagged() -> None:
+    result = SPLINE.evaluate(np.array([-10.0, 0.0, 1024.0, 1034.0, math.nan]))
+    assert result.value[:4] == pytest.approx([232.15, 233.15, 345.79, 346.99], abs=1e-3)
+    assert result.outside.tolist() == [1, 0, 0, 1, 1]
+    assert SPLINE.evaluate(2000.0).outside == 1.0
+
+
+def test_arrays_and_scalars_give_the_same() -> None:
+    x = np.random.default_rng(7).uniform(-50, 250, 50)
+    grid = TWO_INPUTS.evaluate(x[:, None], np.linspace(-10, 50, 7)[None, :])
+    assert grid.value.shape == (50, 7)
+    assert grid.value[3, 2] == pytest.approx(TWO_INPUTS(float(x[3]), 10.0))
+
+
+def test_cells_are_ordered_with_the_last_input_fastest() -> None:
+    inputs = (CalibrationInput(1, 0, (0, 1, 2), (0, 0)), CalibrationInput(2, 0, (0, 1, 2, 3), (0, 0, 0)))
+    grid = Calibration(1, "steps", inputs, (0, 1, 2, 10, 11, 12))
+    assert [grid(0.5, y) for y in (0.5, 1.5, 2.5)] == [0, 1, 2]
+    assert [grid(1.5, y) for y in (0.5, 1.5, 2.5)] == [10, 11, 12]
+
+
+@pytest.mark.parametrize(
+    ("inputs", "coefficients"),
+    [
+        ((), (1.0,)),
+        ((CalibrationInput(1, 1, (0, 1), (0,)),), (1.0,)),
+        ((CalibrationInput(1, 1, (0, 1), (0,)),), (1.0, 1e40)),
+    ],
+)
+def test_what_does_not_fit_together_is_refused(
+    inputs: tuple[CalibrationInput, ...], coefficients: tuple[float, ...]
+) -> None:
+    with pytest.raises(BadData):
+        Calibration(1, "linear", inputs, coefficients)
+    with pytest.raises(BadData):
+        CalibrationInput(1, 1, (0.0, 1.0), (0.0, 1.0))
+
+
+# --- fits
+
+
+def test_a_line_through_exact_points_is_found() -> None:
+    line = fit([(0, 1.0), (100, 51.0), (200, 101.0)], "linear", channel=1)
+    assert line.coefficients == (1.0, 0.5)
+    residuals = line.residuals()
+    assert residuals is not None
+    assert residuals.maximum < 1e-5
+
+
+def test_the_residuals_of_a_line_are_shown() -> None:
+    residuals = fit([(0, 0.0), (1, 1.0), (2, 0.0)], "linear", channel=1).residuals()
+    assert residuals is not None
+    assert residuals.maximum == pytest.approx(2 / 3)
+    assert residuals.rms == pytest.approx(math.sqrt(2) / 3)
+    assert residuals.worst[0] == 1
+
+
+def test_a_polynomial_survives_rounding_to_float32_over_16_bit_raw() -> None:
+    raw = np.linspace(0, 65535, 40)
+    value = 10 * (raw / 65535) ** 3 - 4 * (raw / 65535) ** 2 + raw / 65535
+    cubic = fit(list(zip(raw.tolist(), value.tolist(), strict=True)), "polynomial", channel=1, degree=3)
+    residuals = cubic.residuals()
+    assert residuals is not None
+    assert residuals.maximum < 2e-5
+
+
+def test_a_table_goes_through_its_points_and_straight_in_between() -> None:
+    table = fit([(100, 5.0), (0, 0.0), (50, 1.0), (50, 2.0)], "table", channel=1)
+    assert [table(x) for x in (0, 25, 50, 75, 100)] == pytest.approx([0, 0.75, 1.5, 3.25, 5])
+
+
+def test_steps_hold_up_to_the_next_point() -> None:
+    steps = fit([(0, 1.0), (10, 2.0), (20, 3.0)], "steps", channel=1)
+    assert [steps(x) for x in (0, 9, 10, 25)] == [1, 1, 2, 3]
+
+
+def test_an_actuator_is_fitted_from_units_to_raw() -> None:
+    line = fit([(0, 10.0), (4095, 110.0)], "linear", channel=1, actuator=True)
+    assert line(110.0) == pytest.approx(4095, abs=0.01)
+    assert line(10.0) == pytest.approx(0, abs=0.01)
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_too_few_points_are_refused(method: str) -> None:
+    with pytest.raises(BadData, match="two different inputs"):
+        fit([(5, 1.0), (5, 2.0)], method, channel=1)  # type: ignore[arg-type]
+
+
+def test_points_that_a_float32_cannot_tell_apart_are_refused() -> None:
+    with pytest.raises(BadData, match="Float32"):
+        fit([(16777216, 0.0), (16777217, 1.0), (16777219, 2.0)], "table", channel=1)
+
+
+# --- through the TEDS
+
+finite = st.floats(-1e6, 1e6, width=32)
+
+
+@st.composite
+def calibrations(draw: st.DrawFn) -> Calibration:
+    inputs, cells, each = [], 1, 1
+    for _ in range(draw(st.integers(1, 3))):
+        segments, degree = draw(st.integers(1, 4)), draw(st.integers(0, 3))
+        boundaries = sorted(draw(st.sets(finite, min_size=segments + 1, max_size=segments + 1)))
+        offsets = draw(st.lists(finite, min_size=segments, max_size=segments))
+        channel, key = draw(st.integers(0, 65535)), draw(st.integers(0, 255))
+        inputs.append(CalibrationInput(channel, degree, tuple(boundaries), tuple(offsets), key))
+        cells, each = cells * segments, each * (degree + 1)
+    coefficients = draw(st.lists(finite, min_size=cells * each, max_size=cells * each))
+    number = st.none() | finite
+    low, high = sorted(draw(st.tuples(finite, finite)))
+    moment = st.datetimes(datetime(1970, 1, 1), datetime(2105, 1, 1)).map(
+        lambda d: d.replace(microsecond=0, tzinfo=UTC)
+    )
+    return Calibration(
+        draw(st.integers(1, 255)),
+        draw(st.sampled_from(METHODS)),
+        tuple(inputs),
+        tuple(coefficients),
+        unit=parse_unit("rad"),
+        zero_offset=draw(finite),
+        low_limit=low,
+        high_limit=high,
+        uncertainty=draw(number),
+        date=draw(st.none() | moment),
+        interval=draw(st.none() | st.integers(0, 2**32 - 1).map(float)),
+    )
+
+
+@given(calibrations(), st.sampled_from([2007, 2024]))
+def test_a_calibration_survives_its_teds(calibration: Calibration, edition: teds.Edition) -> None:
+    octets = teds.compose(5, calibration.fields(edition), edition=edition)
+    decoded = teds.decode(octets)
+    assert decoded.verdict == "clean"
+    again = from_decoded(decoded, channel=calibration.channel, units=parse_unit("rad").units)
+    assert again == calibration
+
+
+def test_the_calibrated_unit_is_recognized_again(magnetic: Profile) -> None:
+    table = replace(fit([(0, 0.0), (65535, 360.0)], "table", channel=1), unit=parse_unit("degree"))
+    built = magnetic.build(bytes(10), calibration={1: table})
+    again = calibrations_of(built.blocks)[1]
+    assert again.unit.text == "°"
+    assert again.unit.to_si(again(65535)) == pytest.approx(2 * math.pi)
+
+
+def test_a_foreign_calibration_is_bad_data_and_nothing_else() -> None:
+    foreign = teds.decode(teds.compose(5, [("LinOnly", (1.0, 2.0))]))
+    with pytest.raises(BadData, match="understood"):
+        from_decoded(foreign, channel=1)
+
+
+@given(st.binary(max_size=200))
+def test_any_octets_of_a_calibration_teds_give_a_calibration_or_bad_data(block: bytes) -> None:
+    from teds_provision.teds.frame import frame
+
+    decoded = teds.decode(frame(bytes.fromhex("030400050101") + block))
+    with suppress(BadData):
+        assert isinstance(from_decoded(decoded, channel=1), Calibration)
+
+
+# --- dates
+
+
+def test_an_overdue_calibration_is_warned_about() -> None:
+    now = datetime(2026, 11, 21, tzinfo=UTC)
+    old = replace(SPLINE, date=now - timedelta(days=400), interval=365 * 86400.0)
+    assert old.overdue(now)
+    assert "35 days ago" in old.date_warnings(now)[0]
+    assert not replace(old, interval=None).overdue(now)
+    assert replace(old, date=now).date_warnings(now) == []
+    assert "future" in replace(old, date=now + timedelta(days=3)).date_warnings(now)[0]
+    assert "no date" in SPLINE.date_warnings(now)[0]
+    assert "due again" in replace(old, interval=None).date_warnings(now, 30 * 86400.0)[0]
+    assert "longer than" in replace(old, date=now).date_warnings(now, 30 * 86400.0)[0]
+
+
+# --- files
+
+CSV = """\
+# Angular sensor 7, bench 3
+# date: 2026-10-31
+# interval: 1 year
+# by: lab 2
+# uncertainty: 0.5
+raw, value [degree]
+0, 0
+32768, 181
+65535, 360
+"""
+
+
+def test_a_csv_of_points_becomes_the_table_that_the_profile_asks_for(magnetic: Profile, tmp_path: Path) -> None:
+    path = tmp_path / "cal.csv"
+    path.write_text(CSV)
+    found = load_calibrations(path, magnetic)
+    assert list(found) == [1]
+    table = found[1]
+    assert (table.method, table.by, table.uncertainty) == ("table", "lab 2", 0.5)
+    assert table(32768) == 181
+    assert table.date == datetime(2026, 10, 31, tzinfo=UTC)
+    assert table.interval == pytest.approx(365.2425 * 86400)
+    assert table.unit.to_si(180.0) == pytest.approx(math.pi)
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "0;0,5\n100;1,5\n",
+        "raw\tvalue (N)\n0\t0.5\n100\t1.5\n",
+        "0 0.5\n100 1.5\n",
+        "0,0.5\r\n100,1.5\r\n",
+        "value,raw\n0.5,0\n1.5,100\n",
+        "0x0,0.5\n0x64,1.5\n",
+    ],
+)
+def test_the_habits_of_spreadsheets_are_read(text: str, tactile: Profile) -> None:
+    line = read_calibrations("# channel: 3\n# method: linear\n" + text, "x.csv", tactile)[3]
+    assert line.coefficients == pytest.approx((0.5, 0.01))
+
+
+def test_one_file_may_hold_many_channels(tactile: Profile) -> None:
+    rows = "".join(f"{channel},{raw},{raw / 6553.5}\n" for channel in range(1, 13) for raw in (0, 30000, 65535))
+    found = read_calibrations("channel,raw,value\n" + rows, "all.csv", tactile)
+    assert sorted(found) == list(range(1, 13))
+    assert found[12].method == "polynomial"
+    shared = read_calibrations("# channel: 1-12\n0,0\n65535,10\n", "same.csv", tactile)
+    assert len(shared) == 12
+
+
+def test_the_residual_of_a_fit_becomes_its_uncertainty_where_it_is_greater(tactile: Profile) -> None:
+    text = "# channel: 1\n# method: linear\n# uncertainty: 0.01\n0,0\n1,1\n2,0\n"
+    assert read_calibrations(text, "x.csv", tactile)[1].uncertainty == pytest.approx(2 / 3)
+
+
+def test_an_uncertainty_may_have_its_own_unit(tactile: Profile) -> None:
+    text = "# channel: 1\n# uncertainty: 50 mN\n0,0\n1,1\n"
+    assert read_calibrations(text, "x.csv", tactile)[1].uncertainty == pytest.approx(0.05)
+
+
+def test_segments_with_coefficients_are_read_as_they_are(magnetic: Profile) -> None:
+    text = "from,to,offset,c0,c1\n0,512,0,233.15,0.1\n512,1024,512,284.35,0.12\n"
+    assert read_calibrations(text, "x.csv", magnetic)[1](700) == pytest.approx(306.91, abs=1e-3)
+
+
+READY = {
+    "slope": {"slope": 0.1, "intercept": 5, "zero-offset": 2},
+    "list": {"coefficients": [5, 0.1], "zero-offset": 2},
+    "inputs": {
+        "inputs": [{"channel": 1, "degree": 1, "boundaries": [0, 100], "offsets": [0]}],
+        "coefficients": [7, 0.1],
+    },
+    "points": {"points": [[0, 7], [10, 8]], "method": "linear"},
+    "many": {"date": "2026-01-01", "calibration": [{"channel": 1, "slope": 0.1, "intercept": 7}]},
+}
+
+
+@pytest.mark.parametrize("kind", READY)
+def test_ready_coefficients_are_read_from_json(kind: str, magnetic: Profile) -> None:
+    found = read_calibrations(json.dumps(READY[kind]), "cal.json", magnetic)
+    assert found[1](10) == pytest.approx(8)
+
+
+def test_ready_coefficients_of_several_inputs_are_read_from_toml(tactile: Profile) -> None:
+    text = """
+channel = 1
+date = 2026-10-31
+coefficients = [10, -0.01, 0.5, 0.002]
+[[inputs]]
+channel = 1
+degree = 1
+boundaries = [0, 200]
+offsets = [50]
+[[inputs]]
+channel = 2
+degree = 1
+boundaries = [0, 40]
+offsets = [25]
+"""
+    assert read_calibrations(text, "cal.toml", tactile)[1](100, 20) == pytest.approx(34.55, abs=1e-4)
+
+
+@pytest.mark.parametrize(
+    ("text", "name", "place", "field"),
+    [
+        ("raw,value\n0,0\n1,x\n", "c.csv", 3, "value"),
+        ("raw,value\n0,0\n1,nan\n", "c.csv", 3, "value"),
+        ("raw,value\n0,0\n1\n", "c.csv", 3, "columns"),
+        ("0,0,0\n", "c.csv", 1, "columns"),
+        ("a,b,c\n0,0,0\n", "c.csv", 1, "columns"),
+        ("", "c.csv", 1, "no points"),
+        ("raw,value\n", "c.csv", 1, "no points"),
+        ("# date: tomorrow\n0,0\n1,1\n", "c.csv", 1, "date"),
+        ("# date: 1969-01-01\n0,0\n1,1\n", "c.csv", 1, "date"),
+        ("# intervall: 1 year\n0,0\n1,1\n", "c.csv", 1, "interval"),
+        ("# interval: soon\n0,0\n1,1\n", "c.csv", 1, "interval"),
+        ("# method: tabel\n0,0\n1,1\n", "c.csv", 1, '"table"'),
+        ("# degree: 5\n# method: polynomial\n0,0\n1,1\n", "c.csv", 3, "degree 5"),
+        ("# degree: x\n0,0\n1,1\n", "c.csv", 1, "degree"),
+        ("# unit: N\n0,0\n1,1\n", "c.csv", 1, "unit"),
+        ("raw,value [wibble]\n0,0\n1,1\n", "c.csv", 1, "unit"),
+        ("# channel: 2\n0,0\n1,1\n", "c.csv", 1, "channel"),
+        ("# uncertainty: -1\n0,0\n1,1\n", "c.csv", 1, "uncertainty"),
+        ("# date: 2026-01-01\n# date: 2026-01-02\n0,0\n1,1\n", "c.csv", 2, "twice"),
+        ("0,0\n0,1\n", "c.csv", 1, "different inputs"),
+        ("from,to,offset,c0\n0,1,0,5\n2,3,0,6\n", "c.csv", 3, "from"),
+        ("from,to,c0\n0,1,5\n", "c.csv", 1, '"offset"'),
+        ("slope = 1\nslop = 2\n", "c.toml", 2, '"slope"'),
+        ("slope = \n", "c.toml", 1, "TOML"),
+        ('points = [[1, 2], [3, "x"]]\n', "c.toml", 1, "point 2"),
+        ("slope = 1\npoints = [[0, 1], [2, 3]]\n", "c.toml", 2, "only one"),
+        ("by = 'x'\n", "c.toml", 1, "nothing"),
+        ("coefficients = [1, 2, 3]\nboundaries = [0, 1, 2]\n", "c.toml", 1, "coefficients"),
+        ("slope = 1\nlow-limit = 2\nhigh-limit = 1\n", "c.toml", 2, "low-limit"),
+        ("coefficients = [1, 2, 3, 4]\nboundaries = [0, 2, 1]\n", "c.toml", 2, "ascend"),
+        ("coefficients = [1, 2]\ninputs = 3\n", "c.toml", 2, "inputs"),
+        ("coefficients = [1, 2]\n[[inputs]]\nchanel = 3\n", "c.toml", 3, "chanel"),
+        ("{", "c.json", 1, "JSON"),
+        ("[]", "c.json", 1, "object"),
+        ('{"slope": true}', "c.json", 1, "slope"),
+        ('{\n"slope": 1,\n"channel": "x"}', "c.json", 3, "channel"),
+    ],
+)
+def test_a_bad_file_names_file_line_and_field(text: str, name: str, place: int, field: str, magnetic: Profile) -> None:
+    with pytest.raises(BadData) as caught:
+        read_calibrations(text, name, magnetic)
+    assert caught.value.message.startswith(f"{name}:{place}: ")
+    assert field in caught.value.message + caught.value.hint
+
+
+def test_a_file_for_one_of_many_channels_must_say_which(tactile: Profile) -> None:
+    with pytest.raises(BadData, match="12 channels"):
+        read_calibrations("0,0\n1,1\n", "x.csv", tactile)
+    with pytest.raises(BadData, match="two calibrations"):
+        read_calibrations(
+            '{"calibration": [{"channel": 1, "slope": 1}, {"channel": "1-2", "slope": 1}]}', "x.json", tactile
+        )
+
+
+def test_a_missing_file_is_not_found(magnetic: Profile, tmp_path: Path) -> None:
+    with pytest.raises(NotFound):
+        load_calibrations(tmp_path / "no.csv", magnetic)
+
+
+@given(st.text(max_size=200), st.sampled_from(["c.csv", "c.toml", "c.json"]))
+def test_any_text_is_a_calibration_or_bad_data(text: str, name: str) -> None:
+    profile = load_profile("magnetic-angular-position-sensor")
+    with suppress(BadData):
+        assert read_calibrations(text, name, profile)
