@@ -78,7 +78,7 @@ def create(app: App, folder: Path, uuid: bytes | None, name: str, max_message: i
 )
 @click.option("--pace", is_flag=True, help="Let every NFC frame last as long as at 106 kbit/s.")
 @pass_app
-def run(app: App, folder: Path, crypto_delay: float, flash_delay: float, **links: Any) -> None:
+def run(app: App, /, folder: Path, crypto_delay: float, flash_delay: float, **links: Any) -> None:
     """Run the node in DIR until SIGTERM or Ctrl-C; SIGUSR1 is its reset by hand.
 
     Prints one line when its links are up.
@@ -113,7 +113,7 @@ def run(app: App, folder: Path, crypto_delay: float, flash_delay: float, **links
             server.stop()
 
 
-def _servers(node: Any, *, nfc: str | None, tag: str, can: str | None, pace: bool) -> list[Any]:
+def _servers(node: Any, *, nfc: str | None, tag: Any, can: str | None, pace: bool) -> list[Any]:
     servers: list[Any] = []
     if nfc:
         from teds_provision.node.nfc_server import NfcServer

@@ -1,0 +1,85 @@
+"""``verify``: everything that the profile demands, check by check, with one verdict."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import click
+
+from teds_provision.cli.context import App, pass_app
+from teds_provision.cli.options import command, link_options
+from teds_provision.links import LinkSettings
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+    from teds_provision.teds.image import Image
+    from teds_provision.workflow.verify import Verified
+
+
+@command("teds-provision verify 8d4d --nfc udp:localhost:54321", "teds-provision verify signed.json")
+@click.argument("what", metavar="UUID|IMAGE")
+@click.option("--accept-calibration", metavar='"WHY"', help="Take a calibration that the guard refuses; logged.")
+@link_options
+@pass_app
+def verify(app: App, what: str, links: LinkSettings, accept_calibration: str | None) -> None:
+    """Read a node (or an image file) and check its datasheet; a node must also sign a fresh challenge.
+
+    Exits 0 for "authentic", 4 for "unsigned" and "not authentic", 6 for a calibration that would hurt.
+    """
+    from teds_provision.cli.build import read_file
+    from teds_provision.teds.image import Image
+    from teds_provision.workflow.build import guard
+    from teds_provision.workflow.provision import require_authentic
+    from teds_provision.workflow.verify import Verified, verify_image
+
+    station = app.station()
+    path = Path(what)
+    if path.is_file():
+        image = Image.from_json(read_file(path))
+        verified = Verified(image.uuid, tuple(verify_image(station, image)))
+    else:
+        image, verified = _node(app, what, links)
+    result = {
+        "uuid": verified.uuid.hex(),
+        "verdict": verified.verdict,
+        "checks": [{"name": check.name, "result": check.result, "why": check.why} for check in verified.checks],
+    }
+    if app.json and verified.verdict != "authentic":
+        app.emit(result)
+        raise click.exceptions.Exit(4)
+    app.emit(result, lambda console: _table(console, verified))
+    require_authentic(verified)
+    for warning in guard(station, image, None, accept_calibration):
+        app.warn(warning)
+
+
+def _node(app: App, what: str, links: LinkSettings) -> tuple[Image, Verified]:
+    from teds_provision.cli.rendering import reporter_for
+    from teds_provision.workflow.agree import open_session
+    from teds_provision.workflow.contact import meet
+    from teds_provision.workflow.identify import identify
+    from teds_provision.workflow.provision import verify_node
+    from teds_provision.workflow.reading import read_image
+
+    station = app.station()
+    uuid = station.store.resolve(what)
+    with meet(station, links, uuid, reporter_for(app)) as node:
+        who = identify(station, node)
+        with station.lock("verify", app.note):
+            open_session(station, node)
+            image = read_image(node)
+            return image, verify_node(station, node, image, who.point)
+
+
+def _table(console: Console, verified: Verified) -> None:
+    from rich.table import Table
+
+    style = {"passed": "green", "failed": "bold red", "skipped": "dim"}
+    table = Table("check", "result", "found", box=None, pad_edge=False)
+    for check in verified.checks:
+        table.add_row(check.name, f"[{style[check.result]}]{check.result}[/]", check.why)
+    console.print(table)
+    colour = "bold green" if verified.verdict == "authentic" else "bold red"
+    console.print(f"[{colour}]{verified.uuid.hex()}: {verified.verdict}[/]")

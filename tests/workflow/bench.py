@@ -1,0 +1,107 @@
+"""A station and a node on one desk, in memory: the real Tim behind a link that can lose messages and power."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from teds_provision.errors import NodeSilent
+from teds_provision.links import Contact
+from teds_provision.node.flash_file import default_can_address
+from teds_provision.protocol.flash import Flash
+from teds_provision.protocol.identity import Identity
+from teds_provision.protocol.keys import SoftwareKey, node_key_message
+from teds_provision.protocol.repetition import Repetition
+from teds_provision.protocol.tim import Tim
+from teds_provision.vault import passphrase
+from teds_provision.workflow.conversation import Conversation
+from teds_provision.workflow.station import Station, initialise
+
+from ..protocol.memory import PowerCut, RamFlash
+
+PASSPHRASE = "correct horse battery"
+
+
+def make_station(home: Path, name: str = "bench") -> Station:
+    """A station with a passphrase vault at the lowest cost."""
+    costs = passphrase.THROWAWAY
+    return initialise(home, name=name, keystore="file", ask=lambda prompt, confirm: PASSPHRASE, costs=costs)[0]
+
+
+@dataclass
+class Board:
+    """A node on the desk: its key, flash and the Tim that runs until power is cut."""
+
+    uuid: bytes = bytes.fromhex("8d4d9da65281f7000000")
+    max_message: int = 2048
+    seconds: float = 0.0
+    key: SoftwareKey = field(default_factory=SoftwareKey.generate)
+
+    def __post_init__(self) -> None:
+        flash = Flash(
+            self.uuid,
+            self.key.point,
+            self.key.sign(node_key_message(self.uuid, self.key.point)),
+            can_address=default_can_address(self.uuid),
+        )
+        self.flash = RamFlash(flash)
+        self.power_on()
+
+    def power_on(self) -> None:
+        """Start anew from flash: sessions, pending agreement and stored replies are gone."""
+        self.flash.die_before = self.flash.die_after = False
+        self.tim = Tim(self.key, self.flash, lambda: self.seconds, max_message=self.max_message)
+        self.repetition = Repetition()
+
+    @property
+    def state(self) -> Flash:
+        return self.flash.state
+
+
+@dataclass
+class MemoryLink:
+    """One request, one reply; ``lose_request``/``lose_reply`` say which exchange (from 1) is cut, ``tamper`` changes one."""
+
+    board: Board
+    via: str = "nfc"
+    tapped: bool = True
+    lose_request: int = 0
+    lose_reply: int = 0
+    tamper: Callable[[int, bytes], bytes] | None = None
+    count: int = 0
+    frames: list[bytes] = field(default_factory=list)
+
+    def exchange(self, frame: bytes) -> bytes:
+        self.count += 1
+        self.frames.append(frame)
+        if self.count == self.lose_request:
+            raise NodeSilent("The request was lost.")
+        try:
+            reply = self.board.repetition.answer(
+                self.count,
+                frame,
+                lambda octets: self.board.tim.handle(octets, link=self.via, tapped=self.tapped),
+                now=self.board.seconds,
+            )
+        except PowerCut:
+            self.board.power_on()
+            raise NodeSilent("The node lost power.") from None
+        if self.count == self.lose_reply:
+            raise NodeSilent("The reply was lost.")
+        return self.tamper(self.count, reply) if self.tamper is not None else reply
+
+    def close(self) -> None:
+        self.board.tim.link_lost(self.via)
+
+
+def contact(board: Board, link: MemoryLink | None = None) -> Contact:
+    """The node as a port would find it."""
+    link = link or MemoryLink(board)
+    reply = board.tim.identity().encode()
+    return Contact(Identity.decode(reply), link, tag_uid=b"\x04\x11\x22\x33\x44\x55\x66", address=None)
+
+
+def talk(board: Board, link: MemoryLink | None = None) -> Conversation:
+    """A conversation with the node."""
+    return Conversation(contact(board, link), notice=lambda notice: None)

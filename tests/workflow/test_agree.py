@@ -1,0 +1,188 @@
+"""Key agreement between a station and a node, and every row of the loss table that concerns it."""
+
+from __future__ import annotations
+
+import pytest
+
+from teds_provision.errors import NodeRefused, NodeSilent, NotAuthentic, NotWhitelisted, OtherKey, PolicyRefused
+from teds_provision.protocol.agreement import key_id
+from teds_provision.protocol.frames import Reason, refusal
+from teds_provision.protocol.identity import NodeState
+from teds_provision.store import WhitelistEntry
+from teds_provision.workflow.agree import Agreed, agree
+from teds_provision.workflow.identify import identify
+from teds_provision.workflow.station import Station
+
+from .bench import Board, MemoryLink, make_station, talk
+
+
+def run(station: Station, board: Board, link: MemoryLink | None = None, *, rotate: bool = False) -> Agreed:
+    with talk(board, link) as node:
+        return agree(station, node, identify(station, node), rotate=rotate)
+
+
+def whitelist(station: Station, board: Board) -> None:
+    station.store.put_whitelist(WhitelistEntry(board.uuid))
+
+
+def held(station: Station, board: Board) -> list[tuple[str, int]]:
+    return [(record.state, record.epoch) for record in station.store.keys(board.uuid)]
+
+
+def test_a_whitelisted_node_gets_a_key_and_its_entry_is_pinned(station: Station, board: Board) -> None:
+    whitelist(station, board)
+    agreed = run(station, board)
+    assert (agreed.epoch, agreed.fresh) == (1, True)
+    assert board.state.state == NodeState.KEYED
+    assert board.state.key is not None
+    assert key_id(board.state.key).hex() == agreed.key_id
+    assert board.state.ca == station.ca
+    entry = station.store.whitelisted(board.uuid)
+    assert entry is not None
+    assert (entry.assurance, entry.fingerprint) == ("tap", identify(station, talk(board)).fingerprint)
+    assert held(station, board) == [("active", 1)]
+
+
+def test_a_second_agreement_has_nothing_to_do(station: Station, board: Board) -> None:
+    whitelist(station, board)
+    first = run(station, board)
+    again = run(station, board)
+    assert (again.key_id, again.fresh) == (first.key_id, False)
+
+
+def test_rotation_gives_a_new_key_over_any_link(station: Station, board: Board) -> None:
+    whitelist(station, board)
+    first = run(station, board)
+    rotated = run(station, board, MemoryLink(board, via="can", tapped=False), rotate=True)
+    assert (rotated.epoch, rotated.fresh) == (2, True)
+    assert rotated.key_id != first.key_id
+    assert held(station, board) == [("active", 2)]
+
+
+def test_an_unknown_node_is_refused_before_any_key(station: Station, board: Board) -> None:
+    with pytest.raises(NotWhitelisted):
+        run(station, board)
+    assert board.state.epoch == 0
+
+
+def test_a_known_uuid_with_another_key_is_refused(station: Station, board: Board) -> None:
+    whitelist(station, board)
+    run(station, board)
+    with pytest.raises(OtherKey):
+        run(station, Board())
+
+
+def test_a_station_of_another_owner_cannot_rekey_a_node(station: Station, board: Board, tmp_path) -> None:  # type: ignore[no-untyped-def]
+    whitelist(station, board)
+    first = run(station, board)
+    stranger = make_station(tmp_path / "stranger")
+    whitelist(stranger, board)
+    with pytest.raises(NodeRefused) as refused:
+        run(stranger, board)
+    assert refused.value.reason == Reason.UNTRUSTED_STATION
+    assert board.state.key is not None
+    assert key_id(board.state.key).hex() == first.key_id
+
+
+def test_over_the_bus_a_node_with_nfc_refuses_its_first_key(station: Station, board: Board) -> None:
+    whitelist(station, board)
+    with pytest.raises(NodeRefused) as refused:
+        run(station, board, MemoryLink(board, via="can", tapped=False))
+    assert refused.value.reason == Reason.NOT_PERMITTED
+
+
+def test_a_wrong_node_tag_is_no_key(station: Station, board: Board) -> None:
+    whitelist(station, board)
+
+    def flip(count: int, reply: bytes) -> bytes:
+        return (
+            reply[:24] + bytes([reply[24] ^ 1]) + reply[25:]
+            if len(reply) > 250 and reply[19:23] == b"\0\0\0\1"
+            else reply
+        )
+
+    with pytest.raises(NotAuthentic):
+        run(station, board, MemoryLink(board, tamper=flip))
+    assert held(station, board) == []
+
+
+EXCHANGES = 6  # Read 128, Prove, Request, Confirm, Open, Identify (sealed)
+
+
+@pytest.mark.parametrize("lost", range(1, EXCHANGES + 1))
+@pytest.mark.parametrize("half", ["lose_request", "lose_reply"])
+def test_whatever_message_is_lost_the_same_command_carries_on(
+    station: Station, board: Board, half: str, lost: int
+) -> None:
+    whitelist(station, board)
+    with pytest.raises(NodeSilent):
+        run(station, board, MemoryLink(board, **{half: lost}))  # type: ignore[arg-type]
+    agreed = run(station, board)
+    assert board.state.key is not None
+    assert key_id(board.state.key).hex() == agreed.key_id
+    assert [state for state, _ in held(station, board)] == ["active"]
+
+
+@pytest.mark.parametrize("lost", range(1, EXCHANGES + 2))
+@pytest.mark.parametrize("half", ["lose_request", "lose_reply"])
+def test_a_cut_rotation_leaves_a_working_key(station: Station, board: Board, half: str, lost: int) -> None:
+    whitelist(station, board)
+    run(station, board)
+    with pytest.raises(NodeSilent):
+        run(station, board, MemoryLink(board, **{half: lost}), rotate=True)  # type: ignore[arg-type]
+    run(station, board)
+    assert [state for state, _ in held(station, board)] == ["active"]
+
+
+@pytest.mark.parametrize("when", ["die_before", "die_after"])
+def test_a_node_that_dies_inside_confirm_heals(station: Station, board: Board, when: str) -> None:
+    whitelist(station, board)
+    run(station, board)
+    setattr(board.flash, when, True)
+    with pytest.raises(NodeSilent):
+        run(station, board, rotate=True)
+    assert len(held(station, board)) == 2
+    run(station, board)
+    assert held(station, board) == [("active", 2 if when == "die_after" else 1)]
+
+
+def test_a_forged_refusal_of_open_deletes_nothing(station: Station, board: Board) -> None:
+    whitelist(station, board)
+    run(station, board)
+    board.flash.die_after = True
+    with pytest.raises(NodeSilent):
+        run(station, board, rotate=True)
+    forged = refusal(Reason.UNKNOWN_KEY).encode()
+    with pytest.raises(PolicyRefused):
+        run(station, board, MemoryLink(board, tamper=lambda n, reply: forged if n > 2 else reply))
+    assert len(held(station, board)) == 2
+    assert run(station, board).epoch == 2
+
+
+def test_a_second_agreement_whose_confirm_is_lost_keeps_every_pending_key(station: Station, board: Board) -> None:
+    whitelist(station, board)
+    board.flash.die_after = True
+    with pytest.raises(NodeSilent):
+        run(station, board)  # K1 is on the node, pending here
+    with pytest.raises(NodeSilent):
+        run(station, board, MemoryLink(board, lose_request=5), rotate=True)
+    assert run(station, board).epoch == 1
+    assert held(station, board) == [("active", 1)]
+
+
+def test_a_rotation_by_another_station_is_told_never_healed_by_itself(station: Station, board: Board) -> None:
+    whitelist(station, board)
+    run(station, board)
+    board.flash.state = board.flash.state.__class__(**{**vars(board.flash.state), "key": bytes(16)})
+    board.power_on()
+    with pytest.raises(PolicyRefused, match="knows none of the keys"):
+        run(station, board)
+    assert held(station, board) == [("active", 1)]
+    assert run(station, board, rotate=True).epoch == 2
+
+
+def test_a_lost_store_is_healed_by_a_tap_where_identity_and_ca_were_kept(station: Station, board: Board) -> None:
+    whitelist(station, board)
+    run(station, board)
+    station.store.remove_keys(board.uuid)
+    assert run(station, board).epoch == 2
