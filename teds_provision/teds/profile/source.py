@@ -73,14 +73,13 @@ class _Scan:
 
     def header(self, path: KeyPath, array: bool, line: int) -> KeyPath:
         path = self._resolve(path[:-1]) + path[-1:]
-        self.lines.setdefault(path, line)
+        for length in range(1, len(path) + 1):
+            self.lines.setdefault(path[:length], line)
         if array:
             number = self.counts.get(path, -1) + 1
             self.counts[path] = number
             path = (*path, number)
             self.lines[path] = line
-        else:
-            path = self._resolve(path)
         return path
 
     def _resolve(self, path: KeyPath) -> KeyPath:
