@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import secrets
+import time
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
@@ -18,6 +19,7 @@ from teds_provision.vault.software import SoftwareVault, settle
 FILE_NAME = "vault.json"
 _FORMAT = "teds-provision-vault/1"
 _MAX_OCTETS = 64 * 1024
+_STALE_SECONDS = 60
 Stamp = tuple[int, int, int]
 
 
@@ -149,3 +151,12 @@ def write_whole(path: Path, content: bytes, *, replace: bool) -> None:
     finally:
         with suppress(OSError):
             fresh.unlink()
+        _sweep(path)
+
+
+def _sweep(path: Path) -> None:
+    """Remove what killed writers left beside ``path``; one that may still be at work is left alone."""
+    for left in path.parent.glob(f"{path.name}.*.new"):
+        with suppress(OSError):
+            if time.time() - left.stat().st_mtime > _STALE_SECONDS:
+                left.unlink()

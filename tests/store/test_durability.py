@@ -166,6 +166,29 @@ def test_a_full_disk_gives_a_clear_error(home: Path) -> None:
     assert "no space left" in words or "full" in words
 
 
+def test_a_read_only_disk_gives_a_clear_error(store: Store, home: Path) -> None:
+    store.put_node(NodeRecord(NODE))
+    store.close()
+    code = (
+        "import sys; from pathlib import Path; from teds_provision.errors import StoreFailure\n"
+        "from teds_provision.store import NodeRecord, Store, StoreLock\n"
+        "def write():\n"
+        "    with Store.open(Path(sys.argv[1]), create=True) as store: store.put_node(NodeRecord(bytes(10)))\n"
+        "def lock():\n"
+        "    with StoreLock(Path(sys.argv[1]), command='write'): pass\n"
+        "for act in (write, lock):\n"
+        "    try: act()\n"
+        "    except StoreFailure as failure: print(failure.message, failure.hint)\n"
+    )
+    script = 'mount --bind "$0" "$0" && mount -o remount,ro,bind "$0" && exec "$@"'
+    mounted = ["unshare", "--mount", "--map-root-user", "sh", "-c", script, str(home)]
+    if not shutil.which("unshare") or subprocess.run([*mounted, "true"], capture_output=True, check=False).returncode:
+        pytest.skip("a read-only file system cannot be mounted here")
+    run = subprocess.run([*mounted, sys.executable, "-c", code, str(home)], capture_output=True, text=True, check=False)
+    assert run.returncode == 0, run.stderr
+    assert [line.count("read-only") for line in run.stdout.splitlines()] == [1, 1], run.stdout
+
+
 def test_sqlite_running_out_of_pages_is_a_full_disk(store: Store) -> None:
     store._database.execute("PRAGMA max_page_count = 30")
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import signal
 import stat
 import subprocess
@@ -304,6 +305,58 @@ def test_init_killed_at_any_instant_can_be_run_again(tmp_path: Path) -> None:
         said, _ = process.communicate()
         vault = FileVault.create(home, STORE, Person(), costs=THROWAWAY)
         assert said in ("", vault.identity().point.hex() + "\n")
+
+
+def test_a_change_killed_at_any_instant_leaves_the_old_or_the_new(tmp_path: Path, vault: FileVault) -> None:
+    vault.export_ca(tmp_path / "ca.pem", GOOD)
+    code = (
+        "import sys; from pathlib import Path; from teds_provision.vault.file_vault import FileVault\n"
+        f"vault = FileVault.open(Path(sys.argv[1]), {STORE!r}, lambda prompt, confirm: {GOOD!r})\n"
+        "print('ready', flush=True)\n"
+        "while True: vault.add_master(); vault.retire_masters()"
+    )
+    numbers = []
+    for attempt in range(8):
+        process = subprocess.Popen([sys.executable, "-c", code, str(tmp_path)], stdout=subprocess.PIPE, text=True)
+        assert process.stdout is not None
+        assert process.stdout.readline() == "ready\n"
+        time.sleep(attempt * 0.004)
+        process.send_signal(signal.SIGKILL)
+        process.communicate()
+        again = FileVault.open(tmp_path, STORE, Person())
+        assert again.identity().point == vault.identity().point
+        assert 1 <= len(again._material.masters.keys) <= 2
+        numbers.append(again._material.masters.current)
+    assert numbers == sorted(numbers)
+    assert numbers[-1] > 1
+
+
+def test_what_a_killed_writer_left_is_swept_away_later(tmp_path: Path, vault: FileVault) -> None:
+    old, fresh = tmp_path / "vault.json.0123abcd.new", tmp_path / "vault.json.4567abcd.new"
+    for left in (old, fresh):
+        left.write_text("sealed")
+    os.utime(old, (time.time() - 3600,) * 2)
+    vault.drop_ca()
+    assert (old.exists(), fresh.exists()) == (False, True)
+
+
+def test_a_full_disk_leaves_the_vault_as_it_was(tmp_path: Path, vault: FileVault) -> None:
+    before = (tmp_path / "vault.json").read_bytes()
+    code = (
+        "import resource, sys; from pathlib import Path; from teds_provision.errors import VaultFailure\n"
+        "from teds_provision.vault.file_vault import FileVault\n"
+        f"vault = FileVault.open(Path(sys.argv[1]), {STORE!r}, lambda prompt, confirm: {GOOD!r})\n"
+        "resource.setrlimit(resource.RLIMIT_FSIZE, (100, 100))\n"
+        "try: vault.drop_ca()\n"
+        "except VaultFailure as failure: print(vault.ca() is not None, failure.message)"
+    )
+    run = subprocess.run(
+        [sys.executable, "-c", code, str(tmp_path)], capture_output=True, text=True, timeout=60, check=False
+    )
+    assert run.stdout.startswith("True "), run.stderr
+    assert "cannot be written" in run.stdout
+    assert [path.name for path in tmp_path.iterdir()] == ["vault.json"]
+    assert (tmp_path / "vault.json").read_bytes() == before
 
 
 def test_a_wrapped_key_opens_only_in_its_own_place(vault: FileVault) -> None:
