@@ -1,0 +1,63 @@
+# Two commands: `make demo` shows the whole workflow on this machine, `make test` runs every check.
+# Both make their own virtual environment first; nothing else is needed but Python 3.11 to 3.13 with venv, and make.
+
+PYTHON ?= python3
+VENV ?= .venv
+BIN := $(VENV)/bin
+
+.PHONY: demo test lint types unit bench bench-teds bench-handover fuzz clean
+
+demo: $(VENV)/.run
+	@$(BIN)/teds-provision demo
+
+test: $(VENV)/.dev
+	@sh scripts/install-test-packages
+	@$(MAKE) --no-print-directory lint types unit
+
+lint: $(VENV)/.dev
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+
+types: $(VENV)/.dev
+	$(BIN)/mypy
+
+unit: $(VENV)/.dev
+	$(BIN)/python -m pytest -n 2 --dist worksteal
+
+bench: $(VENV)/.dev
+	$(BIN)/python -m benchmarks.provisioning
+
+bench-teds: $(VENV)/.dev
+	$(BIN)/python -m benchmarks.teds_codec
+
+bench-handover: $(VENV)/.dev
+	$(BIN)/python -m benchmarks.handover
+
+# Coverage-guided fuzzing of the TEDS decoder for ten minutes; atheris gets an environment of its own.
+fuzz: .venv-fuzz/.ready
+	.venv-fuzz/bin/python tests/fuzz/fuzz_teds.py -max_total_time=$(or $(SECONDS),600) tests/fuzz/corpus
+
+$(VENV)/bin/python:
+	@$(PYTHON) -c 'import sys; sys.exit(not (3, 11) <= sys.version_info[:2] <= (3, 13))' || \
+	  { echo "Python 3.11 to 3.13 is needed; name one with: make PYTHON=python3.12 $(MAKECMDGOALS)"; exit 1; }
+	@echo "Making the virtual environment $(VENV) …"
+	@$(PYTHON) -m venv $(VENV)
+	@$(BIN)/python -m pip install --quiet --upgrade pip
+
+$(VENV)/.run: $(VENV)/bin/python pyproject.toml
+	@echo "Installing teds-provision …"
+	@$(BIN)/python -m pip install --quiet --editable .
+	@touch $@
+
+$(VENV)/.dev: $(VENV)/bin/python pyproject.toml
+	@echo "Installing teds-provision and what its tests need …"
+	@$(BIN)/python -m pip install --quiet --editable '.[dev]'
+	@touch $@ $(VENV)/.run
+
+.venv-fuzz/.ready: pyproject.toml
+	$(PYTHON) -m venv .venv-fuzz
+	.venv-fuzz/bin/python -m pip install --quiet --editable '.[fuzz]'
+	@touch $@
+
+clean:
+	rm -rf $(VENV) .venv-fuzz .mypy_cache .ruff_cache .pytest_cache
