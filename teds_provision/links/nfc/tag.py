@@ -180,9 +180,7 @@ def activate(clf: Any, target: Any) -> ReaderTag | None:
                 return ReaderTag(_Type4Tag(clf, target), "Type 4")
             if target.brty == "106A" and target.sel_res and not target.sel_res[0] & 0x60:
                 plain = target.sel_res[0] == 0
-                return ReaderTag(
-                    _Type2Tag(clf, target), "Type 2" if plain else f"SAK {target.sel_res[0]:02X}h"
-                )
+                return ReaderTag(_Type2Tag(clf, target), "Type 2" if plain else f"SAK {target.sel_res[0]:02X}h")
             tag = nfc.tag.activate(clf, target)
             return None if tag is None else ReaderTag(tag, str(tag.type).replace("Tag", "").replace("Type", "Type "))
     except FieldLost:

@@ -97,7 +97,7 @@ def test_a_slow_node_is_waited_for_past_what_it_announced(
     contact = find(port, notices)
     began = time.monotonic()
     echo(contact, 300)
-    assert 1.9 < time.monotonic() - began < 3.0
+    assert 1.9 < time.monotonic() - began < 4.0
     node.wait_for("request 1")
     assert not notices or notices[-1].kind != "retry"
 
@@ -207,7 +207,7 @@ def test_an_empty_reader_gives_no_node_in_time(port: Port, notices: list) -> Non
     began = time.monotonic()
     with pytest.raises(NoNode) as caught:
         find(port, notices, seconds=0.6)
-    assert time.monotonic() - began < 1.2
+    assert time.monotonic() - began < 2.5
     assert caught.value.exit_code == 5
     assert [notice.kind for notice in notices] == ["waiting"]
 
