@@ -44,7 +44,7 @@ class Pkcs11Vault:
 
     def __init__(self, home: Path, store_id: str, uri: Pkcs11Uri, session: TokenSession, content: _Content) -> None:
         self.description = f"PKCS #11 token {session.label!r} by {uri.module_path}"
-        self._home, self._store_id, self._uri = home, store_id, uri
+        self._home, self._store_id = home, store_id
         self._session, self._content = session, content
 
     @classmethod
@@ -60,14 +60,12 @@ class Pkcs11Vault:
         where = Pkcs11Uri.parse(uri)
         session = _open_session(home, where, ask, write=True)
         with _exclusive(home):
-            station = _find_or_make(session, store_id, where, "station")
-            ca = _find_or_make(session, store_id, where, "CA") if with_ca else None
-            content = _Content(station, ca, MasterKeys.generate())
-            _save(home, store_id, content, replace=False)
-        vault = cls(home, store_id, where, session, content)
-        if _load(home, store_id, session).masters != content.masters:
-            raise VaultFailure("The token does not open what was sealed to its key.", hint="Check the token's driver.")
-        return vault
+            if not (home / FILE_NAME).exists():  # else another process was quicker
+                station = _find_or_make(session, store_id, where, "station")
+                ca = _find_or_make(session, store_id, where, "CA") if with_ca else None
+                _save(home, store_id, _Content(station, ca, MasterKeys.generate()), replace=False)
+            content = _load(home, store_id, session)  # the token has to open what was just sealed to its key
+        return cls(home, store_id, where, session, content)
 
     @classmethod
     def open(cls, home: Path, store_id: str, uri: str, ask: Ask) -> Pkcs11Vault:
@@ -105,12 +103,13 @@ class Pkcs11Vault:
             hint="Keep the token itself away, or make the CA in another home with --keystore file.",
         )
 
-    def drop_ca(self, ask: Ask) -> bool:
-        """Destroy the CA key in the token for good; False if there is none. Asks for the PIN where it must."""
-        if self._content.ca is None:
+    def drop_ca(self) -> bool:
+        """Destroy the CA key in the token for good; False if there is none. It cannot be exported before."""
+        key = self._content.ca
+        if key is None:
             return False
-        session = _open_session(self._home, self._uri, ask, write=True)
-        self._replace(_Content(self._content.station, None, self._content.masters), after=self._content.ca, on=session)
+        self._replace(_Content(self._content.station, None, self._content.masters))
+        self._session.destroy(key)
         return True
 
     def add_master(self) -> None:
@@ -126,12 +125,10 @@ class Pkcs11Vault:
         """End the session with the token."""
         self._session.close()
 
-    def _replace(self, content: _Content, *, after: TokenKey | None = None, on: TokenSession | None = None) -> None:
+    def _replace(self, content: _Content) -> None:
         with _exclusive(self._home):
             _save(self._home, self._store_id, content, replace=True)
-            self._content = content
-            if after is not None and on is not None:
-                on.destroy(after)
+        self._content = content
 
     def __repr__(self) -> str:
         return f"Pkcs11Vault({self.description}, station {fingerprint(self._content.station.point)[:16]})"

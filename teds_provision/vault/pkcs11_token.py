@@ -82,9 +82,10 @@ class TokenKey:
 class TokenSession:
     """A session on one token, logged in."""
 
-    def __init__(self, session: Session, label: str) -> None:
+    def __init__(self, session: Session, token: Token) -> None:
         self._session = session
-        self.label = label
+        self._token = token
+        self.label: str = token.label
 
     def find(self, *, label: str | None, identifier: bytes | None) -> TokenKey | None:
         """Return the P-256 key with this label and CKA_ID; None where there is none.
@@ -102,13 +103,14 @@ class TokenSession:
         return key
 
     def destroy(self, key: TokenKey) -> None:
-        """Destroy a key pair for good (CKA_ID and label both fit)."""
+        """Destroy a key pair for good (CKA_ID and label both fit); a writing session shares the login of this one."""
         from pkcs11 import Attribute
 
         def run() -> None:
             wanted = {Attribute.LABEL: key.label, Attribute.ID: key.identifier}
-            for found in list(self._session.get_objects(wanted)):
-                found.destroy()
+            with self._token.open(rw=True) as session:
+                for found in list(session.get_objects(wanted)):
+                    found.destroy()
 
         guarded(run)
 
@@ -218,13 +220,15 @@ def find_token(uri: Pkcs11Uri) -> Token:
 def log_in(token: Token, uri: Pkcs11Uri, pin: str | None, *, write: bool) -> TokenSession:
     """Open a session with ``pin`` (None: the token has its own PIN pad). One try, never a second one.
 
+    A login is the process's, not the session's: where this process holds one already, the module does not look at the
+    PIN. ``open_vault`` asks once per process for that reason.
     Raises WrongPassphrase, which says what the token tells of the tries left, or VaultFailure.
     """
     from pkcs11 import PROTECTED_AUTH, TokenFlag, exceptions
 
     try:
         session = token.open(rw=write, user_pin=PROTECTED_AUTH if pin is None else pin)
-    except exceptions.UserAlreadyLoggedIn:  # this process has logged in already: its sessions share the login
+    except exceptions.UserAlreadyLoggedIn:
         session = guarded(lambda: token.open(rw=write))
     except (exceptions.PinIncorrect, exceptions.PinInvalid, exceptions.PinLenRange, exceptions.ArgumentsBad):
         flags = guarded(lambda: token.slot.get_token().flags)
@@ -240,7 +244,7 @@ def log_in(token: Token, uri: Pkcs11Uri, pin: str | None, *, write: bool) -> Tok
         raise VaultFailure(f"The {uri} has no valid user PIN.", hint="Set one with the token's own tool.") from None
     except exceptions.PKCS11Error as error:
         raise _failure(error) from error
-    return TokenSession(session, token.label)
+    return TokenSession(session, token)
 
 
 def ask_pin(token: Token, uri: Pkcs11Uri, ask: Ask) -> str | None:

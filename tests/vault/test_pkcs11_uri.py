@@ -1,0 +1,79 @@
+"""PKCS #11 URIs (RFC 7512)."""
+
+from __future__ import annotations
+
+from contextlib import suppress
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from teds_provision.errors import UsageFailure
+from teds_provision.vault.pkcs11_uri import Pkcs11Uri
+
+M = "?module-path=/lib/m.so"
+
+
+def test_every_attribute_is_read():
+    text = "pkcs11:token=The%20Station;serial=DE%3B0;manufacturer=Snake%20Oil;model=1.0;object=key;id=%00%ff;slot-id=7"
+    assert Pkcs11Uri.parse(text + ";type=private" + M) == Pkcs11Uri(
+        "/lib/m.so", "The Station", "DE;0", "Snake Oil", "1.0", "key", b"\x00\xff", 7
+    )
+    assert Pkcs11Uri.parse("PKCS11:" + M) == Pkcs11Uri("/lib/m.so")
+
+
+@pytest.mark.parametrize("query", ["pin-value=1234", "pin-source=file:/etc/pin", "pin-source=%7Cprog", "pin-value="])
+@pytest.mark.parametrize("between", ["&", "?"])
+def test_no_uri_may_hold_a_pin_and_the_message_does_not_repeat_it(query, between):
+    text = f"pkcs11:token=t{M}&{query}" if between == "&" else f"pkcs11:token=t?{query}&module-path=/lib/m.so"
+    with pytest.raises(UsageFailure, match="may not hold a PIN") as refused:
+        Pkcs11Uri.parse(text)
+    assert "1234" not in str(refused.value)
+    assert "--passphrase-fd" in refused.value.hint
+
+
+def test_a_pin_among_the_path_attributes_is_refused_as_well():
+    with pytest.raises(UsageFailure, match="may not hold a PIN"):
+        Pkcs11Uri.parse("pkcs11:token=t;pin-value=1234" + M)
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "",
+        "pkcs11",
+        "file:token=t" + M,
+        "pkcs11:token=t",
+        "pkcs11:token=t?module-name=softhsm",
+        "pkcs11:token=t;token=u" + M,
+        "pkcs11:token" + M,
+        "pkcs11:=t" + M,
+        "pkcs11:token=t;colour=red" + M,
+        "pkcs11:token=t" + M + "&x-vendor=1",
+        "pkcs11:token=%ff" + M,
+        "pkcs11:token=" + M,
+        "pkcs11:token=%1b[2J" + M,
+        "pkcs11:type=cert" + M,
+        "pkcs11:slot-id=one" + M,
+        "pkcs11:slot-id=%c2%b2" + M,
+        "pkcs11:?module-path=",
+        "pkcs11:library-version=3" + M,
+    ],
+)
+def test_what_might_name_something_else_is_refused(text):
+    with pytest.raises(UsageFailure):
+        Pkcs11Uri.parse(text)
+
+
+@given(st.text(max_size=60))
+def test_any_text_is_read_or_refused(text):
+    for whole in (text, "pkcs11:" + text, "pkcs11:" + text + M):
+        with suppress(UsageFailure):
+            assert isinstance(Pkcs11Uri.parse(whole), Pkcs11Uri)
+
+
+@given(st.text(alphabet=st.characters(min_codepoint=33, max_codepoint=0x2FF), min_size=1).filter(str.isprintable))
+def test_any_printable_label_can_be_said(label):
+    from urllib.parse import quote
+
+    assert Pkcs11Uri.parse(f"pkcs11:token={quote(label, safe='')}{M}").token == label
