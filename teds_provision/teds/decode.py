@@ -85,10 +85,10 @@ class _Walk(Head):
         fields: list[Field] = []
         seen: set[int] = set()
         at, last, width, octets = start, 0, self.width, self.octets
-        tedsid_due = True
+        tedsid_at = self.tedsid_at
         while at < end:
             kind = octets[at]
-            is_tedsid = kind == TEDSID and tedsid_due
+            is_tedsid = at == tedsid_at
             body = at + 2 if is_tedsid else at + 1 + width
             size = octets[at + 1] if body == at + 2 and body <= end else int.from_bytes(octets[at + 1 : body], "big")
             stop = body + size
@@ -98,7 +98,6 @@ class _Walk(Head):
             self.left -= 1
             raw = octets[body:stop]
             if is_tedsid:
-                tedsid_due = False
                 fields.append(_field(kind, "TEDSID", tuple(raw), raw, at))
             else:
                 spec = spec_of.get(kind)

@@ -123,6 +123,7 @@ class _Conversion:
         entries = [part for part in self.decoded.fields if part.name == "DirBlock"]
         standard = {"TEDSID", "NumLang", "DirBlock", "SubSum"}
         plain = all(part.name in standard for part in self.decoded.fields)
+        plain = plain and self.decoded.fields[0].name == "TEDSID"
         if plain and len(entries) == len(self.decoded.text) and entries:
             pairs: list[tuple[str, object]] = [
                 ("Text", {"Text": text, **_directory(entry)})
@@ -130,10 +131,12 @@ class _Conversion:
             ]
             block = composer.block([("TEDSID", {"family": self.decoded.fields[0].raw[0]}), *pairs])
             return self.framed(block)
+        first = self.decoded.fields[0]
+        if first.name != "TEDSID":
+            raise BadData("A text-based TEDS whose TEDSID is not first cannot be converted.")
         self.say("warning", "kept", "The directory does not describe the texts; it is kept, Offset and all.", None)
         old = recompose(self.decoded)
         block = old[4:-2] if self.decoded.framed else old
-        first = self.decoded.fields[0]
         return self.framed(self.tedsid(first, composer.width) + block[2 + len(first.raw) :])
 
 

@@ -26,7 +26,7 @@ class Head:
         self.width = 1
         self.left = MAX_TUPLES
         self.text: tuple[bytes, ...] = ()
-        self.widened = False
+        self.tedsid_at: int | None = None
 
     def find(
         self,
@@ -80,6 +80,7 @@ class Head:
     def tedsid(self, start: int, end: int) -> None:
         """Take edition, class and tuple width from the TEDSID, wherever it stands."""
         at = start if self.octets[start] == TEDSID else self.search_tedsid(start, end)
+        self.tedsid_at = at
         if at != start:
             found = "no TEDSID" if at is None else f"the TEDSID at octet {at}"
             first = self.octets[start]

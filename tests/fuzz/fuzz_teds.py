@@ -1,0 +1,74 @@
+"""Coverage-guided fuzzing of the TEDS codec (atheris), and the same check for a replay without it.
+
+Run: python tests/fuzz/fuzz_teds.py tests/fuzz/corpus/teds -max_total_time=600 -rss_limit_mb=512 -max_len=4096
+
+The first octet of an input chooses: even, the rest goes to the decoder as it is; odd, the rest is a data block and gets
+a right Length and checksum first, so that the fuzzer need not find a checksum. Nothing but BadData may come out, and that
+only where it is documented; what is read must be given back.
+"""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parents[2]
+
+
+def check(data: bytes) -> None:
+    """Read one input in every way there is; raises AssertionError, or whatever should not have come out."""
+    from teds_provision import teds
+    from teds_provision.errors import BadData
+    from teds_provision.teds.frame import frame
+
+    if not data:
+        return
+    octets = frame(data[1:]) if data[0] & 1 else data[1:]
+    decoded = teds.decode(octets)
+    assert teds.encode(decoded) == octets
+    errors = [finding for finding in decoded.findings if finding.severity == "error"]
+    assert bool(errors) == (decoded.verdict not in {"clean", "block-clean", "message"})
+    try:
+        teds.decode(octets, strict=True)
+        assert not errors
+    except BadData:
+        assert errors
+    try:
+        again = teds.recompose(decoded)
+    except BadData:
+        assert decoded.verdict in {"malformed", "message"}
+    else:
+        assert again == octets or decoded.verdict not in {"clean", "block-clean"}
+    for edition in (2007, 2024):
+        try:
+            other, findings = teds.convert(decoded, edition)
+        except BadData:
+            continue
+        if decoded.verdict == "clean" and not findings:
+            assert teds.decode(other).edition == edition
+            assert teds.decode(other).verdict == "clean"
+    for field in decoded.fields:
+        teds.unpack_uuid(field.raw)
+        teds.read_key(field.raw)
+
+
+def main() -> None:
+    """Fuzz with atheris; arguments are those of libFuzzer."""
+    import atheris
+
+    sys.path.insert(0, str(ROOT))
+    with atheris.instrument_imports(include=["teds_provision"]):
+        import teds_provision.teds.composer
+        import teds_provision.teds.content
+        import teds_provision.teds.editions
+        import teds_provision.teds.keyforms
+        import teds_provision.teds.security
+        import teds_provision.teds.tables_calibration
+        import teds_provision.teds.text
+        import teds_provision.teds.uuid  # noqa: F401
+    atheris.Setup(sys.argv, check)
+    atheris.Fuzz()
+
+
+if __name__ == "__main__":
+    main()
