@@ -48,12 +48,13 @@ class TnepTag:
         self._jobs: queue.SimpleQueue[Callable[[], None] | None] = queue.SimpleQueue()
         self._worker = threading.Thread(target=self._work, name="nfc-node", daemon=True)
         self._initial = b""
+        self._shown: bytes | None = None  # the initial message that stands in the mailbox, None for any other
         memory.written = self._written
 
     def start(self) -> None:
         """Put the initial message and start the worker."""
         self._initial = self._initial_message()
-        self._memory.put(self._initial)
+        self._show(self._initial)
         self._worker.start()
 
     def stop(self) -> None:
@@ -66,7 +67,7 @@ class TnepTag:
         with self._lock:
             self._serial += 1
             self._selected = False
-            self._memory.put(self._initial)
+            self._show(self._initial)
             self._fresh.clear()
             self._jobs.put(self._renew)
 
@@ -91,6 +92,7 @@ class TnepTag:
         with self._lock:
             self._serial += 1
             serial = self._serial
+            self._shown = None
             self._memory.put(b"")
         self._jobs.put(lambda: self._serve(serial, octets))
 
@@ -105,8 +107,10 @@ class TnepTag:
         initial = self._initial_message()
         with self._lock:
             self._initial = initial
-            if serial == self._serial:
-                self._memory.put(initial if answer is None else answer)
+            if serial == self._serial and answer is None:
+                self._show(initial)
+            elif serial == self._serial and answer is not None:
+                self._memory.put(answer)
 
     def _answer(self, serial: int, octets: bytes) -> bytes | None:
         """Return the message that answers ``octets``, None for the initial message."""
@@ -133,10 +137,14 @@ class TnepTag:
     def _renew(self) -> None:
         initial = self._initial_message()
         with self._lock:
-            changed, self._initial = initial != self._initial, initial
-            if changed and not self._selected and self._jobs.empty():
-                self._memory.put(initial)
+            self._initial = initial
+            if self._shown is not None and self._shown != initial:
+                self._show(initial)
             self._fresh.set()
+
+    def _show(self, initial: bytes) -> None:
+        self._shown = initial
+        self._memory.put(initial)
 
     def _forget(self) -> None:
         self._responder.forget()
