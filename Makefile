@@ -11,7 +11,7 @@ demo: $(VENV)/.run
 	@$(BIN)/teds-provision demo
 
 test: $(VENV)/.dev
-	@sh scripts/install-test-packages
+	@sh scripts/install-test-packages || { test -z "$$CI" && echo "Going on without them: the tests marked system are skipped."; }
 	@$(MAKE) --no-print-directory lint types unit
 
 lint: $(VENV)/.dev

@@ -217,6 +217,8 @@ def initialise(
     if store.setting("station_point") is not None:
         return station, store.setting("keystore_why") or ""
     with StoreLock(home, command="init"):
+        if store.setting("station_point") is not None:  # another init was first
+            return station, store.setting("keystore_why") or ""
         more = {} if costs is None else {"costs": costs}
         vault, why = create_vault(home, store.id, keystore, ask, **more)  # type: ignore[arg-type]
         identity, ca = vault.identity(), vault.ca()

@@ -61,7 +61,7 @@ class Board:
 
 @dataclass
 class MemoryLink:
-    """One request, one reply; ``lose_request``/``lose_reply`` say which exchange (from 1) is cut, ``tamper`` changes one."""
+    """One request, one reply; ``lose_request``/``lose_reply`` name the exchange (from 1) that is cut."""
 
     board: Board
     via: str = "nfc"

@@ -1,0 +1,271 @@
+"""Staged writes and the verified commit: every refusal of profile section 5, one by one and in order."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from teds_provision.protocol.frames import (
+    Attribute,
+    Function,
+    Reason,
+    TedsStatus,
+    decode_list,
+    query_teds,
+    read_teds,
+    refusal,
+    security_command,
+    update_teds,
+    write_teds,
+)
+from teds_provision.protocol.keys import GROUP_ORDER, SoftwareKey, station_key_message
+from teds_provision.teds import security
+from teds_provision.teds.frame import frame
+from teds_provision.teds.image import SECURITY
+
+from .desk import CA, META, NAME, STATION, UUID, Desk, digest
+from .memory import PowerCut
+
+BLOCKS = {(0, 1): META, (1, 12): NAME}
+
+
+@pytest.fixture
+def desk() -> Desk:
+    return Desk().agree().open()
+
+
+def status(desk: Desk, channel: int, access_code: int) -> TedsStatus:
+    return TedsStatus.decode(desk.plain(query_teds(channel, access_code)).payload)
+
+
+def read(desk: Desk, channel: int, access_code: int) -> bytes:
+    octets = b""
+    while part := desk.plain(read_teds(channel, access_code, len(octets))).payload[4:]:
+        octets += part
+    return octets
+
+
+# -- reading -----------------------------------------------------------------------------------------------------------
+
+
+def test_query_of_an_absent_teds_says_not_available() -> None:
+    found = status(Desk(), 1, 5)
+    assert (found.attributes, found.size, found.checksum) == (Attribute.NOT_AVAILABLE, 0, 0)
+    assert found.max_size > 0
+
+
+def test_query_of_the_security_teds_says_it_is_the_manufacturers() -> None:
+    found = status(Desk(), 0, 128)
+    assert found.attributes == Attribute.MANUFACTURER
+    assert found.size == len(Desk().flash.security_teds())
+
+
+def test_read_of_an_absent_teds_gets_18() -> None:
+    assert Desk().plain(read_teds(1, 5, 0)) == refusal(Reason.NO_SUCH_TEDS)
+
+
+@pytest.mark.parametrize(("channel", "code"), [(0, 0), (0, 18), (0, 127), (0, 136), (256, 3), (0xFFFF, 1)])
+def test_a_teds_that_the_node_could_never_hold_gets_18(channel: int, code: int) -> None:
+    assert Desk().plain(query_teds(channel, code)) == refusal(Reason.NO_SUCH_TEDS)
+    assert Desk().plain(read_teds(channel, code, 0)) == refusal(Reason.NO_SUCH_TEDS)
+
+
+def test_read_past_the_end_gives_the_length_and_no_octets() -> None:
+    size = len(Desk().flash.security_teds())
+    assert Desk().plain(read_teds(0, 128, size + 9)).payload == size.to_bytes(4, "big")
+
+
+def test_list_names_every_teds_ascending() -> None:
+    desk = Desk().provision()
+    assert decode_list(desk.plain(security_command(Function.LIST)).payload) == [(0, 1), (0, 128), (1, 12)]
+
+
+# -- staging -----------------------------------------------------------------------------------------------------------
+
+
+def test_segments_build_the_image_and_drop_what_lay_behind(desk: Desk) -> None:
+    assert desk.sealed(write_teds(1, 12, 0, NAME[:10] + b"junk")).ok
+    assert desk.sealed(write_teds(1, 12, 10, NAME[10:])).ok
+    answer = TedsStatus.decode(desk.sealed(update_teds(1, 12)).payload)
+    assert answer.size == len(NAME)
+    assert desk.plain(read_teds(1, 12, 0)).reason == Reason.NO_SUCH_TEDS, "nothing counts before the commit"
+
+
+def test_a_gap_gets_4_and_changes_nothing(desk: Desk) -> None:
+    assert desk.sealed(write_teds(1, 12, 0, NAME)).ok
+    assert desk.sealed(write_teds(1, 12, len(NAME) + 1, b"x")) == refusal(Reason.BAD_FORM)
+    assert desk.sealed(update_teds(1, 12)).ok
+
+
+def test_a_read_only_teds_gets_3_and_survives_unlisted() -> None:
+    desk = Desk(blocks={(0, 13): frame(bytes.fromhex("0304050d0101"))}, read_only=frozenset({(0, 13)}))
+    desk.agree().open()
+    assert desk.sealed(write_teds(0, 13, 0, b"x")) == refusal(Reason.NOT_PERMITTED)
+    assert desk.commit(BLOCKS).ok
+    assert (0, 13) in desk.flash.blocks
+    assert status(desk, 0, 13).attributes == Attribute.READ_ONLY
+
+
+def test_too_much_gets_10(desk: Desk) -> None:
+    limit = status(desk, 0, 128).max_size
+    assert desk.sealed(write_teds(0, 128, 0, bytes(limit))).ok
+    assert desk.sealed(write_teds(0, 128, limit, b"x")) == refusal(Reason.TOO_LARGE)
+
+
+def test_a_write_of_what_can_never_be_held_gets_18(desk: Desk) -> None:
+    assert desk.sealed(write_teds(0, 18, 0, b"x")) == refusal(Reason.NO_SUCH_TEDS)
+
+
+@pytest.mark.parametrize("teds", [NAME[:-1] + bytes([NAME[-1] ^ 1]), NAME + b"\0", META, b"", frame(b"\x05\x01\x41")])
+def test_update_checks_length_checksum_and_class(desk: Desk, teds: bytes) -> None:
+    desk.stage((1, 12), teds)
+    assert desk.sealed(update_teds(1, 12)) == refusal(Reason.BAD_FORM)
+
+
+def test_update_of_128_while_only_others_are_staged_gets_2(desk: Desk) -> None:
+    desk.stage((1, 12), NAME)
+    assert desk.sealed(update_teds(0, 128)) == refusal(Reason.WRONG_STATE)
+
+
+def test_update_with_nothing_staged_answers_like_query(desk: Desk) -> None:
+    assert desk.sealed(update_teds(0, 128)) == desk.sealed(query_teds(0, 128))
+
+
+def test_staging_goes_with_its_session(desk: Desk) -> None:
+    desk.stage((1, 12), NAME)
+    desk.open()
+    assert desk.sealed(write_teds(1, 12, len(NAME), b"x")) == refusal(Reason.BAD_FORM)
+
+
+# -- the commit --------------------------------------------------------------------------------------------------------
+
+
+def test_a_good_commit_answers_like_query_and_can_be_read_back(desk: Desk) -> None:
+    assert desk.commit(BLOCKS) == desk.plain(query_teds(0, 128))
+    assert read(desk, 0, 1) == META
+    assert read(desk, 1, 12) == NAME
+    assert security.decode(read(desk, 0, 128)).sequence == 1
+
+
+def test_a_stored_block_that_is_not_listed_is_removed(desk: Desk) -> None:
+    assert desk.commit(BLOCKS).ok
+    assert desk.commit({(0, 1): META}).ok
+    assert set(desk.flash.blocks) == {(0, 1), SECURITY}
+
+
+def test_a_listed_block_may_be_stored_already(desk: Desk) -> None:
+    assert desk.commit(BLOCKS).ok
+    desk.stage(SECURITY, desk.signed(BLOCKS))
+    assert desk.sealed(update_teds(0, 128)).ok
+    assert desk.flash.sequence == 2
+
+
+def high_s(teds: bytes) -> bytes:
+    shown = security.decode(teds)
+    assert shown.signature is not None
+    s = GROUP_ORDER - int.from_bytes(shown.signature[32:], "big")
+    return shown.with_signature(shown.signature[:32] + s.to_bytes(32, "big")).encode()
+
+
+def resigned(desk: Desk, **changes: object) -> bytes:
+    """Change fields and sign again, rightly."""
+    shown = replace(security.decode(desk.signed(BLOCKS)), **changes)
+    return shown.with_signature(STATION.sign(security.tbs(UUID, shown.encode()))).encode()
+
+
+def test_every_refusal_of_the_commit(desk: Desk) -> None:
+    other = SoftwareKey(23)
+    certified_by_other = SoftwareKey(29).sign(station_key_message(STATION.point))
+    wrong = {**BLOCKS, (1, 12): frame(bytes.fromhex("0304000c0101040100050161"))}
+    cases: list[tuple[bytes, Reason]] = [
+        (desk.signed(BLOCKS)[:-1] + b"\0", Reason.BAD_FORM),
+        (desk.flash.security_teds(), Reason.BAD_FORM),
+        (frame(b"\x03\x04\0\x80\1\1"), Reason.BAD_FORM),
+        (resigned(desk, values={**security.OUR_VALUES, 4: 0}), Reason.BAD_FORM),
+        (resigned(desk, values={**security.OUR_VALUES, 109: 2}), Reason.BAD_FORM),
+        (resigned(desk, node_key=other.point), Reason.BAD_SIGNATURE),
+        (resigned(desk, node_key_signature=bytes(64)), Reason.BAD_SIGNATURE),
+        (resigned(desk, station_key_signature=certified_by_other), Reason.BAD_SIGNATURE),
+        (resigned(desk, station_key=other.point), Reason.BAD_SIGNATURE),
+        (security.decode(desk.signed(BLOCKS)).with_signature(bytes(64)).encode(), Reason.BAD_SIGNATURE),
+        (high_s(desk.signed(BLOCKS)), Reason.BAD_SIGNATURE),
+        (desk.signed(wrong), Reason.DIGEST_MISMATCH),
+        (desk.signed({(0, 1): META}), Reason.DIGEST_MISMATCH),
+        (desk.signed({**BLOCKS, (1, 3): NAME}), Reason.DIGEST_MISMATCH),
+        (desk.signed(BLOCKS, sequence=0), Reason.STALE_SEQUENCE),
+        (desk.signed(BLOCKS, sequence=65537), Reason.STALE_SEQUENCE),
+        (desk.signed(BLOCKS, key_epoch=0), Reason.WRONG_EPOCH),
+        (desk.signed(BLOCKS, key_epoch=2), Reason.WRONG_EPOCH),
+    ]
+    for teds, reason in cases:
+        assert desk.commit(BLOCKS, teds) == refusal(reason)
+        assert desk.flash.blocks == {}, "a refusal changes nothing"
+    assert desk.commit(BLOCKS, desk.signed(BLOCKS, sequence=65536)).ok
+
+
+def test_a_meta_teds_of_another_node_gets_9_but_a_2024_uuid_is_not_compared(desk: Desk) -> None:
+    foreign = frame(bytes.fromhex("030400010101040a") + bytes(10) + bytes.fromhex("0a043f8000000c043f0000000d020001"))
+    assert desk.commit({(0, 1): foreign}) == refusal(Reason.WRONG_UUID)
+    new_form = frame(bytes.fromhex("030500ff0102010410") + bytes(16))
+    assert desk.commit({(0, 1): new_form}).ok
+
+
+def test_extra_fields_are_covered_by_the_signature(desk: Desk) -> None:
+    assert desk.commit(BLOCKS, resigned(desk, extra={111: b"ours", 255: b""})).ok
+
+
+def test_any_certified_station_may_write(desk: Desk) -> None:
+    second = SoftwareKey(31)
+    shown = replace(
+        security.decode(desk.signed(BLOCKS)),
+        station_key=second.point,
+        station_key_signature=CA.sign(station_key_message(second.point)),
+    )
+    signed = shown.with_signature(second.sign(security.tbs(UUID, shown.encode()))).encode()
+    assert desk.commit(BLOCKS, signed).ok
+
+
+@pytest.mark.parametrize("when", ["die_before", "die_after"])
+def test_power_cut_in_the_commit_leaves_all_old_or_all_new(desk: Desk, when: str) -> None:
+    assert desk.commit(BLOCKS).ok
+    old = dict(desk.flash.blocks)
+    new = {(0, 1): META}
+    setattr(desk.memory, when, True)
+    with pytest.raises(PowerCut):
+        desk.commit(new)
+    assert set(desk.flash.blocks) == (set(old) if when == "die_before" else {(0, 1), SECURITY})
+    desk.memory.die_before = desk.memory.die_after = False
+    desk.restart()
+    assert desk.tim.flash == desk.flash
+
+
+def test_every_flipped_octet_of_a_signed_teds_is_refused(desk: Desk) -> None:
+    good = desk.signed({(0, 1): META})
+    desk.stage((0, 1), META)
+    for at in range(len(good)):
+        body = bytearray(good[4:-2]) if 4 <= at < len(good) - 2 else None
+        flipped = bytearray(good)
+        if body is not None:  # with a right checksum, so that only canonical form and signatures can catch it
+            body[at - 4] ^= 1
+            flipped = bytearray(frame(bytes(body)))
+        else:
+            flipped[at] ^= 1
+        desk.stage(SECURITY, bytes(flipped))
+        assert not desk.sealed(update_teds(0, 128)).ok, f"octet {at}"
+
+
+@settings(max_examples=200, deadline=None)
+@given(octets=st.binary(max_size=80), link=st.sampled_from(["nfc", "can:f1"]), keyed=st.booleans())
+def test_any_octets_get_a_reply_and_never_an_exception(octets: bytes, link: str, keyed: bool) -> None:
+    desk = Desk().agree() if keyed else Desk()
+    before = desk.flash.blocks
+    desk.raw(octets, link=link, tapped=link == "nfc")
+    desk.raw(b"\0\0" + octets, link=link, tapped=True)
+    assert desk.flash.blocks == before
+
+
+def test_digest_is_over_the_whole_teds() -> None:
+    assert security.decode(Desk().signed({(0, 1): META})).signed_blocks == {(0, 1): digest(META)}
