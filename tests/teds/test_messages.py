@@ -179,7 +179,7 @@ def test_composing_names_the_argument_at_fault():
         compose_command(1, 1, 1, {"access_code": 300})
     with pytest.raises(BadData, match="'colour'"):
         compose_command(1, 1, 1, {"access_code": 3, "colour": 1})
-    with pytest.raises(BadData, match="no command 1.99"):
+    with pytest.raises(BadData, match=r"no command 1\.99"):
         compose_command(1, 1, 99)
 
 

@@ -1,0 +1,187 @@
+"""TEDS in files: told apart, read and written in every format that is known here.
+
+==========  =======================================  ==========================================================
+kind        what                                     holds
+==========  =======================================  ==========================================================
+binary      octets, one TEDS after the other         octets; no channels
+hex         hex digits with comments                 everything
+ihex        Intel HEX                                octets; no channels
+json        field tree with names (``teds/1``)       everything
+xml         the same as XML (``schema/teds-1.xsd``)  everything
+image       all TEDS of one node (``teds-image/1``)  framed TEDS with channels; needs a Meta-TEDS with the UUID
+toml        profile of a transducer type             what a type has: see :func:`lost`
+==========  =======================================  ==========================================================
+
+A sealed handover ``bundle`` is told apart, but holds no TEDS that could be read here.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Final, Literal, get_args
+
+from teds_provision.errors import BadData
+from teds_provision.teds.formats.block import MAX_FILE, Block, class_of, is_run, split_run, with_class
+
+__all__ = ["FORMATS", "Block", "Format", "Kind", "class_of", "detect", "lost", "read_blocks", "write_blocks"]
+
+Format = Literal["binary", "hex", "ihex", "json", "xml", "image", "toml"]
+Kind = Literal["binary", "hex", "ihex", "json", "xml", "image", "toml", "bundle"]
+FORMATS: Final[tuple[str, ...]] = get_args(Format)
+_CONTROL: Final = re.compile(r"[\x00-\x08\x0b\x0e-\x1f]")
+
+
+def detect(octets: bytes) -> Kind:
+    """What a file holds, by its content alone; whatever is no text is binary. Raises BadData for an empty file."""
+    if not octets:
+        raise BadData("The file is empty.")
+    text = _text(octets)
+    if text is None:
+        return "binary"
+    stripped = text.lstrip()
+    if stripped.startswith("<"):
+        return "xml"
+    if stripped.startswith("{"):
+        return _json_kind(text)
+    if stripped.startswith(":"):
+        return "ihex"
+    from teds_provision.teds.formats.hextext import looks_like_hex
+
+    if looks_like_hex(text):
+        return "hex"
+    return "toml" if "=" in text or stripped.startswith("[") else "hex"
+
+
+def _text(octets: bytes) -> str | None:
+    """Text of a file, None where it holds control characters or is no UTF-8."""
+    try:
+        text = octets[:MAX_FILE].decode("utf-8-sig")
+    except UnicodeDecodeError:
+        return None
+    return None if _CONTROL.search(text) else text
+
+
+def _json_kind(text: str) -> Kind:
+    import json
+
+    try:
+        data = json.loads(text)
+    except (ValueError, RecursionError):
+        return "json"
+    if isinstance(data, dict) and data.get("format") == "teds-image/1":
+        return "image"
+    return "bundle" if isinstance(data, dict) and "ciphertext" in data else "json"
+
+
+def read_blocks(octets: bytes, kind: Kind | None = None, *, path: Path | None = None) -> list[Block]:
+    """TEDS of a file as (channel or None, access code or None, octets).
+
+    ``path`` is where a profile lies, so that what it extends is found beside it. Raises BadData for a file that does
+    not hold what its kind says, with the place of the fault. Octets that make no TEDS are no fault here: decoding them
+    gives the findings.
+    """
+    if len(octets) > MAX_FILE:
+        raise BadData(f"The file has {len(octets)} octets; at most {MAX_FILE} are read.")
+    kind = kind or detect(octets)
+    if kind == "binary":
+        return [with_class(piece) for piece in split_run(octets)]
+    if kind == "xml":
+        from teds_provision.teds.formats.xmlform import read_xml
+
+        return read_xml(octets)
+    try:
+        text = octets.decode("utf-8-sig")
+    except UnicodeDecodeError as error:
+        raise BadData(f"Octet {error.start} of the file is no UTF-8 text.") from error
+    return _read_text(text, kind, path)
+
+
+def _read_text(text: str, kind: Kind, path: Path | None) -> list[Block]:
+    if kind == "hex":
+        from teds_provision.teds.formats.hextext import read_hex
+
+        return read_hex(text)
+    if kind == "ihex":
+        from teds_provision.teds.formats.intelhex import read_intel_hex
+
+        return read_intel_hex(text)
+    if kind == "json":
+        from teds_provision.teds.formats.jsonform import read_json
+
+        return read_json(text)
+    if kind == "image":
+        from teds_provision.teds.image import Image
+
+        image = Image.from_json(text)
+        return [Block(channel, code, image.blocks[channel, code]) for channel, code in image]
+    if kind == "toml":
+        from teds_provision.teds.formats.profileform import read_profile
+
+        return read_profile(text, path)
+    raise BadData("A sealed bundle holds keys for other stations, no TEDS that can be read here.")
+
+
+def write_blocks(blocks: Sequence[Block], format: Format) -> bytes | str:
+    """Write TEDS: octets for binary, text for every other format; :func:`lost` says what the format cannot hold.
+
+    Raises BadData where nothing sensible can be written: several TEDS that would run into each other in a binary file,
+    an image of a node without UUID.
+    """
+    if format == "binary":
+        if len(blocks) > 1 and not is_run(blocks):
+            raise BadData(
+                "Several TEDS stand in one binary file only if each has a right Length and checksum.",
+                hint="Use hex, json or xml.",
+            )
+        return b"".join(block.octets for block in blocks)
+    if format == "hex":
+        from teds_provision.teds.formats.hextext import write_hex
+
+        return write_hex(blocks)
+    if format == "ihex":
+        from teds_provision.teds.formats.intelhex import write_intel_hex
+
+        return write_intel_hex(blocks)
+    if format == "json":
+        from teds_provision.teds.formats.jsonform import write_json
+
+        return write_json(blocks)
+    if format == "xml":
+        from teds_provision.teds.formats.xmlform import write_xml
+
+        return write_xml(blocks)
+    if format == "image":
+        return _image(blocks)
+    from teds_provision.teds.formats.profileform import write_profile
+
+    return write_profile(blocks)[0]
+
+
+def lost(blocks: Sequence[Block], format: Format) -> tuple[str, ...]:
+    """What the format cannot hold of these TEDS, one sentence each; empty where writing loses nothing."""
+    if format == "toml":
+        from teds_provision.teds.formats.profileform import write_profile
+
+        return write_profile(blocks)[1]
+    if format in {"binary", "ihex"} and any(block.channel is not None for block in blocks):
+        return ("the channels of the TEDS.",)
+    return ()
+
+
+def _image(blocks: Sequence[Block]) -> str:
+    from teds_provision.teds import decode
+    from teds_provision.teds.image import Image
+
+    placed: dict[tuple[int, int], bytes] = {}
+    for channel, code, octets in blocks:
+        if channel is None or code is None:
+            raise BadData("An image holds TEDS with channel and access code.", hint="Use hex, json or xml.")
+        if (channel, code) in placed:
+            raise BadData(f"Two TEDS stand at channel {channel}, access code {code}; an image holds one of each.")
+        placed[channel, code] = octets
+    uuid = decode(placed[0, 1]).get("UUID") if (0, 1) in placed else None
+    if not isinstance(uuid, bytes) or len(uuid) != 10:
+        raise BadData("An image needs a Meta-TEDS on channel 0 with a UUID of 10 octets.", hint="Use hex, json or xml.")
+    return Image(uuid, placed).to_json()

@@ -1,0 +1,109 @@
+"""Intel HEX (hexadecimal object file format, Intel 1988, record types 00 to 05), as flash tools read and write it.
+
+Each run of octets without a gap is one stretch. Ours begins a new stretch for every TEDS, with at least one octet of
+gap, at addresses that are multiples of 16; a stretch that holds several framed TEDS is cut apart when read.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from typing import Final
+
+from teds_provision.errors import BadData
+from teds_provision.teds.formats.block import Block, split_run, with_class
+
+DATA, END, SEGMENT_BASE, SEGMENT_START, LINEAR_BASE, LINEAR_START = range(6)
+_RECORD: Final = 16
+_ALIGNED: Final = 16
+_LENGTHS: Final = {END: 0, SEGMENT_BASE: 2, SEGMENT_START: 4, LINEAR_BASE: 2, LINEAR_START: 4}
+
+
+def read_intel_hex(text: str) -> list[Block]:
+    """Read the TEDS of an Intel HEX text, by address; raises BadData naming the line."""
+    return [with_class(piece) for _, octets in stretches(text) for piece in split_run(octets)]
+
+
+def stretches(text: str) -> list[tuple[int, bytes]]:
+    """Runs of octets without a gap as (address, octets), ascending; raises BadData where records overlap."""
+    pieces: list[tuple[int, bytes]] = []
+    base = 0
+    ended = False
+    for number, line in enumerate(text.splitlines(), 1):
+        if not line.strip():
+            continue
+        if ended:
+            raise BadData(f"Line {number} stands behind the end record.")
+        kind, address, data = _record(line.strip(), number)
+        if kind == DATA:
+            pieces += _place(base, address, data)
+        elif kind in {SEGMENT_BASE, LINEAR_BASE}:
+            base = int.from_bytes(data, "big") << (4 if kind == SEGMENT_BASE else 16)
+        ended = kind == END
+    if not ended:
+        raise BadData("The Intel HEX text has no end record (:00000001FF): it was cut off.")
+    return _joined(sorted(pieces))
+
+
+def _place(base: int, address: int, data: bytes) -> Iterator[tuple[int, bytes]]:
+    """Addresses wrap at 64 KiB within a record."""
+    here = 0x10000 - address
+    yield base + address, data[:here]
+    if data[here:]:
+        yield base, data[here:]
+
+
+def _record(line: str, number: int) -> tuple[int, int, bytes]:
+    if not line.startswith(":"):
+        raise BadData(f"Line {number} does not begin with a colon.")
+    try:
+        octets = bytes.fromhex(line[1:])
+    except ValueError as error:
+        raise BadData(f"Line {number} holds something that is no hex digit.") from error
+    if len(octets) < 5 or octets[0] != len(octets) - 5:
+        raise BadData(f"Line {number} does not have the length that it says.")
+    if sum(octets) & 0xFF:
+        raise BadData(f"The checksum of line {number} is wrong.")
+    kind, data = octets[3], octets[4:-1]
+    if kind > LINEAR_START or _LENGTHS.get(kind, len(data)) != len(data):
+        raise BadData(f"Line {number} holds a record of type {kind} with {len(data)} octets, which is none.")
+    return kind, int.from_bytes(octets[1:3], "big"), data
+
+
+def _joined(pieces: list[tuple[int, bytes]]) -> list[tuple[int, bytes]]:
+    runs: list[tuple[int, list[bytes]]] = []
+    end = -1
+    for address, data in pieces:
+        if not data:
+            continue
+        if address < end:
+            raise BadData(f"Two records of the Intel HEX text overlap at address {address:08X}.")
+        if address != end:
+            runs.append((address, []))
+        runs[-1][1].append(data)
+        end = address + len(data)
+    return [(address, b"".join(parts)) for address, parts in runs]
+
+
+def write_intel_hex(blocks: Sequence[Block], *, address: int = 0) -> str:
+    """Write each TEDS as a stretch of its own, from ``address`` on; channels are lost."""
+    lines: list[str] = []
+    at, high = address, 0
+    for block in blocks:
+        octets = block.octets
+        if at + len(octets) > 1 << 32:
+            raise BadData("Intel HEX ends at address FFFFFFFF; these TEDS do not fit.")
+        done = 0
+        while done < len(octets):
+            if at >> 16 != high:
+                high = at >> 16
+                lines.append(_line(LINEAR_BASE, 0, high.to_bytes(2, "big")))
+            take = min(_RECORD, len(octets) - done, 0x10000 - (at & 0xFFFF))
+            lines.append(_line(DATA, at & 0xFFFF, octets[done : done + take]))
+            done, at = done + take, at + take
+        at = (at // _ALIGNED + 1) * _ALIGNED
+    return "\n".join([*lines, _line(END, 0, b"")]) + "\n"
+
+
+def _line(kind: int, address: int, data: bytes) -> str:
+    octets = bytes([len(data)]) + address.to_bytes(2, "big") + bytes([kind]) + data
+    return f":{octets.hex().upper()}{-sum(octets) & 0xFF:02X}"
