@@ -193,6 +193,8 @@ def calibrations(draw: st.DrawFn) -> Calibration:
         uncertainty=draw(number),
         date=draw(st.none() | moment),
         interval=draw(st.none() | st.integers(0, 2**32 - 1).map(float)),
+        monotone=draw(st.sampled_from([None, "increasing", "decreasing", "either"])),
+        raw_range=draw(st.none() | st.just((0.0, 4095.0))),
     )
 
 

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from datetime import UTC, datetime, timedelta
 
 from teds_provision.errors import BadData
-from teds_provision.teds.calibration.model import METHODS, Calibration, CalibrationInput, Method
+from teds_provision.teds.calibration.model import METHODS, MONOTONE, Calibration, CalibrationInput, Method, Monotone
 from teds_provision.teds.image import BlockId
 from teds_provision.teds.model import Decoded, Field, TimeInstance, Units
 from teds_provision.teds.units import WrittenUnit, recognize
@@ -44,7 +44,19 @@ def from_decoded(
         date=_date(_top(decoded, "LstCalDt")),
         interval=_seconds(_top(decoded, "CalInrvl")),
         actuator=actuator,
+        monotone=_monotone(_top(decoded, "Monotone")),
+        raw_range=_raw_range(_top(decoded, "RawRange")),
     )
+
+
+def _monotone(code: object) -> Monotone | None:
+    return MONOTONE[code - 1] if isinstance(code, int) and 1 <= code <= len(MONOTONE) else None
+
+
+def _raw_range(value: object) -> tuple[float, float] | None:
+    if isinstance(value, tuple) and len(value) == 2 and value[0] < value[1]:
+        return float(value[0]), float(value[1])
+    return None
 
 
 def calibrations_of(blocks: Mapping[BlockId, bytes]) -> dict[int, Calibration]:

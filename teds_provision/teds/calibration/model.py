@@ -26,8 +26,11 @@ if TYPE_CHECKING:
     from teds_provision.teds.calibration.fitting import Residuals
 
 Method = Literal["linear", "polynomial", "table", "steps"]
+Monotone = Literal["increasing", "decreasing", "either"]
 METHODS: Final[tuple[Method, ...]] = ("linear", "polynomial", "table", "steps")
 """Names of the codes of field 135 (house profile), in order."""
+MONOTONE: Final[tuple[Monotone, ...]] = ("increasing", "decreasing", "either")
+"""Names of the codes 1 to 3 of field 137 (house profile)."""
 
 PLAIN: Final = parse_unit("1")
 _Value = TypeVar("_Value")
@@ -87,7 +90,9 @@ class Calibration:
 
     ``unit`` is the calibrated unit with its way into SI (SIConvrt); limits, uncertainty and zero offset are in it. For
     an actuator the formula runs from calibrated units to raw, and the zero offset is raw. ``points`` are the
-    (raw, value) pairs that it was fitted to; they do not go into the TEDS. ``interval`` is in seconds.
+    (raw, value) pairs that it was fitted to; they do not go into the TEDS. ``interval`` is in seconds. ``monotone`` and
+    ``raw_range`` are what the transducer type demands and delivers, carried along so that the guard knows them without
+    the profile.
     """
 
     channel: int
@@ -104,6 +109,8 @@ class Calibration:
     actuator: bool = False
     points: tuple[tuple[float, float], ...] = ()
     by: str = ""
+    monotone: Monotone | None = None
+    raw_range: tuple[float, float] | None = None
 
     def __post_init__(self) -> None:
         if not self.inputs:
@@ -116,6 +123,8 @@ class Calibration:
                 f"{cells} cells of {each} need {cells * each}."
             )
         object.__setattr__(self, "coefficients", float32(self.coefficients, "Coefficients"))
+        if self.raw_range:
+            object.__setattr__(self, "raw_range", float32(self.raw_range, "RawRange"))
         for name in ("zero_offset", "low_limit", "high_limit", "uncertainty"):
             value = getattr(self, name)
             if value is not None:
@@ -211,6 +220,10 @@ class Calibration:
         out.append(("Method", METHODS.index(self.method)))
         if self.zero_offset:
             out.append(("ZeroOffset", self.zero_offset))
+        if self.monotone:
+            out.append(("Monotone", 1 + MONOTONE.index(self.monotone)))
+        if self.raw_range:
+            out.append(("RawRange", self.raw_range))
         return out
 
 

@@ -82,6 +82,8 @@ def calibration_of(order: Order, channel: ChannelProfile) -> Calibration:
         date=_date(order),
         interval=_interval(order, channel),
         by=str(by) if by is not None else "",
+        monotone=channel.calibration.monotone,
+        raw_range=channel.calibration.raw_range,
     )
 
 

@@ -1,0 +1,345 @@
+"""The guard refuses what has hurt robots before, and lets through what is right."""
+
+from __future__ import annotations
+
+import struct
+import time
+from dataclasses import replace
+from datetime import UTC, datetime
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from teds_provision import teds
+from teds_provision.teds.calibration import Calibration, CalibrationInput, fit, read_calibrations
+from teds_provision.teds.frame import frame, unframe
+from teds_provision.teds.guard import GuardFinding, check_calibration
+from teds_provision.teds.image import BlockId
+from teds_provision.teds.profile import Profile, load_profile, shipped_profiles
+from teds_provision.teds.units import parse_unit
+
+UUID = bytes(10)
+Blocks = dict[BlockId, bytes]
+
+
+@pytest.fixture(scope="module")
+def magnetic() -> Profile:
+    return load_profile("magnetic-angular-position-sensor", [shipped_profiles()])
+
+
+@pytest.fixture(scope="module")
+def tactile() -> Profile:
+    return load_profile("tactile-finger-sensor", [shipped_profiles()])
+
+
+def angle_table(points: int = 1025, *, gain: float = 1.0) -> Calibration:
+    raw = np.linspace(0, 65535, points)
+    value = gain * 360 * raw / 65535 + 0.4 * np.sin(raw / 65535 * 2 * np.pi)
+    table = fit(list(zip(raw.tolist(), value.tolist(), strict=True)), "table", channel=1)
+    return replace(table, unit=parse_unit("degree"))
+
+
+def force_line(intercept: float = 0.0, slope: float = 10 / 65535, **more: object) -> Calibration:
+    part = CalibrationInput(1, 1, (0, 65535), (0,))
+    return Calibration(1, "linear", (part,), (intercept, slope), unit=parse_unit("N"), **more)  # type: ignore[arg-type]
+
+
+def built(profile: Profile, calibration: Calibration, channel: int = 1) -> Blocks:
+    return profile.build(UUID, calibration={channel: calibration}).blocks
+
+
+def codes(findings: list[GuardFinding], severity: str = "error") -> set[str]:
+    return {finding.code for finding in findings if finding.severity == severity}
+
+
+def text(findings: list[GuardFinding], code: str) -> str:
+    return next(finding.message for finding in findings if finding.code == code)
+
+
+def test_a_right_calibration_has_no_finding(magnetic: Profile, tactile: Profile) -> None:
+    blocks = built(magnetic, angle_table())
+    assert check_calibration(blocks, blocks, magnetic) == []
+    assert check_calibration(blocks) == []
+    line = built(tactile, force_line())
+    assert check_calibration(line, line, tactile) == []
+
+
+def test_every_shipped_profile_takes_a_straight_line_over_its_range() -> None:
+    for name in ("load-cell", "temperature-sensor", "accelerometer", "gripper", "tactile-finger-sensor"):
+        profile = load_profile(name, [shipped_profiles()])
+        calibrations = {}
+        for channel in profile.channels:
+            low, high = channel.unit.from_si(channel.low_limit), channel.unit.from_si(channel.high_limit)
+            assert channel.raw_range is not None
+            pairs = f"{channel.raw_range[0]},{low}\n{channel.raw_range[1]},{high}\n"
+            calibrations |= read_calibrations(
+                f"# channel: {channel.number}\n# method: linear\n{pairs}", "x.csv", profile
+            )
+        blocks = profile.build(UUID, calibration=calibrations).blocks
+        assert check_calibration(blocks, blocks, profile, calibrations=calibrations) == [], name
+        assert check_calibration(blocks) == [], name
+
+
+# --- erased words
+
+
+@pytest.mark.parametrize("word", [b"\xff\xff\xff\xff", b"\x7f\xff\xff\xff", b"\x7f\x80\x00\x00", b"\x00\x00\xff\xff"])
+def test_an_erased_word_among_the_coefficients_is_refused(word: bytes, magnetic: Profile) -> None:
+    blocks = built(magnetic, angle_table())
+    block = bytearray(unframe(blocks[1, 5]))
+    at = block.index(struct.pack(">f", angle_table().coefficients[200]))
+    block[at : at + 4] = word
+    findings = check_calibration({**blocks, (1, 5): frame(bytes(block))}, blocks, magnetic)
+    assert codes(findings) == {"erased"}
+    assert "coefficient 201 of 2048 (segment 101)" in text(findings, "erased")
+
+
+@pytest.mark.parametrize("octets", [b"\xff" * 300, bytes(300), b""])
+def test_erased_flash_instead_of_a_teds_is_refused(octets: bytes, magnetic: Profile) -> None:
+    blocks = built(magnetic, angle_table())
+    assert codes(check_calibration({**blocks, (1, 5): octets}, None, magnetic)) == {"erased"}
+
+
+def test_all_zero_coefficients_are_refused(tactile: Profile) -> None:
+    findings = check_calibration(built(tactile, force_line(0.0, 0.0)), None, tactile)
+    assert "erased" in codes(findings)
+
+
+def test_an_erased_limit_or_offset_is_refused(tactile: Profile) -> None:
+    line = replace(force_line(), zero_offset=float("nan"))
+    assert codes(check_calibration(built(tactile, line), None, tactile)) == {"erased"}
+
+
+def test_a_damaged_teds_is_refused(magnetic: Profile) -> None:
+    blocks = built(magnetic, angle_table(5))
+    octets = bytearray(blocks[1, 5])
+    octets[20] ^= 1
+    assert codes(check_calibration({**blocks, (1, 5): bytes(octets)}, None, magnetic)) == {"unreadable"}
+
+
+def test_coefficients_that_do_not_fit_their_segments_are_refused(tactile: Profile) -> None:
+    blocks = built(tactile, force_line())
+    fields = [pair for pair in force_line().fields() if pair[0] != "Coefs"]
+    for coefficients in ((1.0,), ()):
+        octets = teds.compose(5, [*fields, ("Coefs", coefficients)])
+        assert codes(check_calibration({**blocks, (1, 5): octets}, None, tactile)) == {"inconsistent"}
+
+
+def test_boundaries_that_do_not_ascend_are_refused(tactile: Profile) -> None:
+    part = CalibrationInput(1, 1, (0, 40000, 30000), (0, 40000))
+    line = Calibration(1, "table", (part,), (0.0, 1e-4, 4.0, 1e-4), unit=parse_unit("N"))
+    assert codes(check_calibration(built(tactile, line), None, tactile)) == {"inconsistent"}
+
+
+def test_a_calibration_of_another_kind_is_not_judged_but_said(tactile: Profile) -> None:
+    blocks = built(tactile, force_line())
+    findings = check_calibration({**blocks, (1, 5): teds.compose(5, [("LinOnly", (0.0, 1.0))])}, None, tactile)
+    assert (codes(findings), codes(findings, "warning")) == (set(), {"unknown"})
+
+
+# --- sign, slope, gain and offset
+
+
+def test_a_reversed_slope_is_refused_against_what_the_node_has(tactile: Profile) -> None:
+    reversed_line = force_line(10.0, -10 / 65535)
+    findings = check_calibration(built(tactile, reversed_line), built(tactile, force_line()))
+    assert codes(findings) == {"reversed"}
+    assert "falls by 10 N from raw 0 to raw 65535; with what the node has now it rose by 10 N" in text(
+        findings, "reversed"
+    )
+
+
+def test_a_reversed_slope_is_refused_against_the_profile_alone(tactile: Profile) -> None:
+    findings = check_calibration(built(tactile, force_line(10.0, -10 / 65535)), None, tactile)
+    assert codes(findings) == {"reversed"}
+
+
+def test_a_reversed_slope_is_refused_by_what_the_teds_itself_carries(tactile: Profile) -> None:
+    text_ = "# channel: 1\n# method: linear\n0,10\n65535,0\n"
+    calibration = read_calibrations(text_, "x.csv", tactile)[1]
+    assert codes(check_calibration(built(tactile, calibration))) == {"reversed"}
+
+
+def test_a_reversed_sign_is_refused(tactile: Profile) -> None:
+    findings = check_calibration(built(tactile, force_line(-0.05, -10 / 65535)), built(tactile, force_line(0.05)))
+    assert {"reversed", "limits"} <= codes(findings)
+
+
+def test_gain_and_offset_exchanged_are_refused() -> None:
+    profile = load_profile("load-cell", [shipped_profiles()])
+    part = CalibrationInput(1, 1, (4_194_304, 12_582_912), (8_388_608,))
+    right = Calibration(1, "linear", (part,), (0.3, 500 / 4_194_304), unit=parse_unit("N"))
+    wrong = replace(right, coefficients=right.coefficients[::-1])
+    findings = check_calibration(built(profile, wrong), built(profile, right), profile)
+    assert "swapped" in codes(findings)
+    again = check_calibration(built(profile, right), built(profile, right), profile)
+    assert codes(again) == set()
+
+
+def test_gain_and_offset_exchanged_in_a_whole_table_are_refused(magnetic: Profile) -> None:
+    right = angle_table(17)
+    flipped = [right.coefficients[n ^ 1] for n in range(len(right.coefficients))]
+    findings = check_calibration(built(magnetic, replace(right, coefficients=tuple(flipped))), built(magnetic, right))
+    assert "swapped" in codes(findings)
+
+
+def test_a_gain_of_zero_is_refused(tactile: Profile) -> None:
+    assert codes(check_calibration(built(tactile, force_line(5.0, 0.0)), None, tactile)) == {"flat"}
+
+
+# --- monotone
+
+
+def bent_table() -> Calibration:
+    table = angle_table(1025)
+    points = [(raw, value - (3.0 if 30000 < raw < 30100 else 0.0)) for raw, value in table.points]
+    return replace(fit(points, "table", channel=1), unit=parse_unit("degree"))
+
+
+def test_a_table_that_must_be_monotone_and_is_not_is_refused(magnetic: Profile) -> None:
+    findings = check_calibration(built(magnetic, bent_table()), None, magnetic)
+    assert codes(findings) == {"not-monotone"}
+    assert "its type says that it must be increasing" in text(findings, "not-monotone")
+    assert "°" in text(findings, "not-monotone")
+
+
+def test_from_the_teds_alone_what_the_node_has_now_says_what_is_expected(magnetic: Profile) -> None:
+    findings = check_calibration(built(magnetic, bent_table()), built(magnetic, angle_table()))
+    assert codes(findings) == {"not-monotone"}
+    alone = check_calibration(built(magnetic, bent_table()))
+    assert (codes(alone), codes(alone, "warning")) == (set(), {"not-monotone"})
+    carried = check_calibration(built(magnetic, replace(bent_table(), monotone="increasing")))
+    assert codes(carried) == {"not-monotone"}
+
+
+def test_a_polynomial_that_turns_back_outside_its_points_is_refused(tactile: Profile) -> None:
+    points = [(raw, 10 * (raw / 40000) ** 0.5) for raw in range(0, 40001, 2000)]
+    cubic = replace(fit(points, "polynomial", channel=1, degree=2), unit=parse_unit("N"))
+    findings = check_calibration(built(tactile, cubic), None, tactile)
+    assert codes(findings) & {"not-monotone", "reversed"}
+
+
+# --- limits and residuals
+
+
+def test_results_beyond_the_limits_are_refused_over_the_whole_raw_range(tactile: Profile) -> None:
+    findings = check_calibration(built(tactile, force_line(0.0, 12 / 65535)), None, tactile)
+    assert codes(findings) == {"limits"}
+    assert text(findings, "limits") == (
+        "raw 65535 gives 12 N, 2 N above the high limit of 10 N; the stated uncertainty is 0.2 N."
+    )
+    inside = check_calibration(built(tactile, force_line(0.0, 10.19 / 65535)), None, tactile)
+    assert codes(inside) == set()
+
+
+def test_extrapolation_counts_and_the_way_out_is_named(tactile: Profile, tmp_path: Path) -> None:
+    narrow = replace(fit([(20000, 0.0), (50000, 10.0)], "linear", channel=1), unit=parse_unit("N"))
+    findings = check_calibration(built(tactile, narrow), None, tactile)
+    assert codes(findings) == {"limits"}
+    assert "covers raw 20000 to 50000" in text(findings, "limits")
+    assert "raw-range" in text(findings, "limits")
+    path = tmp_path / "finger.toml"
+    path.write_text('extends = "tactile-finger-sensor"\n[channel.1-12.calibration]\nraw-range = [20000, 50000]\n')
+    finger = load_profile(path, [shipped_profiles()])
+    blocks = built(finger, replace(narrow, raw_range=(20000, 50000)))
+    assert check_calibration(blocks, None, finger) == []
+    assert check_calibration(blocks) == []
+
+
+def test_the_significant_bits_set_the_raw_range() -> None:
+    profile = load_profile("gripper", [shipped_profiles()])
+    line = replace(fit([(0, 0.0), (4095, 110.0)], "linear", channel=2), unit=parse_unit("mm"))
+    assert check_calibration(built(profile, line, 2), None, profile) == []
+
+
+def test_an_adjusted_zero_of_a_full_turn_is_not_beyond_its_limits(magnetic: Profile) -> None:
+    blocks = built(magnetic, replace(angle_table(), zero_offset=45.0))
+    assert check_calibration(blocks, None, magnetic) == []
+    doubled = built(magnetic, replace(angle_table(gain=2.0), zero_offset=45.0))
+    assert codes(check_calibration(doubled, None, magnetic)) == {"limits"}
+
+
+def test_an_actuator_must_stay_within_its_raw_range() -> None:
+    profile = load_profile("gripper", [shipped_profiles()])
+    good = replace(fit([(0, 0.0), (4095, 110.0)], "linear", channel=1, actuator=True), unit=parse_unit("mm"))
+    assert check_calibration(built(profile, good), None, profile) == []
+    bad = replace(fit([(0, 0.0), (8190, 110.0)], "linear", channel=1, actuator=True), unit=parse_unit("mm"))
+    findings = check_calibration(built(profile, bad), None, profile)
+    assert codes(findings) == {"limits"}
+    assert "110 mm gives raw 8190" in text(findings, "limits")
+
+
+def test_a_fit_whose_residual_exceeds_the_uncertainty_is_refused(tactile: Profile) -> None:
+    points = "0,0\n32768,5.45\n65535,10\n"
+    calibrations = read_calibrations(f"# channel: 1\n# method: linear\n{points}", "x.csv", tactile)
+    blocks = tactile.build(UUID, calibration=calibrations).blocks
+    with_points = check_calibration(blocks, None, tactile, calibrations=calibrations)
+    assert codes(with_points) == {"residual"}
+    assert "misses its point at raw 32768" in text(with_points, "residual")
+    assert codes(check_calibration(blocks)) == {"residual"}
+
+
+def test_a_jump_in_a_table_is_refused(magnetic: Profile) -> None:
+    table = angle_table(101)
+    coefficients = list(table.coefficients)
+    coefficients[2 * 50] += 2.5
+    findings = check_calibration(built(magnetic, replace(table, coefficients=tuple(coefficients))))
+    assert "jump" in codes(findings)
+
+
+def test_a_large_change_and_a_lost_calibration_are_said(tactile: Profile) -> None:
+    findings = check_calibration(built(tactile, force_line(0.0, 8 / 65535)), built(tactile, force_line()), tactile)
+    assert (codes(findings), codes(findings, "warning")) == (set(), {"changed"})
+    assert "up to 2 N (20 % of the range)" in text(findings, "changed")
+    gone = check_calibration(tactile.build(UUID).blocks, built(tactile, force_line()), tactile)
+    assert codes(gone, "warning") == {"removed"}
+
+
+def test_an_overdue_calibration_is_said_where_the_time_is_given(tactile: Profile) -> None:
+    line = force_line(date=datetime(2024, 1, 1, tzinfo=UTC), interval=86400.0 * 365)
+    blocks = built(tactile, line)
+    assert check_calibration(blocks, None, tactile) == []
+    found = check_calibration(blocks, None, tactile, now=datetime(2026, 1, 1, tzinfo=UTC))
+    assert codes(found, "warning") == {"overdue"}
+
+
+# --- several inputs
+
+
+def test_a_calibration_of_two_inputs_is_judged_over_both(tactile: Profile) -> None:
+    temperature = CalibrationInput(2, 1, (0, 65535), (0,))
+    force = CalibrationInput(1, 1, (0, 65535), (0,))
+    gain = 10 / 65535
+    right = Calibration(1, "polynomial", (force, temperature), (0.0, 0.0, gain, 0.0), unit=parse_unit("N"))
+    assert check_calibration(built(tactile, right), None, tactile) == []
+    wrong = replace(right, coefficients=(0.0, 0.0, gain, -2 * gain / 65535))
+    findings = check_calibration(built(tactile, wrong), None, tactile)
+    assert codes(findings) & {"not-monotone", "limits", "reversed"}
+    assert "channel 2 at raw" in " ".join(finding.message for finding in findings)
+
+
+# --- never anything else
+
+
+@settings(max_examples=150)
+@given(data=st.data())
+def test_no_octets_of_a_calibration_raise(data: st.DataObject) -> None:
+    profile = load_profile("tactile-finger-sensor", [shipped_profiles()])
+    blocks = built(profile, force_line())
+    block = bytearray(unframe(blocks[1, 5]))
+    for _ in range(data.draw(st.integers(1, 4))):
+        at = data.draw(st.integers(6, len(block) - 1))
+        block[at] = data.draw(st.integers(0, 255))
+    findings = check_calibration({**blocks, (1, 5): frame(bytes(block))}, blocks, profile)
+    assert all(finding.message.endswith(".") for finding in findings)
+
+
+def test_a_table_of_4000_points_is_judged_in_a_blink(magnetic: Profile) -> None:
+    blocks = built(magnetic, angle_table(4000))
+    check_calibration(blocks, blocks, magnetic)
+    start = time.perf_counter()
+    assert check_calibration(blocks, blocks, magnetic) == []
+    assert time.perf_counter() - start < 1.0
