@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import random
 import signal
+import socket
 import threading
 import time
 from collections.abc import Callable, Iterator
 
 import pytest
 
+from teds_provision.errors import NoNode
 from teds_provision.links import Contact, LinkSettings, Notice, Port, open_port
 
 from .conftest import UUID, Process, StartNode
@@ -156,3 +159,59 @@ def test_the_links_do_not_load_nfcpy_before_a_reader_is_opened() -> None:
 
     code = "import sys, teds_provision.links, teds_provision.links.nfc.poller; assert 'nfc' not in sys.modules"
     subprocess.run([sys.executable, "-c", code], check=True, timeout=30)
+
+
+def test_a_node_that_still_works_for_a_reader_before_asks_the_next_for_time(
+    start_node: StartNode, start: Callable[[str, str], Process], path: str, port: Port
+) -> None:
+    node = start_node(delay=1.5)
+    station = start("stations", f"hold {path}")
+    node.wait_for("request 1")
+    station.kill()  # no RFOFF: the node does not know yet
+    began = time.monotonic()
+    contact = port.find(lambda identity: True, seconds=5, notice=lambda notice: None)
+    assert time.monotonic() - began > 0.9  # S(WTX) until the command has ended
+    assert contact.identity.epoch == 1
+    assert contact.link.exchange(b"abcd") == b"\x01dcba"
+
+
+def test_nonsense_from_the_other_side_is_no_node(path: str, port: Port) -> None:
+    rng = random.Random(1451)
+    stop = threading.Event()
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as other:
+        other.bind(("127.0.0.1", int(path.rsplit(":", 1)[1])))
+        other.settimeout(0.1)
+
+        def babble() -> None:
+            while not stop.is_set():
+                try:
+                    _, address = other.recvfrom(2048)
+                except TimeoutError:
+                    continue
+                octets = rng.randbytes(rng.choice((0, 1, 2, 5, 16, 40)))
+                frames = (octets, b"\x44\x00", b"\x08\x01\x02\x03\x08", b"\x20", b"\x00", b"\x06\x78\x80\xb0\x02\x00")
+                good = [b"106A " + frame.hex().encode() for frame in frames]
+                other.sendto(rng.choice([octets, b"106A", b"106A zz", b"\xff 00", *good * 3]), address)
+
+        thread = threading.Thread(target=babble)
+        thread.start()
+        try:
+            with pytest.raises(NoNode):
+                port.find(lambda identity: True, seconds=4, notice=lambda notice: None)
+        finally:
+            stop.set()
+            thread.join()
+
+
+@pytest.mark.parametrize("tag", ["4", "2"])
+def test_a_node_serves_after_any_nonsense(start_node: StartNode, path: str, port: Port, tag: str) -> None:
+    start_node(tag=tag)
+    rng = random.Random(1588)
+    starts = [b"\x26", b"\x93\x20", b"\xe0\x80", b"\x02", b"\x03", b"\xb2", b"\xa2", b"\x30\x04", b"\xc2"]
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as reader:
+        for _ in range(400):
+            octets = rng.choice(starts) + rng.randbytes(rng.choice((0, 1, 4, 30)))
+            datagram = rng.choice([b"106A " + octets.hex().encode(), octets, b"106A ", b"106A 0", b"212F 00", b""])
+            reader.sendto(datagram, ("127.0.0.1", int(path.rsplit(":", 1)[1])))
+    contact = port.find(lambda identity: True, seconds=5, notice=lambda notice: None)
+    assert contact.link.exchange(b"abcd") == b"\x01dcba"
