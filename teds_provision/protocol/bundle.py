@@ -256,7 +256,7 @@ def _from_json(payload: dict[str, Any]) -> Bundle:
         expires=members.time("expires"),
         mode=cast(Mode, mode),
         ca=point_of(members.get("ca"), "The bundle's CA key"),
-        nodes=tuple(_node_from_json(node, f"Node {at} of the bundle") for at, node in enumerate(nodes, 1)),
+        nodes=tuple(_node_from_json(node, number) for number, node in enumerate(nodes, 1)),
         station_signatures=_signatures(members.get("station_signatures")),
         revoked=tuple(_statement(text) for text in members.list_of("revoked", required=False)),
     )
@@ -264,14 +264,21 @@ def _from_json(payload: dict[str, Any]) -> Bundle:
     return bundle
 
 
-def _node_from_json(node: object, where: str) -> BundledNode:
-    members = Members(node, where)
-    key, kid = link_key_of(members.get("key"), f"{where}: its link key")
+def _node_from_json(node: object, number: int) -> BundledNode:
+    """Read one node; a complaint names it by its place, counted from 1."""
+    try:
+        return _read_node(Members(node, "It"))
+    except (BadData, NotAuthentic) as error:
+        raise type(error)(f"Node {number} of the bundle cannot be taken. {error.message}") from error
+
+
+def _read_node(members: Members) -> BundledNode:
+    key, kid = link_key_of(members.get("key"), "Its link key")
     if kid != key_id(key).hex():
-        raise NotAuthentic(f"{where}: the kid is not that of its link key.")
+        raise NotAuthentic("The kid is not that of its link key.")
     return BundledNode(
         uuid=members.uuid("uuid"),
-        node_key=point_of(members.get("node_public_key"), f"{where}: its public key"),
+        node_key=point_of(members.get("node_public_key"), "Its public key"),
         key=key,
         epoch=members.u32("epoch", first=1),
         sequence=members.u32("sequence"),

@@ -34,10 +34,9 @@ def point_of(jwk: object, what: str) -> bytes:
         raise BadData(f"{what} holds a private or secret key where a public one belongs.")
     if jwk.get("kty") != "EC" or jwk.get("crv") != "P-256":
         raise BadData(f"{what} is not a P-256 key; stations, CAs and nodes have P-256 keys.")
-    x = decode_base64url(jwk.get("x"), f"x of {what}")
-    y = decode_base64url(jwk.get("y"), f"y of {what}")
+    x, y = decode_base64url(jwk.get("x"), what), decode_base64url(jwk.get("y"), what)
     if len(x) != _COORDINATE_OCTETS or len(y) != _COORDINATE_OCTETS:
-        raise BadData(f"The coordinates of {what} are not {_COORDINATE_OCTETS} octets each.")
+        raise BadData(f"{what} has coordinates that are not {_COORDINATE_OCTETS} octets each.")
     if not _on_curve(int.from_bytes(x, "big"), int.from_bytes(y, "big")):
         raise BadData(f"{what} is not a point of the curve P-256.")
     return b"\x04" + x + y

@@ -23,19 +23,19 @@ TAG_OCTETS = 16
 OPEN_OCTETS = 8 + NONCE_OCTETS
 SEALED_HEAD_OCTETS = 4 + TAG_OCTETS
 LAST_COUNTER = 0xFFFFFFFF
-_BLOCK = 16
+BLOCK_OCTETS = 16
 
 
 def pad(octets: bytes) -> bytes:
     """PKCS #7 padding to 16 octets (RFC 5652 section 6.3)."""
-    count = _BLOCK - len(octets) % _BLOCK
+    count = BLOCK_OCTETS - len(octets) % BLOCK_OCTETS
     return octets + bytes([count]) * count
 
 
 def unpad(octets: bytes) -> bytes | None:
     """Take the padding off; None where it is not right."""
     count = octets[-1] if octets else 0
-    if len(octets) % _BLOCK or not 1 <= count <= _BLOCK or octets[-count:] != bytes([count]) * count:
+    if len(octets) % BLOCK_OCTETS or not 1 <= count <= BLOCK_OCTETS or octets[-count:] != bytes([count]) * count:
         return None
     return octets[:-count]
 
@@ -102,7 +102,7 @@ class StationSession:
     def unseal(self, payload: bytes) -> Reply:
         """Open the sealed reply to the last command; raises Garbled or NotAuthentic."""
         assert self._keys is not None, "unseal() before a good accept()"
-        if len(payload) < SEALED_HEAD_OCTETS + _BLOCK or int.from_bytes(payload[:4], "big") != self._counter:
+        if len(payload) < SEALED_HEAD_OCTETS + BLOCK_OCTETS or int.from_bytes(payload[:4], "big") != self._counter:
             raise NotAuthentic("A sealed reply does not belong to the command that was sent.")
         inner = _unseal(self._keys.to_station, payload)
         if inner is None:

@@ -45,8 +45,8 @@ def decode_base64url(text: object, what: str) -> bytes:
 
 
 def dump(value: object) -> bytes:
-    """Return compact JSON in UTF-8."""
-    return json.dumps(value, separators=(",", ":"), ensure_ascii=False, allow_nan=False).encode()
+    """Return compact JSON, in ASCII."""
+    return json.dumps(value, separators=(",", ":"), allow_nan=False).encode("ascii")
 
 
 def load_object(octets: bytes, what: str) -> dict[str, Any]:

@@ -35,7 +35,7 @@ from teds_provision.protocol.frames import (
 )
 from teds_provision.protocol.identity import Identity, NodeState
 from teds_provision.protocol.keys import PrivateKey, prove_message, reset_message, station_key_message, verify
-from teds_provision.protocol.session import LAST_COUNTER, OPEN_OCTETS, SEALED_HEAD_OCTETS, NodeSession
+from teds_provision.protocol.session import BLOCK_OCTETS, LAST_COUNTER, OPEN_OCTETS, SEALED_HEAD_OCTETS, NodeSession
 from teds_provision.protocol.tim_teds import TedsAccess
 
 HALF_OPEN_SECONDS = 60.0
@@ -256,7 +256,7 @@ class Tim:
         return Reply(True, line.half_open.reply)
 
     def _sealed(self, payload: bytes, origin: _Origin) -> Reply:
-        if len(payload) < SEALED_HEAD_OCTETS:
+        if len(payload) < SEALED_HEAD_OCTETS + BLOCK_OCTETS:
             raise Refused(Reason.BAD_FORM)
         line = self._lines[origin.link]
         for session in (line.session, line.half_open):
