@@ -134,11 +134,7 @@ def open_bundle(
     Raises PolicyRefused (not for this station, expired, dated in the future, algorithm), NotAuthentic (unknown sender,
     signature, tag, SIG104, kid of a key) or BadData (form, ranges, count, an UUID twice).
     """
-    signed = jose.decrypt(octets, recipient, cty=CONTENT_TYPE, max_octets=max_octets)
-    verified = jose.verify_compact(signed, trusted, typ=TYPE, max_octets=max_octets)
-    bundle = _from_json(load_object(verified.payload, "The bundle"))
-    if bundle.sender != verified.kid:
-        raise NotAuthentic("The bundle names another sender than the one who signed it.")
+    bundle, sender_key = _opened(octets, recipient, trusted, max_octets)
     if fingerprint(recipient.point) not in bundle.to:
         raise PolicyRefused("The bundle does not name this station as a receiver, though it is sealed to it.")
     if bundle.created > now + CLOCK_TOLERANCE:
@@ -152,7 +148,7 @@ def open_bundle(
     revocations, unknown = open_revocations(bundle.revoked, trusted)
     return OpenedBundle(
         bundle,
-        verified.signer,
+        sender_key,
         hashlib.sha256(octets).hexdigest(),
         _station_signature(bundle, recipient.point),
         revocations,
@@ -171,6 +167,21 @@ def peek_bundle(octets: bytes, *, max_octets: int = MAX_BUNDLE_OCTETS) -> Bundle
         len(octets),
         hashlib.sha256(octets).hexdigest(),
     )
+
+
+def _opened(octets: bytes, recipient: PrivateKey, trusted: FindKey, max_octets: int) -> tuple[Bundle, bytes]:
+    """Unseal, verify and read; each form of the payload is let go as soon as the next one is there."""
+    signed = jose.decrypt(octets, recipient, cty=CONTENT_TYPE, max_octets=max_octets)
+    verified = jose.verify_compact(signed, trusted, typ=TYPE, max_octets=max_octets)
+    del signed
+    kid, signer, payload = verified.kid, verified.signer, verified.payload
+    del verified
+    members = load_object(payload, "The bundle")
+    del payload
+    bundle = _from_json(members)
+    if bundle.sender != kid:
+        raise NotAuthentic("The bundle names another sender than the one who signed it.")
+    return bundle, signer
 
 
 def _check_rules(bundle: Bundle) -> None:

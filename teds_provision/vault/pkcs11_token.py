@@ -200,7 +200,7 @@ def find_token(uri: Pkcs11Uri) -> Token:
         library = guarded(lambda: pkcs11.lib(uri.module_path))
         tokens = guarded(lambda: [token for token in library.get_tokens() if _fits(uri, token)])
     except VaultFailure as failure:
-        if not failure.message.startswith("OS exception"):
+        if type(failure.__cause__) is not pkcs11.PKCS11Error:  # a return code of the module, not the loader's word
             raise
         raise VaultFailure(
             f"The PKCS #11 module {uri.module_path} cannot be loaded.",
@@ -306,8 +306,6 @@ def _locked(uri: Pkcs11Uri) -> VaultFailure:
 def _failure(error: Exception) -> VaultFailure:
     """Name a module's error by its PKCS #11 return code, which is what its maker's pages are sorted by."""
     name = type(error).__name__
-    if name == "PKCS11Error" and str(error):
-        return VaultFailure(str(error), hint="Check the token's driver.")
     gone = name in {"DeviceRemoved", "DeviceError", "TokenNotPresent", "SessionHandleInvalid", "SessionClosed"}
     return VaultFailure(
         f"The token failed ({name}).", hint="Plug it in and run this again." if gone else "Check it with its own tool."

@@ -35,11 +35,13 @@ def test_every_single_octet():
             content_or_leaf(SEALED[:at] + bytes([SEALED[at] ^ flip]) + SEALED[at + 1 :])
 
 
+@settings(deadline=None)
 @given(st.integers(0, len(SEALED)), st.integers(0, 40), st.binary(max_size=40))
 def test_any_octets_cut_out_and_put_in(at, length, octets):
     content_or_leaf(SEALED[:at] + octets + SEALED[at + length :])
 
 
+@settings(deadline=None)
 @given(st.integers(0, len(SEALED)), st.integers(0, len(SEALED)), st.integers(0, len(SEALED)))
 @example(0, 0, len(SEALED))
 def test_pieces_in_another_order(first, second, third):
@@ -47,6 +49,7 @@ def test_pieces_in_another_order(first, second, third):
     content_or_leaf(SEALED[:one] + SEALED[two:three] + SEALED[one:two] + SEALED[three:])
 
 
+@settings(deadline=None)
 @given(st.sampled_from(["iv", "tag", "ciphertext", "protected", "recipients"]))
 def test_parts_of_two_bundles_do_not_mix(name):
     other = json.loads(seal_bundle(bundle(1, to=(RECEIVER, THIRD)), SENDER, [RECEIVER.point, THIRD.point]))
@@ -76,7 +79,7 @@ VALUES = st.recursive(
 )
 
 
-@settings(max_examples=300)
+@settings(max_examples=300, deadline=None)
 @given(st.sampled_from(PATHS), VALUES)
 def test_a_trusted_sender_that_writes_anything_into_any_member(path, value):
     """The signature is good, so the content may differ; but only a leaf, or a bundle that holds to every rule."""
@@ -92,6 +95,7 @@ def test_a_trusted_sender_that_writes_anything_into_any_member(path, value):
     assert found.expires > NOW
 
 
+@settings(deadline=None)
 @given(st.integers(0, len(SEALED)), st.integers(0, 40), st.binary(max_size=40))
 def test_looking_at_a_bundle_never_fails_otherwise(at, length, octets):
     with suppress(BadData):

@@ -6,7 +6,7 @@ import json
 from contextlib import suppress
 
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from teds_provision.errors import BadData, NotAuthentic, PolicyRefused
@@ -71,11 +71,13 @@ def test_base64url_has_one_spelling(text):
         decode_base64url(text, "it")
 
 
+@settings(deadline=None)
 @given(st.binary(max_size=80))
 def test_base64url_round_trip(octets):
     assert decode_base64url(encode_base64url(octets), "it") == decode_base64url(base64url(octets), "it") == octets
 
 
+@settings(deadline=None)
 @given(st.text(alphabet="ABQgw09-_+/= ", max_size=12))
 def test_what_decodes_encodes_to_the_same(text):
     try:
@@ -85,6 +87,7 @@ def test_what_decodes_encodes_to_the_same(text):
     assert encode_base64url(octets) == text
 
 
+@settings(deadline=None)
 @given(st.binary(min_size=64, max_size=64))
 def test_the_test_of_the_curve_agrees_with_the_library(octets):
     for point in (b"\x04" + octets, SoftwareKey(1 + octets[0]).point):
@@ -360,6 +363,7 @@ def test_a_header_that_asks_for_none_inside_a_good_seal():
         open_bundle(sealed_jws({"alg": "none", "typ": TYPE}), RECEIVER, trusts(SENDER), NOW)
 
 
+@settings(deadline=None)
 @given(st.binary(max_size=200))
 def test_any_octets_end_in_a_leaf(octets):
     for read in (opened, verified, lambda junk: jose.read_header(junk, max_octets=LIMIT)):
@@ -376,12 +380,14 @@ JSON = st.recursive(
 )
 
 
+@settings(deadline=None)
 @given(st.dictionaries(st.sampled_from([*jwe(), "aad", "header", "unprotected", "encrypted_key"]), JSON, min_size=1))
 def test_members_of_any_type_end_in_a_leaf_or_change_nothing(changes):
     with suppress(BadData, PolicyRefused, NotAuthentic):
         assert opened(dump(jwe(**changes))) == PAYLOAD
 
 
+@settings(deadline=None)
 @given(JSON)
 def test_any_json_where_a_key_belongs(value):
     for read in (point_of, link_key_of):

@@ -5,7 +5,7 @@ from __future__ import annotations
 from contextlib import suppress
 
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from teds_provision.errors import UsageFailure
@@ -65,6 +65,7 @@ def test_what_might_name_something_else_is_refused(text):
         Pkcs11Uri.parse(text)
 
 
+@settings(deadline=None)
 @given(st.text(max_size=60))
 def test_any_text_is_read_or_refused(text):
     for whole in (text, "pkcs11:" + text, "pkcs11:" + text + M):
@@ -72,6 +73,7 @@ def test_any_text_is_read_or_refused(text):
             assert isinstance(Pkcs11Uri.parse(whole), Pkcs11Uri)
 
 
+@settings(deadline=None)
 @given(st.text(alphabet=st.characters(min_codepoint=33, max_codepoint=0x2FF), min_size=1).filter(str.isprintable))
 def test_any_printable_label_can_be_said(label):
     from urllib.parse import quote
