@@ -191,7 +191,8 @@ def _again(field: Field, known: Mapping[int, FieldSpec], fields: Table | None, e
         spec = fields.inner.get(field.type)
     if field.children and spec is not None:
         inner = b"".join(_again(child, spec.by_type, fields, edition, width) for child in field.children)
-        return raw_tuple(field.type, inner, width=width)
+        # Octets that are no whole tuple made no child: keep them.
+        return raw_tuple(field.type, inner + field.raw[len(inner) :], width=width)
     return raw_tuple(field.type, _leaf(field, spec, edition), width=width)
 
 
@@ -219,6 +220,8 @@ def _tail(decoded: Decoded) -> bytes:
     last = decoded.fields[-1] if decoded.fields else None
     start = 4 * decoded.framed if last is None else last.offset + _header(decoded, last) + len(last.raw)
     end = len(decoded.octets) - 2 * decoded.framed
+    if any(finding.code == "frame-trailing" for finding in decoded.findings):
+        end = int.from_bytes(decoded.octets[:4], "big") + 2
     return decoded.octets[start:end]
 
 

@@ -139,6 +139,8 @@ def _limits(fields: tuple[Field, ...], find: Find) -> None:
 
 def _sample(fields: tuple[Field, ...], find: Find) -> None:
     for field in fields:
+        if field.type == 31:
+            _sampling(field, find)
         if field.type != 18:
             continue
         parts = {child.type: child.value for child in field.children}
@@ -159,6 +161,17 @@ def _level(fields: tuple[Field, ...], find: Find) -> None:
         if field.name == "Level" and isinstance(field.value, str) and field.value not in LEVELS:
             message = f"Level is {str(field.value)!r}; A to E and N are known."
             find("warning", "enumeration", message, field.offset, "Level", "A to E, N", field.value)
+
+
+def _sampling(field: Field, find: Find) -> None:
+    """SDefault is one bit of the mask in some sources, the number 1 to 5 of a mode in others: either will do."""
+    parts = {child.type: child.value for child in field.children}
+    modes, default = parts.get(48), parts.get(49)
+    if not isinstance(modes, int) or not isinstance(default, int) or 1 <= default <= 5:
+        return
+    if default not in (8, 16) or not default & modes:
+        message = f"SDefault {default} is neither a mode from 1 to 5 nor one bit of SampMode {modes:#04x}."
+        find("warning", "sampling", message, field.offset, "SDefault", "1 to 5, or a bit of SampMode", default)
 
 
 def _security(fields: tuple[Field, ...], find: Find, octets: bytes, framed: bool) -> None:

@@ -6,6 +6,7 @@ from typing import Final
 
 from teds_provision.teds.frame import MINIMUM_OCTETS, TEDSID, checksum
 from teds_provision.teds.model import Edition, Finding, Severity
+from teds_provision.teds.shape import MALFORMED_CODES
 from teds_provision.teds.tables import Table, table
 
 MAX_OCTETS: Final = 16 << 20
@@ -20,6 +21,7 @@ class Head:
         self.octets = octets
         self.framed = framed
         self.findings: list[Finding] = []
+        self.errors = 0
         self.edition: Edition | None = None
         self.access_code: int | None = None
         self.table: Table | None = None
@@ -38,9 +40,14 @@ class Head:
         asked: object = "",
         found: object = "",
     ) -> None:
-        """Note a finding, up to ``MAX_FINDINGS``."""
-        if len(self.findings) < MAX_FINDINGS:
-            self.findings.append(Finding(severity, code, message, offset, field, str(asked), str(found)))
+        """Note a finding: up to ``MAX_FINDINGS`` errors and as many others; what decides the verdict always."""
+        if severity == "error":
+            self.errors += 1
+            if self.errors > MAX_FINDINGS and code not in MALFORMED_CODES:
+                return
+        elif len(self.findings) - self.errors >= MAX_FINDINGS:
+            return
+        self.findings.append(Finding(severity, code, message, offset, field, str(asked), str(found)))
 
     def frame(self) -> tuple[int, int]:
         """Check Length and checksum; return start and end of the data block."""

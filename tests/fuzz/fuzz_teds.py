@@ -2,8 +2,8 @@
 
 Run: python tests/fuzz/fuzz_teds.py tests/fuzz/corpus/teds -max_total_time=600 -rss_limit_mb=512 -max_len=4096
 
-The first octet of an input chooses: even, the rest goes to the decoder as it is; odd, the rest is a data block and gets
-a right Length and checksum first, so that the fuzzer need not find a checksum. Nothing but BadData may come out, and that
+The first octet of an input chooses: even, the rest goes to the decoder as it is; odd, the rest is a data block and
+gets a right Length and checksum first, so that the fuzzer need not find one. Nothing but BadData may come out, and that
 only where it is documented; what is read must be given back.
 """
 

@@ -1,0 +1,173 @@
+"""What compose writes to the octet, and how it refuses."""
+
+from __future__ import annotations
+
+from fractions import Fraction
+
+import pytest
+
+from teds_provision import teds
+from teds_provision.errors import BadData
+from teds_provision.teds.frame import unframe
+from tests.teds.vectors import octets_of
+
+META = {"UUID": "94A964323E81FA8003E8", "OholdOff": 0.5, "TestTime": 5, "MaxChan": 2}
+KELVIN = {
+    "CalKey": "CAL_NONE",
+    "ChanType": "sensor",
+    "PhyUnits": teds.Units(kelvins=Fraction(1)),
+    "LowLimit": 233.15,
+    "HiLimit": 398.15,
+    "OError": 0.5,
+    "SelfTest": "provided",
+    "Sample": {"DatModel": "Float32", "ModLenth": 4, "SigBits": 24},
+    "UpdateT": 0.1,
+    "RSetupT": 25e-6,
+    "SPeriod": 0.1,
+    "WarmUpT": 30,
+    "RDelayT": 25e-6,
+    "TestTime": 5,
+    "Sampling": {"SampMode": 1, "SDefault": 1},
+}
+
+
+def test_worked_meta() -> None:
+    assert teds.compose(1, META) == octets_of("x07_meta")
+    group = {"GrpType": 1, "MemList": [1, 2, 3]}
+    assert teds.compose(1, {**META, "MaxChan": 3, "VGroup": group}) == octets_of("x07_meta_vgroup")
+    assert teds.compose(1, [("VGroup", group), *{**META, "MaxChan": 3}.items()]) == octets_of("x07_meta_vgroup")
+    assert teds.compose(1, {**META, "MaxChan": 3, "VGroup": [group]}) == octets_of("x07_meta_vgroup")
+
+
+def test_worked_channel_in_both_editions() -> None:
+    assert teds.compose(3, KELVIN) == octets_of("x07_chan_temp_nested")
+    assert teds.compose(3, KELVIN, edition=2024) == octets_of("x24_chan_temp")
+
+
+def test_worked_names() -> None:
+    name = {"Format": 0, "TCName": "boiler-inlet"}
+    assert teds.compose(12, name) == octets_of("x07_name")
+    assert teds.compose(12, name, width=2) == octets_of("x07_chan_tuple2")
+    assert teds.compose(12, {"TCName": "TPM 36 UBI", "Format": "user defined"}, edition=2024) == octets_of(
+        "w24_ubi_name"
+    )
+
+
+def test_worked_calibration_and_level() -> None:
+    calibration = {
+        "LstCalDt": 0x6955B900,
+        "CalInrvl": 365 * 86400,
+        "SIConvrt": {"Slope": 1, "Intercept": 273.15},
+        "LowLimit": -40,
+        "HiLimit": 125,
+        "OError": 0.2,
+    }
+    assert teds.compose(5, calibration) == octets_of("p07_cal_provisional")
+    assert teds.compose(16, {"Level": "E", "NumOfStandards": 1}, edition=2024) == octets_of("x24_security")
+
+
+def test_pascal_in_both_spellings() -> None:
+    pascal = {"meters": -1, "kilograms": 1, "seconds": -2}
+    nested = teds.compose(3, {**KELVIN, "PhyUnits": pascal})
+    packed = teds.compose(3, {**KELVIN, "PhyUnits": pascal}, edition=2024)
+    assert bytes.fromhex("0c0c32010035017e360182" + "37017c") in nested
+    assert bytes.fromhex("0c0b0080807e827c8080808000") in packed
+
+
+def test_half_powers() -> None:
+    noise = teds.Units(meters=Fraction(1, 2), seconds=Fraction(-3, 2))
+    assert teds.decode(teds.compose(3, {**KELVIN, "PhyUnits": noise})).get("PhyUnits") == noise
+
+
+def test_width_grows_only_where_it_must() -> None:
+    assert unframe(teds.compose(5, {"Coefs": [1.0] * 63}))[5] == 1
+    assert unframe(teds.compose(5, {"Coefs": [1.0] * 64}))[5] == 2
+    long = teds.compose(5, {"Coefs": [0.5] * 1000})
+    assert teds.decode(long).get("Coefs") == (0.5,) * 1000
+    with pytest.raises(BadData, match="Field 129"):
+        teds.compose(5, {"Coefs": [1.0] * 64}, width=1)
+    with pytest.raises(BadData, match="Field 129"):
+        teds.compose(5, {"Coefs": [1.0] * 20000})
+    assert len(teds.compose(5, {"Coefs": [1.0] * 20000}, width=3)) > 80000
+
+
+def test_repeated_inputs_keep_their_order() -> None:
+    inputs = [("CalInput", {"ChanNum": number, "Degree": 1}) for number in (2, 1, 3)]
+    decoded = teds.decode(teds.compose(5, [("ZeroOffset", 0.5), *inputs]))
+    assert [field.name for field in decoded.fields] == ["TEDSID", *["CalInput"] * 3, "ZeroOffset"]
+    assert [field.children[0].value for field in decoded.fields[1:4]] == [2, 1, 3]
+
+
+def test_unknown_fields_by_number() -> None:
+    decoded = teds.decode(teds.compose(1, {**META, "200": b"\1\2"}))
+    assert decoded.fields[-1].raw == b"\1\2"
+
+
+def test_numpy_arrays_are_arrays() -> None:
+    numpy = pytest.importorskip("numpy")
+    octets = teds.compose(5, {"Coefs": numpy.array([1.0, 2.5])})
+    assert teds.decode(octets).get("Coefs") == (1.0, 2.5)
+
+
+@pytest.mark.parametrize(
+    ("fields", "named"),
+    [
+        ({**META, "MaxChan": 70000}, "MaxChan"),
+        ({**META, "MaxChan": -1}, "MaxChan"),
+        ({**META, "MaxChan": 1.5}, "MaxChan"),
+        ({**META, "MaxChan": "two"}, "MaxChan"),
+        ({**META, "OholdOff": "soon"}, "OholdOff"),
+        ({**META, "OholdOff": 1e39}, "OholdOff"),
+        ({**META, "UUID": bytes(16)}, "UUID"),
+        ({**META, "UUID": "no hex"}, "UUID"),
+        ({**META, "VGroup": 3}, "VGroup"),
+        ({**META, "VGroup": {"GrpType": 1, "MemList": 5}}, "MemList"),
+        ({**META, "VGroup": {"GrpType": 1, "MemList": [1, 70000]}}, "MemList"),
+        ({**META, "VGroup": {"Members": [1]}}, "Members"),
+        ({**META, "Colour": 1}, "Colour"),
+        ({**META, "3": b"\0"}, "3"),
+        ({**META, "200": 7}, "200"),
+        ([*META.items(), ("MaxChan", 3)], "MaxChan"),
+        ("MaxChan", "1"),
+        ({**META, "TEDSID": b"\0"}, "TEDSID"),
+        ({**META, "TEDSID": {"family": 256}}, "family"),
+    ],
+)
+def test_refusals_name_the_field(fields: object, named: str) -> None:
+    with pytest.raises(BadData, match=named):
+        teds.compose(1, fields)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize(
+    "units",
+    [3, "K", {"kelvin": 1}, {"kelvins": "x"}, {"meters": 100}, {"meters": 0.3}, {"interpretation": 300}, b"\0" * 3],
+)
+def test_units_that_cannot_be_said(units: object) -> None:
+    with pytest.raises(BadData, match="PhyUnits"):
+        teds.compose(3, {**KELVIN, "PhyUnits": units})
+
+
+@pytest.mark.parametrize("value", [float("nan"), float("inf"), "today", 1 << 40, teds.TimeInstance(0, 1 << 31)])
+def test_times_that_cannot_be_said(value: object) -> None:
+    with pytest.raises(BadData, match="LstCalDt"):
+        teds.compose(5, {"LstCalDt": value})
+
+
+def test_negative_times() -> None:
+    octets = teds.compose(5, {"LstCalDt": -1.5})
+    assert teds.decode(octets).get("LstCalDt") == teds.TimeInstance(1, 500_000_000, True)
+    with pytest.raises(BadData, match="LstCalDt"):
+        teds.compose(5, {"LstCalDt": -1.5}, edition=2024)
+
+
+@pytest.mark.parametrize(
+    ("access_code", "options"), [(0, {}), (256, {}), (1, {"edition": 2010}), (1, {"width": 5}), (1, {"width": 0})]
+)
+def test_impossible_requests(access_code: int, options: dict[str, int]) -> None:
+    with pytest.raises(BadData):
+        teds.compose(access_code, META, **options)  # type: ignore[arg-type]
+
+
+def test_tedsid_may_be_given() -> None:
+    octets = teds.compose(1, {**META, "UUID": bytes(16), "TEDSID": {"family": 99, "subfamily": 1}}, edition=2024)
+    assert teds.decode(octets).get("TEDSID") == (99, 1, 1, 2, 1)

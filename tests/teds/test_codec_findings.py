@@ -1,0 +1,211 @@
+"""Findings say where, what was asked and what stands there; warnings leave the verdict alone."""
+
+from __future__ import annotations
+
+import struct
+import tracemalloc
+
+import pytest
+
+from teds_provision import teds
+from teds_provision.errors import BadData
+from teds_provision.teds.frame import frame, raw_tuple
+from tests.teds.vectors import octets_of
+
+CHANNEL = {
+    "CalKey": 0,
+    "ChanType": 0,
+    "PhyUnits": teds.Units(kelvins=1),
+    "LowLimit": 1.0,
+    "HiLimit": 2.0,
+    "OError": 0.5,
+    "SelfTest": 0,
+    "Sample": {"DatModel": 1, "ModLenth": 4, "SigBits": 32},
+}
+
+
+def block(access_code: int, *parts: bytes) -> bytes:
+    return frame(bytes([3, 4, 0, access_code, 1, 1]) + b"".join(parts))
+
+
+def codes(octets: bytes) -> dict[str, str]:
+    return {finding.code: finding.severity for finding in teds.decode(octets).findings}
+
+
+def only(octets: bytes, code: str) -> teds.Finding:
+    found = [finding for finding in teds.decode(octets).findings if finding.code == code]
+    assert len(found) == 1
+    return found[0]
+
+
+def test_a_wrong_checksum_says_both() -> None:
+    finding = only(octets_of("n07_bad_checksum"), "frame-checksum")
+    assert (finding.offset, finding.asked, finding.found) == (27, "FAF5", "FAF4")
+
+
+def test_a_wrong_length_says_both() -> None:
+    finding = only(octets_of("n07_bad_length"), "frame-length")
+    assert (finding.offset, finding.field, finding.asked, finding.found) == (0, "Length", "25", "26")
+
+
+def test_octets_behind_the_checksum_are_named_and_the_teds_is_read() -> None:
+    octets = octets_of("x07_name") + b"\xff" * 7
+    decoded = teds.decode(octets)
+    assert decoded.verdict == "frame-bad"
+    assert decoded.get("TCName") == "boiler-inlet"
+    assert only(octets, "frame-trailing").offset == 29
+    assert teds.recompose(decoded) == octets_of("x07_name")
+
+
+def test_a_tuple_that_runs_over_is_named() -> None:
+    finding = only(octets_of("n07_overrun"), "not-closed")
+    assert (finding.offset, finding.asked, finding.found) == (13, "5", "40")
+
+
+def test_swapped_limits_are_an_error() -> None:
+    octets = teds.compose(3, {**CHANNEL, "LowLimit": 3.0})
+    assert teds.decode(octets).verdict == "content-nonconformant"
+    finding = only(octets, "limits")
+    assert finding.field == "LowLimit"
+    assert octets[finding.offset] == 13
+
+
+def test_not_available_is_a_warning() -> None:
+    octets = teds.compose(3, {**CHANNEL, "OError": float("nan")})
+    assert bytes.fromhex("0f047fffffff") in octets
+    assert teds.decode(octets).verdict == "clean"
+    assert only(octets, "not-available").field == "OError"
+
+
+def test_infinity_is_a_warning() -> None:
+    assert codes(teds.compose(3, {**CHANNEL, "HiLimit": float("inf")}))["infinite"] == "warning"
+
+
+@pytest.mark.parametrize(
+    ("field", "value", "severity"),
+    [("ChanType", 9, "error"), ("SelfTest", 7, "error"), ("CalKey", 2, "warning"), ("DataXmit", 99, "warning")],
+)
+def test_illegal_values_are_errors_where_the_table_is_sure(field: str, value: int, severity: str) -> None:
+    octets = teds.compose(3, {**CHANNEL, field: value})
+    assert only(octets, "enumeration").severity == severity
+
+
+def test_sample_that_does_not_fit_its_model() -> None:
+    sample = {"DatModel": 1, "ModLenth": 2, "SigBits": 16}
+    assert codes(teds.compose(3, {**CHANNEL, "Sample": sample}))["sample"] == "warning"
+    sample = {"DatModel": 0, "ModLenth": 1, "SigBits": 12}
+    assert only(teds.compose(3, {**CHANNEL, "Sample": sample}), "sample").field == "SigBits"
+
+
+@pytest.mark.parametrize(("modes", "default", "good"), [(0x1F, 16, True), (1, 5, True), (1, 16, False), (1, 0, False)])
+def test_default_mode_is_a_bit_of_the_mask_or_a_number(modes: int, default: int, good: bool) -> None:
+    octets = teds.compose(3, {**CHANNEL, "Sampling": {"SampMode": modes, "SDefault": default}})
+    assert ("sampling" not in codes(octets)) == good
+
+
+def test_out_of_order_and_repeated_fields_are_warnings() -> None:
+    octets = block(12, raw_tuple(5, b"x"), raw_tuple(4, b"\0"), raw_tuple(4, b"\0"))
+    assert codes(octets) == {"order": "warning", "repeated": "warning"}
+    assert teds.decode(octets).verdict == "clean"
+
+
+def test_missing_fields_are_warnings() -> None:
+    assert {f.field for f in teds.decode(block(1)).findings} == {"UUID", "OholdOff", "TestTime", "MaxChan"}
+    assert teds.decode(block(1)).verdict == "clean"
+
+
+def test_both_numberings_of_the_name_are_read() -> None:
+    octets = block(12, raw_tuple(10, b"\0"), raw_tuple(11, b"pump"))
+    decoded = teds.decode(octets)
+    assert (decoded.get("Format"), decoded.get("TCName")) == (0, "pump")
+    assert decoded.verdict == "clean"
+    assert codes(octets) == {"numbering": "warning"}
+    assert teds.recompose(decoded) == octets
+
+
+def test_a_name_that_is_no_utf8_keeps_its_octets() -> None:
+    octets = block(12, raw_tuple(4, b"\0"), raw_tuple(5, b"\xff\xfe"))
+    assert teds.decode(octets).get("TCName") == b"\xff\xfe"
+    assert codes(octets) == {"text": "warning"}
+
+
+def test_an_unknown_field_is_an_error_in_a_class_that_is_known_and_none_elsewhere() -> None:
+    assert codes(block(1, raw_tuple(99, b"\1")))["unknown"] == "error"
+    assert codes(block(5, raw_tuple(99, b"\1")))["unknown"] == "note"
+    assert codes(block(8, raw_tuple(99, b"\1"))) == {"unverified": "note"}
+    assert codes(block(1, raw_tuple(200, b"\1")))["manufacturer"] == "note"
+
+
+def test_an_extension_octet_of_80_means_none() -> None:
+    with_80 = octets_of("w24_ubi_chan")
+    assert with_80[4 + 7 + 6 + 2 + 10] == 0x80
+    units = teds.decode(with_80).get("PhyUnits")
+    assert isinstance(units, teds.Units)
+    assert units.extension == 0
+    assert teds.recompose(teds.decode(with_80)) == with_80
+
+
+def test_free_form_end_user_data_is_kept() -> None:
+    octets = block(7, b"Calibrated by hand, see the binder in room 4")
+    decoded = teds.decode(octets)
+    assert decoded.verdict == "clean"
+    assert decoded.text == (b"Calibrated by hand, see the binder in room 4",)
+    assert teds.recompose(decoded) == octets
+
+
+def test_a_class_without_a_table_keeps_its_tuples_raw() -> None:
+    for access_code in (8, 9, 17, 99, 129, 255):
+        decoded = teds.decode(block(access_code, raw_tuple(10, b"\1\2"), raw_tuple(250, b"")))
+        assert [(field.type, field.name, field.raw) for field in decoded.fields[1:]] == [
+            (10, "", b"\1\2"),
+            (250, "", b""),
+        ]
+        assert decoded.verdict == "clean"
+
+
+@pytest.mark.parametrize("octets", [b"", b"\0", b"\3", b"\3\4", b"\0\0\0\2\0\0", b"\xff" * 64, b"\0" * 64])
+def test_erased_and_empty_memory_is_no_teds(octets: bytes) -> None:
+    assert teds.decode(octets).verdict not in {"clean", "block-clean"}
+
+
+@pytest.mark.parametrize("width", [0, 5, 255])
+def test_a_tuple_width_that_nobody_has_is_an_error(width: int) -> None:
+    octets = frame(bytes([3, 4, 0, 12, 1, width, 4, 1, 0]))
+    assert codes(octets)["tuple-width"] == "error"
+
+
+def test_errors_count_even_behind_a_flood_of_notes() -> None:
+    flood = b"".join(raw_tuple(200, b"") for _ in range(5000))
+    decoded = teds.decode(frame(bytes.fromhex("030400010101") + flood + raw_tuple(99, b"")))
+    assert decoded.verdict == "content-nonconformant"
+    assert len(decoded.findings) < 3000
+
+
+@pytest.mark.parametrize(
+    "content",
+    [
+        b"\xc8\x00" * 4_000_000,
+        b"\x0e\x00" * 4_000_000,
+        b"\x81\x04" + struct.pack(">f", 1.0),
+        bytes(9_000_000),
+        b"\x0c\xfe" + b"\x32\x00" * 127,
+    ],
+)
+def test_hostile_octets_cost_memory_in_bounds(content: bytes) -> None:
+    octets = frame(bytes.fromhex("030400010101") + content)
+    tracemalloc.start()
+    teds.decode(octets)
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert peak < 3 * len(octets) + 64_000_000
+
+
+def test_too_many_octets_are_not_walked() -> None:
+    decoded = teds.decode(bytes.fromhex("030400010101") + bytes(17 << 20))
+    assert decoded.verdict == "malformed"
+    assert decoded.fields == ()
+
+
+def test_strict_names_the_octet() -> None:
+    with pytest.raises(BadData, match="octet 27"):
+        teds.decode(octets_of("n07_bad_checksum"), strict=True)
