@@ -1,0 +1,228 @@
+"""From tap to verified datasheet: done once, repeated, interrupted anywhere, cut anywhere."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from teds_provision.errors import (
+    LinkFailure,
+    NodeRefused,
+    NodeSilent,
+    NotAuthentic,
+    NotWhitelisted,
+    PolicyRefused,
+    TedsProvisionError,
+)
+from teds_provision.protocol.frames import Reason
+from teds_provision.protocol.identity import NodeState
+from teds_provision.teds import security
+from teds_provision.teds.frame import frame
+from teds_provision.teds.image import SECURITY
+from teds_provision.workflow.build import BuildOrder
+from teds_provision.workflow.identify import Identified
+from teds_provision.workflow.progress import Silent
+from teds_provision.workflow.provision import Provisioned, provision
+from teds_provision.workflow.station import Station
+
+from .bench import Board, MemoryLink, make_station, talk
+
+ANGLE = BuildOrder(profile="magnetic-angular-position-sensor")
+
+
+def accept(who: Identified) -> None:
+    """Whoever lies on the reader."""
+
+
+def run(
+    station: Station,
+    board: Board,
+    link: MemoryLink | None = None,
+    order: BuildOrder = ANGLE,
+    accept: Callable[[Identified], None] = accept,
+) -> Provisioned:
+    with talk(board, link) as node:
+        return provision(station, node, order, accept=accept, reporter=Silent())
+
+
+def results(done: Provisioned) -> dict[str, str]:
+    return {step.name: step.result for step in done.steps}
+
+
+def test_a_new_node_ends_authentic(station: Station, board: Board) -> None:
+    done = run(station, board)
+    assert done.verified.verdict == "authentic"
+    assert list(results(done)) == ["identify", "whitelist", "agree", "build", "sign", "write", "verify"]
+    assert set(results(done).values()) == {"done"}
+    assert board.state.state == NodeState.PROVISIONED
+    record = station.store.node(board.uuid)
+    assert record is not None
+    assert (record.verdict, record.sequence, record.epoch) == ("authentic", 1, 1)
+
+
+def test_a_finished_node_has_nothing_to_do(station: Station, board: Board) -> None:
+    run(station, board)
+    before = board.state
+    again = run(station, board)
+    expected = {"identify": "done", "verify": "done"}
+    assert results(again) == {name: expected.get(name, "nothing to do") for name in results(again)}
+    assert board.state == before
+
+
+def test_a_small_node_takes_its_datasheet_in_many_segments(station: Station) -> None:
+    board = Board(max_message=1024)
+    link = MemoryLink(board)
+    assert run(station, board, link).verified.verdict == "authentic"
+    assert max(map(len, link.frames)) <= 1024
+
+
+def test_without_a_yes_an_unknown_node_is_left_alone(station: Station, board: Board) -> None:
+    def no(who: Identified) -> None:
+        raise NotWhitelisted("no")
+
+    with pytest.raises(NotWhitelisted):
+        run(station, board, accept=no)
+    assert board.state.state == NodeState.FACTORY
+    assert station.store.whitelist() == []
+
+
+def test_over_the_bus_of_a_node_without_nfc(station: Station, board: Board) -> None:
+    assert run(station, board, MemoryLink(board, via="can", tapped=True)).verified.verdict == "authentic"
+    entry = station.store.whitelisted(board.uuid)
+    assert entry is not None
+    assert entry.assurance == "bus"
+
+
+def test_an_identified_node_may_be_written_over_the_other_link(station: Station, board: Board) -> None:
+    run(station, board)
+    renamed = replace(ANGLE, name="crane slew")
+    done = run(station, board, MemoryLink(board, via="can", tapped=False), renamed)
+    assert (results(done)["agree"], results(done)["write"]) == ("nothing to do", "done")
+    assert board.state.sequence == 2
+
+
+def exchanges_of_a_whole_run(tmp_path: Path) -> int:
+    link = MemoryLink(Board())
+    run(make_station(tmp_path / "count"), link.board, link)
+    return link.count - 1  # the last one closes the session
+
+
+@pytest.mark.parametrize("half", ["lose_request", "lose_reply"])
+def test_cut_at_every_message_the_same_command_carries_on(tmp_path: Path, half: str) -> None:
+    for lost in range(1, exchanges_of_a_whole_run(tmp_path) + 1):
+        station, board = make_station(tmp_path / f"{half}{lost}"), Board()
+        with pytest.raises(NodeSilent):
+            run(station, board, MemoryLink(board, **{half: lost}))  # type: ignore[arg-type]
+        assert run(station, board).verified.verdict == "authentic", f"{half} {lost}"
+        assert [record.state for record in station.store.keys(board.uuid)] == ["active"]
+        station.close()
+
+
+@pytest.mark.parametrize("when", ["die_before", "die_after"])
+@pytest.mark.parametrize("commit", [1, 2])
+def test_power_cut_at_every_flash_commit(station: Station, board: Board, when: str, commit: int) -> None:
+    if commit == 2:  # the first is the key, the second the datasheet
+        run(station, board, accept=accept)
+        board.flash.state = replace(board.flash.state, provisioned=False)
+        board.power_on()
+    setattr(board.flash, when, True)
+    with pytest.raises(NodeSilent):
+        run(station, board, order=replace(ANGLE, name="another") if commit == 2 else ANGLE)
+    assert run(station, board).verified.verdict == "authentic"
+
+
+def test_a_session_lost_in_the_middle_starts_the_staging_over(station: Station, board: Board) -> None:
+    class Forgetful(MemoryLink):
+        def exchange(self, frame: bytes) -> bytes:
+            if self.count == 14:
+                board.tim.link_lost(self.via)
+            return super().exchange(frame)
+
+    assert run(station, board, Forgetful(board)).verified.verdict == "authentic"
+
+
+def test_a_node_that_is_always_busy_ends_with_the_link(
+    station: Station, board: Board, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("teds_provision.workflow.conversation._BUSY_SECONDS", 0.3)
+    monkeypatch.setattr("teds_provision.workflow.conversation._BUSY_PAUSE", 0.05)
+    busy = bytes([0, 0, 1, Reason.BUSY])
+    with pytest.raises(TedsProvisionError):
+        run(station, board, MemoryLink(board, tamper=lambda n, reply: busy))
+    assert run(station, board).verified.verdict == "authentic"
+
+
+@pytest.mark.parametrize("garbage", [b"", b"\x01", b"\x01\x00\x05abc", b"\x01\x00\x00", bytes(400)])
+def test_garbage_is_an_error_of_ours_and_changes_nothing(station: Station, board: Board, garbage: bytes) -> None:
+    for count in range(1, 12):
+        with pytest.raises(TedsProvisionError):
+            run(station, board, MemoryLink(board, tamper=lambda n, reply, at=count: garbage if n >= at else reply))
+    assert run(station, board).verified.verdict == "authentic"
+
+
+def test_read_only_teds_are_signed_as_they_are(station: Station, board: Board) -> None:
+    phy = frame(bytes.fromhex("0304050d01010a01010b0400000001"))
+    board.flash.state = replace(board.state, blocks={(0, 13): phy}, read_only=frozenset({(0, 13)}))
+    board.power_on()
+    assert run(station, board).verified.verdict == "authentic"
+    assert (0, 13) in security.decode(board.state.blocks[SECURITY]).signed_blocks
+
+
+def test_a_sequence_far_behind_is_caught_up_in_steps(station: Station, board: Board) -> None:
+    run(station, board)
+    station.remember(board.uuid, sequence=200_000)
+    assert run(station, board, order=replace(ANGLE, name="far ahead")).verified.verdict == "authentic"
+    assert board.state.sequence == 200_001
+
+
+def test_a_node_reset_by_hand_is_provisioned_again(station: Station, board: Board) -> None:
+    run(station, board)
+    board.tim.reset_by_hand()
+    done = run(station, board)
+    assert done.verified.verdict == "authentic"
+    assert (board.state.epoch, board.state.sequence) == (2, 2)
+
+
+def test_a_revoked_node_is_refused(station: Station, board: Board) -> None:
+    from teds_provision.store import Revocation
+
+    run(station, board)
+    station.store.put_revocation(Revocation(board.uuid, None, "stolen", ""))
+    with pytest.raises(PolicyRefused, match="stolen"):
+        run(station, board)
+
+
+def test_another_owners_station_is_refused(station: Station, board: Board, tmp_path: Path) -> None:
+    run(station, board)
+    before = board.state
+    with pytest.raises(NodeRefused) as refused:
+        run(make_station(tmp_path / "stranger"), board)
+    assert refused.value.reason == Reason.UNTRUSTED_STATION
+    assert board.state == before
+
+
+def test_a_broken_flash_is_told(station: Station, board: Board) -> None:
+    board.flash.fail = True
+    with pytest.raises(NodeRefused) as refused:
+        run(station, board)
+    assert refused.value.reason == Reason.FLASH_FAILURE
+
+
+def test_a_read_back_that_differs_is_not_believed(station: Station, board: Board) -> None:
+    run(station, board)
+    commit = board.flash.commit
+
+    def corrupting(state):  # type: ignore[no-untyped-def]
+        commit(state)
+        state.blocks[0, 12] = state.blocks[0, 12][:-3] + b"\0" + state.blocks[0, 12][-2:]
+
+    board.flash.commit = corrupting  # type: ignore[method-assign]
+    with pytest.raises(NotAuthentic, match="gives back another TEDS"):
+        run(station, board, order=replace(ANGLE, name="renamed"))
+
+
+def test_the_link_error_is_a_link_error() -> None:
+    assert issubclass(NodeSilent, LinkFailure)

@@ -1,0 +1,169 @@
+"""What verification catches: every octet, every trust rule, every known way to be wrong."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from teds_provision.errors import NotWhitelisted
+from teds_provision.protocol.identity import Identity
+from teds_provision.protocol.keys import SoftwareKey, fingerprint, station_key_message
+from teds_provision.store import TrustRecord
+from teds_provision.teds import security
+from teds_provision.teds.frame import frame
+from teds_provision.teds.image import SECURITY, Image
+from teds_provision.workflow.agree import require_session
+from teds_provision.workflow.identify import identify
+from teds_provision.workflow.provision import verify_node
+from teds_provision.workflow.reading import read_image
+from teds_provision.workflow.station import Station
+from teds_provision.workflow.verify import Verified, verify_image
+
+from .bench import Board, make_station, talk
+from .test_provision import run
+
+
+@pytest.fixture
+def image(station: Station, board: Board) -> Image:
+    return run(station, board).image
+
+
+def verdict(station: Station, image: Image, identity: Identity | None = None) -> str:
+    return Verified(image.uuid, tuple(verify_image(station, image, identity=identity))).verdict
+
+
+def failed(station: Station, image: Image, identity: Identity | None = None) -> list[str]:
+    return [check.name for check in verify_image(station, image, identity=identity) if check.result == "failed"]
+
+
+def test_a_good_image_is_authentic(station: Station, image: Image) -> None:
+    assert verdict(station, image) == "authentic"
+
+
+def test_every_flipped_octet_is_caught(station: Station, image: Image) -> None:
+    for block in image:
+        teds = image.blocks[block]
+        for at in range(len(teds)):
+            flipped = teds[:at] + bytes([teds[at] ^ 0x01]) + teds[at + 1 :]
+            assert verdict(station, image.with_block(block, flipped)) == "not authentic", (block, at)
+
+
+def test_every_flipped_octet_with_a_mended_checksum_is_caught(station: Station, image: Image) -> None:
+    for block in image:
+        teds = image.blocks[block]
+        for at in range(4, len(teds) - 2):
+            body = bytearray(teds[4:-2])
+            body[at - 4] ^= 0x20
+            assert verdict(station, image.with_block(block, frame(bytes(body)))) == "not authentic", (block, at)
+
+
+def test_another_uuid_is_caught(station: Station, image: Image) -> None:
+    assert verdict(station, Image(bytes(10), image.blocks)) == "not authentic"
+
+
+def test_a_missing_block_is_caught(station: Station, image: Image) -> None:
+    for block in image.unsigned_blocks():
+        without = Image(image.uuid, {key: teds for key, teds in image.blocks.items() if key != block})
+        assert failed(station, without) == ["signed TEDS"]
+
+
+def test_an_unlisted_block_is_reported_as_unsigned(station: Station, image: Image) -> None:
+    more = image.with_block((1, 15), frame(bytes.fromhex("0304000f0101")))
+    assert (verdict(station, more), failed(station, more)) == ("unsigned", ["every TEDS is signed"])
+
+
+def test_the_initial_datasheet_is_unsigned(station: Station, board: Board) -> None:
+    initial = Image(board.uuid, {SECURITY: board.state.security_teds()})
+    assert verdict(station, initial) == "unsigned"
+
+
+def test_weak_algorithms_are_never_authentic(station: Station, image: Image) -> None:
+    shown = security.decode(image.blocks[SECURITY])
+    weak = replace(shown, values={**shown.values, 4: 0})
+    signed = weak.with_signature(station.credentials().key.sign(security.tbs(image.uuid, weak.encode()))).encode()
+    assert failed(station, image.with_block(SECURITY, signed)) == ["algorithms"]
+
+
+def test_a_foreign_security_teds_is_shown_and_never_trusted(station: Station, image: Image) -> None:
+    foreign = frame(security.TEDSID_TUPLE + b"\x01\x01\x04\x02\x01\x02")
+    assert verdict(station, image.with_block(SECURITY, foreign)) == "not authentic"
+
+
+# -- trust: nothing in a TEDS is an anchor -----------------------------------------------------------------------------
+
+
+def test_a_stranger_trusts_nothing_until_told(station: Station, image: Image, tmp_path: Path) -> None:
+    stranger = make_station(tmp_path / "stranger")
+    assert "signing station" in failed(stranger, image)
+    stranger.store.put_trust(TrustRecord("peer", "station", station.point, fingerprint(station.point)))
+    assert verdict(stranger, image) == "authentic"
+    stranger.store.remove_trust("peer")
+    stranger.store.put_trust(TrustRecord("owner", "ca", station.ca, fingerprint(station.ca)))
+    assert verdict(stranger, image) == "authentic"
+
+
+def test_a_datasheet_that_brings_its_own_ca_is_not_authentic(station: Station, image: Image) -> None:
+    forger, forged_ca = SoftwareKey.generate(), SoftwareKey.generate()
+    shown = replace(
+        security.decode(image.blocks[SECURITY]),
+        station_key=forger.point,
+        station_key_signature=forged_ca.sign(station_key_message(forger.point)),
+    )
+    signed = shown.with_signature(forger.sign(security.tbs(image.uuid, shown.encode()))).encode()
+    assert failed(station, image.with_block(SECURITY, signed)) == ["signing station", "station certificate"]
+
+
+def test_a_node_key_other_than_the_pinned_one_is_not_authentic(station: Station, image: Image, board: Board) -> None:
+    other = Board(uuid=board.uuid)
+    shown = replace(
+        security.decode(image.blocks[SECURITY]),
+        node_key=other.key.point,
+        node_key_signature=other.state.node_key_signature,
+    )
+    key = station.credentials().key
+    signed = shown.with_signature(key.sign(security.tbs(image.uuid, shown.encode()))).encode()
+    assert failed(station, image.with_block(SECURITY, signed)) == ["node key"]
+
+
+# -- on the node -------------------------------------------------------------------------------------------------------
+
+
+def on_node(station: Station, board: Board) -> Verified:
+    with talk(board) as node:
+        who = identify(station, node)
+        require_session(station, node)
+        return verify_node(station, node, read_image(node), who.point)
+
+
+def test_a_provisioned_node_is_authentic(station: Station, board: Board, image: Image) -> None:
+    verified = on_node(station, board)
+    assert verified.verdict == "authentic"
+    assert [check.result for check in verified.checks if check.name == "possession"] == ["passed"]
+
+
+def test_a_teds_changed_on_the_node_is_caught(station: Station, board: Board, image: Image) -> None:
+    board.flash.state = replace(
+        board.state, blocks={**board.state.blocks, (0, 12): frame(bytes.fromhex("0304000c0101040100050161"))}
+    )
+    board.power_on()
+    assert on_node(station, board).verdict == "not authentic"
+
+
+def test_an_old_datasheet_put_back_is_caught(station: Station, board: Board, image: Image) -> None:
+    identity = replace(board.tim.identity(), sequence=2)
+    assert failed(station, image, identity) == ["sequence"]
+
+
+def test_a_datasheet_of_a_later_epoch_is_caught(station: Station, board: Board, image: Image) -> None:
+    identity = replace(board.tim.identity(), epoch=0)
+    assert failed(station, image, identity) == ["key epoch"]
+
+
+def test_what_is_not_whitelisted_cannot_be_signed(station: Station, board: Board, image: Image) -> None:
+    from teds_provision.workflow.signing import SignOrder, sign_image
+
+    station.store.remove_whitelist(board.uuid)
+    with pytest.raises(NotWhitelisted):
+        sign_image(station, SignOrder(board.uuid, image), None)
