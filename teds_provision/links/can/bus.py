@@ -1,0 +1,193 @@
+"""A CAN bus through python-can: opened, read and written, with every failure turned into one that names its cure."""
+
+from __future__ import annotations
+
+import logging
+import socket
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, Final, NoReturn
+
+from teds_provision.errors import LinkFailure, NoReader, UsageFailure
+from teds_provision.links.can.pacing import Pacer
+from teds_provision.links.can.spec import CanSpec
+
+if TYPE_CHECKING:
+    import can
+
+_SEND_SECONDS: Final = 1.0
+_SOCKETCAND_PORT: Final = 29536
+_BUS_OFF: Final = 0x40
+"""Error class of a SocketCAN error frame (linux/can/error.h, CAN_ERR_BUSOFF)."""
+
+
+@dataclass(frozen=True)
+class Frame:
+    """One CAN data frame with a 29-bit identifier; ``data`` 0 to 8 octets, in FD up to 64."""
+
+    identifier: int
+    data: bytes
+    fd: bool = False
+
+
+class Bus:
+    """An open bus. Sending from one thread while another receives is allowed; two senders take turns themselves."""
+
+    def __init__(self, spec: CanSpec) -> None:
+        self.spec = spec
+        self._bus = _open(spec)
+        self._pacer = Pacer(spec.bitrate, spec.data_bitrate) if spec.pace else None
+
+    @property
+    def busy_seconds(self) -> float:
+        """Wire time of all frames sent so far; 0 unless paced."""
+        return self._pacer.busy_seconds if self._pacer else 0.0
+
+    def send(self, frame: Frame) -> None:
+        """Put one frame on the bus; raises LinkFailure."""
+        import can
+
+        if self._pacer:
+            self._pacer.wait(frame.identifier, frame.data, fd=frame.fd)
+        message = can.Message(
+            arbitration_id=frame.identifier,
+            is_extended_id=True,
+            data=frame.data,
+            is_fd=frame.fd,
+            bitrate_switch=frame.fd,
+        )
+        try:
+            self._bus.send(message, timeout=_SEND_SECONDS)
+        except (can.CanError, OSError, ValueError) as error:
+            self._failed("does not take a frame", error)
+
+    def receive(self, seconds: float) -> Frame | None:
+        """Return the next data frame, None when there is none within ``seconds``; raises LinkFailure (also bus-off)."""
+        import can
+
+        try:
+            message = self._bus.recv(timeout=max(0.0, seconds))
+        except can.CanOperationError as error:
+            if "unpack" in str(error):  # udp_multicast: someone sent a datagram that is no CAN frame
+                return None
+            self._failed("cannot be read", error)
+        except (can.CanError, OSError, ValueError) as error:
+            self._failed("cannot be read", error)
+        if message is None:
+            self._check_alive()
+            return None
+        if message.is_error_frame:
+            if message.arbitration_id & _BUS_OFF:
+                self._bus_off()
+            return None
+        if message.is_remote_frame or not message.is_extended_id:
+            return None
+        return Frame(message.arbitration_id, bytes(message.data), message.is_fd)
+
+    def drain(self, most: int = 10_000) -> None:
+        """Throw away what has come in unread."""
+        for _ in range(most):
+            if self.receive(0.0) is None:
+                return
+
+    def close(self) -> None:
+        """Release the adapter; never raises."""
+        try:
+            self._bus.shutdown()
+        except Exception:  # python-can back ends raise whatever their driver raises
+            logging.getLogger(__name__).debug("The CAN bus did not close cleanly.", exc_info=True)
+
+    def _check_alive(self) -> None:
+        import can
+
+        try:
+            if self._bus.state is can.BusState.ERROR:
+                self._bus_off()
+        except (can.CanError, OSError, NotImplementedError):
+            return
+        if self.spec.interface == "socketcand" and _hung_up(self._bus):
+            raise LinkFailure(
+                f"The socketcand server closed the bus {self.spec.text}.", hint="Start it again, then repeat."
+            )
+
+    def _bus_off(self) -> NoReturn:
+        raise LinkFailure(
+            f"The CAN controller of {self.spec.text} went bus-off: too many frames met errors.",
+            hint="Check wiring, termination (120 ohm at both ends) and the bit rate; then: "
+            f"ip link set {self.spec.channel} type can restart.",
+        )
+
+    def _failed(self, what: str, error: Exception) -> NoReturn:
+        self._check_alive()
+        raise LinkFailure(
+            f"The CAN bus {self.spec.text} {what}: {_reason(error)}.",
+            hint="Check that the adapter is up and plugged in.",
+        ) from error
+
+
+def _open(spec: CanSpec) -> can.BusABC:
+    import can
+
+    for name in ("can", "isotp"):
+        logging.getLogger(name).setLevel(logging.CRITICAL)
+    options: dict[str, Any] = dict(spec.options)
+    if spec.interface == "udp_multicast" or spec.fd:
+        options["fd"] = spec.fd
+    if spec.interface == "socketcand":
+        if spec.fd:
+            raise UsageFailure("socketcand carries classic CAN only.", hint="Leave fd=1 out.")
+        options = {"host": "127.0.0.1", "port": _SOCKETCAND_PORT, "tcp_tune": True} | options
+        _probe(spec, options)
+    try:
+        bus = can.Bus(interface=spec.interface, channel=spec.channel, **options)
+    except can.CanInterfaceNotImplementedError as error:
+        raise NoReader(
+            f"The CAN interface {spec.interface!r} is not usable here: {_reason(error)}.",
+            hint=f"python-can knows {', '.join(sorted(can.VALID_INTERFACES))}.",
+        ) from error
+    except Exception as error:  # back ends raise what their driver, serial port or library raises
+        raise NoReader(f"The CAN bus {spec.text} does not open: {_reason(error)}.", hint=_cure(spec)) from error
+    if spec.interface == "socketcan":
+        bus.set_filters([{"can_id": 0x18DA0000, "can_mask": 0x1FFE0000, "extended": True}])
+    return bus
+
+
+def _probe(spec: CanSpec, options: dict[str, Any]) -> None:
+    """Ask whether anyone listens: python-can itself would try for 10 s without a pause."""
+    try:
+        socket.create_connection((str(options["host"]), int(options["port"])), timeout=3).close()
+    except (OSError, ValueError) as error:
+        raise NoReader(
+            f"No socketcand server answers at {options['host']}:{options['port']} ({_reason(error)}).", hint=_cure(spec)
+        ) from error
+
+
+def _cure(spec: CanSpec) -> str:
+    if spec.interface == "socketcan":
+        data = f" dbitrate {spec.data_bitrate} fd on" if spec.fd else ""
+        return f"Bring it up: sudo ip link set {spec.channel} up type can bitrate {spec.bitrate}{data}."
+    if spec.interface == "udp_multicast":
+        return "It needs a multicast address, and a route to it: sudo ip route add 239.0.0.0/8 dev lo."
+    if spec.interface == "socketcand":
+        return "Start socketcand there, or name it: socketcand:can0?host=127.0.0.1&port=29536."
+    return "Check the channel's name, that the adapter is plugged in, and that its driver is installed."
+
+
+def _reason(error: BaseException) -> str:
+    """The innermost cause in one line: python-can hides it behind its own."""
+    while error.__cause__ is not None:
+        error = error.__cause__
+    text = str(error).strip().splitlines()
+    return (text[0] if text else type(error).__name__).rstrip(".")
+
+
+def _hung_up(bus: can.BusABC) -> bool:
+    """Whether the server has closed the connection; python-can reads that as silence."""
+    connection = getattr(bus, "_SocketCanDaemonBus__socket", None)
+    if not isinstance(connection, socket.socket):
+        return False
+    try:
+        return connection.recv(1, socket.MSG_PEEK | socket.MSG_DONTWAIT) == b""
+    except BlockingIOError:
+        return False
+    except OSError:
+        return True

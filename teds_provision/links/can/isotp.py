@@ -1,0 +1,197 @@
+"""ISO 15765-2 between one pair of addresses: can-isotp's state machine, driven by events instead of polling.
+
+Normal fixed addressing with 29-bit identifiers: 0x18DA ‖ target ‖ source, functional 0x18DBFF ‖ source (ISO 15765-2,
+normal fixed addressing). We ask for 16 frames a block and no gap between them, pad with 0xCC, and take whatever block
+size, gap and padding the other side uses.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable
+from typing import Any, Final
+
+from teds_provision.links.can.bus import Frame
+
+LONGEST: Final = 4095
+"""Octets of the longest message: transaction ‖ a frame of the largest maxMessage."""
+BLOCK_SIZE: Final = 16
+PADDING: Final = 0xCC
+FUNCTIONAL: Final = 0x18DBFF00
+_PHYSICAL: Final = 0x18DA0000
+_TIMEOUT_MS: Final = 1000
+"""N_Bs and N_Cr of ISO 15765-2: the wait for a flow control or the next consecutive frame."""
+_SINGLE, _FIRST, _CONSECUTIVE, _FLOW = range(4)
+
+
+def physical_id(target: int, source: int) -> int:
+    """Identifier of a frame from ``source`` to ``target``."""
+    return _PHYSICAL | target << 8 | source
+
+
+def addresses(identifier: int) -> tuple[int, int] | None:
+    """Target and source of a physical identifier, None for any other."""
+    if identifier & 0x1FFF0000 != _PHYSICAL:
+        return None
+    return identifier >> 8 & 0xFF, identifier & 0xFF
+
+
+def padded(data: bytes, *, fd: bool) -> bytes:
+    """Fill up to 8 octets, or to the next length that FD knows."""
+    if len(data) <= 8 or not fd:
+        return data.ljust(8, bytes([PADDING]))
+    return data.ljust(next(size for size in (12, 16, 20, 24, 32, 48, 64) if size >= len(data)), bytes([PADDING]))
+
+
+def read_single(data: bytes) -> bytes | None:
+    """Content of a single frame (ISO 15765-2, N_PDU table); None when it is none, or says more than it has."""
+    if len(data) < 2 or data[0] >> 4 != _SINGLE:
+        return None
+    start, length = (1, data[0]) if data[0] else (2, data[1])
+    if not length or start + length > len(data):
+        return None
+    return data[start : start + length]
+
+
+def single(body: bytes, *, fd: bool = False) -> bytes:
+    """A padded single frame; ``body`` at most 7 octets, in FD 62."""
+    return padded((bytes([len(body)]) if len(body) <= 7 else bytes([0, len(body)])) + body, fd=fd)
+
+
+class Pair:
+    """Our end of one pair of addresses. Not thread-safe; ``send_frame`` is called from within every method."""
+
+    def __init__(self, own: int, peer: int, send_frame: Callable[[Frame], None], *, fd: bool = False) -> None:
+        import isotp
+
+        self.own, self.peer = own, peer
+        self._receive_id = physical_id(own, peer)
+        self._send_frame = send_frame
+        self._waiting: deque[Any] = deque()
+        self._message = isotp.CanMessage
+        self._wait_fc = isotp.TransportLayerLogic.TxState.WAIT_FC
+        self.error = ""
+        self.overflow = False
+        address = isotp.Address(isotp.AddressingMode.NormalFixed_29bits, source_address=own, target_address=peer)
+        self._logic = isotp.TransportLayerLogic(
+            self._next, self._put, address, error_handler=self._note_error, params=_parameters(fd)
+        )
+
+    def send(self, body: bytes) -> None:
+        """Start to send; what is still under way goes first."""
+        self._logic.send(body)
+        self.run()
+
+    def take(self, frame: Frame) -> bool:
+        """Give in one frame; whether it was of this pair. We answer in the form (classic, FD) in which we are asked."""
+        if frame.identifier != self._receive_id:
+            return False
+        if (data := _tolerable(frame.data)) is None:
+            return True
+        if data[0] >> 4 != _FLOW:
+            self.speak(fd=frame.fd)
+        self._waiting.append(
+            self._message(arbitration_id=frame.identifier, data=data, extended_id=True, is_fd=frame.fd)
+        )
+        self.run()
+        return True
+
+    def speak(self, *, fd: bool) -> None:
+        """From now on send in FD or classic."""
+        params = self._logic.params
+        if params.can_fd != fd and not self.sending:
+            params.can_fd = params.bitrate_switch = fd
+            params.tx_data_length = 64 if fd else 8
+
+    def run(self) -> None:
+        """Do what is due: send the next consecutive frame, give up on what never came."""
+        self._logic.process()
+        while self._waiting:
+            self._logic.process()
+
+    def received(self) -> bytes | None:
+        """The next whole message, None while there is none."""
+        body = self._logic.recv()
+        return None if body is None else bytes(body)
+
+    @property
+    def sending(self) -> bool:
+        """Whether a message of ours is still under way."""
+        return bool(self._logic.transmitting())
+
+    @property
+    def receiving(self) -> bool:
+        """Whether a message of theirs has begun and not ended."""
+        return bool(self._logic.is_rx_active())
+
+    @property
+    def waits_for_flow(self) -> bool:
+        """Whether our first frame, or block, has not been answered yet."""
+        return bool(self._logic.tx_state == self._wait_fc)
+
+    def due_in(self, most: float) -> float:
+        """Seconds until :meth:`run` has something to do, at most ``most``."""
+        delay = self._logic.next_cf_delay()
+        return most if delay is None else max(0.0, min(most, delay))
+
+    def abandon(self) -> None:
+        """Forget what is being sent and received, and past errors."""
+        self._waiting.clear()
+        self._logic.reset()
+        self.error, self.overflow = "", False
+
+    def stop_sending(self) -> None:
+        """Forget what is being sent."""
+        self._logic.clear_tx_queue()
+        self._logic.stop_sending()
+
+    def _next(self, _seconds: float) -> Any:
+        return self._waiting.popleft() if self._waiting else None
+
+    def _put(self, message: Any) -> None:
+        self._send_frame(Frame(message.arbitration_id, bytes(message.data), bool(message.is_fd)))
+
+    def _note_error(self, error: Exception) -> None:
+        import isotp
+
+        if isinstance(error, isotp.errors.UnexpectedFlowControlError | isotp.errors.UnexpectedConsecutiveFrameError):
+            return  # left over from a transfer that one side has given up
+        self.error = str(error)
+        self.overflow = isinstance(error, isotp.errors.OverflowError)
+
+
+def _parameters(fd: bool) -> dict[str, Any]:
+    return {
+        "stmin": 0,
+        "blocksize": BLOCK_SIZE,
+        "tx_padding": PADDING,
+        "max_frame_size": LONGEST,
+        "tx_data_length": 64 if fd else 8,
+        "can_fd": fd,
+        "bitrate_switch": fd,
+        "rx_flowcontrol_timeout": _TIMEOUT_MS,
+        "rx_consecutive_frame_timeout": _TIMEOUT_MS,
+        "wftmax": 1000,
+    }
+
+
+def _tolerable(data: bytes) -> bytes | None:
+    """Drop what ISO 15765-2 says to ignore and can-isotp would take for the end of a transfer.
+
+    Unknown frame types, single frames with an impossible length, first frames of 7 octets or fewer and unknown flow
+    states are ignored; a reserved STmin counts as 127 ms.
+    """
+    if len(data) < 2:
+        return None
+    kind = data[0] >> 4
+    if kind == _SINGLE:
+        return data if read_single(data) is not None else None
+    if kind == _FIRST:
+        length = (data[0] & 0xF) << 8 | data[1]
+        return data if len(data) >= 8 and (length > 7 or length == 0) else None
+    if kind == _CONSECUTIVE:
+        return data
+    if kind == _FLOW and len(data) >= 3 and data[0] & 0xF <= 2:
+        reserved = 0x80 <= data[2] <= 0xF0 or data[2] >= 0xFA
+        return data[:2] + (b"\x7f" if reserved else data[2:3]) + data[3:]
+    return None

@@ -1,0 +1,127 @@
+"""The ``--can`` option: ``INTERFACE:CHANNEL[?key=value&…]`` (command-line contract, "Links")."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Final
+from urllib.parse import unquote
+
+from teds_provision.errors import UsageFailure
+
+FIRST_STATION: Final = 0xF1
+LAST_STATION: Final = 0xF7
+"""Addresses of base stations (profile: wire, "CAN")."""
+LAST_NODE: Final = 0xEF
+"""Nodes have 0x01 to 0xEF."""
+DEFAULT_BITRATE: Final = 500_000
+DEFAULT_DATA_BITRATE: Final = 2_000_000
+
+OptionValue = int | float | str | bool
+
+_HINT: Final = "Write it like socketcan:can0?bitrate=500000 or udp_multicast:239.74.163.2?node=0x21."
+_RESERVED: Final = frozenset({"interface", "channel", "can_filters", "ignore_config", "config_context"})
+_TRUE: Final = frozenset({"1", "true", "yes", "on"})
+_FALSE: Final = frozenset({"0", "false", "no", "off"})
+
+
+@dataclass(frozen=True)
+class CanSpec:
+    """A CAN bus as the user named it.
+
+    ``node`` 1 to 239 is the only node to talk to, None for any; ``source`` is the station's own address, 0xF1 to 0xF7;
+    ``bitrate`` and ``data_bitrate`` in bit/s (the latter for the fast part of an FD frame); ``pace`` holds every sent
+    frame back for the time it would take on a wire; ``options`` go to the python-can interface as they are.
+    """
+
+    interface: str
+    channel: str
+    fd: bool = False
+    node: int | None = None
+    source: int = FIRST_STATION
+    bitrate: int = DEFAULT_BITRATE
+    data_bitrate: int = DEFAULT_DATA_BITRATE
+    pace: bool = False
+    options: tuple[tuple[str, OptionValue], ...] = ()
+
+    @property
+    def text(self) -> str:
+        """Interface and channel, to name the bus in a message."""
+        return f"{self.interface}:{self.channel}"
+
+
+def parse_spec(text: str) -> CanSpec:
+    """Read the ``--can`` option; raises UsageFailure that names the part which is wrong.
+
+    The interface ends at the first colon, so that an IPv6 multicast group may be a channel. ``bitrate`` and
+    ``data_bitrate`` are used here and passed on as well.
+    """
+    place, _, query = text.partition("?")
+    interface, colon, channel = place.partition(":")
+    if not interface.isidentifier() or not colon or not channel:
+        raise UsageFailure(f"--can {text!r} does not name an interface and a channel.", hint=_HINT)
+    values = _pairs(query)
+    fd = _flag(values, "fd")
+    pace = _flag(values, "pace")
+    node = _number(values, "node", 1, LAST_NODE)
+    source = _number(values, "source", FIRST_STATION, LAST_STATION)
+    options: dict[str, OptionValue] = {key: _guess(value) for key, value in values.items()}
+    bitrate = _number(values, "bitrate", 1, 1_000_000)
+    data_bitrate = _number(values, "data_bitrate", 1, 20_000_000)
+    if interface == "udp_multicast":
+        options.setdefault("hop_limit", 0)  # python-can's own default of 1 puts every frame on the network
+    return CanSpec(
+        interface,
+        channel,
+        fd=fd,
+        node=node,
+        source=FIRST_STATION if source is None else source,
+        bitrate=bitrate or DEFAULT_BITRATE,
+        data_bitrate=data_bitrate or DEFAULT_DATA_BITRATE,
+        pace=pace,
+        options=tuple(options.items()),
+    )
+
+
+def _pairs(query: str) -> dict[str, str]:
+    values: dict[str, str] = {}
+    for part in query.split("&") if query else []:
+        key, equals, value = part.partition("=")
+        if not equals or not key.isidentifier() or key in _RESERVED:
+            raise UsageFailure(f"--can has an option {part!r} that is not of the form key=value.", hint=_HINT)
+        if key in values:
+            raise UsageFailure(f"--can names {key} twice.", hint="Give each option once.")
+        values[key] = unquote(value)
+    return values
+
+
+def _flag(values: dict[str, str], key: str) -> bool:
+    value = values.pop(key, "0").lower()
+    if value not in _TRUE | _FALSE:
+        raise UsageFailure(f"--can {key}={value!r} is neither 1 nor 0.", hint=f"Write {key}=1 or leave it out.")
+    return value in _TRUE
+
+
+def _number(values: dict[str, str], key: str, least: int, most: int) -> int | None:
+    """Take ``key`` as a whole number within bounds; bit rates stay behind for the interface."""
+    value = values.get(key) if key.endswith("bitrate") else values.pop(key, None)
+    if value is None:
+        return None
+    number = _guess(value)
+    if not isinstance(number, int) or not least <= number <= most:
+        bounds = f"0x{least:02X} to 0x{most:02X}" if most <= 0xFF else f"{least} to {most}"
+        raise UsageFailure(
+            f"--can {key}={value!r} is not a whole number from {bounds}.", hint=f"Write, for example, {key}={least:#x}."
+        )
+    return number
+
+
+def _guess(value: str) -> int | float | str:
+    """Return what looks like a number as a number: 500000, 0x21, 0.5."""
+    if not value.isascii():
+        return value
+    for read in (lambda: int(value, 0), lambda: int(value), lambda: float(value)):
+        try:
+            return read()
+        except ValueError:
+            continue
+    return value

@@ -1,0 +1,310 @@
+"""A station and nodes in two processes: whole frames both ways, silence, loss, repetition."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import random
+import threading
+import time
+from collections.abc import Callable, Iterator
+
+import pytest
+
+from teds_provision.errors import AddressConflict, LinkFailure, NodeSilent, NoNode, NoReader
+from teds_provision.links.can import port as port_module
+from teds_provision.links.can.port import CanPort
+from teds_provision.links.ports import Contact, Notice
+from teds_provision.node.can_server import CanServer
+from teds_provision.protocol.identity import Identity, NodeState
+from tests.links.can.echo_node import EchoNode
+from tests.links.can.hub import Hub
+
+pytestmark = pytest.mark.link
+Start = Callable[..., None]
+
+
+def anyone(_: Identity) -> bool:
+    return True
+
+
+def quiet(_: Notice) -> None:
+    pass
+
+
+def write(octets: bytes) -> bytes:
+    return b"\x00\x00\x01\x03" + len(octets).to_bytes(2, "big") + octets
+
+
+COUNT = b"\x00\x00\x01\x7f\x00\x00"
+
+
+@contextlib.contextmanager
+def opened(spec: str) -> Iterator[CanPort]:
+    port = CanPort(spec)
+    try:
+        yield port
+    finally:
+        port.close()
+
+
+@contextlib.contextmanager
+def serving(spec: str, node: EchoNode) -> Iterator[CanServer]:
+    server = CanServer(spec, node)
+    server.start()
+    try:
+        yield server
+    finally:
+        server.stop()
+
+
+def find(port: CanPort, seconds: float = 10.0, **options: int) -> Contact:
+    return port.find(anyone, seconds=seconds, notice=quiet, **options)
+
+
+@pytest.mark.parametrize("form", ["", "&fd=1"])
+def test_exchanges_every_length_over_multicast(group: str, nodes: Start, form: str) -> None:
+    nodes(group + form, 0x21)
+    with opened(group + form) as port:
+        contact = find(port)
+        assert contact.address == 0x21
+        assert contact.identity.can_address == 0x21
+        for length in (1, 2, 6, 7, 8, 61, 62, 63, 700, 2048, 4088):
+            octets = os.urandom(length)
+            assert contact.link.exchange(write(octets)) == octets[::-1], length
+
+
+def test_exchanges_over_a_bus_that_never_loses(hub: Hub, nodes: Start) -> None:
+    nodes(hub.spec, 0x30)
+    with opened(hub.spec) as port:
+        link = find(port, address=0x30).link
+        for _ in range(5):
+            octets = os.urandom(4088)
+            assert link.exchange(write(octets)) == octets[::-1]
+
+
+def test_a_node_answers_an_fd_station_in_fd_and_a_classic_one_in_classic(group: str, nodes: Start) -> None:
+    nodes(group + "&fd=1", 0x21)
+    octets = os.urandom(300)
+    with opened(group + "&fd=1") as fd, opened(group + "&source=0xF2") as classic:
+        fd_link, classic_link = find(fd).link, find(classic).link
+        for _ in range(3):
+            assert fd_link.exchange(write(octets)) == octets[::-1]
+            assert classic_link.exchange(write(octets)) == octets[::-1]
+
+
+def test_an_exchange_takes_milliseconds(group: str, nodes: Start) -> None:
+    nodes(group, 0x21)
+    with opened(group) as port:
+        link = find(port).link
+        link.exchange(write(b"warm"))
+        times = []
+        for _ in range(20):
+            began = time.perf_counter()
+            link.exchange(write(bytes(700)))
+            times.append(time.perf_counter() - began)
+    assert min(times) < 0.2, sorted(times)
+
+
+def test_a_hundred_exchanges_under_load(group: str, nodes: Start) -> None:
+    nodes(group, 0x21)
+    stop = threading.Event()
+
+    def burn() -> None:
+        while not stop.is_set():
+            sum(range(2000))
+
+    load = threading.Thread(target=burn)
+    load.start()
+    try:
+        with opened(group) as port:
+            link = find(port).link
+            for _ in range(100):
+                octets = os.urandom(random.randrange(1, 400))
+                assert link.exchange(write(octets)) == octets[::-1]
+    finally:
+        stop.set()
+        load.join()
+
+
+def test_twenty_nodes_answer_one_identify(hub: Hub, nodes: Start) -> None:
+    addresses = list(range(0x10, 0x24))
+    nodes(hub.spec, *addresses)
+    with opened(hub.spec) as port:
+        stop = threading.Event()
+        found = set()
+        for contact in port.watch(stop=stop, notice=quiet):
+            found.add(contact.address)
+            if len(found) == len(addresses):
+                stop.set()
+        assert found == set(addresses)
+        wanted = bytes([19, addresses[19]]) * 5
+        assert port.find(lambda seen: seen.uuid == wanted, seconds=5, notice=quiet).address == addresses[19]
+
+
+def test_watch_tells_again_of_a_node_back_in_factory_state(hub: Hub) -> None:
+    node = EchoNode(0x21)
+    node.state = NodeState.PROVISIONED
+    with serving(hub.spec, node), opened(hub.spec) as port:
+        stop = threading.Event()
+        contacts = port.watch(stop=stop, notice=quiet)
+        assert next(contacts).identity.state is NodeState.PROVISIONED
+        threading.Timer(1.2, lambda: setattr(node, "state", NodeState.FACTORY)).start()
+        assert next(contacts).identity.state is NodeState.FACTORY
+        stop.set()
+        assert list(contacts) == []
+
+
+def test_watch_survives_a_bus_that_goes_away() -> None:
+    hub = Hub()
+    port = CanPort(hub.spec)
+    notices: list[str] = []
+    stop = threading.Event()
+    threading.Timer(0.3, hub.close).start()
+    threading.Timer(2.5, stop.set).start()
+    assert list(port.watch(stop=stop, notice=lambda told: notices.append(told.kind))) == []
+    assert notices == ["waiting", "reader-lost"]
+    port.close()
+
+
+def test_two_nodes_under_one_address_are_a_conflict(hub: Hub) -> None:
+    first, second = EchoNode(0x21, uuid=b"A" * 10), EchoNode(0x21, uuid=b"B" * 10)
+    with serving(hub.spec, first), serving(hub.spec, second), opened(hub.spec) as port:
+        with pytest.raises(AddressConflict, match="0x21"):
+            find(port, seconds=3)
+        kinds: list[str] = []
+        stop = threading.Event()
+        threading.Timer(1.5, stop.set).start()
+        assert list(port.watch(stop=stop, notice=lambda told: kinds.append(told.kind))) == []
+        assert "conflict" in kinds
+
+
+def test_nobody_is_there(hub: Hub) -> None:
+    with opened(hub.spec) as port:
+        began = time.monotonic()
+        with pytest.raises(NoNode, match=r"within 1\.2 s"):
+            find(port, seconds=1.2)
+        assert 1.0 < time.monotonic() - began < 3
+
+
+def test_another_node_than_the_wanted_is_told_and_waited_past(hub: Hub) -> None:
+    told: list[Notice] = []
+    with serving(hub.spec, EchoNode(0x21)), opened(hub.spec + "&node=0x21") as port:
+        with pytest.raises(NoNode, match="2121"):
+            port.find(lambda _: False, seconds=1.2, notice=told.append)
+    assert [notice.kind for notice in told] == ["waiting", "foreign-tag"]
+
+
+def test_a_node_that_falls_silent(hub: Hub, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(port_module, "REPLY_SECONDS", 0.3)
+    with opened(hub.spec) as port:
+        with serving(hub.spec, EchoNode(0x21)):
+            link = find(port).link
+        with pytest.raises(NodeSilent, match="0x21"):
+            link.exchange(COUNT)
+    requests = {data for identifier, data in hub.frames if identifier == 0x18DA21F1 and data[0] >> 4 == 0}
+    repeated = [data for identifier, data in hub.frames if identifier == 0x18DA21F1 and data[2:] == COUNT]
+    assert len(repeated) == 3
+    assert len(set(repeated)) == 1
+    assert requests
+
+
+def test_a_lost_reply_is_repeated_and_the_command_runs_once(hub: Hub, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(port_module, "REPLY_SECONDS", 0.3)
+    node = EchoNode(0x21)
+    with serving(hub.spec, node), opened(hub.spec) as port:
+        link = find(port).link
+        lost: list[bytes] = []
+
+        def lose_first(identifier: int, data: bytes) -> bool:
+            if identifier == 0x18DAF121 and not lost:
+                lost.append(data)
+                return True
+            return False
+
+        hub.lose = lose_first
+        assert link.exchange(COUNT) == b"\x01\x00\x01"
+        assert lost
+        assert node.runs == 1
+        assert link.exchange(COUNT) == b"\x01\x00\x02"
+
+
+@pytest.mark.parametrize("way", [0x18DA21F1, 0x18DAF121])
+def test_a_lost_consecutive_frame_is_made_good(hub: Hub, way: int) -> None:
+    node = EchoNode(0x21)
+    with serving(hub.spec, node), opened(hub.spec) as port:
+        link = find(port).link
+        lost: list[bytes] = []
+
+        def lose_one(identifier: int, data: bytes) -> bool:
+            if identifier == way and data[0] == 0x23 and not lost:
+                lost.append(data)
+                return True
+            return False
+
+        hub.lose = lose_one
+        octets = os.urandom(300)
+        assert link.exchange(write(octets)) == octets[::-1]
+        assert lost
+        assert node.runs == 1
+
+
+def test_a_reply_of_another_transaction_is_dropped(hub: Hub) -> None:
+    node = EchoNode(0x21, delay=0.2)
+    with serving(hub.spec, node), opened(hub.spec) as port:
+        link = find(port).link
+
+        def forge() -> None:
+            request = next(data for way, data in reversed(hub.frames) if way == 0x18DA21F1 and data[2:8] == COUNT)
+            hub.send(0x18DAF121, bytes([4, request[1] ^ 0x55]) + b"\xff\xff\xff\xcc\xcc\xcc")
+
+        threading.Timer(0.1, forge).start()
+        assert link.exchange(COUNT) == b"\x01\x00\x01"
+
+
+def test_a_slow_command_of_one_station_does_not_hold_up_another(hub: Hub) -> None:
+    node = EchoNode(0x21, delay=1.0)
+    with serving(hub.spec, node), opened(hub.spec) as port, opened(hub.spec + "&source=0xF2") as other:
+        slow, identity = find(port).link, b"\x00\x00\x80\x07\x00\x00"
+        replies: list[bytes] = []
+        thread = threading.Thread(target=lambda: replies.append(slow.exchange(write(bytes(500)))))
+        thread.start()
+        time.sleep(0.3)
+        began = time.monotonic()
+        assert find(other, address=0x21).link.exchange(identity)[3:] == node.identify()
+        assert time.monotonic() - began < 0.6
+        thread.join()
+        assert replies == [bytes(500)]
+    assert {name for name, _ in node.seen} == {"can:f1", "can:f2"}
+    assert set(node.links_lost) == {"can:f1", "can:f2"}
+
+
+def test_the_reply_to_set_can_address_leaves_from_the_old_one(hub: Hub) -> None:
+    node = EchoNode(0x21)
+    with serving(hub.spec, node), opened(hub.spec) as port:
+        assert find(port).link.exchange(b"\x00\x00\x80\x0a\x00\x01\x42") == b"\x01\x00\x00"
+        moved = find(port, address=0x42)
+        assert moved.address == 0x42
+        assert moved.link.exchange(write(bytes(100))) == bytes(100)
+
+
+def test_no_bus_is_named_with_its_cure() -> None:
+    with pytest.raises(NoReader) as missing:
+        CanPort("socketcan:nosuch0?bitrate=250000")
+    assert "ip link set nosuch0 up type can bitrate 250000" in missing.value.hint
+    with pytest.raises(NoReader, match="socketcand"):
+        CanPort("socketcand:can0?port=1")
+    with pytest.raises(NoReader):
+        CanPort("nonsense:can0")
+    with pytest.raises(NoReader):
+        CanPort("udp_multicast:127.0.0.1")
+
+
+def test_a_bus_that_closes_is_a_link_failure() -> None:
+    hub = Hub()
+    with opened(hub.spec) as port:
+        time.sleep(0.1)
+        hub.close()
+        with pytest.raises(LinkFailure) as failure:
+            find(port, seconds=3)
+        assert not isinstance(failure.value, NoNode)
