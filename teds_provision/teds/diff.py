@@ -99,7 +99,7 @@ def _block(key: BlockId, where: str, old: Mapping[BlockId, bytes], new: Mapping[
             if text:
                 found = True
                 yield Change(channel, access_code, "curve", "", "", f"{where}: {text}.")
-    units = _units(channel, new) or _units(channel, old)
+    units = _units(channel, old), _units(channel, new)
     ones, others = _flat(before), _flat(after)
     for path in dict.fromkeys((*ones, *others)):
         one, other = ones.get(path), others.get(path)
@@ -107,7 +107,10 @@ def _block(key: BlockId, where: str, old: Mapping[BlockId, bytes], new: Mapping[
         if path[0][0] in skip or (one is not None and other is not None and one.raw == other.raw):
             continue
         found = True
-        was, now = (_shown(field, access_code, path, units) if field else "" for field in (one, other))
+        was, now = (
+            _shown(field, access_code, path, unit) if field else ""
+            for field, unit in zip((one, other), units, strict=True)
+        )
         yield Change(channel, access_code, name, was, now, _sentence(where, path, was, now))
     if not found:
         yield Change(

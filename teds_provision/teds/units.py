@@ -428,6 +428,11 @@ def parse_seconds(value: object) -> float:
     )
 
 
+def short_unit(text: str) -> str:
+    """Sign of a unit where it has one (``°`` for ``degree``), for showing."""
+    return _SHORT.get(text, text)
+
+
 def recognize(units: Units, scale: float, offset: float) -> WrittenUnit:
     """Unit of these exponents that converts into SI this way; one without a usual name is called after its scale."""
 

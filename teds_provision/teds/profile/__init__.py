@@ -3,6 +3,7 @@
 Pure but for reading the files themselves. ``load_profile`` finds and checks, :meth:`Profile.build` makes the TEDS.
 """
 
+from teds_provision.teds.profile.describe import describe, describe_channel, listed, summary
 from teds_provision.teds.profile.load import (
     Listed,
     check,
@@ -32,9 +33,13 @@ __all__ = [
     "TextProfile",
     "check",
     "default_folders",
+    "describe",
+    "describe_channel",
     "find_profile",
     "list_profiles",
+    "listed",
     "load_profile",
     "shipped_profiles",
+    "summary",
     "template",
 ]
