@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from teds_provision.errors import NotFound, UsageFailure
+from teds_provision.errors import BadData, NotFound, UsageFailure
 from teds_provision.store import Draft
 from teds_provision.teds.image import SECURITY, BlockId, Image
 from teds_provision.workflow.sign import known_image, known_node_keys, unsigned_security
@@ -54,10 +54,12 @@ def build(
 ) -> Built:
     """Build a node's datasheet.
 
-    ``has`` is what the node has now (else what it was last read to have): its calibration is kept where the order
-    brings none. ``keep`` are read-only TEDS of the node, to be signed as they are. ``keep_draft`` False changes nothing
-    in the store (dry run). Raises NotFound (profile, file),
-    BadData (profile or calibration with errors), PolicyRefused (a calibration that the guard refuses).
+    ``has`` is what the node has now (else what it was last read to have): where the order brings no calibration, that
+    of an earlier run that never came to write is taken, else the node's is kept. ``keep`` are read-only TEDS of the
+    node, to be signed as they are. ``keep_draft`` False changes nothing in the store (dry run).
+
+    Raises NotFound (profile, file), BadData (profile or calibration with errors), PolicyRefused (a calibration that
+    the guard refuses).
     """
     from teds_provision.teds.profile import default_folders, load_profile
 
@@ -67,7 +69,7 @@ def build(
         raise UsageFailure(f"No profile is known for node {uuid.hex()}.", hint="Add --profile; see: profile list")
     profile = load_profile(wanted, default_folders(station.store.home))
     has = has or known_image(station, uuid)
-    calibrations, warnings = _calibrations(order, profile, has)
+    calibrations, warnings = _calibrations(order, profile, _pending(station, uuid, has) or has)
     name = order.name or (record.name if record else None)
     made = profile.build(uuid, calibration=calibrations, name=name, edition=edition)  # type: ignore[arg-type]
     image = Image(uuid, {**(keep or {}), **made.blocks})
@@ -84,6 +86,27 @@ def build(
         station.store.put_draft(Draft(uuid, image.to_json(), "built", wanted))
         station.audit("build", uuid, "done", profile=profile.name, teds=image.digest())
     return Built(image, profile.name, warnings)
+
+
+def _pending(station: Station, uuid: bytes, has: Image | None) -> Image | None:
+    """What an earlier run built or signed and never wrote: it says which calibration is meant, not the node."""
+    draft = station.store.draft(uuid)
+    if draft is None:
+        return None
+    image = Image.from_json(draft.image)
+    if draft.stage == "signed" and _sequence(image) <= _sequence(has):
+        return None
+    return image
+
+
+def _sequence(image: Image | None) -> int:
+    from teds_provision.teds import security
+
+    octets = image.security if image is not None else None
+    try:
+        return security.decode(octets).sequence if octets is not None else -1
+    except BadData:
+        return -1
 
 
 def _calibrations(
@@ -103,7 +126,7 @@ def _calibrations(
         if access_code == CALIBRATION and channel:
             kept[channel] = Calibration.from_decoded(teds.decode(has.blocks[channel, access_code]))
     numbers = ", ".join(map(str, kept))
-    return kept, (f"The calibration that the node has is kept (channel {numbers}).",) if kept else ()
+    return kept, (f"The calibration that was given before is kept (channel {numbers}).",) if kept else ()
 
 
 def guard(

@@ -11,7 +11,7 @@ from teds_provision.protocol.identity import NodeState
 from teds_provision.protocol.keys import fingerprint, is_point, node_key_message, prove_message, verify
 from teds_provision.store import WhitelistEntry, utc_now
 from teds_provision.teds import security
-from teds_provision.teds.image import SECURITY
+from teds_provision.teds.image import SECURITY, Image
 from teds_provision.workflow.conversation import Conversation
 from teds_provision.workflow.reading import read_block
 from teds_provision.workflow.station import Station
@@ -69,6 +69,8 @@ def identify(station: Station, node: Conversation) -> Identified:
         can_address=identity.can_address,
         last_seen=utc_now(),
     )
+    if station.store.node_image(node.uuid) is None:
+        station.store.put_node_image(node.uuid, Image(node.uuid, {SECURITY: octets}).to_json())
     return Identified(
         uuid=node.uuid,
         point=point,
