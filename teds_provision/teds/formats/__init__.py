@@ -25,7 +25,18 @@ from typing import Final, Literal, get_args
 from teds_provision.errors import BadData
 from teds_provision.teds.formats.block import MAX_FILE, Block, class_of, is_run, split_run, with_class
 
-__all__ = ["FORMATS", "Block", "Format", "Kind", "class_of", "detect", "lost", "read_blocks", "write_blocks"]
+__all__ = [
+    "FORMATS",
+    "Block",
+    "Format",
+    "Kind",
+    "class_of",
+    "detect",
+    "lost",
+    "read_blocks",
+    "with_class",
+    "write_blocks",
+]
 
 Format = Literal["binary", "hex", "ihex", "json", "xml", "image", "toml"]
 Kind = Literal["binary", "hex", "ihex", "json", "xml", "image", "toml", "bundle"]

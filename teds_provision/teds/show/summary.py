@@ -1,0 +1,119 @@
+"""What a TEDS means beyond its fields: place and time of a UUID, range, calibration and due date, keys, weak codes."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from datetime import datetime
+
+from teds_provision.errors import BadData
+from teds_provision.teds.model import Decoded, Units
+from teds_provision.teds.show.values import FINGERPRINT_DIGITS, Context, fingerprint, instant
+
+META, CHANNEL, CALIBRATION, SECURITY = 1, 3, 5, 128
+_PROFILE_VERSION = "ProfileVersion"
+
+Line = tuple[str, str]
+
+
+def summary_of(decoded: Decoded, context: Context, now: datetime) -> tuple[Line, ...]:
+    """Lines of (label, text) for people."""
+    lines = {META: _uuid, CHANNEL: _range, SECURITY: _security}.get(decoded.access_code or 0)
+    if lines is not None:
+        return tuple(lines(decoded, context))
+    return tuple(_calibration(decoded, context, now)) if decoded.access_code == CALIBRATION else ()
+
+
+def _uuid(decoded: Decoded, _context: Context) -> Iterator[Line]:
+    from teds_provision.teds.uuid import unpack_uuid
+
+    value = decoded.get("UUID")
+    parts = unpack_uuid(value) if isinstance(value, bytes) else None
+    if parts is None:
+        return
+    if not parts.plausible:
+        yield "UUID", "gives no sensible place and time: probably random, which is allowed"
+        return
+    if parts.degrees is not None:
+        latitude, longitude = parts.degrees
+        yield "made at", f"{abs(latitude):.4f}° {'NS'[latitude < 0]}, {abs(longitude):.4f}° {'EW'[longitude < 0]}"
+    moment = parts.moment
+    yield "made in", f"{moment:%Y-%m-%d %H:%M:%S} (TAI)" if moment is not None else str(parts.year)
+    if parts.manufacturer:
+        yield "maker's number", str(parts.manufacturer)
+
+
+def _range(decoded: Decoded, context: Context) -> Iterator[Line]:
+    from teds_provision.teds.units import format_value
+
+    low, high, error = (decoded.get(name) for name in ("LowLimit", "HiLimit", "OError"))
+    if context.unit is None or not isinstance(low, float) or not isinstance(high, float):
+        return
+    text = f"{format_value(low, context.unit)} to {format_value(high, context.unit)}"
+    if isinstance(error, float):
+        text += f", uncertainty {format_value(error, context.unit, difference=True)}"
+    yield "range", text
+
+
+def _calibration(decoded: Decoded, context: Context, now: datetime) -> Iterator[Line]:
+    from teds_provision.teds.calibration.decoded import from_decoded
+
+    own = context.beside.get((context.channel or 1, CHANNEL))
+    units, actuator = _channel_of(own)
+    try:
+        calibration = from_decoded(decoded, channel=context.channel, units=units, actuator=actuator)
+    except BadData as error:
+        yield "calibration", f"{error.message} {error.hint}".strip()
+        return
+    segments = " × ".join(str(part.segments) for part in calibration.inputs)
+    degrees = ", ".join(str(part.degree) for part in calibration.inputs)
+    yield "method", f"{calibration.method}: {segments} segments of degree {degrees}"
+    if calibration.date is not None:
+        yield "calibrated", f"{calibration.date:%Y-%m-%d}"
+    if calibration.due is not None:
+        yield "due", f"{calibration.due:%Y-%m-%d}{' (overdue)' if calibration.overdue(now) else ''}"
+
+
+def _channel_of(octets: bytes | None) -> tuple[Units | None, bool]:
+    if octets is None:
+        return None, False
+    from teds_provision.teds import decode
+
+    channel = decode(octets)
+    units = channel.get("PhyUnits")
+    return units if isinstance(units, Units) else None, channel.get("ChanType") == 1
+
+
+def _security(decoded: Decoded, context: Context) -> Iterator[Line]:
+    from teds_provision.teds.keyforms import read_key
+    from teds_provision.teds.model import TimeInstance
+
+    ours = decoded.field(_PROFILE_VERSION) is not None
+    if not ours:
+        yield "kind", "somebody else's Security TEDS (no field 105): shown, never trusted"
+    for name, label in (("NodePublicKey", "node"), ("BaseStationPublicKey", "station")):
+        field = decoded.field(name)
+        point = read_key(field.raw).point if field is not None else None
+        if point is not None:
+            yield (
+                f"{label} key",
+                f"fingerprint {fingerprint(point)[:FINGERPRINT_DIGITS]} (a hint, not an anchor of trust)",
+            )
+    signature = decoded.field("Signature")
+    when = decoded.get("LastModified")
+    signed = f"claims to be signed, {instant(when)}" if isinstance(when, TimeInstance) else "claims to be signed"
+    yield "signature", f"{signed}; check with: verify" if signature is not None else "none: initial or unsigned"
+    for name, field_word in (("Sequence", "sequence"), ("KeyEpoch", "key epoch")):
+        number = decoded.get(name)
+        if isinstance(number, int):
+            yield field_word, str(number)
+    if ours and context.beside:
+        yield from _form(decoded)
+
+
+def _form(decoded: Decoded) -> Iterator[Line]:
+    from teds_provision.teds import security
+
+    try:
+        security.decode(decoded.octets)
+    except BadData as error:
+        yield "form", f"not canonical, so never authentic: {error.message}"
