@@ -1,6 +1,6 @@
 """Coverage-guided fuzzing of the TEDS codec (atheris), and the same check for a replay without it.
 
-Run: python tests/fuzz/fuzz_teds.py tests/fuzz/corpus/teds -max_total_time=600 -rss_limit_mb=512 -max_len=4096
+Run: python tests/fuzz/fuzz_teds.py tests/fuzz/corpus -max_total_time=600
 
 The first octet of an input chooses: even, the rest goes to the decoder as it is; odd, the rest is a data block and
 gets a right Length and checksum first, so that the fuzzer need not find one. Nothing but BadData may come out, and that
@@ -13,6 +13,7 @@ import sys
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[2]
+LIMITS = ["-rss_limit_mb=512", "-max_len=4096", "-timeout=10"]
 
 
 def check(data: bytes) -> None:
@@ -53,7 +54,7 @@ def check(data: bytes) -> None:
 
 
 def main() -> None:
-    """Fuzz with atheris; arguments are those of libFuzzer."""
+    """Fuzz with atheris; arguments are those of libFuzzer, memory and size of an input are bounded here."""
     import atheris
 
     sys.path.insert(0, str(ROOT))
@@ -66,7 +67,7 @@ def main() -> None:
         import teds_provision.teds.tables_calibration
         import teds_provision.teds.text
         import teds_provision.teds.uuid  # noqa: F401
-    atheris.Setup(sys.argv, check)
+    atheris.Setup([sys.argv[0], *LIMITS, *sys.argv[1:]], check)
     atheris.Fuzz()
 
 

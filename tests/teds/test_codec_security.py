@@ -1,0 +1,116 @@
+"""The Security TEDS: ours in canonical form, other people's with keys in any form, weak algorithms named."""
+
+from __future__ import annotations
+
+import base64
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from teds_provision import teds
+from teds_provision.teds import security
+from teds_provision.teds.frame import frame
+
+POINT = b"\x04" + bytes(range(64))
+SPKI = bytes.fromhex("3059301306072a8648ce3d020106082a8648ce3d030107034200") + POINT
+PEM = b"-----BEGIN PUBLIC KEY-----\n" + base64.encodebytes(SPKI) + b"-----END PUBLIC KEY-----\n"
+
+
+def ours(**changes: object) -> bytes:
+    fields = {"signature": bytes(64), "station_key": POINT, "station_key_signature": bytes(64), "ca": "Works:00"}
+    return security.SecurityTeds(POINT, bytes(64), **{**fields, **changes}).encode()  # type: ignore[arg-type]
+
+
+def test_ours_is_clean_and_named() -> None:
+    decoded = teds.decode(ours(signed_blocks={(0, 1): bytes(32), (1, 3): bytes(32)}))
+    assert decoded.verdict == "clean"
+    assert decoded.findings == ()
+    assert [field.name for field in decoded.fields[:7]] == [
+        "TEDSID",
+        "UsedSecScheme",
+        "UsedVerAlg",
+        "UsedEncAlg",
+        "UsedHashAlg",
+        "CA",
+        "LastModified",
+    ]
+    assert decoded.get("UsedEncAlg") == 0
+    key = teds.read_key(str(decoded.get("NodePublicKey")))
+    assert (key.form, key.point) == ("base64", POINT)
+
+
+def test_type_3_behind_the_tedsid_is_the_encryption() -> None:
+    table = teds.table(128)
+    assert table.by_type[3].enumeration[table.by_type[3].type - 3] == "AES-128"
+
+
+@pytest.mark.parametrize("break_it", ["order", "length", "unknown"])
+def test_ours_out_of_canonical_form_is_in_error(break_it: str) -> None:
+    block = ours()[4:-2]
+    if break_it == "order":
+        block = block[:6] + block[9:12] + block[6:9] + block[12:]
+    elif break_it == "length":
+        block = block[:6] + b"\1\2\0\4" + block[9:]
+    else:
+        block = block[:18] + b"\x09\1\0" + block[18:]
+    decoded = teds.decode(frame(block))
+    assert decoded.verdict == "content-nonconformant"
+    assert any(finding.code == "not-canonical" for finding in decoded.findings)
+
+
+@pytest.mark.parametrize(
+    ("written", "form"),
+    [(PEM, "pem"), (SPKI, "der"), (SPKI.hex().encode(), "hex"), (base64.b64encode(SPKI), "base64"), (POINT, "raw")],
+)
+def test_keys_of_other_people_in_every_form(written: bytes, form: str) -> None:
+    fields = {"UsedSecScheme": 4, "UsedVerAlg": 2, "UsedEncAlg": 0, "UsedHashAlg": 1, "NodePublicKey": written}
+    decoded = teds.decode(teds.compose(128, fields))
+    assert decoded.verdict == "clean"
+    assert "foreign" in {finding.code for finding in decoded.findings}
+    key = teds.read_key(decoded.field("NodePublicKey").raw)  # type: ignore[union-attr]
+    assert (key.form, key.point) == (form, POINT)
+
+
+@given(st.binary(max_size=300))
+def test_any_key_is_read(octets: bytes) -> None:
+    assert teds.read_key(octets).form in {"pem", "hex", "base64", "der", "raw"}
+
+
+@pytest.mark.parametrize(
+    ("field", "code", "name"),
+    [
+        ("UsedSecScheme", 0, "NoSec"),
+        ("UsedVerAlg", 1, "DSA"),
+        ("UsedVerAlg", 3, "ElGamal"),
+        ("UsedEncAlg", 2, "RC4"),
+        ("UsedEncAlg", 3, "DES"),
+        ("UsedEncAlg", 4, "Blowfish"),
+        ("UsedHashAlg", 0, "MD5"),
+    ],
+)
+def test_weak_choices_are_named(field: str, code: int, name: str) -> None:
+    fields = {"UsedSecScheme": 4, "UsedVerAlg": 2, "UsedEncAlg": 0, "UsedHashAlg": 1, field: code}
+    weak = [finding for finding in teds.decode(teds.compose(128, fields)).findings if finding.code == "weak"]
+    assert [(finding.field, finding.found) for finding in weak] == [(field, name)]
+
+
+def test_reserved_codes_are_warned_about() -> None:
+    fields = {"UsedSecScheme": 77, "UsedVerAlg": 2, "UsedEncAlg": 0, "UsedHashAlg": 1}
+    findings = teds.decode(teds.compose(128, fields)).findings
+    assert [finding.field for finding in findings if finding.code == "enumeration"] == ["UsedSecScheme"]
+
+
+def test_somebody_elses_class_128_does_not_become_an_error() -> None:
+    block = bytes.fromhex("030400800101") + bytes.fromhex("0104DEADBEEF") + bytes.fromhex("4D0101") + b"\x96\x00"
+    decoded = teds.decode(frame(block))
+    assert decoded.verdict == "clean"
+    assert teds.recompose(decoded) == decoded.octets
+
+
+def test_security_of_2024_keeps_what_nobody_knows() -> None:
+    octets = teds.compose(16, {"Level": "E", "NumOfStandards": 1, "12": b"\x0a", "13": b"\x04"}, edition=2024)
+    decoded = teds.decode(octets)
+    assert decoded.verdict == "clean"
+    assert [(field.type, field.raw) for field in decoded.fields[3:]] == [(12, b"\x0a"), (13, b"\x04")]
+    assert teds.recompose(decoded) == octets
