@@ -68,7 +68,7 @@ def _create(
             raise VaultFailure(
                 "The keys of a backup cannot be put into a token.", hint="Restore with --keystore keyring or file."
             )
-        return Pkcs11Vault.create(home, store_id, keystore, ask), "the token was asked for"
+        return Pkcs11Vault.create(home, store_id, keystore, ask, restored=restored), "the token was asked for"
     if keystore == "keyring":
         return KeyringVault.create(store_id, restored=restored), "the keyring was asked for"
     if keystore == "file":

@@ -9,13 +9,9 @@ they are used: nothing else is promised, whatever the token.
 
 from __future__ import annotations
 
-import fcntl
 import hashlib
 import json
 import os
-import time
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -24,16 +20,15 @@ from teds_provision.protocol.keys import PrivateKey, SoftwareKey, fingerprint, v
 from teds_provision.vault.base import Ask
 from teds_provision.vault.file_vault import write_whole
 from teds_provision.vault.master import MasterKeys
+from teds_provision.vault.pkcs11_lock import exclusive
 from teds_provision.vault.pkcs11_token import TokenKey, TokenSession, ask_pin, find_token, log_in
 from teds_provision.vault.pkcs11_uri import Pkcs11Uri
 
 FILE_NAME = "vault-pkcs11.json"
-LOCK_NAME = "vault-pkcs11.lock"
 _FORMAT = "teds-vault-pkcs11/1"
 _LABEL = b"TEDS1 token vault\0"
 _MAX_OCTETS = 64 * 1024
 _NONCE_OCTETS = 12
-_LOCK_SECONDS = 30.0
 _DAMAGED = "Restore this file from a backup of this station; the keys are still in the token."
 
 
@@ -44,23 +39,32 @@ class Pkcs11Vault:
 
     def __init__(self, home: Path, store_id: str, uri: Pkcs11Uri, session: TokenSession, content: _Content) -> None:
         self.description = f"PKCS #11 token {session.label!r} by {uri.module_path}"
-        self._home, self._store_id = home, store_id
+        self._home, self._store_id, self._module_path = home, store_id, uri.module_path
         self._session, self._content = session, content
 
     @classmethod
-    def create(cls, home: Path, store_id: str, uri: str, ask: Ask, *, with_ca: bool = True) -> Pkcs11Vault:
+    def create(
+        cls, home: Path, store_id: str, uri: str, ask: Ask, *, with_ca: bool = True, restored: str | None = None
+    ) -> Pkcs11Vault:
         """Make the keys in the token that ``uri`` (RFC 7512) names, or take up what an earlier run made.
 
         The URI's ``object`` and ``id`` name the station key; a key of that name which is in the token already is taken,
-        if it cannot leave it. ``with_ca`` False makes no CA key. ``ask`` is called once, for the PIN, unless the token
-        has a pad. Raises UsageFailure (URI), WrongPassphrase, VaultFailure.
+        if it cannot leave it. ``with_ca`` False makes no CA key. ``restored`` is what :meth:`secret_material` gave to a
+        backup; it opens with the same token alone. ``ask`` is called once, for the PIN, unless the token has a pad.
+        Raises UsageFailure (URI), WrongPassphrase, VaultFailure.
         """
         if (home / FILE_NAME).exists():
-            return cls.open(home, store_id, uri, ask)
+            vault = cls.open(home, store_id, uri, ask)
+            if restored is not None:
+                vault._join(_content_of(_parsed(restored.encode(), store_id, "The backup"), vault._session))
+            return vault
         where = Pkcs11Uri.parse(uri)
-        session = _open_session(home, where, ask, write=True)
-        with _exclusive(home):
-            if not (home / FILE_NAME).exists():  # else another process was quicker
+        session = _open_session(where, ask, write=True)
+        with exclusive(where.module_path):
+            if restored is not None:
+                _content_of(_parsed(restored.encode(), store_id, "The backup"), session)
+                write_whole(home / FILE_NAME, restored.encode(), replace=False)
+            elif not (home / FILE_NAME).exists():  # else another process was quicker
                 station = _find_or_make(session, store_id, where, "station")
                 ca = _find_or_make(session, store_id, where, "CA") if with_ca else None
                 _save(home, store_id, _Content(station, ca, MasterKeys.generate()), replace=False)
@@ -75,8 +79,8 @@ class Pkcs11Vault:
         """
         where = Pkcs11Uri.parse(uri)
         _read(home, store_id)  # before anyone is asked for a PIN
-        session = _open_session(home, where, ask, write=False)
-        with _exclusive(home):
+        session = _open_session(where, ask, write=False)
+        with exclusive(where.module_path):
             content = _load(home, store_id, session)
         return cls(home, store_id, where, session, content)
 
@@ -121,12 +125,25 @@ class Pkcs11Vault:
         if len(self._content.masters.keys) > 1:
             self._replace(_Content(self._content.station, self._content.ca, self._content.masters.newest_only()))
 
+    def secret_material(self) -> str:
+        """Return what a backup needs: the file, sealed as it is. It is of no use without the token."""
+        return (self._home / FILE_NAME).read_text()
+
     def close(self) -> None:
         """End the session with the token."""
         self._session.close()
 
+    def _join(self, other: _Content) -> None:
+        """Take in the master keys of a backup of this station; raises VaultFailure if it is of another."""
+        here, there = self._content.masters.keys, other.masters.keys
+        if other.station.point != self._content.station.point or any(
+            here[number] != there[number] for number in here.keys() & there
+        ):
+            raise VaultFailure("The vault holds the keys of another station.", hint="Restore into another --home.")
+        self._replace(_Content(self._content.station, self._content.ca, MasterKeys({**there, **here})))
+
     def _replace(self, content: _Content) -> None:
-        with _exclusive(self._home):
+        with exclusive(self._module_path):
             _save(self._home, self._store_id, content, replace=True)
         self._content = content
 
@@ -141,11 +158,11 @@ class _Content:
         self.station, self.ca, self.masters = station, ca, masters
 
 
-def _open_session(home: Path, uri: Pkcs11Uri, ask: Ask, *, write: bool) -> TokenSession:
-    with _exclusive(home):
+def _open_session(uri: Pkcs11Uri, ask: Ask, *, write: bool) -> TokenSession:
+    with exclusive(uri.module_path):
         token = find_token(uri)
     pin = ask_pin(token, uri, ask)
-    with _exclusive(home):
+    with exclusive(uri.module_path):
         return log_in(token, uri, pin, write=write)
 
 
@@ -182,11 +199,14 @@ def _save(home: Path, store_id: str, content: _Content, *, replace: bool) -> Non
 
 
 def _load(home: Path, store_id: str, session: TokenSession) -> _Content:
-    members = _read(home, store_id)
+    return _content_of(_read(home, store_id), session)
+
+
+def _content_of(members: dict[str, Any], session: TokenSession) -> _Content:
     station = _held(session, members["station"], "station")
     ca = None if members["ca"] is None else _held(session, members["ca"], "CA")
     if not verify(station.point, _signed(members), _octets(members, "signature")):
-        raise VaultFailure(f"{home / FILE_NAME} was changed: its signature does not verify.", hint=_DAMAGED)
+        raise VaultFailure(f"{FILE_NAME} was changed: its signature does not verify.", hint=_DAMAGED)
     return _Content(station, ca, _unsealed(station, members))
 
 
@@ -261,6 +281,10 @@ def _read(home: Path, store_id: str) -> dict[str, Any]:
         raise VaultFailure(f"{path} is missing.", hint=_DAMAGED) from None
     except OSError as error:
         raise VaultFailure(f"{path} cannot be read: {error.strerror}.", hint="Check its owner and mode.") from error
+    return _parsed(octets, store_id, str(path))
+
+
+def _parsed(octets: bytes, store_id: str, path: str) -> dict[str, Any]:
     try:
         members = json.loads(octets)
     except (ValueError, RecursionError):
@@ -270,27 +294,3 @@ def _read(home: Path, store_id: str) -> dict[str, Any]:
     if members.get("format") != _FORMAT or members.get("store") != store_id:
         raise VaultFailure(f"{path} is of another version or belongs to another store.", hint=_DAMAGED)
     return members
-
-
-@contextmanager
-def _exclusive(home: Path) -> Iterator[None]:
-    """Keep other processes of this home off the token (SoftHSMv2#757: parallel processes can fail each other)."""
-    try:
-        descriptor = os.open(home / LOCK_NAME, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_CLOEXEC, 0o600)
-    except OSError as error:
-        raise VaultFailure(f"{home / LOCK_NAME} cannot be opened: {error.strerror}.", hint="Check its mode.") from error
-    try:
-        until = time.monotonic() + _LOCK_SECONDS
-        while True:
-            try:
-                fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-                break
-            except BlockingIOError:
-                if time.monotonic() > until:
-                    raise VaultFailure(
-                        "Another teds-provision has been using the token for long.", hint="Wait for it, or end it."
-                    ) from None
-                time.sleep(0.05)
-        yield
-    finally:
-        os.close(descriptor)

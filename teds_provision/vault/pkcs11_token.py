@@ -119,9 +119,12 @@ class TokenSession:
         guarded(self._session.close, retry=False)
 
     def _generate(self, label: str, identifier: bytes) -> None:
-        from pkcs11 import Attribute, KeyType
+        from pkcs11 import Attribute, KeyType, ObjectClass
         from pkcs11.util.ec import encode_named_curve_parameters
 
+        half = {Attribute.CLASS: ObjectClass.PUBLIC_KEY, Attribute.LABEL: label, Attribute.ID: identifier}
+        for left_over in list(self._session.get_objects(half)):  # of a run that died while the token made the pair
+            left_over.destroy()
         curve = self._session.create_domain_parameters(
             KeyType.EC, {Attribute.EC_PARAMS: encode_named_curve_parameters("secp256r1")}, local=True
         )

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import signal
 import stat
 import subprocess
 import sys
@@ -227,6 +228,32 @@ def test_a_change_of_the_master_key(vault, home, store_id, uri):
         last.unwrap(before, context=CONTEXT)
 
 
+def test_a_backup_opens_with_the_same_token_alone(vault, tmp_path, store_id, uri, uris):
+    wrapped, backup = vault.wrap(b"k" * 16, context=CONTEXT), vault.secret_material()
+    for name in ("again", "elsewhere"):
+        (tmp_path / name).mkdir()
+    again = Pkcs11Vault.create(tmp_path / "again", store_id, uri, Person(), restored=backup)
+    assert again.unwrap(wrapped, context=CONTEXT) == b"k" * 16
+    with pytest.raises(VaultFailure, match="does not hold the station key"):
+        Pkcs11Vault.create(tmp_path / "elsewhere", store_id, uris["spare"], Person(), restored=backup)
+    for damaged in ("", backup.replace('"nonce": "', '"nonce": "00'), backup.replace(store_id, STORE)):
+        with pytest.raises(VaultFailure):
+            Pkcs11Vault.create(tmp_path / "elsewhere", store_id, uri, Person(), restored=damaged)
+    assert not (tmp_path / "elsewhere" / FILE_NAME).exists()
+
+
+def test_a_backup_joins_what_is_there_and_another_stations_does_not(vault, home, tmp_path, store_id, uri, uris):
+    wrapped, backup = vault.wrap(b"k" * 16, context=CONTEXT), vault.secret_material()
+    vault.add_master()
+    vault.retire_masters()
+    again = Pkcs11Vault.create(home, store_id, uri, Person(), restored=backup)
+    assert again.unwrap(wrapped, context=CONTEXT) == b"k" * 16
+    (tmp_path / "other").mkdir()
+    other = Pkcs11Vault.create(tmp_path / "other", store_id, uri.replace("?", ";id=%09?"), Person())
+    with pytest.raises(VaultFailure, match="another station"):
+        Pkcs11Vault.create(home, store_id, uri, Person(), restored=other.secret_material())
+
+
 # Making it
 
 
@@ -240,6 +267,54 @@ def test_a_run_that_died_before_the_file_is_carried_on_with_the_same_keys(vault,
     (home / FILE_NAME).unlink()
     again = Pkcs11Vault.create(home, store_id, uri, Person())
     assert (again.identity().point, again.ca().point) == (vault.identity().point, vault.ca().point)
+
+
+def test_half_a_key_pair_of_a_run_that_died_is_cleared_away(vault, home, store_id, uri):
+    from pkcs11 import Attribute, ObjectClass
+
+    key = vault.identity()
+    wanted = {Attribute.CLASS: ObjectClass.PRIVATE_KEY, Attribute.ID: key.identifier}
+    with vault._session._token.open(rw=True) as session:
+        next(iter(session.get_objects(wanted))).destroy()
+    (home / FILE_NAME).unlink()
+    again = Pkcs11Vault.create(home, store_id, uri, Person()).identity()
+    assert again.point != key.point
+    assert verify(again.point, b"m", again.sign(b"m"))
+
+
+@pytest.mark.parametrize("last_step", ["log_in", "generate", "generate generate", "write_whole", "file written"])
+def test_killed_at_any_step_of_making_it_it_is_carried_on(tmp_path, last_step):
+    """Killed before the named step; inside the module's own writes SoftHSM itself may lose its token."""
+    hsm = SoftHsm(tmp_path)
+    uri = hsm.new_token("mortal")
+    code = (
+        "import os, signal, sys; from pathlib import Path; from teds_provision.vault import pkcs11 as ours\n"
+        "step, times = sys.argv[3].split()[0], len(sys.argv[3].split())\n"
+        "def die_before(real):\n"
+        "    def call(*args, **named):\n"
+        "        global times\n"
+        "        times -= 1\n"
+        "        return os.kill(os.getpid(), signal.SIGKILL) if not times else real(*args, **named)\n"
+        "    return call\n"
+        "place = ours.TokenSession if step == 'generate' else ours\n"
+        "if step == 'file': step, times = '_load', 1\n"
+        "if step != 'none': setattr(place, step, die_before(getattr(place, step)))\n"
+        f"v = ours.Pkcs11Vault.create(Path(sys.argv[1]), 's', sys.argv[2], lambda p, c: {PIN!r})\n"
+        "assert v.unwrap(v.wrap(b'k' * 16, context=b'c'), context=b'c') == b'k' * 16\n"
+        "print(v.identity().point.hex(), v.ca().point.hex())"
+    )
+
+    def run(step):
+        words = [sys.executable, "-c", code, str(tmp_path), uri, step]
+        return subprocess.run(words, env=hsm.environment, capture_output=True, text=True, timeout=60, check=False)
+
+    for _ in range(2):
+        killed = run(last_step)
+        if not (tmp_path / FILE_NAME).exists() or last_step == "log_in":
+            assert killed.returncode == -signal.SIGKILL, killed.stderr
+    first, second = run("none"), run("none")
+    assert first.returncode == second.returncode == 0, first.stderr
+    assert first.stdout == second.stdout
 
 
 def test_two_stores_in_one_token_have_keys_of_their_own(vault, tmp_path, store_id, uri):
