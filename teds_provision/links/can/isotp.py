@@ -21,6 +21,17 @@ FUNCTIONAL: Final = 0x18DBFF00
 _PHYSICAL: Final = 0x18DA0000
 _TIMEOUT_MS: Final = 1000
 """N_Bs and N_Cr of ISO 15765-2: the wait for a flow control or the next consecutive frame."""
+_HARMLESS: Final = frozenset(
+    {
+        "UnexpectedFlowControlError",
+        "UnexpectedConsecutiveFrameError",
+        "ReceptionInterruptedWithSingleFrameError",
+        "ReceptionInterruptedWithFirstFrameError",
+        "MissingEscapeSequenceError",
+        "ChangingInvalidRXDLError",
+    }
+)
+"""Errors of can-isotp that end nothing: left over from a transfer that one side gave up, or a frame to ignore."""
 _SINGLE, _FIRST, _CONSECUTIVE, _FLOW = range(4)
 
 
@@ -152,12 +163,10 @@ class Pair:
         self._send_frame(Frame(message.arbitration_id, bytes(message.data), bool(message.is_fd)))
 
     def _note_error(self, error: Exception) -> None:
-        import isotp
-
-        if isinstance(error, isotp.errors.UnexpectedFlowControlError | isotp.errors.UnexpectedConsecutiveFrameError):
-            return  # left over from a transfer that one side has given up
+        if type(error).__name__ in _HARMLESS:
+            return
         self.error = str(error)
-        self.overflow = isinstance(error, isotp.errors.OverflowError)
+        self.overflow = type(error).__name__ == "OverflowError"
 
 
 def _parameters(fd: bool) -> dict[str, Any]:
@@ -171,7 +180,7 @@ def _parameters(fd: bool) -> dict[str, Any]:
         "bitrate_switch": fd,
         "rx_flowcontrol_timeout": _TIMEOUT_MS,
         "rx_consecutive_frame_timeout": _TIMEOUT_MS,
-        "wftmax": 1000,
+        "wftmax": 255,
     }
 
 

@@ -36,6 +36,8 @@ _SETTLE_SECONDS: Final = 0.08
 """Nodes answer a functional Identify after up to 50 ms; a second one under the same address shows by then."""
 _GONE_ROUNDS: Final = 3
 _SLICE: Final = 0.05
+_LONGEST_TRY: Final = 120.0
+"""Seconds: 4095 octets at the longest gap (127 ms) that a node may ask for take 75 s."""
 
 
 class CanLink:
@@ -66,6 +68,8 @@ class CanLink:
         for number in range(tries):
             if number and time.monotonic() - began >= REPEAT_SECONDS:
                 break
+            if number == 2 and _no_flow(torn):  # perhaps it is busy and will come to it
+                time.sleep(max(0.0, began + seconds - time.monotonic()))
             pair.abandon()
             pair.speak(fd=bus.spec.fd)
             bus.drain()
@@ -83,7 +87,7 @@ class CanLink:
 
     def _failed(self, torn: str) -> LinkFailure:
         where = f"The node at 0x{self.address:02X} on {self._port.spec.text}"
-        if torn and "FlowControl timed out" not in torn:
+        if torn and not _no_flow(torn):
             return Garbled(
                 f"{where} answers, but the transfer breaks: {torn}", hint="Check wiring, bit rate, bus load."
             )
@@ -96,9 +100,15 @@ class CanLink:
         return bus, self._pair
 
 
+def _no_flow(torn: str) -> bool:
+    """Whether a transfer ended because the node never took up our first frame or block."""
+    return "FlowControl timed out" in torn
+
+
 def _await(bus: Bus, pair: Pair, transaction: int, seconds: float) -> bytes | None:
     """Work until the reply to ``transaction`` is here; None after ``seconds`` without progress or when it is torn."""
     until = time.monotonic() + seconds
+    end = time.monotonic() + _LONGEST_TRY
     while True:
         while (body := pair.received()) is not None:
             if body[:1] == bytes([transaction]) and len(body) > 1:
@@ -110,14 +120,14 @@ def _await(bus: Bus, pair: Pair, transaction: int, seconds: float) -> bytes | No
         ours = frame is not None and pair.take(frame)
         pair.run()
         if pair.sending or (ours and pair.receiving):
-            until = max(until, time.monotonic() + seconds)
+            until = min(end, time.monotonic() + seconds)
 
 
 @dataclass
 class _Seen:
-    """What ``watch`` last knew of one address; ``silent`` rounds without an answer."""
+    """What ``watch`` last knew of one node; ``silent`` rounds without an answer."""
 
-    uuid: bytes
+    address: int
     state: NodeState
     silent: int = 0
 
@@ -185,7 +195,7 @@ class CanPort:
 
     def watch(self, *, stop: threading.Event, notice: NoticeSink) -> Iterator[Contact]:
         """Yield each node once: when it first answers, when it comes back, and when it is in factory state again."""
-        seen: dict[int, _Seen] = {}
+        seen: dict[bytes, _Seen] = {}
         conflicts: set[int] = set()
         notice(Notice("waiting", f"Watching {self.spec.text} for nodes."))
         lost = False
@@ -210,8 +220,8 @@ class CanPort:
                 if stop.is_set():
                     return
                 yield self._contact(contact[0], contact[1])
-            for node in _gone(seen, found.keys() | clashing):
-                notice(Notice("node-left", f"The node at 0x{node:02X} does not answer any more."))
+            for uuid, node in _gone(seen, found, clashing):
+                notice(Notice("node-left", f"Node {uuid.hex().upper()} at 0x{node:02X} does not answer any more."))
             stop.wait(max(0.0, round_ends - time.monotonic()))
 
     def _contact(self, node: int, identity: Identity) -> Contact:
@@ -287,23 +297,25 @@ def _tell(notice: NoticeSink, told: set[bytes], node: int, identity: Identity) -
         notice(Notice("foreign-tag", text))
 
 
-def _news(seen: dict[int, _Seen], found: dict[int, Identity]) -> list[tuple[int, Identity]]:
-    """Nodes to announce: new at their address, back after silence, or reset to factory state."""
+def _news(seen: dict[bytes, _Seen], found: dict[int, Identity]) -> list[tuple[int, Identity]]:
+    """Nodes to announce: new, back after silence, or reset to factory state. A new address alone is no news."""
     news = []
     for node, identity in found.items():
-        before = seen.get(node)
+        before = seen.get(identity.uuid)
         reset = identity.state is NodeState.FACTORY
-        if before is None or before.uuid != identity.uuid or (reset and before.state is not NodeState.FACTORY):
+        if before is None or (reset and before.state is not NodeState.FACTORY):
             news.append((node, identity))
-        seen[node] = _Seen(identity.uuid, identity.state)
+        seen[identity.uuid] = _Seen(node, identity.state)
     return news
 
 
-def _gone(seen: dict[int, _Seen], answered: set[int]) -> list[int]:
-    """Addresses that have been silent for so long that their node counts as gone; forgets them."""
-    for node in seen.keys() - answered:
-        seen[node].silent += 1
-    gone = [node for node, last in seen.items() if last.silent >= _GONE_ROUNDS]
-    for node in gone:
-        del seen[node]
+def _gone(seen: dict[bytes, _Seen], found: dict[int, Identity], clashing: set[int]) -> list[tuple[bytes, int]]:
+    """Nodes that have been silent for so long that they count as gone, with their addresses; forgets them."""
+    here = {identity.uuid for identity in found.values()}
+    for uuid, last in seen.items():
+        if uuid not in here and last.address not in clashing:
+            last.silent += 1
+    gone = [(uuid, last.address) for uuid, last in seen.items() if last.silent >= _GONE_ROUNDS]
+    for uuid, _ in gone:
+        del seen[uuid]
     return gone

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import socket
 import threading
 from collections.abc import Callable
@@ -50,10 +51,8 @@ class Hub:
             threading.Thread(target=self._serve, args=(client,), daemon=True).start()
 
     def _serve(self, client: socket.socket) -> None:
-        try:
+        with contextlib.suppress(OSError):
             self._talk(client)
-        except OSError:
-            pass
         with self._lock:
             if client in self._clients:
                 self._clients.remove(client)

@@ -189,9 +189,9 @@ def test_nobody_is_there(hub: Hub) -> None:
 
 def test_another_node_than_the_wanted_is_told_and_waited_past(hub: Hub) -> None:
     told: list[Notice] = []
-    with serving(hub.spec, EchoNode(0x21)), opened(hub.spec + "&node=0x21") as port:
-        with pytest.raises(NoNode, match="2121"):
-            port.find(lambda _: False, seconds=1.2, notice=told.append)
+    spec = hub.spec + "&node=0x21"
+    with serving(hub.spec, EchoNode(0x21)), opened(spec) as port, pytest.raises(NoNode, match="2121"):
+        port.find(lambda _: False, seconds=1.2, notice=told.append)
     assert [notice.kind for notice in told] == ["waiting", "foreign-tag"]
 
 

@@ -1,0 +1,231 @@
+"""ISO-TP between a pair of addresses, in memory: any manners of the other side, and any frames at all."""
+
+from __future__ import annotations
+
+import os
+import time
+from collections import deque
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from teds_provision.links.can.bus import Frame
+from teds_provision.links.can.gathering import Gathering
+from teds_provision.links.can.isotp import Pair, addresses, padded, physical_id, read_single, single
+from teds_provision.links.can.pacing import Pacer, classic_bits, fd_seconds
+
+STATION, NODE = 0xF1, 0x21
+
+
+class Wire:
+    """Two pairs, and the frames between them; ``manners`` are can-isotp parameters of the node."""
+
+    def __init__(self, *, fd: bool = False, **manners: object) -> None:
+        self.frames: deque[Frame] = deque()
+        self.log: list[Frame] = []
+        self.station = Pair(STATION, NODE, self._put, fd=fd)
+        self.node = Pair(NODE, STATION, self._put)
+        for key, value in manners.items():
+            self.node._logic.params.set(key, value, validate=False)
+        self.node._logic.load_params()
+
+    def _put(self, frame: Frame) -> None:
+        self.frames.append(frame)
+        self.log.append(frame)
+
+    def settle(self, seconds: float = 5.0) -> None:
+        until = time.monotonic() + seconds
+        while time.monotonic() < until and (self.frames or self.station.sending or self.node.sending):
+            if self.frames:
+                frame = self.frames.popleft()
+                assert self.station.take(frame) or self.node.take(frame)
+            self.station.run()
+            self.node.run()
+
+
+@pytest.mark.parametrize("length", [1, 6, 7, 8, 62, 63, 700, 4095])
+@pytest.mark.parametrize(
+    "manners",
+    [
+        {},
+        {"blocksize": 0},
+        {"blocksize": 1},
+        {"blocksize": 255, "stmin": 0xF1},
+        {"blocksize": 8, "tx_padding": None},
+        {"tx_padding": 0x55},
+    ],
+    ids=str,
+)
+def test_takes_any_block_size_gap_and_padding(length: int, manners: dict[str, object]) -> None:
+    wire = Wire(**manners)
+    body = os.urandom(length)
+    wire.station.send(body)
+    wire.settle()
+    assert wire.node.received() == body
+    wire.node.send(body[::-1])
+    wire.settle()
+    assert wire.station.received() == body[::-1]
+    assert wire.station.error == ""
+
+
+def test_our_frames_are_what_the_profile_says() -> None:
+    wire = Wire()
+    wire.station.send(bytes(301))
+    wire.settle()
+    assert {frame.identifier for frame in wire.log} == {0x18DA21F1, 0x18DAF121}
+    assert all(len(frame.data) == 8 and not frame.fd for frame in wire.log)
+    assert next(frame.data for frame in wire.log if frame.data[0] == 0x30) == bytes.fromhex("301000cccccccccc")
+    assert wire.log[-1].data[1:] == b"\x00" + b"\xcc" * 6
+
+
+def test_the_node_answers_in_the_form_in_which_it_was_asked() -> None:
+    wire = Wire(fd=True)
+    wire.station.send(bytes(200))
+    wire.settle()
+    assert wire.node.received() == bytes(200)
+    wire.node.send(bytes(200))
+    wire.settle()
+    assert wire.station.received() == bytes(200)
+    assert all(frame.fd for frame in wire.log)
+    wire.log.clear()
+    wire.node.take(Frame(physical_id(NODE, STATION), single(b"abc")))
+    wire.node.send(bytes(20))
+    assert not wire.log[0].fd
+
+
+def test_more_than_4095_octets_are_answered_with_overflow() -> None:
+    wire = Wire()
+    wire.node.take(Frame(physical_id(NODE, STATION), bytes.fromhex("1000000010000000")))
+    overflow = wire.log[-1]
+    assert overflow.data[:1] == b"\x32"
+    wire.station.send(bytes(100))
+    wire.station.take(overflow)
+    assert wire.station.overflow
+
+
+def test_a_second_first_frame_begins_again() -> None:
+    wire = Wire()
+    head = Frame(physical_id(NODE, STATION), bytes.fromhex("100a010203040506"))
+    for data in ("100a090909090909", "100a010203040506", "210708090a"):
+        wire.node.take(Frame(head.identifier, bytes.fromhex(data)))
+    assert wire.node.received() == bytes(range(1, 11))
+    assert wire.node.received() is None
+
+
+def test_wait_frames_and_a_reserved_gap_are_borne() -> None:
+    sent: list[Frame] = []
+    station = Pair(STATION, NODE, sent.append)
+    flow = physical_id(STATION, NODE)
+    station.send(bytes(20))
+    for data in ("310000", "310000", "3000fa"):
+        station.take(Frame(flow, bytes.fromhex(data)))
+    until = time.monotonic() + 2
+    while station.sending and time.monotonic() < until:
+        time.sleep(station.due_in(0.05))
+        station.run()
+    assert [frame.data[0] for frame in sent] == [0x10, 0x21, 0x22]
+
+
+@given(st.lists(st.binary(max_size=64), max_size=30), st.booleans())
+@settings(max_examples=60, deadline=None)
+def test_any_frames_at_all_do_not_break_a_pair(datas: list[bytes], fd: bool) -> None:
+    wire = Wire(fd=fd)
+    wire.station.send(bytes(30))
+    for data in datas:
+        wire.station.take(Frame(physical_id(STATION, NODE), data, fd))
+    wire.station.abandon()
+    wire.station.speak(fd=False)
+    wire.log.clear()
+    wire.frames.clear()
+    wire.station.send(b"still here")
+    wire.settle()
+    assert wire.node.received() == b"still here"
+
+
+def frames_of(node: int, body: bytes) -> list[Frame]:
+    frames: list[Frame] = []
+    pair = Pair(node, STATION, frames.append)
+    pair.send(body)
+    pair.take(Frame(physical_id(node, STATION), b"\x30\x00\x00"))
+    return frames
+
+
+def test_answers_of_many_nodes_come_apart() -> None:
+    gathering = Gathering(STATION, 7)
+    sequences = [frames_of(node, b"\x07" + bytes([node]) * 26) for node in range(1, 21)]
+    flows = [gathering.take(frame) for frames in zip(*sequences, strict=True) for frame in frames]
+    assert gathering.answers == {node: bytes([node]) * 26 for node in range(1, 21)}
+    assert not gathering.conflicts
+    assert not gathering.busy
+    assert [flow.identifier for flow in flows if flow] == [physical_id(node, STATION) for node in range(1, 21)]
+
+
+def test_an_answer_to_an_earlier_identify_is_sent_away() -> None:
+    gathering = Gathering(STATION, 7)
+    first = frames_of(NODE, b"\x06" + bytes(26))[0]
+    flow = gathering.take(first)
+    assert flow is not None
+    assert flow.data[0] == 0x32
+    for frame in frames_of(NODE, b"\x07" + bytes(26)):
+        gathering.take(frame)
+    assert gathering.answers == {NODE: bytes(26)}
+    assert not gathering.conflicts
+
+
+@pytest.mark.parametrize("order", [(0, 0, 1, 1), (0, 2), (0, 1, 1)])
+def test_two_first_frames_or_a_broken_sequence_are_a_conflict(order: tuple[int, ...]) -> None:
+    frames = frames_of(NODE, b"\x07" + bytes(26))
+    gathering = Gathering(STATION, 7)
+    for number in order:
+        gathering.take(frames[number])
+    assert gathering.conflicts == {NODE}
+
+
+@given(st.lists(st.tuples(st.integers(0x18DAF101, 0x18DAF104), st.binary(max_size=64)), max_size=40))
+def test_any_frames_at_all_do_not_break_a_gathering(frames: list[tuple[int, bytes]]) -> None:
+    gathering = Gathering(STATION, 7)
+    for identifier, data in frames:
+        flow = gathering.take(Frame(identifier, data))
+        assert flow is None or len(flow.data) == 8
+
+
+@given(st.binary(min_size=1, max_size=62))
+def test_single_frames_round_trip(body: bytes) -> None:
+    data = single(body, fd=len(body) > 7)
+    assert read_single(data) == body
+    assert len(data) in (8, 12, 16, 20, 24, 32, 48, 64)
+
+
+@given(st.binary(max_size=64))
+def test_any_octets_as_a_single_frame(data: bytes) -> None:
+    body = read_single(data)
+    assert body is None or 0 < len(body) < len(data)
+
+
+def test_addresses_are_those_of_normal_fixed_addressing() -> None:
+    assert physical_id(0x21, 0xF1) == 0x18DA21F1
+    assert addresses(0x18DA21F1) == (0x21, 0xF1)
+    assert addresses(0x18DBFFF1) is None
+    assert padded(b"a", fd=True) == b"a" + b"\xcc" * 7
+
+
+def test_bit_times_lie_within_those_of_the_standard() -> None:
+    # an extended frame with 8 octets has 131 bits without stuffing and at most 160 with it
+    assert classic_bits(0, bytes(8)) > classic_bits(0x15555555, b"\x55" * 8) >= 131
+    assert max(classic_bits(0, bytes(8)), classic_bits(0x1FFFFFFF, b"\xff" * 8)) <= 160
+    assert classic_bits(0x15555555, b"") >= 67
+    # eight times the octets in one FD frame at four times the rate
+    assert fd_seconds(0x18DA21F1, bytes(64), 500_000, 2_000_000) < 3 * classic_bits(0x18DA21F1, bytes(8)) / 500_000
+
+
+def test_a_paced_sender_takes_the_time_of_the_wire() -> None:
+    pacer = Pacer(125_000, 2_000_000)
+    began = time.perf_counter()
+    for _ in range(20):
+        pacer.wait(0x18DA21F1, bytes(8), fd=False)
+    assert (
+        time.perf_counter() - began
+        >= pacer.busy_seconds
+        == pytest.approx(20 * classic_bits(0x18DA21F1, bytes(8)) / 125_000)
+    )

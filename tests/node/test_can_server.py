@@ -1,0 +1,157 @@
+"""The node on the bus as a station of strangers sees it: raw frames over a bus that loses none."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+
+import pytest
+
+from teds_provision.links.can.bus import Bus, Frame
+from teds_provision.links.can.isotp import Pair, physical_id, single
+from teds_provision.links.can.spec import parse_spec
+from teds_provision.node.can_server import CanServer
+from tests.links.can.echo_node import EchoNode
+from tests.links.can.hub import Hub
+
+IDENTIFY = b"\x00\x00\x80\x07\x00\x00"
+COUNT = b"\x00\x00\x01\x7f\x00\x00"
+
+
+class Stranger:
+    """A station made of raw frames, at ``source``."""
+
+    def __init__(self, spec: str, source: int = 0xF1) -> None:
+        self.bus, self.source = Bus(parse_spec(spec)), source
+        self.frames: list[Frame] = []
+
+    def everyone(self, octets: str) -> None:
+        self.bus.send(Frame(0x18DBFF00 | self.source, bytes.fromhex(octets)))
+
+    def ask(self, node: int, body: bytes, seconds: float = 0.4) -> list[bytes]:
+        """Send ``body`` (none if empty) and return every message that comes back within ``seconds``."""
+        pair = Pair(self.source, node, self.bus.send)
+        if body:
+            pair.send(body)
+        messages = []
+        until = time.monotonic() + seconds
+        while time.monotonic() < until:
+            frame = self.bus.receive(0.01)
+            if frame and pair.take(frame):
+                self.frames.append(frame)
+            pair.run()
+            while (message := pair.received()) is not None:
+                messages.append(message)
+        return messages
+
+
+@pytest.fixture
+def hub() -> Iterator[Hub]:
+    hub = Hub()
+    yield hub
+    hub.close()
+
+
+@pytest.fixture
+def node() -> EchoNode:
+    return EchoNode(0x21)
+
+
+@pytest.fixture
+def server(hub: Hub, node: EchoNode) -> Iterator[CanServer]:
+    server = CanServer(hub.spec, node, counts_as_tapped=lambda: True)
+    server.start()
+    yield server
+    server.stop()
+
+
+@pytest.fixture
+def station(hub: Hub, server: CanServer) -> Iterator[Stranger]:
+    station = Stranger(hub.spec)
+    yield station
+    station.bus.close()
+
+
+def test_answers_a_functional_identify_from_its_own_address(station: Stranger, node: EchoNode) -> None:
+    station.everyone("0742000080070000")
+    assert station.ask(0x21, b"") == [b"\x42\x01\x00\x17" + node.identify()]
+    assert node.seen == []
+
+
+@pytest.mark.parametrize("octets", ["0742000101010000", "06420000800700", "0842000080070000", "1042000080070000", "07"])
+def test_answers_nothing_else_that_is_asked_of_everyone(station: Stranger, node: EchoNode, octets: str) -> None:
+    station.everyone(octets)
+    assert station.ask(0x21, b"", 0.2) == []
+    assert node.seen == []
+
+
+def test_an_equal_repetition_is_not_run_again_even_after_a_functional_identify(
+    station: Stranger, node: EchoNode
+) -> None:
+    assert station.ask(0x21, b"\x09" + COUNT) == [b"\x09\x01\x00\x01"]
+    station.everyone("0742000080070000")
+    assert len(station.ask(0x21, b"", 0.2)) == 1
+    assert station.ask(0x21, b"\x09" + COUNT) == [b"\x09\x01\x00\x01"]
+    assert station.ask(0x21, b"\x0a" + COUNT) == [b"\x0a\x01\x00\x02"]
+    assert node.runs == 2
+    assert node.seen[0] == ("can:f1", True)
+
+
+def test_lines_do_not_share_a_stored_reply(hub: Hub, station: Stranger, node: EchoNode) -> None:
+    other = Stranger(hub.spec, 0xF7)
+    try:
+        assert station.ask(0x21, b"\x09" + COUNT) == [b"\x09\x01\x00\x01"]
+        assert other.ask(0x21, b"\x09" + COUNT) == [b"\x09\x01\x00\x02"]
+    finally:
+        other.bus.close()
+    assert [name for name, _ in node.seen] == ["can:f1", "can:f7"]
+
+
+@pytest.mark.parametrize("body", [b"\x01", b"\x01\x00\x00\x80\x07\x00"])
+def test_what_is_too_short_for_a_command_is_dropped(station: Stranger, node: EchoNode, body: bytes) -> None:
+    assert station.ask(0x21, body, 0.2) == []
+    assert node.seen == []
+
+
+def test_a_command_of_bad_form_gets_what_the_node_says_of_it(station: Stranger) -> None:
+    assert station.ask(0x21, b"\x05\x00\x00\x01\x03\x00\x09abc") == [b"\x05cba"]
+
+
+def test_other_addresses_are_not_its_own(station: Stranger, node: EchoNode) -> None:
+    assert station.ask(0x22, b"\x01" + IDENTIFY, 0.2) == []
+    node.address = 0x22
+    assert len(station.ask(0x22, b"\x01" + IDENTIFY, 0.3)) == 1
+    assert station.ask(0x21, b"\x01" + IDENTIFY, 0.2) == []
+
+
+def test_a_station_outside_f1_to_f7_is_not_heard(hub: Hub, server: CanServer, node: EchoNode) -> None:
+    outsider = Stranger(hub.spec, 0xF8)
+    try:
+        assert outsider.ask(0x21, b"\x01" + IDENTIFY, 0.2) == []
+    finally:
+        outsider.bus.close()
+
+
+def test_an_overlong_message_is_told_off_and_the_line_goes_on(station: Stranger) -> None:
+    station.bus.send(Frame(physical_id(0x21, 0xF1), bytes.fromhex("1000000010000000")))
+    assert station.ask(0x21, b"", 0.1) == []
+    assert [frame.data[0] for frame in station.frames] == [0x32]
+    assert station.ask(0x21, b"\x09" + COUNT) == [b"\x09\x01\x00\x01"]
+
+
+def test_garbage_on_the_line_does_no_harm(station: Stranger) -> None:
+    for octets in ("", "00", "ff", "30", "37ffff", "2199", "1005010203040506", "4f00000000000000", "0f010203"):
+        station.bus.send(Frame(physical_id(0x21, 0xF1), bytes.fromhex(octets)))
+    station.bus.send(Frame(0x18DA21F1, single(b"\x09" + COUNT)))
+    assert station.ask(0x21, b"") == [b"\x09\x01\x00\x01"]
+
+
+def test_stopping_ends_the_sessions(hub: Hub, node: EchoNode) -> None:
+    server = CanServer(hub.spec, node)
+    server.start()
+    station = Stranger(hub.spec)
+    assert len(station.ask(0x21, b"\x09" + COUNT)) == 1
+    server.stop()
+    station.bus.close()
+    assert node.links_lost == ["can:f1"]
+    assert node.seen == [("can:f1", False)]
