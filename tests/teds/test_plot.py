@@ -1,0 +1,114 @@
+"""Pictures of calibrations: that they hold what they should; how they look was judged by eye."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from teds_provision.errors import BadData, UsageFailure
+from teds_provision.teds.calibration import Calibration, CalibrationInput, read_calibrations
+from teds_provision.teds.plot import plot_blocks
+from teds_provision.teds.profile import load_profile, shipped_profiles
+from teds_provision.teds.units import parse_unit
+
+pytest.importorskip("matplotlib")
+UUID = bytes(10)
+ROWS = "".join(f"{raw},{raw / 65535 * 10 + 0.05 * (raw % 2)}\n" for raw in range(0, 65536, 5041))
+
+
+@pytest.fixture(scope="module")
+def finger():  # type: ignore[no-untyped-def]
+    return load_profile("tactile-finger-sensor", [shipped_profiles()])
+
+
+def test_a_curve_with_points_residuals_and_limits_is_drawn(finger, tmp_path: Path) -> None:  # type: ignore[no-untyped-def]
+    calibrations = read_calibrations(f"# channel: 1-2\n# date: 2026-10-31\n{ROWS}", "x.csv", finger)
+    blocks = finger.build(UUID, calibration=calibrations).blocks
+    svg = tmp_path / "curve.svg"
+    assert plot_blocks(blocks, svg, profile=finger, calibrations=calibrations) == (1, 2)
+    text = svg.read_text()
+    for words in (
+        "taxel 1",
+        "taxel 2",
+        "value [N]",
+        "residuals: largest",
+        "14 points",
+        "limits ± uncertainty",
+        "due 20",
+    ):
+        assert words in text
+    again = tmp_path / "again.svg"
+    plot_blocks(blocks, again, profile=finger, calibrations=calibrations)
+    assert again.read_bytes() == svg.read_bytes()
+    assert list(tmp_path.glob("*.part")) == []
+
+
+def test_a_table_read_from_a_node_shows_its_nodes_and_its_bend(tmp_path: Path) -> None:
+    angle = load_profile("magnetic-angular-position-sensor", [shipped_profiles()])
+    calibrations = read_calibrations("0,0\n30000,166\n65535,360\n", "x.csv", angle)
+    svg = tmp_path / "angle.svg"
+    assert plot_blocks(angle.build(UUID, calibration=calibrations).blocks, svg, channel=1) == (1,)
+    text = svg.read_text()
+    assert "departure from a straight line" in text
+    assert "3 nodes" in text
+    assert "value [°]" in text
+
+
+def test_a_png_is_a_png(finger, tmp_path: Path) -> None:  # type: ignore[no-untyped-def]
+    calibrations = read_calibrations(f"# channel: 3\n{ROWS}", "x.csv", finger)
+    png = tmp_path / "curve.PNG"
+    plot_blocks(finger.build(UUID, calibration=calibrations).blocks, png)
+    assert png.read_bytes().startswith(b"\x89PNG")
+
+
+def test_several_inputs_and_actuators_are_drawn(finger, tmp_path: Path) -> None:  # type: ignore[no-untyped-def]
+    inputs = (CalibrationInput(1, 1, (0, 65535), (0,)), CalibrationInput(2, 1, (0, 65535), (0,)))
+    two = Calibration(1, "polynomial", inputs, (0.0, 1e-5, 1e-4, 0.0), unit=parse_unit("N"))
+    assert plot_blocks(finger.build(UUID, calibration={1: two}).blocks, tmp_path / "two.svg") == (1,)
+    gripper = load_profile("gripper", [shipped_profiles()])
+    calibrations = read_calibrations("# channel: 1\n0,0\n4095,110\n", "x.csv", gripper)
+    blocks = gripper.build(UUID, calibration=calibrations).blocks
+    assert plot_blocks(blocks, tmp_path / "grip.svg", calibrations=calibrations) == (1,)
+    assert "value [mm]" in (tmp_path / "grip.svg").read_text()
+
+
+def test_what_cannot_be_drawn_is_said(finger, tmp_path: Path) -> None:  # type: ignore[no-untyped-def]
+    calibrations = read_calibrations(f"# channel: 1\n{ROWS}", "x.csv", finger)
+    blocks = finger.build(UUID, calibration=calibrations).blocks
+    with pytest.raises(UsageFailure, match="picture"):
+        plot_blocks(blocks, tmp_path / "x.pdf")
+    with pytest.raises(BadData, match="channel 2"):
+        plot_blocks(blocks, tmp_path / "x.png", channel=2)
+    with pytest.raises(BadData, match="any channel"):
+        plot_blocks({(0, 1): b"", (1, 5): b"\xff" * 40}, tmp_path / "x.png")
+    with pytest.raises(UsageFailure, match="cannot be written"):
+        plot_blocks(blocks, tmp_path / "no" / "x.png")
+    erased = replace(calibrations[1], zero_offset=float("nan"))
+    with pytest.raises(BadData):
+        plot_blocks(finger.build(UUID, calibration={1: erased}).blocks, tmp_path / "x.png")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_missing_extra_is_named_with_its_cure(tmp_path: Path) -> None:
+    code = """
+import sys
+sys.modules["matplotlib"] = None
+from pathlib import Path
+from teds_provision.errors import UsageFailure
+from teds_provision.teds.calibration import read_calibrations
+from teds_provision.teds.plot import plot_blocks
+from teds_provision.teds.profile import load_profile, shipped_profiles
+angle = load_profile("magnetic-angular-position-sensor", [shipped_profiles()])
+blocks = angle.build(bytes(10), calibration=read_calibrations("0,0\\n65535,360\\n", "x.csv", angle)).blocks
+try:
+    plot_blocks(blocks, Path("x.png"))
+except UsageFailure as error:
+    print(error.message, error.hint)
+"""
+    told = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, cwd=tmp_path).stdout
+    assert "matplotlib" in told
+    assert "teds-provision[plot]" in told
