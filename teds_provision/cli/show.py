@@ -94,7 +94,7 @@ def _convert(app: App, files: Sequence[ShownFile], form: Format) -> None:
     from teds_provision.teds.formats import lost, write_blocks
 
     for file in files:
-        if file.bundle is not None or file.message is not None:
+        if file.bundle is not None:
             raise BadData(f"{file.name} holds no TEDS that could be written as {form}.")
         for said in file.conversions.values():
             for finding in said:
@@ -143,8 +143,9 @@ def _diff(app: App, before: str, after: str, *, as_json: bool) -> None:
 
 def _plot(app: App, files: Sequence[ShownFile], path: Path) -> None:
     from teds_provision.cli.show_files import placed
-    from teds_provision.teds.plot import plot_calibration  # type: ignore[import-not-found,unused-ignore]
+    from teds_provision.teds.plot import plot_blocks
 
-    for file in files:
-        plot_calibration(placed(file.blocks), path)
-        app.note(f"Drawn: {path}")
+    if len(files) != 1:
+        raise UsageFailure("A plot shows the calibrations of one file.", hint="Call show once for each.")
+    channels = plot_blocks(placed(files[0].blocks), path)
+    app.note(f"Drawn in {path}: channel {', '.join(map(str, channels))}.")

@@ -38,7 +38,9 @@ class ShownFile:
 
     @property
     def blocks(self) -> list[Block]:
-        """The blocks of its TEDS."""
+        """The blocks of its TEDS; a message is one block without a place."""
+        if self.message is not None:
+            return [Block(None, None, self.message.octets)]
         return [shown.block for shown in self.teds]
 
     @property

@@ -212,6 +212,17 @@ def test_a_diff_speaks_in_physical_terms(show, show_json, tmp_path, image):
     assert json.loads(show("--diff", image, other, "--format", "json")[1]) == shown
 
 
+def test_a_calibration_is_drawn(show, tmp_path, image):
+    pytest.importorskip("matplotlib")
+    picture = tmp_path / "curve.svg"
+    code, _, err = show(image, "--plot", picture)
+    assert (code, "channel 1" in err) == (0, True)
+    assert "<svg" in picture.read_text()
+    assert show(VECTORS / "x07_name.hex", "--plot", picture)[0] == 8
+    assert show(image, "--plot", tmp_path / "curve.gif")[0] == 2
+    assert show(image, image, "--plot", picture)[0] == 2
+
+
 # -- formats -------------------------------------------------------------------------------------------------------
 
 
@@ -224,6 +235,16 @@ def test_an_image_in_other_formats_is_the_same_image(show, image, tmp_path, form
     assert [block.octets for block in again] == [block.octets for block in blocks]
     if format != "ihex":
         assert again == blocks
+
+
+@pytest.mark.parametrize("format", ["hex", "xml", "json", "ihex"])
+def test_a_message_in_other_formats_is_the_same_message(show, show_json, tmp_path, format):
+    _, out, _ = show(VECTORS / "m24_readteds_reply_meta.hex", "--format", format)
+    path = tmp_path / "message"
+    path.write_text(out)
+    _, shown = show_json(path)
+    _, original = show_json(VECTORS / "m24_readteds_reply_meta.hex")
+    assert (shown["verdict"], shown["fields"]) == ("message", original["fields"])
 
 
 def test_xml_of_show_is_valid_by_the_shipped_schema(show, image):

@@ -66,7 +66,7 @@ def _calibration(decoded: Decoded, context: Context, now: datetime) -> Iterator[
         return
     segments = " × ".join(str(part.segments) for part in calibration.inputs)
     degrees = ", ".join(str(part.degree) for part in calibration.inputs)
-    yield "method", f"{calibration.method}: {segments} segments of degree {degrees}"
+    yield "method", f"{calibration.method}: {segments} segment{'' if segments == '1' else 's'} of degree {degrees}"
     if calibration.date is not None:
         yield "calibrated", f"{calibration.date:%Y-%m-%d}"
     if calibration.due is not None:

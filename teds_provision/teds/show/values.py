@@ -81,8 +81,10 @@ def _integer(value: int, spec: FieldSpec | None) -> str:
 
 
 def _number(field: Field, value: float, context: Context, spec: FieldSpec | None) -> str:
+    from teds_provision.teds.formats.tree import shortest
     from teds_provision.teds.units import format_value
 
+    value = shortest(value)
     if field.name in _IN_CHANNEL_UNIT and context.unit is not None:
         difference = field.name in _DIFFERENCES
         if context.converted:

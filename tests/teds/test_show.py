@@ -1,0 +1,121 @@
+"""Putting TEDS into words: units, dates, UUIDs, and never an exception, whatever the octets."""
+
+import json
+from datetime import UTC, datetime
+from pathlib import Path
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from teds_provision import teds
+from teds_provision.teds.formats import Block, read_blocks
+from teds_provision.teds.model import TimeInstance, Units
+from teds_provision.teds.show import describe, shown_to_json
+from teds_provision.teds.show.values import hexadecimal, instant, seconds, span
+
+VECTORS = sorted((Path(__file__).parent.parent / "vectors" / "ieee1451").glob("*.hex"))
+NOW = datetime(2026, 1, 1, tzinfo=UTC)
+KELVIN = Units(kelvins=1)
+
+
+def shown_of(code, fields, **more):
+    return describe(Block(None, code, teds.compose(code, fields)), now=NOW, **more)
+
+
+def texts(shown):
+    pending, out = list(shown.fields), {}
+    while pending:
+        field = pending.pop()
+        out[field.name] = field.text
+        pending += field.children
+    return out
+
+
+def test_limits_are_in_the_unit_that_people_use_and_a_difference_leaves_the_offset_out():
+    said = texts(shown_of(3, {"PhyUnits": KELVIN, "LowLimit": 273.15, "HiLimit": 373.15, "OError": 0.5}))
+    assert (said["LowLimit"], said["HiLimit"], said["OError"]) == ("0 °C", "100 °C", "0.5 °C")
+
+
+def test_times_are_in_a_unit_that_suits():
+    assert [seconds(value) for value in (0.0, 2.5e-8, 1e-4, 0.05, 1.0, 90.0, float("nan"))] == [
+        "0 s",
+        "25 ns",
+        "100 µs",
+        "50 ms",
+        "1 s",
+        "90 s",
+        "not available",
+    ]
+    assert span(TimeInstance(31_536_000)) == "365 days"
+    assert instant(TimeInstance(0)) == "not set (0)"
+    assert instant(TimeInstance(1_700_000_000)) == "2023-11-14 22:13:20 UTC"
+    assert instant(TimeInstance(86_400, 0, True)) == "1969-12-31 00:00:00 UTC"
+    assert "since 1970" in instant(TimeInstance(2**47))
+
+
+def test_long_octets_are_cut_for_people():
+    assert hexadecimal(b"") == "(empty)"
+    assert hexadecimal(bytes(100)).endswith("… (100 octets)")
+
+
+def test_a_uuid_of_2007_is_unpacked():
+    fields = {"UUID": bytes.fromhex("8D4D9DA65281F7000000"), "OholdOff": 1.0, "TestTime": 0.0, "MaxChan": 1}
+    summary = dict(shown_of(1, fields).summary)
+    assert summary["made at"] == "30.2719° N, 120.1272° E"
+    assert summary["made in"].startswith("2012-01-01")
+
+
+def test_calibration_limits_are_in_the_calibrated_unit_when_the_channel_lies_beside():
+    channel = teds.compose(3, {"PhyUnits": Units(radians=1), "LowLimit": 0.0, "HiLimit": 6.2831855})
+    degree = 0.017453292
+    calibration = teds.compose(
+        5,
+        [
+            ("LstCalDt", TimeInstance(1_577_836_800)),
+            ("CalInrvl", TimeInstance(31_536_000)),
+            ("SIConvrt", {"Slope": degree, "Intercept": 0.0}),
+            ("LowLimit", 0.0),
+            ("HiLimit", 360.0),
+            ("CalInput", {"ChanNum": 1, "ChanKey": 0, "Degree": 1, "Boundaries": (0.0, 100.0), "Offsets": (0.0,)}),
+            ("Coefs", (0.0, 3.6)),
+            ("Method", 0),
+        ],
+    )
+    beside = {(1, 3): channel, (1, 5): calibration}
+    shown = describe(Block(1, 5, calibration), beside, now=NOW)
+    assert texts(shown)["HiLimit"] == "360 °"
+    summary = dict(shown.summary)
+    assert summary["method"] == "linear: 1 segment of degree 1"
+    assert summary["due"] == "2020-12-31 (overdue)"
+
+
+def test_a_place_that_the_tedsid_denies_is_named():
+    name = teds.compose(12, {"Format": 0, "TCName": "a"})
+    assert describe(Block(2, 3, name)).title == "channel 2 · ChanTEDS (3), though its TEDSID says 12"
+
+
+@pytest.mark.parametrize("path", VECTORS, ids=lambda path: path.stem)
+def test_every_given_string_can_be_put_into_words_and_json(path):
+    for block in read_blocks(path.read_bytes()):
+        shown = describe(block)
+        assert json.loads(json.dumps(shown_to_json(shown), allow_nan=False))["verdict"] == shown.decoded.verdict
+
+
+@given(st.sampled_from(VECTORS), st.data())
+def test_damage_never_raises(path, data):
+    octets = bytearray(read_blocks(path.read_bytes())[0].octets)
+    for _ in range(data.draw(st.integers(1, 4))):
+        octets[data.draw(st.integers(0, len(octets) - 1))] = data.draw(st.integers(0, 255))
+    code = data.draw(st.none() | st.integers(0, 255))
+    beside = {(1, code or 0): bytes(octets), (1, 3): bytes(octets)}
+    json.dumps(shown_to_json(describe(Block(1, code, bytes(octets)), beside, now=NOW)), allow_nan=False)
+
+
+@given(st.integers(1, 255), st.binary(max_size=120), st.sampled_from([2007, 2024]))
+def test_any_content_of_any_class_never_raises(code, content, edition):
+    from teds_provision.teds.frame import frame
+
+    head = bytes([3, 4, 0, code, 1, 1]) if edition == 2007 else bytes([3, 5, 0, 255, code, 2, 1])
+    octets = frame(head + content)
+    json.dumps(shown_to_json(describe(Block(None, code, octets), {(0, code): octets}, now=NOW)), allow_nan=False)
