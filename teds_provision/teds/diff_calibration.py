@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
 from dataclasses import replace
 from typing import TYPE_CHECKING, Final
 
 from teds_provision.errors import BadData
 from teds_provision.teds.calibration.decoded import from_decoded, is_finite
+from teds_provision.teds.calibration.describe import kind_of
 from teds_provision.teds.calibration.model import Calibration
 from teds_provision.teds.decode import decode
 from teds_provision.teds.image import BlockId
@@ -36,8 +36,8 @@ def curve_change(channel: int, old: Mapping[BlockId, bytes], new: Mapping[BlockI
     curve = curve_of(after, view, others)
     was = replace(curve_of(before, view, others), axes=curve.axes)
     parts = _parts(was, curve)
-    if before.method != after.method or _segments(before) != _segments(after):
-        parts.append(f"{_kind(before)} -> {_kind(after)}")
+    if kind_of(before) != kind_of(after):
+        parts.append(f"{kind_of(before)} -> {kind_of(after)}")
     if not parts:
         return ""
     if not other.actuator and other.uncertainty > 0:
@@ -54,18 +54,6 @@ def _calibration(channel: int, blocks: Mapping[BlockId, bytes], own: Channel) ->
         return None
     sound = is_finite(found) and all(part.ascending for part in found.inputs)
     return found if sound else None
-
-
-def _segments(calibration: Calibration) -> int:
-    return math.prod(part.segments for part in calibration.inputs)
-
-
-def _kind(calibration: Calibration) -> str:
-    segments = _segments(calibration)
-    if calibration.method in ("table", "steps"):
-        return f"{calibration.method} of {segments} segment{'s' if segments > 1 else ''}"
-    degree = calibration.inputs[0].degree
-    return f"{calibration.method} of degree {degree}" if calibration.method == "polynomial" else calibration.method
 
 
 def _parts(was: Curve, curve: Curve) -> list[str]:

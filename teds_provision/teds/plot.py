@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 from teds_provision.errors import BadData, UsageFailure
 from teds_provision.teds.calibration.decoded import calibrations_of, is_finite
+from teds_provision.teds.calibration.describe import kind_of
 from teds_provision.teds.calibration.model import Calibration
 from teds_provision.teds.decode import decode
 from teds_provision.teds.image import BlockId
@@ -139,12 +140,7 @@ def _draw(where: Any, panel: _Panel) -> None:
 
 
 def _subtitle(calibration: Calibration) -> str:
-    segments = math.prod(part.segments for part in calibration.inputs)
-    text: str = calibration.method
-    if calibration.method == "polynomial":
-        text += f" of degree {calibration.inputs[0].degree}"
-    if segments > 1:
-        text += f", {segments} segments"
+    text = kind_of(calibration)
     if calibration.date is not None:
         text += f", {calibration.date:%Y-%m-%d}"
         if calibration.due is not None:

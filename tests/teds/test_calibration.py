@@ -21,10 +21,12 @@ from teds_provision.teds.calibration import (
     Calibration,
     CalibrationInput,
     calibrations_of,
+    describe_calibration,
     fit,
     from_decoded,
     load_calibrations,
     read_calibrations,
+    sentence,
 )
 from teds_provision.teds.profile import Profile, load_profile
 from teds_provision.teds.units import parse_unit
@@ -244,6 +246,18 @@ def test_an_overdue_calibration_is_warned_about() -> None:
     assert "no date" in SPLINE.date_warnings(now)[0]
     assert "due again" in replace(old, interval=None).date_warnings(now, 30 * 86400.0)[0]
     assert "longer than" in replace(old, date=now).date_warnings(now, 30 * 86400.0)[0]
+
+
+def test_a_calibration_is_told_in_one_line_and_as_data(tactile: Profile) -> None:
+    text = "# channel: 1\n# method: linear\n# date: 2026-01-01\n0,0\n32768,5.3\n65535,10\n"
+    calibration = read_calibrations(text, "x.csv", tactile)[1]
+    assert sentence(calibration) == (
+        "channel 1: linear, 3 points, largest residual 0.2 N at raw 32768, rms 0.141 N, due 2026-06-30"
+    )
+    data = describe_calibration(calibration, datetime(2026, 7, 1, tzinfo=UTC))
+    assert data["overdue"] is True
+    assert data["residuals"]["worst"] == {"input": 32768, "difference": pytest.approx(0.2, abs=1e-3)}
+    assert json.loads(json.dumps(data)) == data
 
 
 # --- files

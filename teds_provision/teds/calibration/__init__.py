@@ -8,6 +8,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 from teds_provision.teds.calibration.decoded import calibrations_of, from_decoded
+from teds_provision.teds.calibration.describe import describe_calibration, kind_of, sentence
 from teds_provision.teds.calibration.model import METHODS, Calibration, CalibrationInput, Evaluation, Method
 
 if TYPE_CHECKING:
@@ -22,10 +23,13 @@ __all__ = [
     "Method",
     "Residuals",
     "calibrations_of",
+    "describe_calibration",
     "fit",
     "from_decoded",
+    "kind_of",
     "load_calibrations",
     "read_calibrations",
+    "sentence",
 ]
 _LAZY = {"Residuals": "fitting", "fit": "fitting", "load_calibrations": "files", "read_calibrations": "files"}
 
