@@ -1,6 +1,7 @@
 """Nodes in a process of their own: Identify, and a Write that answers with its payload turned round.
 
-Arguments: JSON with ``spec``, ``addresses`` (one node each), ``delay`` seconds in each Write. Prints ``ready``; ends when stdin closes.
+Arguments: JSON with ``spec``, ``addresses`` (one node each), ``delay`` seconds in each Write. Prints ``ready``; ends
+when stdin closes.
 """
 
 from __future__ import annotations

@@ -1,0 +1,51 @@
+"""An open bus: what is not a data frame, and what the controller says of itself."""
+
+from __future__ import annotations
+
+import socket
+
+import can
+import pytest
+
+from teds_provision.errors import LinkFailure, UsageFailure
+from teds_provision.links.can.bus import Bus, Frame
+from teds_provision.links.can.spec import parse_spec
+
+
+def test_bus_off_is_a_link_failure_that_names_the_cure() -> None:
+    bus = Bus(parse_spec("virtual:bus-off"))
+    with can.Bus(interface="virtual", channel="bus-off") as controller:
+        controller.send(can.Message(arbitration_id=0x40, is_error_frame=True, data=bytes(8)))
+        with pytest.raises(LinkFailure, match="bus-off") as failure:
+            bus.receive(1)
+    bus.close()
+    assert "restart" in failure.value.hint
+
+
+def test_hears_extended_data_frames_alone() -> None:
+    bus = Bus(parse_spec("virtual:others"))
+    with can.Bus(interface="virtual", channel="others") as other:
+        other.send(can.Message(arbitration_id=0x7F1, is_extended_id=False, data=b"a"))
+        other.send(can.Message(arbitration_id=0x18DAF121, is_remote_frame=True, dlc=3))
+        other.send(can.Message(arbitration_id=1, is_error_frame=True, data=bytes(8)))
+        other.send(can.Message(arbitration_id=0x18DAF121, data=b"b"))
+    assert [bus.receive(0.1) for _ in range(4)] == [None, None, None, Frame(0x18DAF121, b"b")]
+    bus.close()
+
+
+def test_a_datagram_that_is_no_frame_is_passed_over(group: str) -> None:
+    spec = parse_spec(group)
+    bus = Bus(spec)
+    port = int(group.rpartition("=")[2])
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as stranger:
+        stranger.setsockopt(socket.IPPROTO_IP, socket.IP_MULTICAST_TTL, 0)
+        stranger.sendto(b"\xc1nonsense", (spec.channel, port))
+    assert bus.receive(0.3) is None
+    bus.send(Frame(0x18DA21F1, b"still here"[:8]))
+    assert bus.receive(0.3) == Frame(0x18DA21F1, b"still he")
+    bus.close()
+
+
+def test_socketcand_has_no_fd() -> None:
+    with pytest.raises(UsageFailure, match="classic"):
+        Bus(parse_spec("socketcand:can0?fd=1"))
