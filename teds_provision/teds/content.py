@@ -182,8 +182,7 @@ def _security(fields: tuple[Field, ...], find: Find, octets: bytes, framed: bool
     from teds_provision.teds import security
     from teds_provision.teds.frame import frame
 
-    block = octets[4:-2] if framed else octets
     try:
-        security.decode(frame(block))
+        security.decode(frame(octets[4:-2] if framed else octets))
     except security.NotCanonical as error:
         find("error", "not-canonical", error.message, None, "", "the canonical form", "")

@@ -245,7 +245,8 @@ class _Walk(Head):
         while at < end:
             kind = octets[at]
             body = at + 1 + width
-            stop = body + int.from_bytes(octets[at + 1 : body], "big")
+            size = octets[at + 1] if body == at + 2 <= end else int.from_bytes(octets[at + 1 : body], "big")
+            stop = body + size
             if body > end or stop > end or self.left <= 0:
                 what = "too many tuples" if self.left <= 0 else f"a tuple of type {kind} that runs past the end"
                 self.find("error", "nested", f"{parent.name} holds {what}.", at, parent.name, end - at, stop - at)
@@ -259,9 +260,10 @@ class _Walk(Head):
                 fields.append(self.nested_special(parent, kind, spec, raw, at, body, kind in seen))
             seen.add(kind)
             at = stop
-        for spec in parent.children:
-            if spec.need == "R" and spec.type not in seen:
-                self.find("warning", "missing", f"{parent.name} holds no {spec.name}.", start, spec.name, "present", "")
+        if not parent.required <= seen:
+            for kind in sorted(parent.required - seen):
+                name = by_type[kind].name
+                self.find("warning", "missing", f"{parent.name} holds no {name}.", start, name, "present", "")
         return tuple(fields)
 
     def nested_special(

@@ -10,10 +10,9 @@ from teds_provision.errors import BadData
 from teds_provision.teds.composer import NO_SUBFAMILY, Composer, recompose, tuple_width
 from teds_provision.teds.frame import TEDSID, frame, raw_tuple
 from teds_provision.teds.model import Decoded, Edition, Field, Finding, Severity, TimeInstance, Units
-from teds_provision.teds.tables import TEXT_BASED, FieldSpec, Table, table
+from teds_provision.teds.tables import ONLY_2024, TEXT_BASED, FieldSpec, Table, table
 
 _VERSIONS: Final = {(2007, 1): 2, (2024, 2): 1}
-_ONLY_2024: Final = frozenset({16, 17})
 _SECURITY: Final = 128
 _UUID_OCTETS: Final = {2007: 10, 2024: 16}
 
@@ -50,7 +49,7 @@ class _Conversion:
         self.findings.append(Finding(severity, code, message, offset, name, asked, found))
 
     def octets(self) -> bytes:
-        if self.table.access_code in _ONLY_2024 and self.edition == 2007:
+        if self.table.access_code in ONLY_2024 and self.edition == 2007:
             self.say("error", "class", f"The 2007 edition has no {self.table.name}.", None)
         composer = Composer(self.table, self.edition, tuple_width(self.decoded))
         if self.table.access_code in TEXT_BASED:

@@ -7,7 +7,7 @@ from typing import Final
 from teds_provision.teds.frame import MINIMUM_OCTETS, TEDSID, checksum
 from teds_provision.teds.model import Edition, Finding, Severity
 from teds_provision.teds.shape import MALFORMED_CODES
-from teds_provision.teds.tables import Table, table
+from teds_provision.teds.tables import MANUFACTURER, ONLY_2024, Table, table
 
 MAX_OCTETS: Final = 16 << 20
 MAX_TUPLES: Final = 32768
@@ -107,6 +107,10 @@ class Head:
         self.edition = 2007 if size == 4 else 2024
         family, self.access_code, version, width = value[0], value[-3], value[-2], value[-1]
         self.table = table(self.access_code)
+        if size == 4 and self.access_code in ONLY_2024:
+            self.find("note", "class", f"The 2007 edition has no {self.table.name}.", at + 3, "TEDSID")
+        elif self.access_code == 0 or 17 < self.access_code < MANUFACTURER:
+            self.find("note", "class", f"The class {self.access_code} is reserved.", at, "TEDSID", "", self.access_code)
         if 1 <= width <= 4:
             self.width = width if at == start else 1
         else:

@@ -21,11 +21,13 @@ def shape_of(octets: bytes) -> Shape:
     A data block starts with a TEDSID (03 04 or 03 05). A message is recognised by a length in its header that fits to
     the octet. Everything else is taken for a framed TEDS, however damaged.
     """
-    if int.from_bytes(octets[:4], "big") == len(octets) - 4 or octets[4:6] in _TEDSIDS:
+    if int.from_bytes(octets[:4], "big") == len(octets) - 4:
         return "framed"
-    if _is_message(octets):
-        return "message"
-    return "block" if octets[:2] in _TEDSIDS else "framed"
+    if octets[:2] in _TEDSIDS:
+        return "message" if _is_message(octets) else "block"
+    if octets[4:6] in _TEDSIDS:
+        return "framed"
+    return "message" if _is_message(octets) else "framed"
 
 
 def _is_message(octets: bytes) -> bool:

@@ -35,6 +35,7 @@ NAMES: Final[Mapping[int, str]] = {
     128: "SecurityTEDS",
 }
 TEXT_BASED: Final = frozenset({2, 4, 6, 10, 11, 14, 15})
+ONLY_2024: Final = frozenset({16, 17})
 MANUFACTURER: Final = 128
 """First type and first access code of the manufacturers' range."""
 
@@ -77,8 +78,11 @@ class FieldSpec:
     by_type: Mapping[int, FieldSpec] = field(init=False, repr=False, compare=False)
     by_name: Mapping[str, FieldSpec] = field(init=False, repr=False, compare=False)
     octets: tuple[int, ...] = field(init=False, repr=False, compare=False)
+    required: frozenset[int] = field(init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:
+        required = frozenset(child.type for child in self.children if child.need == "R")
+        object.__setattr__(self, "required", required)
         object.__setattr__(self, "by_type", {child.type: child for child in self.children})
         object.__setattr__(self, "by_name", {child.name: child for child in self.children})
         object.__setattr__(self, "octets", OCTETS.get(self.kind, ()))

@@ -7,6 +7,7 @@ from collections.abc import Callable, Mapping, Sequence
 from fractions import Fraction
 from functools import lru_cache
 from math import isnan
+from numbers import Integral, Rational, Real
 from typing import Any, Final
 
 from teds_provision.errors import BadData
@@ -137,18 +138,19 @@ def write_int(spec: FieldSpec, value: object, octets: int) -> bytes:
                 return number.to_bytes(octets, "big")
         known = ", ".join(spec.enumeration.values())
         raise _refuse(spec.name, f"knows no value {value!r}" + (f"; it has {known}" if known else ""))
-    if not isinstance(value, int):
+    if not isinstance(value, Integral):
         raise _refuse(spec.name, f"is a whole number, not {value!r}")
-    if not 0 <= value < 1 << 8 * octets:
-        raise _refuse(spec.name, f"goes from 0 to {(1 << 8 * octets) - 1}, {value} does not fit")
-    return int(value).to_bytes(octets, "big")
+    number = int(value)
+    if not 0 <= number < 1 << 8 * octets:
+        raise _refuse(spec.name, f"goes from 0 to {(1 << 8 * octets) - 1}, {number} does not fit")
+    return number.to_bytes(octets, "big")
 
 
 def write_f32(spec: FieldSpec, value: object) -> bytes:
     """Float32; NaN and None become the NaN that means "not available"."""
     if value is None:
         return NOT_AVAILABLE
-    if isinstance(value, bool) or not isinstance(value, int | float | Fraction):
+    if isinstance(value, bool) or not isinstance(value, Real):
         raise _refuse(spec.name, f"is a number, not {value!r}")
     try:
         number = float(value)
@@ -186,7 +188,7 @@ def write_octets(spec: FieldSpec, value: object) -> bytes:
 
 def write_instant(spec: FieldSpec, value: object, edition: Edition) -> bytes:
     """TimeInstance (2007: 8 octets, 2024: 10) or TimeDuration (8); a plain number counts as seconds."""
-    if isinstance(value, int | float | Fraction) and not isinstance(value, bool):
+    if isinstance(value, Real):
         value = _split_seconds(spec, value)
     if not isinstance(value, TimeInstance):
         raise _refuse(spec.name, f"is a time, not {value!r}")
@@ -201,9 +203,10 @@ def write_instant(spec: FieldSpec, value: object, edition: Edition) -> bytes:
     return value.seconds.to_bytes(bits // 8, "big") + (value.nanoseconds | value.negative << 31).to_bytes(4, "big")
 
 
-def _split_seconds(spec: FieldSpec, value: float | Fraction) -> TimeInstance:
+def _split_seconds(spec: FieldSpec, value: Real) -> TimeInstance:
     try:
-        total = round(Fraction(value) * 1_000_000_000)
+        exact = Fraction(value) if isinstance(value, Rational) else Fraction(float(value))
+        total = round(exact * 1_000_000_000)
     except (ValueError, OverflowError) as error:
         raise _refuse(spec.name, f"is a time, not {value!r}") from error
     seconds, nanoseconds = divmod(abs(total), 1_000_000_000)

@@ -171,3 +171,11 @@ def test_impossible_requests(access_code: int, options: dict[str, int]) -> None:
 def test_tedsid_may_be_given() -> None:
     octets = teds.compose(1, {**META, "UUID": bytes(16), "TEDSID": {"family": 99, "subfamily": 1}}, edition=2024)
     assert teds.decode(octets).get("TEDSID") == (99, 1, 1, 2, 1)
+
+
+def test_numpy_numbers_are_numbers() -> None:
+    numpy = pytest.importorskip("numpy")
+    fields = {**META, "MaxChan": numpy.uint16(2), "OholdOff": numpy.float32(0.5)}
+    assert teds.compose(1, fields) == octets_of("x07_meta")
+    with pytest.raises(BadData, match="MaxChan"):
+        teds.compose(1, {**META, "MaxChan": numpy.float64(2)})

@@ -209,3 +209,15 @@ def test_too_many_octets_are_not_walked() -> None:
 def test_strict_names_the_octet() -> None:
     with pytest.raises(BadData, match="octet 27"):
         teds.decode(octets_of("n07_bad_checksum"), strict=True)
+
+
+@pytest.mark.parametrize("access_code", [0, 16, 17, 18, 127])
+def test_classes_that_the_edition_does_not_have_are_noted(access_code: int) -> None:
+    assert codes(block(access_code))["class"] == "note"
+
+
+@pytest.mark.parametrize("version", [3, 4, 5])
+def test_a_bare_block_of_a_later_version_is_a_block(version: int) -> None:
+    decoded = teds.decode(bytes([3, 5, 0, 255, 3, version, 1, 10, 1, 0]))
+    assert not decoded.framed
+    assert decoded.get("CalKey") == 0
