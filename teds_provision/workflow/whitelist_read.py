@@ -1,0 +1,332 @@
+"""Whitelists that other people write: XML in the style of the NCAP, CSV and JSON. Nothing is taken by half.
+
+XML is read with defusedxml: no DTD, so neither entity bombs nor external entities. It is read liberally: an element is
+an entry where it has an attribute ``uuid``, a child ``uuid`` beside its other fields, or a UUID as its text.
+"""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+import re
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Final
+
+from teds_provision.errors import BadData, NotFound
+from teds_provision.store.records import UUID_OCTETS
+
+MAX_FILE_OCTETS: Final = 64 * 1024 * 1024
+MAX_ENTRIES: Final = 250_000
+FORMATS: Final = ("xml", "csv", "json")
+FIELDS: Final = ("uuid", "fingerprint", "added", "assurance", "name")
+
+_SHOWN_MISTAKES = 10
+_MAX_NAME = 200
+_MAX_DEPTH = 16
+_UUID_DIGITS = 2 * UUID_OCTETS
+_ENTRY_ELEMENTS = frozenset({"transducer", "tim", "node", "entry", "item", "device", "uuid"})
+_ALIASES = {"id": "uuid", "uid": "uuid"}
+
+
+@dataclass(frozen=True)
+class Listed:
+    """One entry of a file: the UUID, and the key and name that it gives where it gives them."""
+
+    line: int
+    uuid: bytes
+    fingerprint: str | None = None
+    name: str | None = None
+
+
+@dataclass
+class _Reading:
+    """What has been read so far, and every mistake with its line and field."""
+
+    file: str
+    entries: dict[bytes, Listed] = field(default_factory=dict)
+    mistakes: list[str] = field(default_factory=list)
+    count: int = 0
+
+    def wrong(self, line: int, what: str, why: str) -> None:
+        self.mistakes.append(f"{self.file}:{line}: {what}: {why}")
+
+    def add(self, line: int, values: dict[str, str]) -> None:
+        """Take one entry in, or note what is wrong with it."""
+        self.count += 1
+        if self.count > MAX_ENTRIES:
+            raise BadData(f"{self.file}:{line}: there are more than {MAX_ENTRIES} entries.")
+        before = len(self.mistakes)
+        uuid = self._digits(line, "uuid", values.get("uuid", ""), _UUID_DIGITS)
+        print_text = values.get("fingerprint", "").strip()
+        pin = self._digits(line, "fingerprint", print_text, 64) if print_text else None
+        name = values.get("name", "").strip() or None
+        if name is not None and (len(name) > _MAX_NAME or not name.isprintable()):
+            self.wrong(line, "name", f"a name is printable and has at most {_MAX_NAME} characters")
+        if len(self.mistakes) == before and uuid is not None:
+            self._join(Listed(line, bytes.fromhex(uuid), pin, name))
+
+    def _digits(self, line: int, what: str, text: str, length: int) -> str | None:
+        digits = re.sub(r"[\s:-]", "", text).lower().removeprefix("0x")
+        if len(digits) == length and re.fullmatch("[0-9a-f]+", digits):
+            return digits
+        shown = ascii(text[:48]) if text else "nothing"
+        self.wrong(line, what, f"{length} hex digits are needed, here is {shown}")
+        return None
+
+    def _join(self, entry: Listed) -> None:
+        known = self.entries.get(entry.uuid)
+        if known is not None and known.fingerprint and entry.fingerprint not in (None, known.fingerprint):
+            self.wrong(entry.line, "fingerprint", f"the same UUID has another key in line {known.line}")
+            return
+        if known is not None:
+            entry = Listed(known.line, known.uuid, known.fingerprint or entry.fingerprint, known.name or entry.name)
+        self.entries[entry.uuid] = entry
+
+
+def read_whitelist(path: Path, form: str | None = None) -> list[Listed]:
+    """Read a whitelist file; the format is ``form``, else the file's extension, else what its content looks like.
+
+    Raises NotFound, or BadData that names file, line and field of every mistake (the first ten in full).
+    """
+    text = _text(path)
+    form = form or _form_of(path, text)
+    reading = _Reading(str(path))
+    readers: dict[str, Callable[[str, _Reading], None]] = {"xml": _read_xml, "csv": _read_csv, "json": _read_json}
+    readers[form](text, reading)
+    if reading.mistakes:
+        shown = "; ".join(reading.mistakes[:_SHOWN_MISTAKES])
+        more = len(reading.mistakes) - _SHOWN_MISTAKES
+        raise BadData(
+            f"{shown}{f'; and {more} more' if more > 0 else ''}.",
+            hint="Mend these lines and import again; nothing was imported.",
+        )
+    return list(reading.entries.values())
+
+
+def _text(path: Path) -> str:
+    try:
+        with path.open("rb") as file:
+            octets = file.read(MAX_FILE_OCTETS + 1)
+    except FileNotFoundError:
+        raise NotFound(f"There is no file {path}.") from None
+    except OSError as error:
+        raise NotFound(f"{path} cannot be read: {error.strerror}.") from error
+    if len(octets) > MAX_FILE_OCTETS:
+        raise BadData(f"{path} is larger than {MAX_FILE_OCTETS} octets.", hint="Is this a whitelist?")
+    try:
+        return octets.decode("utf-8-sig")
+    except UnicodeDecodeError as error:
+        line = octets[: error.start].count(b"\n") + 1
+        raise BadData(f"{path}:{line}: the text is not UTF-8.", hint="Save the file as UTF-8.") from error
+
+
+def _form_of(path: Path, text: str) -> str:
+    suffix = path.suffix.lower().removeprefix(".")
+    if suffix in FORMATS:
+        return suffix
+    first = text.lstrip()[:1]
+    return "xml" if first == "<" else "json" if first in ("{", "[") else "csv"
+
+
+# -- XML ---------------------------------------------------------------------------------------------------------------
+
+
+@dataclass
+class _Element:
+    """An element that is still open: its own fields, and the UUIDs that stand in it as children."""
+
+    tag: str
+    line: int
+    fields: dict[str, str]
+    text: list[str] = field(default_factory=list)
+    uuids: list[tuple[int, str]] = field(default_factory=list)
+    entries: int = 0
+
+
+def _read_xml(text: str, reading: _Reading) -> None:
+    from xml.sax import SAXException, SAXParseException
+    from xml.sax.handler import ContentHandler
+
+    from defusedxml.common import DefusedXmlException
+    from defusedxml.expatreader import DefusedExpatParser
+
+    class Handler(ContentHandler):
+        """Feeds elements into the reading as they close."""
+
+        def __init__(self) -> None:
+            super().__init__()
+            self.open: list[_Element] = []
+
+        def startElement(self, name: str, attrs: Any) -> None:
+            if len(self.open) >= _MAX_DEPTH:
+                raise BadData(f"{reading.file}:{parser.getLineNumber()}: elements are nested too deeply.")
+            fields = {_field_name(key): value for key, value in attrs.items()}
+            self.open.append(_Element(_field_name(name), parser.getLineNumber(), fields))
+
+        def characters(self, content: str) -> None:
+            self.open[-1].text.append(content)
+
+        def endElement(self, name: str) -> None:
+            element = self.open.pop()
+            _close_element(element, self.open[-1] if self.open else None, reading)
+
+    parser = DefusedExpatParser(forbid_dtd=True)
+    handler = Handler()
+    parser.setContentHandler(handler)
+    try:
+        parser.parse(io.StringIO(text))
+    except DefusedXmlException as error:
+        raise BadData(
+            f"{reading.file}: the XML has a DTD or entities, which are not read.", hint="Remove the DOCTYPE."
+        ) from error
+    except SAXParseException as error:
+        raise BadData(f"{reading.file}:{error.getLineNumber()}: this is not XML: {error.getMessage()}.") from error
+    except SAXException as error:
+        raise BadData(f"{reading.file}: this is not XML: {error.getMessage()}.") from error
+
+
+def _local(name: str) -> str:
+    return name.rpartition(":")[2].lower()
+
+
+def _field_name(name: str) -> str:
+    local = _local(name)
+    return _ALIASES.get(local, local)
+
+
+def _close_element(element: _Element, parent: _Element | None, reading: _Reading) -> None:
+    text = "".join(element.text).strip()
+    leaf = not element.uuids and not element.entries
+    if parent is not None and leaf and text and not element.fields and element.tag in FIELDS:
+        if element.tag == "uuid":
+            parent.uuids.append((element.line, text))
+        else:
+            parent.fields[element.tag] = text
+        return
+    found = _entry_of(element, text, leaf, parent is None, reading)
+    if parent is not None:
+        parent.entries += found + element.entries
+    elif found + element.entries == 0 and element.tag != "whitelist" and not reading.mistakes:
+        reading.wrong(element.line, element.tag, "there is no UUID in this document")
+
+
+def _entry_of(element: _Element, text: str, leaf: bool, root: bool, reading: _Reading) -> int:
+    """Take in what the element holds by itself; returns how many entries that were."""
+    own = {key: value for key, value in element.fields.items() if key in FIELDS}
+    if "uuid" in own:
+        reading.add(element.line, own)
+        return 1
+    if len(element.uuids) == 1 and not (root and not own):
+        line, uuid = element.uuids[0]
+        reading.add(line, {**own, "uuid": uuid})
+        return 1
+    if len(element.uuids) > 1 and "fingerprint" in own:
+        reading.wrong(element.line, "fingerprint", "it stands beside several UUIDs and belongs to none")
+    for line, uuid in element.uuids:
+        reading.add(line, {"uuid": uuid})
+    if element.uuids:
+        return len(element.uuids)
+    if not leaf or not (text or element.tag in _ENTRY_ELEMENTS):
+        return 0
+    if element.tag in _ENTRY_ELEMENTS or text[:2].lower() == "0x" or root:
+        for part in _parts(text):
+            reading.add(element.line, {**own, "uuid": part})
+        return 1
+    return 0
+
+
+def _parts(text: str) -> list[str]:
+    """Several whole UUIDs in one text, or the one text as it is."""
+    words = re.split(r"[\s,;]+", text.strip())
+    whole = all(len(word.lower().removeprefix("0x")) == _UUID_DIGITS for word in words)
+    return words if whole else [text]
+
+
+# -- CSV ---------------------------------------------------------------------------------------------------------------
+
+
+def _read_csv(text: str, reading: _Reading) -> None:
+    first = next((line for line in text.splitlines() if line.strip() and not line.startswith("#")), "")
+    delimiter = max(",;\t", key=first.count)
+    rows = csv.reader(io.StringIO(text, newline=""), delimiter=delimiter, strict=True)
+    columns: list[str] | None = None
+    try:
+        for row in rows:
+            cells = [cell.strip() for cell in row]
+            if not any(cells) or cells[0].startswith("#"):
+                continue
+            if columns is None:
+                named = [_field_name(cell) for cell in cells]
+                columns = named if "uuid" in named else ["uuid", "fingerprint", "name"]
+                if columns is named:
+                    continue
+            if len(cells) > len(columns) and any(cells[len(columns) :]):
+                reading.wrong(rows.line_num, "row", f"{len(cells)} cells for {len(columns)} columns")
+                continue
+            reading.add(rows.line_num, dict(zip(columns, cells, strict=False)))
+    except csv.Error as error:
+        raise BadData(f"{reading.file}:{rows.line_num}: this is not CSV: {error}.") from error
+
+
+# -- JSON --------------------------------------------------------------------------------------------------------------
+
+
+def _read_json(text: str, reading: _Reading) -> None:
+    try:
+        value = json.loads(text)
+    except json.JSONDecodeError as error:
+        raise BadData(f"{reading.file}:{error.lineno}: this is not JSON: {error.msg}.") from error
+    except (RecursionError, ValueError) as error:
+        raise BadData(f"{reading.file}: this JSON is nested too deeply or has a number that is too long.") from error
+    listed = value.get("whitelist") if isinstance(value, dict) else value
+    if not isinstance(listed, list):
+        raise BadData(f'{reading.file}:1: whitelist: a list is needed, or an object with "whitelist": […].')
+    for line, item in _with_lines(text, inside=isinstance(value, dict)):
+        if isinstance(item, str):
+            reading.add(line, {"uuid": item})
+        elif not isinstance(item, dict):
+            reading.wrong(line, "entry", "an object or a UUID as a string is needed")
+        else:
+            _add_object(line, item, reading)
+
+
+def _add_object(line: int, item: dict[str, Any], reading: _Reading) -> None:
+    values: dict[str, str] = {}
+    for key, value in item.items():
+        name = _field_name(key)
+        if name in FIELDS and not isinstance(value, str | None):
+            reading.wrong(line, name, "a string is needed")
+            return
+        if name in FIELDS and value is not None:
+            values[name] = value
+    reading.add(line, values)
+
+
+def _with_lines(text: str, *, inside: bool) -> Iterator[tuple[int, Any]]:
+    """Give the elements of the list again, each with the line it begins in; the text is known to be JSON."""
+    decoder, blank = json.JSONDecoder(), re.compile(r"[\s,:]*")
+
+    def skip(at: int) -> int:
+        found = blank.match(text, at)
+        return found.end() if found else at
+
+    at = skip(0)
+    if inside:
+        at, start = skip(at + 1), None
+        while text[at] != "}":
+            key, at = decoder.raw_decode(text, at)
+            at = skip(at)
+            start = at if key == "whitelist" else start  # of two, json takes the last
+            _, at = decoder.raw_decode(text, at)
+            at = skip(at)
+        assert start is not None
+        at = start
+    line, counted, at = 1, 0, skip(at + 1)
+    while text[at] != "]":
+        line, counted = line + text.count("\n", counted, at), at
+        item, at = decoder.raw_decode(text, at)
+        yield line, item
+        at = skip(at)

@@ -1,0 +1,19 @@
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from teds_provision.vault import forget_vaults
+from tests.workflow.bench import make_station
+
+
+@pytest.fixture
+def home(tmp_path: Path) -> Iterator[Path]:
+    """The home of a station with a passphrase vault at the lowest cost; every command unlocks it anew."""
+    folder = tmp_path / "home"
+    make_station(folder).close()
+    forget_vaults()
+    yield folder
+    forget_vaults()

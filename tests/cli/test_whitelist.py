@@ -1,0 +1,86 @@
+"""``whitelist``: what it says, asks, refuses, and what repeating it does."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+
+from .shell import call
+
+ONE, TWO = "8d4d9da65281f7000000", "8d4d9da65281f7000001"
+KEY, OTHER = "ab" * 32, "cd" * 32
+
+
+def test_adding_again_is_nothing_to_do_and_another_key_is_refused(home: Path) -> None:
+    added = call(home, "--json", "whitelist", "add", "0x" + ONE.upper(), "--fingerprint", KEY, "--name", "finger")
+    assert added.code == 0
+    (entry,) = added.json["whitelist"]
+    assert (entry["uuid"], entry["fingerprint"], entry["name"]) == (ONE, KEY, "finger")
+    again = call(home, "whitelist", "add", "finger", "--fingerprint", KEY)
+    assert (again.code, "nothing to do" in again.out) == (0, True)
+    other = call(home, "--json", "whitelist", "add", ONE, "--fingerprint", OTHER)
+    assert (other.code, other.json["error"]["code"]) == (6, "other-key")
+    assert f"whitelist remove {ONE}" in other.json["error"]["hint"]
+
+
+def test_removing_asks_and_then_another_key_may_come(home: Path) -> None:
+    call(home, "whitelist", "add", ONE, "--fingerprint", KEY)
+    assert call(home, "whitelist", "remove", ONE).code == 2
+    plan = call(home, "--json", "whitelist", "remove", ONE, "--dry-run")
+    assert [entry["uuid"] for entry in plan.json["whitelist"]] == [ONE]
+    removed = call(home, "--json", "whitelist", "remove", "8d4d", "--yes")
+    assert (removed.code, removed.json["whitelist"], removed.json["removed"]) == (0, [], True)
+    assert call(home, "whitelist", "remove", ONE, "--yes").code == 0
+    assert call(home, "whitelist", "add", ONE, "--fingerprint", OTHER).code == 0
+
+
+@pytest.mark.parametrize("form", ["xml", "csv", "json"])
+def test_export_and_import_go_round(home: Path, tmp_path: Path, form: str) -> None:
+    for uuid in (TWO, ONE):
+        call(home, "whitelist", "add", uuid, "--fingerprint", KEY)
+    path = tmp_path / f"list.{form}"
+    exported = call(home, "--json", "whitelist", "export", path)
+    assert [entry["uuid"] for entry in exported.json["whitelist"]] == [ONE, TWO]
+    for uuid in (ONE, TWO):
+        call(home, "whitelist", "remove", uuid, "--yes")
+    assert call(home, "--json", "whitelist", "import", path, "--dry-run").json["whitelist"] == []
+    imported = call(home, "--json", "whitelist", "import", path)
+    assert [(entry["uuid"], entry["assurance"]) for entry in imported.json["whitelist"]] == [
+        (ONE, "import"),
+        (TWO, "import"),
+    ]
+    again = call(home, "--json", "whitelist", "import", path)
+    assert (again.code, again.json["added"], again.json["changed"], again.json["unchanged"]) == (0, 0, 0, 2)
+
+
+def test_nothing_is_imported_by_half(home: Path, tmp_path: Path) -> None:
+    path = tmp_path / "bad.xml"
+    path.write_text(f'<whitelist>\n<transducer uuid="{ONE}"/>\n<transducer uuid="8d4d"/></whitelist>')
+    refused = call(home, "--json", "whitelist", "import", path)
+    assert refused.code == 8
+    assert "bad.xml:3: uuid" in refused.json["error"]["message"]
+    assert call(home, "--json", "whitelist", "list").json == {"whitelist": []}
+
+
+def test_an_export_that_cannot_be_written_leaves_nothing(home: Path, tmp_path: Path) -> None:
+    assert call(home, "whitelist", "export", tmp_path / "none" / "list.xml").code == 2
+    assert call(home, "whitelist", "export", tmp_path / "list.dat").code == 2
+    assert not (tmp_path / "list.dat").exists()
+
+
+def test_the_list_shows_keys_short_and_names_as_they_are(home: Path) -> None:
+    call(home, "whitelist", "add", ONE, "--fingerprint", KEY, "--name", "[red]x[/]")
+    call(home, "whitelist", "add", TWO)
+    shown = call(home, "whitelist", "list").out
+    assert KEY[:16] in shown
+    assert KEY not in shown
+    assert "[red]x[/]" in shown
+    assert "not pinned yet" in shown
+    assert json.loads(call(home, "--json", "whitelist", "list").out)["whitelist"][1]["fingerprint"] is None
+
+
+def test_a_fingerprint_that_is_none_is_usage(home: Path) -> None:
+    assert call(home, "whitelist", "add", ONE, "--fingerprint", "12").code == 2
+    assert call(home, "whitelist", "add", "8d4d").code == 3
