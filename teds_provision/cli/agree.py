@@ -5,7 +5,7 @@ from __future__ import annotations
 import click
 
 from teds_provision.cli.context import App, pass_app
-from teds_provision.cli.options import command, dry_run_option, link_options
+from teds_provision.cli.options import command, dry_run_option, link_options, yes_option
 from teds_provision.links import LinkSettings
 
 
@@ -14,10 +14,11 @@ from teds_provision.links import LinkSettings
 )
 @click.argument("uuid")
 @click.option("--rotate", is_flag=True, help="Make a new key although there is one.")
+@yes_option
 @dry_run_option
 @link_options
 @pass_app
-def agree(app: App, uuid: str, links: LinkSettings, rotate: bool, dry_run: bool) -> None:
+def agree(app: App, uuid: str, links: LinkSettings, rotate: bool, yes: bool, dry_run: bool) -> None:
     """Agree on a key with a whitelisted node; on a node that has one, do nothing, or --rotate it.
 
     The first agreement needs a tap (or the bus of a node built without NFC); a rotation goes over any link.
@@ -28,6 +29,7 @@ def agree(app: App, uuid: str, links: LinkSettings, rotate: bool, dry_run: bool)
     from teds_provision.workflow.identify import identify
 
     station = app.station()
+    del yes  # nothing here is lost by a new key: the old one stays until the node has proven the new one
     octets = station.store.resolve(uuid)
     station.require_whitelisted(octets)
     if dry_run:

@@ -10,7 +10,7 @@ from typing import Any, TypeVar
 import click
 
 from teds_provision.cli.context import App, pass_app
-from teds_provision.cli.options import command, dry_run_option
+from teds_provision.cli.options import command, dry_run_option, yes_option
 
 Function = TypeVar("Function", bound=Callable[..., Any])
 
@@ -56,12 +56,14 @@ def order_options(function: Function) -> Function:
     "--output", "-o", type=click.Path(path_type=Path, dir_okay=False), metavar="IMAGE", help="Also write it here."
 )
 @click.option("--edition", type=click.Choice(["2007", "2024"]), default="2007", show_default=True, help="TEDS form.")
+@yes_option
 @dry_run_option
 @pass_app
-def build(app: App, uuid: str, order: Any, output: Path | None, edition: str, dry_run: bool) -> None:
+def build(app: App, uuid: str, order: Any, output: Path | None, edition: str, yes: bool, dry_run: bool) -> None:
     """Build the TEDS of the node's type, plus calibration, plus the Security TEDS, still unsigned."""
     from teds_provision.workflow.build import build as run
 
+    del yes  # a build can always be made again
     station = app.station()
     octets = station.store.resolve(uuid)
     with station.lock("build", app.note):

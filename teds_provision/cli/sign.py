@@ -8,7 +8,7 @@ from typing import Any
 import click
 
 from teds_provision.cli.context import App, pass_app
-from teds_provision.cli.options import command, dry_run_option, link_options
+from teds_provision.cli.options import command, dry_run_option, link_options, yes_option
 from teds_provision.errors import UsageFailure
 from teds_provision.links import LinkSettings
 
@@ -18,6 +18,7 @@ from teds_provision.links import LinkSettings
 @click.option("--output", "-o", type=click.Path(path_type=Path, dir_okay=False), metavar="IMAGE", help="Signed image.")
 @click.option("--read-node", is_flag=True, help="Meet the node: take its epoch, sequence and TEDS, not the store's.")
 @click.option("--accept-calibration", metavar='"WHY"', help="Take a calibration that the guard refuses; logged.")
+@yes_option
 @dry_run_option
 @link_options
 @pass_app
@@ -27,6 +28,7 @@ def sign(
     output: Path | None,
     read_node: bool,
     accept_calibration: str | None,
+    yes: bool,
     dry_run: bool,
     links: LinkSettings,
 ) -> None:
@@ -40,6 +42,7 @@ def sign(
     from teds_provision.workflow.contact import meet
     from teds_provision.workflow.signing import SignOrder, sign_image
 
+    del yes  # a signature uses up a sequence number, nothing else
     station = app.station()
     path = Path(what)
     image: Image | None = None

@@ -7,7 +7,7 @@ from pathlib import Path
 import click
 
 from teds_provision.cli.context import App, pass_app
-from teds_provision.cli.options import command, dry_run_option, link_options
+from teds_provision.cli.options import command, dry_run_option, link_options, yes_option
 from teds_provision.links import LinkSettings
 
 
@@ -19,10 +19,11 @@ from teds_provision.links import LinkSettings
 @click.option(
     "--image", type=click.Path(path_type=Path, dir_okay=False), metavar="IMAGE", help="Write this file's image."
 )
+@yes_option
 @dry_run_option
 @link_options
 @pass_app
-def write(app: App, uuid: str, image: Path | None, dry_run: bool, links: LinkSettings) -> None:
+def write(app: App, uuid: str, image: Path | None, yes: bool, dry_run: bool, links: LinkSettings) -> None:
     """Write a signed datasheet over a session, commit it, read it back and compare."""
     from teds_provision.cli.build import read_file
     from teds_provision.cli.rendering import reporter_for
@@ -33,6 +34,7 @@ def write(app: App, uuid: str, image: Path | None, dry_run: bool, links: LinkSet
     from teds_provision.workflow.identify import identify
     from teds_provision.workflow.write import write as run
 
+    del yes  # what is written was signed for this node before, and the commit is all or nothing
     station, reporter = app.station(), reporter_for(app)
     octets = station.store.resolve(uuid)
     station.require_whitelisted(octets)
