@@ -103,7 +103,7 @@ class Composer:
         if not name.isdecimal() or not 0 <= int(name) <= 255 or (int(name) == TEDSID and self.table.access_code != 128):
             raise BadData(f"{self.table.name} has no field {name!r}.", hint=f"It has {', '.join(known) or 'no names'}.")
         if not isinstance(value, bytes | bytearray):
-            raise BadData(f"Field {name} of {self.table.name} is raw octets, not {value!r}.")
+            raise BadData(f"Field {name} of {self.table.name} is raw octets, not {values.shown(value)}.")
         return int(name), bytes(value), True
 
     def value(self, spec: FieldSpec, value: object) -> bytes:
@@ -147,7 +147,7 @@ def _spread(pairs: list[tuple[str, object]], known: Mapping[str, FieldSpec]) -> 
 def _octet(given: Mapping[str, object], key: str, default: int) -> int:
     value = given.get(key, default)
     if not isinstance(value, int) or not 0 <= value <= 255:
-        raise BadData(f"The {key} of the TEDSID is an octet, not {value!r}.")
+        raise BadData(f"The {key} of the TEDSID is an octet, not {values.shown(value)}.")
     return value
 
 

@@ -125,6 +125,12 @@ def is_packed_units(raw: bytes) -> bool:
 # --- writing -----------------------------------------------------------------------------------------------------
 
 
+def shown(value: object) -> str:
+    """Repr of a value for a message, cut to 60 characters."""
+    text = repr(value)
+    return text if len(text) <= 60 else f"{text[:57]}..."
+
+
 def _refuse(name: str, why: str) -> BadData:
     return BadData(f"{name} {why}.")
 
@@ -137,9 +143,9 @@ def write_int(spec: FieldSpec, value: object, octets: int) -> bytes:
             if name.casefold() == wanted:
                 return number.to_bytes(octets, "big")
         known = ", ".join(spec.enumeration.values())
-        raise _refuse(spec.name, f"knows no value {value!r}" + (f"; it has {known}" if known else ""))
+        raise _refuse(spec.name, f"knows no value {shown(value)}" + (f"; it has {known}" if known else ""))
     if not isinstance(value, Integral):
-        raise _refuse(spec.name, f"is a whole number, not {value!r}")
+        raise _refuse(spec.name, f"is a whole number, not {shown(value)}")
     number = int(value)
     if not 0 <= number < 1 << 8 * octets:
         raise _refuse(spec.name, f"goes from 0 to {(1 << 8 * octets) - 1}, {number} does not fit")
@@ -151,19 +157,19 @@ def write_f32(spec: FieldSpec, value: object) -> bytes:
     if value is None:
         return NOT_AVAILABLE
     if isinstance(value, bool) or not isinstance(value, Real):
-        raise _refuse(spec.name, f"is a number, not {value!r}")
+        raise _refuse(spec.name, f"is a number, not {shown(value)}")
     try:
         number = float(value)
         return NOT_AVAILABLE if isnan(number) else _F32.pack(number)
     except OverflowError as error:
-        raise _refuse(spec.name, f"does not fit a Float32: {value!r}") from error
+        raise _refuse(spec.name, f"does not fit a Float32: {shown(value)}") from error
 
 
 def write_array(spec: FieldSpec, value: object) -> bytes:
     """Array of UInt16 or Float32; anything with an order and a length will do (list, tuple, numpy array)."""
     plain: object = value.tolist() if hasattr(value, "tolist") else value
     if not isinstance(plain, Sequence) or isinstance(plain, str | bytes):
-        raise _refuse(spec.name, f"is a list of numbers, not {value!r}")
+        raise _refuse(spec.name, f"is a list of numbers, not {shown(value)}")
     items: list[Any] = list(plain)
     if spec.kind == "f32x2" and len(items) != 2:
         raise _refuse(spec.name, f"has two numbers, not {len(items)}")
@@ -182,7 +188,7 @@ def write_text(spec: FieldSpec, value: object) -> bytes:
 def write_octets(spec: FieldSpec, value: object) -> bytes:
     """Octets as they are."""
     if not isinstance(value, bytes | bytearray | memoryview):
-        raise _refuse(spec.name, f"is octets, not {value!r}")
+        raise _refuse(spec.name, f"is octets, not {shown(value)}")
     return bytes(value)
 
 
@@ -191,7 +197,7 @@ def write_instant(spec: FieldSpec, value: object, edition: Edition) -> bytes:
     if isinstance(value, Real):
         value = _split_seconds(spec, value)
     if not isinstance(value, TimeInstance):
-        raise _refuse(spec.name, f"is a time, not {value!r}")
+        raise _refuse(spec.name, f"is a time, not {shown(value)}")
     if not 0 <= value.nanoseconds < 1 << 31:
         raise _refuse(spec.name, f"has {value.nanoseconds} nanoseconds")
     long = edition == 2024 and spec.kind == "instant"
@@ -208,7 +214,7 @@ def _split_seconds(spec: FieldSpec, value: Real) -> TimeInstance:
         exact = Fraction(value) if isinstance(value, Rational) else Fraction(float(value))
         total = round(exact * 1_000_000_000)
     except (ValueError, OverflowError) as error:
-        raise _refuse(spec.name, f"is a time, not {value!r}") from error
+        raise _refuse(spec.name, f"is a time, not {shown(value)}") from error
     seconds, nanoseconds = divmod(abs(total), 1_000_000_000)
     return TimeInstance(seconds, nanoseconds, total < 0)
 
@@ -219,7 +225,7 @@ def write_uuid(spec: FieldSpec, value: object, edition: Edition) -> bytes:
         try:
             value = bytes.fromhex(value)
         except ValueError as error:
-            raise _refuse(spec.name, f"is hex digits, not {value!r}") from error
+            raise _refuse(spec.name, f"is hex digits, not {shown(value)}") from error
     octets = write_octets(spec, value)
     wanted = 16 if edition == 2024 else 10
     if len(octets) != wanted:
@@ -244,7 +250,7 @@ def as_units(spec: FieldSpec, value: object) -> Units:
         return Units(**parts)
     if isinstance(value, bytes) and is_packed_units(value):
         return units_of(value)
-    raise _refuse(spec.name, f"is physical units, not {value!r}")
+    raise _refuse(spec.name, f"is physical units, not {shown(value)}")
 
 
 def pack_units(spec: FieldSpec, units: Units) -> bytes:
