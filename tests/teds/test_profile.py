@@ -21,6 +21,7 @@ from teds_provision.teds.profile import (
     check,
     default_folders,
     find_profile,
+    keys,
     list_profiles,
     load_profile,
     shipped_profiles,
@@ -414,3 +415,15 @@ def test_a_damaged_profile_is_a_profile_or_bad_data(data: st.DataObject, tmp_pat
     text = GOOD[:at] + data.draw(st.text("[]{}=\"'.\n#,- 019aex", max_size=6)) + GOOD[to:]
     with suppress(BadData, NotFound):
         assert load_profile(write(tmp_path, "damaged", text), [tmp_path]).channels
+
+
+def test_the_manual_names_every_key() -> None:
+    manual = (Path(__file__).parents[2] / "docs" / "profiles.md").read_text(encoding="utf-8")
+    tables = (
+        *(keys.META_KEYS, keys.GEO_KEYS, keys.PROXY_KEYS, keys.SAMPLE_KEYS, keys.DATA_SET_KEYS),
+        *(keys.CHANNEL_KEYS, keys.PHY_KEYS),
+    )
+    for key in (key for table in tables for key in table):
+        assert f"`{key.key}`" in manual, key.key
+        assert all(f"`{choice}`" in manual for choice in key.choices)
+    assert all(f"`{name}`" in manual for name in shipped())

@@ -14,12 +14,16 @@ from typing import Final
 
 
 class Kind(Enum):
-    """How a value is written in the profile."""
+    """How a value is written in the profile (docs/profiles.md, "Units and times")."""
 
-    TIME = 'time: seconds, or a text like "100 us"'
-    VALUE = "number in the channel's unit, or a text with its own unit"
-    DIFFERENCE = "number in the channel's unit, or a text with its own unit (a difference: no offset)"
-    ANGLE = 'number of rad, or a text like "90 degree"'
+    TIME = "time"
+    """Seconds, or a text like "100 us"."""
+    VALUE = "value"
+    """A number in the channel's unit, or a text with its own unit."""
+    DIFFERENCE = "difference"
+    """As VALUE, without the offset of the unit."""
+    ANGLE = "angle"
+    """A number of rad, or a text like "90 degree"."""
     FLAG = "true or false"
     U8 = "0 to 255"
     U16 = "0 to 65535"
