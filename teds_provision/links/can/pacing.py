@@ -49,20 +49,23 @@ class Pacer:
 
     def __init__(self, bitrate: int, data_bitrate: int) -> None:
         self._bitrate, self._data_bitrate = bitrate, data_bitrate
-        self._free_at = 0.0
+        self._free_at = self._last = 0.0
         self.busy_seconds = 0.0
 
     def wait(self, identifier: int, data: bytes, *, fd: bool) -> None:
-        """Sleep, and for the last millisecond spin, until the frame is through."""
+        """Sleep until the frame is through, the last 0.1 ms by asking the clock."""
         if fd:
             duration = fd_seconds(identifier, data, self._bitrate, self._data_bitrate)
         else:
             duration = classic_bits(identifier, data) / self._bitrate
         self.busy_seconds += duration
-        self._free_at = max(time.perf_counter(), self._free_at) + duration
+        now = time.perf_counter()
+        # a controller has a queue: the next frame is made ready while this one is still on the wire
+        queued = now - self._free_at < self._last
+        self._free_at = (self._free_at if queued else now) + duration
+        self._last = duration
         while (left := self._free_at - time.perf_counter()) > 0:
-            if left > 2e-3:
-                time.sleep(left - 1e-3)
+            time.sleep(max(0.0, left - 1e-4))  # 0 lets other threads run: a bare loop would hold them up for 5 ms
 
 
 def _bits(value: int, count: int) -> list[int]:
