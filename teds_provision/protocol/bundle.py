@@ -37,7 +37,7 @@ Mode = Literal["copy", "move"]
 FindKey = Callable[[str], bytes | None]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, slots=True)
 class BundledNode:
     """One node: its UUID (10 octets), public key (65), link key (16), and what the sender knows of it.
 

@@ -43,7 +43,7 @@ def point_of(jwk: object, what: str) -> bytes:
 
 
 def _on_curve(x: int, y: int) -> bool:
-    return x < _P and y < _P and (y * y - (x * x - 3) * x - _B) % _P == 0
+    return x < _P and y < _P and (y * y - (x * x - 3) % _P * x - _B) % _P == 0
 
 
 def link_key_jwk(key: bytes, key_id: bytes) -> dict[str, str]:

@@ -45,7 +45,8 @@ class Members:
 
     def text_or_none(self, name: str) -> str | None:
         """Like :meth:`text`; None where it is absent or null."""
-        return None if self.get(name) is None else self.text(name)
+        value = self._members.get(name)
+        return None if value is None else self._printable(name, value)
 
     def list_of(self, name: str, *, required: bool = True) -> list[Any]:
         """Return a list; an empty one where an optional one is absent or null."""
@@ -73,7 +74,7 @@ class Members:
 
     def sha256_or_none(self, name: str) -> str | None:
         """Like :meth:`sha256`; None where it is absent or null."""
-        return None if self.get(name) is None else self.sha256(name)
+        return None if self._members.get(name) is None else self.sha256(name)
 
     def time(self, name: str) -> datetime:
         """Return an RFC 3339 time, in UTC."""

@@ -15,6 +15,7 @@ from teds_provision.errors import BadData
 _TO_URL = bytes.maketrans(b"+/", b"-_")
 # The two characters of plain base64 and the padding become one that no alphabet holds.
 _FROM_URL = bytes.maketrans(b"-_+/=", b"+/***")
+_PADDING = (b"", b"===", b"==", b"=")
 _ALPHABET = b"ABCDEFGHIJKLMNOPQRSTUVWXYZabcdefghijklmnopqrstuvwxyz0123456789+/"
 # The last characters that leave no spare bit set, by how many characters the last group has (1 decodes to nothing).
 _LAST = (frozenset(_ALPHABET), frozenset[int](), frozenset(_ALPHABET[::16]), frozenset(_ALPHABET[::4]))
@@ -32,11 +33,14 @@ def encode_base64url(octets: bytes) -> str:
 
 def decode_base64url(text: object, what: str) -> bytes:
     """Read base64url (text or ASCII octets) without padding, spare bits zero; raises BadData that names ``what``."""
-    if not isinstance(text, str | bytes):
-        raise BadData(f"{what} is not a base64url string.")
     try:
-        octets = (text if isinstance(text, bytes) else text.encode("ascii")).translate(_FROM_URL)
-        plain = binascii.a2b_base64(octets + b"=" * (-len(octets) % 4), strict_mode=True)
+        if isinstance(text, str):
+            octets = text.encode("ascii").translate(_FROM_URL)
+        elif isinstance(text, bytes):
+            octets = text.translate(_FROM_URL)
+        else:
+            raise BadData(f"{what} is not a base64url string.")
+        plain = binascii.a2b_base64(octets + _PADDING[len(octets) % 4], strict_mode=True)
     except ValueError as error:
         raise BadData(f"{what} is not base64url without padding.") from error
     if octets and octets[-1] not in _LAST[len(octets) % 4]:
