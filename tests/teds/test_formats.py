@@ -367,3 +367,21 @@ def test_a_damaged_text_file_is_read_or_refused_with_bad_data(format, data):
         text[data.draw(st.integers(0, len(text) - 1))] = data.draw(SMALL)
     with suppress(BadData, NotFound):
         read_blocks(bytes(text), format)
+
+
+# -- the page for people ----------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("language", ["", "json", "xml"])
+def test_the_examples_of_the_page_are_the_same_teds(language):
+    import re
+
+    page = (ROOT / "docs" / "formats.md").read_text()
+    (example,) = re.findall(rf"^```{language}\n((?:#|\{{|<\?xml).*?)^```", page, re.DOTALL | re.MULTILINE)
+    fields = [("Format", 0), ("TCName", "boiler inlet"), ("200", b"\x01\x02")]
+    assert read_blocks(example.encode()) == [Block(1, 12, teds.compose(12, fields))]
+
+
+def test_the_page_names_every_format():
+    page = (ROOT / "docs" / "formats.md").read_text()
+    assert all(f"| `{format}` |" in page for format in FORMATS)
