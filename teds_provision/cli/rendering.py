@@ -9,13 +9,20 @@ from typing import TYPE_CHECKING
 from teds_provision.workflow.progress import NOTHING, Reporter, Silent, StepResult
 
 if TYPE_CHECKING:
-    from rich.console import RenderableType
+    from rich.console import Console, RenderableType
     from rich.live import Live
+    from rich.table import Table
 
     from teds_provision.cli.context import App
     from teds_provision.links import Notice
 
 _FOREIGN_SHOWN = 3
+_PIPE_COLUMNS = 1000
+
+
+def print_table(console: Console, table: Table) -> None:
+    """Print a table; outside a terminal nothing of it is cut off or wrapped."""
+    console.print(table, width=None if console.is_terminal else _PIPE_COLUMNS)
 
 
 def reporter_for(app: App) -> Reporter:

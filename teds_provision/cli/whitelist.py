@@ -104,6 +104,8 @@ def list_entries(app: App) -> None:
         from rich.table import Table
         from rich.text import Text
 
+        from teds_provision.cli.rendering import print_table
+
         if not entries:
             console.print("The whitelist is empty.")
             return
@@ -111,7 +113,7 @@ def list_entries(app: App) -> None:
         for entry in entries:
             key = entry.fingerprint[:16] if entry.fingerprint else "not pinned yet"
             table.add_row(entry.uuid.hex(), key, entry.assurance, entry.added, Text(entry.name or ""))
-        console.print(table)
+        print_table(console, table)
 
     from teds_provision.workflow.whitelist import as_dict
 

@@ -1,0 +1,93 @@
+"""``log``: every act, whether the chain holds, and following it."""
+
+from __future__ import annotations
+
+import json
+import signal
+import sqlite3
+import subprocess
+import sys
+from contextlib import closing
+from pathlib import Path
+
+import pytest
+
+from teds_provision.store import Store
+
+from .shell import call, clean_environment
+
+ONE, TWO = "8d4d9da65281f7000000", "8d4d9da65281f7000001"
+
+
+def tamper(home: Path, *statements: str) -> None:
+    """Whoever may write the file can drop the triggers too."""
+    with closing(sqlite3.connect(home / "store.sqlite3")) as connection, connection:
+        for name in ("changed", "shortened"):
+            connection.execute(f"DROP TRIGGER audit_is_never_{name}")
+        for statement in statements:
+            connection.execute(statement)
+
+
+def test_each_act_is_one_entry_and_the_chain_holds(home: Path) -> None:
+    call(home, "whitelist", "add", ONE)
+    call(home, "whitelist", "add", TWO)
+    told = call(home, "--json", "log")
+    assert (told.code, told.json["intact"], told.json["count"]) == (0, True, 3)
+    assert [(entry["act"], entry["uuid"]) for entry in told.json["entries"]] == [
+        ("init", None),
+        ("whitelist", ONE),
+        ("whitelist", TWO),
+    ]
+    assert [entry["uuid"] for entry in call(home, "--json", "log", TWO).json["entries"]] == [TWO]
+    assert [entry["seq"] for entry in call(home, "--json", "log", "--last", 1).json["entries"]] == [3]
+    shown = call(home, "log")
+    assert ONE in shown.out
+    assert "chain intact" in shown.err
+
+
+@pytest.mark.parametrize(
+    ("statement", "first_bad"),
+    [
+        ("UPDATE audit SET outcome = 'nothing' WHERE seq = 2", 2),
+        ("DELETE FROM audit WHERE seq = 2", 2),
+        ("DELETE FROM audit WHERE seq = 3", 3),
+    ],
+)
+def test_a_broken_chain_is_exit_7_and_named(home: Path, statement: str, first_bad: int) -> None:
+    call(home, "whitelist", "add", ONE)
+    call(home, "whitelist", "add", TWO)
+    tamper(home, statement)
+    told = call(home, "--json", "log")
+    assert (told.code, told.json["intact"], told.json["first_bad"]) == (7, False, first_bad)
+    shown = call(home, "log")
+    assert shown.code == 7
+    assert "does not hold" in shown.err
+    assert call(home, "log", "--follow").code == 7
+
+
+def test_control_characters_in_an_entry_do_not_reach_the_terminal(home: Path) -> None:
+    with Store.open(home) as store:
+        store.audit.append("identify", bytes.fromhex(ONE), "odd", {"name": "a\x1b[31m\x9b\nb"})
+    shown = call(home, "log").out
+    assert "\x1b" not in shown
+    assert "\x9b" not in shown
+    assert shown.count("\n") == 2
+
+
+@pytest.mark.parametrize(("number", "code"), [(signal.SIGTERM, 0), (signal.SIGINT, 130)])
+def test_following_gives_one_object_per_line_until_it_is_ended(home: Path, number: signal.Signals, code: int) -> None:
+    command = [sys.executable, "-m", "teds_provision", "--home", str(home), "--json", "log", "--follow"]
+    follower = subprocess.Popen(
+        command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=clean_environment()
+    )
+    try:
+        assert follower.stdout is not None
+        assert json.loads(follower.stdout.readline())["act"] == "init"
+        call(home, "whitelist", "add", ONE)
+        assert json.loads(follower.stdout.readline())["uuid"] == ONE
+        follower.send_signal(number)
+        _, err = follower.communicate(timeout=20)
+    finally:
+        follower.kill()
+    assert follower.returncode == code
+    assert "Traceback" not in err
