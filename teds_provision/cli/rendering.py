@@ -22,7 +22,9 @@ _PIPE_COLUMNS = 1000
 
 def print_table(console: Console, table: Table) -> None:
     """Print a table; outside a terminal nothing of it is cut off or wrapped."""
-    console.print(table, width=None if console.is_terminal else _PIPE_COLUMNS)
+    if not console.is_terminal:
+        console.width = _PIPE_COLUMNS
+    console.print(table)
 
 
 def reporter_for(app: App) -> Reporter:
