@@ -33,8 +33,8 @@ def curve_change(channel: int, old: Mapping[BlockId, bytes], new: Mapping[BlockI
         return None
     others = {part.channel: channel_of(part.channel, new, None) for part in after.inputs}
     view = replace(other, raw=after.raw_range or other.raw)
-    curve = curve_of(after, view, others)
-    was = replace(curve_of(before, view, others), axes=curve.axes)
+    curve = curve_of(after, view, others, also=before, dense=True)
+    was = replace(curve_of(before, view, others, also=after, dense=True), axes=curve.axes)
     parts = _parts(was, curve)
     if kind_of(before) != kind_of(after):
         parts.append(f"{kind_of(before)} -> {kind_of(after)}")

@@ -21,7 +21,7 @@ from teds_provision.teds.image import BlockId
 from teds_provision.teds.model import Decoded
 
 if TYPE_CHECKING:
-    from teds_provision.teds.guard_curve import Channel, Curve
+    from teds_provision.teds.guard_curve import Channel
     from teds_provision.teds.profile.model import Profile
 
 CALIBRATION: Final = 5
@@ -32,8 +32,8 @@ _SMALLEST_NORMAL: Final = 2.0**-126
 class GuardFinding:
     """One finding: an ``error`` refuses the datasheet (unless a person says why it is right), a ``warning`` does not.
 
-    Codes: erased, unreadable, inconsistent, unknown, flat, overflow, limits, reversed, swapped, not-monotone, jump,
-    residual, removed, changed, overdue.
+    ``message`` goes behind "channel 1: " and has no full stop. Codes: erased, unreadable, inconsistent, unknown, flat,
+    overflow, limits, reversed, swapped, not-monotone, jump, residual, removed, changed, overdue.
     """
 
     channel: int
@@ -65,7 +65,8 @@ def check_calibration(
             findings.append(
                 GuardFinding(channel, "removed", "the calibration that the node has is taken away.", "warning")
             )
-    return sorted(findings, key=lambda finding: finding.severity != "error")
+    plain = (replace(finding, message=finding.message.removesuffix(".")) for finding in findings)
+    return sorted(plain, key=lambda finding: finding.severity != "error")
 
 
 @dataclass(frozen=True)
@@ -143,8 +144,9 @@ class _Judge:
         channel = self._demanded(self._channel(self.number, self.new), calibration)
         numbers = {part.channel for part in calibration.inputs}
         channels = {number: self._channel(number, self.new) for number in numbers}
-        curve = curve_of(calibration, channel, channels)
-        before = self._before(channel, channels)
+        old = self._before()
+        curve = curve_of(calibration, channel, channels, also=old)
+        before = curve_of(old, channel, channels, also=calibration) if old is not None else None
         for code, severity, message in guard_checks.check(curve, before, self.given):
             yield GuardFinding(self.number, code, message, severity)
 
@@ -157,10 +159,8 @@ class _Judge:
             raw = max(raw[0], channel.raw[0]), min(raw[1], channel.raw[1])
         return replace(channel, monotone=calibration.monotone, raw=raw if raw and raw[0] < raw[1] else channel.raw)
 
-    def _before(self, channel: Channel, channels: Mapping[int, Channel]) -> Curve | None:
-        """Curve that the node has now, over the range of the new one; None where there is none that can be computed."""
-        from teds_provision.teds.guard_curve import curve_of
-
+    def _before(self) -> Calibration | None:
+        """Calibration that the node has now; None where there is none that can be computed."""
         octets = self.old.get((self.number, CALIBRATION))
         if octets is None:
             return None
@@ -168,9 +168,7 @@ class _Judge:
             calibration = self._calibration(decode(octets), self.old)
         except BadData:
             return None
-        if any(True for _ in self._damage(calibration)):
-            return None
-        return curve_of(calibration, channel, channels)
+        return None if any(True for _ in self._damage(calibration)) else calibration
 
 
 def _looks_erased(value: float) -> bool:

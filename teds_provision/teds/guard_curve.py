@@ -176,16 +176,37 @@ class Curve:
         return float(axis[min(int(np.searchsorted(axis, value, side="right")), len(axis) - 1)])
 
 
-def curve_of(calibration: Calibration, channel: Channel, channels: Mapping[int, Channel]) -> Curve:
-    """Evaluate a calibration (finite, boundaries ascending) over what all its inputs can give."""
+def curve_of(
+    calibration: Calibration,
+    channel: Channel,
+    channels: Mapping[int, Channel],
+    *,
+    also: Calibration | None = None,
+    dense: bool = False,
+) -> Curve:
+    """Evaluate a calibration (finite, boundaries ascending) over what all its inputs can give.
+
+    One input is sampled at every integer, or at 65537 places and both sides of each boundary. Where the curve (and that
+    of ``also``, which it is to be compared with) is straight between its boundaries, these and the ends are enough
+    unless ``dense``.
+    """
     main = next((n for n, part in enumerate(calibration.inputs) if part.channel == channel.number), 0)
     count = len(calibration.inputs)
     each = SAMPLES if count == 1 else max(9, int(GRID ** (1 / count)))
+    if count == 1 and not dense and _straight(calibration) and (also is None or _straight(also)):
+        each = 2
     axes = []
     for number, part in enumerate(calibration.inputs):
         source = channel if number == main else channels.get(part.channel)
-        axes.append(_axis(part.boundaries, source, each, channel.actuator and number == main, calibration.unit))
+        edges = part.boundaries
+        if also is not None and len(also.inputs) == count:
+            edges = tuple(sorted({*edges, *also.inputs[number].boundaries}))
+        axes.append(_axis(edges, source, each, channel.actuator and number == main, calibration.unit))
     return Curve(calibration, channel, tuple(axes), main)
+
+
+def _straight(calibration: Calibration) -> bool:
+    return len(calibration.inputs) == 1 and calibration.inputs[0].degree <= 1
 
 
 def _axis(
@@ -205,7 +226,7 @@ def _axis(
     edges = np.asarray(boundaries)
     below = np.ceil(edges) - 1 if whole else np.nextafter(edges, -np.inf)
     at = np.ceil(edges) if whole else edges
-    if count != SAMPLES and len(edges) > count:
+    if 2 < count < SAMPLES and len(edges) > count:
         below, at = below[:: len(edges) // count + 1], at[:: len(edges) // count + 1]
     samples = np.concatenate([spread, below, at])
     return np.unique(samples[(samples >= low) & (samples <= high)])

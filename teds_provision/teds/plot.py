@@ -86,7 +86,7 @@ def _panels(
             own = replace(own, raw=calibration.raw_range)
         others = {part.channel: channel_of(part.channel, blocks, profile) for part in calibration.inputs}
         points = calibrations[number].points if number in calibrations else ()
-        panels.append(_Panel(_name(number, blocks), curve_of(calibration, own, others), points))
+        panels.append(_Panel(_name(number, blocks), curve_of(calibration, own, others, dense=True), points))
     return panels
 
 

@@ -432,3 +432,10 @@ def test_any_text_is_a_calibration_or_bad_data(text: str, name: str) -> None:
     profile = load_profile("magnetic-angular-position-sensor")
     with suppress(BadData):
         assert read_calibrations(text, name, profile)
+
+
+def test_a_calibration_kept_from_a_node_gives_the_same_octets(magnetic: Profile) -> None:
+    built = magnetic.build(bytes(10), calibration=read_calibrations(CSV, "x.csv", magnetic))
+    kept = Calibration.from_decoded(teds.decode(built.blocks[1, 5]))
+    assert magnetic.build(bytes(10), calibration={1: kept}).blocks == built.blocks
+    assert magnetic.build(bytes(10), calibration=calibrations_of(built.blocks)).blocks == built.blocks

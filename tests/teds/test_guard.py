@@ -229,7 +229,7 @@ def test_results_beyond_the_limits_are_refused_over_the_whole_raw_range(tactile:
     findings = check_calibration(built(tactile, force_line(0.0, 12 / 65535)), None, tactile)
     assert codes(findings) == {"limits"}
     assert text(findings, "limits") == (
-        "raw 65535 gives 12 N, 2 N above the high limit of 10 N; the stated uncertainty is 0.2 N."
+        "raw 65535 gives 12 N, 2 N above the high limit of 10 N; the stated uncertainty is 0.2 N"
     )
     inside = check_calibration(built(tactile, force_line(0.0, 10.19 / 65535)), None, tactile)
     assert codes(inside) == set()
@@ -334,7 +334,7 @@ def test_no_octets_of_a_calibration_raise(data: st.DataObject) -> None:
         at = data.draw(st.integers(6, len(block) - 1))
         block[at] = data.draw(st.integers(0, 255))
     findings = check_calibration({**blocks, (1, 5): frame(bytes(block))}, blocks, profile)
-    assert all(finding.message.endswith(".") for finding in findings)
+    assert all(finding.message[-1] != "." for finding in findings)
 
 
 def test_a_table_of_4000_points_is_judged_in_a_blink(magnetic: Profile) -> None:

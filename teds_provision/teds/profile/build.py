@@ -39,7 +39,10 @@ def build(
         )
     for number in calibration:
         if profile.channel(number) is None:
-            raise BadData(f"There is a calibration for channel {number}; {profile.name} has {len(profile.channels)}.")
+            raise BadData(
+                f"The calibration is for channel {number}; {profile.name} has channels 1 to {len(profile.channels)}.",
+                hint="Give the calibration of this type, or --no-calibration to drop the one that the node has.",
+            )
     warnings: list[str] = []
     uuid = _uuid(uuid, edition, warnings)
     meta = (("UUID", uuid), *profile.meta, ("MaxChan", len(profile.channels)))
