@@ -76,6 +76,14 @@ def create(app: App, folder: Path, uuid: bytes | None, name: str, max_message: i
 @click.option(
     "--flash-delay", type=click.FloatRange(min=0), default=0, metavar="MS", help="Milliseconds per flash commit."
 )
+@click.option(
+    "--wait-time",
+    type=click.IntRange(4, 60),
+    default=20,
+    show_default=True,
+    metavar="WT_INT",
+    help="TNEP minimum waiting time, a multiple of 4 (4 is 1 ms, 20 is 16 ms).",
+)
 @click.option("--pace", is_flag=True, help="Let every NFC frame last as long as at 106 kbit/s.")
 @pass_app
 def run(app: App, /, folder: Path, crypto_delay: float, flash_delay: float, **links: Any) -> None:
@@ -113,12 +121,12 @@ def run(app: App, /, folder: Path, crypto_delay: float, flash_delay: float, **li
             server.stop()
 
 
-def _servers(node: Any, *, nfc: str | None, tag: Any, can: str | None, pace: bool) -> list[Any]:
+def _servers(node: Any, *, nfc: str | None, tag: Any, can: str | None, pace: bool, wait_time: int) -> list[Any]:
     servers: list[Any] = []
     if nfc:
         from teds_provision.node.nfc_server import NfcServer
 
-        servers.append(NfcServer(nfc, node, tag=tag, pace=pace))
+        servers.append(NfcServer(nfc, node, tag=tag, pace=pace, wt_int=wait_time // 4 * 4))
     if can:
         from teds_provision.node.can_server import CanServer
 

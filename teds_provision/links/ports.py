@@ -107,6 +107,4 @@ def open_port(settings: LinkSettings) -> Port:
                 "--via can needs to know the bus.", hint="Add --can, e.g. --can socketcan:can0?bitrate=500000."
             )
         return CanPort(settings.can)
-    raise UsageFailure(
-        f"The link {settings.via!r} is not part of this version.", hint="Use --via nfc or --via can."
-    )
+    raise UsageFailure(f"The link {settings.via!r} is not part of this version.", hint="Use --via nfc or --via can.")

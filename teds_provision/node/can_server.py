@@ -14,7 +14,7 @@ from teds_provision.links.can.bus import Bus, Frame
 from teds_provision.links.can.isotp import FUNCTIONAL, Pair, addresses, read_single
 from teds_provision.links.can.spec import FIRST_STATION, LAST_STATION, parse_spec
 from teds_provision.node.handler import NodeHandler
-from teds_provision.protocol.frames import COMMAND_HEADER, Function, Reply, security_command
+from teds_provision.protocol.frames import Function, Reply, security_command
 from teds_provision.protocol.repetition import Repetition
 
 _IDENTIFY: Final = security_command(Function.IDENTIFY).encode()
@@ -24,17 +24,32 @@ _FLOW_CONTROL: Final = 3
 _REOPEN_SECONDS: Final = 1.0
 
 
+class _Moved:
+    """A job: the node has another address now, so that the line to this station is a new one."""
+
+
 class _Line:
-    """One base station's line: its own session (by name), stored reply and worker; a Pair for each own address."""
+    """One base station's line: its own session (by name), stored reply and worker.
+
+    A link is one pair of addresses: with a new own address it begins anew. ``pairs`` keeps the old Pair as long as it
+    still sends.
+    """
 
     def __init__(self, server: CanServer, station: int) -> None:
         self.station = station
         self.name = f"can:{station:02x}"
         self.pairs: dict[int, Pair] = {}
         self.repetition = Repetition()
-        self.jobs: queue.Queue[tuple[Pair, bytes] | None] = queue.Queue(maxsize=4)
+        self.jobs: queue.Queue[tuple[Pair, bytes] | _Moved | None] = queue.Queue(maxsize=4)
         self.worker = threading.Thread(target=self._work, args=(server,), name=self.name, daemon=True)
         self.worker.start()
+
+    def moved(self) -> None:
+        """Begin anew, once what was asked before is done."""
+        try:
+            self.jobs.put_nowait(_Moved())
+        except queue.Full:
+            return
 
     def put(self, pair: Pair, body: bytes) -> None:
         """Queue a request; a station that asks on and on without waiting loses what does not fit."""
@@ -58,7 +73,10 @@ class _Line:
 
     def _work(self, server: CanServer) -> None:
         while (job := self.jobs.get()) is not None:
-            server.run_request(self, *job)
+            if isinstance(job, _Moved):
+                server.begin_anew(self)
+            else:
+                server.run_request(self, *job)
 
 
 class CanServer:
@@ -99,6 +117,11 @@ class CanServer:
         if self._bus is not None:
             self._bus.close()
             self._bus = None
+
+    def begin_anew(self, line: _Line) -> None:
+        """The pair of addresses is another one: session and stored reply of the old one are gone."""
+        line.repetition.forget()
+        self._handler.lost(line.name)
 
     def run_request(self, line: _Line, pair: Pair, body: bytes) -> None:
         """Run one request in the worker of its line and send the reply from the address that was asked."""
@@ -171,8 +194,7 @@ class CanServer:
         line, pair = self._pair(station, own)
         pair.take(frame)
         while (body := pair.received()) is not None:
-            if len(body) > COMMAND_HEADER:
-                line.put(pair, body)
+            line.put(pair, body)
 
     def _pair(self, station: int, own: int) -> tuple[_Line, Pair]:
         assert self._bus is not None
@@ -181,6 +203,8 @@ class CanServer:
             line = self._lines[station] = _Line(self, station)
         pair = line.pairs.get(own)
         if pair is None:
+            if line.pairs:
+                line.moved()
             line.pairs = {at: old for at, old in line.pairs.items() if old.sending}
             pair = line.pairs[own] = Pair(own, station, self._bus.send)
         return line, pair

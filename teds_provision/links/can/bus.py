@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import socket
+import sys
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Final, NoReturn
 
@@ -146,9 +147,21 @@ def _open(spec: CanSpec) -> can.BusABC:
         ) from error
     except Exception as error:  # back ends raise what their driver, serial port or library raises
         raise NoReader(f"The CAN bus {spec.text} does not open: {_reason(error)}.", hint=_cure(spec)) from error
+    if spec.interface == "udp_multicast":
+        _this_group_alone(bus)
     if spec.interface == "socketcan":
         bus.set_filters([{"can_id": 0x18DA0000, "can_mask": 0x1FFE0000, "extended": True}])
     return bus
+
+
+def _this_group_alone(bus: can.BusABC) -> None:
+    """Hear no other group on the same port: Linux delivers every group that any socket of the machine has joined."""
+    multicast = getattr(bus, "_multicast", None)
+    found = getattr(multicast, "_socket", None)
+    if not isinstance(found, socket.socket) or not sys.platform.startswith("linux"):
+        return
+    level, option = (socket.IPPROTO_IPV6, 29) if found.family == socket.AF_INET6 else (socket.IPPROTO_IP, 49)
+    found.setsockopt(level, option, 0)  # IPV6_MULTICAST_ALL, IP_MULTICAST_ALL (linux/in6.h, linux/in.h)
 
 
 def _probe(spec: CanSpec, options: dict[str, Any]) -> None:

@@ -34,6 +34,8 @@ _ROUND_SECONDS: Final = 1.0
 _HELLO_SECONDS: Final = 1.0
 _SETTLE_SECONDS: Final = 0.08
 """Nodes answer a functional Identify after up to 50 ms; a second one under the same address shows by then."""
+_EVERYONE_SECONDS: Final = 0.3
+"""How long everyone is waited for: 50 ms of random wait, and time for a few dozen answers to pass."""
 _GONE_ROUNDS: Final = 3
 _SLICE: Final = 0.05
 _LONGEST_TRY: Final = 120.0
@@ -193,6 +195,23 @@ class CanPort:
             hint="Check its power, the bit rate and the address; teds-provision identify --via can lists who answers.",
         )
 
+    def everyone(self, *, seconds: float, notice: NoticeSink) -> list[Contact]:
+        """Every node that answers, as soon as one does: what identify shows, and provision chooses from.
+
+        Raises NoNode after ``seconds``, AddressConflict, LinkFailure.
+        """
+        until = time.monotonic() + seconds
+        notice(Notice("waiting", f"Asking every node on {self.spec.text}.", seconds))
+        while self.spec.node is None and (left := until - time.monotonic()) > 0:
+            gathering = self._new_gathering()
+            ask_all(self.bus(), gathering, min(_EVERYONE_SECONDS, left), enough=lambda: False, settle=0.0)
+            if gathering.conflicts:
+                raise _conflict(gathering)
+            found = _identities(gathering)
+            if found:
+                return [self._contact(node, identity) for node, identity in found]
+        return [self.find(lambda _: True, seconds=max(0.1, until - time.monotonic()), notice=notice)]
+
     def watch(self, *, stop: threading.Event, notice: NoticeSink) -> Iterator[Contact]:
         """Yield each node once: when it first answers, when it comes back, and when it is in factory state again."""
         seen: dict[bytes, _Seen] = {}
@@ -258,10 +277,7 @@ class CanPort:
         for node, identity in _identities(gathering):
             _tell(notice, told, node, identity)
         if gathering.conflicts:
-            raise AddressConflict(
-                conflict_text(min(gathering.conflicts)),
-                hint="Give one of them another address: connect it alone or tap it, then provision it again.",
-            )
+            raise _conflict(gathering)
         return None
 
     def _round(self, stop: threading.Event) -> tuple[dict[int, Identity], set[int]]:
@@ -275,6 +291,13 @@ class CanPort:
 
     def _new_gathering(self) -> Gathering:
         return Gathering(self.spec.source, self.next_transaction())
+
+
+def _conflict(gathering: Gathering) -> AddressConflict:
+    return AddressConflict(
+        conflict_text(min(gathering.conflicts)),
+        hint="Give one of them another address: connect it alone or tap it, then provision it again.",
+    )
 
 
 def _identities(gathering: Gathering) -> list[tuple[int, Identity]]:
