@@ -1,0 +1,30 @@
+"""``demo``: the whole story on this machine."""
+
+from __future__ import annotations
+
+from teds_provision.cli.context import App, pass_app
+from teds_provision.cli.options import command
+
+
+@command("teds-provision demo", "teds-provision --json demo")
+@pass_app
+def demo(app: App) -> None:
+    """Two base stations and a virtual node: provision over NFC, verify over CAN, hand over, verify from the second.
+
+    Uses throwaway homes and vaults, talks to this machine alone, leaves nothing behind.
+    """
+    from teds_provision.cli.rendering import reporter_for
+    from teds_provision.workflow.demo import run_demo
+
+    reporter = reporter_for(app)
+    try:
+        done = run_demo(reporter, lambda text: app.note(f"\n{text}"))
+    finally:
+        close = getattr(reporter, "close", None)
+        if close is not None:
+            close()
+    steps = [{"name": step.name, "result": step.result, "seconds": step.seconds} for step in done.steps]
+    app.emit(
+        {"uuid": done.uuid.hex(), "steps": steps, "verdict": done.verdict},
+        f"\nDone: {len(steps)} steps, the sensor is {done.verdict} and in the hands of station crane.",
+    )

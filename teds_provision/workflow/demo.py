@@ -1,0 +1,183 @@
+"""The whole story on one machine: two base stations, one virtual node, NFC and CAN frames, a handover.
+
+The node is a process of its own; the stations live in this one, with throwaway homes and vaults that are deleted at the
+end. Nothing leaves the machine: NFC goes over UDP on 127.0.0.1, CAN over multicast with hop limit 0.
+"""
+
+from __future__ import annotations
+
+import json
+import secrets
+import shutil
+import socket
+import subprocess
+import sys
+import tempfile
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from teds_provision.errors import LinkFailure, NotAuthentic
+from teds_provision.links import LinkSettings
+from teds_provision.workflow.build import BuildOrder
+from teds_provision.workflow.contact import meet
+from teds_provision.workflow.progress import Reporter, StepResult, Steps
+from teds_provision.workflow.provision import Provisioned, provision, require_authentic, verify_node
+from teds_provision.workflow.station import Station, initialise
+
+PROFILE = "magnetic-angular-position-sensor"
+_START_SECONDS = 20.0
+_STOP_SECONDS = 5.0
+
+
+@dataclass
+class Demo:
+    """What the demo is at: its folder, stations, links and the steps so far."""
+
+    folder: Path
+    reporter: Reporter
+    say: Callable[[str], None]
+    nfc: str = ""
+    can: str = ""
+    uuid: bytes = b""
+    stack: ExitStack = field(default_factory=ExitStack)
+
+    def __post_init__(self) -> None:
+        self.steps = Steps(self.reporter)
+        self.nfc = f"udp:127.0.0.1:{_free_port()}"
+        self.can = f"udp_multicast:239.74.163.2?port={_free_port()}"
+
+    def over(self, via: str) -> LinkSettings:
+        """Link options of a station in this demo."""
+        return LinkSettings(via, self.nfc, self.can, timeout=15.0)
+
+
+@dataclass(frozen=True)
+class DemoDone:
+    """The demo's steps and its verdict: that of the last verification."""
+
+    steps: tuple[StepResult, ...]
+    verdict: str
+    uuid: bytes
+
+
+def run_demo(reporter: Reporter, say: Callable[[str], None]) -> DemoDone:
+    """Run it; raises whatever a step raises. The folder is gone afterwards, however it ends."""
+    folder = Path(tempfile.mkdtemp(prefix="teds-provision-demo-"))
+    try:
+        demo = Demo(folder, reporter, say)
+        with demo.stack:
+            return _run(demo)
+    finally:
+        shutil.rmtree(folder, ignore_errors=True)
+
+
+def _run(demo: Demo) -> DemoDone:
+    demo.say("Two base stations, each with its own keys, and a sensor on a reader (a process of its own).")
+    first, second = _station(demo, "bench"), _station(demo, "crane")
+    with demo.steps.step("start node") as step:
+        demo.uuid = demo.stack.enter_context(_node(demo.folder / "node", demo.nfc, demo.can))
+        step.detail = f"{demo.uuid.hex()} on {demo.nfc} and {demo.can}"
+    demo.say("Tap: station bench provisions the sensor over NFC.")
+    done = _provision(demo, first)
+    demo.say("The same sensor over CAN: written anew under another name, verified, its key rotated.")
+    _over_can(demo, first)
+    demo.say("Hand over: crane gets a copy of the key, then bench gives the sensor away for good.")
+    from teds_provision.workflow.demo_handover import hand_over
+
+    hand_over(demo, first, second)
+    return DemoDone(tuple(demo.steps.done), done.verified.verdict, demo.uuid)
+
+
+def _station(demo: Demo, name: str) -> Station:
+    from teds_provision.vault.passphrase import THROWAWAY
+
+    secret = secrets.token_hex(16)
+    with demo.steps.step("init") as step:
+        station, _ = initialise(
+            demo.folder / name, name=name, keystore="file", ask=lambda prompt, confirm: secret, costs=THROWAWAY
+        )
+        step.detail = f"station {name}, key {station.fingerprint[:16]}"
+    demo.stack.callback(station.close)
+    return station
+
+
+def _provision(demo: Demo, station: Station) -> Provisioned:
+    with meet(station, demo.over("nfc"), demo.uuid, demo.reporter) as node:
+        done = provision(station, node, BuildOrder(PROFILE), accept=lambda who: None, reporter=demo.reporter)
+    require_authentic(done.verified)
+    demo.steps.done += done.steps
+    return done
+
+
+def _over_can(demo: Demo, station: Station) -> None:
+    from teds_provision.workflow.agree import agree
+    from teds_provision.workflow.identify import identify
+
+    with meet(station, demo.over("can"), demo.uuid, demo.reporter) as node:
+        order = BuildOrder(PROFILE, name="crane slew angle")
+        done = provision(station, node, order, accept=lambda who: None, reporter=demo.reporter)
+        require_authentic(done.verified)
+        demo.steps.done += done.steps
+    with meet(station, demo.over("can"), demo.uuid, demo.reporter) as node, demo.steps.step("rotate") as step:
+        agreed = agree(station, node, identify(station, node), rotate=True)
+        step.detail = f"key epoch {agreed.epoch}, key {agreed.key_id}"
+
+
+def verify_from(demo: Demo, station: Station, what: str) -> None:
+    """Verify the node from one station over CAN, in a session under its key; raises unless it is authentic."""
+    from teds_provision.workflow.agree import require_session
+    from teds_provision.workflow.identify import identify
+    from teds_provision.workflow.reading import read_image
+
+    with demo.steps.step(what) as step:
+        with meet(station, demo.over("can"), demo.uuid, demo.reporter) as node:
+            who = identify(station, node)
+            held = require_session(station, node)
+            verified = verify_node(station, node, read_image(node), who.point)
+        if verified.verdict != "authentic":
+            raise NotAuthentic(f"The demo's node is {verified.verdict} as seen from {station.name}.")
+        step.detail = f"{station.name} finds it {verified.verdict}, key epoch {held.record.epoch}"
+
+
+@contextmanager
+def _node(folder: Path, nfc: str, can: str) -> Iterator[bytes]:
+    """A virtual transducer in a process of its own, while the context lasts; gives its UUID."""
+    command = [sys.executable, "-m", "teds_provision", "--json", "node"]
+    made = subprocess.run([*command, "create", str(folder)], capture_output=True, text=True, check=False)
+    if made.returncode:
+        raise LinkFailure(f"The virtual node could not be made: {made.stdout.strip()}")
+    process = subprocess.Popen(
+        [*command, "run", str(folder), "--nfc", nfc, "--can", can], stdout=subprocess.PIPE, text=True
+    )
+    try:
+        yield _ready(process)
+    finally:
+        process.terminate()
+        try:
+            process.wait(_STOP_SECONDS)
+        except subprocess.TimeoutExpired:
+            process.kill()
+            process.wait()
+
+
+def _ready(process: subprocess.Popen[str]) -> bytes:
+    import selectors
+
+    assert process.stdout is not None
+    with selectors.DefaultSelector() as selector:
+        selector.register(process.stdout, selectors.EVENT_READ)
+        line = process.stdout.readline() if selector.select(_START_SECONDS) else ""
+    try:
+        said = json.loads(line)
+        return bytes.fromhex(said["uuid"])
+    except (ValueError, KeyError, TypeError):
+        raise LinkFailure(f"The virtual node did not start: {line.strip() or 'no answer'}") from None
+
+
+def _free_port() -> int:
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+        probe.bind(("127.0.0.1", 0))
+        port: int = probe.getsockname()[1]
+        return port
