@@ -318,6 +318,11 @@ def test_the_residual_of_a_fit_becomes_its_uncertainty_where_it_is_greater(tacti
     assert read_calibrations(text, "x.csv", tactile)[1].uncertainty == pytest.approx(2 / 3)
 
 
+def test_the_rounding_of_a_table_is_no_uncertainty(magnetic: Profile) -> None:
+    rows = "".join(f"{raw},{raw * 360 / 65535}\n" for raw in range(0, 65536, 257))
+    assert read_calibrations(rows, "x.csv", magnetic)[1].uncertainty is None
+
+
 def test_an_uncertainty_may_have_its_own_unit(tactile: Profile) -> None:
     text = "# channel: 1\n# uncertainty: 50 mN\n0,0\n1,1\n"
     assert read_calibrations(text, "x.csv", tactile)[1].uncertainty == pytest.approx(0.05)

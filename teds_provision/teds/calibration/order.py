@@ -66,11 +66,10 @@ def calibration_of(order: Order, channel: ChannelProfile) -> Calibration:
             raise
         raise order.wrong("", error.message) from error
     stated = _uncertainty(order, unit)
-    left = None if curve.actuator else curve.residuals()  # an actuator's residuals are raw
     low, high = order.number("low-limit"), order.number("high-limit")
     if low is not None and high is not None and low >= high:
         raise order.wrong("low-limit", "it must be below the high limit.")
-    known = [value for value in (stated, left.maximum if left else None) if value]
+    known = [value for value in (stated, _misfit(curve)) if value]
     by = order.get("by")
     return replace(
         curve,
@@ -85,6 +84,14 @@ def calibration_of(order: Order, channel: ChannelProfile) -> Calibration:
         monotone=channel.calibration.monotone,
         raw_range=channel.calibration.raw_range,
     )
+
+
+def _misfit(curve: Calibration) -> float | None:
+    """Largest residual of a fit in the calibrated unit; None where it is Float32 rounding (or raw, of an actuator)."""
+    left = None if curve.actuator else curve.residuals()
+    if left is None:
+        return None
+    return left.maximum if left.maximum > 1e-5 * max(map(abs, left.references)) else None
 
 
 def _curve(order: Order, channel: ChannelProfile) -> Calibration:
