@@ -210,7 +210,7 @@ def _value(kind, count):
         return st.integers(0, 256**fixed - 1)
     simple = {
         "f32": st.floats(width=32, allow_nan=False),
-        "duration": st.integers(-(2**63), 2**63 - 1).map(lambda ticks: float(ticks // 2**30)),
+        "duration": st.integers(-140_000, 140_000).map(float),
         "time": st.builds(TimeInstance, st.integers(0, 2**48 - 1), st.integers(0, 10**9 - 1)),
         "text": text,
         "texts": st.lists(text, min_size=count, max_size=count).map(tuple),
@@ -239,6 +239,15 @@ def test_every_command_comes_back_as_it_was_composed(number, channel, data):
     assert (message.channel, message.group, message.function) == (channel, *number)
     if message.school == "concatenated":  # raw octets at the end may close as tagged arguments by chance
         assert {a.name: a.value for a in message.arguments} == values
+
+
+def test_a_duration_that_does_not_fit_is_refused():
+    for timeout in (1e6, float("inf"), float("nan")):
+        with pytest.raises(BadData, match="'timeout'"):
+            compose_service(2, 1, 1, {**SAMPLE_READ, "timeout": timeout})
+
+
+SAMPLE_READ = {"app": bytes(16), "ncap": bytes(16), "tim": bytes(16), "channel": 1, "sampling_mode": 5}
 
 
 @given(st.sampled_from(sorted(NETWORK)), st.sampled_from(sorted(MESSAGE_TYPES)), st.data())
