@@ -24,15 +24,16 @@ from teds_provision.links import LinkSettings
 def identify(app: App, links: LinkSettings, watch: bool, add: bool) -> None:
     """Wait for a tap; read UUID and key, and have the node prove that it holds it.
 
-    Over --via can every node on the bus is asked.
+    Over --via can every node on the bus is asked; with --json several are listed under "nodes".
     """
     from teds_provision.cli.rendering import reporter_for
-    from teds_provision.workflow.contact import meet
+    from teds_provision.workflow.contact import meet_everyone
 
     station, reporter = app.station(), reporter_for(app)
     if not watch:
-        with meet(station, links, None, reporter) as node:
-            _emit(app, _one(station, node, add))
+        with meet_everyone(links, reporter) as nodes:
+            found = [_one(station, node, add) for node in nodes]
+        _emit(app, found[0] if len(found) == 1 else {**found[0], "nodes": found})
         return
     from teds_provision.workflow.watching import watch_nodes
 
@@ -75,8 +76,11 @@ def _one(station: Any, node: Any, add: bool) -> dict[str, Any]:
 
 
 def _emit(app: App, found: dict[str, Any]) -> None:
+    app.emit(found, "\n".join(map(_line, found.get("nodes", [found]))))
+
+
+def _line(found: dict[str, Any]) -> str:
     listed = "whitelisted" if found["whitelisted"] else "not whitelisted"
     name = f"  {found['name']}" if found["name"] else ""
     tag = f"  tag {found['tag_uid']}" if found["tag_uid"] else ""
-    text = f"{found['uuid']}  key {found['fingerprint'][:16]}  {found['state']}  {listed}{name}{tag}"
-    app.emit(found, text)
+    return f"{found['uuid']}  key {found['fingerprint'][:16]}  {found['state']}  {listed}{name}{tag}"

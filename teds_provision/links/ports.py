@@ -72,6 +72,9 @@ class Port(Protocol):
         Foreign tags and unwanted nodes are reported through ``notice`` and waited past.
         """
 
+    def everyone(self, *, seconds: float, notice: NoticeSink) -> list[Contact]:
+        """Wait until any node is tapped, or answers on the bus: there, all that answer. Raises NoNode."""
+
     def watch(self, *, stop: threading.Event, notice: NoticeSink) -> Iterator[Contact]:
         """Yield every node as it comes, once per visit (debounced), until ``stop`` is set; survives unplugging.
 

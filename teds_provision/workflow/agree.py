@@ -28,8 +28,9 @@ def open_session(station: Station, node: Conversation) -> NodeKey | None:
     """Open a session under the first key that the node knows, newest pending first; None where it knows none.
 
     The key that worked becomes the active one and all others go: that is the only thing that ever deletes a key.
-    Raises PolicyRefused for a node that was moved away or revoked, LinkFailure.
+    Raises PolicyRefused for a node that was moved away, LinkFailure.
     """
+    station.require_not_given_away(node.uuid)
     for held in station.node_keys(node.uuid):
         try:
             node.open(held.key)
@@ -46,9 +47,29 @@ def open_session(station: Station, node: Conversation) -> NodeKey | None:
     return None
 
 
-def require_session(station: Station, node: Conversation) -> NodeKey:
-    """Open a session or say why there is none: no key held (NotFound-like refusal), or the node has another."""
+def session_if_keyed(station: Station, node: Conversation) -> NodeKey | None:
+    """Open a session as :func:`open_session` does; where a handover demands a new key, go on under that new key.
+
+    None for a node whose keys this station does not hold, or gave away.
+    """
+    if station.store.tombstone(node.uuid) is not None:
+        return None
     held = open_session(station, node)
+    entry = station.store.whitelisted(node.uuid)
+    due = station.rotation_due(node.uuid) is not None and entry is not None and entry.fingerprint is not None
+    if held is None or not due or entry is None:
+        return held
+    try:
+        _agree_anew(station, node, entry, station.ca_of(node.uuid))
+    except SessionLost as lost:
+        raise lost.cause from lost
+    return station.node_keys(node.uuid)[0]
+
+
+def require_session(station: Station, node: Conversation) -> NodeKey:
+    """Open a session or say why there is none: given away, no key held (PolicyRefused), or the node has another."""
+    station.require_not_given_away(node.uuid)
+    held = session_if_keyed(station, node)
     if held is not None:
         return held
     if not station.has_keys(node.uuid):
@@ -73,17 +94,31 @@ def agree(station: Station, node: Conversation, who: Identified, *, rotate: bool
     ``rotate`` demands a new one: inside a session where a key is known, else by tap. Raises NotWhitelisted, OtherKey,
     PolicyRefused, NodeRefused, NotAuthentic, LinkFailure; whatever is cut, the same call carries on.
     """
+    if who.state == NodeState.FACTORY:
+        _welcome_back(station, node.uuid)
     entry = station.require_whitelisted(node.uuid)
     held = open_session(station, node) if who.state != NodeState.FACTORY else None
+    rotate = rotate or station.rotation_due(node.uuid) is not None
     if held is not None and not rotate:
         return Agreed(held.record.epoch, held.record.key_id, fresh=False)
     if held is None and who.state != NodeState.FACTORY and station.has_keys(node.uuid) and not rotate:
         raise unknown_key(node.uuid)
     pinned = _pin_for(entry, node, who)
+    ca = station.ca if who.state == NodeState.FACTORY else station.ca_of(node.uuid)
     try:
-        return _agree_anew(station, node, pinned)
+        return _agree_anew(station, node, pinned, ca)
     except SessionLost as lost:
         raise lost.cause from lost
+
+
+def _welcome_back(station: Station, uuid: bytes) -> None:
+    """A node whose move was closed by its receipt, and that was reset since, may be keyed here again."""
+    tombstone = station.store.tombstone(uuid)
+    row = station.store.handover(tombstone.handover_id, "out") if tombstone is not None else None
+    if row is not None and row.state == "closed" and not station.has_keys(uuid):
+        with station.store.transaction():
+            station.store.remove_tombstone(uuid)
+            station.audit("handover", uuid, "came back after a reset", handover=row.id)
 
 
 def _pin_for(entry: WhitelistEntry, node: Conversation, who: Identified) -> WhitelistEntry:
@@ -100,21 +135,27 @@ def _pin_for(entry: WhitelistEntry, node: Conversation, who: Identified) -> Whit
     )
 
 
-def _agree_anew(station: Station, node: Conversation, entry: WhitelistEntry) -> Agreed:
+def _agree_anew(station: Station, node: Conversation, entry: WhitelistEntry, ca: bytes) -> Agreed:
+    """Request, Confirm, Open; ``ca`` is the one that the node keeps, or shall keep from now on."""
     uuid = node.uuid
-    agreement = StationAgreement(station.credentials(), uuid)
+    agreement = StationAgreement(
+        replace(station.credentials(), ca=ca, station_signature=station.signature_under(ca)), uuid
+    )
     reply = node.send(agreement.request(), "the key agreement")
     agreed = agreement.accept(reply, pinned=entry.fingerprint, epoch=station.active_epoch(uuid))
     key_id = agreed.key_id.hex()
     with station.store.transaction():
         station.add_pending(uuid, key=agreed.key, key_id=agreed.key_id, epoch=agreed.epoch)
+        station.set_ca_of(uuid, ca)
         if entry != station.store.whitelisted(uuid):
             station.store.put_whitelist(entry)
         station.audit("agree", uuid, "pending", key_id=key_id, epoch=agreed.epoch, via=node.contact.link.via)
     node.send(agreed.confirm, "the key confirmation")
     node.forget()
     node.open(agreed.key)
-    station.store.promote_key(uuid, key_id)
+    with station.store.transaction():
+        station.store.promote_key(uuid, key_id)
+        station.rotated(uuid)
     identity = read_identity(node)
     station.remember(
         uuid,

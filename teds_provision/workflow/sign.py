@@ -72,9 +72,9 @@ def unsigned_security(station: Station, keys: NodeKeys, image: Image) -> bytes:
     return unsigned_datasheet(
         keys,
         station.point,
-        station.station_signature,
+        station.signature_under(station.ca_of(keys.uuid)),
         digests(image.blocks),
-        ca=security.ca_hint(station.name, fingerprint(station.ca)),
+        ca=security.ca_hint(station.name, fingerprint(station.ca_of(keys.uuid))),
         sequence=node.sequence if node else 0,
         key_epoch=node.epoch if node else 0,
     ).encode()
@@ -114,15 +114,15 @@ def sign(
     unsigned = unsigned_datasheet(
         keys,
         station.point,
-        station.station_signature,
+        station.signature_under(station.ca_of(keys.uuid)),
         digests(image.blocks),
-        ca=security.ca_hint(station.name, fingerprint(station.ca)),
+        ca=security.ca_hint(station.name, fingerprint(station.ca_of(keys.uuid))),
         last_modified=_now(),
         sequence=number,
         key_epoch=epoch,
     )
     station.remember(keys.uuid, sequence=number)
-    octets = sign_datasheet(unsigned, keys.uuid, station.credentials())
+    octets = sign_datasheet(unsigned, keys.uuid, station.credentials(keys.uuid))
     station.audit("sign", keys.uuid, "done", sequence=number, epoch=epoch, teds=image.digest())
     return Signed(image.with_block(SECURITY, octets), number, reused=False)
 
@@ -133,11 +133,12 @@ def _says_the_same(station: Station, keys: NodeKeys, image: Image, octets: bytes
         found = security.decode(octets)
     except BadData:
         return False
+    ca = station.ca_of(keys.uuid)
     return (
         found.signed
         and (found.node_key, found.node_key_signature) == (keys.key, keys.signature)
-        and (found.station_key, found.station_key_signature) == (station.point, station.station_signature)
-        and found.ca == security.ca_hint(station.name, fingerprint(station.ca))
+        and (found.station_key, found.station_key_signature) == (station.point, station.signature_under(ca))
+        and found.ca == security.ca_hint(station.name, fingerprint(ca))
         and found.key_epoch == epoch
         and found.signed_blocks == digests(image.blocks)
         and signature_good(found, octets, keys.uuid)

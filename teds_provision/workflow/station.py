@@ -7,9 +7,9 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from teds_provision.errors import NotFound, NotWhitelisted, PolicyRefused
+from teds_provision.errors import NotAuthentic, NotFound, NotWhitelisted, PolicyRefused
 from teds_provision.protocol.agreement import Credentials, other_key
-from teds_provision.protocol.keys import fingerprint, station_key_message
+from teds_provision.protocol.keys import fingerprint, station_key_message, verify
 from teds_provision.store import KeyRecord, NodeRecord, Store, StoreLock, WhitelistEntry
 
 if TYPE_CHECKING:
@@ -101,16 +101,55 @@ class Station:
             self._vault = open_vault(self.store.home, self.store.id, self.keystore, self._ask)
         return self._vault
 
-    def credentials(self) -> Credentials:
-        """What the station shows and signs with."""
-        return Credentials(self.vault.identity(), self.station_signature, self.ca)
+    def credentials(self, uuid: bytes | None = None) -> Credentials:
+        """What the station shows and signs with: to node ``uuid`` under the CA that this node keeps, else its own."""
+        ca = self.ca if uuid is None else self.ca_of(uuid)
+        return Credentials(self.vault.identity(), self.signature_under(ca), ca)
 
     def certify(self, point: bytes) -> bytes:
         """SIG104 of this owner's CA over another station's key; raises NotFound where the CA key is not here."""
         ca = self.vault.ca()
-        if ca is None:
+        if ca is None or ca.point != self.ca:
             raise NotFound("The CA key is not in this vault.", hint="Do this where the CA key is kept.")
         return ca.sign(station_key_message(point))
+
+    # -- CAs and their signatures over stations --------------------------------------------------------------------
+
+    def ca_of(self, uuid: bytes) -> bytes:
+        """P(CA) that a node keeps: the owner's, or that of the bundle in which the node's key came."""
+        other = self.store.setting(_ca_setting(uuid))
+        return bytes.fromhex(other) if other else self.ca
+
+    def set_ca_of(self, uuid: bytes, ca: bytes) -> None:
+        """Note which CA a node keeps."""
+        if ca != self.ca_of(uuid):
+            self.store.set_setting(_ca_setting(uuid), "" if ca == self.ca else ca.hex())
+
+    def certificate(self, ca: bytes, point: bytes) -> bytes | None:
+        """SIG104 of ``ca`` over a station's key as far as it is known here."""
+        if (ca, point) == (self.ca, self.point):
+            return self.station_signature
+        known = self.store.setting(_certificate_setting(ca, point))
+        return bytes.fromhex(known) if known else None
+
+    def keep_certificate(self, ca: bytes, point: bytes, signature: bytes) -> None:
+        """Keep a SIG104; raises NotAuthentic where it does not verify."""
+        if not verify(ca, station_key_message(point), signature):
+            raise NotAuthentic(f"The CA {fingerprint(ca)[:16]} did not sign the station {fingerprint(point)[:16]}.")
+        if self.certificate(ca, point) is None:
+            self.store.set_setting(_certificate_setting(ca, point), signature.hex())
+
+    def signature_under(self, ca: bytes) -> bytes:
+        """SIG104 of ``ca`` over this station's key; raises PolicyRefused where there is none."""
+        signature = self.certificate(ca, self.point)
+        if signature is None:
+            raise PolicyRefused(
+                f"This station is not certified by the CA {fingerprint(ca)[:16]}.",
+                hint="Have it signed where that CA key is kept: teds-provision trust ca sign REQUEST",
+            )
+        return signature
+
+    # -- link keys -------------------------------------------------------------------------------------------------
 
     def node_keys(self, uuid: bytes) -> list[NodeKey]:
         """Every key held for a node, in the order of trying: newest pending first, the active one last."""
@@ -143,9 +182,10 @@ class Station:
 
     # -- trust -----------------------------------------------------------------------------------------------------
 
-    def trusted_cas(self) -> list[bytes]:
-        """CA keys that count here: the owner's, and those added."""
-        return [self.ca, *(record.point for record in self.store.trusted() if record.role == "ca")]
+    def trusted_cas(self, uuid: bytes | None = None) -> list[bytes]:
+        """CA keys that count here: the owner's, those added, and for one node that of the bundle it came in."""
+        cas = [self.ca, *(record.point for record in self.store.trusted() if record.role == "ca")]
+        return cas if uuid is None or self.ca_of(uuid) in cas else [*cas, self.ca_of(uuid)]
 
     def trusted_stations(self) -> list[bytes]:
         """Station keys that count here: its own, and those added."""
@@ -156,18 +196,41 @@ class Station:
         revoked = self.store.revocation(uuid)
         if revoked is not None:
             raise PolicyRefused(f"Node {uuid.hex()} was revoked: {revoked.why}.")
-        tombstone = self.store.tombstone(uuid)
-        if tombstone is not None:
-            raise PolicyRefused(
-                f"Node {uuid.hex()} was moved to station {tombstone.to_fingerprint[:16]}; its key rests here.",
-                hint=f"Use it there, or: teds-provision handover undo {tombstone.handover_id}",
-            )
+        self.require_not_given_away(uuid)
         entry = self.store.whitelisted(uuid)
         if entry is None:
             raise NotWhitelisted(
                 f"Node {uuid.hex()} is not on the whitelist.", hint=f"Add it: teds-provision whitelist add {uuid.hex()}"
             )
         return entry
+
+    def require_not_given_away(self, uuid: bytes) -> None:
+        """Raise PolicyRefused for a node that was moved to another station: its key is used no more."""
+        tombstone = self.store.tombstone(uuid)
+        if tombstone is None:
+            return
+        row = self.store.handover(tombstone.handover_id, "out")
+        undo = f"Use it there, or: teds-provision handover undo {tombstone.handover_id}"
+        back = "Use it there, or have it handed back (export-keys there, import-keys here)."
+        raise PolicyRefused(
+            f"Node {uuid.hex()} was moved to station {tombstone.to_fingerprint[:16]}; its key rests here.",
+            hint=undo if row is not None and row.state == "open" else back,
+        )
+
+    def rotation_due(self, uuid: bytes) -> str | None:
+        """Why the next session with a node has to rotate its key first; None where it has not."""
+        return self.store.setting(_rotation_setting(uuid)) or None
+
+    def demand_rotation(self, uuid: bytes, why: str) -> None:
+        """Have the next session with a node rotate its key before anything else."""
+        self.store.set_setting(_rotation_setting(uuid), why)
+
+    def rotated(self, uuid: bytes) -> None:
+        """Note that a node has a key that no other station holds."""
+        if self.rotation_due(uuid):
+            self.store.set_setting(_rotation_setting(uuid), "")
+        for holder in self.store.holders(uuid):
+            self.store.remove_holder(uuid, holder.fingerprint)
 
     def check_pin(self, uuid: bytes, point: bytes) -> None:
         """Raise OtherKey where this UUID is known with another key than ``point``."""
@@ -196,6 +259,18 @@ class Station:
     def lock(self, command: str, notice: Callable[[str], object] | None = None) -> StoreLock:
         """One changing command at a time; waits, then says who holds the store."""
         return StoreLock(self.store.home, command=command, notice=notice)
+
+
+def _ca_setting(uuid: bytes) -> str:
+    return f"ca-of:{uuid.hex()}"
+
+
+def _rotation_setting(uuid: bytes) -> str:
+    return f"rotate:{uuid.hex()}"
+
+
+def _certificate_setting(ca: bytes, point: bytes) -> str:
+    return f"certificate:{fingerprint(ca)}:{fingerprint(point)}"
 
 
 def not_initialised(home: Path) -> NotFound:

@@ -69,8 +69,8 @@ def verify_image(station: Station, image: Image, *, identity: Identity | None = 
         return [*checks, Check("signed", "failed", "this is the initial Security TEDS: nobody has signed it yet")]
     checks += [
         Check("signed", "passed"),
-        _station(station, shown),
-        _certificate(station, shown),
+        _station(station, image.uuid, shown),
+        _certificate(station, image.uuid, shown),
         _signature(image, octets, shown),
         _blocks(image, shown),
         _unlisted(image, shown),
@@ -137,9 +137,9 @@ def _not_revoked(station: Station, uuid: bytes) -> Check:
     return _check("not revoked", revoked is None, f"revoked: {revoked.why}" if revoked else "")
 
 
-def _station(station: Station, shown: SecurityTeds) -> Check:
+def _station(station: Station, uuid: bytes, shown: SecurityTeds) -> Check:
     key = shown.station_key or b""
-    certified = any(datasheet.station_signature_good(shown, ca) for ca in station.trusted_cas())
+    certified = any(datasheet.station_signature_good(shown, ca) for ca in station.trusted_cas(uuid))
     return _check(
         "signing station",
         key in station.trusted_stations() or certified,
@@ -148,9 +148,9 @@ def _station(station: Station, shown: SecurityTeds) -> Check:
     )
 
 
-def _certificate(station: Station, shown: SecurityTeds) -> Check:
+def _certificate(station: Station, uuid: bytes, shown: SecurityTeds) -> Check:
     name = "station certificate"
-    for ca in station.trusted_cas():
+    for ca in station.trusted_cas(uuid):
         if datasheet.station_signature_good(shown, ca):
             return Check(name, "passed", f"CA {fingerprint(ca)[:16]}")
     if shown.station_key == station.point or shown.station_key not in station.trusted_stations():

@@ -74,6 +74,10 @@ class NfcPort:
             hint="Hold the node's NFC antenna flat on the reader, or give it more time with --timeout.",
         )
 
+    def everyone(self, *, seconds: float, notice: NoticeSink) -> list[Contact]:
+        """The node that is tapped: a reader sees one at a time; see ``Port.everyone``."""
+        return [self.find(lambda _: True, seconds=seconds, notice=notice)]
+
     def watch(self, *, stop: threading.Event, notice: NoticeSink) -> Iterator[Contact]:
         """Yield each node that is held to the reader, once per visit, until ``stop`` is set (within 0.3 s).
 
