@@ -23,7 +23,7 @@ def read(app: App, uuid: str, output: Path | None, links: LinkSettings) -> None:
     """Read every TEDS of a node, over a session where this station holds its key; look at it with show."""
     from teds_provision.cli.build import write_file
     from teds_provision.cli.rendering import reporter_for
-    from teds_provision.workflow.agree import open_session
+    from teds_provision.workflow.agree import session_if_keyed
     from teds_provision.workflow.contact import meet
     from teds_provision.workflow.identify import identify
     from teds_provision.workflow.reading import read_image
@@ -33,7 +33,7 @@ def read(app: App, uuid: str, output: Path | None, links: LinkSettings) -> None:
     with meet(station, links, octets, reporter_for(app)) as node:
         identify(station, node)
         with station.lock("read", app.note):
-            open_session(station, node)
+            session_if_keyed(station, node)
             image = read_image(node)
             if node.sealed:
                 station.store.put_node_image(octets, image.to_json())

@@ -58,7 +58,7 @@ def verify(app: App, what: str, links: LinkSettings, accept_calibration: str | N
 def _node(app: App, what: str, links: LinkSettings) -> tuple[Image, Verified]:
     from teds_provision.cli.rendering import reporter_for
     from teds_provision.protocol.identity import NodeState
-    from teds_provision.workflow.agree import open_session, unknown_key
+    from teds_provision.workflow.agree import session_if_keyed, unknown_key
     from teds_provision.workflow.contact import meet
     from teds_provision.workflow.identify import identify
     from teds_provision.workflow.provision import verify_node
@@ -69,8 +69,9 @@ def _node(app: App, what: str, links: LinkSettings) -> tuple[Image, Verified]:
     with meet(station, links, uuid, reporter_for(app)) as node:
         who = identify(station, node)
         with station.lock("verify", app.note):
-            held = open_session(station, node)
-            if held is None and station.has_keys(uuid) and who.state != NodeState.FACTORY:
+            held = session_if_keyed(station, node)
+            given_away = station.store.tombstone(uuid) is not None
+            if held is None and station.has_keys(uuid) and not given_away and who.state != NodeState.FACTORY:
                 raise unknown_key(uuid)
             image = read_image(node)
             return image, verify_node(station, node, image, who.point)

@@ -41,7 +41,10 @@ def open_session(station: Station, node: Conversation) -> NodeKey | None:
         except NotAuthentic:
             continue
         if held.record.state == "pending" or len(station.store.keys(node.uuid)) > 1:
-            station.store.promote_key(node.uuid, held.record.key_id)
+            with station.store.transaction():
+                station.store.promote_key(node.uuid, held.record.key_id)
+                if held.record.state == "pending" and held.record.source == "agreement":
+                    station.rotated(node.uuid)
             station.audit("key", node.uuid, "active", key_id=held.record.key_id, epoch=held.record.epoch)
         return held
     return None
@@ -98,7 +101,7 @@ def agree(station: Station, node: Conversation, who: Identified, *, rotate: bool
         _welcome_back(station, node.uuid)
     entry = station.require_whitelisted(node.uuid)
     held = open_session(station, node) if who.state != NodeState.FACTORY else None
-    rotate = rotate or station.rotation_due(node.uuid) is not None
+    rotate = rotate or (held is not None and station.rotation_due(node.uuid) is not None)
     if held is not None and not rotate:
         return Agreed(held.record.epoch, held.record.key_id, fresh=False)
     if held is None and who.state != NodeState.FACTORY and station.has_keys(node.uuid) and not rotate:
