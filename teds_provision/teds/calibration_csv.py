@@ -134,7 +134,7 @@ def _header(table: CsvTable, number: int, cells: list[str]) -> _Columns | None:
     """Columns that a header names; None where the first line is data."""
     try:
         [_number(cell, decimal_comma=True) for cell in cells]
-    except ValueError:
+    except (ValueError, OverflowError):
         pass
     else:
         return None

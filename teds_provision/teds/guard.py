@@ -33,7 +33,7 @@ class GuardFinding:
     """One finding: an ``error`` refuses the datasheet (unless a person says why it is right), a ``warning`` does not.
 
     ``message`` goes behind "channel 1: " and has no full stop. Codes: erased, unreadable, inconsistent, unknown, flat,
-    overflow, limits, reversed, swapped, not-monotone, jump, residual, removed, changed, overdue.
+    overflow, limits, unlimited, reversed, swapped, not-monotone, jump, residual, removed, changed, overdue.
     """
 
     channel: int
@@ -144,7 +144,7 @@ class _Judge:
         channel = self._demanded(self._channel(self.number, self.new), calibration)
         numbers = {part.channel for part in calibration.inputs}
         channels = {number: self._channel(number, self.new) for number in numbers}
-        old = self._before()
+        old = self._before(channel)
         curve = curve_of(calibration, channel, channels, also=old)
         before = curve_of(old, channel, channels, also=calibration) if old is not None else None
         for code, severity, message in guard_checks.check(curve, before, self.given):
@@ -159,11 +159,14 @@ class _Judge:
             raw = max(raw[0], channel.raw[0]), min(raw[1], channel.raw[1])
         return replace(channel, monotone=calibration.monotone, raw=raw if raw and raw[0] < raw[1] else channel.raw)
 
-    def _before(self) -> Calibration | None:
-        """Calibration that the node has now; None where there is none that can be computed."""
+    def _before(self, channel: Channel) -> Calibration | None:
+        """Calibration that the node has now; None where there is none that can be computed and compared."""
         octets = self.old.get((self.number, CALIBRATION))
         if octets is None:
             return None
+        had = self._channel(self.number, self.old)
+        if (had.units, had.actuator) != (channel.units, channel.actuator):
+            return None  # the node was of another type
         try:
             calibration = self._calibration(decode(octets), self.old)
         except BadData:

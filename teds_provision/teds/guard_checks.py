@@ -123,6 +123,8 @@ def _limits(curve: Curve) -> Iterator[Raised]:
     else:
         low, high, tolerance = channel.low, channel.high, channel.tolerance
         values, names = (curve.unshifted if channel.full_turn else curve.result), ("low limit", "high limit")
+    if not math.isfinite(low) or not math.isfinite(high):
+        yield "unlimited", "warning", "the channel states no limits: the results were not held against them."
     slack = tolerance + 4 * FLOAT32_STEP * max(abs(low), abs(high), 0.0) if math.isfinite(low + high) else tolerance
     for limit, over, name, where in (
         (low, low - values, names[0], "below"),

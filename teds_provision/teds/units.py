@@ -408,7 +408,7 @@ def parse_seconds(value: object) -> float:
 
     Raises BadData.
     """
-    if isinstance(value, (int, float)) and not isinstance(value, bool):
+    if isinstance(value, (int, float)) and not isinstance(value, bool) and abs(value) < 1e300:
         return float(value)
     match = _QUANTITY.match(value) if isinstance(value, str) else None
     if match is None:

@@ -140,6 +140,19 @@ def test_a_table_goes_through_its_points_and_straight_in_between() -> None:
     assert [table(x) for x in (0, 25, 50, 75, 100)] == pytest.approx([0, 0.75, 1.5, 3.25, 5])
 
 
+def test_a_table_can_be_thinned_and_stays_as_close_as_asked() -> None:
+    raw = np.linspace(0, 65535, 20_000)
+    points = list(zip(raw.tolist(), (360 * raw / 65535 + np.sin(raw / 9000)).tolist(), strict=True))
+    with pytest.raises(BadData, match="too large"):
+        fit(points, "table", channel=1)
+    thin = fit(points, "table", channel=1, tolerance=0.01)
+    assert 20 < thin.inputs[0].segments < 200
+    residuals = thin.residuals()
+    assert residuals is not None
+    assert 0.001 < residuals.maximum < 0.0101
+    assert fit(points, "table", channel=1, tolerance=5.0).inputs[0].segments == 1
+
+
 def test_steps_hold_up_to_the_next_point() -> None:
     steps = fit([(0, 1.0), (10, 2.0), (20, 3.0)], "steps", channel=1)
     assert [steps(x) for x in (0, 9, 10, 25)] == [1, 1, 2, 3]
@@ -396,6 +409,10 @@ offsets = [25]
         ("from,to,offset,c0\n0,1,0,5\n2,3,0,6\n", "c.csv", 3, "from"),
         ("from,to,c0\n0,1,5\n", "c.csv", 1, '"offset"'),
         ("slope = 1\nslop = 2\n", "c.toml", 2, '"slope"'),
+        (f"slope = {10**400}\n", "c.toml", 1, "slope"),
+        ("coefficients = [1.0, inf]\n", "c.toml", 1, "coefficients"),
+        (f"points = [[0, 1], [2, {10**400}]]\n", "c.toml", 1, "point 2"),
+        (f"raw,value\n0,0\n0x{'f' * 400},1\n", "c.csv", 3, "raw"),
         ("slope = \n", "c.toml", 1, "TOML"),
         ('points = [[1, 2], [3, "x"]]\n', "c.toml", 1, "point 2"),
         ("slope = 1\npoints = [[0, 1], [2, 3]]\n", "c.toml", 2, "only one"),

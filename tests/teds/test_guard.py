@@ -306,6 +306,16 @@ def test_an_overdue_calibration_is_said_where_the_time_is_given(tactile: Profile
     assert codes(found, "warning") == {"overdue"}
 
 
+def test_a_node_that_was_of_another_type_is_not_compared(tactile: Profile, magnetic: Profile) -> None:
+    falling = replace(angle_table(), coefficients=tuple(-value for value in angle_table().coefficients))
+    assert check_calibration(built(tactile, force_line()), built(magnetic, falling), tactile) == []
+
+
+def test_a_channel_without_limits_is_said(tactile: Profile) -> None:
+    blocks = {key: octets for key, octets in built(tactile, force_line()).items() if key == (1, 5)}
+    assert codes(check_calibration(blocks), "warning") == {"unlimited"}
+
+
 # --- several inputs
 
 

@@ -27,6 +27,7 @@ KEYS: Final = (
     "degree",
     "unit",
     "uncertainty",
+    "tolerance",
     "zero-offset",
     "low-limit",
     "high-limit",
@@ -40,7 +41,7 @@ KEYS: Final = (
     "inputs",
     "calibration",
 )
-CSV_KEYS: Final = KEYS[:11]
+CSV_KEYS: Final = KEYS[:12]
 _CHANNELS: Final = re.compile(r"(\d+)(?:\s*-\s*(\d+))?\Z")
 
 

@@ -14,6 +14,7 @@ from teds_provision.teds.calibration.model import Calibration, CalibrationInput,
 
 Points = Sequence[tuple[float, float]]
 MAXIMUM_DEGREE = 12
+MAXIMUM_NODES = 8000  # 8 octets of coefficients each, in one tuple of at most 65535
 
 
 @dataclass(frozen=True)
@@ -60,13 +61,20 @@ def residuals(calibration: Calibration) -> Residuals:
 
 
 def fit(
-    points: Points, method: Method, *, channel: int, degree: int | None = None, actuator: bool = False
+    points: Points,
+    method: Method,
+    *,
+    channel: int,
+    degree: int | None = None,
+    actuator: bool = False,
+    tolerance: float = 0.0,
 ) -> Calibration:
     """Fit a calibration to (raw, value) points. The curve only; dates, limits and unit are the caller's.
 
     linear: least squares, C = [intercept, slope], H = 0. polynomial: least squares about the middle of the points
     (default degree: 3, or what the points allow). table: through every point, straight in between; points of the same
-    input are averaged. steps: the value of a point holds up to the next one. Raises BadData for too few points.
+    input are averaged, and with a ``tolerance`` nodes are left out as long as every point stays that close. steps: the
+    value of a point holds up to the next one. Raises BadData for too few points, or more than a TEDS can hold.
     """
     pairs = oriented(points, actuator=actuator)
     distinct = len({x for x, _ in pairs})
@@ -86,9 +94,9 @@ def fit(
             xs = [x for x, _ in pairs]
             part, coefficients = _polynomial(pairs, wanted, about=(min(xs) + max(xs)) / 2)
         case "table":
-            part, coefficients = _table(_averaged(pairs))
+            part, coefficients = _table(_held(_thinned(_averaged(pairs), tolerance)))
         case "steps":
-            part, coefficients = _steps(_averaged(pairs))
+            part, coefficients = _steps(_held(_averaged(pairs)))
     curve = CalibrationInput(channel, *part)
     if not curve.ascending:
         raise BadData("Two inputs of the calibration lie so close together that a Float32 cannot tell them apart.")
@@ -127,6 +135,36 @@ def _steps(pairs: Points) -> tuple[_Part, tuple[float, ...]]:
     x, y = _columns(pairs)
     end = x[-1] + (x[-1] - x[-2])
     return (0, (*x.tolist(), float(end)), tuple(x.tolist())), tuple(y.tolist())
+
+
+def _held(pairs: list[tuple[float, float]]) -> list[tuple[float, float]]:
+    if len(pairs) > MAXIMUM_NODES:
+        raise BadData(
+            f"A table of {len(pairs)} nodes is too large for a TEDS, which holds {MAXIMUM_NODES} at most.",
+            hint="Thin it with a tolerance (# tolerance: 0.05), or fit a polynomial.",
+        )
+    return pairs
+
+
+def _thinned(pairs: list[tuple[float, float]], tolerance: float) -> list[tuple[float, float]]:
+    """Nodes of a polygon that stays within ``tolerance`` of every point (Douglas-Peucker, measured upright)."""
+    if tolerance <= 0 or len(pairs) < 3:
+        return pairs
+    x, y = _columns(pairs)
+    keep = np.zeros(len(x), dtype=bool)
+    keep[[0, -1]] = True
+    pending = [(0, len(x) - 1)]
+    while pending:
+        first, last = pending.pop()
+        if last - first < 2:
+            continue
+        inner = slice(first + 1, last)
+        away = np.abs(y[inner] - np.interp(x[inner], x[[first, last]], y[[first, last]]))
+        worst = first + 1 + int(np.argmax(away))
+        if away.max() > tolerance:
+            keep[worst] = True
+            pending += [(first, worst), (worst, last)]
+    return [pair for pair, kept in zip(pairs, keep.tolist(), strict=True) if kept]
 
 
 def _columns(pairs: Points) -> tuple[NDArray[np.float64], NDArray[np.float64]]:

@@ -12,8 +12,14 @@ from teds_provision.errors import BadData
 from teds_provision.teds.calibration.fitting import fit
 from teds_provision.teds.calibration.model import METHODS, Calibration, CalibrationInput, Method
 from teds_provision.teds.profile.model import ChannelProfile
+from teds_provision.teds.profile.reader import FLOAT32_MAXIMUM
 from teds_provision.teds.profile.source import Table
 from teds_provision.teds.units import WrittenUnit, parse_seconds, parse_unit
+
+
+def is_number(value: object) -> bool:
+    """Whether a value is a finite number that a Float32 may hold."""
+    return type(value) in (int, float) and abs(value) <= FLOAT32_MAXIMUM  # type: ignore[arg-type]
 
 
 @dataclass
@@ -40,7 +46,7 @@ class Order:
             return None
         try:
             number = float(value) if isinstance(value, (str, int, float)) and not isinstance(value, bool) else None
-        except ValueError:
+        except (ValueError, OverflowError):
             number = None
         if number is None or not math.isfinite(number):
             raise self.wrong(key, f"a number is expected, not {value!r}.")
@@ -51,7 +57,7 @@ class Order:
         value = self.get(key)
         if value is None:
             return None
-        if isinstance(value, list | tuple) and value and all(type(part) in (int, float) for part in value):
+        if isinstance(value, list | tuple) and value and all(is_number(part) for part in value):
             return tuple(float(part) for part in value)
         raise self.wrong(key, f"a list of numbers is expected, not {str(value)[:60]}.")
 
@@ -102,7 +108,10 @@ def _curve(order: Order, channel: ChannelProfile) -> Calibration:
             points = _points(order)
             chosen = method or _asked(channel) or ("linear" if len(points) == 2 else "table")
             wanted = degree if degree is not None else channel.calibration.degree
-            return fit(points, chosen, channel=channel.number, degree=wanted, actuator=actuator)
+            tolerance = order.number("tolerance")
+            return fit(
+                points, chosen, channel=channel.number, degree=wanted, actuator=actuator, tolerance=tolerance or 0.0
+            )
         case ["segments"]:
             return _segments(order, channel, method)
         case ["inputs", "coefficients"]:
@@ -128,7 +137,7 @@ def _points(order: Order) -> list[tuple[float, float]]:
     rows = value if isinstance(value, list | tuple) else []
     points = []
     for number, row in enumerate(rows, 1):
-        if not isinstance(row, list | tuple) or len(row) != 2 or not all(type(part) in (int, float) for part in row):
+        if not isinstance(row, list | tuple) or len(row) != 2 or not all(map(is_number, row)):
             raise order.wrong("points", f"point {number} is not a pair of numbers [raw, value].")
         points.append((float(row[0]), float(row[1])))
     if not points:

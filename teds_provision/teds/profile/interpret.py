@@ -29,7 +29,7 @@ from teds_provision.teds.profile.model import (
     Profile,
     TextProfile,
 )
-from teds_provision.teds.profile.reader import Problems, Section
+from teds_provision.teds.profile.reader import FLOAT32_MAXIMUM, Problems, Section
 from teds_provision.teds.profile.source import Table
 from teds_provision.teds.units import WrittenUnit, parse_seconds, parse_unit
 
@@ -312,6 +312,9 @@ def _demand(section: Section, unit: WrittenUnit | None) -> CalibrationDemand:
             seconds = parse_seconds(interval)
         except BadData as error:
             part.error("interval", f"{error.message} {error.hint}")
+        if seconds is not None and not 0 < seconds < 2**32:
+            part.error("interval", f"{interval!r} is not a time that a TEDS can hold.")
+            seconds = None
     part.unit = unit
     deviation = part.read(Key("standard-deviation", "", Kind.NUMBER, "standard deviation in the channel's unit"))
     demand = CalibrationDemand(
@@ -345,9 +348,9 @@ def _raw_range(part: Section) -> tuple[float, float] | None:
     if value is None:
         return None
     if isinstance(value, list) and len(value) == 2 and all(type(end) in (int, float) for end in value):
-        low, high = float(value[0]), float(value[1])
-        if low < high:
-            return low, high
+        low, high = value
+        if -FLOAT32_MAXIMUM <= low < high <= FLOAT32_MAXIMUM:
+            return float(low), float(high)
     part.error("raw-range", f"two numbers, the lower one first, are expected, like [0, 65535], not {value!r}.")
     return None
 

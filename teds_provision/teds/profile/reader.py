@@ -236,6 +236,8 @@ def _not_negative(value: float) -> float:
 def _number(value: object) -> float:
     if isinstance(value, bool) or not isinstance(value, (int, float)):
         raise _Wrong(f"a number is expected, not {value!r}.")
+    if isinstance(value, int) and abs(value) > FLOAT32_MAXIMUM:
+        raise _Wrong("the number does not fit a Float32.")
     return float(value)
 
 
