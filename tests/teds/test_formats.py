@@ -385,3 +385,25 @@ def test_the_examples_of_the_page_are_the_same_teds(language):
 def test_the_page_names_every_format():
     page = (ROOT / "docs" / "formats.md").read_text()
     assert all(f"| `{format}` |" in page for format in FORMATS)
+
+
+@settings(max_examples=60, suppress_health_check=[HealthCheck.too_slow])
+@given(st.lists(known_teds(), min_size=1, max_size=4), st.data())
+def test_any_teds_give_a_profile_that_names_its_losses(blocks, data):
+    blocks = [damaged(block, data) for block in blocks]
+    text = write_blocks(blocks, "toml")
+    said = lost(blocks, "toml")
+    assert text.count("# Not held here: ") == len(said)
+
+
+@settings(max_examples=60, suppress_health_check=[HealthCheck.too_slow])
+@given(st.sampled_from(["load-cell", "accelerometer", "gripper"]), st.data())
+def test_a_changed_datasheet_is_held_by_a_profile_or_its_loss_is_named(name, data):
+    path = ROOT / "profiles" / f"{name}.toml"
+    blocks = read_blocks(path.read_bytes(), path=path)
+    number = data.draw(st.integers(0, len(blocks) - 1))
+    block = bytearray(blocks[number].octets[4:-2])
+    block[data.draw(st.integers(6, len(block) - 1))] = data.draw(SMALL)
+    blocks[number] = blocks[number]._replace(octets=frame(bytes(block)))
+    if not lost(blocks, "toml") and blocks[number].access_code != 1:  # the UUID of a Meta-TEDS is the node's
+        assert read_blocks(write_blocks(blocks, "toml").encode()) == blocks
