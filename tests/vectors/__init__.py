@@ -1,0 +1,1 @@
+"""Published vectors of the profile, and the program that makes them."""
