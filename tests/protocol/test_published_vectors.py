@@ -1,0 +1,425 @@
+"""The published vectors: our generator, node and station keep to them, and plain primitives agree."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from datetime import datetime
+from typing import Any
+
+import pytest
+
+from teds_provision.errors import TedsProvisionError
+from teds_provision.links.can.bus import Frame
+from teds_provision.links.can.gathering import Gathering
+from teds_provision.links.can.isotp import Pair
+from teds_provision.links.nfc import message, tnep
+from teds_provision.links.nfc.pieces import Piece, Requester, room
+from teds_provision.protocol.agreement import Credentials, StationAgreement
+from teds_provision.protocol.bundle import open_bundle
+from teds_provision.protocol.frames import Command, decode_reply
+from teds_provision.protocol.keys import SoftwareKey, fingerprint, station_key_message
+from teds_provision.protocol.receipt import open_receipt
+from teds_provision.protocol.session import StationSession
+from teds_provision.teds import security
+from tests.vectors import generate
+from tests.vectors.recipes_links import Mailbox, TagHandler, node
+from tests.vectors.scene import BLOCKS
+
+from . import vector_node as vn
+from .vector_node import Entry
+
+TRANSCRIPTS = ("rotation", "sessions", "refusals", "commit", "reset")
+
+
+def cases(*names: str) -> pytest.MarkDecorator:
+    found = list(vn.entries(*names))
+    return pytest.mark.parametrize(("document", "entry"), [pytest.param(d, e, id=i) for i, d, e in found])
+
+
+@pytest.mark.parametrize("name", generate.FILES)
+def test_generating_the_vectors_again_changes_nothing(name: str) -> None:
+    path = generate.FOLDER / f"{name}.json"
+    assert path.read_text(encoding="utf-8") == generate.document(name)
+
+
+# -- transcripts: the node ---------------------------------------------------------------------------------------------
+
+
+@cases(*TRANSCRIPTS)
+def test_the_node_answers_as_published(document: Entry, entry: Entry) -> None:
+    replay = vn.Replay(document, entry)
+    for step in entry["steps"]:
+        reply = replay.run(step)
+        if reply is not None:
+            assert reply.hex() == step["reply"], step["note"]
+    assert replay.tim.identity().encode().hex() == entry["end"]["identify"]
+    assert replay.memory.state == vn.flash_of(document, entry["end"])
+
+
+def test_every_reason_that_the_node_gives_is_in_the_vectors() -> None:
+    given: set[int] = set()
+    for _, _, entry in vn.entries(*TRANSCRIPTS):
+        for step in entry["steps"]:
+            given |= {step.get("reason", 0), step.get("inner", {}).get("reason", 0)}
+    assert given >= set(range(1, 19)) - {17}, "17 (busy) is for nodes that can serve one station at a time"
+
+
+# -- transcripts: the station ------------------------------------------------------------------------------------------
+
+
+def command_of(frame: str) -> Command:
+    octets = bytes.fromhex(frame)
+    return Command(int.from_bytes(octets[:2], "big"), octets[2], octets[3], octets[6:])
+
+
+def credentials_in(document: Entry, request: bytes) -> Credentials:
+    """Who sends this Request: found by its point."""
+    names = {bytes.fromhex(key["P"]): name for name, key in document["keys"].items()}
+    station, ca = (document["keys"][names[part]] for part in (request[:65], request[129:194]))
+    signer = SoftwareKey(int(ca["d"], 16))
+    key = SoftwareKey(int(station["d"], 16))
+    return Credentials(key, signer.sign(station_key_message(key.point)), signer.point)
+
+
+@cases(*TRANSCRIPTS)
+def test_the_station_sends_and_takes_what_is_published(document: Entry, entry: Entry) -> None:
+    uuid = bytes.fromhex(document["uuid"])
+    sessions: dict[str, StationSession] = {}
+    for step in entry["steps"]:
+        inner = step.get("inner")
+        if "open" in step:
+            opened = step["open"]
+            session = StationSession(bytes.fromhex(opened["K"]), uuid, nonce=bytes.fromhex(opened["nonceS"]))
+            assert session.open().encode().hex() == step["command"]
+            if "reason" not in step:
+                session.accept(decode_reply(bytes.fromhex(step["reply"])).payload)
+                sessions[opened["session"]] = session
+        if inner is not None:
+            session = sessions[inner["session"]]
+            assert session.seal(command_of(inner["command"])).encode().hex() == step["command"], step["note"]
+            if "reply" in inner:
+                found = session.unseal(decode_reply(bytes.fromhex(step["reply"])).payload)
+                assert found.encode().hex() == inner["reply"], step["note"]
+        if "agreement" in step:
+            told = step["agreement"]
+            command = command_of(inner["command"] if inner else step["command"])
+            reply = decode_reply(bytes.fromhex(inner["reply"] if inner else step["reply"]))
+            one_time = SoftwareKey(int(document["keys"][told["one_time"]]["d"], 16))
+            agreement = StationAgreement(credentials_in(document, command.payload), uuid, one_time=one_time)
+            assert agreement.request() == command
+            agreed = agreement.accept(
+                reply.payload, pinned=document["keys"]["node"]["fingerprint"], epoch=told["epoch_held"]
+            )
+            assert (agreed.key.hex(), agreed.epoch) == (told["K"], told["epoch"])
+            assert agreed.confirm.payload.hex() == told["tagS"]
+
+
+# -- transcripts: plain primitives -----------------------------------------------------------------------------------
+
+
+@cases(*TRANSCRIPTS)
+def test_plain_primitives_give_the_same_keys_tags_and_frames(document: Entry, entry: Entry) -> None:
+    uuid = bytes.fromhex(document["uuid"])
+    keys: dict[str, tuple[bytes, bytes]] = {}
+    for step in entry["steps"]:
+        if "open" in step and "reason" not in step:
+            keys[step["open"]["session"]] = check_open(uuid, step)
+        if "inner" in step:
+            to_node, to_station = keys[step["inner"]["session"]]
+            sent = vn.unseal(to_node, bytes.fromhex(step["command"])[6:])
+            assert sent == vn.padded(bytes.fromhex(step["inner"]["command"]))
+            if "reply" in step["inner"]:
+                payload = bytes.fromhex(step["reply"])[3:]
+                assert payload[:4] == bytes.fromhex(step["command"])[6:10], "the counter of the command"
+                assert vn.unseal(to_station, payload) == vn.padded(bytes.fromhex(step["inner"]["reply"]))
+        if "agreement" in step:
+            check_agreement(document, uuid, step)
+
+
+def check_open(uuid: bytes, step: Entry) -> tuple[bytes, bytes]:
+    opened, command, reply = step["open"], bytes.fromhex(step["command"]), bytes.fromhex(step["reply"])
+    link_key, nonces = bytes.fromhex(opened["K"]), bytes.fromhex(opened["nonceS"]) + reply[3:19]
+    assert command[:6].hex() == "000080030018"
+    assert command[6:14] == hashlib.sha256(b"TEDS1 key id\0" + link_key).digest()[:8]
+    assert reply[3:19].hex() == step["nonceN"]
+    okm = vn.hkdf(link_key, nonces, b"TEDS1 session\0" + uuid, 64)
+    assert (okm[:16].hex(), okm[16:32].hex()) == (opened["k_sn"], opened["k_ns"])
+    assert reply[19:] == vn.mac(okm[32:], b"node open" + command[6:14] + nonces)
+    return okm[:16], okm[16:32]
+
+
+def check_agreement(document: Entry, uuid: bytes, step: Entry) -> None:
+    told, frames = step["agreement"], step.get("inner", step)
+    request, reply = bytes.fromhex(frames["command"])[6:], bytes.fromhex(frames["reply"])[3:]
+    station, signature, ca, one_time = request[:65], request[65:129], request[129:194], request[194:]
+    vn.check_signature(ca, b"TEDS1 station key\0" + station, signature)
+    nonce, epoch, tag, teds = reply[:16], reply[16:20], reply[20:36], reply[36:]
+    node = bytes.fromhex(document["keys"]["node"]["P"])
+    secret = next(key["d"] for key in document["keys"].values() if key["P"] == station.hex())
+    assert document["keys"][told["one_time"]]["P"] == one_time.hex()
+    shared = vn.ecdh(document["keys"][told["one_time"]]["d"], node) + vn.ecdh(secret, node)
+    script = hashlib.sha256(
+        b"TEDS1 transcript\0" + request + nonce + epoch + uuid + node + hashlib.sha256(teds).digest()
+    ).digest()
+    okm = vn.hkdf(shared, nonce, b"TEDS1 link key\0" + script, 48)
+    assert okm[:16].hex() == told["K"]
+    assert tag == vn.mac(okm[16:], b"node" + script)
+    assert told["tagS"] == vn.mac(okm[16:], b"station" + script).hex()
+
+
+def test_proofs_of_reset_verify() -> None:
+    document = vn.load("reset")
+    node, uuid = bytes.fromhex(document["keys"]["node"]["P"]), bytes.fromhex(document["uuid"])
+    proofs = 0
+    for entry in document["entries"]:
+        for step in entry["steps"]:
+            frames = step.get("inner", step)
+            if frames.get("command", "")[4:8] == "8009" and "reason" not in frames:
+                epoch = entry["start"]["epoch"].to_bytes(4, "big")
+                challenge, proof = bytes.fromhex(frames["command"])[6:], bytes.fromhex(frames["reply"])[3:]
+                vn.check_signature(node, b"TEDS1 reset\0" + uuid + epoch + challenge, proof)
+                proofs += 1
+    assert proofs == 3
+
+
+# -- canonical form ----------------------------------------------------------------------------------------------------
+
+
+@cases("canonical")
+def test_canonical_form_as_published(document: Entry, entry: Entry) -> None:
+    teds = bytes.fromhex(entry["teds"])
+    try:
+        shown = security.decode(teds)
+        form_good = shown.signed and shown.values == security.OUR_VALUES
+    except security.NotCanonical:
+        form_good = False
+    assert form_good == (entry["reason"] != 4), entry["note"]
+    if form_good:
+        assert security.decode(teds).encode() == teds, "what is read is written the same"
+
+
+def test_the_node_gives_the_published_reason_at_the_commit() -> None:
+    document = vn.load("canonical")
+    from .desk import Desk  # its node has other keys; the session only carries the writes
+
+    for entry in document["entries"]:
+        desk = Desk()
+        start = next(e for e in vn.load("commit")["entries"] if e["name"] == "good")["start"]
+        desk.memory.state = vn.flash_of(document, start)
+        desk.key = bytes.fromhex(start["K"])
+        desk.restart()
+        desk.open()
+        reply = desk.commit(dict(BLOCKS), bytes.fromhex(entry["teds"]))
+        assert reply.reason == entry["reason"], entry["name"]
+
+
+# -- NFC ---------------------------------------------------------------------------------------------------------------
+
+
+@cases("nfc_pieces")
+def test_nfc_messages_as_published(document: Entry, entry: Entry) -> None:
+    mailbox = Mailbox(entry["max_ndef"])
+    from teds_provision.node.nfc_tnep import TnepTag
+
+    tag = TnepTag(mailbox, TagHandler(node(entry["name"], entry["state"])), wt_int=20, n_wait=15)
+    tag.start()
+    shown = [mailbox.shown.get(timeout=10)]
+    for step in entry["steps"]:
+        assert len(step["message"]) // 2 <= entry["max_ndef"]
+        if step["by"] == "station":
+            shown.append(mailbox.write(bytes.fromhex(step["message"])))
+        else:
+            assert shown[-1].hex() == step["message"], step["note"]
+    tag.stop()
+
+
+@cases("nfc_pieces")
+def test_a_station_cuts_its_requests_as_published(document: Entry, entry: Entry) -> None:
+    requester, done = None, 0
+    for step, answer in zip(entry["steps"], entry["steps"][1:], strict=False):
+        if "command" in step:
+            first = piece_in(step)
+            assert first is not None
+            command = bytes.fromhex(step["command"])
+            requester, wanted = Requester(first.transaction, command, room(entry["max_ndef"])), step["reply"]
+        if requester is None or step["by"] != "station":
+            continue
+        assert piece_in(step) == requester.next(), step["note"]
+        taken = piece_in(answer)
+        assert taken is not None
+        assert requester.take(taken)
+        if requester.reply is not None:
+            assert requester.reply.hex() == wanted
+            requester, done = None, done + 1
+    assert requester is None
+    assert done == sum("command" in step for step in entry["steps"])
+
+
+def piece_in(step: Entry) -> Piece | None:
+    payload = tnep.external(message.decode(bytes.fromhex(step["message"])), tnep.TIM_TYPE)
+    return None if payload is None else Piece.decode(payload)
+
+
+def test_a_stranger_reads_the_initial_message() -> None:
+    import ndef
+
+    document = vn.load("nfc_pieces")
+    for entry in document["entries"]:
+        octets = bytes.fromhex(entry["steps"][0]["message"])
+        service, ident = ndef.message_decoder(octets, known_types={})
+        assert (service.type, ident.type) == ("urn:nfc:wkt:Tp", "urn:nfc:ext:teds-provision:id")
+        uri = b"urn:nfc:xsn:teds-provision:tim"
+        assert service.data == bytes([0x10, len(uri)]) + uri + bytes([0, 20, 15]) + entry["max_ndef"].to_bytes(2, "big")
+        assert ident.data[1:11].hex() == document["uuid"]
+
+
+# -- CAN ---------------------------------------------------------------------------------------------------------------
+
+
+def reassembled(steps: list[Entry], by: str, identifier: str) -> bytes:
+    """The one ISO-TP message of a sender, put together from ISO 15765-2 alone; checks number and padding."""
+    octets, length, number = b"", 0, 0
+    for step in steps:
+        data = bytes.fromhex(step["data"])
+        if step["by"] != by or step["id"] != identifier or data[0] >> 4 == 3:
+            continue
+        if data[0] >> 4 == 0:
+            start, length = (1, data[0]) if data[0] else (2, data[1])
+            octets = data[start:]
+        elif data[0] >> 4 == 1:
+            length, octets = (data[0] & 15) << 8 | data[1], data[2:]
+        else:
+            number = number + 1 & 15
+            assert data[0] == 0x20 | number
+            octets += data[1:]
+    assert set(octets[length:]) <= {0xCC}, "padding"
+    return octets[:length]
+
+
+@cases("can_frames")
+def test_can_frames_hold_the_published_command_and_reply(document: Entry, entry: Entry) -> None:
+    target, source = entry["node_address"], entry["station_address"]
+    to_node = f"18dbff{source:02x}" if entry.get("functional") else f"18da{target:02x}{source:02x}"
+    transaction = f"{entry['transaction']:02x}"
+    assert reassembled(entry["steps"], "station", to_node).hex() == transaction + entry["command"]
+    found = reassembled(entry["steps"], "node", f"18da{source:02x}{target:02x}")
+    assert found.hex() == transaction + entry["reply"]
+    for step in entry["steps"]:
+        assert len(step["data"]) == 16 or entry["fd"]
+
+
+@cases("can_frames")
+def test_our_ends_of_the_bus_send_the_published_frames(document: Entry, entry: Entry) -> None:
+    if entry.get("functional"):
+        return check_gathering(entry)
+    station, address, fd = entry["station_address"], entry["node_address"], entry["fd"]
+    sent: dict[str, list[Frame]] = {"station": [], "node": []}
+    ends = {
+        "station": Pair(station, address, sent["station"].append, fd=fd),
+        "node": Pair(address, station, sent["node"].append, fd=fd),
+    }
+    ends["station"].send(bytes([entry["transaction"]]) + bytes.fromhex(entry["command"]))
+    for step in entry["steps"]:
+        by, other = step["by"], "node" if step["by"] == "station" else "station"
+        for _ in range(40):
+            ends[by].run()
+            if sent[by]:
+                break
+        frame = sent[by].pop(0)
+        assert (f"{frame.identifier:08x}", frame.data.hex(), frame.fd) == (step["id"], step["data"], step["fd"])
+        ends[other].take(frame)
+        if ends["node"].received() is not None:
+            ends["node"].send(bytes([entry["transaction"]]) + bytes.fromhex(entry["reply"]))
+    answer = ends["station"].received()
+    assert answer is not None
+    assert answer[1:].hex() == entry["reply"]
+    return None
+
+
+def check_gathering(entry: Entry) -> None:
+    gathering = Gathering(entry["station_address"], entry["transaction"])
+    flows = []
+    for step in entry["steps"]:
+        frame = Frame(int(step["id"], 16), bytes.fromhex(step["data"]), step["fd"])
+        if step["by"] != "station":
+            flow = gathering.take(frame)
+            flows += [flow.data.hex()] if flow else []
+    published = [step["data"] for step in entry["steps"][1:] if step["by"] == "station"]
+    assert flows == published
+    assert bool(gathering.conflicts) == entry["conflict"]
+    if not entry["conflict"]:
+        assert gathering.answers == {entry["node_address"]: bytes.fromhex(entry["reply"])}
+
+
+def test_a_node_on_a_bus_answers_the_published_functional_identify() -> None:
+    import can
+
+    from teds_provision.node.can_server import CanServer
+
+    entry = vn.load("can_frames")["entries"][0]
+    server = CanServer("virtual:published-vectors", TagHandler(node(entry["name"])))
+    server.start()
+    try:
+        with can.Bus(interface="virtual", channel="published-vectors") as bus:
+            for step in entry["steps"]:
+                if step["by"] == "station":
+                    data = bytes.fromhex(step["data"])
+                    bus.send(can.Message(arbitration_id=int(step["id"], 16), data=data, is_extended_id=True))
+                else:
+                    got = bus.recv(timeout=5)
+                    assert got is not None
+                    assert (f"{got.arbitration_id:08x}", bytes(got.data).hex()) == (step["id"], step["data"])
+    finally:
+        server.stop()
+
+
+# -- handover ----------------------------------------------------------------------------------------------------------
+
+
+def trust_store(document: Entry, names: list[str]) -> dict[str, bytes]:
+    points = [bytes.fromhex(document["keys"][name]["P"]) for name in names]
+    return {fingerprint(each): each for each in points}
+
+
+@cases("handover")
+def test_bundles_open_or_are_refused_as_published(document: Entry, entry: Entry) -> None:
+    recipient = SoftwareKey(int(document["keys"][entry["recipient"]]["d"], 16))
+    now = datetime.fromisoformat(entry["now"])
+    outcome: Any = "opened"
+    try:
+        opened = open_bundle(entry["bundle"].encode(), recipient, trust_store(document, entry["trusted"]).get, now)
+    except TedsProvisionError as error:
+        outcome = error.exit_code
+    assert outcome == entry["outcome"], entry["note"]
+    if outcome != "opened":
+        return
+    told = entry["payload"]
+    assert (opened.bundle.id, opened.bundle.mode) == (told["id"], told["mode"])
+    assert [each.uuid.hex() for each in opened.bundle.nodes] == [each["uuid"] for each in told["nodes"]]
+    assert opened.bundle.nodes[0].key.hex() == "b42d833f8c86218d72b6baf189f57654"
+    assert opened.station_signature is not None
+    receipt = open_receipt(entry["receipt_jws"].encode(), trust_store(document, [entry["recipient"]]).get)
+    assert (receipt.id, receipt.bundle_sha256) == (told["id"], opened.sha256)
+
+
+@cases("handover")
+def test_another_jose_opens_every_good_bundle(document: Entry, entry: Entry) -> None:
+    if entry["outcome"] != "opened":
+        return
+    from jwcrypto import jwe, jwk, jws
+
+    def key(name: str, *, private: bool) -> Any:
+        held = SoftwareKey(int(document["keys"][name]["d"], 16))
+        from teds_provision.protocol.jwk import public_jwk
+        from teds_provision.protocol.strict_json import encode_base64url
+
+        members = public_jwk(held.point) | ({"d": encode_base64url(held.secret())} if private else {})
+        return jwk.JWK(**members)
+
+    token = jwe.JWE()
+    token.deserialize(entry["bundle"], key(entry["recipient"], private=True))
+    assert token.payload.decode() == entry["jws"]
+    signed = jws.JWS()
+    signed.deserialize(entry["jws"], key("station", private=False))
+    assert json.loads(signed.payload) == entry["payload"]
