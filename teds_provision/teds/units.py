@@ -18,13 +18,41 @@ from typing import TYPE_CHECKING, Any, Final
 
 from teds_provision.errors import BadData
 from teds_provision.teds.model import Units
+from teds_provision.teds.units_table import (
+    BASES,
+    LOG_RATIO,
+    NAME_OF,
+    NAMED,
+    PRODUCT,
+    RATIO,
+    ROWS,
+    SPECIAL,
+    SPECIAL_ROWS,
+    TABLE,
+    from_exponents,
+    units_of,
+)
 
 if TYPE_CHECKING:
     import pint
 
-PRODUCT, RATIO, LOG_PRODUCT, LOG_RATIO, DIGITAL, ARBITRARY = range(6)
+__all__ = [
+    "BASES",
+    "LOG_RATIO",
+    "PRODUCT",
+    "RATIO",
+    "WrittenUnit",
+    "display_unit",
+    "format_units",
+    "format_value",
+    "in_display_units",
+    "parse_seconds",
+    "parse_unit",
+    "parse_units",
+    "recognize",
+    "short_unit",
+]
 
-BASES: Final = ("radians", "steradians", "meters", "kilograms", "seconds", "amperes", "kelvins", "moles", "candelas")
 _SYMBOLS: Final = ("rad", "sr", "m", "kg", "s", "A", "K", "mol", "cd")
 _PINT_BASES: Final = {
     "radian": "radians",
@@ -65,133 +93,6 @@ class WrittenUnit:
         return value / abs(self.scale)
 
 
-def _from_exponents(interpretation: int, exponents: Mapping[str, Fraction]) -> Units:
-    rad, sr, m, kg, s, a, k, mol, cd = (exponents.get(base, Fraction(0)) for base in BASES)
-    return Units(interpretation, rad, sr, m, kg, s, a, k, mol, cd)
-
-
-def _units(interpretation: int = PRODUCT, **exponents: float) -> Units:
-    return _from_exponents(interpretation, {name: Fraction(value) for name, value in exponents.items()})
-
-
-_NEWTON = {"meters": 1, "kilograms": 1, "seconds": -2}
-_JOULE = {"meters": 2, "kilograms": 1, "seconds": -2}
-_WATT = {"meters": 2, "kilograms": 1, "seconds": -3}
-_PASCAL = {"meters": -1, "kilograms": 1, "seconds": -2}
-_VOLT = {"meters": 2, "kilograms": 1, "seconds": -3, "amperes": -1}
-_OHM = {"meters": 2, "kilograms": 1, "seconds": -3, "amperes": -2}
-_FARAD = {"meters": -2, "kilograms": -1, "seconds": 4, "amperes": 2}
-_HENRY = {"meters": 2, "kilograms": 1, "seconds": -2, "amperes": -2}
-_TESLA = {"kilograms": 1, "seconds": -2, "amperes": -1}
-
-_NAMED: Final[dict[str, Units]] = {
-    "rad": _units(radians=1),
-    "rad/s": _units(radians=1, seconds=-1),
-    "rad/s²": _units(radians=1, seconds=-2),
-    "sr": _units(steradians=1),
-    "m": _units(meters=1),
-    "m²": _units(meters=2),
-    "m³": _units(meters=3),
-    "m/s": _units(meters=1, seconds=-1),
-    "m/s²": _units(meters=1, seconds=-2),
-    "m³/s": _units(meters=3, seconds=-1),
-    "kg": _units(kilograms=1),
-    "kg/m³": _units(kilograms=1, meters=-3),
-    "s": _units(seconds=1),
-    "1/s": _units(seconds=-1),
-    "A": _units(amperes=1),
-    "K": _units(kelvins=1),
-    "mol": _units(moles=1),
-    "cd": _units(candelas=1),
-    "lm": _units(candelas=1, steradians=1),
-    "lx": _units(candelas=1, steradians=1, meters=-2),
-    "N": _units(**_NEWTON),
-    "N·m": _units(**_JOULE),
-    "N/m": _units(kilograms=1, seconds=-2),
-    "Pa": _units(**_PASCAL),
-    "W": _units(**_WATT),
-    "V": _units(**_VOLT),
-    "V/m": _units(**{**_VOLT, "meters": 1}),
-    "Ω": _units(**_OHM),
-    "F": _units(**_FARAD),
-    "H": _units(**_HENRY),
-    "T": _units(**_TESLA),
-    "Wb": _units(**{**_TESLA, "meters": 2}),
-    "C": _units(amperes=1, seconds=1),
-}
-_NAME_OF: Final = {units: name for name, units in _NAMED.items()}
-
-_DEGREE = math.pi / 180
-_TURN = 2 * math.pi
-_ROWS: Final = (
-    # spellings, name in _NAMED, scale, offset
-    ("degree degrees deg °", "rad", _DEGREE, 0.0),
-    ("degree/s deg/s °/s", "rad/s", _DEGREE, 0.0),
-    ("turn revolution rev", "rad", _TURN, 0.0),
-    ("mrad", "rad", 1e-3, 0.0),
-    ("rpm", "rad/s", _TURN / 60, 0.0),
-    ("rad/s^2", "rad/s²", 1.0, 0.0),
-    ("kN", "N", 1e3, 0.0),
-    ("mN", "N", 1e-3, 0.0),
-    ("kgf", "N", 9.80665, 0.0),
-    ("Nm N*m J", "N·m", 1.0, 0.0),
-    ("mNm mN*m mN·m", "N·m", 1e-3, 0.0),
-    ("nm", "m", 1e-9, 0.0),
-    ("um µm μm", "m", 1e-6, 0.0),
-    ("mm", "m", 1e-3, 0.0),
-    ("cm", "m", 1e-2, 0.0),
-    ("km", "m", 1e3, 0.0),
-    ("mm/s", "m/s", 1e-3, 0.0),
-    ("m/s^2 m/s**2", "m/s²", 1.0, 0.0),
-    ("g_n gn", "m/s²", 9.80665, 0.0),
-    ("g", "kg", 1e-3, 0.0),
-    ("mg", "kg", 1e-6, 0.0),
-    ("degC °C celsius", "K", 1.0, 273.15),
-    ("degF °F", "K", 5 / 9, 459.67 * 5 / 9),
-    ("ms", "s", 1e-3, 0.0),
-    ("us µs μs", "s", 1e-6, 0.0),
-    ("ns", "s", 1e-9, 0.0),
-    ("min", "s", 60.0, 0.0),
-    ("h", "s", 3600.0, 0.0),
-    ("Hz", "1/s", 1.0, 0.0),
-    ("kHz", "1/s", 1e3, 0.0),
-    ("MHz", "1/s", 1e6, 0.0),
-    ("mV", "V", 1e-3, 0.0),
-    ("uV µV μV", "V", 1e-6, 0.0),
-    ("mA", "A", 1e-3, 0.0),
-    ("mW", "W", 1e-3, 0.0),
-    ("kW", "W", 1e3, 0.0),
-    ("ohm", "Ω", 1.0, 0.0),
-    ("kohm kΩ", "Ω", 1e3, 0.0),
-    ("pF", "F", 1e-12, 0.0),
-    ("fF", "F", 1e-15, 0.0),
-    ("mT", "T", 1e-3, 0.0),
-    ("uT µT μT", "T", 1e-6, 0.0),
-    ("hPa mbar", "Pa", 1e2, 0.0),
-    ("kPa", "Pa", 1e3, 0.0),
-    ("MPa", "Pa", 1e6, 0.0),
-    ("bar", "Pa", 1e5, 0.0),
-)
-_TABLE: Final = {text: (name, scale, offset) for texts, name, scale, offset in _ROWS for text in texts.split()}
-_STRAIN: Final = _units(RATIO, meters=1)
-_SPECIAL_ROWS: Final = (
-    ("1 count counts LSB", _units(), 1.0, 0.0),
-    ("digital bit bits boolean state", _units(DIGITAL), 1.0, 0.0),
-    ("arbitrary a.u. arb", _units(ARBITRARY), 1.0, 0.0),
-    ("% percent", _units(RATIO), 0.01, 0.0),
-    ("ratio", _units(RATIO), 1.0, 0.0),
-    ("ppm", _units(RATIO), 1e-6, 0.0),
-    ("strain m/m mm/mm", _STRAIN, 1.0, 0.0),
-    ("microstrain ustrain µε um/m µm/m", _STRAIN, 1e-6, 0.0),
-    ("mV/V", _units(RATIO, **_VOLT), 1e-3, 0.0),
-    ("dB decibel", _units(LOG_RATIO), 0.1, 0.0),
-    ("dBm", _units(LOG_PRODUCT, **_WATT), 0.1, -3.0),
-)
-_SPECIAL: Final = {
-    text: (units, scale, offset) for texts, units, scale, offset in _SPECIAL_ROWS for text in texts.split()
-}
-
-
 @cache
 def parse_unit(text: str) -> WrittenUnit:
     """Read a unit as people write it: ``degree``, ``N``, ``mm``, ``degC``, ``1/s``, ``mV/V``, ``%``, ``count``.
@@ -201,13 +102,13 @@ def parse_unit(text: str) -> WrittenUnit:
     ``g_n`` the standard acceleration of free fall. Raises BadData naming the text and how to write it.
     """
     text = text.strip()
-    if text in _SPECIAL:
-        return WrittenUnit(text, *_SPECIAL[text])
-    if text in _NAMED:
-        return WrittenUnit(text, _NAMED[text])
-    if text in _TABLE:
-        name, scale, offset = _TABLE[text]
-        return WrittenUnit(text, _NAMED[name], scale, offset)
+    if text in SPECIAL:
+        return WrittenUnit(text, *SPECIAL[text])
+    if text in NAMED:
+        return WrittenUnit(text, NAMED[text])
+    if text in TABLE:
+        name, scale, offset = TABLE[text]
+        return WrittenUnit(text, NAMED[name], scale, offset)
     if not text:
         raise _unknown(text)
     return _ratio(text) or _by_pint(text)
@@ -265,7 +166,7 @@ def _by_pint(text: str) -> WrittenUnit:
     grams = float(out["kilograms"])  # pint's root unit is the gram
     offset = float(zero.m)
     return WrittenUnit(
-        text, _from_exponents(PRODUCT, out), (float(scale.m) - offset) * 1000.0**-grams, offset * 1000.0**-grams
+        text, from_exponents(PRODUCT, out), (float(scale.m) - offset) * 1000.0**-grams, offset * 1000.0**-grams
     )
 
 
@@ -283,7 +184,7 @@ def _representable(text: str, exponents: dict[str, Fraction]) -> None:
 
 
 def _unknown(text: str) -> BadData:
-    near = get_close_matches(text, [*_NAMED, *_TABLE, *_SPECIAL], n=1, cutoff=0.6)
+    near = get_close_matches(text, [*NAMED, *TABLE, *SPECIAL], n=1, cutoff=0.6)
     guess = f'Did you mean "{near[0]}"? ' if near else ""
     return BadData(
         f'"{text}" is not a unit.', hint=f'{guess}Write it like "degree", "N", "mm", "degC", "m/s²", "mV/V" or "count".'
@@ -317,7 +218,7 @@ def format_units(units: Units) -> str:
     """
     exponents = {base: getattr(units, base) for base in BASES}
     plain = Units(**exponents)
-    name = _NAME_OF.get(plain) or _product(plain)
+    name = NAME_OF.get(plain) or _product(plain)
     if units.extension not in (0, 128):
         name = f"{name} (unit extension TEDS {units.extension})".strip()
     match units.interpretation:
@@ -338,12 +239,12 @@ def format_units(units: Units) -> str:
 
 
 _FRIENDLY: Final = {
-    _NAMED["rad"]: "degree",
-    _NAMED["rad/s"]: "degree/s",
-    _NAMED["K"]: "degC",
-    _units(RATIO): "%",
-    _units(LOG_RATIO): "dB",
-    _SPECIAL["dBm"][0]: "dBm",
+    NAMED["rad"]: "degree",
+    NAMED["rad/s"]: "degree/s",
+    NAMED["K"]: "degC",
+    units_of(RATIO): "%",
+    units_of(LOG_RATIO): "dB",
+    SPECIAL["dBm"][0]: "dBm",
 }
 _SHORT: Final = {
     "degree": "°",
@@ -419,9 +320,9 @@ def parse_seconds(value: object) -> float:
     if not text or text in _TIMES:
         return number * _TIMES.get(text, 1.0)
     unit = parse_unit(text)
-    if unit.units == _NAMED["s"]:
+    if unit.units == NAMED["s"]:
         return unit.to_si(number)
-    if unit.units == _NAMED["1/s"] and number:
+    if unit.units == NAMED["1/s"] and number:
         return 1.0 / unit.to_si(number)
     raise BadData(
         f'"{value}" is not a time: {text} is no unit of time.', hint='Write it like "100 us", "5 s" or "10 kHz".'
@@ -441,10 +342,10 @@ def recognize(units: Units, scale: float, offset: float) -> WrittenUnit:
 
     if close(scale, 1.0) and offset == 0:
         return WrittenUnit(format_units(units), units)
-    for texts, name, its_scale, its_offset in _ROWS:
-        if _NAMED[name] == units and close(scale, its_scale) and close(offset, its_offset):
+    for texts, name, its_scale, its_offset in ROWS:
+        if NAMED[name] == units and close(scale, its_scale) and close(offset, its_offset):
             return WrittenUnit(_SHORT.get(texts.split()[0], texts.split()[0]), units, its_scale, its_offset)
-    for texts, special, its_scale, its_offset in _SPECIAL_ROWS:
+    for texts, special, its_scale, its_offset in SPECIAL_ROWS:
         if special == units and close(scale, its_scale) and close(offset, its_offset):
             return WrittenUnit(texts.split()[0], units, its_scale, its_offset)
     name = f"× {scale:.7g} {format_units(units)}".strip()

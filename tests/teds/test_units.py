@@ -99,7 +99,7 @@ def test_counts_are_the_plain_product_of_nothing() -> None:
 
 def test_the_table_agrees_with_pint() -> None:
     ours_only = {"rev", "Nm", "mNm", "N m", "gn", "counts", "LSB"}  # pint reads Nm as a textile count, rev not at all
-    for text in [*u._TABLE, *u._NAMED]:
+    for text in [*u.TABLE, *u.NAMED]:
         if text in ours_only:
             continue
         by_pint = u._by_pint(text)
