@@ -174,6 +174,7 @@ def _parameters(fd: bool) -> dict[str, Any]:
         "stmin": 0,
         "blocksize": BLOCK_SIZE,
         "tx_padding": PADDING,
+        "tx_data_min_length": 8,
         "max_frame_size": LONGEST,
         "tx_data_length": 64 if fd else 8,
         "can_fd": fd,
