@@ -76,10 +76,20 @@ def build(app: App, uuid: str, order: Any, output: Path | None, edition: str, ye
         {"access_code": code, "channel": channel, "octets": len(teds), "sha256": hashlib.sha256(teds).hexdigest()}
         for (channel, code), teds in sorted(built.image.blocks.items())
     ]
+    from teds_provision.teds.calibration import describe_calibration, sentence
+
+    calibrations = [describe_calibration(calibration) for calibration in built.calibrations.values()]
+    fits = "".join(f"\n  {sentence(calibration)}" for calibration in built.calibrations.values())
     lines = [f"{b['access_code']:>4}  channel {b['channel']:<3} {b['octets']:>5} octets" for b in blocks]
     app.emit(
-        {"uuid": octets.hex(), "profile": built.profile, "blocks": blocks, "warnings": list(built.warnings)},
-        f"Built {octets.hex()} as {built.profile}:\n" + "\n".join(lines),
+        {
+            "uuid": octets.hex(),
+            "profile": built.profile,
+            "blocks": blocks,
+            "warnings": list(built.warnings),
+            "calibrations": calibrations,
+        },
+        f"Built {octets.hex()} as {built.profile}:\n" + "\n".join(lines) + fits,
     )
 
 

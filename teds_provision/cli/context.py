@@ -65,6 +65,8 @@ class App:
             console = self.console()
             if callable(human):
                 human(console)
+            elif isinstance(human, str):
+                console.print(human, markup=False)
             else:
                 console.print(human)
 
@@ -116,7 +118,7 @@ class App:
         """Get a passphrase or PIN: from --passphrase-fd (one line, read once), else from the terminal."""
         if self._passphrase_fd is not None:
             if self._passphrase is None:
-                self._passphrase = _read_line(self._passphrase_fd)
+                self._passphrase = read_line(self._passphrase_fd)
             return self._passphrase
         if self.no_input or not sys.stdin.isatty():
             raise WrongPassphrase(
@@ -147,13 +149,14 @@ class App:
         App.current = None
 
 
-def _read_line(descriptor: int) -> str:
+def read_line(descriptor: int) -> str:
+    """Read a secret: one line of a file descriptor; raises UsageFailure (not readable), WrongPassphrase (empty)."""
     try:
         with os.fdopen(os.dup(descriptor), "rb") as stream:
             line = stream.readline(4096)
     except OSError as error:
         raise UsageFailure(f"--passphrase-fd {descriptor} cannot be read: {error.strerror}.") from error
-    text = line.decode(errors="strict").rstrip("\r\n")
+    text = line.decode(errors="surrogateescape").rstrip("\r\n")
     if not text:
         raise WrongPassphrase(f"--passphrase-fd {descriptor} gave an empty line.")
     return text

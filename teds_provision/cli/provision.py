@@ -140,18 +140,19 @@ def _tell(app: App, done: Provisioned) -> None:
 
 
 def _summary(console: Console, done: Provisioned) -> None:
+    from rich.markup import escape
     from rich.table import Table
 
     from teds_provision.workflow.summary import summarise
 
     summary = summarise(done.image)
     table = Table(show_header=False, box=None, pad_edge=False)
-    table.add_row("node", f"[bold]{summary.name or '(no name)'}[/]")
+    table.add_row("node", f"[bold]{escape(summary.name or '(no name)')}[/]")
     table.add_row("UUID", done.who.uuid.hex())
     table.add_row("key", done.who.fingerprint[:16])
     for channel in summary.channels:
         calibrated = ", calibrated" if channel.calibrated else ""
-        table.add_row(f"channel {channel.number}", f"{channel.name}  {channel.range}{calibrated}".strip())
+        table.add_row(f"channel {channel.number}", f"{escape(channel.name)}  {channel.range}{calibrated}".strip())
     verdict = done.verified.verdict
     table.add_row("verdict", f"[bold {'green' if verdict == 'authentic' else 'red'}]{verdict}[/]")
     console.print(table)

@@ -78,12 +78,13 @@ def _node(app: App, what: str, links: LinkSettings) -> tuple[Image, Verified]:
 
 
 def _table(console: Console, verified: Verified) -> None:
+    from rich.markup import escape
     from rich.table import Table
 
     style = {"passed": "green", "failed": "bold red", "skipped": "dim"}
     table = Table("check", "result", "found", box=None, pad_edge=False)
     for check in verified.checks:
-        table.add_row(check.name, f"[{style[check.result]}]{check.result}[/]", check.why)
+        table.add_row(check.name, f"[{style[check.result]}]{check.result}[/]", escape(check.why))
     console.print(table)
     colour = "bold green" if verified.verdict == "authentic" else "bold red"
     console.print(f"[{colour}]{verified.uuid.hex()}: {verified.verdict}[/]")

@@ -11,6 +11,7 @@ from teds_provision.protocol.identity import NodeState
 from teds_provision.store import WhitelistEntry
 from teds_provision.workflow.conversation import Conversation, SessionLost
 from teds_provision.workflow.identify import Identified
+from teds_provision.workflow.journal import recorded
 from teds_provision.workflow.reading import read_identity
 from teds_provision.workflow.station import NodeKey, Station
 
@@ -91,6 +92,7 @@ def unknown_key(uuid: bytes) -> PolicyRefused:
     )
 
 
+@recorded("agree")
 def agree(station: Station, node: Conversation, who: Identified, *, rotate: bool = False) -> Agreed:
     """End with a session open under an agreed key: the present one, or a new one.
 

@@ -3,18 +3,20 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from teds_provision.errors import BadData, NotFound, UsageFailure
 from teds_provision.store import Draft
 from teds_provision.teds.image import SECURITY, BlockId, Image
+from teds_provision.workflow.journal import recorded
 from teds_provision.workflow.sign import known_image, known_node_keys, unsigned_security
 from teds_provision.workflow.station import Station
 
 if TYPE_CHECKING:
     from teds_provision.teds.calibration import Calibration
+    from teds_provision.teds.profile import Profile
 
 CALIBRATION = 5
 
@@ -40,8 +42,10 @@ class Built:
     image: Image
     profile: str
     warnings: tuple[str, ...]
+    calibrations: Mapping[int, Calibration] = field(default_factory=dict)
 
 
+@recorded("build")
 def build(
     station: Station,
     uuid: bytes,
@@ -74,18 +78,18 @@ def build(
     made = profile.build(uuid, calibration=calibrations, name=name, edition=edition)  # type: ignore[arg-type]
     image = Image(uuid, {**(keep or {}), **made.blocks})
     warnings += made.warnings
-    warnings += guard(station, image, has, order.accept_calibration, profile=profile)
+    warnings += guard(station, image, has, order.accept_calibration, calibrations=calibrations, profile=profile)
     try:
         image = image.with_block(SECURITY, unsigned_security(station, known_node_keys(station, uuid, has), image))
     except NotFound:
         warnings += ("The node's key is not known yet: the Security TEDS is added when it was identified.",)
     if not keep_draft:
-        return Built(image, profile.name, warnings)
+        return Built(image, profile.name, warnings, calibrations)
     with station.store.transaction():
         station.remember(uuid, profile=wanted, name=name)
         station.store.put_draft(Draft(uuid, image.to_json(), "built", wanted))
         station.audit("build", uuid, "done", profile=profile.name, teds=image.digest())
-    return Built(image, profile.name, warnings)
+    return Built(image, profile.name, warnings, calibrations)
 
 
 def _pending(station: Station, uuid: bytes, has: Image | None) -> Image | None:
@@ -110,34 +114,36 @@ def _sequence(image: Image | None) -> int:
 
 
 def _calibrations(
-    order: BuildOrder, profile: object, has: Image | None
+    order: BuildOrder, profile: Profile, has: Image | None
 ) -> tuple[dict[int, Calibration], tuple[str, ...]]:
-    from teds_provision import teds
-    from teds_provision.teds.calibration import Calibration, load_calibrations
+    from teds_provision.teds.calibration import calibrations_of, load_calibrations
 
     if order.calibration is not None:
         if not order.calibration.is_file():
             raise NotFound(f"There is no calibration file {order.calibration}.")
-        return load_calibrations(order.calibration, profile), ()  # type: ignore[arg-type]
+        return load_calibrations(order.calibration, profile), ()
     if order.drop_calibration or has is None:
         return {}, ()
-    kept: dict[int, Calibration] = {}
-    for channel, access_code in has:
-        if access_code == CALIBRATION and channel:
-            kept[channel] = Calibration.from_decoded(teds.decode(has.blocks[channel, access_code]))
+    kept = calibrations_of(has.blocks)
     numbers = ", ".join(map(str, kept))
     return kept, (f"The calibration that was given before is kept (channel {numbers}).",) if kept else ()
 
 
 def guard(
-    station: Station, image: Image, has: Image | None, accepted: str | None, *, profile: object | None = None
+    station: Station,
+    image: Image,
+    has: Image | None,
+    accepted: str | None,
+    *,
+    calibrations: Mapping[int, Calibration] | None = None,
+    profile: Profile | None = None,
 ) -> tuple[str, ...]:
     """Refuse a calibration that would hurt (exit 6), unless someone said why it is right; returns warnings."""
     from teds_provision.errors import PolicyRefused
     from teds_provision.teds.guard import check_calibration
 
     old = has.unsigned_blocks() if has is not None else None
-    findings = check_calibration(image.unsigned_blocks(), old, profile=profile)  # type: ignore[arg-type]
+    findings = check_calibration(image.unsigned_blocks(), old, profile, calibrations=calibrations)  # type: ignore[arg-type]
     errors = [f"channel {finding.channel}: {finding.message}" for finding in findings if finding.severity == "error"]
     if errors and accepted is None:
         more = f" (and {len(errors) - 1} more)" if len(errors) > 1 else ""

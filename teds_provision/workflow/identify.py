@@ -13,6 +13,7 @@ from teds_provision.store import WhitelistEntry, utc_now
 from teds_provision.teds import security
 from teds_provision.teds.image import SECURITY, Image
 from teds_provision.workflow.conversation import Conversation
+from teds_provision.workflow.journal import recorded
 from teds_provision.workflow.reading import read_block
 from teds_provision.workflow.station import Station
 
@@ -49,6 +50,7 @@ def prove(node: Conversation, point: bytes) -> None:
         )
 
 
+@recorded("identify")
 def identify(station: Station, node: Conversation) -> Identified:
     """Read UUID and key, demand the proof, and hold both against what this station knows.
 
@@ -103,6 +105,11 @@ def describe(node: Conversation) -> Description:
         except NodeRefused:
             continue
         found, count = decoded.get("TCName"), decoded.get("MaxChan")
-        name = found if isinstance(found, str) else name
+        name = printable(found) if isinstance(found, str) else name
         channels = count if isinstance(count, int) else channels
     return Description(name, channels)
+
+
+def printable(text: str) -> str:
+    """A name as a node gives it, without the characters that steer a terminal."""
+    return "".join(character if character.isprintable() else "\N{REPLACEMENT CHARACTER}" for character in text)

@@ -18,6 +18,7 @@ from teds_provision.workflow.agree import Agreed, agree
 from teds_provision.workflow.build import BuildOrder, Built, build
 from teds_provision.workflow.conversation import Conversation
 from teds_provision.workflow.identify import Identified, identify, prove
+from teds_provision.workflow.journal import recorded
 from teds_provision.workflow.progress import DONE, NOTHING, Reporter, StepResult, Steps
 from teds_provision.workflow.reading import Survey, read_identity, survey
 from teds_provision.workflow.sign import Signed, sign
@@ -40,6 +41,7 @@ class Provisioned:
     warnings: tuple[str, ...]
 
 
+@recorded("provision")
 def provision(
     station: Station, node: Conversation, order: BuildOrder, *, accept: Accept, reporter: Reporter
 ) -> Provisioned:
@@ -56,16 +58,6 @@ class _Run:
         self.steps = Steps(reporter)
 
     def run(self) -> Provisioned:
-        row = self.station.store.begin_step(self.node.uuid, "provision")
-        result = "failed"
-        try:
-            done = self._run()
-            result = done.verified.verdict
-            return done
-        finally:
-            self.station.store.end_step(row, result)
-
-    def _run(self) -> Provisioned:
         who = self._identify()
         self._whitelist(who)
         self._agree(who)
@@ -138,6 +130,7 @@ class _Run:
         return verified
 
 
+@recorded("verify")
 def verify_node(station: Station, node: Conversation, image: Image, point: bytes) -> Verified:
     """Check what was read off a node, have it prove its key, and record the verdict. Raises only for the link."""
     identity = read_identity(node) if node.sealed else None

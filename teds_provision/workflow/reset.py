@@ -12,6 +12,7 @@ from teds_provision.protocol.keys import reset_message, verify
 from teds_provision.workflow.agree import require_session
 from teds_provision.workflow.conversation import Conversation, SessionLost
 from teds_provision.workflow.identify import CHALLENGE_OCTETS, Identified
+from teds_provision.workflow.journal import recorded
 from teds_provision.workflow.reading import read_identity
 from teds_provision.workflow.station import Station
 
@@ -25,6 +26,7 @@ class ResetReceipt:
     proof: bytes
 
 
+@recorded("reset")
 def reset_node(station: Station, node: Conversation, who: Identified) -> ResetReceipt:
     """Reset in a session; a node that is in factory state already gives the same proof plainly.
 

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 from teds_provision import teds
 from teds_provision.teds.image import Image
+from teds_provision.workflow.identify import printable
 
 NAME, CHANNEL, CALIBRATION = 12, 3, 5
 
@@ -38,7 +39,7 @@ def summarise(image: Image) -> Summary:
 def _name(image: Image, channel: int) -> str | None:
     octets = image.blocks.get((channel, NAME))
     found = teds.decode(octets).get("TCName") if octets is not None else None
-    return found if isinstance(found, str) else None
+    return printable(found) if isinstance(found, str) else None
 
 
 def _channel(image: Image, channel: int) -> ChannelSummary:

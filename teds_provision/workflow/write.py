@@ -12,6 +12,7 @@ from teds_provision.protocol.frames import Reason, update_teds, write_teds
 from teds_provision.teds import security
 from teds_provision.teds.image import SECURITY, BlockId, Image
 from teds_provision.workflow.conversation import Conversation, SessionLost
+from teds_provision.workflow.journal import recorded
 from teds_provision.workflow.reading import read_block, read_identity, read_image
 from teds_provision.workflow.sign import known_image, node_keys_of, sign
 from teds_provision.workflow.station import Station
@@ -32,6 +33,7 @@ class Written:
     on_node: Image
 
 
+@recorded("write")
 def write(
     station: Station, node: Conversation, image: Image, *, has: Image | None = None, progress: Progress | None = None
 ) -> Written:
