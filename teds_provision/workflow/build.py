@@ -143,7 +143,7 @@ def guard(
     from teds_provision.teds.guard import check_calibration
 
     old = has.unsigned_blocks() if has is not None else None
-    findings = check_calibration(image.unsigned_blocks(), old, profile, calibrations=calibrations)  # type: ignore[arg-type]
+    findings = check_calibration(image.unsigned_blocks(), old, profile, calibrations=calibrations)
     errors = [f"channel {finding.channel}: {finding.message}" for finding in findings if finding.severity == "error"]
     if errors and accepted is None:
         more = f" (and {len(errors) - 1} more)" if len(errors) > 1 else ""

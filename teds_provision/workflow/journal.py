@@ -27,7 +27,7 @@ def recorded(
     ) -> Callable[Concatenate[Station, Target, Rest], Result]:
         @wraps(work)
         def run(station: Station, target: Target, /, *args: Rest.args, **rest: Rest.kwargs) -> Result:
-            uuid = target.uuid if isinstance(target, Conversation) else target
+            uuid: bytes = getattr(target, "uuid", target)
             row = station.store.begin_step(uuid, step)
             result = "interrupted"
             try:
