@@ -1,0 +1,37 @@
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from tests.workflow.bench import make_station
+
+from .desk import Desk, Node, Station
+
+
+@pytest.fixture(scope="session")
+def prepared(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Homes of two owners' stations, with passphrase vaults at the lowest cost."""
+    folder = tmp_path_factory.mktemp("stations")
+    for name in ("bench", "rival"):
+        make_station(folder / name, name).close()
+    return folder
+
+
+@pytest.fixture
+def desk(tmp_path: Path, prepared: Path) -> Iterator[Desk]:
+    desk = Desk(tmp_path, prepared)
+    yield desk
+    desk.clear()
+
+
+@pytest.fixture
+def station(desk: Desk) -> Station:
+    return desk.station()
+
+
+@pytest.fixture
+def node(desk: Desk) -> Node:
+    """A new node that is not powered yet."""
+    return desk.node()

@@ -1,0 +1,284 @@
+"""A desk for whole runs: stations that are driven by command line, nodes in processes of their own, real links."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import selectors
+import signal
+import socket
+import sqlite3
+import subprocess
+import sys
+import time
+from contextlib import closing
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from tests.cli.shell import Outcome, clean_environment
+from tests.workflow.bench import PASSPHRASE
+
+ROOT = Path(__file__).resolve().parents[2]
+PROGRAM = (sys.executable, "-m", "teds_provision")
+ANGLE = "magnetic-angular-position-sensor"
+FINGER = "tactile-finger-sensor"
+WATCHED = 25.0
+_TIMES = re.compile(r"\d{4}-\d\d-\d\dT[\d:.]+Z?")
+
+
+def free_port() -> int:
+    """A UDP port of 127.0.0.1 that nobody has."""
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+        probe.bind(("127.0.0.1", 0))
+        return int(probe.getsockname()[1])
+
+
+@dataclass(frozen=True)
+class Links:
+    """A reader and a bus that nobody else uses."""
+
+    nfc: str = field(default_factory=lambda: f"udp:localhost:{free_port()}")
+    can: str = field(default_factory=lambda: f"udp_multicast:239.74.163.2?port={free_port()}")
+
+    def over(self, via: str) -> list[str]:
+        """The user's options for one of them."""
+        return ["--via", "nfc", "--nfc", self.nfc] if via == "nfc" else ["--via", "can", "--can", self.can]
+
+
+class Running:
+    """A process whose lines are waited for; ended by its id at the latest when the test ends."""
+
+    def __init__(
+        self,
+        *words: object,
+        passphrase: str | None = None,
+        environment: dict[str, str] | None = None,
+        cwd: Path = ROOT,
+        program: tuple[str, ...] = PROGRAM,
+    ) -> None:
+        read, write = os.pipe()
+        given = [] if passphrase is None else ["--passphrase-fd", str(read)]
+        os.write(write, (passphrase or "").encode() + b"\n")
+        os.close(write)
+        try:
+            self.process = subprocess.Popen(
+                [*program, *given, *map(str, words)],
+                stdin=subprocess.DEVNULL,
+                stdout=subprocess.PIPE,
+                stderr=subprocess.PIPE,
+                pass_fds=(read,),
+                env=environment or clean_environment(),
+                cwd=cwd,
+            )
+        finally:
+            os.close(read)
+        self.out = self.err = ""
+        self._selector = selectors.DefaultSelector()
+        for stream in (self.process.stdout, self.process.stderr):
+            assert stream is not None
+            os.set_blocking(stream.fileno(), False)
+            self._selector.register(stream, selectors.EVENT_READ)
+
+    def read(self, seconds: float) -> bool:
+        """Take in what came within ``seconds``; False where there was nothing."""
+        came = False
+        for key, _ in self._selector.select(seconds):
+            octets = os.read(key.fd, 65536)
+            came = came or bool(octets)
+            if not octets:
+                self._selector.unregister(key.fileobj)
+            elif key.fileobj is self.process.stdout:
+                self.out += octets.decode()
+            else:
+                self.err += octets.decode()
+        return came
+
+    def wait_for(self, text: str, seconds: float = WATCHED) -> None:
+        """Wait until ``text`` stands on stdout or stderr."""
+        until = time.monotonic() + seconds
+        while text not in self.out + self.err:
+            assert time.monotonic() < until, f"no {text!r} in {self.out!r} {self.err!r}"
+            if not self._selector.get_map():
+                raise AssertionError(f"ended without {text!r}: {self.out!r} {self.err!r}")
+            self.read(0.1)
+
+    def wait_for_lines(self, count: int, seconds: float = WATCHED) -> list[Any]:
+        """Wait for ``count`` lines of JSON on stdout and return them."""
+        until = time.monotonic() + seconds
+        while self.out.count("\n") < count:
+            assert time.monotonic() < until, f"not {count} lines: {self.out!r} {self.err!r}"
+            assert self._selector.get_map(), f"ended before line {count}: {self.out!r} {self.err!r}"
+            self.read(0.1)
+        return [json.loads(line) for line in self.out.splitlines()]
+
+    def end(self, seconds: float = WATCHED) -> Outcome:
+        """Wait for its end by itself."""
+        until = time.monotonic() + seconds
+        while self._selector.get_map() and time.monotonic() < until:
+            self.read(0.1)
+        code = self.process.wait(max(0.1, until - time.monotonic()))
+        return Outcome(code, self.out, self.err)
+
+    def signal(self, number: int) -> None:
+        """Send it a signal."""
+        self.process.send_signal(number)
+
+    def close(self) -> None:
+        """End it, whatever it does."""
+        if self.process.poll() is None:
+            self.process.kill()
+        self.process.wait(10)
+        self._selector.close()
+        for stream in (self.process.stdout, self.process.stderr):
+            assert stream is not None
+            stream.close()
+
+
+class Desk:
+    """Where the processes of one test run; every one of them is gone afterwards."""
+
+    def __init__(self, folder: Path, prepared: Path) -> None:
+        self.folder = folder
+        self.prepared = prepared
+        self.links = Links()
+        self.running: list[Running] = []
+
+    def start(self, *words: object, **more: Any) -> Running:
+        """Start the program."""
+        self.running.append(Running(*words, **more))
+        return self.running[-1]
+
+    def clear(self) -> None:
+        """End all that runs."""
+        for process in self.running:
+            process.close()
+
+    def station(self, name: str = "bench") -> Station:
+        """A station with keys of its own, prepared once and copied for each test."""
+        home = self.folder / name
+        subprocess.run(["cp", "-a", str(self.prepared / name), str(home)], check=True)
+        return Station(self, home)
+
+    def node(self, name: str = "node", *, uuid: str | None = None, called: str = "") -> Node:
+        """A new node in factory state, made by command."""
+        folder = self.folder / name
+        words = ["--json", "node", "create", folder, *(["--uuid", uuid] if uuid else []), "--name", called]
+        made = self.start(*words).end()
+        assert made.code == 0, made
+        return Node(self, folder, made.json["uuid"])
+
+
+@dataclass
+class Node:
+    """A virtual transducer; its process lies on the desk's reader and hangs on its bus, as far as it is told to."""
+
+    desk: Desk
+    folder: Path
+    uuid: str
+    process: Running | None = None
+
+    def start(self, *options: object, nfc: bool = True, can: bool = False) -> Node:
+        """Power on, and wait until its links are up."""
+        links = self.desk.links
+        where = [*(["--nfc", links.nfc] if nfc else []), *(["--can", links.can] if can else [])]
+        self.process = self.desk.start("--json", "node", "run", self.folder, *where, *options)
+        (ready,) = self.process.wait_for_lines(1)
+        assert ready["ready"] is True
+        return self
+
+    def stop(self) -> None:
+        """Take it away politely."""
+        assert self.process is not None
+        self.process.signal(signal.SIGTERM)
+        assert self.process.end().code == 0
+
+    def kill(self) -> None:
+        """Cut its power."""
+        assert self.process is not None
+        self.process.process.kill()
+        self.process.end()
+
+    def press(self) -> None:
+        """Hold its button, and wait until it is in factory state."""
+        assert self.process is not None
+        self.process.signal(signal.SIGUSR1)
+        until = time.monotonic() + 5
+        while self.flash["key"] is not None:
+            assert time.monotonic() < until
+            time.sleep(0.02)
+
+    @property
+    def octets(self) -> bytes:
+        """Its whole flash file."""
+        return (self.folder / "flash.json").read_bytes()
+
+    @property
+    def flash(self) -> dict[str, Any]:
+        """What stands in its flash."""
+        return dict(json.loads(self.octets)["flash"])
+
+    @property
+    def datasheet(self) -> dict[tuple[int, int], bytes]:
+        """Its TEDS by (channel, access code)."""
+        return {(channel, code): bytes.fromhex(teds) for channel, code, teds in self.flash["blocks"]}
+
+
+@dataclass
+class Station:
+    """A base station: its home, and every command as a process of its own."""
+
+    desk: Desk
+    home: Path
+    passphrase: str | None = PASSPHRASE
+
+    def start(self, *words: object, **more: Any) -> Running:
+        """Start a command."""
+        return self.desk.start("--home", self.home, *words, passphrase=self.passphrase, **more)
+
+    def run(self, *words: object, **more: Any) -> Outcome:
+        """Run a command to its end."""
+        return self.start(*words, **more).end(40)
+
+    def ask(self, *words: object, code: int = 0, **more: Any) -> Any:
+        """Run a command with --json to its end; its one object. The exit code must be ``code``."""
+        outcome = self.run("--json", *words, **more)
+        assert outcome.code == code, outcome
+        return outcome.json
+
+    def refuses(self, *words: object, code: int) -> dict[str, str]:
+        """Run a command with --json that must fail with ``code``; what it says."""
+        said = self.ask(*words, code=code)
+        assert set(said) == {"error"}
+        assert set(said["error"]) == {"code", "message", "hint"}
+        assert said["error"]["message"].endswith((".", "?", "!")), said
+        return dict(said["error"])
+
+    def provision(self, via: str = "nfc", *more: object, code: int = 0) -> Any:
+        """All of it in one, over one of the desk's links."""
+        return self.ask("provision", *more, "--yes", *self.desk.links.over(via), code=code)
+
+    def tables(self, *, without: tuple[str, ...] = ()) -> dict[str, list[Any]]:
+        """Every row of the store by table; moments (which differ between runs) are blanked out."""
+        with closing(sqlite3.connect(f"file:{self.home}/store.sqlite3?mode=ro", uri=True)) as database:
+            names = [name for (name,) in database.execute("SELECT name FROM sqlite_master WHERE type = 'table'")]
+            wanted = [name for name in names if not name.startswith("sqlite_") and name not in without]
+            tables = {name: [_blank(row) for row in database.execute(f"SELECT * FROM {name}")] for name in wanted}
+        if "audit" in without:
+            tables["meta"] = [row for row in tables["meta"] if row[0] != "audit-head"]
+        return tables
+
+    def keys(self, uuid: str) -> list[tuple[str, int]]:
+        """State and epoch of every key that is held for a node."""
+        (node,) = self.ask("nodes", uuid)["nodes"]
+        return [(key["state"], key["epoch"]) for key in node["keys"]]
+
+
+def _blank(row: tuple[Any, ...]) -> tuple[Any, ...]:
+    return tuple("(moment)" if isinstance(value, str) and _TIMES.fullmatch(value) else value for value in row)
+
+
+def results(done: Any) -> dict[str, str]:
+    """Result of each step of a provisioning."""
+    return {step["name"]: step["result"] for step in done["steps"]}
