@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterable
 from math import isinf, isnan
 from typing import Final
 
-from teds_provision.teds.model import Field, Units
+from teds_provision.teds.model import Field, TimeInstance, Units
 from teds_provision.teds.tables import FieldSpec, Table
 
 Find = Callable[..., None]
@@ -51,6 +51,8 @@ def _values(fields: Iterable[Field], spec_of: Callable[[int], FieldSpec | None],
                 _enumeration(field, spec, find)
         elif value.__class__ is Units:
             _interpretation(field, find)
+        elif value.__class__ is TimeInstance:
+            _time(field, find)
         elif value.__class__ is str or value.__class__ is bytes:
             _text(field, spec_of(field.type), find)
 
@@ -102,6 +104,12 @@ def _interpretation(field: Field, find: Find) -> None:
     if units.interpretation in (4, 5) and units != Units(units.interpretation, extension=units.extension):
         message = f"{field.name} is digital data or arbitrary and yet has exponents."
         find("warning", "units", message, field.offset, field.name, "no exponents", "some")
+
+
+def _time(field: Field, find: Find) -> None:
+    if isinstance(field.value, TimeInstance) and field.value.nanoseconds > 999_999_999:
+        message = f"{field.name} has {field.value.nanoseconds} nanoseconds, a second or more."
+        find("warning", "time", message, field.offset, field.name, "<= 999999999", field.value.nanoseconds)
 
 
 def _text(field: Field, spec: FieldSpec | None, find: Find) -> None:

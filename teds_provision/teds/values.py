@@ -198,9 +198,9 @@ def write_instant(spec: FieldSpec, value: object, edition: Edition) -> bytes:
         value = _split_seconds(spec, value)
     if not isinstance(value, TimeInstance):
         raise _refuse(spec.name, f"is a time, not {shown(value)}")
-    if not 0 <= value.nanoseconds < 1 << 31:
-        raise _refuse(spec.name, f"has {value.nanoseconds} nanoseconds")
     long = edition == 2024 and spec.kind == "instant"
+    if not 0 <= value.nanoseconds < 1 << (32 if long else 31):
+        raise _refuse(spec.name, f"has {value.nanoseconds} nanoseconds")
     if long and value.negative:
         raise _refuse(spec.name, "cannot lie before 1970 in the 2024 form")
     bits = 48 if long else 32

@@ -66,6 +66,14 @@ def test_times_before_1970_and_after_2106() -> None:
     assert [finding.code for finding in to(octets, 2007)[1]] == ["lost"]
 
 
+def test_nanoseconds_beyond_a_second_are_kept_and_warned_about() -> None:
+    block = bytes.fromhex("030400050101" + "0a0a" + "00006955b900" + "b65fffff")
+    decoded = teds.decode(frame(block))
+    assert decoded.get("LstCalDt") == teds.TimeInstance(0x6955B900, 0xB65FFFFF)
+    assert "time" in {finding.code for finding in decoded.findings}
+    assert teds.recompose(decoded) == frame(block)
+
+
 def test_sub_family_is_lost() -> None:
     octets = teds.compose(12, {"Format": 0, "TCName": "x", "TEDSID": {"subfamily": 4}}, edition=2024)
     assert [finding.code for finding in to(octets, 2007)[1]] == ["lost"]
