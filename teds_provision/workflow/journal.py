@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import wraps
-from typing import Concatenate, ParamSpec, TypeVar
+from typing import Any, Concatenate, ParamSpec, TypeVar, cast
 
 from teds_provision.errors import TedsProvisionError
 from teds_provision.workflow.conversation import Conversation
@@ -27,7 +27,7 @@ def recorded(
     ) -> Callable[Concatenate[Station, Target, Rest], Result]:
         @wraps(work)
         def run(station: Station, target: Target, /, *args: Rest.args, **rest: Rest.kwargs) -> Result:
-            uuid: bytes = getattr(target, "uuid", target)
+            uuid = cast(bytes, getattr(cast(Any, target), "uuid", target))
             row = station.store.begin_step(uuid, step)
             result = "interrupted"
             try:
