@@ -37,6 +37,9 @@ class Vault(Protocol):
     def unwrap(self, wrapped: bytes, *, context: bytes) -> bytes:
         """Open what :meth:`wrap` gave, under the same context."""
 
+    def secret_material(self) -> str:
+        """Return what a sealed backup has to hold so that this vault can be made again. Whoever calls it seals it."""
+
 
 def node_key_context(store_id: str, uuid: bytes, epoch: int, slot: int) -> bytes:
     """Return what a wrapped node key is bound to: store, node, epoch (u32) and slot (u32)."""

@@ -64,10 +64,6 @@ def _create(
     if keystore is not None and keystore.startswith("pkcs11:"):
         from teds_provision.vault.pkcs11 import Pkcs11Vault
 
-        if restored is not None:
-            raise VaultFailure(
-                "The keys of a backup cannot be put into a token.", hint="Restore with --keystore keyring or file."
-            )
         return Pkcs11Vault.create(home, store_id, keystore, ask, restored=restored), "the token was asked for"
     if keystore == "keyring":
         return KeyringVault.create(store_id, restored=restored), "the keyring was asked for"

@@ -1,0 +1,155 @@
+"""Copies of a whole store: taken while it is in use, opened in memory, put in the place of a lost one."""
+
+from __future__ import annotations
+
+import os
+import secrets
+import sqlite3
+import time
+from contextlib import closing, suppress
+from enum import Enum
+from pathlib import Path
+from typing import Final
+
+from teds_provision.errors import BadData, StoreFailure
+from teds_provision.store.audit import AuditLog
+from teds_provision.store.database import FILE_NAME, Database, as_store_failure
+from teds_provision.store.store import Store
+
+_MAGIC: Final = b"SQLite format 3\0"
+_FORMAT_VERSIONS: Final = slice(18, 20)  # of the file header: 1 for a rollback journal, 2 for a write-ahead log
+_STALE_SECONDS: Final = 60
+_DAMAGE: Final = (sqlite3.SQLITE_CORRUPT, sqlite3.SQLITE_NOTADB)
+
+
+class Relation(Enum):
+    """How a copy stands to the store it is held against, by their audit logs."""
+
+    SAME = "the same state"
+    OLDER = "an older state"
+    NEWER = "a newer state"
+    DIVERGED = "a state that went another way"
+
+
+def take(store: Store) -> bytes:
+    """Return the store as the octets of a database file, as it is at one moment, whoever else is at work on it.
+
+    Raises StoreFailure.
+    """
+    database = store._database
+    with closing(sqlite3.connect(":memory:")) as copy:
+        with database._lock, database._translated():
+            database._connection.backup(copy)
+        octets = bytearray(copy.serialize())
+    octets[_FORMAT_VERSIONS] = b"\1\1"
+    return bytes(octets)
+
+
+def load(octets: bytes) -> Store:
+    """Open what :func:`take` gave, in memory; an older schema is brought forward. Raises BadData, StoreFailure."""
+    if not octets.startswith(_MAGIC) or octets[_FORMAT_VERSIONS] != b"\1\1":
+        raise BadData("The backup holds no store.")
+    connection = sqlite3.connect(":memory:", isolation_level=None, check_same_thread=False)
+    try:
+        connection.deserialize(octets)
+        database = Database(Path("backup", FILE_NAME), connection)
+        database._set_up(create=False)
+        store = Store(database)
+        store.id = store._identifier(create=False)
+        store.audit = AuditLog(database, store.id)
+        if store.damage() is not None:
+            raise BadData("The store in the backup is damaged.")
+    except sqlite3.Error as error:
+        connection.close()
+        raise BadData("The backup holds no store that can be read.") from error
+    except BaseException:
+        connection.close()
+        raise
+    return store
+
+
+def place(copy: Store, home: Path) -> None:
+    """Make a copy the store of a home that has none: the whole file, or none. The caller holds the StoreLock.
+
+    Raises StoreFailure: a store is there already, or it cannot be written.
+    """
+    path = home / FILE_NAME
+    fresh = path.with_name(f"{FILE_NAME}.{secrets.token_hex(4)}.new")
+    if path.exists():
+        raise StoreFailure(f"There is a store in {home} already.", hint="Restore into another --home.")
+    try:
+        with open(os.open(fresh, os.O_CREAT | os.O_EXCL | os.O_WRONLY | os.O_NOFOLLOW, 0o600), "wb") as file:
+            file.write(take(copy))
+            file.flush()
+            os.fsync(file.fileno())
+        for left in ("-wal", "-shm"):  # of a store that is gone: they would be replayed into this one
+            path.with_name(FILE_NAME + left).unlink(missing_ok=True)
+        os.replace(fresh, path)
+        directory = os.open(home, os.O_RDONLY)
+        try:
+            os.fsync(directory)
+        finally:
+            os.close(directory)
+    except OSError as error:
+        raise as_store_failure(error, path) from error
+    finally:
+        _sweep(path, fresh)
+
+
+def set_aside(home: Path) -> Path:
+    """Give a damaged store another name, with its log, and return it. Raises StoreFailure."""
+    path = home / FILE_NAME
+    name = f"{FILE_NAME}.damaged-{time.strftime('%Y%m%dT%H%M%S', time.gmtime())}"
+    try:
+        for end in ("-wal", "-shm", ""):  # the store last: as long as it has its name, the same command goes on
+            with suppress(FileNotFoundError):
+                path.with_name(FILE_NAME + end).rename(path.with_name(name + end))
+    except OSError as error:
+        raise as_store_failure(error, path) from error
+    return path.with_name(name)
+
+
+def is_damage(failure: StoreFailure) -> bool:
+    """Say whether a store could not be used because its file is damaged (and not locked, newer or unreadable)."""
+    cause = failure.__cause__
+    return isinstance(cause, sqlite3.Error) and getattr(cause, "sqlite_errorcode", 0) & 0xFF in _DAMAGE
+
+
+def relation(copy: Store, live: Store) -> Relation:
+    """Compare the audit logs of a copy and of a store: the one that goes on where the other ended is the newer."""
+    ours, theirs = live.audit.check(), copy.audit.check()
+    if (ours.count, ours.head) == (theirs.count, theirs.head):
+        return Relation.SAME
+    if _hash_at(live, theirs.count) == theirs.head:
+        return Relation.OLDER
+    if _hash_at(copy, ours.count) == ours.head:
+        return Relation.NEWER
+    return Relation.DIVERGED
+
+
+def extend_audit(live: Store, copy: Store) -> int:
+    """Append what a newer copy's audit log goes on with; returns how many entries. Call it inside a transaction."""
+    database, after = live._database, live.audit.check().count
+    rows = copy._database.execute("SELECT * FROM audit WHERE seq > ? ORDER BY seq", (after,))
+    for row in rows:
+        database.execute("INSERT INTO audit VALUES(?, ?, ?, ?, ?, ?, ?, ?)", row)
+    if rows:
+        live.audit._remember(int(rows[-1][0]), bytes(rows[-1][-1]))
+    return len(rows)
+
+
+def _hash_at(store: Store, seq: int) -> str:
+    if seq == 0:
+        return store.audit._root.hex()
+    entry = next(store.audit.entries(seq - 1), None)
+    return entry.hash if entry is not None and entry.seq == seq else ""
+
+
+def _sweep(path: Path, fresh: Path) -> None:
+    """Remove the file that was begun, and what killed restores left."""
+    with suppress(OSError):
+        fresh.unlink()
+    for left in path.parent.glob(f"{path.name}.*.new"):
+        with suppress(OSError):
+            if time.time() - left.stat().st_mtime > _STALE_SECONDS:
+                left.unlink()
