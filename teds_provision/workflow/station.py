@@ -44,8 +44,9 @@ class Station:
             raise not_initialised(home)
         station = cls(Store.open(home), ask)
         if station.store.setting("station_point") is None:
+            asked = station.store.setting("requested_point") is not None
             station.close()
-            raise not_initialised(home)
+            raise not_certified() if asked else not_initialised(home)
         return station
 
     def close(self) -> None:
@@ -153,7 +154,7 @@ class Station:
 
     def node_keys(self, uuid: bytes) -> list[NodeKey]:
         """Every key held for a node, in the order of trying: newest pending first, the active one last."""
-        return [NodeKey(record, self._unwrap(record)) for record in self.store.keys(uuid)]
+        return [NodeKey(record, self.unwrap(record)) for record in self.store.keys(uuid)]
 
     def has_keys(self, uuid: bytes) -> bool:
         """Whether any key is held for a node."""
@@ -174,7 +175,8 @@ class Station:
             source = "import" if imported else "agreement"
             self.store.add_key(KeyRecord(uuid, epoch, key_id.hex(), "pending", slot, wrapped, source))  # type: ignore[arg-type]
 
-    def _unwrap(self, record: KeyRecord) -> bytes:
+    def unwrap(self, record: KeyRecord) -> bytes:
+        """Return a link key in the clear; raises VaultFailure where it is damaged or of another vault."""
         from teds_provision.vault import node_key_context
 
         context = node_key_context(self.store.id, record.uuid, record.epoch, record.slot)
@@ -278,6 +280,13 @@ def not_initialised(home: Path) -> NotFound:
     return NotFound(f"There is no base station in {home} yet.", hint="Make one: teds-provision init")
 
 
+def not_certified() -> NotFound:
+    """The error for a station that asked for a certificate and has none yet."""
+    return NotFound(
+        "This station waits for the certificate of its CA.", hint="Bring it: teds-provision init --certificate CERT"
+    )
+
+
 def initialise(
     home: Path, *, name: str | None, keystore: str | None, ask: Ask, costs: object | None = None
 ) -> tuple[Station, str]:
@@ -294,6 +303,8 @@ def initialise(
     with StoreLock(home, command="init"):
         if store.setting("station_point") is not None:  # another init was first
             return station, store.setting("keystore_why") or ""
+        if store.setting("requested_point") is not None:
+            raise not_certified()
         more = {} if costs is None else {"costs": costs}
         vault, why = create_vault(home, store.id, keystore, ask, **more)  # type: ignore[arg-type]
         identity, ca = vault.identity(), vault.ca()

@@ -1,0 +1,368 @@
+"""``export-keys``, ``import-keys``, ``handover``: node keys from one base station to another."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
+
+import click
+
+from teds_provision.cli.context import App, pass_app
+from teds_provision.cli.options import COMMAND_SETTINGS, command, dry_run_option, examples, link_options, yes_option
+from teds_provision.links import LinkSettings
+
+if TYPE_CHECKING:
+    from teds_provision.workflow.handover_export import ExportPlan
+    from teds_provision.workflow.handover_import import Imported, ImportPlan
+    from teds_provision.workflow.station import Station
+
+_LINK_OPTIONS = ("via", "nfc", "can", "ble")
+_MEANS = {
+    "copy": "A copy: both stations hold the same keys from now on, and either can pose as a node to the other.",
+    "move": "A move: the keys rest here at once. Only when the other station has rotated them at its first contact is"
+    " this one locked out for certain.",
+}
+
+
+@command(
+    "teds-provision export-keys --to lab --all --output lab.jwe",
+    "teds-provision export-keys --to lab 8d4d --mode move --output finger.jwe",
+)
+@click.argument("uuids", metavar="[UUID]…", nargs=-1)
+@click.option("--to", "receivers", multiple=True, required=True, metavar="STATION", help="Name, fingerprint or PEM.")
+@click.option("--all", "everything", is_flag=True, help="Every node whose key is held and proven.")
+@click.option("--mode", type=click.Choice(["copy", "move"]), default="copy", show_default=True, help="Share, or give.")
+@click.option("--output", type=click.Path(path_type=Path, dir_okay=False), required=True, metavar="FILE")
+@click.option(
+    "--expires",
+    type=click.IntRange(1, 365),
+    default=7,
+    show_default=True,
+    metavar="DAYS",
+    help="How long it can be imported.",
+)
+@click.option("--ca", metavar="FINGERPRINT", help="Only the nodes that keep this CA key.")
+@yes_option
+@dry_run_option
+@pass_app
+def export_keys(
+    app: App,
+    uuids: tuple[str, ...],
+    receivers: tuple[str, ...],
+    everything: bool,
+    mode: Literal["copy", "move"],
+    output: Path,
+    expires: int,
+    ca: str | None,
+    yes: bool,
+    dry_run: bool,
+) -> None:
+    """Hand node keys to other base stations in one bundle, sealed to them and signed by this one.
+
+    Nothing is ever written unsealed. A move marks the nodes as given away before the file exists; its receipt closes
+    it (handover receipt), handover undo takes it back before that.
+    """
+    from teds_provision.workflow.handover_export import ExportOrder, plan_export
+    from teds_provision.workflow.handover_export import export_keys as run
+
+    if everything == bool(uuids):
+        raise click.UsageError("Name the nodes, or say --all.")
+    station = app.station()
+    nodes = None if everything else tuple(station.store.resolve(uuid) for uuid in uuids)
+    order = ExportOrder(receivers, nodes, mode, expires, ca)
+    with station.lock("export-keys", app.note):
+        plan = plan_export(station, order)
+        told = _exported(plan, output, station)
+        if dry_run:
+            app.emit({**told, "id": None if plan.earlier is None else plan.id, "plan": True}, _plan_text(plan, station))
+            return
+        app.note(_plan_text(plan, station))
+        app.confirm(f"{mode.capitalize()} {_count(len(plan.nodes))}?", yes=yes)
+        done = run(station, plan, output)
+    told |= {"sha256": done.sha256, "octets": done.octets, "fresh": done.fresh}
+    again = "" if done.fresh else " (nothing to do, it is there already)"
+    next_step = "\nIts receipt closes the move: teds-provision handover receipt FILE.receipt" if mode == "move" else ""
+    app.emit(told, f"{_count(len(plan.nodes))} in {output}, handover {plan.id}{again}.{next_step}")
+
+
+def _exported(plan: ExportPlan, output: Path, station: Station) -> dict[str, Any]:
+    return {
+        "bundle": str(output),
+        "from": station.fingerprint,
+        "to": [{"name": record.name, "fingerprint": record.fingerprint} for record in plan.receivers],
+        "mode": plan.mode,
+        "count": len(plan.nodes),
+        "id": plan.id,
+        "expires": plan.expires.strftime("%Y-%m-%dT%H:%M:%SZ"),
+        "nodes": [node.uuid.hex() for node, _ in plan.nodes],
+        "skipped": [{"uuid": uuid.hex(), "why": why} for uuid, why in plan.skipped],
+    }
+
+
+def _plan_text(plan: ExportPlan, station: Station) -> str:
+    from teds_provision.workflow.trust import spoken
+
+    lines = [f"{plan.mode.capitalize()} {_count(len(plan.nodes))}, to be imported by {plan.expires:%Y-%m-%d %H:%M} UTC"]
+    lines += [f"  {node.uuid.hex()}  epoch {key.epoch}  {node.name or ''}".rstrip() for node, key in plan.nodes[:20]]
+    lines += [f"  … and {len(plan.nodes) - 20} more"] if len(plan.nodes) > 20 else []
+    lines += [f"  not {uuid.hex()}: {why}" for uuid, why in plan.skipped]
+    lines.append("For comparison by voice:")
+    lines += [f"  to   {record.name}\n       {spoken(record.fingerprint)}" for record in plan.receivers]
+    lines.append(f"  from {station.name}\n       {spoken(station.fingerprint)}")
+    return "\n".join([*lines, _MEANS[plan.mode]])
+
+
+@command(
+    "teds-provision import-keys lab.jwe --no-prove",
+    "teds-provision import-keys lab.jwe --via can --can udp_multicast:239.74.163.2 --yes",
+)
+@click.argument("file", type=click.Path(path_type=Path, dir_okay=False))
+@click.option(
+    "--prove/--no-prove", default=None, help="Meet each node and open a session (default: with link options)."
+)
+@click.option(
+    "--receipt",
+    type=click.Path(path_type=Path, dir_okay=False),
+    metavar="FILE",
+    help="Where the signed receipt goes (default: FILE.receipt).",
+)
+@yes_option
+@dry_run_option
+@link_options
+@click.pass_context
+def import_keys(
+    ctx: click.Context,
+    file: Path,
+    prove: bool | None,
+    receipt: Path | None,
+    yes: bool,
+    dry_run: bool,
+    links: LinkSettings,
+) -> None:
+    """Take node keys over from a trusted base station: check, show the plan, take in, write the receipt.
+
+    A node counts as taken over when it opened a session here; after a move its key is rotated in it, and only then is
+    the sender locked out. The same bundle again changes nothing and gives the same receipt.
+    """
+    from teds_provision.protocol.bundle import MAX_BUNDLE_OCTETS
+    from teds_provision.workflow.handover_files import read_limited
+    from teds_provision.workflow.handover_import import Imported, plan_import
+    from teds_provision.workflow.handover_import import import_keys as run
+
+    app = ctx.find_object(App)
+    assert app is not None
+    station = app.station()
+    receipt = receipt or file.with_name(file.name + ".receipt")
+    octets = read_limited(file, MAX_BUNDLE_OCTETS, "bundle")
+    with station.lock("import-keys", app.note):
+        plan = plan_import(station, octets)
+        told, text = _import_plan(station, plan)
+        if dry_run:
+            app.emit({**told, "receipt": None, "plan": True}, text)
+            return
+        if isinstance(plan, Imported):
+            done = plan
+        else:
+            _require_receipt_place(receipt)
+            app.note(text)
+            app.confirm(f"Take {_count(len(plan.taken))} in?", yes=yes)
+            done = run(station, plan)
+        _write_receipt(receipt, done.receipt)
+        given = any(ctx.get_parameter_source(name) != click.core.ParameterSource.DEFAULT for name in _LINK_OPTIONS)
+        outcomes = _prove(app, station, done, links) if (given if prove is None else prove) else []
+    _tell_import(app, station, done, receipt, told, outcomes)
+    if prove and any(outcome["why"] for outcome in outcomes):
+        ctx.exit(5)
+
+
+def _import_plan(station: Station, plan: ImportPlan | Imported) -> tuple[dict[str, Any], str]:
+    """The result as far as it is known before anything happens, and the plan for people."""
+    from teds_provision.workflow.handover import peer_name
+    from teds_provision.workflow.handover_import import Imported
+    from teds_provision.workflow.trust import spoken
+
+    if isinstance(plan, Imported):
+        sender, mode, handover_id = plan.row.peers[0], plan.row.mode, plan.row.id
+        nodes = [{"uuid": uuid.hex(), "decision": "same", "why": ""} for uuid in plan.uuids]
+        nodes += [{"uuid": uuid, "decision": "refused", "why": why} for uuid, why in plan.notes.refused]
+        told = _import_result(sender, mode, handover_id, nodes, [])
+        return told, f"This bundle was taken in on {plan.row.created}; nothing is left to do."
+    bundle = plan.opened.bundle
+    nodes = [{"uuid": one.node.uuid.hex(), "decision": one.decision, "why": one.why} for one in plan.nodes]
+    denied = [{"uuid": one.uuid.hex(), "why": one.why} for one in plan.denied]
+    told = _import_result(bundle.sender, bundle.mode, bundle.id, nodes, denied)
+    lines = [f"A {bundle.mode} of {_count(len(nodes))} from {peer_name(station, bundle.sender)}"]
+    lines += [f"  {node['decision']:<8} {node['uuid']}  {node['why']}".rstrip() for node in nodes[:40]]
+    lines += [f"  … and {len(nodes) - 40} more"] if len(nodes) > 40 else []
+    lines += [f"  revoked  {one['uuid']}  {one['why']}" for one in denied]
+    lines += [f"For comparison by voice:\n  from {spoken(bundle.sender)}\n  to   {spoken(station.fingerprint)}"]
+    if not plan.ca_is_known:
+        from teds_provision.protocol.keys import fingerprint
+
+        lines.append(f"The CA {fingerprint(bundle.ca)[:16]} will be trusted for these nodes, and for no others.")
+    lines.append(
+        "A copy: the sender keeps the same keys, and either can pose as a node to the other."
+        if bundle.mode == "copy"
+        else "A move: each key is rotated at the first contact; until then the sender can still use it."
+    )
+    return told, "\n".join(lines)
+
+
+def _import_result(
+    sender: str, mode: str, handover_id: str, nodes: list[dict[str, str]], denied: list[dict[str, str]]
+) -> dict[str, Any]:
+    return {
+        "from": sender,
+        "id": handover_id,
+        "mode": mode,
+        "count": len(nodes),
+        "imported": [node["uuid"] for node in nodes if node["decision"] != "refused"],
+        "refused": [{"uuid": node["uuid"], "why": node["why"]} for node in nodes if node["decision"] == "refused"],
+        "decisions": {node["uuid"]: node["decision"] for node in nodes},
+        "revoked": denied,
+    }
+
+
+def _require_receipt_place(receipt: Path) -> None:
+    from teds_provision.workflow.handover_files import require_new
+
+    require_new(receipt)
+
+
+def _write_receipt(receipt: Path, octets: bytes) -> None:
+    from teds_provision.workflow.handover_files import write_new
+
+    if not (receipt.is_file() and receipt.read_bytes().strip() == octets):
+        write_new(receipt, octets + b"\n")
+
+
+def _prove(app: App, station: Station, done: Imported, links: LinkSettings) -> list[dict[str, Any]]:
+    from teds_provision.cli.rendering import reporter_for
+    from teds_provision.workflow.handover_prove import Proven, is_proven, prove_nodes
+
+    waiting = [uuid for uuid in done.uuids if not is_proven(station, uuid)]
+    outcomes = prove_nodes(station, links, waiting, reporter_for(app)) if waiting else []
+    return [
+        {"uuid": one.uuid.hex(), "rotated": one.rotated, "why": ""}
+        if isinstance(one, Proven)
+        else {"uuid": one.uuid.hex(), "rotated": False, "why": one.why}
+        for one in outcomes
+    ]
+
+
+def _tell_import(
+    app: App, station: Station, done: Imported, receipt: Path, told: dict[str, Any], outcomes: list[dict[str, Any]]
+) -> None:
+    from teds_provision.workflow.handover_prove import is_proven
+
+    proven = [uuid.hex() for uuid in done.uuids if is_proven(station, uuid)]
+    pending = [uuid.hex() for uuid in done.uuids if uuid.hex() not in set(proven)]
+    not_met = {one["uuid"]: one["why"] for one in outcomes if one["why"]}
+    told |= {"receipt": str(receipt), "fresh": done.fresh, "proven": proven, "pending": pending, "not_proven": not_met}
+    lines = [f"{_count(len(done.uuids))} taken in" + ("." if done.fresh else " before; nothing changed.")]
+    lines += [f"  refused {uuid}: {why}" for uuid, why in done.notes.refused]
+    lines += [f"  not met {uuid}: {why}" for uuid, why in not_met.items()]
+    rotated = sum(bool(one["rotated"]) for one in outcomes)
+    lines += [f"{_count(rotated)} rotated: the sender is locked out of them."] if rotated else []
+    if pending:
+        lines.append(f"{_count(len(pending))} not proven yet: their first contact here proves them (agree UUID).")
+    lines.append(f"Receipt for the sender: {receipt}")
+    app.emit(told, "\n".join(lines))
+
+
+def _count(number: int) -> str:
+    return f"{number} node{'' if number == 1 else 's'}"
+
+
+@click.group(
+    context_settings=COMMAND_SETTINGS,
+    epilog=examples("teds-provision handover list", "teds-provision handover receipt lab.jwe.receipt"),
+)
+def handover() -> None:
+    """Handovers under way: list them, close them by their receipt, take a move back."""
+
+
+@handover.command("list", context_settings=COMMAND_SETTINGS, epilog=examples("teds-provision handover list"))
+@pass_app
+def list_(app: App) -> None:
+    """Every bundle that left or came."""
+    from datetime import UTC, datetime
+
+    from teds_provision.workflow.handover import list_handovers
+
+    listed = list_handovers(app.station(), datetime.now(UTC))
+    rows = [
+        {
+            "id": one.row.id,
+            "direction": one.row.direction,
+            "mode": one.row.mode,
+            "state": one.row.state,
+            "peers": list(one.row.peers),
+            "names": list(one.peers),
+            "count": one.count,
+            "created": one.row.created,
+            "expires": one.expires,
+            "expired": one.expired,
+        }
+        for one in listed
+    ]
+    lines = [
+        f"{row['id']}  {row['direction']:<3} {row['mode']}  {row['state']:<8} {row['count']:>5}"
+        f"  {', '.join(row['names'])}  {row['created']}{'  expired' if row['expired'] else ''}"  # type: ignore[arg-type]
+        for row in rows
+    ]
+    app.emit({"handovers": rows}, "\n".join(lines) or "No bundle has left or come.")
+
+
+@handover.command(context_settings=COMMAND_SETTINGS, epilog=examples("teds-provision handover receipt lab.jwe.receipt"))
+@click.argument("file", type=click.Path(path_type=Path, dir_okay=False))
+@pass_app
+def receipt(app: App, file: Path) -> None:
+    """Close a handover with the receiver's signed receipt; the keys of a move are then deleted here."""
+    from teds_provision.protocol.receipt import MAX_RECEIPT_OCTETS
+    from teds_provision.workflow.handover import close, peer_name
+    from teds_provision.workflow.handover_files import read_limited
+
+    station = app.station()
+    octets = read_limited(file, MAX_RECEIPT_OCTETS, "receipt")
+    with station.lock("handover receipt", app.note):
+        done = close(station, octets)
+    imported, refused = done.receipt.imported, done.receipt.refused
+    told = {
+        "id": done.row.id,
+        "from": done.receipt.sender,
+        "mode": done.row.mode,
+        "state": "closed",
+        "imported": [uuid.hex() for uuid in imported],
+        "refused": [{"uuid": one.uuid.hex(), "why": one.why} for one in refused],
+        "fresh": done.fresh,
+    }
+    text = f"Station {peer_name(station, done.receipt.sender)} took {_count(len(imported))} in"
+    text += ("; their keys are deleted here." if done.row.mode == "move" else ".") if done.fresh else " (known before)."
+    lines = [f"  refused {one.uuid.hex()}: {one.why}" for one in refused]
+    if refused and done.row.mode == "move":
+        lines.append("What was refused is this station's again, to be rotated at the next contact.")
+    app.emit(told, "\n".join([text, *lines]))
+
+
+@handover.command(context_settings=COMMAND_SETTINGS, epilog=examples("teds-provision handover undo 3d1a4d1c --yes"))
+@click.argument("id_", metavar="ID")
+@yes_option
+@dry_run_option
+@pass_app
+def undo(app: App, id_: str, yes: bool, dry_run: bool) -> None:
+    """Take a move back before its receipt; each node's key is rotated at the next contact, before anything else."""
+    from teds_provision.workflow.handover import find_handover
+    from teds_provision.workflow.handover import undo as run
+
+    station = app.station()
+    with station.lock("handover undo", app.note):
+        row = find_handover(station, id_)
+        if dry_run:
+            app.emit({"id": row.id, "state": row.state, "plan": "undo"}, f"Plan: take the {row.mode} {row.id} back.")
+            return
+        app.confirm("Take this move back? The receiver may have the keys all the same until they are rotated.", yes=yes)
+        done = run(station, row)
+    told = {"id": row.id, "state": "undone", "nodes": [uuid.hex() for uuid in done.uuids], "fresh": done.fresh}
+    text = f"{_count(len(done.uuids))} back here; the next contact with each rotates its key first."
+    app.emit(told, text if done.fresh else "Nothing to do: this move was taken back before.")
