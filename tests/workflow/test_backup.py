@@ -164,7 +164,7 @@ def test_a_backup_that_another_key_has_signed_is_not_the_stations(station: Stati
     with pytest.raises(NotAuthentic):
         open_with_key(backup_file.seal_to_key(real, forger, recovery.point), recovery)
     forged = open_with_key(backup_file.seal_to_key(replace(real, point=forger.point), forger, recovery.point), recovery)
-    with pytest.raises(PolicyRefused, match="the store in .* is of station"):
+    with pytest.raises(PolicyRefused, match=r"the store in .* is of station"):
         open_present(station.store.home, forged)
     with pytest.raises(NotAuthentic):
         restored_into(tmp_path / "new", forged)
@@ -412,7 +412,7 @@ def test_states_that_went_different_ways_keep_both_sides_newest(station: Station
 def test_the_backup_of_another_station_is_refused(station: Station, tmp_path: Path) -> None:
     back_up(station, tmp_path / "b")
     other = make_station(tmp_path / "other")
-    with pytest.raises(PolicyRefused, match="the store in .* is of station") as caught:
+    with pytest.raises(PolicyRefused, match=r"the store in .* is of station") as caught:
         open_present(tmp_path / "other", opened(tmp_path / "b"))
     assert caught.value.exit_code == 6
     other.close()
