@@ -160,7 +160,7 @@ def nfc_pieces() -> Iterator[dict[str, Any]]:
     )
     tap = Tap(
         "request-in-two-pieces",
-        "maxNdef 200: Request of 265 octets in two pieces (167 and 98), its reply in two (163 and the rest).",
+        "maxNdef 200: Request of 265 octets in two pieces (167 and 98), its reply in two (161 and 115).",
         max_ndef=200,
     )
     yield tap.select().exchange(REQUEST, TRANSACTION).end()
