@@ -86,11 +86,14 @@ class NfcPort:
         """
         here: bytes | None = None  # the node of the visit that is not over yet
         gone_at, told = 0.0, ""
+        waiting = Notice("waiting", "Hold a node to the reader.")
+        notice(waiting)
         while not stop.is_set():
             seen = self._look(notice, stop)
             same = isinstance(seen, Visit) and seen.identity.uuid == here
             if here is not None and not same and (seen is not None or time.monotonic() - gone_at > _DEBOUNCE):
                 notice(Notice("node-left", f"Node {here.hex().upper()} was taken off the reader."))
+                notice(waiting)
                 here = None
             if seen is None:
                 stop.wait(_PAUSE)
