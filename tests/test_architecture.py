@@ -1,0 +1,129 @@
+"""The rules of docs/architecture.md: which room imports which, what is loaded late, and how long things may get."""
+
+from __future__ import annotations
+
+import ast
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+PACKAGE = Path(__file__).parent.parent / "teds_provision"
+MODULES = sorted(PACKAGE.rglob("*.py"))
+LINES_OF_A_MODULE = 400
+LINES_OF_A_FUNCTION = 80
+
+# Room: the rooms that it may import. Everything may import errors, and itself.
+ARROWS = {
+    "errors": set(),
+    "teds": set(),
+    "protocol": {"teds"},
+    "links": {"protocol", "teds"},
+    "vault": {"protocol", "teds"},
+    "store": {"protocol", "teds"},
+    "node": {"links", "protocol", "teds"},
+    "workflow": {"links", "vault", "store", "protocol", "teds"},
+    "cli": {"workflow", "node", "links", "vault", "store", "protocol", "teds"},
+    "__main__": {"cli"},
+}
+# `teds` names the commands that it shows: numbers and names, from modules which import nothing of `teds` themselves.
+NAMES_FOR_TEDS = {"teds_provision.protocol.frames"}
+# Too slow to load before they are needed: --help, --version and a pure decode must not wait for them.
+HEAVY = {"nfc", "ndef", "can", "isotp", "keyring", "rich", "cryptography", "pint", "numpy", "matplotlib", "pkcs11"}
+PURE = ("protocol", "teds")
+IO = {"socket", "sqlite3", "subprocess", "threading", "time", "click", "serial"}
+
+
+def name_of(path: Path) -> str:
+    return str(path.relative_to(PACKAGE))
+
+
+def room_of(path: Path) -> str:
+    parts = path.relative_to(PACKAGE).parts
+    return parts[0] if len(parts) > 1 else path.stem
+
+
+def imports(tree: ast.AST) -> Iterator[tuple[str, int]]:
+    """Every module that is imported anywhere in a tree, with its line; `from x import y` counts as x.y too."""
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Import):
+            yield from ((alias.name, node.lineno) for alias in node.names)
+        elif isinstance(node, ast.ImportFrom):
+            assert node.level == 0, "imports are absolute"
+            yield from ((f"{node.module}.{alias.name}", node.lineno) for alias in node.names)
+
+
+def parsed(path: Path) -> ast.Module:
+    return ast.parse(path.read_text(encoding="utf-8"), str(path))
+
+
+@pytest.mark.parametrize("path", MODULES, ids=name_of)
+def test_arrows_between_rooms_point_one_way(path: Path) -> None:
+    room = room_of(path)
+    if room == "__init__":
+        assert not [name for name, _ in imports(parsed(path)) if name.startswith("teds_provision")]
+        return
+    allowed = ARROWS[room] | {room, "errors"}
+    wrong = [
+        f"line {line}: {name}"
+        for name, line in imports(parsed(path))
+        if name.startswith("teds_provision.")
+        and name.split(".")[1] not in allowed | {"__version__"}
+        and not (room == "teds" and name.rpartition(".")[0] in NAMES_FOR_TEDS)
+    ]
+    assert not wrong, f"{room} imports what it may not: {wrong}"
+
+
+@pytest.mark.parametrize("module", sorted(NAMES_FOR_TEDS))
+def test_names_that_teds_uses_make_no_circle(module: str) -> None:
+    path = PACKAGE.parent / (module.replace(".", "/") + ".py")
+    assert not [name for name, _ in imports(parsed(path)) if name.startswith("teds_provision.teds")]
+
+
+def test_the_rooms_are_those_of_the_page() -> None:
+    assert {room_of(path) for path in MODULES} - {"__init__"} == set(ARROWS)
+
+
+def test_no_arrow_of_the_table_makes_a_circle() -> None:
+    def reachable(room: str, seen: frozenset[str]) -> set[str]:
+        assert room not in seen, f"circle through {room}"
+        return {room}.union(*(reachable(next_room, seen | {room}) for next_room in ARROWS[room]))
+
+    for room in ARROWS:
+        assert reachable(room, frozenset()) <= set(ARROWS)
+
+
+@pytest.mark.parametrize("path", [path for path in MODULES if room_of(path) in PURE], ids=name_of)
+def test_protocol_and_teds_do_no_io(path: Path) -> None:
+    found = {name.split(".")[0] for name, _ in imports(parsed(path))}
+    assert not found & IO
+
+
+@pytest.mark.parametrize("path", MODULES, ids=name_of)
+def test_a_module_is_not_too_long(path: Path) -> None:
+    assert len(path.read_text(encoding="utf-8").splitlines()) <= LINES_OF_A_MODULE
+
+
+@pytest.mark.parametrize("path", MODULES, ids=name_of)
+def test_a_function_fits_on_a_screen(path: Path) -> None:
+    functions = [node for node in ast.walk(parsed(path)) if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef)]
+    long = [f"{node.name}: {(node.end_lineno or 0) - node.lineno + 1} lines" for node in functions]
+    too_long = [text for text in long if int(text.split()[-2]) > LINES_OF_A_FUNCTION]
+    assert not too_long
+
+
+@pytest.mark.parametrize(
+    "statement",
+    [
+        "import teds_provision.teds",
+        "from teds_provision.__main__ import main; import sys; sys.argv[1:] = ['--version']; main()",
+        "from teds_provision.cli.main import run; run(['--help'])",
+    ],
+)
+def test_what_must_be_quick_loads_nothing_heavy(statement: str) -> None:
+    ask = f"import sys\ntry:\n    exec({statement!r})\nfinally:\n    print('LOADED', *sorted(sys.modules))"
+    done = subprocess.run([sys.executable, "-c", ask], capture_output=True, text=True, timeout=60, check=False)
+    loaded = done.stdout.split("LOADED")[1].split()
+    assert not HEAVY.intersection(loaded), statement
