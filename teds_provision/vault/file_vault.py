@@ -65,7 +65,7 @@ class FileVault(SoftwareVault):
         Raises VaultFailure (missing, damaged, of another store), WrongPassphrase.
         """
         path = home / FILE_NAME
-        content = _read(path)
+        content = read_sealed(path)
         if content.get("store") != store_id:
             raise VaultFailure(f"{path} belongs to another store.", hint="Restore the backup that holds both.")
         passphrase = ask("Passphrase of this station's keys", False)
@@ -104,7 +104,8 @@ def _sealed(store_id: str, material: Material, key: SealingKey) -> bytes:
     return json.dumps({"format": _FORMAT, "store": store_id, **sealed}, indent=1).encode() + b"\n"
 
 
-def _read(path: Path) -> dict[str, Any]:
+def read_sealed(path: Path) -> dict[str, Any]:
+    """Read the file, still sealed; raises VaultFailure (missing, damaged)."""
     try:
         with open(os.open(path, os.O_RDONLY | os.O_NOFOLLOW), "rb") as file:
             octets = file.read(_MAX_OCTETS + 1)

@@ -90,6 +90,16 @@ class KeyringVault(SoftwareVault):
         return _name_of(type(self._backend))
 
 
+def inspect() -> str:
+    """Name the keyring that would hold the keys, after it has answered (for doctor).
+
+    Raises NoKeyring (none, or none that may hold a secret), VaultFailure (locked, or it fails).
+    """
+    name, backend = next(_viable())
+    _get(name, backend, _entry("doctor"))
+    return ALLOWED[name]
+
+
 def _entry(store_id: str) -> str:
     return f"station/{store_id}"
 

@@ -1,0 +1,49 @@
+"""``doctor`` as a command: what it tells, and its exit codes."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from .shell import call, clean_environment, spawn
+
+
+def test_every_check_has_name_result_cause_and_cure(home: Path) -> None:
+    told = spawn("--home", home, "--json", "doctor")
+    assert told.code == 0, told.out
+    checks = told.json["checks"]
+    assert all(set(check) == {"name", "result", "why", "fix"} for check in checks)
+    assert {check["result"] for check in checks} <= {"ok", "warning", "skipped"}
+    assert {"python", "libraries", "clock", "store", "keyring", "can loopback"} <= {check["name"] for check in checks}
+    assert "Traceback" not in told.err
+
+
+def test_people_see_the_cure_under_each_trouble(home: Path) -> None:
+    home.chmod(0o755)
+    shown = call(home, "doctor")
+    assert shown.code == 0
+    assert f"→ chmod 700 {home}" in shown.out
+    assert "warning" in shown.err
+
+
+@pytest.mark.parametrize(
+    ("words", "code"),
+    [(("--nfc", "tty:NONE7:pn532"), 5), (("--can", "nosuch:can0"), 5)],
+)
+def test_a_named_link_that_fails_is_exit_5(home: Path, words: tuple[str, ...], code: int) -> None:
+    told = call(home, "--json", "doctor", *words)
+    assert told.code == code
+    assert any(check["result"] == "failed" and check["fix"] for check in told.json["checks"])
+
+
+def test_a_broken_store_is_exit_7_whatever_else_fails(home: Path) -> None:
+    (home / "vault.json").unlink()
+    assert call(home, "doctor", "--can", "nosuch:can0").code == 7
+
+
+def test_it_works_before_there_is_a_station_and_makes_nothing(tmp_path: Path) -> None:
+    told = spawn("--home", tmp_path / "none", "doctor", environment=clean_environment(HOME=str(tmp_path)))
+    assert told.code == 0
+    assert "teds-provision init" in told.out
+    assert not (tmp_path / "none").exists()

@@ -1,0 +1,375 @@
+"""The doctor: machines with every trouble that readers, buses, stores and clocks are known for."""
+
+from __future__ import annotations
+
+import os
+import socket
+import sqlite3
+import time
+import tomllib
+from collections.abc import Iterator
+from contextlib import closing
+from importlib import metadata
+from pathlib import Path
+
+import pytest
+
+from teds_provision.protocol.keys import SoftwareKey, to_pem
+from teds_provision.store import NodeRecord, Store, StoreLock
+from teds_provision.vault import forget_vaults
+from teds_provision.workflow import doctor, doctor_machine
+from teds_provision.workflow.doctor import CHECKS, Finding, Place, examine, exit_code
+from teds_provision.workflow.doctor_links import READERS
+from teds_provision.workflow.doctor_store import holds_private_key
+
+from .bench import make_station
+
+
+@pytest.fixture
+def place(tmp_path: Path) -> Place:
+    """A machine without any hardware, and no station."""
+    (tmp_path / "system").mkdir()
+    (tmp_path / "work").mkdir()
+    return Place(tmp_path / "home", workspace=tmp_path / "work", system=tmp_path / "system", environment={})
+
+
+@pytest.fixture
+def stationed(place: Place) -> Iterator[Place]:
+    forget_vaults()
+    make_station(place.home).close()
+    yield place
+    forget_vaults()
+
+
+def look(place: Place, name: str) -> list[Finding]:
+    """What one check finds."""
+    list(examine(Place(place.home / "nowhere"))) if not CHECKS else None
+    return list(CHECKS[name][1](place))
+
+
+def by_name(place: Place) -> dict[str, Finding]:
+    return {finding.name: finding for _, finding in examine(place)}
+
+
+def plug_in(place: Place, vendor: int, product: int, *, driver: str | None = None, node: bool = True) -> None:
+    """A USB device as sysfs and devfs show it."""
+    devices = place.at("/sys/bus/usb/devices")
+    device, interface = devices / "1-2", devices / "1-2:1.0"
+    device.mkdir(parents=True)
+    interface.mkdir()
+    texts = {"idVendor": f"{vendor:04x}", "idProduct": f"{product:04x}", "busnum": "1", "devnum": "5"}
+    for name, text in texts.items():
+        (device / name).write_text(text + "\n")
+    if driver is not None:
+        target = place.at(f"/sys/bus/usb/drivers/{driver}")
+        target.mkdir(parents=True)
+        (interface / "driver").symlink_to(target)
+    if node:
+        file = place.at("/dev/bus/usb/001/005")
+        file.parent.mkdir(parents=True)
+        file.touch(mode=0o666)
+
+
+def test_a_machine_without_anything_has_no_failure(place: Place, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("DBUS_SESSION_BUS_ADDRESS", f"unix:path={place.home}/no-bus")
+    found = list(examine(place))
+    assert exit_code(found) == 0
+    assert [finding for _, finding in found if finding.result == "failed"] == []
+    assert all(finding.why.endswith((".", ")")) for _, finding in found)
+    assert not place.home.exists()
+
+
+def test_the_registry_holds_every_check(place: Place) -> None:
+    list(examine(place))
+    machine = ["python", "libraries", "argon2id", "libusb", "clock"]
+    links = ["nfc readers", "serial ports", "nfc loopback", "nfc", "can interfaces", "can loopback", "can"]
+    station = ["home", "disk", "store", "keyring", "vault", "keys folder"]
+    assert sorted(CHECKS) == sorted(machine + links + station)
+
+
+# -- readers -----------------------------------------------------------------------------------------------------------
+
+
+def test_the_known_readers_are_those_of_nfcpy() -> None:
+    from teds_provision.links.nfc.library import nfc
+
+    assert set(READERS) == set(nfc.clf.device.usb_device_map)
+
+
+def test_a_free_reader_is_named_with_its_path(place: Place) -> None:
+    plug_in(place, 0x054C, 0x06C3)
+    (reader,) = look(place, "nfc readers")
+    assert (reader.name, reader.result) == ("reader usb:054c:06c3", "ok")
+    assert "/dev/bus/usb/001/005" in reader.why
+    assert "--nfc usb:054c:06c3" in reader.why
+
+
+@pytest.mark.parametrize(("ids", "driver"), [((0x04E6, 0x5591), "pn533_usb"), ((0x054C, 0x06C1), "port100")])
+def test_a_kernel_driver_that_holds_a_reader_is_named_with_its_removal(
+    place: Place, ids: tuple[int, int], driver: str
+) -> None:
+    plug_in(place, *ids, driver=driver)
+    (reader,) = look(place, "nfc readers")
+    assert (reader.result, driver in reader.why) == ("warning", True)
+    assert f"modprobe -r {driver}" in reader.fix
+    (asked,) = look(Place(place.home, nfc="usb", system=place.system), "nfc readers")
+    assert asked.result == "failed"
+
+
+def test_a_reader_that_this_user_may_not_open_gets_its_udev_rule(place: Place) -> None:
+    plug_in(place, 0x072F, 0x2200, node=False)
+    (reader,) = look(place, "nfc readers")
+    assert reader.result == "warning"
+    assert 'ATTRS{idVendor}=="072f", ATTRS{idProduct}=="2200"' in reader.fix
+    assert 'TAG+="uaccess"' in reader.fix
+
+
+def test_pcscd_is_a_trouble_only_beside_a_reader(place: Place) -> None:
+    comm = place.at("/proc/123/comm")
+    comm.parent.mkdir(parents=True)
+    comm.write_text("pcscd\n")
+    assert [finding.result for finding in look(place, "nfc readers")] == ["skipped", "ok"]
+    plug_in(place, 0x072F, 0x2200, driver="usbfs")
+    reader, pcscd = look(place, "nfc readers")
+    assert "held by another program" in reader.why
+    assert (pcscd.result, "systemctl stop pcscd" in pcscd.fix) == ("warning", True)
+
+
+def test_other_usb_devices_are_none_of_ours(place: Place) -> None:
+    plug_in(place, 0x1D6B, 0x0002)
+    assert [finding.result for finding in look(place, "nfc readers")] == ["skipped"]
+
+
+def test_serial_ports_are_listed(place: Place) -> None:
+    place.at("/dev").mkdir()
+    place.at("/dev/ttyUSB0").touch()
+    (ports,) = look(place, "serial ports")
+    assert (ports.result, "ttyUSB0" in ports.why) == ("ok", True)
+    place.at("/dev/ttyACM0").symlink_to("gone")  # as good as closed, also to root
+    (ports,) = look(place, "serial ports")
+    assert (ports.result, "dialout" in ports.fix) == ("warning", True)
+
+
+@pytest.mark.parametrize(
+    ("path", "words"),
+    [
+        ("udp:10.0.0.1:54321", "loopback"),
+        ("nonsense", "not the path of a reader"),
+        ("tty:NONE7:pn532", ""),
+    ],
+)
+def test_a_reader_that_was_asked_for_and_does_not_open_is_exit_5(place: Place, path: str, words: str) -> None:
+    asked = Place(place.home, nfc=path, system=place.system, workspace=place.workspace)
+    (reader,) = look(asked, "nfc")
+    assert (reader.result, words in reader.why) == ("failed", True)
+    assert reader.fix
+    assert exit_code([("link", reader)]) == 5
+
+
+def test_an_empty_simulated_reader_says_how_to_put_a_node_on_it(place: Place) -> None:
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+        probe.bind(("127.0.0.1", 0))
+        port = probe.getsockname()[1]
+    (reader,) = look(Place(place.home, nfc=f"udp:localhost:{port}", system=place.system), "nfc")
+    assert (reader.result, f"--nfc udp:localhost:{port}" in reader.fix) == ("warning", True)
+
+
+# -- buses -------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("flags", "result"), [("0x40081", "ok"), ("0x40080", "warning")])
+def test_a_can_interface_of_the_kernel_is_up_or_gets_its_command(place: Place, flags: str, result: str) -> None:
+    for name, kind in (("can0", "280"), ("eth0", "1")):
+        folder = place.at(f"/sys/class/net/{name}")
+        folder.mkdir(parents=True)
+        (folder / "type").write_text(kind + "\n")
+        (folder / "flags").write_text(flags + "\n")
+    (interface,) = look(place, "can interfaces")
+    assert (interface.name, interface.result) == ("can can0", result)
+    assert ("ip link set can0 up type can bitrate 500000" in interface.fix) is (result == "warning")
+
+
+def test_frames_of_a_simulated_bus_come_back(place: Place) -> None:
+    (loopback,) = look(place, "can loopback")
+    assert (loopback.result, loopback.fix) == ("ok", "")
+
+
+@pytest.mark.parametrize("spec", ["socketcan:can99", "nonsense", "nosuch:can0", "socketcand:can0?port=1"])
+def test_a_bus_that_was_asked_for_and_does_not_open_is_exit_5(place: Place, spec: str) -> None:
+    asked = Place(place.home, can=spec, system=place.system)
+    (bus,) = look(asked, "can")
+    assert bus.result == "failed"
+    assert bus.fix
+
+
+def test_a_bus_that_was_asked_for_opens(place: Place) -> None:
+    (bus,) = look(Place(place.home, can="udp_multicast:239.74.99.7?port=47007"), "can")
+    assert (bus.result, bus.why) == ("ok", "udp_multicast:239.74.99.7 opens.")
+
+
+# -- the machine -------------------------------------------------------------------------------------------------------
+
+
+def test_the_versions_asked_for_are_those_of_the_project() -> None:
+    project = tomllib.loads((Path(__file__).parents[2] / "pyproject.toml").read_text())["project"]
+    declared = dict(text.split(">=") for text in project["dependencies"])
+    assert {name: declared[name] for name in doctor_machine._LIBRARIES} == doctor_machine._LIBRARIES
+
+
+def test_a_missing_an_old_and_a_shadowing_library_are_told(place: Place, monkeypatch: pytest.MonkeyPatch) -> None:
+    real = metadata.version
+
+    def version(name: str) -> str:
+        if name == "msgpack":
+            raise metadata.PackageNotFoundError(name)
+        return {"nfcpy": "0.13.5", "ndef": "0.2"}.get(name) or real(name)
+
+    monkeypatch.setattr(metadata, "version", version)
+    libraries, ndeflib = look(place, "libraries")
+    assert libraries.result == "failed"
+    assert "msgpack is missing, nfcpy 0.13.5 (needs 1.0.4)" in libraries.why
+    assert libraries.fix == "pip install 'nfcpy>=1.0.4' 'msgpack>=1.0'"
+    assert (ndeflib.result, "pip uninstall --yes ndef" in ndeflib.fix) == ("failed", True)
+
+
+def test_a_clock_that_went_back_is_told(stationed: Place, monkeypatch: pytest.MonkeyPatch) -> None:
+    assert look(stationed, "clock")[0].result == "ok"
+    monkeypatch.setattr("teds_provision.store.audit.utc_now", lambda: "2099-01-01T00:00:00Z")
+    with Store.open(stationed.home) as store:
+        store.audit.append("test", None, "done")
+    (clock,) = look(stationed, "clock")
+    assert (clock.result, "before the last entry" in clock.why) == ("failed", True)
+
+
+@pytest.mark.parametrize(("ahead", "result"), [(0, "ok"), (86_000, "warning")])
+def test_a_hardware_clock_that_differs_is_told(place: Place, ahead: int, result: str) -> None:
+    clock = place.at("/sys/class/rtc/rtc0/since_epoch")
+    clock.parent.mkdir(parents=True)
+    clock.write_text(f"{int(time.time()) + ahead}\n")
+    assert look(place, "clock")[0].result == result
+
+
+def test_a_check_that_breaks_is_a_finding_and_the_others_run(place: Place, monkeypatch: pytest.MonkeyPatch) -> None:
+    def broken(place: Place) -> Iterator[Finding]:
+        raise OSError("a library fell over")
+        yield
+
+    list(examine(place))
+    monkeypatch.setitem(doctor.CHECKS, "clock", ("machine", broken))
+    found = by_name(place)
+    assert (found["clock"].result, "fell over" in found["clock"].why) == ("failed", True)
+    assert "keys folder" in found
+    assert exit_code(list(examine(place))) == 1
+
+
+# -- the station -------------------------------------------------------------------------------------------------------
+
+
+def test_a_healthy_station_has_nothing_that_failed(stationed: Place, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("DBUS_SESSION_BUS_ADDRESS", f"unix:path={stationed.home}/no-bus")
+    found = by_name(stationed)
+    for name in ("home", "store", "audit log", "backup", "lock", "disk"):
+        assert found[name].result == "ok", found[name]
+    assert found["keyring"].result == "skipped"
+    assert (found["vault"].result, "cheaply" in found["vault"].why) == ("warning", True)
+
+
+def test_a_home_open_to_others_gets_its_chmod(stationed: Place) -> None:
+    stationed.home.chmod(0o777)
+    assert [(one.result, one.fix) for one in look(stationed, "home")] == [("failed", f"chmod 700 {stationed.home}")]
+    stationed.home.chmod(0o755)
+    (stationed.home / "vault.json").chmod(0o644)
+    home, files = look(stationed, "home")
+    assert (home.result, files.result) == ("warning", "failed")
+    assert f"chmod 600 {stationed.home / 'vault.json'}" in files.fix
+
+
+def test_a_damaged_store_and_a_broken_chain_are_exit_7(stationed: Place) -> None:
+    with closing(sqlite3.connect(stationed.home / "store.sqlite3")) as connection, connection:
+        connection.execute("DROP TRIGGER audit_is_never_changed")
+        connection.execute("UPDATE audit SET outcome = 'x'")
+    log = next(one for one in look(stationed, "store") if one.name == "audit log")
+    assert (log.result, exit_code([("store", log)])) == ("failed", 7)
+    for end in ("-wal", "-shm"):
+        (stationed.home / f"store.sqlite3{end}").unlink(missing_ok=True)
+    (stationed.home / "store.sqlite3").write_bytes(b"no database" * 1000)
+    found = list(examine(stationed))
+    store = next(one for _, one in found if one.name == "store")
+    assert (store.result, "restore" in store.fix) == ("failed", True)
+    assert exit_code(found) == 7
+
+
+def test_who_holds_the_store_is_named(stationed: Place) -> None:
+    with StoreLock(stationed.home, command="provision"):
+        lock = next(one for one in look(stationed, "store") if one.name == "lock")
+    assert (lock.result, str(os.getpid()) in lock.why, "provision" in lock.why) == ("warning", True, True)
+
+
+def test_a_lost_passphrase_file_is_told_without_asking_for_anything(stationed: Place) -> None:
+    (stationed.home / "vault.json").unlink()
+    vault = by_name(stationed)["vault"]
+    assert (vault.result, "restore" in vault.fix) == ("failed", True)
+
+
+def test_nodes_without_a_backup_are_a_warning(stationed: Place) -> None:
+    with Store.open(stationed.home) as store:
+        store.put_node(NodeRecord(bytes(10)))
+    backup = next(one for one in look(stationed, "store") if one.name == "backup")
+    assert (backup.result, backup.fix) == ("warning", "teds-provision backup FILE")
+    with Store.open(stationed.home) as store:
+        store.audit.append("backup", None, "done")
+    assert next(one for one in look(stationed, "store") if one.name == "backup").result == "ok"
+
+
+def test_a_station_whose_keyring_is_gone_is_a_failure(stationed: Place, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("DBUS_SESSION_BUS_ADDRESS", f"unix:path={stationed.home}/no-bus")
+    with Store.open(stationed.home) as store:
+        store.set_setting("keystore", "keyring")
+    found = by_name(stationed)
+    assert (found["keyring"].result, found["vault"].result) == ("failed", "failed")
+    monkeypatch.setenv("PYTHON_KEYRING_BACKEND", "keyring.backends.null.Keyring")
+    assert "null" in by_name(stationed)["keyring"].why
+
+
+def test_a_token_whose_module_is_missing_is_a_failure(stationed: Place) -> None:
+    with Store.open(stationed.home) as store:
+        store.set_setting("keystore", "pkcs11:token=bench?module-path=/nowhere/module.so")
+    vault = by_name(stationed)["vault"]
+    assert (vault.result, "module" in vault.why) == ("failed", True)
+
+
+# -- keys/ -------------------------------------------------------------------------------------------------------------
+
+
+def private_keys() -> dict[str, bytes]:
+    from cryptography.hazmat.primitives.asymmetric import ec
+    from cryptography.hazmat.primitives.serialization import Encoding, NoEncryption, PrivateFormat
+
+    key = ec.generate_private_key(ec.SECP256R1())
+    plain = NoEncryption()
+    return {
+        "pkcs8.pem": key.private_bytes(Encoding.PEM, PrivateFormat.PKCS8, plain),
+        "sec1.pem": key.private_bytes(Encoding.PEM, PrivateFormat.TraditionalOpenSSL, plain),
+        "pkcs8.der": key.private_bytes(Encoding.DER, PrivateFormat.PKCS8, plain),
+        "sec1.der": key.private_bytes(Encoding.DER, PrivateFormat.TraditionalOpenSSL, plain),
+        "ssh": key.private_bytes(Encoding.PEM, PrivateFormat.OpenSSH, plain),
+        "key.jwk": b'{"kty": "EC", "crv": "P-256", "x": "AA", "y": "AA", "d": "AA"}',
+    }
+
+
+@pytest.mark.parametrize("name", ["pkcs8.pem", "sec1.pem", "pkcs8.der", "sec1.der", "ssh", "key.jwk"])
+def test_a_private_key_in_the_keys_folder_is_found_in_every_form(place: Place, name: str) -> None:
+    folder = place.workspace / "keys" / "stations"
+    folder.mkdir(parents=True)
+    (folder / "bench.pem").write_text(to_pem(SoftwareKey.generate().point))
+    (folder.parent / "README.md").write_text("Public keys only.\n")
+    assert look(place, "keys folder")[0].result == "ok"
+    (folder / name).write_bytes(private_keys()[name])
+    (keys,) = look(place, "keys folder")
+    assert (keys.result, f"keys/stations/{name}" in keys.why) == ("failed", True)
+
+
+def test_the_keys_folder_of_this_project_holds_no_private_key() -> None:
+    folder = Path(__file__).parents[2] / "keys"
+    assert folder.is_dir()
+    assert [path for path in folder.rglob("*") if path.is_file() and holds_private_key(path)] == []
