@@ -9,9 +9,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
-from teds_provision.errors import BadData, NotAuthentic, NotFound, PolicyRefused
+from teds_provision.errors import BadData, NotAuthentic, NotFound, PolicyRefused, VaultFailure
 from teds_provision.protocol.jwk import point_of, public_jwk
 from teds_provision.protocol.keys import PrivateKey, fingerprint, station_key_message, verify
 from teds_provision.protocol.strict_json import decode_base64url, dump, encode_base64url, load_object
@@ -191,3 +191,65 @@ def _name(value: object) -> str:
     if not isinstance(value, str) or not value.isprintable() or not 0 < len(value) <= 100:
         raise BadData("A station's name is printable text of at most 100 characters.")
     return value
+
+
+# -- the CA key itself ------------------------------------------------------------------------------------------------
+
+
+def require_ca(station: Station) -> PrivateKey:
+    """Return the CA key; raises PolicyRefused where this station's CA is kept elsewhere."""
+    ca = station.vault.ca()
+    if ca is None or ca.point != station.ca:
+        raise PolicyRefused(
+            f"The key of this station's CA {fingerprint(station.ca)[:16]} is not in this vault.",
+            hint="Bring it: trust ca import FILE. A CA of its own has a station made by init in another --home.",
+        )
+    return ca
+
+
+def export_ca(station: Station, vault: Vault, path: Path, passphrase: str) -> None:
+    """Write the CA key to a new file under a passphrase; raises PolicyRefused, VaultFailure (token, file)."""
+    require_ca(station)
+    _software(vault).export_ca(path, passphrase)
+    station.audit("ca", None, "exported", ca=fingerprint(station.ca))
+
+
+def drop_ca(station: Station) -> bool:
+    """Delete the CA key from the vault; False if it is not there."""
+    dropped: bool = _software(station.vault).drop_ca()
+    if dropped:
+        station.audit("ca", None, "dropped", ca=fingerprint(station.ca))
+    return dropped
+
+
+def import_ca(station: Station, vault: Vault, path: Path, passphrase: str) -> None:
+    """Bring the CA key back; raises WrongPassphrase, NotFound, VaultFailure, PolicyRefused (another CA's key)."""
+    from teds_provision.protocol.keys import SoftwareKey
+    from teds_provision.vault.ca_file import read_ca
+
+    if SoftwareKey.from_secret(read_ca(path, passphrase)).point != station.ca:
+        raise PolicyRefused(f"{path} holds another CA key than that of this station ({fingerprint(station.ca)[:16]}).")
+    _software(vault).import_ca(path, passphrase)
+    station.audit("ca", None, "imported", ca=fingerprint(station.ca))
+
+
+def _software(vault: Vault) -> Any:
+    """The vault's own methods for its CA key, which not every kind has."""
+    if not all(hasattr(vault, name) for name in ("export_ca", "drop_ca")):
+        raise VaultFailure(f"The {vault.kind} vault cannot do that with its CA key.")
+    if vault.kind == "pkcs11" and not hasattr(vault, "import_ca"):
+        return _Token(vault)
+    return vault
+
+
+class _Token:
+    """A token's CA key: it can be destroyed, but neither leave nor come."""
+
+    def __init__(self, vault: Any) -> None:
+        self.export_ca, self.drop_ca = vault.export_ca, vault.drop_ca
+
+    def import_ca(self, path: Path, passphrase: str) -> None:
+        """Refuse."""
+        raise VaultFailure(
+            "A CA key from a file cannot be put into a token.", hint="Use --keystore file in another home."
+        )

@@ -24,6 +24,7 @@ from teds_provision.workflow.station import Station
 from teds_provision.workflow.trust import find_trusted
 
 DEFAULT_DAYS = 7
+OUT_OF_SERVICE = ("decommissioned", "replaced by")  # verdicts that workflow.life gives
 
 
 @dataclass(frozen=True)
@@ -160,6 +161,8 @@ class _Selection:
             return "its key was never proven in a session" if uuid in self.pending else "no key of it is held here"
         if self.station.rotation_due(uuid):
             return "its key must be rotated first"
+        if node is not None and (node.verdict or "").startswith(OUT_OF_SERVICE):
+            return "it is out of service"
         if node is None or node.point is None:
             return "its public key is not known"
         return ""

@@ -42,7 +42,7 @@ def pair(tmp_path: Path) -> Iterator[Pair]:
 
 
 def test_after_a_copy_both_stations_reach_the_node(pair: Pair) -> None:
-    path, exported = pair.export("copy")
+    path, _exported = pair.export("copy")
     taken = pair.take(path)
     assert taken.uuids == (pair.board.uuid,)
     assert held(pair.south, pair.board) == [("pending", 1, "import")]
@@ -96,7 +96,7 @@ def test_one_bundle_for_several_stations(pair: Pair, tmp_path: Path) -> None:
     trust(pair.north, west)
     trust(west, pair.north)
     trust(pair.south, west)
-    path, exported = pair.export("copy", to=("south", west.fingerprint[:16]))
+    path, _exported = pair.export("copy", to=("south", west.fingerprint[:16]))
     for station in (pair.south, west):
         pair.take(path, station)
         assert session(station, pair.board) == 1
@@ -110,7 +110,7 @@ def test_one_bundle_for_several_stations(pair: Pair, tmp_path: Path) -> None:
 
 def test_a_move_rests_the_key_at_once(pair: Pair) -> None:
     _, exported = pair.export("move")
-    for act in (session, lambda station, board: key_again(station, board)):
+    for act in (session, key_again):
         with pytest.raises(PolicyRefused, match="was moved to station") as refused:
             act(pair.north, pair.board)
         assert f"handover undo {exported.plan.id}" in refused.value.hint
@@ -230,7 +230,7 @@ def test_the_receipt_closes_a_move_and_deletes_its_keys(pair: Pair) -> None:
 
 
 def test_a_receipt_is_for_this_bundle_from_its_receiver(pair: Pair, tmp_path: Path) -> None:
-    path, exported = pair.export("move")
+    path, _exported = pair.export("move")
     taken = pair.take(path)
     before = everything(pair.north)
     with pytest.raises(NotAuthentic):
@@ -313,7 +313,7 @@ def test_a_node_refused_by_the_receiver_of_a_move_is_the_senders_again(tmp_path:
 def test_a_node_that_was_given_away_and_reset_may_be_keyed_again(pair: Pair) -> None:
     path, _ = pair.export("move")
     close(pair.north, pair.take(path).receipt)
-    with pytest.raises(PolicyRefused, match="have it handed back|was moved"):
+    with pytest.raises(PolicyRefused, match="was moved to station"):
         key_again(pair.north, pair.board)
     pair.board.tim.reset_by_hand()
     key_again(pair.north, pair.board)
@@ -438,7 +438,7 @@ def test_a_plan_changes_nothing(pair: Pair) -> None:
 
 def test_the_bundle_says_what_the_profile_lists(pair: Pair) -> None:
     provisioned(pair.north, pair.board)
-    path, exported = pair.export("copy")
+    path, _exported = pair.export("copy")
     keys = {pair.north.fingerprint: pair.north.point}
     opened = open_bundle(path.read_bytes(), pair.south.vault.identity(), keys.get, datetime.now(UTC))
     (node,) = opened.bundle.nodes

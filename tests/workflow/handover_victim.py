@@ -1,0 +1,87 @@
+"""A process that exports or imports and is killed before its n-th statement or step on disk: ``kill -9`` for real."""
+
+from __future__ import annotations
+
+import os
+import signal
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+from unittest.mock import patch
+
+from teds_provision.store.database import Database
+from teds_provision.workflow import handover_files
+from teds_provision.workflow.handover_export import ExportOrder, export_keys, plan_export
+from teds_provision.workflow.handover_import import ImportPlan, import_keys, plan_import
+from teds_provision.workflow.station import Station
+
+from .bench import PASSPHRASE
+
+
+@contextmanager
+def counted(at: Callable[[int], None]) -> Iterator[None]:
+    """Call ``at(n)`` before the n-th change: each statement that is no SELECT, and each step that writes a file."""
+    count = 0
+
+    def step() -> None:
+        nonlocal count
+        count += 1
+        at(count)
+
+    def hooked(real: Callable[..., Any]) -> Callable[..., Any]:
+        def run(self: Database, statement: str, values: Any = ()) -> Any:
+            if not statement.startswith("SELECT"):
+                step()
+            return real(self, statement, values)
+
+        return run
+
+    def filed(real: Callable[..., Any]) -> Callable[..., Any]:
+        def run(*words: Any) -> Any:
+            step()
+            return real(*words)
+
+        return run
+
+    with (
+        patch.object(Database, "execute", hooked(Database.execute)),
+        patch.object(Database, "change", hooked(Database.change)),
+        patch.object(handover_files, "_publish", filed(handover_files._publish)),
+        patch.object(handover_files, "_sync_folder", filed(handover_files._sync_folder)),
+    ):
+        yield
+
+
+def open_station(home: Path) -> Station:
+    return Station.open(home, ask=lambda prompt, confirm: PASSPHRASE)
+
+
+def export(station: Station, bundle: Path) -> None:
+    """A move of all nodes, as the command does it."""
+    export_keys(station, plan_export(station, ExportOrder(("south",), None, "move")), bundle)
+
+
+def take(station: Station, bundle: Path) -> bytes:
+    """An import, as the command does it; returns the receipt."""
+    plan = plan_import(station, bundle.read_bytes())
+    done = import_keys(station, plan) if isinstance(plan, ImportPlan) else plan
+    return done.receipt
+
+
+def main(home: str, act: str, last: str, bundle: str) -> None:
+    """Do it, and die before step ``last``."""
+
+    def die(count: int) -> None:
+        if count == int(last):
+            os.kill(os.getpid(), signal.SIGKILL)
+
+    station = open_station(Path(home))
+    station.credentials()
+    with counted(die):
+        (export if act == "export" else take)(station, Path(bundle))
+
+
+if __name__ == "__main__":
+    main(*sys.argv[1:])
