@@ -41,6 +41,10 @@ class App:
         self._passphrase_fd = passphrase_fd
         self._passphrase: str | None = None
         self._closers: list[Callable[[], None]] = []
+        self.live_line: Callable[[], None] = lambda: None
+        """Takes a live progress line away; called before anything else is told or asked."""
+        if verbose or debug:
+            _log_to_stderr(logging_level=10 if debug or verbose > 1 else 20, libraries=debug)
         App.current = self
 
     @staticmethod
@@ -59,6 +63,7 @@ class App:
 
         ``human`` is a rich renderable (or a str), or a function that is given the console.
         """
+        self.live_line()
         if self.json:
             print(json.dumps(result, ensure_ascii=False), flush=True)
         elif human is not None:
@@ -80,15 +85,18 @@ class App:
     def note(self, text: str, *, level: int = 0) -> None:
         """Say something on stderr, unless --quiet (or fewer ``-v`` than ``level``); not with --json."""
         if not self.quiet and not self.json and self.verbose >= level:
+            self.live_line()
             print(text, file=sys.stderr, flush=True)
 
     def warn(self, text: str) -> None:
         """Warn on stderr, also with --json; only --quiet silences it."""
+        self.live_line()
         if not self.quiet:
             print(f"Warning: {text}", file=sys.stderr, flush=True)
 
     def fail_line(self, error: TedsProvisionError) -> None:
         """Tell an error that does not end the command (``--watch``): one JSON object, or a line on stderr."""
+        self.live_line()
         if self.json:
             told = {"code": error.code, "message": error.message, "hint": error.hint}
             print(json.dumps({"error": told}, ensure_ascii=False), flush=True)
@@ -108,6 +116,7 @@ class App:
         """Ask before something that cannot be undone; ``yes`` is the command's --yes. Aborts on "no" (exit 130)."""
         if yes:
             return
+        self.live_line()
         if not self.interactive:
             raise UsageFailure(
                 "This needs a confirmation and nobody can be asked.", hint="Add --yes, or --dry-run to see the plan."
@@ -125,6 +134,7 @@ class App:
                 f"{prompt.rstrip(': ')} is needed and nobody can be asked.",
                 hint="Give it through a file descriptor: --passphrase-fd 3 3<FILE.",
             )
+        self.live_line()
         answer: str = click.prompt(prompt, hide_input=True, confirmation_prompt=confirm, err=True)
         return answer
 
@@ -143,10 +153,10 @@ class App:
         self._closers.append(close)
 
     def close(self) -> None:
-        """Close everything that was registered, last first."""
+        """Close everything that was registered, last first; a second call does nothing."""
+        self.live_line()
         while self._closers:
             self._closers.pop()()
-        App.current = None
 
 
 def read_line(descriptor: int) -> str:
@@ -160,6 +170,17 @@ def read_line(descriptor: int) -> str:
     if not text:
         raise WrongPassphrase(f"--passphrase-fd {descriptor} gave an empty line.")
     return text
+
+
+def _log_to_stderr(*, logging_level: int, libraries: bool) -> None:
+    """Log what we do (never a payload) on stderr; libraries too with --debug."""
+    import logging
+
+    handler = logging.StreamHandler()
+    handler.setFormatter(logging.Formatter("%(asctime)s %(name)s: %(message)s"))
+    logger = logging.getLogger() if libraries else logging.getLogger("teds_provision")
+    logger.addHandler(handler)
+    logger.setLevel(logging_level)
 
 
 pass_app = click.make_pass_decorator(App)

@@ -16,13 +16,7 @@ def demo(app: App) -> None:
     from teds_provision.cli.rendering import reporter_for
     from teds_provision.workflow.demo import run_demo
 
-    reporter = reporter_for(app)
-    try:
-        done = run_demo(reporter, lambda text: app.note(f"\n{text}"))
-    finally:
-        close = getattr(reporter, "close", None)
-        if close is not None:
-            close()
+    done = run_demo(reporter_for(app), lambda text: app.note(f"\n{text}"))
     steps = [{"name": step.name, "result": step.result, "seconds": step.seconds} for step in done.steps]
     app.emit(
         {"uuid": done.uuid.hex(), "steps": steps, "verdict": done.verdict},

@@ -99,7 +99,7 @@ def _read_config(ctx: click.Context, _parameter: click.Parameter, home: Path | N
     help="Folder of the store (default: the platform's user data folder).",
 )
 @click.option("--json", "as_json", envvar=f"{ENVIRONMENT_PREFIX}_JSON", is_flag=True, help="One JSON object on stdout.")
-@click.option("--verbose", "-v", count=True, help="Say more on stderr; twice for every frame's name and size.")
+@click.option("--verbose", "-v", count=True, help="Log on stderr what is done; twice: every command with its size.")
 @click.option("--quiet", "-q", is_flag=True, help="Say nothing but results and errors.")
 @click.option("--debug", is_flag=True, help="Show tracebacks and library logs.")
 @click.option("--no-input", is_flag=True, help="Never prompt; fail where a prompt would be needed.")
@@ -124,6 +124,7 @@ def run(arguments: list[str]) -> int:
     except click.exceptions.Exit as finished:
         return finished.exit_code
     except (click.Abort, KeyboardInterrupt):
+        _settle()
         _say("Interrupted: the same command carries on from here.")
         return INTERRUPTED
     except click.ClickException as error:
@@ -162,7 +163,14 @@ def _traceback(arguments: list[str]) -> None:
         traceback.print_exc()
 
 
+def _settle() -> None:
+    """Take the live line away before something else is told."""
+    if App.current is not None:
+        App.current.live_line()
+
+
 def _fail(arguments: list[str], exit_code: int, code: str, message: str, hint: str) -> int:
+    _settle()
     if _wants(arguments, "--json"):
         print(json.dumps({"error": {"code": code, "message": message, "hint": hint}}), flush=True)
     else:

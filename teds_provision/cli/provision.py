@@ -58,11 +58,8 @@ def provision(
     if watch:
         _watch(app, station, links, run, reporter)
         return
-    try:
-        with meet(station, links, wanted, reporter) as node:
-            done = run(node)
-    finally:
-        _end_live(reporter)
+    with meet(station, links, wanted, reporter) as node:
+        done = run(node)
     _tell(app, done)
     require_authentic(done.verified)
 
@@ -80,7 +77,6 @@ def _runner(
                 f"Node {who.uuid.hex()} is not on the whitelist, and nobody can be asked.",
                 hint=f"Add --yes, or: teds-provision whitelist add {who.uuid.hex()} --fingerprint {who.fingerprint}",
             )
-        _end_live(reporter)
         app.confirm(f"Whitelist node {who.uuid.hex()} with key {who.fingerprint[:16]}?", yes=False)
 
     def one(node: Conversation) -> Provisioned:
@@ -101,7 +97,6 @@ def _watch(
     stop = threading.Event()
     signal.signal(signal.SIGTERM, lambda *_: stop.set())
     for outcome in watch_nodes(station, links, run, reporter, stop):
-        _end_live(reporter)
         if isinstance(outcome, TedsProvisionError):
             app.fail_line(outcome)
         else:
@@ -156,9 +151,3 @@ def _summary(console: Console, done: Provisioned) -> None:
     verdict = done.verified.verdict
     table.add_row("verdict", f"[bold {'green' if verdict == 'authentic' else 'red'}]{verdict}[/]")
     console.print(table)
-
-
-def _end_live(reporter: Reporter) -> None:
-    close = getattr(reporter, "close", None)
-    if close is not None:
-        close()

@@ -31,7 +31,11 @@ def reporter_for(app: App) -> Reporter:
     """The reporter that suits this run: silent for --json and --quiet, lines in a pipe, live on a terminal."""
     if app.json or app.quiet:
         return Silent()
-    return LiveReporter(app) if sys.stderr.isatty() else LineReporter(app)
+    if not sys.stderr.isatty():
+        return LineReporter(app)
+    live = LiveReporter(app)
+    app.live_line = live.close
+    return live
 
 
 class LineReporter:

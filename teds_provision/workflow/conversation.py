@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import time
 from types import TracebackType
 
@@ -11,6 +12,7 @@ from teds_provision.links.ports import NoticeSink
 from teds_provision.protocol.frames import Command, Function, Reason, Reply, decode_reply, security_command
 from teds_provision.protocol.session import StationSession
 
+_log = logging.getLogger(__name__)
 _BUSY_PAUSE = 0.25
 _BUSY_SECONDS = 10.0
 _REOPENINGS = 2
@@ -167,7 +169,10 @@ class Conversation:
     def _exchange(self, command: Command) -> Reply:
         until = time.monotonic() + _BUSY_SECONDS
         while True:
-            reply = decode_reply(self.contact.link.exchange(command.encode()))
+            frame = command.encode()
+            raw = self.contact.link.exchange(frame)
+            _log.debug("%d.%d: %d octets out, %d back", command.command_class, command.function, len(frame), len(raw))
+            reply = decode_reply(raw)
             if reply.ok or reply.reason != Reason.BUSY or time.monotonic() >= until:
                 return reply
             self._notice(Notice("retry", "The node is busy with another station", until - time.monotonic()))
