@@ -75,21 +75,23 @@ def add(app: App, uuid: str, fingerprint: str | None, name: str | None, dry_run:
 @pass_app
 def remove(app: App, uuid: str, yes: bool, dry_run: bool) -> None:
     """Take a node off the whitelist and forget its pinned key, so that a replaced board can be pinned anew."""
+    from teds_provision.workflow.whitelist import is_pinned
     from teds_provision.workflow.whitelist import remove as run
 
     station = app.station()
     octets = station.store.resolve(uuid)
     entry = station.store.whitelisted(octets)
     told = f"{octets.hex()}{f' ({entry.name})' if entry and entry.name else ''}"
-    if entry is None:
+    pinned = entry.fingerprint if entry is not None else None
+    if entry is None and not is_pinned(station, octets):
         text = f"{told} is not on the whitelist (nothing to do)."
     elif dry_run:
-        text = f"Plan: take {told} off the whitelist, forget its key {(entry.fingerprint or 'none')[:16]}."
+        text = f"Plan: take {told} off the whitelist, forget its key {(pinned or 'that it showed')[:16]}."
     else:
         app.confirm(f"Take {told} off the whitelist and forget its pinned key?", yes=yes)
         with station.lock("whitelist remove", app.note):
             run(station, octets)
-        text = f"{told} is off the whitelist."
+        text = f"{told} is off the whitelist{'' if entry else ' as before, and its key is forgotten'}."
     _emit(app, station, text, removed=entry is not None and not dry_run)
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 from dataclasses import dataclass
 
-from teds_provision.errors import NodeRefused, NotAuthentic
+from teds_provision.errors import BadData, NodeRefused, NotAuthentic
 from teds_provision.protocol.frames import Function, security_command
 from teds_provision.protocol.identity import NodeState
 from teds_provision.protocol.keys import fingerprint, is_point, node_key_message, prove_message, verify
@@ -54,8 +54,26 @@ def prove(node: Conversation, point: bytes) -> None:
 def identify(station: Station, node: Conversation) -> Identified:
     """Read UUID and key, demand the proof, and hold both against what this station knows.
 
-    Raises OtherKey (a known UUID with another key), NotAuthentic, BadData, LinkFailure. Records what was seen.
+    Raises OtherKey (a known UUID with another key), NotAuthentic, BadData, LinkFailure. Records what was seen. A tap
+    pins the key that it brought; over a bus, where anyone can call itself by any UUID, only a whitelisted key is kept.
     """
+    who = examine(station, node)
+    pinned = who.whitelisted is not None and who.whitelisted.fingerprint is not None
+    station.remember(
+        node.uuid,
+        state=int(who.state),
+        can_address=node.identity.can_address,
+        last_seen=utc_now(),
+        **({"point": who.point} if node.tapped or pinned else {}),
+    )
+    known = known_key(station, node.uuid)
+    if known != who.point:
+        station.store.put_node_image(node.uuid, Image(node.uuid, {SECURITY: who.security_teds}).to_json())
+    return who
+
+
+def examine(station: Station, node: Conversation) -> Identified:
+    """What :func:`identify` finds out, without a trace in the store (but of a wrong key in the audit log)."""
     octets = read_block(node, SECURITY)
     shown = security.decode(octets)
     point = shown.node_key
@@ -64,15 +82,6 @@ def identify(station: Station, node: Conversation) -> Identified:
     prove(node, point)
     station.check_pin(node.uuid, point)
     identity = node.identity
-    station.remember(
-        node.uuid,
-        point=point,
-        state=int(identity.state),
-        can_address=identity.can_address,
-        last_seen=utc_now(),
-    )
-    if station.store.node_image(node.uuid) is None:
-        station.store.put_node_image(node.uuid, Image(node.uuid, {SECURITY: octets}).to_json())
     return Identified(
         uuid=node.uuid,
         point=point,
@@ -83,6 +92,16 @@ def identify(station: Station, node: Conversation) -> Identified:
         security_teds=octets,
         whitelisted=station.store.whitelisted(node.uuid),
     )
+
+
+def known_key(station: Station, uuid: bytes) -> bytes | None:
+    """P(node) of the Security TEDS that was last read from this UUID, None where there is none of this profile."""
+    text = station.store.node_image(uuid)
+    octets = Image.from_json(text).security if text is not None else None
+    try:
+        return security.decode(octets).node_key if octets is not None else None
+    except BadData:
+        return None
 
 
 @dataclass(frozen=True)

@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from teds_provision.errors import NotAuthentic
+from teds_provision.errors import NotAuthentic, PolicyRefused
 from teds_provision.protocol.datasheet import NodeKeys
 from teds_provision.protocol.identity import NodeState
 from teds_provision.store import Draft, WhitelistEntry
@@ -165,11 +165,22 @@ def require_authentic(verified: Verified) -> None:
 
 
 def add_to_whitelist(station: Station, node: Conversation, who: Identified) -> WhitelistEntry:
-    """Whitelist a node that was just identified, pinned to its key; by tap, or by the bus of a CAN-only node."""
+    """Whitelist a node that was just identified, pinned to its key; by tap, or by the bus of a CAN-only node.
+
+    An entry that another process made meanwhile stays. Raises PolicyRefused (revoked), OtherKey.
+    """
     assurance = "tap" if node.tapped else "bus"
     entry = WhitelistEntry(who.uuid, who.fingerprint, assurance=assurance)  # type: ignore[arg-type]
     with station.store.transaction():
+        revoked = station.store.revocation(who.uuid)
+        if revoked is not None:
+            raise PolicyRefused(f"Node {who.uuid.hex()} was revoked: {revoked.why}.", hint="It was not whitelisted.")
+        station.check_pin(who.uuid, who.point)
+        present = station.store.whitelisted(who.uuid)
+        if present is not None:
+            return present
         station.store.put_whitelist(entry)
+        station.remember(who.uuid, point=who.point)
         station.audit("whitelist", who.uuid, "added", fingerprint=who.fingerprint, assurance=assurance)
     return entry
 

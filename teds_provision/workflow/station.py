@@ -248,10 +248,11 @@ class Station:
 
     def remember(self, uuid: bytes, **facts: object) -> NodeRecord:
         """Bring what is known of a node up to date and return it."""
-        known = self.store.node(uuid) or NodeRecord(uuid)
-        changed = replace(known, **facts)  # type: ignore[arg-type]
-        if changed != known or self.store.node(uuid) is None:
-            self.store.put_node(changed)
+        with self.store.transaction():  # no other process changes what was read before it is written
+            present = self.store.node(uuid)
+            changed = replace(present or NodeRecord(uuid), **facts)  # type: ignore[arg-type]
+            if changed != present:
+                self.store.put_node(changed)
         return changed
 
     def audit(self, act: str, uuid: bytes | None, outcome: str, **detail: object) -> None:

@@ -109,17 +109,24 @@ def add(station: Station, plan: Plan, *, source: str | None = None) -> None:
 
 
 def remove(station: Station, uuid: bytes) -> bool:
-    """Take a node off the whitelist and forget its pinned key; False where it was not on it.
+    """Take a node off the whitelist and forget its pinned key; False where there was neither.
 
     Epoch, sequence and link keys stay: they still count when the node comes back. A replaced board under the same UUID
     can be pinned anew from here on.
     """
     with station.store.transaction():
         removed = station.store.remove_whitelist(uuid)
-        if removed:
-            station.store.unpin_node(uuid)
-            station.audit("whitelist", uuid, "removed")
-    return removed
+        pinned = is_pinned(station, uuid)
+        station.store.unpin_node(uuid)
+        if removed or pinned:
+            station.audit("whitelist", uuid, "removed" if removed else "unpinned")
+    return removed or pinned
+
+
+def is_pinned(station: Station, uuid: bytes) -> bool:
+    """Whether the key of this UUID is known from a contact, be it whitelisted or not."""
+    node = station.store.node(uuid)
+    return node is not None and node.point is not None
 
 
 def as_dict(entry: WhitelistEntry) -> dict[str, Any]:
