@@ -112,6 +112,13 @@ def agree(station: Station, node: Conversation, who: Identified, *, rotate: bool
     ca = station.ca if who.state == NodeState.FACTORY else station.ca_of(node.uuid)
     try:
         return _agree_anew(station, node, pinned, ca)
+    except NodeRefused as refusal:
+        # Identify may have been answered while the node was still storing the key of a run that was cut off
+        late = refusal.reason == Reason.NOT_PERMITTED and who.state == NodeState.FACTORY and not rotate
+        held = open_session(station, node) if late else None
+        if held is None:
+            raise
+        return Agreed(held.record.epoch, held.record.key_id, fresh=True)
     except SessionLost as lost:
         raise lost.cause from lost
 
