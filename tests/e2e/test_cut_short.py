@@ -1,0 +1,198 @@
+"""Power cuts, ``kill -9`` and Ctrl-C at every step of a provisioning: the same command carries on from there."""
+
+from __future__ import annotations
+
+import signal
+import sqlite3
+import time
+from collections.abc import Callable
+from contextlib import closing
+
+import pytest
+
+from .desk import ANGLE, Desk, Node, Running, Station
+
+pytestmark = pytest.mark.link
+
+SLOW = ("--crypto-delay", "120", "--flash-delay", "250")
+"""A node slow enough that every step can be met in the middle; milliseconds."""
+
+Moment = Callable[[Station, Node, Running], bool]
+
+
+def told(step: str) -> Moment:
+    """The station has just said that ``step`` is done: it is in the next one."""
+    return lambda station, node, command: f"✓ {step}" in command.err
+
+
+def key_pending(station: Station, node: Node, command: Running) -> bool:
+    """The station has stored the new key and sends Confirm (loss table, third row)."""
+    with closing(sqlite3.connect(f"file:{station.home}/store.sqlite3?mode=ro", uri=True)) as database:
+        return database.execute("SELECT count(*) FROM keys WHERE state = 'pending'").fetchone()[0] > 0
+
+
+def key_on_node(station: Station, node: Node, command: Running) -> bool:
+    """The node has committed the key; its reply is on the way."""
+    return node.flash["key"] is not None
+
+
+def sheet_on_node(station: Station, node: Node, command: Running) -> bool:
+    """The node has committed the datasheet; its reply, read-back and verification are still to come."""
+    return bool(node.flash["provisioned"])
+
+
+MOMENTS = {
+    "once identified": told("identify"),
+    "in the agreement": told("whitelist"),
+    "key stored, not confirmed": key_pending,
+    "key committed, reply under way": key_on_node,
+    "agreed": told("agree"),
+    "built": told("build"),
+    "in the write": told("sign"),
+    "datasheet committed": sheet_on_node,
+    "in the verification": told("write"),
+}
+
+
+def start(station: Station, via: str) -> Running:
+    return station.start("provision", "--profile", ANGLE, "--yes", "--timeout", "15", *station.desk.links.over(via))
+
+
+def until(moment: Moment, station: Station, node: Node, command: Running) -> None:
+    """Let a command run up to the moment; it must not have ended before."""
+    end = time.monotonic() + 20
+    while not moment(station, node, command):
+        assert time.monotonic() < end, (command.out, command.err)
+        command.read(0.002)
+        assert command.process.poll() is None, (command.out, command.err)
+
+
+def carries_on(station: Station, node: Node, via: str) -> None:
+    """The same command ends well; station and node agree on one key, and the log is whole."""
+    done = station.provision(via, "--profile", ANGLE)
+    assert done["verdict"] == "authentic"
+    flash, links = node.flash, station.desk.links.over(via)
+    assert flash["provisioned"] is True
+    assert station.keys(node.uuid) == [("active", flash["epoch"])]
+    assert len(node.datasheet) == 5
+    verified = station.ask("verify", node.uuid, *links)
+    assert all(check["result"] == "passed" for check in verified["checks"])
+    assert station.ask("log")["intact"] is True
+
+
+@pytest.mark.parametrize("via", ["nfc", "can"])
+@pytest.mark.parametrize("moment", MOMENTS)
+def test_a_killed_station_carries_on(desk: Desk, station: Station, node: Node, moment: str, via: str) -> None:
+    node.start(*SLOW, nfc=via == "nfc", can=via == "can")
+    command = start(station, via)
+    until(MOMENTS[moment], station, node, command)
+    command.signal(signal.SIGKILL)
+    assert command.end().code == -signal.SIGKILL
+    carries_on(station, node, via)
+
+
+@pytest.mark.parametrize("via", ["nfc", "can"])
+def test_a_node_that_is_still_storing_the_key_when_the_next_run_begins(station: Station, node: Node, via: str) -> None:
+    """It identifies itself as in factory state and is keyed a moment later: the key that was sent is found to work."""
+    node.start("--flash-delay", "1500", nfc=via == "nfc", can=via == "can")
+    command = start(station, via)
+    until(key_pending, station, node, command)
+    command.signal(signal.SIGKILL)
+    command.end()
+    carries_on(station, node, via)
+    assert node.flash["epoch"] == 1 or via == "nfc"
+
+
+@pytest.mark.parametrize("via", ["nfc", "can"])
+@pytest.mark.parametrize("moment", ["in the agreement", "key committed, reply under way", "agreed", "in the write"])
+def test_a_node_that_lost_power_is_carried_on_with(station: Station, node: Node, moment: str, via: str) -> None:
+    """The node is gone for good; the command says so with exit 5, and the same one finishes when it is back."""
+    wires = {"nfc": via == "nfc", "can": via == "can"}
+    node.start(*SLOW, **wires)
+    command = start(station, via)
+    until(MOMENTS[moment], station, node, command)
+    node.kill()
+    outcome = command.end(40)
+    assert outcome.code == 5, outcome
+    assert outcome.out == ""
+    assert "Error:" in outcome.err
+    assert "Traceback" not in outcome.err
+    node.start(**wires)
+    carries_on(station, node, via)
+
+
+@pytest.mark.parametrize("via", ["nfc", "can"])
+def test_a_node_whose_power_only_flickers_needs_no_second_command_or_one(
+    station: Station, node: Node, via: str
+) -> None:
+    wires = {"nfc": via == "nfc", "can": via == "can"}
+    node.start(*SLOW, **wires)
+    command = start(station, via)
+    until(MOMENTS["in the write"], station, node, command)
+    node.kill()
+    node.start(**wires)
+    outcome = command.end(40)
+    assert outcome.code in (0, 5), outcome
+    carries_on(station, node, via)
+
+
+@pytest.mark.parametrize("via", ["nfc", "can"])
+@pytest.mark.parametrize("moment", ["in the agreement", "key stored, not confirmed", "in the write"])
+def test_ctrl_c_ends_at_once_and_loses_nothing(station: Station, node: Node, moment: str, via: str) -> None:
+    node.start(*SLOW, nfc=via == "nfc", can=via == "can")
+    command = start(station, via)
+    until(MOMENTS[moment], station, node, command)
+    began = time.monotonic()
+    command.signal(signal.SIGINT)
+    outcome = command.end(10)
+    assert outcome.code == 130
+    assert time.monotonic() - began < 2
+    assert outcome.err.rstrip().endswith("the same command carries on from here.")
+    assert "Traceback" not in outcome.err
+    carries_on(station, node, via)
+
+
+def test_ctrl_c_while_waiting_for_a_node(station: Station, node: Node) -> None:
+    before = station.tables()
+    command = start(station, "nfc")
+    command.wait_for("Hold the node")
+    command.signal(signal.SIGINT)
+    assert command.end(3).code == 130
+    assert station.tables() == before
+    node.start()
+    carries_on(station, node, "nfc")
+
+
+def kill_after_growing_delays(station: Station, node: Node, via: str, *, first: float, step: float) -> int:
+    """Kill the command after ever longer; returns how often it was killed before it ended by itself."""
+    kills, delay = 0, first
+    while True:
+        command = start(station, via)
+        end = time.monotonic() + delay
+        while time.monotonic() < end and command.process.poll() is None:
+            command.read(0.01)
+        if command.process.poll() is not None:
+            assert command.end().code == 0, (command.out, command.err)
+            return kills
+        command.signal(signal.SIGKILL)
+        command.end()
+        kills, delay = kills + 1, delay + step
+
+
+@pytest.mark.parametrize("via", ["nfc", "can"])
+def test_a_station_that_is_killed_again_and_again_gets_there(station: Station, node: Node, via: str) -> None:
+    node.start(*SLOW, nfc=via == "nfc", can=via == "can")
+    assert kill_after_growing_delays(station, node, via, first=0.3, step=0.15) > 2
+    carries_on(station, node, via)
+
+
+@pytest.mark.soak
+@pytest.mark.timeout(600)
+@pytest.mark.parametrize("via", ["nfc", "can"])
+@pytest.mark.parametrize("first", [0.3, 0.31, 0.32])
+def test_killed_at_every_hundredth_of_a_second(
+    desk: Desk, station: Station, node: Node, via: str, first: float
+) -> None:
+    node.start("--crypto-delay", "20", "--flash-delay", "40", nfc=via == "nfc", can=via == "can")
+    assert kill_after_growing_delays(station, node, via, first=first, step=0.02) > 5
+    carries_on(station, node, via)

@@ -1,0 +1,100 @@
+"""Tap after tap: ``--watch`` with nodes that come and go, and how it ends."""
+
+from __future__ import annotations
+
+import signal
+
+import pytest
+
+from .desk import ANGLE, Desk, Node, Station, results
+
+pytestmark = pytest.mark.link
+
+
+def test_node_after_node_is_provisioned_as_it_is_tapped(desk: Desk, station: Station) -> None:
+    """Three nodes on one reader, the first one twice; one line each; SIGTERM ends it well."""
+    nodes = [desk.node(f"node{number}") for number in range(3)]
+    words = ["--json", "provision", "--watch", "--yes", "--profile", ANGLE, *desk.links.over("nfc")]
+    watch = station.start(*words)
+    for count, node in enumerate([*nodes, nodes[0]], start=1):
+        node.start()
+        done = watch.wait_for_lines(count)[-1]
+        assert (done["uuid"], done["verdict"]) == (node.uuid, "authentic")
+        node.stop()
+    assert set(results(done).values()) == {"done", "nothing to do"}
+    watch.signal(signal.SIGTERM)
+    outcome = watch.end()
+    assert outcome.code == 0
+    assert outcome.out.count("\n") == 4
+    assert len(station.ask("nodes")["nodes"]) == 3
+
+
+def test_both_kinds_of_tag_take_turns(desk: Desk, station: Station) -> None:
+    first, second = desk.node("first"), desk.node("second")
+    watch = station.start("--json", "identify", "--watch", "--add", *desk.links.over("nfc"))
+    first.start("--tag", "2")
+    found = watch.wait_for_lines(1)[-1]
+    assert (found["uuid"], found["whitelisted"], found["state"]) == (first.uuid, True, "factory")
+    first.stop()
+    second.start("--tag", "4")
+    assert watch.wait_for_lines(2)[-1]["uuid"] == second.uuid
+    watch.signal(signal.SIGTERM)
+    assert watch.end().code == 0
+    listed = {entry["uuid"]: entry["assurance"] for entry in station.ask("whitelist", "list")["whitelist"]}
+    assert listed == {first.uuid: "tap", second.uuid: "tap"}
+
+
+def test_new_nodes_on_the_bus_are_seen_as_they_are_plugged_in(desk: Desk, station: Station) -> None:
+    first, second = desk.node("first"), desk.node("second")
+    first.start(nfc=False, can=True)
+    watch = station.start("--json", "provision", "--watch", "--yes", "--profile", ANGLE, *desk.links.over("can"))
+    assert watch.wait_for_lines(1)[-1]["uuid"] == first.uuid
+    second.start(nfc=False, can=True)
+    assert watch.wait_for_lines(2)[-1]["uuid"] == second.uuid
+    watch.signal(signal.SIGTERM)
+    outcome = watch.end()
+    assert outcome.code == 0
+    assert outcome.out.count("authentic") == 2
+
+
+def test_one_node_that_fails_does_not_end_the_watch(desk: Desk, station: Station) -> None:
+    """A node of another owner is refused in its line; the next one is provisioned."""
+    foreign, own = desk.node("foreign"), desk.node("own")
+    foreign.start()
+    assert desk.station("rival").provision("nfc", "--profile", ANGLE)["verdict"] == "authentic"
+    sheet = foreign.octets
+    watch = station.start("--json", "provision", "--watch", "--yes", "--profile", ANGLE, *desk.links.over("nfc"))
+    (said,) = watch.wait_for_lines(1)
+    assert said["error"]["code"] == "node-refused"
+    assert foreign.octets == sheet
+    foreign.stop()
+    own.start()
+    assert watch.wait_for_lines(2)[-1]["verdict"] == "authentic"
+    watch.signal(signal.SIGTERM)
+    assert watch.end().code == 0
+
+
+@pytest.mark.parametrize("command", ["provision", "identify"])
+@pytest.mark.parametrize("via", ["nfc", "can"])
+def test_ctrl_c_ends_a_watch_with_130(station: Station, command: str, via: str) -> None:
+    links = station.desk.links.over(via)
+    order = ["--profile", ANGLE, "--yes"] if command == "provision" else []
+    watch = station.start("-v", command, "--watch", *order, *links)
+    watch.wait_for("…")
+    watch.signal(signal.SIGINT)
+    outcome = watch.end(5)
+    assert outcome.code == 130
+    assert "Interrupted" in outcome.err
+    assert "Traceback" not in outcome.err
+    assert outcome.out == ""
+
+
+def test_a_person_reads_one_line_for_each_node(station: Station, node: Node) -> None:
+    node.start()
+    watch = station.start("identify", "--watch", *station.desk.links.over("nfc"))
+    watch.wait_for(node.uuid)
+    watch.wait_for("not whitelisted")
+    watch.signal(signal.SIGTERM)
+    outcome = watch.end()
+    assert outcome.code == 0
+    assert outcome.out.count("\n") == 1
