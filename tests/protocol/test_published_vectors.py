@@ -20,6 +20,7 @@ from teds_provision.protocol.bundle import open_bundle
 from teds_provision.protocol.frames import Command, decode_reply
 from teds_provision.protocol.keys import SoftwareKey, fingerprint, station_key_message
 from teds_provision.protocol.receipt import open_receipt
+from teds_provision.protocol.repetition import Repetition
 from teds_provision.protocol.session import StationSession
 from teds_provision.teds import security
 from tests.vectors import generate
@@ -181,6 +182,40 @@ def test_proofs_of_reset_verify() -> None:
                 vn.check_signature(node, b"TEDS1 reset\0" + uuid + epoch + challenge, proof)
                 proofs += 1
     assert proofs == 3
+
+
+# -- repetition --------------------------------------------------------------------------------------------------------
+
+
+@cases("repetition")
+def test_repetitions_are_answered_as_published(document: Entry, entry: Entry) -> None:
+    replay, kept = vn.Replay(document, entry), Repetition()
+    for step in entry["steps"]:
+        if "event" in step:
+            kept.forget()
+            replay.run(step)
+            continue
+        ran: list[bytes] = []
+
+        def run(frame: bytes, step: Entry = step, ran: list[bytes] = ran) -> bytes:
+            ran.append(frame)
+            reply = replay.run({**step, "link": "nfc", "tapped": True})
+            assert reply is not None
+            return reply
+
+        frame = bytes.fromhex(step["command"])
+        reply = run(frame) if step["functional"] else kept.answer(step["transaction"], frame, run, now=step["at"])
+        assert (reply.hex(), bool(ran)) == (step["reply"], step["run"]), step["note"]
+    assert replay.tim.identity().encode().hex() == entry["end"]["identify"]
+
+
+# -- the page ----------------------------------------------------------------------------------------------------------
+
+
+def test_the_page_of_the_vectors_names_every_file_and_its_entries() -> None:
+    page = (generate.FOLDER.parents[2] / "docs" / "vectors.md").read_text(encoding="utf-8")
+    for name in generate.FILES:
+        assert f"| `{name}.json` | {len(vn.load(name)['entries'])} |" in page
 
 
 # -- canonical form ----------------------------------------------------------------------------------------------------

@@ -350,6 +350,11 @@ def can_frames() -> Iterator[dict[str, Any]]:
     )
     yield _transfer("request-fd", "The same in CAN FD with 64 octets a frame.", REQUEST, fd=True)
     yield _transfer(
+        "set-can-address",
+        "Set CAN address to 21 on a node without NFC in factory state: the reply leaves from the old address.",
+        security_command(Function.SET_CAN_ADDRESS, b"\x21"),
+    )
+    yield _transfer(
         "refusal", "Close outside a session: the reply fits one single frame.", security_command(Function.CLOSE)
     )
 
