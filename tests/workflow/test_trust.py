@@ -1,0 +1,177 @@
+"""Whose keys count: added by a person, public only, P-256 only, never one's own."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from cryptography.hazmat.primitives.asymmetric import ec, ed25519, rsa
+from cryptography.hazmat.primitives.serialization import Encoding, NoEncryption, PrivateFormat, PublicFormat
+
+from teds_provision.errors import BadData, NotAuthentic, NotFound, PolicyRefused, UsageFailure
+from teds_provision.protocol.keys import SoftwareKey, fingerprint, to_pem
+from teds_provision.workflow.station import Station
+from teds_provision.workflow.trust import add, candidate, candidates_of, find_trusted, private_keys, remove, spoken
+
+from .bench import make_station
+
+ROOT = Path(__file__).resolve().parents[2]
+OTHER = SoftwareKey(21)
+
+
+@pytest.fixture
+def north(tmp_path: Path) -> Iterator[Station]:
+    made = make_station(tmp_path / "north", "north")
+    yield made
+    made.close()
+
+
+@pytest.fixture
+def keys(tmp_path: Path) -> Path:
+    folder = tmp_path / "keys"
+    folder.mkdir()
+    return folder
+
+
+def public(key: object) -> str:
+    made = key.public_key().public_bytes(Encoding.PEM, PublicFormat.SubjectPublicKeyInfo)  # type: ignore[attr-defined]
+    return str(made.decode())
+
+
+def private(key: object, encoding: Encoding = Encoding.PEM) -> bytes:
+    return bytes(key.private_bytes(encoding, PrivateFormat.PKCS8, NoEncryption()))  # type: ignore[attr-defined]
+
+
+def test_a_key_counts_once_it_was_added_and_until_it_is_removed(north: Station, keys: Path) -> None:
+    (keys / "lab.pem").write_text(to_pem(OTHER.point))
+    assert north.trusted_stations() == [north.point]
+    assert add(north, [candidate(north, "lab", keys / "lab.pem", "station")]) == 1
+    assert north.trusted_stations() == [north.point, OTHER.point]
+    again = candidate(north, "lab", keys / "lab.pem", "station")
+    assert again.known
+    assert add(north, [again]) == 0
+    remove(north, find_trusted(north, "lab"))
+    assert north.trusted_stations() == [north.point]
+
+
+def test_a_key_is_found_by_name_fingerprint_or_file(north: Station, keys: Path) -> None:
+    path = keys / "lab.pem"
+    path.write_text(to_pem(OTHER.point))
+    digits = fingerprint(OTHER.point)
+    with pytest.raises(PolicyRefused, match="is not trusted here"):
+        find_trusted(north, str(path))
+    add(north, [candidate(north, "lab", path, "station")])
+    for text in ("lab", digits, digits[:16].upper(), spoken(digits), str(path)):
+        assert find_trusted(north, text, "station").name == "lab"
+    with pytest.raises(NotFound):
+        find_trusted(north, digits[:6])
+    with pytest.raises(NotFound):
+        find_trusted(north, "lab", "ca")
+
+
+@pytest.mark.parametrize(
+    ("content", "says"),
+    [
+        (lambda: private(ec.generate_private_key(ec.SECP256R1())).decode(), "private key where a public one"),
+        (lambda: public(rsa.generate_private_key(65537, 2048)), "not a P-256 key"),
+        (lambda: public(ec.generate_private_key(ec.SECP384R1())), "not a P-256 key"),
+        (lambda: public(ed25519.Ed25519PrivateKey.generate()), "not a P-256 key"),
+        (lambda: "a letter", "no public key"),
+        (lambda: "", "no public key"),
+    ],
+)
+def test_what_is_no_public_p256_key(north: Station, keys: Path, content, says: str) -> None:  # type: ignore[no-untyped-def]
+    (keys / "bad.pem").write_text(content())
+    with pytest.raises(BadData, match=says):
+        candidate(north, "bad", keys / "bad.pem", "station")
+
+
+def test_its_own_key_needs_no_trust(north: Station, keys: Path) -> None:
+    (keys / "self.pem").write_text(to_pem(north.point))
+    with pytest.raises(PolicyRefused, match="own key"):
+        candidate(north, "self", keys / "self.pem", "station")
+    (keys / "ca.pem").write_text(to_pem(north.ca))
+    with pytest.raises(PolicyRefused, match="own key"):
+        candidate(north, "self", keys / "ca.pem", "ca")
+
+
+def test_a_name_stands_for_one_key(north: Station, keys: Path) -> None:
+    for number in (21, 22):
+        (keys / f"{number}.pem").write_text(to_pem(SoftwareKey(number).point))
+    add(north, [candidate(north, "lab", keys / "21.pem", "station")])
+    with pytest.raises(PolicyRefused, match="already stands for"):
+        candidate(north, "lab", keys / "22.pem", "station")
+    with pytest.raises(UsageFailure):
+        candidate(north, "a\x1b[31m", keys / "22.pem", "station")
+
+
+def test_a_folder_of_keys_with_roles_by_name(north: Station, keys: Path) -> None:
+    (keys / "lab.pem").write_text(to_pem(OTHER.point))
+    (keys / "owner.ca.pem").write_text(to_pem(SoftwareKey(22).point))
+    (keys / "own.pem").write_text(to_pem(north.point))
+    (keys / "README.md").write_text("Public keys.")
+    found = candidates_of(north, keys, "station")
+    assert [(one.record.name, one.record.role) for one in found] == [("lab", "station"), ("owner", "ca")]
+    add(north, found)
+    assert SoftwareKey(22).point in north.trusted_cas()
+
+
+def bad_files() -> dict[str, bytes]:
+    key = ec.generate_private_key(ec.SECP256R1())
+    return {
+        "key.pem": private(key),
+        "nested/deep.txt": b"some text before\n" + private(key),
+        "old.key": private(key, Encoding.DER),
+        "jwk.json": json.dumps({"kty": "EC", "crv": "P-256", "d": "AA"}).encode(),
+        "link.json": json.dumps({"kty": "oct", "k": "AA"}).encode(),
+        "vault.json": b'{"format": "teds-provision-vault/1"}',
+    }
+
+
+@pytest.mark.parametrize("name", list(bad_files()))
+def test_a_folder_that_holds_a_private_key_is_refused_whole(north: Station, keys: Path, name: str) -> None:
+    (keys / "lab.pem").write_text(to_pem(OTHER.point))
+    (keys / name).parent.mkdir(exist_ok=True)
+    (keys / name).write_bytes(bad_files()[name])
+    with pytest.raises(PolicyRefused, match="is for public keys"):
+        candidates_of(north, keys, "station")
+    assert north.store.trusted() == []
+
+
+def test_the_keys_folder_of_this_workspace_holds_no_private_key() -> None:
+    assert list(private_keys(ROOT / "keys")) == []
+
+
+def test_no_private_key_is_under_version_control() -> None:
+    """But for those of the test vectors, which are published on purpose."""
+    try:
+        listed = subprocess.run(["git", "ls-files", "-z"], cwd=ROOT, capture_output=True, check=True).stdout
+    except (OSError, subprocess.CalledProcessError):
+        pytest.skip("not a git work tree")
+    marker = b"-----BEGIN " + b"PRIVATE KEY-----"
+    for name in listed.decode().split("\0"):
+        path = ROOT / name
+        if name and path.is_file() and not name.startswith("tests/"):
+            assert marker not in path.read_bytes(), name
+
+
+def test_an_empty_or_missing_folder(north: Station, keys: Path) -> None:
+    for folder in (keys, keys / "none"):
+        with pytest.raises(NotFound):
+            candidates_of(north, folder, "station")
+
+
+def test_a_certificate_that_does_not_verify(north: Station, keys: Path) -> None:
+    from teds_provision.workflow.fleet import Certificate, write_certificate
+
+    forged = Certificate("lab", OTHER.point, north.ca, OTHER.sign(b"something else"))
+    (keys / "lab.cert").write_bytes(write_certificate(forged))
+    with pytest.raises(NotAuthentic):
+        candidate(north, "lab", keys / "lab.cert", "station")
+
+
+def test_a_fingerprint_as_it_is_spoken() -> None:
+    assert spoken("0123456789abcdef") == "0123 4567 89ab cdef"
