@@ -35,7 +35,8 @@ bench-handover: $(VENV)/.dev
 
 # Coverage-guided fuzzing of the TEDS decoder for ten minutes; atheris gets an environment of its own.
 fuzz: .venv-fuzz/.ready
-	.venv-fuzz/bin/python tests/fuzz/fuzz_teds.py -max_total_time=$(or $(SECONDS),600) tests/fuzz/corpus
+	@mkdir -p build/fuzz
+	.venv-fuzz/bin/python tests/fuzz/fuzz_teds.py -max_total_time=$(or $(SECONDS),600) -artifact_prefix=build/ build/fuzz tests/fuzz/corpus
 
 $(VENV)/bin/python:
 	@$(PYTHON) -c 'import sys; sys.exit(not (3, 11) <= sys.version_info[:2] <= (3, 13))' || \

@@ -8,6 +8,7 @@ Importing this package loads neither nfcpy nor python-can.
 
 from __future__ import annotations
 
-from teds_provision.links.ports import Contact, Link, LinkSettings, Notice, Port, open_port
+from teds_provision.links.opening import open_port
+from teds_provision.links.ports import Contact, Link, LinkSettings, Notice, Port
 
 __all__ = ["Contact", "Link", "LinkSettings", "Notice", "Port", "open_port"]

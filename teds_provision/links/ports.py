@@ -1,4 +1,4 @@
-"""The interface of every link, and the one function that opens a port from the user's link options."""
+"""The interface of every link: what a port, a contact and a link can do, and the user's link options."""
 
 from __future__ import annotations
 
@@ -7,7 +7,6 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import Literal, Protocol
 
-from teds_provision.errors import UsageFailure
 from teds_provision.protocol.identity import Identity
 
 NoticeKind = Literal["waiting", "foreign-tag", "reader-ready", "reader-lost", "node-left", "conflict", "retry"]
@@ -94,20 +93,3 @@ class LinkSettings:
     can: str | None = None
     ble: str | None = None
     timeout: float = 60.0
-
-
-def open_port(settings: LinkSettings) -> Port:
-    """Open the reader or bus that ``settings`` name; raises NoReader with the cure, or UsageFailure."""
-    if settings.via == "nfc":
-        from teds_provision.links.nfc.reader import NfcPort
-
-        return NfcPort(settings.nfc or "usb")
-    if settings.via == "can":
-        from teds_provision.links.can.port import CanPort
-
-        if not settings.can:
-            raise UsageFailure(
-                "--via can needs to know the bus.", hint="Add --can, e.g. --can socketcan:can0?bitrate=500000."
-            )
-        return CanPort(settings.can)
-    raise UsageFailure(f"The link {settings.via!r} is not part of this version.", hint="Use --via nfc or --via can.")

@@ -9,48 +9,26 @@ from __future__ import annotations
 import json
 import secrets
 import shutil
-import socket
 import subprocess
 import sys
 import tempfile
 from collections.abc import Callable, Iterator
-from contextlib import ExitStack, contextmanager
-from dataclasses import dataclass, field
+from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
 
-from teds_provision.errors import LinkFailure, NotAuthentic
-from teds_provision.links import LinkSettings
+from teds_provision.errors import LinkFailure
 from teds_provision.workflow.build import BuildOrder
 from teds_provision.workflow.contact import meet
-from teds_provision.workflow.progress import Reporter, StepResult, Steps
-from teds_provision.workflow.provision import Provisioned, provision, require_authentic, verify_node
+from teds_provision.workflow.demo_desk import Demo
+from teds_provision.workflow.demo_handover import hand_over
+from teds_provision.workflow.progress import Reporter, StepResult
+from teds_provision.workflow.provision import Provisioned, provision, require_authentic
 from teds_provision.workflow.station import Station, initialise
 
 PROFILE = "magnetic-angular-position-sensor"
 _START_SECONDS = 20.0
 _STOP_SECONDS = 5.0
-
-
-@dataclass
-class Demo:
-    """What the demo is at: its folder, stations, links and the steps so far."""
-
-    folder: Path
-    reporter: Reporter
-    say: Callable[[str], None]
-    nfc: str = ""
-    can: str = ""
-    uuid: bytes = b""
-    stack: ExitStack = field(default_factory=ExitStack)
-
-    def __post_init__(self) -> None:
-        self.steps = Steps(self.reporter)
-        self.nfc = f"udp:127.0.0.1:{_free_port()}"
-        self.can = f"udp_multicast:239.74.163.2?port={_free_port()}"
-
-    def over(self, via: str) -> LinkSettings:
-        """Link options of a station in this demo."""
-        return LinkSettings(via, self.nfc, self.can, timeout=15.0)
 
 
 @dataclass(frozen=True)
@@ -84,8 +62,6 @@ def _run(demo: Demo) -> DemoDone:
     demo.say("The same sensor over CAN: written anew under another name, verified, its key rotated.")
     _over_can(demo, first)
     demo.say("Hand over: crane gets a copy of the key, then bench gives the sensor away for good.")
-    from teds_provision.workflow.demo_handover import hand_over
-
     hand_over(demo, first, second)
     return DemoDone(tuple(demo.steps.done), done.verified.verdict, demo.uuid)
 
@@ -125,22 +101,6 @@ def _over_can(demo: Demo, station: Station) -> None:
         step.detail = f"key epoch {agreed.epoch}, key {agreed.key_id}"
 
 
-def verify_from(demo: Demo, station: Station, what: str) -> None:
-    """Verify the node from one station over CAN, in a session under its key; raises unless it is authentic."""
-    from teds_provision.workflow.agree import require_session
-    from teds_provision.workflow.identify import identify
-    from teds_provision.workflow.reading import read_image
-
-    with demo.steps.step(what) as step:
-        with meet(station, demo.over("can"), demo.uuid, demo.reporter) as node:
-            who = identify(station, node)
-            held = require_session(station, node)
-            verified = verify_node(station, node, read_image(node), who.point)
-        if verified.verdict != "authentic":
-            raise NotAuthentic(f"The demo's node is {verified.verdict} as seen from {station.name}.")
-        step.detail = f"{station.name} finds it {verified.verdict}, key epoch {held.record.epoch}"
-
-
 @contextmanager
 def _node(folder: Path, nfc: str, can: str) -> Iterator[bytes]:
     """A virtual transducer in a process of its own, while the context lasts; gives its UUID."""
@@ -174,10 +134,3 @@ def _ready(process: subprocess.Popen[str]) -> bytes:
         return bytes.fromhex(said["uuid"])
     except (ValueError, KeyError, TypeError):
         raise LinkFailure(f"The virtual node did not start: {line.strip() or 'no answer'}") from None
-
-
-def _free_port() -> int:
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
-        probe.bind(("127.0.0.1", 0))
-        port: int = probe.getsockname()[1]
-        return port

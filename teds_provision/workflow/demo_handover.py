@@ -2,26 +2,22 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Literal
+from typing import Literal
 
 from teds_provision.errors import LinkFailure, PolicyRefused
 from teds_provision.protocol.keys import fingerprint
 from teds_provision.store import TrustRecord
+from teds_provision.workflow.demo_desk import Demo, verify_from
 from teds_provision.workflow.handover import close
 from teds_provision.workflow.handover_export import ExportOrder, export_keys, plan_export
 from teds_provision.workflow.handover_import import Imported, import_keys, plan_import
 from teds_provision.workflow.handover_prove import Proven, prove_nodes
+from teds_provision.workflow.station import Station
 from teds_provision.workflow.trust import Candidate, add
-
-if TYPE_CHECKING:
-    from teds_provision.workflow.demo import Demo
-    from teds_provision.workflow.station import Station
 
 
 def hand_over(demo: Demo, first: Station, second: Station) -> None:
     """Copy: both stations reach the node. Move: only the second does."""
-    from teds_provision.workflow.demo import verify_from
-
     with demo.steps.step("trust") as step:
         for station, other in ((first, second), (second, first)):
             record = TrustRecord(other.name, "station", other.point, fingerprint(other.point))
