@@ -41,12 +41,13 @@ def open_session(station: Station, node: Conversation) -> NodeKey | None:
             raise
         except NotAuthentic:
             continue
-        if held.record.state == "pending" or len(station.store.keys(node.uuid)) > 1:
-            with station.store.transaction():
+        with station.store.transaction():
+            station.remember(node.uuid, epoch=held.record.epoch)  # what is signed without the node is for this epoch
+            if held.record.state == "pending" or len(station.store.keys(node.uuid)) > 1:
                 station.store.promote_key(node.uuid, held.record.key_id)
                 if held.record.state == "pending" and held.record.source == "agreement":
                     station.rotated(node.uuid)
-            station.audit("key", node.uuid, "active", key_id=held.record.key_id, epoch=held.record.epoch)
+                station.audit("key", node.uuid, "active", key_id=held.record.key_id, epoch=held.record.epoch)
         return held
     return None
 
@@ -167,11 +168,11 @@ def _agree_anew(station: Station, node: Conversation, entry: WhitelistEntry, ca:
     node.open(agreed.key)
     with station.store.transaction():
         station.store.promote_key(uuid, key_id)
+        station.remember(uuid, epoch=agreed.epoch, point=agreed.node)
         station.rotated(uuid)
     identity = read_identity(node)
     station.remember(
         uuid,
-        epoch=agreed.epoch,
         sequence=identity.sequence,
         state=int(identity.state),
         can_address=identity.can_address,

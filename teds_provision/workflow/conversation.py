@@ -42,7 +42,7 @@ _CURE = {
     Reason.NOT_PERMITTED: "Tap the node on the NFC reader (--via nfc), or reset it by hand.",
     Reason.UNKNOWN_KEY: "Another station may have rotated the key. To take the node back: tap it, agree UUID --rotate.",
     Reason.STALE_SEQUENCE: "Sign again against the node: sign UUID --read-node.",
-    Reason.WRONG_EPOCH: "Sign again after the key agreement: sign UUID.",
+    Reason.WRONG_EPOCH: "Sign again after the key agreement: sign UUID --read-node.",
     Reason.TOO_LARGE: "Use a smaller calibration table, or a node with more flash.",
     Reason.FLASH_FAILURE: "Try again; if it stays, the board is broken.",
 }

@@ -60,7 +60,7 @@ def write(
     if signed.key_epoch != identity.epoch:
         raise PolicyRefused(
             f"The image was signed for key epoch {signed.key_epoch}; the node is at {identity.epoch}.",
-            hint="Sign again: teds-provision sign UUID",
+            hint="Sign again for this key: teds-provision sign UUID --read-node",
         )
     octets = 0
     for step in range(identity.sequence + SEQUENCE_WINDOW, signed.sequence, SEQUENCE_WINDOW):
