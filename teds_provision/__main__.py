@@ -12,9 +12,12 @@ def main() -> None:
 
         print(f"teds-provision {__version__}")
         return
-    from teds_provision.cli.main import run
+    try:
+        from teds_provision.cli.main import run
 
-    sys.exit(run(sys.argv[1:]))
+        sys.exit(run(sys.argv[1:]))
+    except KeyboardInterrupt:  # while Python was still importing, or already leaving
+        sys.exit(130)
 
 
 if __name__ == "__main__":

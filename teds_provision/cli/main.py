@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib
 import json
+import os
 import sys
 from pathlib import Path
 from typing import Any
@@ -12,7 +13,7 @@ import click
 
 from teds_provision import __version__
 from teds_provision.cli.context import App
-from teds_provision.cli.table import COMMANDS, SECTIONS
+from teds_provision.cli.table import COMMANDS, GROUPS, SECTIONS
 from teds_provision.errors import BadData, TedsProvisionError
 
 ENVIRONMENT_PREFIX = "TEDS_PROVISION"
@@ -58,15 +59,39 @@ class LazyGroup(click.Group):
                 formatter.write_dl([(name.ljust(width), entry.help) for name, entry in entries.items()])
 
 
-class FlatDefaults(dict[str, Any]):
-    """Values of config.toml: one flat table serves every command; a table named like a command goes before it."""
+class Defaults(dict[str, Any]):
+    """Values of config.toml: what stands outside of a table serves every command, a table the command of its name.
+
+    The same word may be an option and a command (``profile``), so a command is given plain values, never tables.
+    """
 
     def get(self, key: str, default: Any = None) -> Any:
-        """Return the defaults of command ``key``, or the value of option ``key``."""
-        if key in COMMANDS:
-            own = super().get(key)
-            return FlatDefaults({**self, **(own if isinstance(own, dict) else {})})
-        return super().get(key, default)
+        """Return the defaults of command ``key``, or the value of global option ``key``."""
+        if key not in COMMANDS:
+            return super().get(key, default)
+        return _of_command(self, key, GroupDefaults if key in GROUPS else dict)
+
+
+class GroupDefaults(dict[str, Any]):
+    """The values of a command that has commands of its own, which are all that it is asked for."""
+
+    def get(self, key: str, default: Any = None) -> Any:
+        """Return the defaults of command ``key``."""
+        return _of_command(self, key, dict)
+
+
+def _of_command(values: dict[str, Any], name: str, make: type[dict[str, Any]]) -> dict[str, Any]:
+    own = dict.get(values, name.replace("-", "_"))
+    common = {key: value for key, value in values.items() if not isinstance(value, dict)}
+    return make({**common, **(own if isinstance(own, dict) else {})})
+
+
+def _as_parameters(values: dict[str, Any]) -> dict[str, Any]:
+    """Spell the keys as click names parameters, in every table."""
+    return {
+        name.replace("-", "_"): _as_parameters(value) if isinstance(value, dict) else value
+        for name, value in values.items()
+    }
 
 
 def _read_config(ctx: click.Context, _parameter: click.Parameter, home: Path | None) -> Path | None:
@@ -78,7 +103,9 @@ def _read_config(ctx: click.Context, _parameter: click.Parameter, home: Path | N
             values = tomllib.loads(path.read_text())
         except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
             raise BadData(f"{path} is not valid TOML: {error}.", hint="Mend or remove the file.") from error
-        ctx.default_map = FlatDefaults({name.replace("-", "_"): value for name, value in values.items()})
+        except OSError as error:
+            raise BadData(f"{path} cannot be read: {error.strerror}.", hint="Check its owner and mode.") from error
+        ctx.default_map = Defaults(_as_parameters(values))
     return home
 
 
@@ -153,7 +180,11 @@ def _usage(error: click.ClickException) -> str:
 
 
 def _wants(arguments: list[str], option: str) -> bool:
-    return option in arguments or bool(App.current and getattr(App.current, option.strip("-"), False))
+    name = option.strip("-")
+    if App.current is not None and getattr(App.current, name):
+        return True
+    said = os.environ.get(f"{ENVIRONMENT_PREFIX}_{name.upper()}", "").lower()
+    return option in arguments or (App.current is None and said in ("1", "true", "yes", "on", "t", "y"))
 
 
 def _traceback(arguments: list[str]) -> None:

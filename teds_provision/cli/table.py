@@ -57,3 +57,5 @@ SECTIONS: Final[dict[str, dict[str, Entry]]] = {
 }
 
 COMMANDS: Final = {name: entry for section in SECTIONS.values() for name, entry in section.items()}
+GROUPS: Final = frozenset({"trust", "profile", "whitelist", "handover", "node"})
+"""The commands that have commands of their own."""

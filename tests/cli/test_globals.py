@@ -1,0 +1,387 @@
+"""The rules that hold for every command: where output goes, how errors look, what asks, what is imported."""
+
+from __future__ import annotations
+
+import importlib.util
+import json
+import os
+import pty
+import re
+import select
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from teds_provision import __version__
+from teds_provision.cli.table import COMMANDS, GROUPS
+
+from .shell import Outcome, call, clean_environment, spawn
+
+ONE = "8d4d9da65281f7000000"
+PRESENT = [name for name, entry in COMMANDS.items() if importlib.util.find_spec(f"teds_provision.cli.{entry.module}")]
+HEAVY = ("nfc", "can", "isotp", "keyring", "rich", "cryptography", "pint", "numpy", "matplotlib", "pkcs11", "sqlite3")
+
+
+def on_terminal(
+    home: Path, *words: object, answers: bytes = b"", environment: dict[str, str] | None = None
+) -> tuple[int, str, str]:
+    """Run with a terminal as stdin, stdout and stderr in pipes; returns exit code, stdout and stderr."""
+    master, terminal = pty.openpty()
+    process = subprocess.Popen(
+        [sys.executable, "-m", "teds_provision", "--home", str(home), *map(str, words)],
+        stdin=terminal,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        env=environment or clean_environment(),
+        start_new_session=True,
+    )
+    os.close(terminal)
+    try:
+        if answers:
+            assert process.stderr is not None
+            assert select.select([process.stderr], [], [], 30)[0], "nothing was asked"
+            os.write(master, answers)
+        out, err = process.communicate(timeout=60)
+    finally:
+        process.kill()
+        os.close(master)
+    return process.returncode, out.decode(), err.decode()
+
+
+# -- help --------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("words", [["--help"], ["--version"]])
+def test_help_and_version_load_nothing_heavy(words: list[str]) -> None:
+    code = (
+        "import sys; sys.argv[1:] = sys.argv[1:]\n"
+        "from teds_provision.__main__ import main\n"
+        "try: main()\n"
+        "except SystemExit: pass\n"
+        f"print([name for name in {HEAVY!r} if name in sys.modules], file=sys.stderr)"
+    )
+    done = subprocess.run([sys.executable, "-c", code, *words], capture_output=True, text=True, check=True, timeout=60)
+    assert done.stderr.strip() == "[]"
+    assert done.stdout
+
+
+def test_version_is_told() -> None:
+    assert spawn("--version").out == f"teds-provision {__version__}\n"
+    assert call(Path("/nonexistent"), "--version").out == f"teds-provision {__version__}\n"
+
+
+def test_help_names_every_command_once() -> None:
+    shown = spawn("--help")
+    assert shown.code == 0
+    for name in COMMANDS:
+        assert len(re.findall(rf"^  {name} ", shown.out, re.MULTILINE)) == 1, name
+
+
+@pytest.mark.parametrize("name", PRESENT)
+def test_every_command_has_help_with_examples(tmp_path: Path, name: str) -> None:
+    shown = call(tmp_path, name, "--help")
+    assert shown.code == 0
+    assert "Examples:" in shown.out
+    assert f"teds-provision {name}" in shown.out or f" {name}" in shown.out
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("name", PRESENT)
+def test_no_option_can_hold_a_secret(tmp_path: Path, name: str) -> None:
+    options = re.findall(r"--([a-z-]+)", call(tmp_path, name, "--help").out)
+    secret = {option for option in options if re.search("pass|pin$|secret|token", option)}
+    assert secret <= {"passphrase-fd", "backup-passphrase-fd"}
+
+
+def test_a_mistyped_command_is_usage_with_the_nearest_one(tmp_path: Path) -> None:
+    told = spawn("--json", "--home", tmp_path, "whitlist")
+    assert (told.code, told.json["error"]["code"]) == (2, "usage")
+    assert "'whitelist'" in told.json["error"]["message"]
+
+
+# -- results and errors ------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("words", "exit_code", "code"),
+    [
+        (["nodes", "none"], 3, "not-found"),
+        (["whitelist", "remove", ONE], 0, ""),
+        (["whitelist", "add", ONE, "--fingerprint", "zz"], 2, "usage"),
+        (["whitelist", "import", "none.csv"], 3, "not-found"),
+        (["nodes", "--nonsense"], 2, "usage"),
+        (["sign", ONE], 6, "not-whitelisted"),
+        (["agree", ONE], 6, "not-whitelisted"),
+        (["backup", "b"], 7, "wrong-passphrase"),
+        (["doctor", "--can", "nonsense"], 5, ""),
+    ],
+)
+def test_json_is_one_object_on_stdout_and_nothing_else(
+    home: Path, tmp_path: Path, words: list[str], exit_code: int, code: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    told = spawn("--home", home, "--json", *words)
+    assert told.code == exit_code, told
+    assert "Traceback" not in told.err
+    if code:
+        assert set(told.json) == {"error"}
+        assert set(told.json["error"]) == {"code", "message", "hint"}
+        assert told.json["error"]["code"] == code
+        assert told.json["error"]["message"]
+
+
+def test_without_a_station_every_command_says_init(tmp_path: Path) -> None:
+    for words in (["nodes"], ["log"], ["whitelist", "list"], ["backup", "b"]):
+        told = call(tmp_path / "none", "--json", *words)
+        assert (told.code, told.json["error"]["code"]) == (3, "not-found")
+        assert "teds-provision init" in told.json["error"]["hint"]
+    assert not (tmp_path / "none").exists()
+
+
+def test_an_error_for_people_is_at_most_three_lines_on_stderr(home: Path) -> None:
+    told = spawn("--home", home, "nodes", "none")
+    assert (told.code, told.out) == (3, "")
+    assert told.err.startswith("Error: ")
+    assert told.err.count("\n") <= 3
+
+
+def test_debug_alone_shows_a_traceback(home: Path) -> None:
+    assert "Traceback" not in spawn("--home", home, "nodes", "none").err
+    assert "Traceback" in spawn("--home", home, "--debug", "nodes", "none").err
+    environment = clean_environment(TEDS_PROVISION_DEBUG="1")
+    assert "Traceback" in spawn("--home", home, "nodes", "none", environment=environment).err
+
+
+def test_a_bug_is_told_as_one_without_a_traceback(home: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def broken(*_: object) -> None:
+        raise ZeroDivisionError("secret detail")
+
+    monkeypatch.setattr("teds_provision.workflow.inventory.inventory", broken)
+    told = call(home, "--json", "nodes")
+    assert (told.code, told.json["error"]["code"]) == (1, "bug")
+    assert "secret detail" not in told.out + told.err
+
+
+@pytest.mark.parametrize("words", [["whitelist", "list"], ["nodes"], ["log"], ["doctor"], ["--help"]])
+def test_a_pipe_and_no_color_have_no_escape_codes(home: Path, words: list[str]) -> None:
+    call(home, "whitelist", "add", ONE)
+    for more in ({}, {"NO_COLOR": "1"}, {"TERM": "xterm-256color", "COLORTERM": "truecolor"}):
+        told = spawn("--home", home, *words, environment=clean_environment(**more))
+        assert told.code == 0
+        assert "\x1b" not in told.out + told.err
+
+
+def test_quiet_says_nothing_but_the_result(home: Path) -> None:
+    assert spawn("--home", home, "--quiet", "log").err == ""
+
+
+def test_a_reader_that_stops_reading_is_no_error_message(home: Path) -> None:
+    call(home, "whitelist", "add", ONE)
+    command = f"{sys.executable} -m teds_provision --home {home} log | head -c 5; exit ${{PIPESTATUS[0]}}"
+    done = subprocess.run(
+        ["bash", "-c", command], capture_output=True, text=True, timeout=60, check=False, env=clean_environment()
+    )
+    assert "Traceback" not in done.stderr
+    assert "Exception ignored" not in done.stderr
+
+
+# -- options from elsewhere --------------------------------------------------------------------------------------------
+
+
+def test_variables_stand_for_options(home: Path, tmp_path: Path) -> None:
+    environment = clean_environment(TEDS_PROVISION_HOME=str(home), TEDS_PROVISION_JSON="1")
+    assert spawn("nodes", environment=environment).json == {"nodes": []}
+    for words in (["nodes", "--nonsense"], ["--nonsense", "nodes"], ["nonsense"]):
+        assert spawn(*words, environment=environment).json["error"]["code"] == "usage"
+    environment = clean_environment(TEDS_PROVISION_HOME=str(home), TEDS_PROVISION_DRY_RUN="1")
+    assert "Plan" in spawn("whitelist", "add", ONE, environment=environment).out
+    environment = clean_environment(TEDS_PROVISION_HOME=str(home), TEDS_PROVISION_CAN="nonsense")
+    assert spawn("doctor", environment=environment).code == 5
+
+
+def test_config_toml_stands_for_options_and_the_command_line_goes_before_it(home: Path) -> None:
+    (home / "config.toml").write_text('can = "nonsense"\ndry-run = true\n\n[log]\nlast = 0\n')
+    assert call(home, "doctor").code == 5
+    assert call(home, "doctor", "--can", "udp_multicast:239.74.99.8?port=47008").code == 0
+    assert "Plan" in call(home, "whitelist", "add", ONE).out
+    assert call(home, "--json", "log").json["entries"] == []
+    assert len(call(home, "--json", "log", "--last", "1").json["entries"]) == 1
+
+
+def test_a_table_of_config_toml_serves_its_command_alone(home: Path) -> None:
+    (home / "config.toml").write_text(
+        "[whitelist.add]\ndry-run = true\n[profile]\njson = false\n[identify]\nadd = true\n"
+    )
+    assert "Plan" in call(home, "whitelist", "add", ONE).out
+    assert "1 new" in call(home, "whitelist", "add", ONE, "--name", "x").out
+    assert "nothing to do" in call(home, "whitelist", "remove", ONE, "--yes").out
+
+
+def test_an_option_that_is_called_like_a_command_takes_no_table_for_its_value(home: Path) -> None:
+    """``profile`` is both: another value in the file must not become the profile of every node."""
+    (home / "config.toml").write_text("timeout = 5\n")
+    call(home, "whitelist", "add", ONE)
+    told = call(home, "--json", "build", ONE)
+    assert "timeout" not in told.json["error"]["message"]
+    (home / "config.toml").write_text('profile = "no-such-type"\n')
+    told = call(home, "--json", "build", ONE)
+    assert (told.code, "no-such-type" in told.json["error"]["message"]) == (3, True)
+
+
+def test_the_groups_of_the_table_are_those_of_the_program() -> None:
+    import click
+
+    from teds_provision.cli.main import cli
+
+    with cli.make_context("teds-provision", ["nodes"]) as context:
+        groups = {name for name in PRESENT if isinstance(cli.get_command(context, name), click.Group)}
+    assert groups == GROUPS & set(PRESENT)
+
+
+def test_a_config_that_is_no_toml_is_bad_data(home: Path) -> None:
+    (home / "config.toml").write_text("can = \n")
+    told = spawn("--home", home, "--json", "nodes")
+    assert (told.code, told.json["error"]["code"]) == (8, "bad-data")
+    assert "config.toml" in told.json["error"]["message"]
+    (home / "config.toml").write_bytes(b"\xff\xfe")
+    assert spawn("--home", home, "nodes").code == 8
+
+
+# -- asking ------------------------------------------------------------------------------------------------------------
+
+
+def test_a_question_can_be_answered_on_a_terminal(home: Path) -> None:
+    call(home, "whitelist", "add", ONE)
+    code, _, err = on_terminal(home, "whitelist", "remove", ONE, answers=b"n\n")
+    assert (code, "[y/N]" in err) == (130, True)
+    code, out, _ = on_terminal(home, "whitelist", "remove", ONE, answers=b"y\n")
+    assert (code, "is off the whitelist" in out) == (0, True)
+
+
+@pytest.mark.parametrize("words", [["--no-input"], ["--json"]])
+def test_no_input_and_json_never_ask(home: Path, words: list[str]) -> None:
+    call(home, "whitelist", "add", ONE)
+    code, out, err = on_terminal(home, *words, "whitelist", "remove", ONE)
+    assert code == 2
+    assert "--yes" in out + err
+    code, out, err = on_terminal(home, *words, "backup", home / "b")
+    assert code == 7
+    assert "--passphrase-fd" in out + err
+
+
+def test_a_passphrase_that_is_typed_is_not_shown(home: Path, tmp_path: Path) -> None:
+    from tests.workflow.bench import PASSPHRASE
+
+    master, terminal = pty.openpty()
+    process = subprocess.Popen(
+        [sys.executable, "-m", "teds_provision", "--home", str(home), "backup", str(tmp_path / "b")],
+        stdin=terminal,
+        stdout=terminal,
+        stderr=terminal,
+        env=clean_environment(),
+        start_new_session=True,
+    )
+    os.close(terminal)
+    shown = b""
+    answers = [PASSPHRASE, "the words of the backup", "the words of the backup"]
+    try:
+        until = time.monotonic() + 40
+        while process.poll() is None and time.monotonic() < until:
+            if select.select([master], [], [], 0.2)[0]:
+                try:
+                    shown += os.read(master, 4096)
+                except OSError:
+                    break
+                if answers and shown.rstrip().endswith(b":"):
+                    time.sleep(0.1)  # the prompt is out; the echo goes off with it
+                    os.write(master, answers.pop(0).encode() + b"\n")
+        process.wait(10)
+    finally:
+        process.kill()
+        os.close(master)
+    assert process.returncode == 0, shown
+    assert PASSPHRASE.encode() not in shown
+    assert b"the words of the backup" not in shown
+
+
+@pytest.mark.parametrize(("line", "code"), [(b"", "wrong-passphrase"), (b"\n", "wrong-passphrase")])
+def test_an_empty_passphrase_descriptor_is_told(home: Path, tmp_path: Path, line: bytes, code: str) -> None:
+    read, write = os.pipe()
+    os.write(write, line)
+    os.close(write)
+    command = [sys.executable, "-m", "teds_provision", "--json", "--home", str(home), "--passphrase-fd", str(read)]
+    done = subprocess.run(
+        [*command, "backup", str(tmp_path / "b")], pass_fds=(read,), capture_output=True, text=True, check=False
+    )
+    os.close(read)
+    assert (done.returncode, json.loads(done.stdout)["error"]["code"]) == (7, code)
+
+
+def test_a_passphrase_descriptor_that_is_closed_is_usage(home: Path, tmp_path: Path) -> None:
+    told = spawn("--home", home, "--json", "--passphrase-fd", "77", "backup", tmp_path / "b")
+    assert (told.code, told.json["error"]["code"]) == (2, "usage")
+    assert "77" in told.json["error"]["message"]
+
+
+def test_a_passphrase_that_is_no_text_is_told_and_not_shown(home: Path, tmp_path: Path) -> None:
+    read, write = os.pipe()
+    os.write(write, b"\xff\xfe hidden words \n")
+    os.close(write)
+    command = [sys.executable, "-m", "teds_provision", "--json", "--home", str(home), "--passphrase-fd", str(read)]
+    done = subprocess.run(
+        [*command, "backup", str(tmp_path / "b")], pass_fds=(read,), capture_output=True, text=True, check=False
+    )
+    os.close(read)
+    assert done.returncode == 7
+    assert "hidden" not in done.stdout + done.stderr
+
+
+# -- interruption ------------------------------------------------------------------------------------------------------
+
+
+def interrupted(home: Path, *words: str, after: str) -> Outcome:
+    process = subprocess.Popen(
+        [sys.executable, "-m", "teds_provision", "--home", str(home), *words],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        env=clean_environment(),
+    )
+    try:
+        stream = process.stdout if after == "out" else process.stderr
+        assert stream is not None
+        first = stream.readline()
+        assert first
+        process.send_signal(signal.SIGINT)
+        out, err = process.communicate(timeout=30)
+    finally:
+        process.kill()
+    return Outcome(process.returncode, out, err)
+
+
+def test_ctrl_c_is_130_without_a_traceback(home: Path) -> None:
+    ended = interrupted(home, "log", "--follow", after="out")
+    assert ended.code == 130
+    assert "Traceback" not in ended.err
+    assert "Interrupted" in ended.err
+
+
+def test_ctrl_c_while_starting_is_130_too(home: Path) -> None:
+    for delay in (0.02, 0.05, 0.1, 0.15):
+        process = subprocess.Popen(
+            [sys.executable, "-m", "teds_provision", "--home", str(home), "log", "--follow"],
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.PIPE,
+            text=True,
+            env=clean_environment(),
+        )
+        time.sleep(delay)
+        process.send_signal(signal.SIGINT)
+        _, err = process.communicate(timeout=30)
+        if "teds_provision" in err:  # else Python itself had not started yet
+            assert "Traceback" not in err
+            assert process.returncode == 130
