@@ -91,12 +91,15 @@ class _Run:
         return agreed
 
     def _build(self, present: Survey) -> Built:
+        from teds_provision.teds.calibration import sentence
+
         with self.steps.step("build") as step:
             keep = {block: present.image.blocks[block] for block in present.read_only}
             built = build(self.station, self.node.uuid, self.order, has=present.image, keep=keep)
             if built.image.unsigned_blocks() == present.image.unsigned_blocks():
                 step.result = NOTHING
-            step.detail = f"{built.profile}, {len(built.image.blocks)} TEDS"
+            fits = "".join(f"; {sentence(calibration)}" for calibration in built.calibrations.values())
+            step.detail = f"{built.profile}, {len(built.image.blocks)} TEDS{fits}"
         return built
 
     def _sign(self, who: Identified, built: Built, present: Survey, earlier: bytes | None) -> Signed:
