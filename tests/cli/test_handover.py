@@ -1,0 +1,422 @@
+"""``export-keys``, ``import-keys``, ``handover`` as typed: results, exit codes, and every kind of bad input."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+from typing import Any
+
+import pytest
+from cryptography.hazmat.primitives.asymmetric import ec, rsa
+from cryptography.hazmat.primitives.serialization import Encoding, NoEncryption, PrivateFormat, PublicFormat
+
+from teds_provision.protocol import jose
+from teds_provision.protocol.bundle import TYPE, Bundle, BundledNode, _to_json, seal_bundle
+from teds_provision.protocol.keys import SoftwareKey, fingerprint, station_key_message, to_pem
+from teds_provision.protocol.strict_json import base64url, decode_base64url, dump
+from teds_provision.vault import forget_vaults
+from tests.workflow.bench import PASSPHRASE
+from tests.workflow.handover_desk import Pair, everything, session
+from tests.workflow.handover_victim import open_station
+
+from .shell import Outcome, call, spawn
+
+UUIDS = ["8d4d9da65281f7000001", "8d4d9da65281f7000002"]
+
+
+class Homes:
+    """North with two keyed nodes, south without; commands run in this process, unlocked by a passphrase."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder, self.north, self.south = folder, folder / "north", folder / "south"
+
+    def run(self, home: Path, *words: object) -> Outcome:
+        read, write = os.pipe()
+        os.write(write, PASSPHRASE.encode() + b"\n")
+        os.close(write)
+        forget_vaults()
+        try:
+            return call(home, "--json", "--passphrase-fd", read, *words)
+        finally:
+            os.close(read)
+
+    def export(self, *words: object, name: str = "keys.jwe") -> Path:
+        done = self.run(self.north, "export-keys", "--to", "south", "--yes", "--output", self.folder / name, *words)
+        assert done.code == 0, done
+        return self.folder / name
+
+    def refused(self, code: int, *words: object, home: Path | None = None) -> dict[str, Any]:
+        """A command that fails with one clear cause and changes nothing."""
+        home = home or self.south
+        before = self.state(home)
+        done = self.run(home, *words)
+        assert done.code == code, done
+        assert self.state(home) == before
+        error: dict[str, Any] = done.json["error"]
+        assert error["message"].count("\n") == 0
+        return error
+
+    def state(self, home: Path) -> object:
+        station = open_station(home)
+        try:
+            return everything(station)
+        finally:
+            station.close()
+
+
+@pytest.fixture(scope="module")
+def prepared(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("pair")
+    Pair.make(folder, 2).close()
+    return folder
+
+
+@pytest.fixture
+def homes(prepared: Path, tmp_path: Path) -> Iterator[Homes]:
+    shutil.copytree(prepared, tmp_path / "pair")
+    yield Homes(tmp_path / "pair")
+    forget_vaults()
+
+
+# -- the way it goes --------------------------------------------------------------------------------------------------
+
+
+def test_a_copy_there(homes: Homes) -> None:
+    output = homes.folder / "keys.jwe"
+    done = homes.run(homes.north, "export-keys", "--to", "south", "--all", "--output", output, "--yes").json
+    assert (done["bundle"], done["mode"], done["count"], done["nodes"]) == (str(output), "copy", 2, UUIDS)
+    assert [to["name"] for to in done["to"]] == ["south"]
+    assert output.stat().st_mode & 0o777 == 0o600
+    taken = homes.run(homes.south, "import-keys", output, "--yes").json
+    assert (taken["id"], taken["count"], taken["imported"], taken["refused"]) == (done["id"], 2, UUIDS, [])
+    assert taken["from"] == done["from"]
+    assert Path(taken["receipt"]).read_bytes().count(b".") == 2
+    assert (taken["proven"], taken["pending"]) == ([], UUIDS)
+    again = homes.run(homes.south, "import-keys", output, "--yes").json
+    assert (again["fresh"], again["imported"]) == (False, UUIDS)
+    closed = homes.run(homes.north, "handover", "receipt", taken["receipt"]).json
+    assert (closed["state"], closed["imported"], closed["fresh"]) == ("closed", UUIDS, True)
+
+
+def test_a_move_and_its_receipt_lost_and_found(homes: Homes) -> None:
+    path = homes.export("--all", "--mode", "move")
+    taken = homes.run(homes.south, "import-keys", path, "--yes").json
+    receipt = Path(taken["receipt"])
+    first = receipt.read_bytes()
+    receipt.unlink()
+    assert homes.run(homes.south, "import-keys", path, "--yes").code == 0
+    assert receipt.read_bytes() == first
+    (row,) = homes.run(homes.north, "handover", "list").json["handovers"]
+    assert (row["state"], row["mode"], row["names"]) == ("open", "move", ["south"])
+    for fresh in (True, False):
+        assert homes.run(homes.north, "handover", "receipt", receipt).json["fresh"] is fresh
+    (row,) = homes.run(homes.north, "handover", "list").json["handovers"]
+    assert row["state"] == "closed"
+
+
+def test_an_export_again_finds_nothing_to_do(homes: Homes) -> None:
+    path = homes.export("--all", "--mode", "move")
+    octets, before = path.read_bytes(), homes.state(homes.north)
+    homes.export("--all", "--mode", "move")
+    assert (path.read_bytes(), homes.state(homes.north)) == (octets, before)
+
+
+def test_a_dry_run_tells_and_changes_nothing(homes: Homes) -> None:
+    before = homes.state(homes.north), homes.state(homes.south)
+    output = homes.folder / "keys.jwe"
+    plan = homes.run(homes.north, "export-keys", "--to", "south", "--all", "--mode", "move", "--output", output,
+                     "--dry-run").json  # fmt: skip
+    assert (plan["plan"], plan["count"], plan["id"]) == (True, 2, None)
+    assert not output.exists()
+    assert homes.state(homes.north) == before[0]
+    homes.export("--all")
+    plan = homes.run(homes.south, "import-keys", output, "--dry-run").json
+    assert (plan["plan"], plan["imported"], plan["receipt"]) == (True, UUIDS, None)
+    assert set(plan["decisions"].values()) == {"new"}
+    assert homes.state(homes.south) == before[1]
+    assert not (homes.folder / "keys.jwe.receipt").exists()
+
+
+def test_people_are_shown_both_fingerprints_in_fours_and_what_it_means(homes: Homes) -> None:
+    from teds_provision.workflow.trust import spoken
+
+    station = open_station(homes.north)
+    both = [spoken(station.fingerprint), *(spoken(record.fingerprint) for record in station.store.trusted())]
+    station.close()
+    told = {}
+    for mode in ("copy", "move"):
+        words = ["export-keys", "--to", "south", "--all", "--mode", mode, "--output", homes.folder / f"{mode}.jwe"]
+        done = spawn("--home", homes.north, *words, "--yes", passphrase=PASSPHRASE)
+        assert done.code == 0
+        assert all(digits in done.err for digits in both)
+        told[mode] = done.err
+    assert "can pose as a node to the other" in told["copy"]
+    assert "Only when the other station has rotated them" in told["move"]
+    done = spawn("--home", homes.south, "import-keys", homes.folder / "move.jwe", "--yes", passphrase=PASSPHRASE)
+    assert all(digits in done.err for digits in both)
+    assert "will be trusted for these nodes, and for no others" in done.err
+
+
+def test_it_asks_and_nobody_answers(homes: Homes) -> None:
+    output = homes.folder / "keys.jwe"
+    homes.refused(2, "export-keys", "--to", "south", "--all", "--output", output, home=homes.north)
+    assert not output.exists()
+    homes.export("--all")
+    homes.refused(2, "import-keys", output)
+
+
+def test_undo_by_the_first_digits_of_the_id(homes: Homes) -> None:
+    homes.export(UUIDS[0], "--mode", "move")
+    (row,) = homes.run(homes.north, "handover", "list").json["handovers"]
+    assert homes.run(homes.north, "handover", "undo", row["id"][:8], "--dry-run").json["plan"] == "undo"
+    undone = homes.run(homes.north, "handover", "undo", row["id"][:8], "--yes").json
+    assert (undone["state"], undone["nodes"]) == ("undone", [UUIDS[0]])
+    error = homes.refused(6, "export-keys", "--to", "south", UUIDS[0], "--output", homes.folder / "x", "--yes",
+                          home=homes.north)  # fmt: skip
+    assert "must be rotated first" in error["message"]
+
+
+# -- what a user gets wrong -------------------------------------------------------------------------------------------
+
+
+def test_a_receiver_that_is_none(homes: Homes) -> None:
+    key = ec.generate_private_key(ec.SECP256R1())
+    files = {
+        "private.pem": (key.private_bytes(Encoding.PEM, PrivateFormat.PKCS8, NoEncryption()), 8, "private key"),
+        "rsa.pem": (_public(rsa.generate_private_key(65537, 2048)), 8, "not a P-256 key"),
+        "p384.pem": (_public(ec.generate_private_key(ec.SECP384R1())), 8, "not a P-256 key"),
+        "stranger.pem": (_public(key), 6, "is not trusted here"),
+    }
+    output = homes.folder / "keys.jwe"
+    for name, (octets, code, says) in files.items():
+        (homes.folder / name).write_bytes(octets)
+        words = ["export-keys", "--to", homes.folder / name, "--all", "--output", output, "--yes"]
+        assert says in homes.refused(code, *words, home=homes.north)["message"]
+    homes.refused(3, "export-keys", "--to", "nobody", "--all", "--output", output, "--yes", home=homes.north)
+    assert not output.exists()
+
+
+def _public(key: Any) -> bytes:
+    return bytes(key.public_key().public_bytes(Encoding.PEM, PublicFormat.SubjectPublicKeyInfo))
+
+
+def test_an_output_that_cannot_be(homes: Homes) -> None:
+    occupied = homes.folder / "occupied"
+    occupied.write_text("a letter")
+    for output, code in ((occupied, 2), (homes.folder / "none" / "keys.jwe", 3)):
+        words = ["export-keys", "--to", "south", "--all", "--mode", "move", "--output", output, "--yes"]
+        homes.refused(code, *words, home=homes.north)
+    assert occupied.read_text() == "a letter"
+
+
+def test_a_receipts_place_that_is_taken_is_found_before_anything_changes(homes: Homes) -> None:
+    path = homes.export("--all")
+    (homes.folder / "keys.jwe.receipt").write_text("a letter")
+    homes.refused(2, "import-keys", path, "--yes")
+    other = homes.folder / "other.receipt"
+    assert homes.run(homes.south, "import-keys", path, "--yes", "--receipt", other).json["receipt"] == str(other)
+
+
+# -- bad bundles ------------------------------------------------------------------------------------------------------
+
+
+class Forger:
+    """Makes bundles from north to south that break one rule each."""
+
+    def __init__(self, homes: Homes) -> None:
+        north, south = open_station(homes.north), open_station(homes.south)
+        self.sender, self.ca = north.vault.identity(), north.vault.ca()
+        self.receiver = south.point
+        self.stations = north, south
+        self.folder = homes.folder
+        assert self.ca is not None
+        now = datetime.now(UTC).replace(microsecond=0)
+        digits = fingerprint(self.receiver)
+        self.good = Bundle(
+            id="3d1a4d1c-52c4-4d0b-9d3c-0c8f4bd5a7f1",
+            sender=north.fingerprint,
+            to=(digits,),
+            created=now,
+            expires=now + timedelta(days=7),
+            mode="copy",
+            ca=north.ca,
+            nodes=(self.node(1), self.node(2)),
+            station_signatures={digits: self.ca.sign(station_key_message(self.receiver))},
+        )
+
+    @staticmethod
+    def node(number: int) -> BundledNode:
+        return BundledNode(bytes(9) + bytes([number]), SoftwareKey(number + 90).point, bytes([number]) * 16, 3)
+
+    def close(self) -> None:
+        for station in self.stations:
+            station.close()
+
+    def file(self, octets: bytes) -> Path:
+        path = self.folder / "bad.jwe"
+        path.write_bytes(octets)
+        return path
+
+    def sealed(self, **changes: Any) -> bytes:
+        return seal_bundle(replace(self.good, **changes), self.sender, [self.receiver])
+
+    def members(self, **changes: Any) -> bytes:
+        """A payload with members that the sender's own code would not write."""
+        payload = json.loads(dump(_to_json(self.good))) | changes
+        return self.signed(dump(payload))
+
+    def signed(self, payload: bytes, **header: Any) -> bytes:
+        named = {"alg": "ES256", "kid": fingerprint(self.sender.point), "typ": TYPE} | header
+        text = base64url(dump(named)) + b"." + base64url(payload)
+        return jose.encrypt(text + b"." + base64url(self.sender.sign(text)), [self.receiver], cty="JWS")
+
+    def protected(self, **changes: Any) -> bytes:
+        document = json.loads(self.sealed())
+        header = json.loads(decode_base64url(document["protected"], "")) | changes
+        return dump(document | {"protected": base64url(dump(header)).decode()})
+
+    def flipped(self, member: str) -> bytes:
+        document = json.loads(self.sealed())
+        text = document[member]
+        return dump(document | {member: ("B" if text[0] == "A" else "A") + text[1:]})
+
+
+@pytest.fixture
+def forger(homes: Homes) -> Iterator[Forger]:
+    made = Forger(homes)
+    yield made
+    made.close()
+
+
+def _expired(forger: Forger) -> bytes:
+    past = datetime.now(UTC) - timedelta(days=9)
+    return forger.sealed(created=past, expires=past + timedelta(days=7))
+
+
+def _with_duplicate(forger: Forger) -> bytes:
+    nodes = json.loads(dump(_to_json(forger.good)))["nodes"]
+    return forger.members(nodes=[nodes[0], nodes[0]])
+
+
+def _other_recipient(forger: Forger) -> bytes:
+    other = SoftwareKey(41)
+    signatures = {fingerprint(other.point): forger.ca.sign(station_key_message(other.point))}  # type: ignore[union-attr]
+    bundle = replace(forger.good, to=tuple(signatures), station_signatures=signatures)
+    return seal_bundle(bundle, forger.sender, [other.point])
+
+
+def _stranger(forger: Forger) -> bytes:
+    stranger = SoftwareKey(42)
+    return seal_bundle(replace(forger.good, sender=fingerprint(stranger.point)), stranger, [forger.receiver])
+
+
+def _bomb(forger: Forger) -> bytes:
+    return b'{"protected":' + b"[" * 200_000 + b"]" * 200_000 + b"}"
+
+
+BAD: dict[str, tuple[Callable[[Forger], bytes], int, str]] = {
+    "wrong recipient": (_other_recipient, 6, "not sealed for this station"),
+    "unknown sender": (_stranger, 4, "Nobody trusted here"),
+    "header changed": (lambda f: f.protected(cty="JWS", x="y"), 4, ""),
+    "iv changed": (lambda f: f.flipped("iv"), 4, "was changed"),
+    "payload changed": (lambda f: f.flipped("ciphertext"), 4, "was changed"),
+    "tag changed": (lambda f: f.flipped("tag"), 4, "was changed"),
+    "expired": (_expired, 6, "expired"),
+    "made in the future": (
+        lambda f: f.sealed(created=f.good.created + timedelta(days=1)), 6, "in the future"),
+    "truncated": (lambda f: f.sealed()[:-200], 8, ""),
+    "cut to nothing": (lambda f: b"", 8, ""),
+    "count wrong": (lambda f: f.members(count=3), 8, "says that it holds 3 nodes, and holds 2"),
+    "a UUID twice": (_with_duplicate, 8, "names an UUID twice"),
+    "alg none inside": (lambda f: f.signed(b"{}", alg="none"), 6, "'none' is not accepted"),
+    "alg HS256 inside": (lambda f: f.signed(b"{}", alg="HS256"), 6, "is not accepted"),
+    "alg dir outside": (lambda f: f.protected(alg="dir"), 6, "is not accepted"),
+    "alg RSA-OAEP outside": (lambda f: f.protected(alg="RSA-OAEP"), 6, "is not accepted"),
+    "enc A128CBC-HS256": (lambda f: f.protected(enc="A128CBC-HS256"), 6, "is not accepted"),
+    "crit outside": (lambda f: f.protected(crit=["exp"]), 6, "crit is not accepted"),
+    "crit inside": (lambda f: f.signed(b"{}", crit=["exp"]), 6, "crit is not accepted"),
+    "zip": (lambda f: f.protected(zip="DEF"), 6, "zip is not accepted"),
+    "another format": (lambda f: f.members(format="teds-handover/9"), 8, "format is not"),
+    "a receipt in its place": (lambda f: f.signed(b"{}", typ="teds-receipt+jws"), 8, "not teds-handover"),
+    "a private key": (lambda f: to_pem(f.receiver).encode().replace(b"PUBLIC", b"PRIVATE"), 8, ""),
+    "nested JSON": (_bomb, 8, ""),
+    "a move to two": (lambda f: f.members(mode="move", to=[*f.good.to, "ab" * 32]), 6, "exactly one receiver"),
+    "no signature of the CA": (lambda f: f.sealed(station_signatures={}), 6, "brings no signature of the CA"),
+    "a wrong signature of the CA": (
+        lambda f: f.members(station_signatures={f.good.to[0]: base64url(f.sender.sign(b"no")).decode()}), 4,
+        "does not verify"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", list(BAD))
+def test_a_bad_bundle(homes: Homes, forger: Forger, name: str) -> None:
+    make, code, says = BAD[name]
+    error = homes.refused(code, "import-keys", forger.file(make(forger)), "--yes")
+    assert says in error["message"]
+    assert not (homes.folder / "bad.jwe.receipt").exists()
+
+
+def test_the_forgers_good_bundle_is_taken(homes: Homes, forger: Forger) -> None:
+    assert homes.run(homes.south, "import-keys", forger.file(forger.sealed()), "--yes").code == 0
+
+
+def test_a_replayed_id(homes: Homes, forger: Forger) -> None:
+    homes.run(homes.south, "import-keys", forger.file(forger.sealed()), "--yes")
+    (homes.folder / "bad.jwe.receipt").unlink()
+    path = forger.file(forger.sealed(nodes=(forger.node(3),)))
+    assert "replayed or forged" in homes.refused(6, "import-keys", path, "--yes")["message"]
+
+
+def test_an_older_epoch(homes: Homes, forger: Forger) -> None:
+    homes.run(homes.south, "import-keys", forger.file(forger.sealed()), "--yes")
+    (homes.folder / "bad.jwe.receipt").unlink()
+    older = replace(forger.node(1), epoch=2, key=bytes(16))
+    path = forger.file(forger.sealed(id="3d1a4d1c-52c4-4d0b-9d3c-0c8f4bd5a7f2", nodes=(older,)))
+    assert "epoch 2 is older than 3" in homes.refused(6, "import-keys", path, "--yes")["message"]
+
+
+def test_a_sender_that_is_trusted_no_more(homes: Homes) -> None:
+    path = homes.export("--all")
+    assert homes.run(homes.south, "trust", "remove", "north", "--yes").code == 0
+    assert "Nobody trusted here" in homes.refused(4, "import-keys", path, "--yes")["message"]
+
+
+def test_100_mb_of_junk_are_refused_without_being_read(homes: Homes, tmp_path: Path) -> None:
+    path = tmp_path / "junk"
+    with path.open("wb") as file:
+        file.truncate(100_000_000)
+    assert "larger than" in homes.refused(8, "import-keys", path, "--yes")["message"]
+    path.write_bytes(b'{"protected":"' + b"A" * 30_000_000)
+    homes.refused(8, "import-keys", path, "--yes")
+
+
+def test_no_file_at_all(homes: Homes) -> None:
+    homes.refused(3, "import-keys", homes.folder / "none", "--yes")
+    homes.refused(3, "handover", "receipt", homes.folder / "none")
+    homes.refused(3, "handover", "undo", "12345678", "--yes")
+
+
+def test_bad_receipts(homes: Homes) -> None:
+    path = homes.export("--all", "--mode", "move")
+    receipt = Path(homes.run(homes.south, "import-keys", path, "--yes").json["receipt"])
+    octets = receipt.read_bytes().strip()
+    for bad, code in ((octets[:-5] + b"AAAAA", 4), (octets[:40], 8), (b"", 8), (path.read_bytes(), 8)):
+        receipt.write_bytes(bad)
+        homes.refused(code, "handover", "receipt", receipt, home=homes.north)
+    receipt.write_bytes(octets)
+    homes.refused(4, "handover", "receipt", receipt)
+
+
+def test_a_node_that_was_moved_says_where_it_went(homes: Homes) -> None:
+    homes.export("--all", "--mode", "move")
+    error = homes.refused(6, "agree", UUIDS[0], "--timeout", "1", home=homes.north)
+    assert "was moved to station" in error["message"]
+    station = open_station(homes.north)
+    with pytest.raises(Exception, match="was moved"):
+        session(station, Pair.make(homes.folder / "more", 1).board)
+    station.close()
