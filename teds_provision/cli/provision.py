@@ -45,11 +45,13 @@ def provision(
     --yes accepts the node that lies on the reader. A finished node is left as it is.
     """
     from teds_provision.cli.rendering import reporter_for
+    from teds_provision.workflow.build import check_order
     from teds_provision.workflow.contact import meet
     from teds_provision.workflow.provision import require_authentic
 
     station, reporter = app.station(), reporter_for(app)
     wanted = station.store.resolve(uuid) if uuid is not None else None
+    check_order(station, wanted, order)
     run = _runner(app, station, order, yes, reporter)
     if dry_run:
         with meet(station, links, wanted, reporter) as node:

@@ -65,19 +65,10 @@ def build(
     Raises NotFound (profile, file), BadData (profile or calibration with errors), PolicyRefused (a calibration that
     the guard refuses).
     """
-    from teds_provision.teds.profile import default_folders, load_profile
-
-    record = station.store.node(uuid)
-    wanted = order.profile or (record.profile if record else None)
-    if wanted is None:
-        raise UsageFailure(f"No profile is known for node {uuid.hex()}.", hint="Add --profile; see: profile list")
-    profile = load_profile(wanted, default_folders(station.store.home))
     has = has or known_image(station, uuid)
-    calibrations, warnings = _calibrations(order, profile, _pending(station, uuid, has) or has)
-    name = order.name or (record.name if record else None)
-    made = profile.build(uuid, calibration=calibrations, name=name, edition=edition)  # type: ignore[arg-type]
-    image = Image(uuid, {**(keep or {}), **made.blocks})
-    warnings += made.warnings
+    plan = _composed(station, uuid, order, _pending(station, uuid, has) or has, edition)
+    profile, calibrations, warnings = plan.profile, plan.calibrations, plan.warnings
+    image = Image(uuid, {**(keep or {}), **plan.blocks})
     warnings += guard(station, image, has, order.accept_calibration, calibrations=calibrations, profile=profile)
     try:
         image = image.with_block(SECURITY, unsigned_security(station, known_node_keys(station, uuid, has), image))
@@ -86,10 +77,48 @@ def build(
     if not keep_draft:
         return Built(image, profile.name, warnings, calibrations)
     with station.store.transaction():
-        station.remember(uuid, profile=wanted, name=name)
-        station.store.put_draft(Draft(uuid, image.to_json(), "built", wanted))
+        station.remember(uuid, profile=plan.wanted, name=plan.name)
+        station.store.put_draft(Draft(uuid, image.to_json(), "built", plan.wanted))
         station.audit("build", uuid, "done", profile=profile.name, teds=image.digest())
     return Built(image, profile.name, warnings, calibrations)
+
+
+@dataclass(frozen=True)
+class _Composed:
+    """The TEDS that profile, calibration and name give; ``wanted`` is the profile as it was asked for."""
+
+    profile: Profile
+    wanted: str
+    name: str | None
+    calibrations: dict[int, Calibration]
+    blocks: Mapping[BlockId, bytes]
+    warnings: tuple[str, ...]
+
+
+def _composed(station: Station, uuid: bytes, order: BuildOrder, has: Image | None, edition: int) -> _Composed:
+    from teds_provision.teds.profile import default_folders, load_profile
+
+    record = station.store.node(uuid)
+    wanted = order.profile or (record.profile if record else None)
+    if wanted is None:
+        raise UsageFailure(f"No profile is known for node {uuid.hex()}.", hint="Add --profile; see: profile list")
+    profile = load_profile(wanted, default_folders(station.store.home))
+    calibrations, warnings = _calibrations(order, profile, has)
+    name = order.name or (record.name if record else None)
+    try:
+        made = profile.build(uuid, calibration=calibrations, name=name, edition=edition)  # type: ignore[arg-type]
+    except UnicodeEncodeError as error:  # an argument in another encoding than the terminal's
+        raise BadData("The name of the node is not valid text.", hint="Give it in the terminal's encoding.") from error
+    return _Composed(profile, wanted, name, calibrations, made.blocks, warnings + made.warnings)
+
+
+def check_order(station: Station, uuid: bytes | None, order: BuildOrder) -> None:
+    """Try what an order names, before a node is waited for or changed; a UUID of None is any node's.
+
+    Raises UsageFailure (no profile known), NotFound, BadData, as :func:`build` would; changes nothing.
+    """
+    if uuid is not None or order.profile is not None:
+        _composed(station, uuid or bytes(10), order, None, 2007)
 
 
 def _pending(station: Station, uuid: bytes, has: Image | None) -> Image | None:

@@ -15,7 +15,7 @@ from teds_provision.protocol.identity import NodeState
 from teds_provision.store import Draft, WhitelistEntry
 from teds_provision.teds.image import SECURITY, Image
 from teds_provision.workflow.agree import Agreed, agree
-from teds_provision.workflow.build import BuildOrder, Built, build
+from teds_provision.workflow.build import BuildOrder, Built, build, check_order
 from teds_provision.workflow.conversation import Conversation
 from teds_provision.workflow.identify import Identified, identify, prove
 from teds_provision.workflow.journal import recorded
@@ -59,6 +59,7 @@ class _Run:
 
     def run(self) -> Provisioned:
         who = self._identify()
+        check_order(self.station, who.uuid, self.order)
         self._whitelist(who)
         self._agree(who)
         present = survey(self.node)

@@ -226,3 +226,20 @@ def test_a_read_back_that_differs_is_not_believed(station: Station, board: Board
 
 def test_the_link_error_is_a_link_error() -> None:
     assert issubclass(NodeSilent, LinkFailure)
+
+
+@pytest.mark.parametrize("orders", ["no such profile", "no profile", "broken calibration", "no calibration file"])
+def test_a_wrong_order_changes_nothing(station: Station, board: Board, tmp_path: Path, orders: str) -> None:
+    broken = tmp_path / "angle.csv"
+    broken.write_text("raw,value\n1,one\n")
+    order = {
+        "no such profile": replace(ANGLE, profile="no-such-sensor"),
+        "no profile": BuildOrder(),
+        "broken calibration": replace(ANGLE, calibration=broken),
+        "no calibration file": replace(ANGLE, calibration=tmp_path / "none.csv"),
+    }[orders]
+    with pytest.raises(TedsProvisionError) as wrong:
+        run(station, board, order=order)
+    assert wrong.value.exit_code in (2, 3, 8)
+    assert board.state.state == NodeState.FACTORY
+    assert station.store.whitelisted(board.uuid) is None
