@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from teds_provision.errors import BadData, NodeRefused, NotAuthentic
 from teds_provision.protocol.frames import Function, security_command
@@ -66,10 +66,21 @@ def identify(station: Station, node: Conversation) -> Identified:
         last_seen=utc_now(),
         **({"point": who.point} if node.tapped or pinned else {}),
     )
+    if node.tapped and who.whitelisted is not None and not pinned:
+        who = replace(who, whitelisted=_pin(station, who.whitelisted, who.fingerprint))
     known = known_key(station, node.uuid)
     if known != who.point:
         station.store.put_node_image(node.uuid, Image(node.uuid, {SECURITY: who.security_teds}).to_json())
     return who
+
+
+def _pin(station: Station, entry: WhitelistEntry, key: str) -> WhitelistEntry:
+    """Give an entry that was made without a fingerprint the key that was just tapped and proven (section 2)."""
+    pinned = replace(entry, fingerprint=key, assurance="tap")
+    with station.store.transaction():
+        station.store.put_whitelist(pinned)
+        station.audit("whitelist", entry.uuid, "pinned", fingerprint=key, assurance="tap")
+    return pinned
 
 
 def examine(station: Station, node: Conversation) -> Identified:

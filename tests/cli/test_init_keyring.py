@@ -1,0 +1,104 @@
+"""A station whose keys lie in a real gnome-keyring: init, doctor, backup, a lost keyring, restore."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from tests.vault.test_keyring_vault import Session
+
+pytestmark = pytest.mark.system
+
+RUN = """
+import io, os, subprocess
+def program(*words, passphrase=None):
+    command = [sys.executable, "-m", "teds_provision", "--json", "--home", str(home / "station")]
+    read, write = os.pipe()
+    if passphrase:
+        os.write(write, passphrase.encode() + b"\\n")
+        command += ["--passphrase-fd", str(read)]
+    os.close(write)
+    done = subprocess.run([*command, *words], pass_fds=(read,), capture_output=True, text=True)
+    os.close(read)
+    return [done.returncode, json.loads(done.stdout)]
+"""
+WORDS = "four random words here"
+
+
+@pytest.fixture
+def session(tmp_path: Path) -> Session:
+    import shutil
+
+    for program in ("dbus-run-session", "gnome-keyring-daemon"):
+        if shutil.which(program) is None:
+            pytest.skip(f"{program} is missing: scripts/install-test-packages installs it")
+    home = tmp_path / "user"
+    home.mkdir(mode=0o700)
+    made = Session(home)
+    made.environment["PYTHONPATH"] = str(Path(__file__).parents[2])
+    return made
+
+
+def run(session: Session, lines: str, **options: Any) -> dict[str, Any]:
+    return session.run(RUN + lines, **options)
+
+
+def test_the_whole_life_of_a_station_with_a_keyring(session: Session) -> None:
+    said = run(
+        session,
+        f"""
+made, again = program("init"), program("init")
+doctor = program("doctor")
+backup = program("backup", str(home / "b"), passphrase={WORDS!r})
+say(made=made, again=again, doctor=doctor, backup=backup)
+""",
+    )
+    (code, made), (_, again) = said["made"], said["again"]
+    assert (code, made["keystore"], made["why"]) == (0, "keyring", "a keyring works here")
+    assert again == made
+    results = {check["name"]: check["result"] for check in said["doctor"][1]["checks"]}
+    assert (said["doctor"][0], results["keyring"], results["vault"]) == (0, "ok", "ok")
+    assert said["backup"][0] == 0
+    assert [path.name for path in (session.home / "station").iterdir() if "vault" in path.name] == []
+
+    locked = run(session, 'say(doctor=program("doctor"), backup=program("backup", str(home / "c")))', password=None)
+    assert (locked["doctor"][0], locked["backup"][0]) == (7, 7)
+    assert not (session.home / "c").exists()
+
+    (session.home / "data" / "keyrings" / "login.keyring").unlink()  # the keyring is lost, the store is not
+    restored = run(
+        session,
+        f"""
+lost = program("backup", str(home / "c"), passphrase={WORDS!r})
+back = program("restore", str(home / "b"), passphrase={WORDS!r})
+say(lost=lost, back=back, doctor=program("doctor"), backup=program("backup", str(home / "c"), passphrase={WORDS!r}))
+""",
+    )
+    assert restored["lost"][0] == 7
+    assert (restored["back"][0], restored["back"][1]["action"]) == (0, "nothing")
+    assert restored["doctor"][0] == 0
+    assert restored["backup"][0] == 0
+
+
+def test_a_keyring_station_comes_back_on_a_machine_without_a_keyring(session: Session, tmp_path: Path) -> None:
+    said = run(session, f'say(made=program("init"), backup=program("backup", str(home / "b"), passphrase={WORDS!r}))')
+    words = tmp_path / "words"
+    words.write_text(WORDS + "\n")
+    command = f"{sys.executable} -m teds_provision --json --home {tmp_path / 'new'} --passphrase-fd 3 restore"
+    environment = {**session.environment, "DBUS_SESSION_BUS_ADDRESS": f"unix:path={tmp_path}/no-bus"}
+    done = subprocess.run(
+        ["bash", "-c", f"{command} {session.home / 'b'} 3<{words}"],
+        capture_output=True,
+        text=True,
+        env=environment,
+        check=True,
+        timeout=60,
+    )
+    told = json.loads(done.stdout)
+    assert (told["action"], told["keystore"]) == ("rebuilt", "file")
+    assert told["station"] == said["made"][1]["fingerprint"]
