@@ -1,0 +1,118 @@
+"""``trust`` and ``init --request`` as typed."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+from cryptography.hazmat.primitives.asymmetric import ec
+from cryptography.hazmat.primitives.serialization import Encoding, NoEncryption, PrivateFormat
+
+from teds_provision.protocol.keys import SoftwareKey, fingerprint, to_pem
+from teds_provision.workflow.trust import spoken
+from tests.workflow.bench import PASSPHRASE
+
+from .shell import Outcome, call, spawn
+
+KEY = SoftwareKey(51)
+DIGITS = fingerprint(KEY.point)
+
+
+@pytest.fixture
+def pem(tmp_path: Path) -> Path:
+    path = tmp_path / "keys" / "lab.pem"
+    path.parent.mkdir()
+    path.write_text(to_pem(KEY.point))
+    return path
+
+
+def unlocked(home: Path, *words: object) -> Outcome:
+    return spawn("--home", home, "--json", *words, passphrase=PASSPHRASE)
+
+
+def test_add_list_remove(home: Path, pem: Path) -> None:
+    assert call(home, "--json", "trust", "add", "lab", pem).code == 2
+    plan = call(home, "--json", "trust", "add", "lab", pem, "--dry-run")
+    assert (plan.json["plan"], plan.json["added"]) == (True, 1)
+    assert call(home, "--json", "trust", "list").json["trusted"] == []
+    added = call(home, "--json", "trust", "add", "lab", pem, "--yes")
+    assert added.json == {"trusted": [{"name": "lab", "role": "station", "fingerprint": DIGITS}], "added": 1}
+    assert call(home, "--json", "trust", "add", "lab", pem, "--yes").json["added"] == 0
+    (listed,) = call(home, "--json", "trust", "list").json["trusted"]
+    assert (listed["name"], listed["role"], listed["fingerprint"]) == ("lab", "station", DIGITS)
+    assert call(home, "--json", "trust", "remove", "lab").code == 2
+    assert call(home, "--json", "trust", "remove", DIGITS[:16], "--yes").json["removed"]["name"] == "lab"
+    assert call(home, "--json", "trust", "remove", "lab", "--yes").code == 3
+
+
+def test_the_whole_fingerprint_is_shown_to_compare(home: Path, pem: Path) -> None:
+    assert spoken(DIGITS) in call(home, "trust", "add", "lab", pem, "--yes").err
+
+
+def test_a_folder(home: Path, pem: Path) -> None:
+    (pem.parent / "owner.ca.pem").write_text(to_pem(SoftwareKey(52).point))
+    added = call(home, "--json", "trust", "add", "--from", pem.parent, "--yes")
+    assert [(one["name"], one["role"]) for one in added.json["trusted"]] == [("lab", "station"), ("owner", "ca")]
+    key = ec.generate_private_key(ec.SECP256R1())
+    (pem.parent / "oops.txt").write_bytes(key.private_bytes(Encoding.PEM, PrivateFormat.PKCS8, NoEncryption()))
+    refused = call(home, "--json", "trust", "add", "--from", pem.parent, "--yes")
+    assert (refused.code, refused.json["error"]["code"]) == (6, "refused")
+
+
+def test_usage(home: Path, pem: Path) -> None:
+    for words in ([], ["lab"], ["lab", pem, "--from", pem.parent]):
+        assert call(home, "--json", "trust", "add", *words).code == 2
+    assert call(home, "--json", "trust", "add", "lab", pem.parent / "none.pem", "--yes").code == 3
+
+
+def test_a_station_without_a_ca_of_its_own(home: Path, tmp_path: Path) -> None:
+    east, asked, cert = tmp_path / "east", tmp_path / "east.request", tmp_path / "east.cert"
+    for _ in range(2):
+        made = unlocked(east, "init", "--name", "east", "--keystore", "file", "--request", asked)
+        assert (made.code, made.json["ca"]) == (0, None), made
+    assert "init --certificate" in unlocked(east, "nodes").json["error"]["hint"]
+    assert unlocked(home, "trust", "ca", "sign", asked, "--output", cert).code == 2
+    assert unlocked(home, "trust", "ca", "sign", asked, "--output", cert, "--dry-run").json["plan"] is True
+    assert not cert.exists()
+    for fresh in (True, False):
+        signed = unlocked(home, "trust", "ca", "sign", asked, "--output", cert, "--yes").json
+        assert (signed["name"], signed["fingerprint"], signed["fresh"]) == ("east", made.json["fingerprint"], fresh)
+    assert unlocked(east, "init", "--certificate", cert).code == 2
+    for _ in range(2):
+        done = unlocked(east, "init", "--certificate", cert, "--yes")
+        assert done.code == 0, done
+        assert done.json["ca"]["fingerprint"] == signed["ca"]
+    assert unlocked(east, "trust", "ca", "create").code == 6
+    unlocked(tmp_path / "west", "init", "--keystore", "file", "--request", tmp_path / "west.request")
+    refused = unlocked(east, "trust", "ca", "sign", tmp_path / "west.request", "--output", tmp_path / "x", "--yes")
+    assert refused.code == 3
+
+
+def test_the_ca_key_away_and_back(home: Path, tmp_path: Path) -> None:
+    path = tmp_path / "ca.pem"
+    shown = unlocked(home, "trust", "ca", "create").json["fingerprint"]
+    assert unlocked(home, "trust", "ca", "export", path).json == {"file": str(path)}
+    assert path.stat().st_mode & 0o777 == 0o600
+    assert b"ENCRYPTED" in path.read_bytes()
+    assert unlocked(home, "trust", "ca", "export", path).code == 7
+    assert unlocked(home, "trust", "ca", "drop").code == 2
+    assert [unlocked(home, "trust", "ca", "drop", "--yes").json["dropped"] for _ in range(2)] == [True, False]
+    assert unlocked(home, "trust", "ca", "create").code == 6
+    assert unlocked(home, "trust", "ca", "import", path).json["fingerprint"] == shown
+    assert unlocked(home, "trust", "ca", "create").code == 0
+
+
+@pytest.mark.parametrize("words", [["trust"], ["export-keys"], ["import-keys"], ["handover"], ["revoke"], ["init"]])
+def test_help_loads_no_cryptography(words: list[str]) -> None:
+    import subprocess
+    import sys
+
+    script = (
+        "import sys\nfrom teds_provision.cli.main import run\n"
+        f"code = run({[*words, '--help']!r})\n"
+        "heavy = {'cryptography', 'nfc', 'can', 'keyring', 'rich', 'numpy', 'pint'} & set(sys.modules)\n"
+        "print('HEAVY', sorted(heavy), code)"
+    )
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True, timeout=60)
+    assert done.stdout.splitlines()[-1] == "HEAVY [] 0"
+    assert "Examples:" in done.stdout
