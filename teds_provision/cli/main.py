@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import importlib
 import json
 import os
@@ -155,7 +156,7 @@ def run(arguments: list[str]) -> int:
         _say("Interrupted: the same command carries on from here.")
         return INTERRUPTED
     except click.ClickException as error:
-        return _fail(arguments, 2, "usage", _usage(error), "")
+        return _fail(arguments, 2, "usage", _usage(error), _usage_hint(error))
     except TedsProvisionError as error:
         _traceback(arguments)
         return _fail(arguments, error.exit_code, error.code, error.message, error.hint)
@@ -177,6 +178,12 @@ def _usage(error: click.ClickException) -> str:
     if isinstance(error, click.UsageError) and error.ctx is not None:
         text += f" (see: {error.ctx.command_path} --help)"
     return text
+
+
+def _usage_hint(error: click.ClickException) -> str:
+    if isinstance(error, click.NoSuchOption) and any(error.option_name in option.opts for option in cli.params):
+        return f"{error.option_name} is a global option: teds-provision {error.option_name} COMMAND …"
+    return ""
 
 
 def _wants(arguments: list[str], option: str) -> bool:
@@ -203,7 +210,8 @@ def _settle() -> None:
 def _fail(arguments: list[str], exit_code: int, code: str, message: str, hint: str) -> int:
     _settle()
     if _wants(arguments, "--json"):
-        print(json.dumps({"error": {"code": code, "message": message, "hint": hint}}), flush=True)
+        with contextlib.suppress(BrokenPipeError):
+            print(json.dumps({"error": {"code": code, "message": message, "hint": hint}}), flush=True)
     else:
         _say(f"Error: {message}")
         if hint:

@@ -36,6 +36,7 @@ SECTIONS: Final[dict[str, dict[str, Entry]]] = {
         "verify": Entry("verify", "verify", "Check a node or an image against everything the profile demands."),
         "read": Entry("read", "read", "Read every TEDS of a node."),
         "reset": Entry("reset", "reset", "Take a node back to factory state, with its signed receipt."),
+        "address": Entry("address", "address", "Give a node another CAN address."),
         "nodes": Entry("nodes", "nodes", "What this station knows of its nodes."),
         "log": Entry("log", "log", "The audit log, and whether its hash chain holds."),
         "show": Entry("show", "show", "Decode TEDS, images, profiles, bundles and messages."),

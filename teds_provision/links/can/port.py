@@ -296,7 +296,7 @@ class CanPort:
 def _conflict(gathering: Gathering) -> AddressConflict:
     return AddressConflict(
         conflict_text(min(gathering.conflicts)),
-        hint="Give one of them another address: connect it alone or tap it, then provision it again.",
+        hint="Tap one of them, or connect it alone, and: teds-provision address UUID NEW.",
     )
 
 

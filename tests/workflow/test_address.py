@@ -1,0 +1,37 @@
+"""Another CAN address: by tap, in a session, never plainly over the bus of a keyed node."""
+
+from __future__ import annotations
+
+import pytest
+
+from teds_provision.errors import NodeRefused
+from teds_provision.workflow.address import set_address
+from teds_provision.workflow.station import Station
+
+from .bench import Board, MemoryLink, talk
+from .test_provision import run
+
+
+def test_a_tapped_node_takes_another_address_and_keeps_it(station: Station, board: Board) -> None:
+    with talk(board) as node:
+        assert set_address(station, node, 0x21)
+    board.power_on()
+    assert board.state.can_address == 0x21
+    record = station.store.node(board.uuid)
+    assert record is not None
+    assert record.can_address == 0x21
+    with talk(board) as node:
+        assert not set_address(station, node, 0x21), "again there is nothing to do"
+
+
+def test_over_the_bus_it_takes_a_session(station: Station, board: Board) -> None:
+    run(station, board)
+    with talk(board, MemoryLink(board, via="can", tapped=False)) as node:
+        assert set_address(station, node, 0x22)
+    assert board.state.can_address == 0x22
+
+
+def test_over_the_bus_without_a_key_it_is_refused(station: Station, board: Board) -> None:
+    with talk(board, MemoryLink(board, via="can", tapped=False)) as node, pytest.raises(NodeRefused):
+        set_address(station, node, 0x23)
+    assert board.state.can_address != 0x23
