@@ -9,7 +9,7 @@ from teds_provision.cli.options import command, dry_run_option, link_options, ye
 from teds_provision.links import LinkSettings
 
 
-class _Address(click.ParamType):
+class _Address(click.ParamType[int]):
     name = "address"
 
     def convert(self, value: object, param: click.Parameter | None, ctx: click.Context | None) -> int:

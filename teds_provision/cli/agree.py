@@ -10,7 +10,8 @@ from teds_provision.links import LinkSettings
 
 
 @command(
-    "teds-provision agree 8d4d --nfc udp:localhost:54321", "teds-provision agree 8d4d --rotate --via can --can udp_multicast:239.74.163.2"
+    "teds-provision agree 8d4d --nfc udp:localhost:54321",
+    "teds-provision agree 8d4d --rotate --via can --can udp_multicast:239.74.163.2",
 )
 @click.argument("uuid")
 @click.option("--rotate", is_flag=True, help="Make a new key although there is one.")
