@@ -6,7 +6,7 @@ import tomllib
 from pathlib import Path
 from typing import Any
 
-from teds_provision.teds.tables import FieldSpec, Table, name_of
+from teds_provision.teds.tables_form import FieldSpec, Table, name_of
 
 
 def calibration_table() -> Table:

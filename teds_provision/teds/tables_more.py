@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any, Final
 
-from teds_provision.teds.tables import Confidence, FieldSpec, Need
+from teds_provision.teds.tables_form import Confidence, FieldSpec, Need
 
 RADIO: Final = {0: "IEEE 802.11", 1: "Bluetooth", 2: "ZigBee", 3: "6LoWPAN", 255: "manufacturer"}
 

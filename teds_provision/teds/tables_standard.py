@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any, Final
 
-from teds_provision.teds.tables import FieldSpec, Need
+from teds_provision.teds.tables_form import FieldSpec, Need
 
 UNITS_NAMES: Final = {
     50: "UnitType",
