@@ -106,13 +106,15 @@ class _Run:
     def _sign(self, who: Identified, built: Built, present: Survey, earlier: bytes | None) -> Signed:
         with self.steps.step("sign") as step:
             keys = NodeKeys(who.uuid, who.point, who.key_signature)
+            # a node whose TEDS are not what it was signed for takes them only under a newer sequence
+            intact = present.image.unsigned_blocks() == built.image.unsigned_blocks()
             signed = sign(
                 self.station,
                 keys,
                 built.image,
                 epoch=present.identity.epoch,
                 node_sequence=present.identity.sequence,
-                on_node=present.image.security if present.identity.state == NodeState.PROVISIONED else None,
+                on_node=present.image.security if intact and present.identity.state == NodeState.PROVISIONED else None,
                 earlier=earlier,
             )
             self.station.store.put_draft(Draft(who.uuid, signed.image.to_json(), "signed", built.profile))

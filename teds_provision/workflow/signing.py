@@ -51,24 +51,27 @@ def sign_image(station: Station, order: SignOrder, node: Conversation | None) ->
     sequence = record.sequence if record else 0
     has = known_image(station, uuid)
     if node is not None:
-        require_session(station, node)
+        if not order.dry_run:  # opening a session may settle or rotate keys
+            require_session(station, node)
         found = survey(node)
         has, epoch, sequence = found.image, found.identity.epoch, found.identity.sequence
         keep = {block: has.blocks[block] for block in found.read_only if block not in image.blocks}
         image = Image(uuid, {**image.blocks, **keep})
     keys = known_node_keys(station, uuid, has or image)
-    guard(station, image, has, order.accept_calibration)
+    guard(station, image, has, order.accept_calibration, record=not order.dry_run)
     changes = diff_blocks(has.unsigned_blocks() if has else {}, image.unsigned_blocks())
     told = tuple(change.text for change in changes)
     if order.dry_run:
         return SignDone(Signed(image, sequence, reused=False), told)
+    # a node whose TEDS are not what it was signed for takes them only under a newer sequence
+    intact = node is None or has is None or has.unsigned_blocks() == image.unsigned_blocks()
     signed = sign(
         station,
         keys,
         image,
         epoch=epoch,
         node_sequence=sequence if node is not None else _sequence_of(has),
-        on_node=has.security if has is not None else None,
+        on_node=has.security if has is not None and intact else None,
         earlier=image.security,
     )
     if order.image is None:
