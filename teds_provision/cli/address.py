@@ -9,23 +9,20 @@ from teds_provision.cli.options import command, dry_run_option, link_options, ye
 from teds_provision.links import LinkSettings
 
 
-class _Address(click.ParamType[int]):
-    name = "address"
-
-    def convert(self, value: object, param: click.Parameter | None, ctx: click.Context | None) -> int:
-        """Read 1 to 239, decimal or with 0x."""
-        try:
-            number = int(str(value), 0)
-        except ValueError:
-            number = 0
-        if not 1 <= number <= 239:
-            self.fail("a CAN address is 1 to 239 (0x01 to 0xEF).", param, ctx)
-        return number
+def _address(_ctx: click.Context, _parameter: click.Parameter, text: str) -> int:
+    """Read 1 to 239, decimal or with 0x."""
+    try:
+        number = int(text, 0)
+    except ValueError:
+        number = 0
+    if not 1 <= number <= 239:
+        raise click.BadParameter("a CAN address is 1 to 239 (0x01 to 0xEF).")
+    return number
 
 
 @command("teds-provision address 8d4d 0x21 --nfc udp:localhost:54321")
 @click.argument("uuid")
-@click.argument("address", type=_Address())
+@click.argument("address", callback=_address)
 @yes_option
 @dry_run_option
 @link_options
