@@ -13,6 +13,7 @@ from teds_provision.teds.profile.source import Item, Table, Where
 from teds_provision.teds.units import WrittenUnit, parse_seconds, parse_unit
 
 _LIMITS = {Kind.U8: 0xFF, Kind.U16: 0xFFFF, Kind.U32: 0xFFFF_FFFF}
+_SHOWN = 60  # characters of a wrong value that a message shows
 FLOAT32_MAXIMUM = 3.4028234663852886e38
 
 
@@ -28,6 +29,14 @@ class Problem:
     def __str__(self) -> str:
         place = f"{self.where}: " if self.field == "" else f"{self.where}: {self.field}: "
         return place + self.message
+
+
+def _shown(value: object) -> str:
+    """A value of the file as a message shows it."""
+    if isinstance(value, tuple):  # of Table
+        return "a list of tables [[…]]"
+    text = repr(value)
+    return text if len(text) <= _SHOWN else text[: _SHOWN - 1] + "…"
 
 
 class _Wrong(Exception):
@@ -102,7 +111,7 @@ class Section:
         if value is None:
             return default
         if not isinstance(value, str):
-            self.error(key, f"a text in quotes is expected, not {value!r}.")
+            self.error(key, f"a text in quotes is expected, not {_shown(value)}.")
             return default
         return value
 
@@ -112,7 +121,7 @@ class Section:
         if value is None:
             return ()
         if not isinstance(value, list) or not all(isinstance(part, str) for part in value):
-            self.error(key, f'a list of texts is expected, like ["nfc", "can"], not {value!r}.')
+            self.error(key, f'a list of texts is expected, like ["nfc", "can"], not {_shown(value)}.')
             return ()
         return tuple(value)
 
@@ -122,7 +131,7 @@ class Section:
         if value is None:
             return default
         if not isinstance(value, bool):
-            self.error(key, f"true or false is expected, not {value!r}.")
+            self.error(key, f"true or false is expected, not {_shown(value)}.")
             return default
         return value
 
@@ -131,7 +140,7 @@ class Section:
         self._known.add(key)
         entry = self.table.entries.get(key)
         if isinstance(entry, Item):
-            self.error(key, f"a table [{self.path(key)}] is expected, not {entry.value!r}.")
+            self.error(key, f"a table [{self.path(key)}] is expected, not {_shown(entry.value)}.")
             return None
         return None if entry is None else Section(entry, self.problems, self.unit)
 
@@ -199,7 +208,7 @@ class Section:
                 return finite(_number(value))
             case Kind.FLAG:
                 if not isinstance(value, bool):
-                    raise _Wrong(f"true or false is expected, not {value!r}.")
+                    raise _Wrong(f"true or false is expected, not {_shown(value)}.")
                 return int(value)
             case Kind.CHOICE:
                 return _choice(key, value)
@@ -235,7 +244,7 @@ def _not_negative(value: float) -> float:
 
 def _number(value: object) -> float:
     if isinstance(value, bool) or not isinstance(value, (int, float)):
-        raise _Wrong(f"a number is expected, not {value!r}.")
+        raise _Wrong(f"a number is expected, not {_shown(value)}.")
     if isinstance(value, int) and abs(value) > FLOAT32_MAXIMUM:
         raise _Wrong("the number does not fit a Float32.")
     return float(value)
@@ -260,7 +269,7 @@ def _angle(value: object) -> float:
 
 def _integer(value: object, limit: int) -> int:
     if isinstance(value, bool) or not isinstance(value, int) or not 0 <= value <= limit:
-        raise _Wrong(f"a whole number from 0 to {limit} is expected, not {value!r}.")
+        raise _Wrong(f"a whole number from 0 to {limit} is expected, not {_shown(value)}.")
     return value
 
 
@@ -276,7 +285,7 @@ def _choice(key: Key, value: object) -> int:
 
 def _list(key: Key, value: object) -> tuple[object, ...]:
     if not isinstance(value, list) or not value:
-        raise _Wrong(f"a list is expected, like {key.example}, not {value!r}.")
+        raise _Wrong(f"a list is expected, like {key.example}, not {_shown(value)}.")
     if key.field == "DAngles":
         if len(value) != 2:
             raise _Wrong(f"two angles are expected, not {len(value)}.")
