@@ -1,0 +1,145 @@
+"""Export and import of 10,000 node keys beside the bare JOSE operations of jwcrypto on the same payload.
+
+Run: ``python -m benchmarks.handover [COUNT]``. Ours is everything between the command and its end but the terminal:
+reading and unwrapping keys, the bundle, the file, the store's transaction with its sync to disk, the receipt. Theirs is
+JWS and JWE over the payload in memory, with JSON, and nothing kept. Aim: less than twice as long.
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+import tempfile
+import time
+import tracemalloc
+from collections.abc import Callable
+from datetime import UTC, datetime
+from pathlib import Path
+
+from jwcrypto import jwe, jwk, jws
+
+from teds_provision.protocol.agreement import key_id
+from teds_provision.protocol.bundle import _to_json, open_bundle
+from teds_provision.protocol.keys import SoftwareKey, fingerprint
+from teds_provision.protocol.strict_json import dump
+from teds_provision.store import NodeRecord, TrustRecord, WhitelistEntry
+from teds_provision.vault import passphrase
+from teds_provision.workflow.handover_export import ExportOrder, export_keys, plan_export
+from teds_provision.workflow.handover_import import Imported, import_keys, plan_import
+from teds_provision.workflow.station import Station, initialise
+
+ROUNDS = 3
+AIM = 2.0
+
+
+def make(home: Path, name: str) -> Station:
+    def ask(prompt: str, confirm: bool) -> str:
+        return "correct horse battery"
+
+    return initialise(home, name=name, keystore="file", ask=ask, costs=passphrase.THROWAWAY)[0]
+
+
+def fill(station: Station, count: int) -> None:
+    """Nodes with a proven key each, as after provisioning."""
+    with station.store.transaction():
+        for number in range(count):
+            uuid, key = number.to_bytes(10, "big"), number.to_bytes(16, "big")
+            point = SoftwareKey(1 + number % 97).point
+            identifier = key_id(key)
+            station.add_pending(uuid, key=key, key_id=identifier, epoch=3)
+            station.store.promote_key(uuid, identifier.hex())
+            station.store.put_whitelist(WhitelistEntry(uuid, fingerprint(point)))
+            name, profile = f"finger {number}", "tactile-finger-sensor"
+            record = NodeRecord(uuid, point, name, profile, 2, 3, 7, groups=("left hand",), teds_sha256="ab" * 32)
+            station.store.put_node(record)
+
+
+def timed(work: Callable[[], object]) -> tuple[float, object]:
+    begun = time.perf_counter()
+    result = work()
+    return time.perf_counter() - begun, result
+
+
+def bare(payload: bytes, north: jwk.JWK, south: jwk.JWK) -> tuple[float, float]:
+    """Seconds that jwcrypto takes to sign and seal, and to open and verify, JSON to JSON."""
+    members = json.loads(payload)
+    sealed = ""
+
+    def seal() -> None:
+        nonlocal sealed
+        inner = jws.JWS(json.dumps(members, separators=(",", ":")))
+        inner.add_signature(north, None, json.dumps({"alg": "ES256", "kid": "north", "typ": "teds-handover+jws"}))
+        outer = jwe.JWE(
+            inner.serialize(compact=True).encode(),
+            json.dumps({"alg": "ECDH-ES+A256KW", "enc": "A256GCM", "cty": "JWS"}),
+        )
+        outer.add_recipient(south, json.dumps({"kid": "south"}))
+        sealed = outer.serialize()
+
+    def open_() -> None:
+        outer = jwe.JWE()
+        outer.deserialize(sealed, south)
+        inner = jws.JWS()
+        inner.deserialize(outer.payload.decode(), north)
+        assert json.loads(inner.payload)["count"] == len(members["nodes"])
+
+    return min(timed(seal)[0] for _ in range(ROUNDS)), min(timed(open_)[0] for _ in range(ROUNDS))
+
+
+def main(count: int = 10_000) -> None:
+    jwe.default_max_compressed_size = 64 << 20
+    with tempfile.TemporaryDirectory() as folder:
+        place = Path(folder)
+        north = make(place / "north", "north")
+        fill(north, count)
+        exports, imports = [], []
+        for number in range(ROUNDS):
+            south = make(place / f"south{number}", f"south {number}")
+            for station, other in ((north, south), (south, north)):
+                station.store.put_trust(TrustRecord(other.name, "station", other.point, other.fingerprint))
+            bundle = place / f"{number}.jwe"
+            order = ExportOrder((south.name,), None, "copy")
+            exports.append(timed(lambda o=order, b=bundle: export_keys(north, plan_export(north, o), b))[0])
+
+            def take(station: Station = south, path: Path = bundle) -> Imported:
+                plan = plan_import(station, path.read_bytes())
+                assert not isinstance(plan, Imported)
+                return import_keys(station, plan)
+
+            seconds, done = timed(take)
+            assert isinstance(done, Imported)
+            assert len(done.uuids) == count
+            imports.append(seconds)
+        octets = bundle.read_bytes()
+        opened = open_bundle(octets, south.vault.identity(), {north.fingerprint: north.point}.get, datetime.now(UTC))
+        payload = dump(_to_json(opened.bundle))
+        keys = [jwk.JWK.generate(kty="EC", crv="P-256") for _ in range(2)]
+        theirs = bare(payload, *keys)
+        print(f"{count} keys, payload {len(payload) / 1e6:.1f} MB, bundle {len(octets) / 1e6:.1f} MB; best of {ROUNDS}")
+        for name, ours, other in (("export", min(exports), theirs[0]), ("import", min(imports), theirs[1])):
+            mark = "" if ours < AIM * other else f"   (aim: {AIM:.0f} x)"
+            print(f"  {name}: ours {ours:6.2f} s, bare jwcrypto {other:6.2f} s, ratio {ours / other:5.2f}{mark}")
+        total, bare_total = min(exports) + min(imports), sum(theirs)
+        print(f"  both:   ours {total:6.2f} s, bare jwcrypto {bare_total:6.2f} s, ratio {total / bare_total:5.2f}")
+        memory(place, north, count)
+
+
+def memory(place: Path, north: Station, count: int) -> None:
+    """Peak of what Python allocates in one export and one import."""
+    south = make(place / "memory", "memory")
+    for station, other in ((north, south), (south, north)):
+        station.store.put_trust(TrustRecord(other.name, "station", other.point, other.fingerprint))
+    bundle = place / "memory.jwe"
+    for name, work in (
+        ("export", lambda: export_keys(north, plan_export(north, ExportOrder(("memory",), None, "copy")), bundle)),
+        ("import", lambda: import_keys(south, plan_import(south, bundle.read_bytes()))),  # type: ignore[arg-type]
+    ):
+        tracemalloc.start()
+        work()
+        peak = tracemalloc.get_traced_memory()[1]
+        tracemalloc.stop()
+        print(f"  {name}: peak of {peak / 1e6:.0f} MB in Python, {peak / count / 1e3:.1f} kB per key")
+
+
+if __name__ == "__main__":
+    main(*map(int, sys.argv[1:]))
