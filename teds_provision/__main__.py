@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from io import TextIOWrapper
 
 
 def main() -> None:
@@ -12,6 +13,8 @@ def main() -> None:
 
         print(f"teds-provision {__version__}")
         return
+    if isinstance(sys.stdout, TextIOWrapper):  # a name in another encoding is no reason to fail after the work is done
+        sys.stdout.reconfigure(errors="backslashreplace")
     try:
         from teds_provision.cli.main import run
 

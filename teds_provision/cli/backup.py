@@ -60,6 +60,7 @@ def backup(
         plan = {"backup": str(file), "to": to, "replaces": file.exists(), "dry_run": True}
         app.emit(plan, f"Plan: seal the store of {station.name} to {to}, into {file}.")
         return
+    _require_place(app.home, file)
     if file.exists():
         app.confirm(f"{file} exists. Replace it?", yes=yes)
     done = run(station, file, _asker(app, backup_passphrase_fd), recovery=point)
@@ -132,6 +133,18 @@ def restore(
     _emit(app, content, done, f"The station {told} is back in {app.home}, its keys in the keystore {done.keystore}.")
 
 
+def _require_place(home: Path, file: Path) -> None:
+    """Refuse a folder that is not there, and the station's own files, before anyone is asked for a passphrase."""
+    from teds_provision.errors import NotFound, UsageFailure
+
+    folder = file.absolute().parent
+    if not folder.is_dir():
+        raise NotFound(f"There is no folder {folder}.")
+    own = file.name.startswith(("store.", "vault", "config.toml")) and folder.resolve() == home.resolve()
+    if own:
+        raise UsageFailure(f"{file} is a file of the station itself.", hint="Give the backup another name or place.")
+
+
 def _merge(app: App, store: Any, content: Content, told: str, *, yes: bool, dry_run: bool) -> None:
     from teds_provision.store import StoreLock
     from teds_provision.workflow.restore import bring_vault, merge
@@ -172,13 +185,12 @@ def _emit(app: App, content: Content, done: Restored, text: str, *, dry: bool = 
 
 
 def _open(app: App, file: Path, recovery_key: Path | None, ask: Callable[[str, bool], str]) -> Content:
-    from teds_provision.cli.build import read_file
     from teds_provision.errors import UsageFailure, VaultFailure, WrongPassphrase
     from teds_provision.protocol.keys import SoftwareKey
     from teds_provision.vault.ca_file import read_ca
-    from teds_provision.workflow.backup_file import is_for_key, open_with_key, open_with_passphrase
+    from teds_provision.workflow.backup_file import is_for_key, open_with_key, open_with_passphrase, read
 
-    octets = read_file(file)
+    octets = read(file)
     if not is_for_key(octets):
         return open_with_passphrase(octets, ask("Passphrase of the backup", False))
     if recovery_key is None:

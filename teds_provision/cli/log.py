@@ -11,6 +11,7 @@ import click
 
 from teds_provision.cli.context import App, pass_app
 from teds_provision.cli.options import command
+from teds_provision.cli.rendering import shown
 from teds_provision.errors import StoreFailure
 
 if TYPE_CHECKING:
@@ -102,12 +103,9 @@ def _line(entry: AuditEntry) -> str:
     node = entry.uuid.hex() if entry.uuid else "-"
     detail = ", ".join(f"{key} {_short(value)}" for key, value in entry.detail.items() if value is not None)
     line = f"{entry.seq:>5}  {entry.at}  {entry.who}  {entry.act:<10} {node:<20}  {entry.outcome}"
-    return f"{line}  {detail}".rstrip().translate(_UNPRINTABLE)
+    return shown(f"{line}  {detail}".rstrip())
 
 
 def _short(value: object) -> str:
     text = value if isinstance(value, str) else json.dumps(value, ensure_ascii=False)
     return text[:16] if len(text) == 64 and text.isalnum() else text
-
-
-_UNPRINTABLE = dict.fromkeys((*range(32), *range(127, 160)), "?")

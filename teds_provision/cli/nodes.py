@@ -34,7 +34,7 @@ def _table(console: Console, found: list[dict[str, Any]]) -> None:
     from rich.table import Table
     from rich.text import Text
 
-    from teds_provision.cli.rendering import print_table
+    from teds_provision.cli.rendering import print_table, shown
 
     if not found:
         console.print("No node is known yet. Tap one: teds-provision identify --add")
@@ -44,13 +44,13 @@ def _table(console: Console, found: list[dict[str, Any]]) -> None:
     for node in found:
         table.add_row(
             node["uuid"],
-            Text(node["name"] or ""),
+            Text(shown(node["name"])),
             node["state"] or "unseen",
             str(node["epoch"]),
             str(node["sequence"]),
             (node["fingerprint"] or "")[:16],
             Text(node["verdict"] or "", style=_COLOURS.get(node["verdict"], "red")),
-            Text(_remarks(node)),
+            Text(shown(_remarks(node))),
         )
     print_table(console, table)
 
@@ -72,6 +72,8 @@ def _remarks(node: dict[str, Any]) -> str:
 
 
 def _one(console: Console, node: dict[str, Any]) -> None:
+    from teds_provision.cli.rendering import shown
+
     address = f"0x{node['can_address']:02x}" if node["can_address"] else "none"
     keys = [f"{key['key_id']} {key['state']}, epoch {key['epoch']}, {key['created']}" for key in node["keys"]]
     rows = [
@@ -92,4 +94,4 @@ def _one(console: Console, node: dict[str, Any]) -> None:
     ]
     for title, text in rows:
         if text:
-            console.print(f"{title:<12} {text}", markup=False)
+            console.print(f"{title:<12} {shown(text)}", markup=False)

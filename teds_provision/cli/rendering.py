@@ -20,6 +20,11 @@ _FOREIGN_SHOWN = 3
 _PIPE_COLUMNS = 1000
 
 
+def shown(text: str | None) -> str:
+    """A name or remark from outside, fit for a terminal: what cannot be printed becomes ``?``."""
+    return "".join(character if character.isprintable() else "?" for character in text or "")
+
+
 def print_table(console: Console, table: Table) -> None:
     """Print a table; outside a terminal nothing of it is cut off or wrapped."""
     if not console.is_terminal:

@@ -54,10 +54,11 @@ def add(app: App, uuid: str, fingerprint: str | None, name: str | None, dry_run:
     """Whitelist one node; a key that is pinned already is never replaced (exit 6)."""
     from teds_provision.workflow.whitelist import add as run
     from teds_provision.workflow.whitelist import plan_addition
-    from teds_provision.workflow.whitelist_read import Listed
+    from teds_provision.workflow.whitelist_read import Listed, require_name
 
     station = app.station()
     octets = station.store.resolve(uuid)
+    require_name(name)
     wanted = Listed(0, octets, fingerprint, name)
     if dry_run:
         _emit_plan(app, station, plan_addition(station, [wanted]), dry_run=True)
@@ -106,7 +107,7 @@ def list_entries(app: App) -> None:
         from rich.table import Table
         from rich.text import Text
 
-        from teds_provision.cli.rendering import print_table
+        from teds_provision.cli.rendering import print_table, shown
 
         if not entries:
             console.print("The whitelist is empty.")
@@ -114,7 +115,7 @@ def list_entries(app: App) -> None:
         table = Table("UUID", "key", "assurance", "added", "name", box=None, pad_edge=False)
         for entry in entries:
             key = entry.fingerprint[:16] if entry.fingerprint else "not pinned yet"
-            table.add_row(entry.uuid.hex(), key, entry.assurance, entry.added, Text(entry.name or ""))
+            table.add_row(entry.uuid.hex(), key, entry.assurance, entry.added, Text(shown(entry.name)))
         print_table(console, table)
 
     from teds_provision.workflow.whitelist import as_dict
@@ -130,7 +131,8 @@ def list_entries(app: App) -> None:
 def import_file(app: App, file: Path, form: str | None, dry_run: bool) -> None:
     """Add every entry of an XML (NCAP), CSV or JSON file, all or none.
 
-    One wrong line refuses the whole file (exit 8), one UUID that is pinned to another key too (exit 6).
+    One wrong line refuses the whole file (exit 8), one UUID that is pinned to another key too (exit 6). Taken are UUID,
+    fingerprint and name; when it was added, and with which assurance, is this station's to say.
     """
     from teds_provision.workflow.whitelist import add as run
     from teds_provision.workflow.whitelist import plan_addition

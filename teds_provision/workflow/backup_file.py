@@ -12,10 +12,11 @@ from __future__ import annotations
 
 import hashlib
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any, Final
 
 from teds_provision import __version__
-from teds_provision.errors import BadData, NotAuthentic, PolicyRefused
+from teds_provision.errors import BadData, NotAuthentic, NotFound, PolicyRefused
 from teds_provision.protocol import jose
 from teds_provision.protocol.keys import PrivateKey, fingerprint, is_point
 from teds_provision.protocol.strict_json import decode_base64url, dump, load_object
@@ -57,6 +58,18 @@ def seal_to_passphrase(content: Content, key: PrivateKey, passphrase: str, costs
 def seal_to_key(content: Content, key: PrivateKey, recovery: bytes) -> bytes:
     """Return the file for the 65-octet point of a recovery key."""
     return jose.encrypt(_signed(content, key), [recovery], cty=TYP) + b"\n"
+
+
+def read(path: Path) -> bytes:
+    """Read a file that should be a backup, and not endlessly; raises NotFound, BadData."""
+    try:
+        with path.open("rb") as file:
+            head = file.read(64)
+            _check_start(head)
+            octets = head + file.read(MAX_OCTETS)
+    except OSError as error:
+        raise NotFound(f"{path} cannot be read: {error.strerror}.") from error
+    return octets
 
 
 def is_for_key(octets: bytes) -> bool:
@@ -142,9 +155,13 @@ def _parsed(payload: bytes) -> Content:
 def _document(octets: bytes) -> dict[str, Any]:
     if len(octets) > MAX_OCTETS:
         raise BadData(f"The file is larger than {MAX_OCTETS} octets; no backup is.")
-    if octets[:64].lstrip()[:1] != b"{":
-        raise BadData("This is not a backup.", hint="Give the file that teds-provision backup wrote.")
+    _check_start(octets[:64])
     return load_object(octets, "The backup")
+
+
+def _check_start(octets: bytes) -> None:
+    if octets.lstrip()[:1] != b"{":
+        raise BadData("This is not a backup.", hint="Give the file that teds-provision backup wrote.")
 
 
 def _digest(document: dict[str, Any]) -> str:

@@ -164,6 +164,11 @@ def render(entries: Iterable[WhitelistEntry], form: str) -> str:
     lines = ['<?xml version="1.0" encoding="UTF-8"?>', "<whitelist>"]
     for row in rows:
         attributes = {**row, "uuid": f"0x{row['uuid']}"}
-        shown = " ".join(f"{key}={quoteattr(value)}" for key, value in attributes.items() if value is not None)
+        shown = " ".join(f"{key}={quoteattr(_legal(value))}" for key, value in attributes.items() if value is not None)
         lines.append(f"  <transducer {shown}/>")
     return "\n".join([*lines, "</whitelist>", ""])
+
+
+def _legal(text: str) -> str:
+    """What XML 1.0 can hold; a name that a node or an older version brought may have control characters."""
+    return "".join(character if character.isprintable() else "\ufffd" for character in text)

@@ -27,6 +27,7 @@ _SHOWN_MISTAKES = 10
 _MAX_NAME = 200
 _MAX_DEPTH = 16
 _UUID_DIGITS = 2 * UUID_OCTETS
+_NAME_RULE = f"a name is printable and has at most {_MAX_NAME} characters"
 _ENTRY_ELEMENTS = frozenset({"transducer", "tim", "node", "entry", "item", "device", "uuid"})
 _ALIASES = {"id": "uuid", "uid": "uuid"}
 
@@ -63,8 +64,8 @@ class _Reading:
         print_text = values.get("fingerprint", "").strip()
         pin = self._digits(line, "fingerprint", print_text, 64) if print_text else None
         name = values.get("name", "").strip() or None
-        if name is not None and (len(name) > _MAX_NAME or not name.isprintable()):
-            self.wrong(line, "name", f"a name is printable and has at most {_MAX_NAME} characters")
+        if not _is_name(name):
+            self.wrong(line, "name", _NAME_RULE)
         if len(self.mistakes) == before and uuid is not None:
             self._join(Listed(line, bytes.fromhex(uuid), pin, name))
 
@@ -104,6 +105,16 @@ def read_whitelist(path: Path, form: str | None = None) -> list[Listed]:
             hint="Mend these lines and import again; nothing was imported.",
         )
     return list(reading.entries.values())
+
+
+def require_name(name: str | None) -> None:
+    """Raise BadData for what cannot be a node's name."""
+    if not _is_name(name):
+        raise BadData(f"{_NAME_RULE[0].upper()}{_NAME_RULE[1:]}.")
+
+
+def _is_name(name: str | None) -> bool:
+    return name is None or (len(name) <= _MAX_NAME and name.isprintable())
 
 
 def _text(path: Path) -> str:

@@ -60,6 +60,18 @@ def test_an_existing_file_is_replaced_only_when_told(home: Path, sealed: Path) -
     assert sealed.read_bytes() != before
 
 
+def test_the_stations_own_files_and_missing_folders_are_refused(home: Path, tmp_path: Path) -> None:
+    before = (home / "store.sqlite3").stat().st_ino
+    for name in ("store.sqlite3", "vault.json"):
+        assert spawn("--home", home, "backup", home / name, "--yes", passphrase=PASSPHRASE).code == 2
+    assert (home / "store.sqlite3").stat().st_ino == before
+    assert spawn("--home", home, "backup", tmp_path / "no" / "b", passphrase=PASSPHRASE).code == 3
+
+
+def test_an_endless_file_is_not_read_to_its_end(tmp_path: Path) -> None:
+    assert restore(tmp_path / "new", Path("/dev/zero"))[0] == 8
+
+
 def test_a_merge_shows_its_plan_and_asks(home: Path, sealed: Path) -> None:
     call(home, "whitelist", "remove", ONE.hex(), "--yes")
     refused = spawn("--home", home, "restore", sealed, passphrase=PASSPHRASE)

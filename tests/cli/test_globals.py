@@ -189,6 +189,22 @@ def test_a_reader_that_stops_reading_is_no_error_message(home: Path) -> None:
     assert "Exception ignored" not in done.stderr
 
 
+def test_a_terminal_of_another_encoding_and_names_that_are_no_text_are_no_failure(home: Path, tmp_path: Path) -> None:
+    home.chmod(0o755)
+    told = spawn("--home", home, "doctor", environment=clean_environment(PYTHONIOENCODING="ascii"))
+    assert (told.code, "chmod 700" in told.out) == (0, True)
+    path = os.fsdecode(os.fsencode(tmp_path) + b"/\xff.csv")
+    done = subprocess.run(
+        [sys.executable, "-m", "teds_provision", "--home", str(home), "--json", "whitelist", "export", path],
+        capture_output=True,
+        check=False,
+        timeout=60,
+        env=clean_environment(),
+    )
+    assert done.returncode == 0
+    assert json.loads(done.stdout)["whitelist"] == []
+
+
 # -- options from elsewhere --------------------------------------------------------------------------------------------
 
 

@@ -7,6 +7,8 @@ from pathlib import Path
 
 import pytest
 
+from teds_provision.store import Store, WhitelistEntry
+
 from .shell import call
 
 ONE, TWO = "8d4d9da65281f7000000", "8d4d9da65281f7000001"
@@ -79,6 +81,16 @@ def test_the_list_shows_keys_short_and_names_as_they_are(home: Path) -> None:
     assert "[red]x[/]" in shown
     assert "not pinned yet" in shown
     assert json.loads(call(home, "--json", "whitelist", "list").out)["whitelist"][1]["fingerprint"] is None
+
+
+def test_a_name_that_no_terminal_and_no_xml_can_hold_is_refused_or_made_harmless(home: Path, tmp_path: Path) -> None:
+    assert call(home, "whitelist", "add", ONE, "--name", "a\x1b[31m").code == 8
+    with Store.open(home) as store:
+        store.put_whitelist(WhitelistEntry(bytes.fromhex(ONE), name="a\x1b[31m\x01"))
+    assert "\x1b" not in call(home, "whitelist", "list").out
+    call(home, "whitelist", "export", tmp_path / "list.xml")
+    assert call(home, "whitelist", "import", tmp_path / "list.xml").code == 0
+    assert "\x01" not in (tmp_path / "list.xml").read_text()
 
 
 def test_a_fingerprint_that_is_none_is_usage(home: Path) -> None:
