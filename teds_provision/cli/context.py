@@ -75,6 +75,22 @@ class App:
             else:
                 console.print(human)
 
+    def conclude(
+        self,
+        result: dict[str, Any],
+        human: Callable[[Console], None] | RenderableType | None,
+        error: TedsProvisionError | None,
+    ) -> None:
+        """Tell a result and the error that it ends with, if any: with --json both in the one object."""
+        if error is None or not self.json:
+            self.emit(result, human)
+            if error is not None:
+                raise error
+            return
+        told = {"code": error.code, "message": error.message, "hint": error.hint}
+        self.emit({**result, "error": told})
+        raise click.exceptions.Exit(error.exit_code)
+
     def console(self, *, stderr: bool = False) -> Console:
         """Return a rich console; colour yields to NO_COLOR and to a pipe, long lines are not broken in a pipe."""
         from rich.console import Console

@@ -47,7 +47,6 @@ def provision(
     from teds_provision.cli.rendering import reporter_for
     from teds_provision.workflow.build import check_order
     from teds_provision.workflow.contact import meet
-    from teds_provision.workflow.provision import require_authentic
 
     station, reporter = app.station(), reporter_for(app)
     wanted = station.store.resolve(uuid) if uuid is not None else None
@@ -57,22 +56,25 @@ def provision(
         with meet(station, links, wanted, reporter) as node:
             _plan(app, station, node)
         return
+    station.unlock()
     if watch:
         _watch(app, station, links, run, reporter)
         return
     with meet(station, links, wanted, reporter) as node:
         done = run(node)
     _tell(app, done)
-    require_authentic(done.verified)
 
 
 def _runner(
     app: App, station: Station, order: Any, yes: bool, reporter: Reporter
 ) -> Callable[[Conversation], Provisioned]:
+    from teds_provision.workflow.identify import examine
     from teds_provision.workflow.provision import provision as run
 
+    accepted: set[tuple[bytes, str]] = set()
+
     def accept(who: Identified) -> None:
-        if yes:
+        if yes or (who.uuid, who.fingerprint) in accepted:
             return
         if not app.interactive:
             raise NotWhitelisted(
@@ -80,8 +82,11 @@ def _runner(
                 hint=f"Add --yes, or: teds-provision whitelist add {who.uuid.hex()} --fingerprint {who.fingerprint}",
             )
         app.confirm(f"Whitelist node {who.uuid.hex()} with key {who.fingerprint[:16]}?", yes=False)
+        accepted.add((who.uuid, who.fingerprint))
 
     def one(node: Conversation) -> Provisioned:
+        if app.interactive and not yes and station.store.whitelisted(node.uuid) is None:
+            accept(examine(station, node))  # before the store is locked: people take their time
         with station.lock("provision", app.note):
             done = run(station, node, order, accept=accept, reporter=reporter)
         for warning in done.warnings:
@@ -102,14 +107,14 @@ def _watch(
         if isinstance(outcome, TedsProvisionError):
             app.fail_line(outcome)
         else:
-            _tell(app, outcome)
+            _tell(app, outcome, last=False)
 
 
 def _plan(app: App, station: Station, node: Conversation) -> None:
     from teds_provision.protocol.identity import NodeState
-    from teds_provision.workflow.identify import identify
+    from teds_provision.workflow.identify import examine
 
-    who = identify(station, node)
+    who = examine(station, node)
     steps = ["identify"]
     steps += [] if who.whitelisted else ["whitelist"]
     steps += ["agree"] if who.state == NodeState.FACTORY or not station.has_keys(who.uuid) else []
@@ -118,11 +123,18 @@ def _plan(app: App, station: Station, node: Conversation) -> None:
     app.emit({"uuid": who.uuid.hex(), "state": who.state.name.lower(), "plan": steps}, text)
 
 
-def _tell(app: App, done: Provisioned) -> None:
+def _tell(app: App, done: Provisioned, *, last: bool = True) -> None:
+    """Tell one node's end; ``last`` ends the command with the error of a datasheet that is not authentic."""
+    from teds_provision.workflow.provision import require_authentic
     from teds_provision.workflow.summary import summarise
 
+    error: TedsProvisionError | None = None
+    try:
+        require_authentic(done.verified)
+    except TedsProvisionError as failure:
+        error = failure
     summary = summarise(done.image)
-    app.emit(
+    app.conclude(
         {
             "uuid": done.who.uuid.hex(),
             "fingerprint": done.who.fingerprint,
@@ -133,6 +145,7 @@ def _tell(app: App, done: Provisioned) -> None:
             "warnings": list(done.warnings),
         },
         lambda console: _summary(console, done),
+        error if last else None,
     )
 
 

@@ -52,6 +52,9 @@ def sign(
         image = Image.from_json(read_file(path))
     uuid = image.uuid if image is not None else station.store.resolve(what)
     order = SignOrder(uuid, image, accept_calibration, dry_run)
+    if not dry_run:
+        station.require_whitelisted(uuid)
+        station.unlock()
     if read_node:
         with meet(station, links, uuid, reporter_for(app)) as node, station.lock("sign", app.note):
             done = sign_image(station, order, node)

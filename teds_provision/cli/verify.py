@@ -9,12 +9,14 @@ import click
 
 from teds_provision.cli.context import App, pass_app
 from teds_provision.cli.options import command, link_options
+from teds_provision.errors import TedsProvisionError
 from teds_provision.links import LinkSettings
 
 if TYPE_CHECKING:
     from rich.console import Console
 
     from teds_provision.teds.image import Image
+    from teds_provision.workflow.station import Station
     from teds_provision.workflow.verify import Verified
 
 
@@ -30,8 +32,6 @@ def verify(app: App, what: str, links: LinkSettings, accept_calibration: str | N
     """
     from teds_provision.cli.build import read_file
     from teds_provision.teds.image import Image
-    from teds_provision.workflow.build import guard
-    from teds_provision.workflow.provision import require_authentic
     from teds_provision.workflow.verify import Verified, verify_image
 
     station = app.station()
@@ -46,13 +46,24 @@ def verify(app: App, what: str, links: LinkSettings, accept_calibration: str | N
         "verdict": verified.verdict,
         "checks": [{"name": check.name, "result": check.result, "why": check.why} for check in verified.checks],
     }
-    if app.json and verified.verdict != "authentic":
-        app.emit(result)
-        raise click.exceptions.Exit(4)
-    app.emit(result, lambda console: _table(console, verified))
-    require_authentic(verified)
-    for warning in guard(station, image, None, accept_calibration):
+    warnings, error = _judged(station, image, verified, accept_calibration)
+    for warning in warnings:
         app.warn(warning)
+    app.conclude(result | {"warnings": list(warnings)}, lambda console: _table(console, verified), error)
+
+
+def _judged(
+    station: Station, image: Image, verified: Verified, accepted: str | None
+) -> tuple[tuple[str, ...], TedsProvisionError | None]:
+    """Warnings, and what the verification ends with: not authentic (4), or a calibration that would hurt (6)."""
+    from teds_provision.workflow.build import guard
+    from teds_provision.workflow.provision import require_authentic
+
+    try:
+        require_authentic(verified)
+        return guard(station, image, None, accepted), None
+    except TedsProvisionError as error:
+        return (), error
 
 
 def _node(app: App, what: str, links: LinkSettings) -> tuple[Image, Verified]:
@@ -66,6 +77,7 @@ def _node(app: App, what: str, links: LinkSettings) -> tuple[Image, Verified]:
 
     station = app.station()
     uuid = station.store.resolve(what)
+    station.unlock(uuid)
     with meet(station, links, uuid, reporter_for(app)) as node:
         who = identify(station, node)
         with station.lock("verify", app.note):

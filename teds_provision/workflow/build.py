@@ -69,7 +69,15 @@ def build(
     plan = _composed(station, uuid, order, _pending(station, uuid, has) or has, edition)
     profile, calibrations, warnings = plan.profile, plan.calibrations, plan.warnings
     image = Image(uuid, {**(keep or {}), **plan.blocks})
-    warnings += guard(station, image, has, order.accept_calibration, calibrations=calibrations, profile=profile)
+    warnings += guard(
+        station,
+        image,
+        has,
+        order.accept_calibration,
+        calibrations=calibrations,
+        profile=profile,
+        record=keep_draft,
+    )
     try:
         image = image.with_block(SECURITY, unsigned_security(station, known_node_keys(station, uuid, has), image))
     except NotFound:
@@ -166,8 +174,12 @@ def guard(
     *,
     calibrations: Mapping[int, Calibration] | None = None,
     profile: Profile | None = None,
+    record: bool = True,
 ) -> tuple[str, ...]:
-    """Refuse a calibration that would hurt (exit 6), unless someone said why it is right; returns warnings."""
+    """Refuse a calibration that would hurt (exit 6), unless someone said why it is right; returns warnings.
+
+    That reason goes into the audit log, unless ``record`` is False (dry run).
+    """
     from teds_provision.errors import PolicyRefused
     from teds_provision.teds.guard import check_calibration
 
@@ -180,6 +192,6 @@ def guard(
             f"The calibration is refused: {errors[0]}{more}.",
             hint='Mend it; or, if it is right, say why: --accept-calibration "why".',
         )
-    if errors:
+    if errors and record:
         station.audit("accept-calibration", image.uuid, "accepted", why=accepted, findings=errors)
     return tuple(f"channel {finding.channel}: {finding.message}" for finding in findings)

@@ -102,6 +102,14 @@ class Station:
             self._vault = open_vault(self.store.home, self.store.id, self.keystore, self._ask)
         return self._vault
 
+    def unlock(self, uuid: bytes | None = None) -> None:
+        """Open the vault now: nobody is asked for a passphrase while the store is locked or a node lies there.
+
+        With ``uuid`` only where a key of that node is held, as nothing is unwrapped otherwise.
+        """
+        if uuid is None or self.has_keys(uuid):
+            _ = self.vault
+
     def credentials(self, uuid: bytes | None = None) -> Credentials:
         """What the station shows and signs with: to node ``uuid`` under the CA that this node keeps, else its own."""
         ca = self.ca if uuid is None else self.ca_of(uuid)

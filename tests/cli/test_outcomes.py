@@ -1,0 +1,79 @@
+"""How commands end: one object on stdout whatever happens, dry runs without a trace, no lock while someone is asked."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import click
+import pytest
+
+from teds_provision.cli.context import App
+from teds_provision.cli.provision import _plan, _runner
+from teds_provision.errors import NotAuthentic
+from teds_provision.store import StoreLock, WhitelistEntry
+from teds_provision.workflow.agree import agree
+from teds_provision.workflow.build import BuildOrder, build
+from teds_provision.workflow.identify import identify
+from teds_provision.workflow.progress import Silent
+from teds_provision.workflow.signing import SignOrder, sign_image
+
+from ..workflow.bench import Board, make_station, talk
+
+ANGLE = BuildOrder(profile="magnetic-angular-position-sensor")
+
+
+def test_a_result_and_its_error_are_one_object(capsys: pytest.CaptureFixture[str]) -> None:
+    app = App(as_json=True)
+    with pytest.raises(click.exceptions.Exit) as ended:
+        app.conclude({"verdict": "unsigned"}, None, NotAuthentic("Nobody signed it.", hint="Sign it."))
+    assert ended.value.exit_code == 4
+    said = json.loads(capsys.readouterr().out)
+    assert said["verdict"] == "unsigned"
+    assert said["error"] == {"code": "not-authentic", "message": "Nobody signed it.", "hint": "Sign it."}
+
+
+def test_people_see_the_result_before_the_error(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(NotAuthentic):
+        App().conclude({}, "all checks", NotAuthentic("Nobody signed it."))
+    assert capsys.readouterr().out == "all checks\n"
+
+
+def test_a_dry_run_of_provision_leaves_no_trace(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    station, board = make_station(tmp_path / "home"), Board()
+    _plan(App(as_json=True), station, talk(board))
+    assert json.loads(capsys.readouterr().out)["plan"][:3] == ["identify", "whitelist", "agree"]
+    assert station.store.nodes() == []
+    assert station.store.node_image(board.uuid) is None
+    assert station.store.steps(board.uuid) == []
+
+
+def test_a_dry_run_of_sign_against_the_node_settles_no_key(tmp_path: Path) -> None:
+    station, board = make_station(tmp_path / "home"), Board()
+    station.store.put_whitelist(WhitelistEntry(board.uuid))
+    with talk(board) as node:
+        agree(station, node, identify(station, node))
+    build(station, board.uuid, ANGLE)
+    station.demand_rotation(board.uuid, "a copy was handed over")
+    before = station.store.keys(board.uuid)
+    with talk(board) as node:
+        sign_image(station, SignOrder(board.uuid, dry_run=True), node)
+    assert station.store.keys(board.uuid) == before
+    assert board.state.epoch == 1
+
+
+def test_the_store_is_free_while_a_person_is_asked(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    home = tmp_path / "home"
+    station, board, asked = make_station(home), Board(), []
+
+    def confirm(question: str, **_: object) -> bool:
+        with StoreLock(home, command="another", wait=0.0):
+            asked.append(question)
+        return True
+
+    monkeypatch.setattr(click, "confirm", confirm)
+    monkeypatch.setattr(App, "interactive", True)
+    with talk(board) as node:
+        done = _runner(App(home=home, quiet=True), station, ANGLE, False, Silent())(node)
+    assert done.verified.verdict == "authentic"
+    assert len(asked) == 1
