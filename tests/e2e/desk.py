@@ -252,7 +252,7 @@ class Station:
         said = self.ask(*words, code=code)
         assert set(said) == {"error"}
         assert set(said["error"]) == {"code", "message", "hint"}
-        assert said["error"]["message"].endswith((".", "?", "!")), said
+        assert said["error"]["message"].endswith((".", "?", "!", ")")), said
         return dict(said["error"])
 
     def provision(self, via: str = "nfc", *more: object, code: int = 0) -> Any:
