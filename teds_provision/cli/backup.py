@@ -147,7 +147,7 @@ def _require_place(home: Path, file: Path) -> None:
 
 def _merge(app: App, store: Any, content: Content, told: str, *, yes: bool, dry_run: bool) -> None:
     from teds_provision.store import StoreLock
-    from teds_provision.workflow.restore import bring_vault, merge
+    from teds_provision.workflow.restore import complete_vault, merge
 
     plan = merge(store, content, dry_run=True)
     how = plan.relation.value if plan.relation is not None else ""
@@ -159,7 +159,7 @@ def _merge(app: App, store: Any, content: Content, told: str, *, yes: bool, dry_
     if plan.back:
         app.confirm("Bring this back?", yes=yes)
     with StoreLock(app.home, command="restore", notice=app.note):
-        bring_vault(app.home, content, app.ask_secret, store.setting("keystore"))
+        complete_vault(store, content, app.ask_secret)
         done = merge(store, content, dry_run=False)
     _emit(app, content, done, "Brought back." if done.back else "The store lacks nothing of it (nothing to do).")
 

@@ -12,13 +12,25 @@ from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from teds_provision.errors import NotAuthentic, PolicyRefused, StoreFailure
+from teds_provision.errors import NotAuthentic, PolicyRefused, StoreFailure, VaultFailure, WrongPassphrase
 from teds_provision.protocol.keys import fingerprint
 from teds_provision.store import NodeRecord, Revocation, Store, StoreLock, Tombstone
-from teds_provision.store.snapshot import Relation, extend_audit, is_damage, load, place, relation, set_aside
-from teds_provision.vault import Ask, Vault, create_vault
+from teds_provision.store.snapshot import (
+    Relation,
+    extend_audit,
+    is_damage,
+    load,
+    place,
+    relation,
+    set_aside,
+    settings,
+)
+from teds_provision.vault import Ask, Vault, create_vault, node_key_context, open_vault
 from teds_provision.vault.passphrase import PRODUCT, Costs
+from teds_provision.vault.software import SoftwareVault
 from teds_provision.workflow.backup_file import Content
+
+_OF_THIS_MACHINE = frozenset({"keystore", "keystore_why"})
 
 
 @dataclass(frozen=True)
@@ -112,6 +124,38 @@ def bring_vault(
     return vault, why
 
 
+def complete_vault(store: Store, content: Content, ask: Ask) -> Vault:
+    """Open the vault of a living station; make it again where it is lost, and join master keys that it lacks.
+
+    A CA key that was taken out of the vault since the backup stays out. Raises VaultFailure and its leaves.
+    """
+    keystore = store.setting("keystore") or content.keystore
+    try:
+        vault = open_vault(store.home, store.id, keystore, ask)
+    except WrongPassphrase:
+        raise
+    except VaultFailure:  # lost, or locked: then making it fails as well and says so
+        return bring_vault(store.home, content, ask, keystore)[0]
+    if _opens_all(vault, content):
+        return vault
+    had_ca = vault.ca() is not None
+    vault, _ = bring_vault(store.home, content, ask, keystore)
+    if not had_ca and isinstance(vault, SoftwareVault):
+        vault.drop_ca()
+    return vault
+
+
+def _opens_all(vault: Vault, content: Content) -> bool:
+    with load(content.database) as copy:
+        try:
+            for record in copy.all_keys():
+                context = node_key_context(copy.id, record.uuid, record.epoch, record.slot)
+                vault.unwrap(record.wrapped, context=context)
+        except VaultFailure:
+            return False
+    return True
+
+
 def merge(store: Store, content: Content, *, dry_run: bool) -> Restored:
     """Bring back into a living store what it lacks, in one transaction; ``dry_run`` tries it out and changes nothing.
 
@@ -174,6 +218,7 @@ class _Merge:
         self._keys()
         self._images()
         self._trust()
+        self._settings()
 
     def told(self) -> list[str]:
         """What stayed, in sentences."""
@@ -281,6 +326,16 @@ class _Merge:
                 continue
             self.live.put_trust(record)
             self.back[f"trust in {record.role} {record.name}"] += 1
+
+    def _settings(self) -> None:
+        """Facts of the station and marks on nodes (whose CA a node keeps, a rotation that is due)."""
+        present = settings(self.live)
+        for name, value in settings(self.copy).items():
+            if name in _OF_THIS_MACHINE or present.get(name) == value:
+                continue
+            if name not in present or self.newer:
+                self.live.set_setting(name, value)
+                self.back["settings"] += 1
 
 
 def _epochs(store: Store) -> dict[bytes, int]:

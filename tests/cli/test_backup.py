@@ -202,3 +202,47 @@ def test_killed_in_the_middle_of_a_merge_the_store_is_old_or_new(home: Path, sea
         assert call(home, "--json", "log").json["intact"]
     assert restore(home, sealed, "--yes")[0] == 0
     assert len(call(home, "--json", "whitelist", "list").json["whitelist"]) == 1
+
+
+def test_a_full_disk_leaves_the_old_backup_and_no_rest(home: Path, sealed: Path, tmp_path: Path) -> None:
+    before, words = sealed.read_bytes(), tmp_path / "words"
+    words.write_text(PASSPHRASE + "\n")
+    run = f"{sys.executable} -m teds_provision --home {home} --passphrase-fd 3 backup {sealed} --yes 3<{words}"
+    done = subprocess.run(
+        ["bash", "-c", f"ulimit -f 8; {run}"],
+        capture_output=True,
+        text=True,
+        check=False,
+        timeout=60,
+        env=clean_environment(),
+    )
+    assert done.returncode == 7
+    assert "cannot be written" in done.stderr
+    assert sealed.read_bytes() == before
+    assert [path.name for path in tmp_path.iterdir() if path.name.startswith(sealed.name)] == [sealed.name]
+
+
+@pytest.mark.parametrize("delay", [0.0, 0.002, 0.01])
+def test_killed_while_it_writes_a_backup_is_the_old_or_the_new_one(
+    home: Path, sealed: Path, tmp_path: Path, delay: float
+) -> None:
+    read, write = os.pipe()
+    os.write(write, PASSPHRASE.encode() + b"\n")
+    os.close(write)
+    process = subprocess.Popen(
+        [sys.executable, "-m", "teds_provision", "--home", str(home), "--passphrase-fd", str(read)]
+        + ["backup", str(sealed), "--yes"],
+        pass_fds=(read,),
+        env=clean_environment(),
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.DEVNULL,
+    )
+    os.close(read)
+    before = sealed.stat().st_ino
+    while process.poll() is None and not list(tmp_path.glob("station.backup.*.new")):
+        if sealed.stat().st_ino != before:
+            break
+    time.sleep(delay)
+    process.kill()
+    process.wait()
+    assert restore(tmp_path / "new", sealed)[0] == 0

@@ -29,10 +29,11 @@ from teds_provision.store import Draft, Holder, NodeRecord, Revocation, Store, T
 from teds_provision.store.snapshot import Relation, load, place, take
 from teds_provision.vault import forget_vaults
 from teds_provision.vault.passphrase import THROWAWAY
+from teds_provision.vault.software import SoftwareVault
 from teds_provision.workflow import backup_file
 from teds_provision.workflow.backup import BackedUp, backup
 from teds_provision.workflow.backup_file import Content, is_for_key, open_with_key, open_with_passphrase
-from teds_provision.workflow.restore import Restored, merge, open_present, rebuild
+from teds_provision.workflow.restore import Restored, complete_vault, merge, open_present, rebuild
 from teds_provision.workflow.station import Station, initialise
 
 from ..vault.softhsm import PIN, loaded, unload
@@ -418,18 +419,61 @@ def test_the_backup_of_another_station_is_refused(station: Station, tmp_path: Pa
     other.close()
 
 
-def test_an_old_vault_is_joined_not_replaced(station: Station, tmp_path: Path) -> None:
-    """The master key was changed since: keys from before and after have to open."""
-    from teds_provision.vault.software import SoftwareVault
-    from teds_provision.workflow.restore import bring_vault
-
-    back_up(station, tmp_path / "b")
+def software(station: Station) -> SoftwareVault:
     assert isinstance(station.vault, SoftwareVault)
-    station.vault.add_master()
+    return station.vault
+
+
+def test_master_keys_of_the_backup_join_those_of_the_vault(station: Station, tmp_path: Path) -> None:
+    """The master key was changed since: keys from before and after have to open."""
+    back_up(station, tmp_path / "b")
+    software(station).add_master()
+    software(station).retire_masters()
+    software(station).drop_ca()
     forget_vaults()
-    vault, _ = bring_vault(station.store.home, opened(tmp_path / "b"), ask, "file", THROWAWAY)
+    vault = complete_vault(station.store, opened(tmp_path / "b"), ask)
     assert isinstance(vault, SoftwareVault)
     assert len(vault._material.masters.keys) == 2
+    assert vault.ca() is None  # it was taken out since, and stays out
+
+
+def test_a_vault_that_lacks_nothing_is_left_as_it_is(station: Station, tmp_path: Path) -> None:
+    back_up(station, tmp_path / "b")
+    software(station).drop_ca()
+    before = (station.store.home / "vault.json").read_bytes()
+    forget_vaults()
+    assert complete_vault(station.store, opened(tmp_path / "b"), ask).ca() is None
+    assert (station.store.home / "vault.json").read_bytes() == before
+
+
+def test_a_lost_vault_comes_back_beside_its_store(station: Station, tmp_path: Path) -> None:
+    back_up(station, tmp_path / "b")
+    (station.store.home / "vault.json").unlink()
+    forget_vaults()
+    assert complete_vault(station.store, opened(tmp_path / "b"), ask).identity().point == station.point
+    again = Station.open(station.store.home, ask=ask)
+    assert keys_of(again, ONE)[0][0] == 1
+    again.close()
+
+
+def test_marks_on_nodes_do_not_go_back_and_come_forward(station: Station, tmp_path: Path) -> None:
+    """For example that a rotation is due: an older backup that does not know it must not lift it."""
+    station.store.set_setting("mark", "before")
+    back_up(station, tmp_path / "old")
+    station.store.set_setting("mark", "due")
+    station.store.set_setting("other", "due")
+    station.audit("test", ONE, "marked")
+    merge(station.store, opened(tmp_path / "old"), dry_run=False)
+    assert station.store.setting("mark") == "due"
+    back_up(station, tmp_path / "new")
+    stale = tmp_path / "stale"
+    with load(opened(tmp_path / "old").database) as copy:
+        stale.mkdir(mode=0o700)
+        place(copy, stale)
+    with Store.open(stale) as store:
+        done = merge(store, opened(tmp_path / "new"), dry_run=False)
+        assert done.relation is Relation.NEWER
+        assert (store.setting("mark"), store.setting("other")) == ("due", "due")
 
 
 def test_a_key_that_the_vault_does_not_open_is_told_when_backing_up(station: Station, tmp_path: Path) -> None:
