@@ -9,6 +9,7 @@ from teds_provision.protocol.agreement import StationAgreement
 from teds_provision.protocol.frames import Reason
 from teds_provision.protocol.identity import NodeState
 from teds_provision.store import WhitelistEntry
+from teds_provision.workflow.boards import epoch_to_exceed, settled
 from teds_provision.workflow.conversation import Conversation, SessionLost
 from teds_provision.workflow.identify import Identified
 from teds_provision.workflow.journal import recorded
@@ -42,6 +43,7 @@ def open_session(station: Station, node: Conversation) -> NodeKey | None:
         except NotAuthentic:
             continue
         with station.store.transaction():
+            settled(station, node.uuid)
             station.remember(node.uuid, epoch=held.record.epoch)  # what is signed without the node is for this epoch
             if held.record.state == "pending" or len(station.store.keys(node.uuid)) > 1:
                 station.store.promote_key(node.uuid, held.record.key_id)
@@ -155,7 +157,7 @@ def _agree_anew(station: Station, node: Conversation, entry: WhitelistEntry, ca:
         replace(station.credentials(), ca=ca, station_signature=station.signature_under(ca)), uuid
     )
     reply = node.send(agreement.request(), "the key agreement")
-    agreed = agreement.accept(reply, pinned=entry.fingerprint, epoch=station.active_epoch(uuid))
+    agreed = agreement.accept(reply, pinned=entry.fingerprint, epoch=epoch_to_exceed(station, uuid, entry.fingerprint))
     key_id = agreed.key_id.hex()
     with station.store.transaction():
         station.add_pending(uuid, key=agreed.key, key_id=agreed.key_id, epoch=agreed.epoch)
@@ -170,6 +172,7 @@ def _agree_anew(station: Station, node: Conversation, entry: WhitelistEntry, ca:
         station.store.promote_key(uuid, key_id)
         station.remember(uuid, epoch=agreed.epoch, point=agreed.node)
         station.rotated(uuid)
+        settled(station, uuid)
     identity = read_identity(node)
     station.remember(
         uuid,

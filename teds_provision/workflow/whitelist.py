@@ -18,6 +18,7 @@ from xml.sax.saxutils import quoteattr
 from teds_provision.errors import OtherKey, PolicyRefused, UsageFailure
 from teds_provision.protocol.keys import fingerprint
 from teds_provision.store import WhitelistEntry
+from teds_provision.workflow.boards import let_go
 from teds_provision.workflow.station import Station
 from teds_provision.workflow.whitelist_read import FIELDS, FORMATS, Listed
 
@@ -115,6 +116,7 @@ def remove(station: Station, uuid: bytes) -> bool:
     can be pinned anew from here on.
     """
     with station.store.transaction():
+        let_go(station, uuid)
         removed = station.store.remove_whitelist(uuid)
         pinned = is_pinned(station, uuid)
         station.store.unpin_node(uuid)

@@ -94,7 +94,7 @@ def _commit(station: Station, node: Conversation, image: Image, has: Image | Non
             node.send(update_teds(*SECURITY), "the commit")
             return octets
         except NodeRefused as refusal:
-            if refusal.reason != Reason.DIGEST_MISMATCH or not skip - {SECURITY}:
+            if refusal.reason != Reason.DIGEST_MISMATCH or not skip - {SECURITY} or attempt == _STARTS - 1:
                 raise
             skip = set()  # the node does not hold what it was last read to hold: send everything
         except SessionLost as lost:
