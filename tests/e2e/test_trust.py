@@ -53,6 +53,7 @@ def test_a_replaced_board_is_taken_after_the_old_pin_is_removed(desk: Desk, stat
     old, new = desk.node("old", uuid=UUID), desk.node("new", uuid=UUID)
     old.start()
     station.provision("nfc", "--profile", ANGLE)
+    station.ask("agree", UUID, "--rotate", *desk.links.over("nfc"))
     old.stop()
     new.start()
     station.refuses("provision", "--yes", *desk.links.over("nfc"), code=6)
@@ -60,6 +61,22 @@ def test_a_replaced_board_is_taken_after_the_old_pin_is_removed(desk: Desk, stat
     done = station.provision("nfc", "--profile", ANGLE)
     assert done["verdict"] == "authentic"
     assert new.flash["provisioned"] is True
+    assert station.keys(UUID) == [("active", 1)]
+    assert station.ask("agree", UUID, "--rotate", *desk.links.over("nfc"))["epoch"] == 2
+    assert station.provision("nfc")["verdict"] == "authentic"
+    new.stop()
+    old.start()
+    assert station.refuses("provision", "--yes", *desk.links.over("nfc"), code=6)["code"] == "other-key"
+
+
+def test_the_same_board_comes_back_after_it_was_taken_off_the_whitelist(station: Station, node: Node) -> None:
+    node.start()
+    station.provision("nfc", "--profile", ANGLE)
+    station.ask("whitelist", "remove", node.uuid, "--yes")
+    sheet = node.octets
+    assert results(station.provision("nfc"))["agree"] == "nothing to do"
+    assert node.octets == sheet
+    assert station.keys(node.uuid) == [("active", 1)]
 
 
 @pytest.mark.parametrize("via", ["nfc", "can"])
