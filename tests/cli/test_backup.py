@@ -209,7 +209,7 @@ def test_a_full_disk_leaves_the_old_backup_and_no_rest(home: Path, sealed: Path,
     words.write_text(PASSPHRASE + "\n")
     run = f"{sys.executable} -m teds_provision --home {home} --passphrase-fd 3 backup {sealed} --yes 3<{words}"
     done = subprocess.run(
-        ["bash", "-c", f"ulimit -f 8; {run}"],
+        ["bash", "-c", f"ulimit -f 128; {run}"],
         capture_output=True,
         text=True,
         check=False,
@@ -230,8 +230,18 @@ def test_killed_while_it_writes_a_backup_is_the_old_or_the_new_one(
     os.write(write, PASSPHRASE.encode() + b"\n")
     os.close(write)
     process = subprocess.Popen(
-        [sys.executable, "-m", "teds_provision", "--home", str(home), "--passphrase-fd", str(read)]
-        + ["backup", str(sealed), "--yes"],
+        [
+            sys.executable,
+            "-m",
+            "teds_provision",
+            "--home",
+            str(home),
+            "--passphrase-fd",
+            str(read),
+            "backup",
+            str(sealed),
+            "--yes",
+        ],
         pass_fds=(read,),
         env=clean_environment(),
         stdout=subprocess.DEVNULL,
