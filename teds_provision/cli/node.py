@@ -98,8 +98,7 @@ def run(app: App, /, folder: Path, crypto_delay: float, flash_delay: float, **li
         raise UsageFailure(
             "A node needs a link.", hint="Add --nfc udp:localhost:54321, --can udp_multicast:239.74.163.2, or both."
         )
-    node = VirtualNode(folder, delays=Delays(crypto_delay / 1000, flash_delay / 1000))
-    node.flash_file.hold()
+    node = VirtualNode(folder, delays=Delays(crypto_delay / 1000, flash_delay / 1000), exclusive=True)
     stop = threading.Event()
     for number in (signal.SIGTERM, signal.SIGINT):
         signal.signal(number, lambda *_: stop.set())
@@ -142,8 +141,7 @@ def reset(app: App, folder: Path) -> None:
     """Reset the node in DIR by hand (button held 5 s) while it is not running."""
     from teds_provision.node.virtual import VirtualNode
 
-    node = VirtualNode(folder)
-    node.flash_file.hold()
+    node = VirtualNode(folder, exclusive=True)
     node.reset_by_hand()
     uuid = node.tim.flash.uuid.hex()
     app.emit({"uuid": uuid, "state": "factory"}, f"Node {uuid} is back in factory state.")

@@ -11,7 +11,7 @@ import zlib
 from pathlib import Path
 from typing import Any
 
-from teds_provision.errors import BadData, NotFound, StoreLocked, UsageFailure
+from teds_provision.errors import BadData, NotFound, StoreFailure, StoreLocked, UsageFailure
 from teds_provision.protocol.flash import Flash, FlashFailure
 from teds_provision.protocol.keys import SoftwareKey, node_key_message
 from teds_provision.teds.image import BlockId
@@ -26,13 +26,19 @@ def default_can_address(uuid: bytes) -> int:
 
 
 class FlashFile:
-    """Flash and identity key of one virtual node in ``folder/flash.json`` (mode 0600); ``delay`` seconds a commit."""
+    """Flash and identity key of one virtual node in ``folder/flash.json`` (mode 0600); ``delay`` seconds a commit.
 
-    def __init__(self, folder: Path, *, delay: float = 0.0) -> None:
+    ``exclusive`` takes the node for this process until it ends. Raises NotFound, BadData, StoreLocked (it runs),
+    StoreFailure (the folder cannot be used).
+    """
+
+    def __init__(self, folder: Path, *, delay: float = 0.0, exclusive: bool = False) -> None:
         self.path = folder / FILE
         self._delay = delay
-        self._document = self._read()
         self._lock: int | None = None
+        if exclusive and folder.is_dir():
+            self._hold()  # before anything is read: what another process wrote last must not be undone
+        self._document = self._read()
 
     @classmethod
     def create(cls, folder: Path, *, uuid: bytes | None = None, name: str = "", max_message: int = 2048) -> FlashFile:
@@ -42,7 +48,10 @@ class FlashFile:
             if uuid not in (None, existing.load().uuid):
                 raise UsageFailure(f"{folder} already holds another node.", hint="Choose another folder.")
             return existing
-        folder.mkdir(parents=True, exist_ok=True, mode=0o700)
+        try:
+            folder.mkdir(parents=True, exist_ok=True, mode=0o700)
+        except OSError as error:
+            raise _unusable(folder, error) from error
         uuid = secrets.token_bytes(10) if uuid is None else uuid
         key = SoftwareKey.generate()
         flash = Flash(
@@ -52,7 +61,10 @@ class FlashFile:
             can_address=default_can_address(uuid),
         )
         head = {"format": FORMAT, "name": name, "max_message": max_message, "key": key.secret().hex()}
-        _replace(folder / FILE, head | {"flash": _flash_to_json(flash)})
+        try:
+            _replace(folder / FILE, head | {"flash": _flash_to_json(flash)})
+        except OSError as error:
+            raise _unusable(folder, error) from error
         return cls(folder)
 
     @property
@@ -84,27 +96,47 @@ class FlashFile:
             raise FlashFailure from error
         self._document = document
 
-    def hold(self) -> None:
-        """Take the node for this process until it ends; raises StoreLocked where it runs already."""
-        self._lock = os.open(self.path.with_name("lock"), os.O_CREAT | os.O_RDWR | os.O_CLOEXEC, 0o600)
+    def release(self) -> None:
+        """Let another process take the node."""
+        if self._lock is not None:
+            os.close(self._lock)
+            self._lock = None
+
+    def _hold(self) -> None:
+        """Take the node for this process until it ends."""
         try:
+            self._lock = os.open(self.path.with_name("lock"), os.O_CREAT | os.O_RDWR | os.O_CLOEXEC, 0o600)
             fcntl.flock(self._lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
             raise StoreLocked(f"The node in {self.path.parent} is already running.") from None
+        except OSError as error:
+            raise _unusable(self.path.parent, error) from error
 
     def _read(self) -> dict[str, Any]:
         try:
-            document = json.loads(self.path.read_text())
+            document = json.loads(self.path.read_text(encoding="utf-8"))
         except FileNotFoundError:
             raise NotFound(
                 f"There is no virtual node in {self.path.parent}.",
                 hint=f"Make one: teds-provision node create {self.path.parent}",
             ) from None
+        except OSError as error:
+            raise _unusable(self.path.parent, error) from error
         except ValueError as error:
             raise BadData(f"{self.path} is not a virtual node's flash.") from error
-        if not isinstance(document, dict) or document.get("format") != FORMAT:
-            raise BadData(f"{self.path} is not a virtual node's flash.")
-        return document
+        try:
+            whole = document["format"] == FORMAT and "name" in document and int(document["max_message"]) > 0
+            SoftwareKey.from_secret(bytes.fromhex(document["key"]))
+            _flash_from_json(document["flash"])
+        except (KeyError, TypeError, ValueError, AttributeError, BadData):
+            whole = False
+        if not whole:
+            raise BadData(f"{self.path} is not a virtual node's flash, or it is damaged.", hint="Make a new node.")
+        return dict(document)
+
+
+def _unusable(folder: Path, error: OSError) -> StoreFailure:
+    return StoreFailure(f"The folder {folder} cannot be used: {error.strerror}.", hint="Choose another folder.")
 
 
 def _flash_to_json(flash: Flash) -> dict[str, Any]:
@@ -151,7 +183,7 @@ def _flash_from_json(data: dict[str, Any]) -> Flash:
 def _replace(path: Path, document: dict[str, Any]) -> None:
     temporary = path.with_suffix(".new")
     descriptor = os.open(temporary, os.O_WRONLY | os.O_CREAT | os.O_TRUNC | os.O_CLOEXEC, 0o600)
-    with os.fdopen(descriptor, "w") as stream:
+    with os.fdopen(descriptor, "w", encoding="utf-8") as stream:
         json.dump(document, stream)
         stream.flush()
         os.fsync(stream.fileno())

@@ -54,13 +54,21 @@ class LinkServer(Protocol):
 
 
 class VirtualNode:
-    """A NodeHandler: runs one command at a time, whichever link it came by, like the one core of a small board."""
+    """A NodeHandler: runs one command at a time, whichever link it came by, like the one core of a small board.
+
+    ``exclusive`` takes the node for this process; see FlashFile.
+    """
 
     def __init__(
-        self, folder: Path, *, delays: Delays | None = None, clock: Callable[[], float] = time.monotonic
+        self,
+        folder: Path,
+        *,
+        delays: Delays | None = None,
+        clock: Callable[[], float] = time.monotonic,
+        exclusive: bool = False,
     ) -> None:
         delays = delays or Delays()
-        self.flash_file = FlashFile(folder, delay=delays.flash)
+        self.flash_file = FlashFile(folder, delay=delays.flash, exclusive=exclusive)
         self._one = threading.Lock()
         self.tim = Tim(
             _SlowKey(self.flash_file.key, delays.crypto),
