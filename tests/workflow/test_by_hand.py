@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import pytest
 
-from teds_provision.errors import NodeSilent
+from teds_provision.errors import NodeRefused, NodeSilent
+from teds_provision.protocol.frames import Reason, refusal
 from teds_provision.store import WhitelistEntry
+from teds_provision.teds.image import Image
 from teds_provision.workflow.agree import agree, require_session
 from teds_provision.workflow.build import BuildOrder, build
 from teds_provision.workflow.identify import identify
@@ -39,3 +41,25 @@ def test_a_datasheet_signed_by_hand_after_a_cut_agreement_is_taken(
         require_session(station, node)
         assert write(station, node, signed.image).octets > 0
     assert board.state.provisioned
+
+
+def test_a_node_that_refuses_at_the_last_of_all_attempts_is_told_as_such(station: Station, board: Board) -> None:
+    station.store.put_whitelist(WhitelistEntry(board.uuid))
+    with talk(board) as node:
+        agree(station, node, identify(station, node))
+    build(station, board.uuid, ANGLE)
+    signed = sign_image(station, SignOrder(board.uuid), None).signed.image
+    lost = 2
+
+    def drop_session(_count: int, reply: bytes) -> bytes:
+        nonlocal lost
+        if link.frames[-1][2:4] == b"\x80\x04" and len(link.frames[-1]) > 500 and lost:
+            lost -= 1
+            return refusal(Reason.WRONG_STATE).encode()
+        return reply
+
+    link = MemoryLink(board, tamper=drop_session)
+    with pytest.raises(NodeRefused) as refused, talk(board, link) as node:
+        require_session(station, node)
+        write(station, node, signed, has=Image(board.uuid, signed.unsigned_blocks()))
+    assert (lost, refused.value.reason) == (0, Reason.DIGEST_MISMATCH)
