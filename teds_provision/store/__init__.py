@@ -1,6 +1,7 @@
 """What a station remembers: whitelist, nodes, wrapped keys, journal, trust and the audit log, in one SQLite file."""
 
 from teds_provision.store.audit import AuditEntry, AuditLog, AuditVerdict
+from teds_provision.store.bulk_tables import Batch
 from teds_provision.store.lock import StoreLock
 from teds_provision.store.records import (
     Draft,
@@ -21,6 +22,7 @@ __all__ = [
     "AuditEntry",
     "AuditLog",
     "AuditVerdict",
+    "Batch",
     "Draft",
     "Handover",
     "Holder",

@@ -12,7 +12,7 @@ import sqlite3
 import stat
 import threading
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any, TypeVar
@@ -115,6 +115,11 @@ class Database:
         """Run one statement and return how many rows it changed; raises StoreFailure."""
         with self._lock, self._translated():
             return self._connection.execute(statement, values).rowcount
+
+    def execute_many(self, statement: str, rows: Iterable[Sequence[Any]]) -> None:
+        """Run one statement with each row of values; raises StoreFailure."""
+        with self._lock, self._translated():
+            self._connection.executemany(statement, rows)
 
     def one(self, statement: str, values: Sequence[Any] = ()) -> tuple[Any, ...] | None:
         """Return the first row, None if there is none; raises StoreFailure."""

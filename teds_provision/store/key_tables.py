@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from dataclasses import replace
 from typing import Any
 
 from teds_provision.errors import NotFound
@@ -88,4 +87,5 @@ class KeyTables:
 
 
 def _key(seq: int, *row: Any) -> KeyRecord:
-    return replace(KeyRecord(*row), seq=seq)
+    values = (*row, seq)
+    return KeyRecord(*values)

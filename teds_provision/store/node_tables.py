@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import re
-from dataclasses import fields, replace
+from dataclasses import fields
 from typing import Any
 
 from teds_provision.errors import NotFound, OtherKey, UsageFailure
@@ -14,6 +14,7 @@ from teds_provision.store.records import UUID_OCTETS, Draft, NodeRecord, Step, W
 _UUID_DIGITS = 2 * UUID_OCTETS
 _MIN_PREFIX = 4
 _SHOWN_CANDIDATES = 5
+_GROUPS = next(place for place, column in enumerate(fields(NodeRecord)) if column.name == "groups")
 _NODE_COLUMNS = ", ".join(column.name for column in fields(NodeRecord))
 
 
@@ -161,8 +162,8 @@ class NodeTables:
 
 
 def _node(*row: Any) -> NodeRecord:
-    record = NodeRecord(*row)
-    return replace(record, groups=tuple(json.loads(str(record.groups))))
+    values = (*row[:_GROUPS], tuple(json.loads(row[_GROUPS])), *row[_GROUPS + 1 :])
+    return NodeRecord(*values)
 
 
 def _by_name(name: str) -> tuple[str, tuple[str, str]]:

@@ -9,6 +9,7 @@ from types import TracebackType
 
 from teds_provision.errors import StoreFailure
 from teds_provision.store.audit import AuditLog
+from teds_provision.store.bulk_tables import BulkTables
 from teds_provision.store.database import Database
 from teds_provision.store.handover_tables import HandoverTables
 from teds_provision.store.key_tables import KeyTables
@@ -17,7 +18,7 @@ from teds_provision.store.node_tables import NodeTables
 _ID_OCTETS = 16
 
 
-class Store(NodeTables, KeyTables, HandoverTables):
+class Store(NodeTables, KeyTables, HandoverTables, BulkTables):
     """Whitelist, nodes, wrapped keys, drafts, journal, trust, handovers and the audit log of one station.
 
     Every method is durable when it returns, and all of them raise StoreFailure (or StoreLocked) where the file cannot

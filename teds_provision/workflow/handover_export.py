@@ -17,10 +17,10 @@ from teds_provision.errors import NotFound, PolicyRefused, UsageFailure
 from teds_provision.protocol.bundle import Bundle, BundledNode, Mode, seal_bundle
 from teds_provision.protocol.keys import fingerprint
 from teds_provision.protocol.payload import time_text
-from teds_provision.store import Handover, Holder, KeyRecord, NodeRecord, Tombstone, TrustRecord
+from teds_provision.store import Batch, Handover, Holder, KeyRecord, NodeRecord, Tombstone, TrustRecord, utc_now
 from teds_provision.workflow.handover import OPEN, Notes, content_digest
 from teds_provision.workflow.handover_files import require_new, write_new
-from teds_provision.workflow.station import Station
+from teds_provision.workflow.station import ROTATION, Station
 from teds_provision.workflow.trust import find_trusted
 
 DEFAULT_DAYS = 7
@@ -128,8 +128,10 @@ class _Selection:
         store = station.store
         self.station, self.order, self.receivers = station, order, receivers
         self.nodes = {node.uuid: node for node in store.nodes()}
-        self.keys = {key.uuid: key for key in store.all_keys() if key.state == "active"}
-        self.pending = {key.uuid for key in store.all_keys() if key.state == "pending"}
+        held = list(store.all_keys())
+        self.keys = {key.uuid: key for key in held if key.state == "active"}
+        self.pending = {key.uuid for key in held if key.state == "pending"}
+        self.due = {bytes.fromhex(uuid) for uuid, why in store.settings(ROTATION).items() if why}
         self.tombstones = {tombstone.uuid: tombstone for tombstone in store.tombstones()}
         self.revoked = {revocation.uuid for revocation in store.revocations()}
         self.open = {row.id: row for row in store.handovers() if row.direction == "out" and row.state == OPEN}
@@ -159,7 +161,7 @@ class _Selection:
             return f"it was moved to station {tombstone.to_fingerprint[:16]}"
         if uuid not in self.keys:
             return "its key was never proven in a session" if uuid in self.pending else "no key of it is held here"
-        if self.station.rotation_due(uuid):
+        if uuid in self.due:
             return "its key must be rotated first"
         if node is not None and (node.verdict or "").startswith(OUT_OF_SERVICE):
             return "it is out of service"
@@ -189,7 +191,8 @@ _CURE = "See teds-provision nodes UUID; rotate with: teds-provision agree UUID -
 
 def _one_ca(station: Station, order: ExportOrder, nodes: list[tuple[NodeRecord, KeyRecord]]) -> bytes:
     """The CA that the nodes keep: one bundle has one."""
-    found = {fingerprint(ca): ca for ca in (station.ca_of(node.uuid) for node, _ in nodes)}
+    of, own = station.cas_of_nodes(), station.ca
+    found = {fingerprint(ca): ca for ca in {of.get(node.uuid, own) for node, _ in nodes}}
     if order.ca is not None:
         found = {digits: ca for digits, ca in found.items() if digits.startswith(order.ca.lower())}
         if not found:
@@ -279,12 +282,11 @@ def _record(station: Station, plan: ExportPlan, digest: str) -> None:
     store.put_handover(replace(row, nodes=notes.to_json(), bundle_sha256=digest))
     for record in plan.receivers:
         station.keep_certificate(plan.ca, record.point, plan.signatures[record.fingerprint])
-    for node, _ in plan.nodes:
-        if plan.mode == "move":
-            if plan.earlier is None:
-                store.put_tombstone(Tombstone(node.uuid, peers[0], plan.id))
-            continue
-        for peer in peers:
-            store.put_holder(Holder(node.uuid, peer))
+    if plan.mode == "copy":
+        now = utc_now()
+        store.put_batch(Batch(holders=[Holder(node.uuid, peer, now) for node, _ in plan.nodes for peer in peers]))
+    elif plan.earlier is None:
+        now = utc_now()
+        store.put_batch(Batch(tombstones=[Tombstone(node.uuid, peers[0], plan.id, now) for node, _ in plan.nodes]))
     detail = {"handover": plan.id, "mode": plan.mode, "to": list(peers), "nodes": list(uuids_hex), "file": digest}
     station.audit("export", None, "again" if plan.earlier else "done", **detail)

@@ -20,9 +20,9 @@ from teds_provision.protocol.keys import fingerprint, station_key_message, verif
 from teds_provision.protocol.payload import time_text
 from teds_provision.protocol.receipt import Receipt, RefusedNode, seal_receipt
 from teds_provision.protocol.revocation import Revocation as Statement
-from teds_provision.store import Handover, Holder, NodeRecord, Revocation, WhitelistEntry
+from teds_provision.store import Batch, Handover, Holder, KeyRecord, NodeRecord, Revocation, WhitelistEntry, utc_now
 from teds_provision.workflow.handover import IMPORTED, Notes, digest_of
-from teds_provision.workflow.station import Station
+from teds_provision.workflow.station import CA_OF, ROTATION, Station
 
 Decision = Literal["new", "newer", "same", "refused"]
 
@@ -143,8 +143,7 @@ def import_keys(station: Station, plan: ImportPlan, now: datetime | None = None)
         _keep_ca(station, plan)
         for statement in plan.denied:
             deny(station, statement)
-        for planned in plan.taken:
-            _take_in(station, plan, planned)
+        _Arrivals(station, plan).take_in()
         station.store.put_handover(row)
         taken = [node.node.uuid.hex() for node in plan.taken]
         detail = {"handover": bundle.id, "mode": bundle.mode, "from": bundle.sender, "nodes": taken}
@@ -237,39 +236,88 @@ def _keep_ca(station: Station, plan: ImportPlan) -> None:
         station.keep_certificate(bundle.ca, point, signature)
 
 
-def _take_in(station: Station, plan: ImportPlan, planned: PlannedNode) -> None:
-    store, node, bundle = station.store, planned.node, plan.opened.bundle
-    if store.remove_tombstone(node.uuid):
-        station.audit("handover", node.uuid, "came back", handover=bundle.id)
-    if planned.decision != "same":
-        station.add_pending(node.uuid, key=node.key, key_id=key_id(node.key), epoch=node.epoch, imported=True)
-    _remember(station, node)
-    pin = store.whitelisted(node.uuid)
-    if pin is None:
-        store.put_whitelist(WhitelistEntry(node.uuid, fingerprint(node.node_key), assurance="import", name=node.name))
-    elif pin.fingerprint is None:
-        store.put_whitelist(replace(pin, fingerprint=fingerprint(node.node_key), assurance="import"))
-    if planned.decision != "same":
-        station.set_ca_of(node.uuid, bundle.ca)
-    for holder in {bundle.sender, *bundle.to} - {station.fingerprint}:
-        store.put_holder(Holder(node.uuid, holder, mode=bundle.mode))
-    if bundle.mode == "move":
-        station.demand_rotation(node.uuid, f"moved here by {bundle.id}: the sender has had this key")
+class _Arrivals:
+    """The rows of every node that is taken in, made from the tables as they are (read once), written at once."""
 
+    def __init__(self, station: Station, plan: ImportPlan) -> None:
+        store, bundle = station.store, plan.opened.bundle
+        self.station, self.plan, self.bundle = station, plan, bundle
+        self.known = {node.uuid: node for node in store.nodes()}
+        self.pins = {entry.uuid: entry for entry in store.whitelist()}
+        self.slots = store.slots()
+        self.cas = station.cas_of_nodes()
+        self.resting = {tombstone.uuid for tombstone in store.tombstones()}
+        self.others = sorted({bundle.sender, *bundle.to} - {station.fingerprint})
+        self.now = utc_now()
 
-def _remember(station: Station, node: BundledNode) -> None:
-    known = station.store.node(node.uuid) or NodeRecord(node.uuid)
-    state = NodeState.PROVISIONED if node.teds_sha256 else NodeState.KEYED
-    station.store.put_node(
-        replace(
+    def take_in(self) -> None:
+        """Write all of them."""
+        taken, store, now = self.plan.taken, self.station.store, self.now
+        back = [one.node.uuid for one in taken if one.node.uuid in self.resting]
+        store.remove_tombstones(back)
+        for uuid in back:
+            self.station.audit("handover", uuid, "came back", handover=self.bundle.id)
+        mode = self.bundle.mode
+        store.put_batch(
+            Batch(
+                nodes=[self._node(one.node) for one in taken],
+                whitelist=[entry for entry in (self._entry(one.node) for one in taken) if entry is not None],
+                keys=[self._key(one.node) for one in taken if one.decision != "same"],
+                holders=[Holder(one.node.uuid, other, now, mode) for one in taken for other in self.others],
+                settings=self._settings(),
+            )
+        )
+
+    def _key(self, node: BundledNode) -> KeyRecord:
+        return self.station.wrapped(
+            node.uuid,
+            key=node.key,
+            key_id=key_id(node.key),
+            epoch=node.epoch,
+            slot=self.slots.get(node.uuid, 0) + 1,
+            source="import",
+            created=self.now,
+        )
+
+    def _entry(self, node: BundledNode) -> WhitelistEntry | None:
+        """The whitelist entry, pinned to the node's key; None where it is pinned already."""
+        pin, digits = self.pins.get(node.uuid), fingerprint(node.node_key)
+        if pin is None:
+            return WhitelistEntry(node.uuid, digits, self.now, "import", node.name)
+        return None if pin.fingerprint is not None else replace(pin, fingerprint=digits, assurance="import")
+
+    def _node(self, node: BundledNode) -> NodeRecord:
+        state = int(NodeState.PROVISIONED if node.teds_sha256 else NodeState.KEYED)
+        known = self.known.get(node.uuid)
+        if known is None:
+            return NodeRecord(
+                node.uuid,
+                node.node_key,
+                node.name,
+                node.profile,
+                state,
+                node.epoch,
+                node.sequence,
+                groups=node.groups,
+                teds_sha256=node.teds_sha256,
+            )
+        return replace(
             known,
             point=node.node_key,
             name=known.name or node.name,
             profile=known.profile or node.profile,
             groups=tuple(dict.fromkeys((*known.groups, *node.groups))),
-            state=known.state or int(state),
+            state=known.state or state,
             epoch=max(known.epoch, node.epoch),
             sequence=max(known.sequence, node.sequence),
             teds_sha256=node.teds_sha256 if node.sequence >= known.sequence else known.teds_sha256,
         )
-    )
+
+    def _settings(self) -> dict[str, str]:
+        """Which CA each node keeps, and after a move that its key has to be rotated."""
+        ca, own, taken = self.bundle.ca, self.station.ca, self.plan.taken
+        why = f"moved here by {self.bundle.id}: the sender has had this key"
+        due = {ROTATION + one.node.uuid.hex(): why for one in taken} if self.bundle.mode == "move" else {}
+        said = "" if ca == own else ca.hex()
+        changed = [one.node.uuid for one in taken if one.decision != "same" and self.cas.get(one.node.uuid, own) != ca]
+        return due | {CA_OF + uuid.hex(): said for uuid in changed}

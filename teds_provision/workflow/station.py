@@ -10,12 +10,15 @@ from typing import TYPE_CHECKING
 from teds_provision.errors import NotAuthentic, NotFound, NotWhitelisted, PolicyRefused
 from teds_provision.protocol.agreement import Credentials, other_key
 from teds_provision.protocol.keys import fingerprint, station_key_message, verify
-from teds_provision.store import KeyRecord, NodeRecord, Store, StoreLock, WhitelistEntry
+from teds_provision.store import KeyRecord, NodeRecord, Store, StoreLock, WhitelistEntry, utc_now
+from teds_provision.store.records import KeySource
 
 if TYPE_CHECKING:
     from teds_provision.vault import Ask, Vault
 
 DEFAULT_NAME = "station"
+CA_OF, ROTATION = "ca-of:", "rotate:"
+"""Names of settings by node (UUID in hex follows): the CA key that it keeps, and why a rotation is due."""
 
 
 @dataclass(frozen=True)
@@ -129,6 +132,10 @@ class Station:
         other = self.store.setting(_ca_setting(uuid))
         return bytes.fromhex(other) if other else self.ca
 
+    def cas_of_nodes(self) -> dict[bytes, bytes]:
+        """P(CA) of every node that keeps another CA than the owner's."""
+        return {bytes.fromhex(uuid): bytes.fromhex(ca) for uuid, ca in self.store.settings(CA_OF).items() if ca}
+
     def set_ca_of(self, uuid: bytes, ca: bytes) -> None:
         """Note which CA a node keeps."""
         if ca != self.ca_of(uuid):
@@ -174,14 +181,22 @@ class Station:
 
     def add_pending(self, uuid: bytes, *, key: bytes, key_id: bytes, epoch: int, imported: bool = False) -> None:
         """Store a new key durably as pending; nothing else is touched."""
-        from teds_provision.vault import node_key_context
-
         with self.store.transaction():
             slot = self.store.next_slot(uuid)
-            context = node_key_context(self.store.id, uuid, epoch, slot)
-            wrapped = self.vault.wrap(key, context=context)
-            source = "import" if imported else "agreement"
-            self.store.add_key(KeyRecord(uuid, epoch, key_id.hex(), "pending", slot, wrapped, source))  # type: ignore[arg-type]
+            source: KeySource = "import" if imported else "agreement"
+            self.store.add_key(
+                self.wrapped(uuid, key=key, key_id=key_id, epoch=epoch, slot=slot, source=source, created=utc_now())
+            )
+
+    def wrapped(
+        self, uuid: bytes, *, key: bytes, key_id: bytes, epoch: int, slot: int, source: KeySource, created: str
+    ) -> KeyRecord:
+        """Return the record of a new pending key in a slot that the node never had."""
+        from teds_provision.vault import node_key_context
+
+        context = node_key_context(self.store.id, uuid, epoch, slot)
+        sealed = self.vault.wrap(key, context=context)
+        return KeyRecord(uuid, epoch, key_id.hex(), "pending", slot, sealed, source, created)
 
     def unwrap(self, record: KeyRecord) -> bytes:
         """Return a link key in the clear; raises VaultFailure where it is damaged or of another vault."""
@@ -273,11 +288,11 @@ class Station:
 
 
 def _ca_setting(uuid: bytes) -> str:
-    return f"ca-of:{uuid.hex()}"
+    return CA_OF + uuid.hex()
 
 
 def _rotation_setting(uuid: bytes) -> str:
-    return f"rotate:{uuid.hex()}"
+    return ROTATION + uuid.hex()
 
 
 def _certificate_setting(ca: bytes, point: bytes) -> str:

@@ -48,6 +48,7 @@ def counted(at: Callable[[int], None]) -> Iterator[None]:
     with (
         patch.object(Database, "execute", hooked(Database.execute)),
         patch.object(Database, "change", hooked(Database.change)),
+        patch.object(Database, "execute_many", hooked(Database.execute_many)),
         patch.object(handover_files, "_publish", filed(handover_files._publish)),
         patch.object(handover_files, "_sync_folder", filed(handover_files._sync_folder)),
     ):

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 import stat
 from collections.abc import Iterator
 from dataclasses import replace
@@ -28,7 +27,7 @@ from teds_provision.workflow.reading import read_image
 from .bench import Board, MemoryLink, make_station, talk
 from .handover_desk import Pair, everything, held, key_up, node_key_id, provisioned, row, session, trust
 
-SESSIONS = int(os.environ.get("TEDS_PROVISION_SOAK_SESSIONS", "20"))
+SESSIONS = 1000
 
 
 @pytest.fixture
