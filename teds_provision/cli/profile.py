@@ -14,7 +14,8 @@ from teds_provision.cli.options import COMMAND_SETTINGS, command, dry_run_option
 from teds_provision.errors import BadData, UsageFailure
 
 if TYPE_CHECKING:
-    from rich.console import Console, RenderableType
+    from rich.console import Console
+    from rich.table import Table
 
     from teds_provision.teds.profile import Problem
 
@@ -39,6 +40,8 @@ def list_(app: App) -> None:
         from rich.markup import escape
         from rich.table import Table
 
+        from teds_provision.cli.rendering import print_table
+
         table = Table(box=None, pad_edge=False)
         for title in ("Profile", "Channels", "Links"):
             table.add_column(title, no_wrap=True)
@@ -49,7 +52,7 @@ def list_(app: App) -> None:
             elif not entry["abstract"]:
                 title = escape(entry["title"])
                 table.add_row(entry["name"], str(entry["channels"]), ", ".join(entry["links"]), title)
-        console.print(table)
+        print_table(console, table)
 
     app.emit({"profiles": entries}, human)
 
@@ -70,6 +73,8 @@ def show(app: App, name: str) -> None:
 def _show(console: Console, data: dict[str, Any]) -> None:
     from rich.markup import escape
 
+    from teds_provision.cli.rendering import print_table
+
     console.print(f"[bold]{escape(data['title'])}[/bold]  {escape(data['file'])}")
     if data["extends"]:
         console.print(f"extends {' -> '.join(data['extends'])}", markup=False)
@@ -77,12 +82,12 @@ def _show(console: Console, data: dict[str, Any]) -> None:
         console.print(data["description"] + "\n", markup=False)
     if data["links"]:
         console.print(f"Links: {', '.join(data['links'])}", markup=False)
-    console.print(_channels(data["channels"]))
+    print_table(console, _channels(data["channels"]))
     for warning in data["warnings"]:
         console.print(f"Warning: {warning}", markup=False)
 
 
-def _channels(channels: list[dict[str, Any]]) -> RenderableType:
+def _channels(channels: list[dict[str, Any]]) -> Table:
     from rich.table import Table
     from rich.text import Text
 

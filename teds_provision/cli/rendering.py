@@ -26,10 +26,14 @@ def shown(text: str | None) -> str:
 
 
 def print_table(console: Console, table: Table) -> None:
-    """Print a table; outside a terminal nothing of it is cut off or wrapped."""
-    if not console.is_terminal:
-        console.width = _PIPE_COLUMNS
-    console.print(table)
+    """Print a table; outside a terminal nothing of it is cut off, wrapped or padded at the end of a line."""
+    if console.is_terminal:
+        console.print(table)
+        return
+    console.width = _PIPE_COLUMNS
+    with console.capture() as captured:
+        console.print(table)
+    console.file.writelines(f"{line.rstrip()}\n" for line in captured.get().splitlines())
 
 
 def reporter_for(app: App) -> Reporter:
