@@ -59,7 +59,8 @@ def test_a_node_that_refuses_at_the_last_of_all_attempts_is_told_as_such(station
         return reply
 
     link = MemoryLink(board, tamper=drop_session)
-    with pytest.raises(NodeRefused) as refused, talk(board, link) as node:
+    with talk(board, link) as node:
         require_session(station, node)
-        write(station, node, signed, has=Image(board.uuid, signed.unsigned_blocks()))
+        with pytest.raises(NodeRefused) as refused:
+            write(station, node, signed, has=Image(board.uuid, signed.unsigned_blocks()))
     assert (lost, refused.value.reason) == (0, Reason.DIGEST_MISMATCH)
