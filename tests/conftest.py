@@ -1,11 +1,35 @@
-"""For all tests: hypothesis without deadlines (machines are shared), and the same examples on every run of the gate."""
+"""For all tests: hypothesis without deadlines (machines are shared), the same examples on every run of the gate.
+
+At the gate (``CI`` is set) a test marked ``system`` that is skipped has failed: what it needs is to be installed there.
+"""
 
 from __future__ import annotations
 
 import os
+import signal
+from collections.abc import Generator
 
+import pytest
 from hypothesis import settings
+
+AT_THE_GATE = os.environ.get("CI", "").lower() not in ("", "0", "false")
 
 settings.register_profile("desk", deadline=None, print_blob=True)
 settings.register_profile("gate", deadline=None, print_blob=True, derandomize=True)
-settings.load_profile("gate" if os.environ.get("CI") else "desk")
+settings.load_profile("gate" if AT_THE_GATE else "desk")
+
+
+def pytest_configure() -> None:
+    """Take Ctrl-C as usual: what a shell starts in the background ignores it, and so would the programs under test."""
+    if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
+        signal.signal(signal.SIGINT, signal.default_int_handler)
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_makereport(item: pytest.Item) -> Generator[None, pytest.TestReport, pytest.TestReport]:
+    """Fail what is skipped at the gate although the gate has to have what it needs."""
+    report = yield
+    if AT_THE_GATE and report.skipped and item.get_closest_marker("system") and not hasattr(report, "wasxfail"):
+        why = report.longrepr[2] if isinstance(report.longrepr, tuple) else report.longrepr
+        report.outcome, report.longrepr = "failed", f"skipped at the gate, where nothing may be missing: {why}"
+    return report
