@@ -70,6 +70,8 @@ def export_keys(
     station = app.station()
     nodes = None if everything else tuple(station.store.resolve(uuid) for uuid in uuids)
     order = ExportOrder(receivers, nodes, mode, expires, ca)
+    if not dry_run:
+        station.unlock()
     with station.lock("export-keys", app.note):
         plan = plan_export(station, order)
         told = _exported(plan, output, station)
@@ -154,6 +156,7 @@ def import_keys(
     station = app.station()
     receipt = receipt or file.with_name(file.name + ".receipt")
     octets = read_limited(file, MAX_BUNDLE_OCTETS, "bundle")
+    station.unlock()
     with station.lock("import-keys", app.note):
         plan = plan_import(station, octets)
         told, text = _import_plan(station, plan)
@@ -332,7 +335,7 @@ def receipt(app: App, file: Path) -> None:
         "id": done.row.id,
         "from": done.receipt.sender,
         "mode": done.row.mode,
-        "state": "closed",
+        "state": done.row.state,
         "imported": [uuid.hex() for uuid in imported],
         "refused": [{"uuid": one.uuid.hex(), "why": one.why} for one in refused],
         "fresh": done.fresh,

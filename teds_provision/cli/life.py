@@ -38,6 +38,7 @@ def revoke(app: App, uuid: str, why: str, yes: bool, dry_run: bool) -> None:
             {"uuid": octets.hex(), "plan": "revoke", "keys": keys}, f"Plan: revoke {octets.hex()}, delete {keys} keys."
         )
         return
+    station.unlock()
     with station.lock("revoke", app.note):
         if station.store.revocation(octets) is None:
             app.confirm(f"Revoke node {octets.hex()} for good?", yes=yes)
@@ -72,6 +73,7 @@ def decommission(app: App, uuid: str, force: bool, yes: bool, dry_run: bool, lin
     if dry_run:
         app.emit({"uuid": octets.hex(), "plan": "decommission"}, f"Plan: reset {octets.hex()}, take it out of service.")
         return
+    station.unlock(octets)
     with station.lock("decommission", app.note):
         if is_finished(station, octets):
             app.emit(
@@ -140,6 +142,7 @@ def replace(
     assert app is not None
     station = app.station()
     octets, spare = station.store.resolve(old), station.store.resolve(new)
+    station.unlock(octets)
     with station.lock("replace", app.note):
         plan = plan_takeover(station, octets, spare, copy_calibration=copy_calibration)
         taken = plan.new if plan.done else plan.old

@@ -196,6 +196,7 @@ def sign(app: App, request: Path, output: Path, yes: bool, dry_run: bool) -> Non
     if dry_run:
         app.emit({**told, "plan": True}, f"Plan: certify\n{shown}")
         return
+    station.unlock()
     with station.lock("trust ca sign", app.note):
         app.note(shown)
         app.confirm("Certify it? Whoever holds its key can then write and rekey every node of this owner.", yes=yes)
@@ -215,9 +216,9 @@ def export(app: App, file: Path) -> None:
     from teds_provision.workflow.fleet import export_ca
 
     station = app.station()
+    vault = station.vault
+    passphrase = app.ask_secret("New passphrase for the CA key's file", confirm=True)
     with station.lock("trust ca export", app.note):
-        vault = station.vault
-        passphrase = app.ask_secret("New passphrase for the CA key's file", confirm=True)
         export_ca(station, vault, file, passphrase)
     app.emit({"file": str(file)}, f"The CA key is in {file}. Keep it away, then: teds-provision trust ca drop")
 
@@ -230,6 +231,7 @@ def drop(app: App, yes: bool) -> None:
     from teds_provision.workflow.fleet import drop_ca
 
     station = app.station()
+    station.unlock()
     with station.lock("trust ca drop", app.note):
         app.confirm("Delete the CA key from this vault? Only its exported file can bring it back.", yes=yes)
         dropped = drop_ca(station)
@@ -245,8 +247,9 @@ def import_(app: App, file: Path) -> None:
     from teds_provision.workflow.fleet import import_ca
 
     station = app.station()
+    vault = station.vault
+    passphrase = app.ask_secret("Passphrase of the CA key's file")
     with station.lock("trust ca import", app.note):
-        vault = station.vault
-        import_ca(station, vault, file, app.ask_secret("Passphrase of the CA key's file"))
+        import_ca(station, vault, file, passphrase)
     digits = fingerprint(station.ca)
     app.emit({"fingerprint": digits}, f"The CA key {digits[:16]} is in this vault.")

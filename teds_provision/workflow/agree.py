@@ -46,7 +46,7 @@ def open_session(station: Station, node: Conversation) -> NodeKey | None:
             settled(station, node.uuid)
             station.remember(node.uuid, epoch=held.record.epoch)  # what is signed without the node is for this epoch
             if held.record.state == "pending" or len(station.store.keys(node.uuid)) > 1:
-                station.store.promote_key(node.uuid, held.record.key_id)
+                station.promote(node.uuid, held.record.key_id)
                 if held.record.state == "pending" and held.record.source == "agreement":
                     station.rotated(node.uuid)
                 station.audit("key", node.uuid, "active", key_id=held.record.key_id, epoch=held.record.epoch)
@@ -169,7 +169,7 @@ def _agree_anew(station: Station, node: Conversation, entry: WhitelistEntry, ca:
     node.forget()
     node.open(agreed.key)
     with station.store.transaction():
-        station.store.promote_key(uuid, key_id)
+        station.promote(uuid, key_id)
         station.remember(uuid, epoch=agreed.epoch, point=agreed.node)
         station.rotated(uuid)
         settled(station, uuid)

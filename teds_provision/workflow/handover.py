@@ -17,7 +17,7 @@ from teds_provision.errors import NotAuthentic, NotFound, PolicyRefused
 from teds_provision.protocol.agreement import key_id
 from teds_provision.protocol.bundle import Bundle
 from teds_provision.protocol.receipt import Receipt, open_receipt
-from teds_provision.store import Handover, Tombstone
+from teds_provision.store import Handover, Holder
 from teds_provision.workflow.station import Station
 
 OPEN, CLOSED, UNDONE, IMPORTED = "open", "closed", "undone", "imported"
@@ -120,7 +120,7 @@ def undo(station: Station, row: Handover) -> Undone:
         return Undone(row, uuids, fresh=False)
     with station.store.transaction():
         for uuid in uuids:
-            _lift(station, uuid, row.id)
+            _lift(station, uuid, row)
         station.store.put_handover(replace(row, state=UNDONE))
         station.audit("handover", None, "undone", handover=row.id, nodes=[uuid.hex() for uuid in uuids])
     return Undone(row, uuids, fresh=True)
@@ -138,6 +138,8 @@ class Closed:
 def close(station: Station, octets: bytes) -> Closed:
     """Take in the receipt of a bundle that left here; a move is then over: its keys are deleted.
 
+    A copy for several stations is closed when each has sent its receipt.
+
     What the receiver refused comes back to this station, to be rotated at the next contact. Raises NotAuthentic
     (signature, sender, another file), PolicyRefused (not ours, undone), NotFound (unknown id), BadData.
     """
@@ -148,7 +150,8 @@ def close(station: Station, octets: bytes) -> Closed:
         raise NotFound(f"No bundle {receipt.id} left this station.", hint="Give the receipt to the bundle's sender.")
     _check_receipt(station, row, receipt)
     text = octets.strip().decode("ascii")
-    if row.state == CLOSED and (row.mode == "move" or row.receipt == text):
+    texts = (row.receipt or "").split()
+    if text in texts or (row.state == CLOSED and row.mode == "move"):
         return Closed(row, receipt, fresh=False)
     if row.state == UNDONE:
         station.audit("handover", None, "receipt of an undone move", handover=row.id)
@@ -163,12 +166,15 @@ def close(station: Station, octets: bytes) -> Closed:
             station.store.drop_draft(uuid)
         for refused in receipt.refused:
             if row.mode == "move":
-                _lift(station, refused.uuid, row.id)
+                _lift(station, refused.uuid, row)
             else:
                 station.store.remove_holder(refused.uuid, receipt.sender)
-        station.store.put_handover(replace(row, state=CLOSED, receipt=text))
+        texts.append(text)
+        state = CLOSED if len(texts) >= len(row.peers) else row.state
+        row = replace(row, state=state, receipt="\n".join(texts))
+        station.store.put_handover(row)
         detail = {"handover": row.id, "imported": len(receipt.imported), "refused": len(receipt.refused)}
-        station.audit("handover", None, "closed", **detail)
+        station.audit("handover", None, "receipt", state=state, **{"from": receipt.sender}, **detail)
     return Closed(row, receipt, fresh=True)
 
 
@@ -186,12 +192,13 @@ def _check_receipt(station: Station, row: Handover, receipt: Receipt) -> None:
         raise NotAuthentic("The receipt names other nodes than the bundle held.")
 
 
-def _lift(station: Station, uuid: bytes, handover_id: str) -> None:
-    """Let a resting key be used again; as another station has seen it, a new one is due first."""
-    tombstone: Tombstone | None = station.store.tombstone(uuid)
-    if tombstone is not None and tombstone.handover_id == handover_id:
+def _lift(station: Station, uuid: bytes, row: Handover) -> None:
+    """Let a resting key be used again; as another station may have it, a new one is due first."""
+    tombstone = station.store.tombstone(uuid)
+    if tombstone is not None and tombstone.handover_id == row.id:
         station.store.remove_tombstone(uuid)
-        station.demand_rotation(uuid, f"the move {handover_id} did not happen")
+        station.demand_rotation(uuid, f"the move {row.id} did not happen")
+        station.store.put_holder(Holder(uuid, row.peers[0], mode="move"))
 
 
 @dataclass(frozen=True)

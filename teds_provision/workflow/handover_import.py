@@ -22,7 +22,7 @@ from teds_provision.protocol.receipt import Receipt, RefusedNode, seal_receipt
 from teds_provision.protocol.revocation import Revocation as Statement
 from teds_provision.store import Batch, Handover, Holder, KeyRecord, NodeRecord, Revocation, WhitelistEntry, utc_now
 from teds_provision.workflow.handover import IMPORTED, Notes, digest_of
-from teds_provision.workflow.station import CA_OF, ROTATION, Station
+from teds_provision.workflow.station import CA_OF, NEXT_CA, ROTATION, Station
 
 Decision = Literal["new", "newer", "same", "refused"]
 
@@ -319,5 +319,12 @@ class _Arrivals:
         why = f"moved here by {self.bundle.id}: the sender has had this key"
         due = {ROTATION + one.node.uuid.hex(): why for one in taken} if self.bundle.mode == "move" else {}
         said = "" if ca == own else ca.hex()
-        changed = [one.node.uuid for one in taken if one.decision != "same" and self.cas.get(one.node.uuid, own) != ca]
-        return due | {CA_OF + uuid.hex(): said for uuid in changed}
+        for one in taken:
+            uuid = one.node.uuid
+            if one.decision == "same" or self.cas.get(uuid, own) == ca:
+                continue
+            if one.decision == "newer":  # the key held now stays good, under its CA, until the new one is proven
+                due[NEXT_CA + uuid.hex()] = f"{key_id(one.node.key).hex()}:{ca.hex()}"
+            else:
+                due[CA_OF + uuid.hex()] = said
+        return due

@@ -17,8 +17,9 @@ if TYPE_CHECKING:
     from teds_provision.vault import Ask, Vault
 
 DEFAULT_NAME = "station"
-CA_OF, ROTATION = "ca-of:", "rotate:"
-"""Names of settings by node (UUID in hex follows): the CA key that it keeps, and why a rotation is due."""
+CA_OF, NEXT_CA, ROTATION = "ca-of:", "next-ca:", "rotate:"
+"""Names of settings by node (UUID in hex follows): the CA key that it keeps, the one that it keeps if a pending key
+(``keyId:P(CA)``, both hex) turns out to be good, and why a rotation is due."""
 
 
 @dataclass(frozen=True)
@@ -140,6 +141,16 @@ class Station:
         """Note which CA a node keeps."""
         if ca != self.ca_of(uuid):
             self.store.set_setting(_ca_setting(uuid), "" if ca == self.ca else ca.hex())
+
+    def promote(self, uuid: bytes, key_id: str) -> None:
+        """Make a key the active one after a good Open under it; its CA is then the one that the node keeps."""
+        with self.store.transaction():
+            self.store.promote_key(uuid, key_id)
+            named, _, ca = (self.store.setting(NEXT_CA + uuid.hex()) or "").partition(":")
+            if named:
+                self.store.set_setting(NEXT_CA + uuid.hex(), "")
+            if named == key_id:
+                self.set_ca_of(uuid, bytes.fromhex(ca))
 
     def certificate(self, ca: bytes, point: bytes) -> bytes | None:
         """SIG104 of ``ca`` over a station's key as far as it is known here."""

@@ -12,6 +12,7 @@ from pathlib import Path
 import pytest
 
 from teds_provision.errors import NodeRefused, NotAuthentic, NotFound, PolicyRefused, UsageFailure
+from teds_provision.protocol.agreement import key_id
 from teds_provision.protocol.bundle import open_bundle
 from teds_provision.protocol.receipt import open_receipt
 from teds_provision.store import WhitelistEntry
@@ -23,6 +24,7 @@ from teds_provision.workflow.handover_prove import is_proven, prove_node
 from teds_provision.workflow.identify import identify
 from teds_provision.workflow.provision import verify_node
 from teds_provision.workflow.reading import read_image
+from teds_provision.workflow.reset import reset_node
 
 from .bench import Board, MemoryLink, make_station, talk
 from .handover_desk import Pair, everything, held, key_up, node_key_id, provisioned, row, session, trust
@@ -101,6 +103,18 @@ def test_one_bundle_for_several_stations(pair: Pair, tmp_path: Path) -> None:
         assert session(station, pair.board) == 1
     assert {h.fingerprint for h in pair.south.store.holders()} == {pair.north.fingerprint, west.fingerprint}
     assert pair.south.certificate(pair.north.ca, west.point) is not None
+    west.close()
+
+
+def test_a_copy_for_several_is_closed_by_the_last_receipt(pair: Pair, tmp_path: Path) -> None:
+    west = make_station(tmp_path / "west", "west")
+    trust(pair.north, west)
+    trust(west, pair.north)
+    path, exported = pair.export("copy", to=("south", "west"))
+    for station, state in ((pair.south, "open"), (west, "closed")):
+        receipt = pair.take(path, station).receipt
+        assert (close(pair.north, receipt).row.state, close(pair.north, receipt).fresh) == (state, False)
+    assert row(pair.north, exported.plan.id, "out").state == "closed"
     west.close()
 
 
@@ -269,7 +283,9 @@ def test_undo_gives_the_key_back_and_rotates_it_before_anything_else(pair: Pair)
     _, exported = pair.export("move")
     assert undo(pair.north, find_handover(pair.north, exported.plan.id[:8])).fresh
     assert not undo(pair.north, find_handover(pair.north, exported.plan.id)).fresh
+    assert [holder.fingerprint for holder in pair.north.store.holders()] == [pair.south.fingerprint]
     assert session(pair.north, pair.board) == 2
+    assert pair.north.store.holders() == []
     assert session(pair.north, pair.board) == 2
 
 
@@ -512,6 +528,37 @@ def test_a_newer_epoch_comes_in_beside_the_old_key_until_it_is_proven(pair: Pair
     assert held(pair.south, pair.board) == [("pending", 2, "import"), ("active", 1, "import")]
     assert session(pair.south, pair.board) == 2
     assert held(pair.south, pair.board) == [("active", 2, "import")]
+
+
+def test_a_newer_key_under_another_ca_counts_once_it_is_proven(pair: Pair) -> None:
+    """North shares a node; south resets it and keys it under its own CA, then shares it back."""
+    pair.take(pair.export("copy")[0])
+    with talk(pair.board) as node:
+        reset_node(pair.south, node, identify(pair.south, node))
+    key_again(pair.south, pair.board)
+    assert pair.board.state.ca == pair.south.ca
+    bundle = pair.folder / "back.jwe"
+    export_keys(pair.south, plan_export(pair.south, ExportOrder(("north",), None)), bundle)
+    pair.take(bundle, pair.north)
+    assert pair.north.ca_of(pair.board.uuid) == pair.north.ca
+    assert session(pair.north, pair.board) == 2
+    assert pair.north.ca_of(pair.board.uuid) == pair.south.ca
+    assert provisioned(pair.north, pair.board).verified.verdict == "authentic"
+
+
+def test_a_claimed_key_under_another_ca_does_not_spoil_the_one_in_use(pair: Pair) -> None:
+    """A trusted station that errs, or lies: its key is never proven, and the node stays reachable and writable."""
+    path, _ = pair.export("copy")
+    pair.take(path)
+    key = bytes(range(16))
+    pair.south.add_pending(pair.board.uuid, key=key, key_id=key_id(key), epoch=9)
+    pair.south.store.promote_key(pair.board.uuid, key_id(key).hex())
+    pair.south.set_ca_of(pair.board.uuid, pair.south.ca)
+    bundle = pair.folder / "lie.jwe"
+    export_keys(pair.south, plan_export(pair.south, ExportOrder(("north",), None)), bundle)
+    pair.take(bundle, pair.north)
+    assert session(pair.north, pair.board) == 1
+    assert provisioned(pair.north, pair.board).verified.verdict == "authentic"
 
 
 def test_a_uuid_known_with_another_node_key_is_refused_and_the_rest_comes_in(tmp_path: Path) -> None:
