@@ -71,7 +71,7 @@ class App:
             if callable(human):
                 human(console)
             elif isinstance(human, str):
-                console.print(human, markup=False)
+                console.print(harmless(human), markup=False)
             else:
                 console.print(human)
 
@@ -102,13 +102,13 @@ class App:
         """Say something on stderr, unless --quiet (or fewer ``-v`` than ``level``); not with --json."""
         if not self.quiet and not self.json and self.verbose >= level:
             self.live_line()
-            print(text, file=sys.stderr, flush=True)
+            print(harmless(text), file=sys.stderr, flush=True)
 
     def warn(self, text: str) -> None:
         """Warn on stderr, also with --json; only --quiet silences it."""
         self.live_line()
         if not self.quiet:
-            print(f"Warning: {text}", file=sys.stderr, flush=True)
+            print(harmless(f"Warning: {text}"), file=sys.stderr, flush=True)
 
     def fail_line(self, error: TedsProvisionError) -> None:
         """Tell an error that does not end the command (``--watch``): one JSON object, or a line on stderr."""
@@ -117,9 +117,8 @@ class App:
             told = {"code": error.code, "message": error.message, "hint": error.hint}
             print(json.dumps({"error": told}, ensure_ascii=False), flush=True)
         else:
-            print(
-                f"Error: {error.message}" + (f"\n  → {error.hint}" if error.hint else ""), file=sys.stderr, flush=True
-            )
+            told_lines = f"Error: {error.message}" + (f"\n  → {error.hint}" if error.hint else "")
+            print(harmless(told_lines), file=sys.stderr, flush=True)
 
     # -- asking ----------------------------------------------------------------------------------------------------
 
@@ -173,6 +172,11 @@ class App:
         self.live_line()
         while self._closers:
             self._closers.pop()()
+
+
+def harmless(text: str) -> str:
+    """Text for a terminal: nothing in it that a node, a tag or a file brought can steer the terminal."""
+    return "".join(character if character.isprintable() or character in "\n\t" else "?" for character in text)
 
 
 def read_line(descriptor: int) -> str:

@@ -13,7 +13,7 @@ from typing import Any
 import click
 
 from teds_provision import __version__
-from teds_provision.cli.context import App
+from teds_provision.cli.context import App, harmless
 from teds_provision.cli.table import COMMANDS, GROUPS, SECTIONS
 from teds_provision.errors import BadData, TedsProvisionError
 
@@ -152,9 +152,7 @@ def run(arguments: list[str]) -> int:
     except click.exceptions.Exit as finished:
         return finished.exit_code
     except (click.Abort, KeyboardInterrupt):
-        _settle()
-        _say("Interrupted: the same command carries on from here.")
-        return INTERRUPTED
+        return _fail(arguments, INTERRUPTED, "interrupted", "Interrupted: the same command carries on from here.", "")
     except click.ClickException as error:
         return _fail(arguments, 2, "usage", _usage(error), _usage_hint(error))
     except TedsProvisionError as error:
@@ -213,11 +211,11 @@ def _fail(arguments: list[str], exit_code: int, code: str, message: str, hint: s
         with contextlib.suppress(BrokenPipeError):
             print(json.dumps({"error": {"code": code, "message": message, "hint": hint}}), flush=True)
     else:
-        _say(f"Error: {message}")
+        _say(message if exit_code == INTERRUPTED else f"Error: {message}")
         if hint:
             _say(f"  → {hint}")
     return exit_code
 
 
 def _say(text: str) -> None:
-    print(text, file=sys.stderr, flush=True)
+    print(harmless(text), file=sys.stderr, flush=True)

@@ -6,6 +6,7 @@ import sys
 import time
 from typing import TYPE_CHECKING
 
+from teds_provision.cli.context import harmless
 from teds_provision.workflow.progress import NOTHING, Reporter, Silent, StepResult
 
 if TYPE_CHECKING:
@@ -108,7 +109,7 @@ class LiveReporter:
             self._show()
         else:
             self._stop()
-            self._console.print(f"… {notice.text}", style="yellow", markup=False)
+            self._console.print(harmless(f"… {notice.text}"), style="yellow", markup=False)
 
     def written(self, octets: int, total: int) -> None:
         """Show how far the transfer is."""
@@ -130,10 +131,11 @@ class LiveReporter:
 
     def _render(self) -> RenderableType:
         from rich.spinner import Spinner
+        from rich.text import Text
 
         left = "" if self._until is None else f" ({max(0.0, self._until - time.monotonic()):.0f} s left)"
         what = f"  {self._what}{left}" if self._what else ""
-        return Spinner("dots", text=f"{self._step}{what}")
+        return Spinner("dots", text=Text(harmless(f"{self._step}{what}")))  # a bare text would be read as markup
 
     def close(self) -> None:
         """Take the live line away."""

@@ -7,10 +7,13 @@ from pathlib import Path
 
 import click
 import pytest
+from rich.spinner import Spinner
 
 from teds_provision.cli.context import App
 from teds_provision.cli.provision import _plan, _runner
+from teds_provision.cli.rendering import LiveReporter
 from teds_provision.errors import NotAuthentic
+from teds_provision.links.nfc.message import Record
 from teds_provision.store import StoreLock, WhitelistEntry
 from teds_provision.workflow.agree import agree
 from teds_provision.workflow.build import BuildOrder, build
@@ -19,6 +22,7 @@ from teds_provision.workflow.progress import Silent
 from teds_provision.workflow.signing import SignOrder, sign_image
 
 from ..workflow.bench import Board, make_station, talk
+from .shell import call
 
 ANGLE = BuildOrder(profile="magnetic-angular-position-sensor")
 
@@ -77,3 +81,38 @@ def test_the_store_is_free_while_a_person_is_asked(tmp_path: Path, monkeypatch: 
         done = _runner(App(home=home, quiet=True), station, ANGLE, False, Silent())(node)
     assert done.verified.verdict == "authentic"
     assert len(asked) == 1
+
+
+def test_nothing_that_a_tag_says_steers_the_terminal(capsys: pytest.CaptureFixture[str]) -> None:
+    hostile = Record(4, b"x\x1b]0;mine\x07[red]").name
+    assert hostile == "urn:nfc:ext:x\\x1b]0;mine\\x07[red]"
+    app = App()
+    app.note("a\x1b[2Jb\u202ec\u009b")
+    app.warn("a\x1b[2Jb")
+    app.fail_line(NotAuthentic("a\x1b[2Jb\r", hint="c\x9bd"))
+    app.emit({}, "a\x1b[2Jb\nnext [line]")
+    said = capsys.readouterr()
+    assert said.out == "a?[2Jb\nnext [line]\n"
+    assert said.err == "a?[2Jb?c?\nWarning: a?[2Jb\nError: a?[2Jb?\n  → c?d\n"
+
+
+def test_what_is_waited_for_is_no_markup() -> None:
+    reporter = LiveReporter(App())
+    reporter._what = "Looking on udp_multicast:[ff02::1] \x1b[2J"
+    shown = reporter._render()
+    assert isinstance(shown, Spinner)
+    assert str(shown.text).strip() == "Looking on udp_multicast:[ff02::1] ?[2J"
+
+
+@pytest.mark.parametrize("ended", [KeyboardInterrupt, click.Abort])
+def test_an_interrupted_command_says_so_in_json_too(
+    ended: type[BaseException], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def end(_home: Path, **_: object) -> None:
+        raise ended
+
+    monkeypatch.setattr("teds_provision.workflow.station.Station.open", end)
+    said = call(tmp_path, "--json", "nodes")
+    assert (said.code, said.json["error"]["code"]) == (130, "interrupted")
+    told = call(tmp_path, "nodes")
+    assert (told.code, told.out, told.err) == (130, "", "Interrupted: the same command carries on from here.\n")

@@ -26,8 +26,8 @@ class Record:
 
     @property
     def name(self) -> str:
-        """The type as people write it, e.g. ``urn:nfc:wkt:U`` or ``text/plain``; octets outside ASCII escaped."""
-        return _NAMES[self.tnf] + self.type.decode("ascii", "backslashreplace")
+        """The type as people write it, e.g. ``urn:nfc:wkt:U`` or ``text/plain``; all but printable ASCII escaped."""
+        return _NAMES[self.tnf] + "".join(chr(octet) if 32 <= octet < 127 else f"\\x{octet:02x}" for octet in self.type)
 
     def is_external(self, name: bytes) -> bool:
         """Tell whether this is the external type ``name`` (compared without case, as the NFC Forum asks)."""
