@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import sys
 from io import TextIOWrapper
 
@@ -18,9 +19,19 @@ def main() -> None:
     try:
         from teds_provision.cli.main import run
 
-        sys.exit(run(sys.argv[1:]))
+        sys.exit(_told(run(sys.argv[1:])))
     except KeyboardInterrupt:  # while Python was still importing, or already leaving
         sys.exit(130)
+
+
+def _told(code: int) -> int:
+    """The exit code, once stdout is written out; 1 where its reader went away (``| head``), without a word."""
+    try:
+        sys.stdout.flush()
+    except BrokenPipeError:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # Python flushes once more when it ends
+        return code or 1
+    return code
 
 
 if __name__ == "__main__":
