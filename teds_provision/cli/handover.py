@@ -32,7 +32,13 @@ _MEANS = {
 @click.option("--to", "receivers", multiple=True, required=True, metavar="STATION", help="Name, fingerprint or PEM.")
 @click.option("--all", "everything", is_flag=True, help="Every node whose key is held and proven.")
 @click.option("--mode", type=click.Choice(["copy", "move"]), default="copy", show_default=True, help="Share, or give.")
-@click.option("--output", type=click.Path(path_type=Path, dir_okay=False), required=True, metavar="FILE")
+@click.option(
+    "--output",
+    type=click.Path(path_type=Path, dir_okay=False),
+    required=True,
+    metavar="FILE",
+    help="Where the sealed bundle goes.",
+)
 @click.option(
     "--expires",
     type=click.IntRange(1, 365),
@@ -60,7 +66,7 @@ def export_keys(
     """Hand node keys to other base stations in one bundle, sealed to them and signed by this one.
 
     Nothing is ever written unsealed. A move marks the nodes as given away before the file exists; its receipt closes
-    it (handover receipt), handover undo takes it back before that.
+    it ("handover receipt"); before that "handover undo" takes it back.
     """
     from teds_provision.workflow.handover_export import ExportOrder, plan_export
     from teds_provision.workflow.handover_export import export_keys as run
@@ -266,7 +272,7 @@ def _tell_import(
     lines += [f"  refused {uuid}: {why}" for uuid, why in done.notes.refused]
     lines += [f"  not met {uuid}: {why}" for uuid, why in not_met.items()]
     rotated = sum(bool(one["rotated"]) for one in outcomes)
-    lines += [f"{_count(rotated)} rotated: the sender is locked out of them."] if rotated else []
+    lines += [f"{_count(rotated)} rotated: the sender is locked out for certain."] if rotated else []
     if pending:
         lines.append(f"{_count(len(pending))} not proven yet: their first contact here proves them (agree UUID).")
     lines.append(f"Receipt for the sender: {receipt}")
@@ -317,7 +323,11 @@ def list_(app: App) -> None:
     app.emit({"handovers": rows}, "\n".join(lines) or "No bundle has left or come.")
 
 
-@handover.command(context_settings=COMMAND_SETTINGS, epilog=examples("teds-provision handover receipt lab.jwe.receipt"))
+@handover.command(
+    context_settings=COMMAND_SETTINGS,
+    short_help="Close a handover with the receiver's signed receipt.",
+    epilog=examples("teds-provision handover receipt lab.jwe.receipt"),
+)
 @click.argument("file", type=click.Path(path_type=Path, dir_okay=False))
 @pass_app
 def receipt(app: App, file: Path) -> None:
@@ -348,7 +358,11 @@ def receipt(app: App, file: Path) -> None:
     app.emit(told, "\n".join([text, *lines]))
 
 
-@handover.command(context_settings=COMMAND_SETTINGS, epilog=examples("teds-provision handover undo 3d1a4d1c --yes"))
+@handover.command(
+    context_settings=COMMAND_SETTINGS,
+    short_help="Take a move back before its receipt.",
+    epilog=examples("teds-provision handover undo 3d1a4d1c --yes"),
+)
 @click.argument("id_", metavar="ID")
 @yes_option
 @dry_run_option
