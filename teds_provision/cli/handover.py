@@ -104,16 +104,21 @@ def _exported(plan: ExportPlan, output: Path, station: Station) -> dict[str, Any
         "expires": plan.expires.strftime("%Y-%m-%dT%H:%M:%SZ"),
         "nodes": [node.uuid.hex() for node, _ in plan.nodes],
         "skipped": [{"uuid": uuid.hex(), "why": why} for uuid, why in plan.skipped],
+        "also_held_by": list(plan.also_held_by),
     }
 
 
 def _plan_text(plan: ExportPlan, station: Station) -> str:
+    from teds_provision.workflow.handover import peer_name
     from teds_provision.workflow.trust import spoken
 
     lines = [f"{plan.mode.capitalize()} {_count(len(plan.nodes))}, to be imported by {plan.expires:%Y-%m-%d %H:%M} UTC"]
     lines += [f"  {node.uuid.hex()}  epoch {key.epoch}  {node.name or ''}".rstrip() for node, key in plan.nodes[:20]]
     lines += [f"  … and {len(plan.nodes) - 20} more"] if len(plan.nodes) > 20 else []
     lines += [f"  not {uuid.hex()}: {why}" for uuid, why in plan.skipped]
+    if plan.also_held_by:
+        names = ", ".join(peer_name(station, digits) for digits in plan.also_held_by)
+        lines.append(f"  also held, by an earlier copy, by {names}: until the keys are rotated")
     lines.append("For comparison by voice:")
     lines += [f"  to   {record.name}\n       {spoken(record.fingerprint)}" for record in plan.receivers]
     lines.append(f"  from {station.name}\n       {spoken(station.fingerprint)}")

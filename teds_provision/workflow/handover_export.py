@@ -42,7 +42,8 @@ class ExportOrder:
 class ExportPlan:
     """What would be handed over. ``skipped`` are nodes that ``--all`` leaves out, and why.
 
-    ``earlier`` is the open handover that this one carries on: the same keys to the same stations.
+    ``earlier`` is the open handover that this one carries on: the same keys to the same stations. ``also_held_by`` are
+    other stations (fingerprints) that hold a copy of any of these keys.
     """
 
     id: str
@@ -55,6 +56,7 @@ class ExportPlan:
     content: str
     expires: datetime
     earlier: Handover | None
+    also_held_by: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -92,7 +94,17 @@ def plan_export(station: Station, order: ExportOrder, now: datetime | None = Non
         expires = now.replace(microsecond=0) + timedelta(days=order.days)
     handover_id = earlier.id if earlier else str(uuids.uuid4())
     return ExportPlan(
-        handover_id, order.mode, receivers, ca, signatures, tuple(nodes), tuple(skipped), content, expires, earlier
+        handover_id,
+        order.mode,
+        receivers,
+        ca,
+        signatures,
+        tuple(nodes),
+        tuple(skipped),
+        content,
+        expires,
+        earlier,
+        _other_holders(station, nodes, receivers),
     )
 
 
@@ -220,6 +232,15 @@ def _signature(station: Station, ca: bytes, receiver: TrustRecord) -> bytes:
             hint="Where the CA key is kept: trust ca sign REQUEST --output CERT; here: trust add NAME CERT",
         )
     return known
+
+
+def _other_holders(
+    station: Station, nodes: list[tuple[NodeRecord, KeyRecord]], receivers: tuple[TrustRecord, ...]
+) -> tuple[str, ...]:
+    """Stations besides the receivers that hold any of these keys since an earlier copy."""
+    chosen = {node.uuid for node, _ in nodes}
+    found = {holder.fingerprint for holder in station.store.holders() if holder.uuid in chosen}
+    return tuple(sorted(found - {record.fingerprint for record in receivers}))
 
 
 def _is_same(row: Handover, content: str, now: datetime) -> bool:

@@ -162,6 +162,21 @@ def test_people_are_shown_both_fingerprints_in_fours_and_what_it_means(homes: Ho
     assert "will be trusted for these nodes, and for no others" in done.err
 
 
+def test_a_move_tells_who_else_holds_a_copy(homes: Homes) -> None:
+    from teds_provision.store import TrustRecord
+
+    north = open_station(homes.north)
+    west = SoftwareKey(61)
+    north.store.put_trust(TrustRecord("west", "station", west.point, fingerprint(west.point)))
+    north.close()
+    words = ["export-keys", "--all", "--yes", "--output"]
+    assert homes.run(homes.north, *words, homes.folder / "copy.jwe", "--to", "west").code == 0
+    move = [*words, homes.folder / "move.jwe", "--to", "south", "--mode", "move"]
+    assert homes.run(homes.north, *move, "--dry-run").json["also_held_by"] == [fingerprint(west.point)]
+    said = spawn("--home", homes.north, *move, passphrase=PASSPHRASE)
+    assert "also held, by an earlier copy, by west" in said.err
+
+
 def test_it_asks_and_nobody_answers(homes: Homes) -> None:
     output = homes.folder / "keys.jwe"
     homes.refused(2, "export-keys", "--to", "south", "--all", "--output", output, home=homes.north)
