@@ -16,20 +16,23 @@ from teds_provision.protocol.frames import (
     security_command,
 )
 from teds_provision.protocol.identity import Identity
-from teds_provision.teds.image import BlockId, Image
+from teds_provision.teds.image import SECURITY, BlockId, Image
 from teds_provision.workflow.conversation import Conversation
 
 LARGEST_TEDS = 1 << 20
+LARGEST_SECURITY = 4094 - 78
+"""A Security TEDS fits into the sealed reply to Request, a frame of at most 4094 octets (wire, "maxMessage")."""
 LARGEST_IMAGE = 4 << 20
 
 
 def read_block(node: Conversation, block: BlockId) -> bytes:
     """Read one TEDS, segment by segment, as long as its Length says (or as the node has octets).
 
-    Raises NodeRefused (18: no such TEDS), Garbled, BadData for a Length beyond 1 MiB.
+    Raises NodeRefused (18: no such TEDS), Garbled, BadData for a Length beyond 1 MiB (of a Security TEDS, 4016 octets).
     """
     channel, access_code = block
-    octets = b""
+    largest = LARGEST_SECURITY if block == SECURITY else LARGEST_TEDS
+    octets = bytearray()
     while True:
         payload = node.ask(
             read_teds(channel, access_code, len(octets)), f"to read TEDS {access_code} of channel {channel}"
@@ -37,11 +40,11 @@ def read_block(node: Conversation, block: BlockId) -> bytes:
         if len(payload) < 4 or int.from_bytes(payload[:4], "big") != len(octets):
             raise Garbled(f"The node read TEDS {access_code} of channel {channel} from another offset than was asked.")
         octets += payload[4:]
-        total = 4 + int.from_bytes(octets[:4], "big") if len(octets) >= 4 else LARGEST_TEDS
+        total = 4 + int.from_bytes(octets[:4], "big") if len(octets) >= 4 else largest
         if len(payload) == 4 or len(octets) >= total:
-            return octets
-        if total > LARGEST_TEDS:
-            raise BadData(f"TEDS {access_code} of channel {channel} claims {total} octets; 1 MiB is the most read.")
+            return bytes(octets)
+        if total > largest:
+            raise BadData(f"TEDS {access_code} of channel {channel} claims {total} octets; {largest} is the most read.")
 
 
 def list_blocks(node: Conversation) -> list[BlockId]:

@@ -18,6 +18,7 @@ from teds_provision.links.nfc.tnep import TIM_TYPE
 _HEAD = struct.Struct(">BBHHH")
 _ANSWER, _MORE = 1, 2
 _PIECE_HEAD = _HEAD.size + 4  # 12 octets before the body
+LONGEST_FRAME = 4094  # octets: the largest maxMessage (wire, "maxMessage")
 
 
 @dataclass(frozen=True)
@@ -88,7 +89,7 @@ class Requester:
     def steps_allowed(self) -> int:
         """How many messages a well-behaved node may need at most; more of them go nowhere.
 
-        A node may give as few as 8 octets of its reply at a time: 65,535 octets are the most that a total can say.
+        A node may give as few as 8 octets of its reply at a time.
         """
         return len(self._frame) // self._room + (self._total or 0) // 8 + 16
 
@@ -116,6 +117,8 @@ class Requester:
         return True
 
     def _take_reply(self, piece: Piece) -> None:
+        if piece.total > LONGEST_FRAME:
+            raise Garbled(f"The node announces a reply of {piece.total} octets; {LONGEST_FRAME} is the most.")
         if self._total is None:
             self._total = piece.total
         if piece.total != self._total:

@@ -15,6 +15,7 @@ from teds_provision.links.nfc.message import Record
 from teds_provision.links.nfc.pieces import Piece, Requester, room
 
 PATIENCE = 5.0  # seconds that a station goes on reading
+LONGEST = 120.0  # seconds that one transaction may take, however the node spins it out
 _REREADS = 3  # of a torn message
 _STATUS_OCTETS = len(message.encode([tnep.status(0)]))
 
@@ -58,10 +59,12 @@ class Poller:
             )
         self._select()
         requester = Requester(transaction, frame, octets)
-        steps = 0
+        steps, end = 0, self._clock() + LONGEST
         while (reply := requester.reply) is None:
             if steps > requester.steps_allowed:
                 raise Garbled("The node asks for the same pieces again and again.")
+            if self._clock() > end:
+                raise NodeSilent(f"The node did not come to an end of its reply within {LONGEST:.0f} s.")
             steps += 1
             request = message.encode([tnep.payload_record(requester.next().encode())])
             self._exchange(request, lambda records: _take(records, requester))

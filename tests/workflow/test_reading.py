@@ -1,0 +1,33 @@
+"""What a node may make a station read before anything is known of it."""
+
+from __future__ import annotations
+
+import pytest
+
+from teds_provision.errors import BadData
+from teds_provision.protocol.frames import Reply
+from teds_provision.teds.image import SECURITY
+from teds_provision.workflow.reading import LARGEST_SECURITY, read_block
+
+from .bench import Board, MemoryLink, talk
+
+
+@pytest.mark.parametrize(("block", "most"), [(SECURITY, LARGEST_SECURITY), ((0, 1), 1 << 20)])
+def test_a_teds_that_claims_to_be_endless_is_not_read(board: Board, block: tuple[int, int], most: int) -> None:
+    def claim(count: int, _reply: bytes) -> bytes:
+        return Reply(True, (0).to_bytes(4, "big") + most.to_bytes(4, "big")).encode()
+
+    link = MemoryLink(board, tamper=claim)
+    with pytest.raises(BadData, match=f"{most} is the most"):
+        read_block(talk(board, link), block)
+    assert link.count == 1
+
+
+def test_the_largest_security_teds_is_read_octet_by_octet(board: Board) -> None:
+    teds = (LARGEST_SECURITY - 4).to_bytes(4, "big") + bytes(LARGEST_SECURITY - 4)
+
+    def drip(count: int, _reply: bytes) -> bytes:
+        at = count - 1
+        return Reply(True, at.to_bytes(4, "big") + teds[at : at + 1]).encode()
+
+    assert read_block(talk(board, MemoryLink(board, tamper=drip)), SECURITY) == teds
