@@ -37,7 +37,13 @@ def _uuid(_ctx: click.Context, _parameter: click.Parameter, text: str | None) ->
     return octets
 
 
-@node.command(context_settings=COMMAND_SETTINGS)
+@node.command(
+    context_settings=COMMAND_SETTINGS,
+    epilog=examples(
+        "teds-provision node create bench/finger",
+        "teds-provision node create bench/angle --uuid 8d4d9da65281f7000000 --name angle",
+    ),
+)
 @click.argument("folder", metavar="DIR", type=click.Path(path_type=Path, file_okay=False))
 @click.option("--uuid", callback=_uuid, metavar="HEX", help="Its UUID, 20 hex digits (default: random).")
 @click.option("--name", default="", help="What its maker calls it.")
@@ -46,7 +52,8 @@ def _uuid(_ctx: click.Context, _parameter: click.Parameter, text: str | None) ->
     type=click.IntRange(1024, 4094),
     default=2048,
     show_default=True,
-    help="Octets of its longest frame.",
+    metavar="OCTETS",
+    help="Length of its longest frame.",
 )
 @pass_app
 def create(app: App, folder: Path, uuid: bytes | None, name: str, max_message: int) -> None:
@@ -63,7 +70,14 @@ def create(app: App, folder: Path, uuid: bytes | None, name: str, max_message: i
     )
 
 
-@node.command(context_settings=COMMAND_SETTINGS)
+@node.command(
+    context_settings=COMMAND_SETTINGS,
+    short_help="Run the node in DIR until SIGTERM or Ctrl-C.",
+    epilog=examples(
+        "teds-provision node run bench/finger --nfc udp:localhost:54321",
+        "teds-provision node run bench/finger --nfc udp:localhost:54321 --can udp_multicast:239.74.163.2",
+    ),
+)
 @click.argument("folder", metavar="DIR", type=click.Path(path_type=Path, file_okay=False))
 @click.option("--nfc", metavar="PATH", help="Lie on this simulated reader: udp:localhost:54321.")
 @click.option("--tag", type=click.Choice(["4", "2"]), default="4", show_default=True, help="NFC Forum tag type.")
@@ -134,7 +148,11 @@ def _servers(node: Any, *, nfc: str | None, tag: Any, can: str | None, pace: boo
     return servers
 
 
-@node.command(context_settings=COMMAND_SETTINGS)
+@node.command(
+    context_settings=COMMAND_SETTINGS,
+    short_help="Reset the node in DIR by hand.",
+    epilog=examples("teds-provision node reset bench/finger"),
+)
 @click.argument("folder", metavar="DIR", type=click.Path(path_type=Path, file_okay=False))
 @pass_app
 def reset(app: App, folder: Path) -> None:

@@ -36,7 +36,9 @@ def link_options(function: Function) -> Function:
         return function(*args, links=LinkSettings(via, nfc, can, ble, timeout), **rest)
 
     options = [
-        click.option("--via", type=click.Choice(["nfc", "can", "ble"]), default="nfc", show_default=True, help="Link."),
+        click.option(
+            "--via", type=click.Choice(["nfc", "can", "ble"]), default="nfc", show_default=True, help="The link to use."
+        ),
         click.option("--nfc", metavar="PATH", help="Reader: usb, usb:072f:2200, tty:USB0:pn532, udp:localhost:54321."),
         click.option("--can", metavar="INTERFACE:CHANNEL", help="Bus: socketcan:can0, udp_multicast:239.74.163.2, …"),
         click.option("--ble", metavar="ADAPTER", help="Not in this version."),

@@ -58,7 +58,9 @@ def list_(app: App) -> None:
 
 
 @profile.command(
-    context_settings=COMMAND_SETTINGS, epilog=examples("teds-provision profile show tactile-finger-sensor")
+    context_settings=COMMAND_SETTINGS,
+    short_help="Show one type: channels, units, ranges, calibration.",
+    epilog=examples("teds-provision profile show tactile-finger-sensor"),
 )
 @click.argument("name")
 @pass_app

@@ -16,13 +16,14 @@ _FILE = click.Path(path_type=Path, dir_okay=False)
     "teds-provision init --name bench",
     "teds-provision init --keystore file",
     "teds-provision init --name lab --request lab.request",
+    "teds-provision init --certificate lab.cert",
 )
 @click.option("--name", help="The station's name, shown in every datasheet that it signs.")
 @click.option(
     "--keystore", metavar="keyring|file|pkcs11:URI", help="Where the keys lie (default: the keyring if one works)."
 )
 @click.option("--request", type=_FILE, metavar="FILE", help="Make no CA key; ask for another's signature in FILE.")
-@click.option("--certificate", type=_FILE, metavar="CERT", help="Take in what trust ca sign gave for that request.")
+@click.option("--certificate", type=_FILE, metavar="CERT", help='Take in what "trust ca sign" gave for that request.')
 @yes_option
 @pass_app
 def init(
@@ -31,7 +32,7 @@ def init(
     """Make this base station's identity and its CA key; a second run shows them.
 
     The keys lie in the OS keyring, in a PKCS #11 token, or sealed under a passphrase. Stations of one owner share one
-    CA: --request here, trust ca sign where the CA key is, --certificate here.
+    CA: --request here, "trust ca sign" where the CA key is, --certificate here.
     """
     from teds_provision.protocol.keys import fingerprint, to_pem
     from teds_provision.workflow.station import initialise

@@ -30,6 +30,7 @@ def trust() -> None:
 
 @trust.command(
     context_settings=COMMAND_SETTINGS,
+    short_help="Trust the public key of a station or CA.",
     epilog=examples("teds-provision trust add lab keys/lab.pem", "teds-provision trust add --from keys/ --yes"),
 )
 @click.argument("name", required=False)
@@ -48,7 +49,7 @@ def add(
     yes: bool,
     dry_run: bool,
 ) -> None:
-    """Trust the public key of a station or CA: a PEM file, or the certificate that trust ca sign gave.
+    """Trust the public key of a station or CA: a PEM file, or the certificate that "trust ca sign" gave.
 
     Compare the fingerprint with its owner by voice. In a folder NAME.pem and NAME.cert are stations, NAME.ca.pem CAs.
     """
@@ -153,13 +154,19 @@ def list_(app: App) -> None:
 @trust.group(
     "ca",
     context_settings=COMMAND_SETTINGS,
+    short_help="The owner's CA key: show, sign with it, export, drop, import.",
     epilog=examples("teds-provision trust ca sign lab.request --output lab.cert"),
 )
 def ca() -> None:
-    """The owner's CA key: it signs station keys, so that stations of one owner write and rekey each other's nodes."""
+    """The owner's CA key: it signs station keys, so that stations of one owner write and rekey each other's nodes.
+
+    The public key is no secret; the private one stays in the vault, or in the encrypted file that export makes.
+    """
 
 
-@ca.command(context_settings=COMMAND_SETTINGS, epilog=examples("teds-provision trust ca create"))
+@ca.command(
+    context_settings=COMMAND_SETTINGS, short_help="Show the CA key.", epilog=examples("teds-provision trust ca create")
+)
 @pass_app
 def create(app: App) -> None:
     """Show the CA key, which init made; a station that another CA certified has none."""
@@ -174,6 +181,7 @@ def create(app: App) -> None:
 
 @ca.command(
     context_settings=COMMAND_SETTINGS,
+    short_help="Certify the station that made REQUEST with init --request.",
     epilog=examples("teds-provision trust ca sign lab.request --output lab.cert --yes"),
 )
 @click.argument("request", type=_FILE)
@@ -208,11 +216,18 @@ def sign(app: App, request: Path, output: Path, yes: bool, dry_run: bool) -> Non
     app.emit({**told, "fresh": fresh}, text if fresh else f"Nothing to do, {output} is there already.")
 
 
-@ca.command(context_settings=COMMAND_SETTINGS, epilog=examples("teds-provision trust ca export owner-ca.pem"))
+@ca.command(
+    context_settings=COMMAND_SETTINGS,
+    short_help="Write the CA key to a new file, encrypted under a passphrase.",
+    epilog=examples("teds-provision trust ca export owner-ca.pem"),
+)
 @click.argument("file", type=_FILE)
 @pass_app
 def export(app: App, file: Path) -> None:
-    """Write the CA key to a new file, encrypted under a passphrase (PKCS #8); the vault keeps it until ca drop."""
+    """Write the CA key to a new file, encrypted under a passphrase (PKCS #8).
+
+    The vault keeps it until "trust ca drop".
+    """
     from teds_provision.workflow.fleet import export_ca
 
     station = app.station()
@@ -242,7 +257,7 @@ def drop(app: App, yes: bool) -> None:
 @click.argument("file", type=_FILE)
 @pass_app
 def import_(app: App, file: Path) -> None:
-    """Bring the CA key back from the file of ca export."""
+    """Bring the CA key back from the file that "trust ca export" wrote."""
     from teds_provision.protocol.keys import fingerprint
     from teds_provision.workflow.fleet import import_ca
 

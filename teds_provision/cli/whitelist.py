@@ -42,7 +42,11 @@ def _fingerprint(_ctx: click.Context, _parameter: click.Parameter, text: str | N
     return digits
 
 
-@whitelist.command(context_settings=COMMAND_SETTINGS)
+@whitelist.command(
+    context_settings=COMMAND_SETTINGS,
+    short_help="Whitelist one node.",
+    epilog=examples("teds-provision whitelist add 8d4d9da65281f7000000 --name finger-1"),
+)
 @click.argument("uuid")
 @click.option(
     "--fingerprint", "-f", callback=_fingerprint, metavar="F", help="Fingerprint of the node's key, 64 hex digits."
@@ -69,7 +73,11 @@ def add(app: App, uuid: str, fingerprint: str | None, name: str | None, dry_run:
     _emit_plan(app, station, plan, dry_run=False)
 
 
-@whitelist.command(context_settings=COMMAND_SETTINGS)
+@whitelist.command(
+    context_settings=COMMAND_SETTINGS,
+    short_help="Take a node off the whitelist and forget its pinned key.",
+    epilog=examples("teds-provision whitelist remove 8d4d --yes"),
+)
 @click.argument("uuid")
 @yes_option
 @dry_run_option
@@ -96,10 +104,13 @@ def remove(app: App, uuid: str, yes: bool, dry_run: bool) -> None:
     _emit(app, station, text, removed=entry is not None and not dry_run)
 
 
-@whitelist.command("list", context_settings=COMMAND_SETTINGS)
+@whitelist.command("list", context_settings=COMMAND_SETTINGS, epilog=examples("teds-provision whitelist list"))
 @pass_app
 def list_entries(app: App) -> None:
-    """Show every entry."""
+    """Show every entry.
+
+    UUID, the pinned key, how well it was proven, when the entry was added, and the node's name.
+    """
     station = app.station()
     entries = station.store.whitelist()
 
@@ -123,7 +134,11 @@ def list_entries(app: App) -> None:
     app.emit({"whitelist": [as_dict(entry) for entry in entries]}, human)
 
 
-@whitelist.command("import", context_settings=COMMAND_SETTINGS)
+@whitelist.command(
+    "import",
+    context_settings=COMMAND_SETTINGS,
+    epilog=examples("teds-provision whitelist import ncap.xml --dry-run", "teds-provision whitelist import ncap.xml"),
+)
 @click.argument("file", type=click.Path(path_type=Path))
 @click.option("--format", "form", type=click.Choice(["xml", "csv", "json"]), help="Default: by extension or content.")
 @dry_run_option
@@ -149,7 +164,12 @@ def import_file(app: App, file: Path, form: str | None, dry_run: bool) -> None:
     _emit_plan(app, station, plan, dry_run=False)
 
 
-@whitelist.command("export", context_settings=COMMAND_SETTINGS)
+@whitelist.command(
+    "export",
+    context_settings=COMMAND_SETTINGS,
+    short_help="Write every entry to a file.",
+    epilog=examples("teds-provision whitelist export whitelist.csv"),
+)
 @click.argument("file", type=click.Path(path_type=Path, dir_okay=False))
 @click.option("--format", "form", type=click.Choice(["xml", "csv", "json"]), help="Default: by extension, else xml.")
 @dry_run_option

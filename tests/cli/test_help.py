@@ -1,0 +1,127 @@
+"""Help is written for every command, its examples can be typed as they stand, and showing it loads nothing heavy."""
+
+from __future__ import annotations
+
+import shlex
+import subprocess
+import sys
+from collections.abc import Iterator
+from contextlib import ExitStack
+
+import click
+import pytest
+
+from teds_provision.cli.main import cli
+from teds_provision.cli.table import COMMANDS, GROUPS
+
+from .shell import clean_environment
+
+HEAVY = ("nfc", "can", "isotp", "keyring", "rich", "cryptography", "pint", "numpy", "matplotlib", "pkcs11", "sqlite3")
+PROGRAM = "teds-provision"
+WIDTH, TERMINAL = 100, 80
+
+
+def walk(group: click.Group, path: tuple[str, ...]) -> Iterator[tuple[tuple[str, ...], click.Command]]:
+    """Every command under a group, with the words that call it."""
+    with click.Context(group) as context:
+        for name in group.list_commands(context):
+            command = group.get_command(context, name)
+            assert command is not None
+            yield (*path, name), command
+            if isinstance(command, click.Group):
+                yield from walk(command, (*path, name))
+
+
+ALL = dict(walk(cli, ()))
+every_command = pytest.mark.parametrize(("words", "command"), ALL.items(), ids=[" ".join(words) for words in ALL])
+
+
+def examples(command: click.Command) -> list[str]:
+    """The lines under "Examples:" in a command's help."""
+    lines = (command.epilog or "").splitlines()
+    return [line.strip() for line in lines[lines.index("Examples:") + 1 :]] if "Examples:" in lines else []
+
+
+def chain(stack: ExitStack, words: list[str]) -> list[click.Context]:
+    """Parse a command line as the program does, and run nothing of it."""
+    contexts = [cli.make_context(PROGRAM, words)]
+    while True:
+        context = stack.enter_context(contexts[-1])
+        if not isinstance(context.command, click.Group):
+            return contexts
+        rest = [*context._protected_args, *context.args]
+        name, command, rest = context.command.resolve_command(context, rest)
+        assert command is not None
+        contexts.append(command.make_context(name, rest, parent=context))
+
+
+def test_the_table_says_which_commands_have_commands_of_their_own() -> None:
+    assert {words[0] for words in ALL if len(words) > 1} == GROUPS
+    assert {words[0] for words in ALL} == set(COMMANDS)
+
+
+@every_command
+def test_every_command_says_in_a_sentence_what_it_does(words: tuple[str, ...], command: click.Command) -> None:
+    first = (command.help or "").split("\n\n")[0].strip()
+    assert first.endswith((".", "!")), f"{words}: {first!r}"
+    assert first[0].isupper()
+
+
+@every_command
+def test_the_line_in_its_groups_help_is_whole(words: tuple[str, ...], command: click.Command) -> None:
+    longest = max(len(other[-1]) for other in ALL if other[:-1] == words[:-1])
+    if len(words) == 1:
+        assert len(COMMANDS[words[0]].help) < WIDTH - longest - 4
+        return
+    room = TERMINAL - 2 - longest - 6  # as click counts
+    line = command.get_short_help_str(room)
+    assert not line.endswith("..."), line
+    assert len(line) <= room
+
+
+@every_command
+def test_every_option_is_explained(words: tuple[str, ...], command: click.Command) -> None:
+    options = [parameter for parameter in command.params if isinstance(parameter, click.Option)]
+    unexplained = [option.opts[-1] for option in options if not (option.help or "").strip()]
+    assert not unexplained
+    for option in options:  # INTEGER or PATH alone would say nothing of what is meant
+        if not option.is_flag and not isinstance(option.type, click.Choice) and option.name != "name":
+            assert option.metavar, f"{words}: {option.opts[-1]}"
+
+
+@every_command
+def test_every_command_has_an_example_of_itself(words: tuple[str, ...], command: click.Command) -> None:
+    lines = examples(command)
+    assert lines
+    for line in lines:
+        with ExitStack() as stack:
+            contexts = chain(stack, shlex.split(line.partition(" > ")[0])[1:])
+            assert line.split()[0] == PROGRAM
+            assert tuple(context.info_name for context in contexts[1:])[: len(words)] == words, line
+
+
+@every_command
+def test_help_fits_the_width_it_is_written_for(words: tuple[str, ...], command: click.Command) -> None:
+    with click.Context(command, info_name=" ".join((PROGRAM, *words)), max_content_width=WIDTH) as context:
+        shown = command.get_help(context)
+    prose = [line for line in shown.splitlines() if PROGRAM not in line]
+    assert max(map(len, prose)) <= WIDTH
+
+
+def test_examples_fit_on_a_line() -> None:
+    assert {line for command in ALL.values() for line in examples(command) if len(line) > WIDTH + 10} == set()
+
+
+def test_the_help_of_no_command_loads_anything_heavy() -> None:
+    code = (
+        "import sys\n"
+        "from teds_provision.cli.main import run\n"
+        f"for words in {[list(words) for words in ALL]!r}:\n"
+        "    assert run([*words, '--help']) == 0, words\n"
+        f"print([name for name in {HEAVY!r} if name in sys.modules], file=sys.stderr)\n"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, check=True, timeout=60, env=clean_environment()
+    )
+    assert done.stderr.strip() == "[]"
+    assert done.stdout.count("Usage: ") == len(ALL)
