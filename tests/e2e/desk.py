@@ -17,6 +17,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+from teds_provision.store import Store
 from tests.cli.shell import Outcome, clean_environment
 from tests.workflow.bench import PASSPHRASE
 
@@ -185,7 +186,7 @@ class Node:
         where = [*(["--nfc", links.nfc] if nfc else []), *(["--can", links.can] if can else [])]
         self.process = self.desk.start("--json", "node", "run", self.folder, *where, *options)
         (ready,) = self.process.wait_for_lines(1)
-        assert ready["ready"] is True
+        assert ready.get("ready") is True, ready
         return self
 
     def stop(self) -> None:
@@ -271,8 +272,13 @@ class Station:
 
     def keys(self, uuid: str) -> list[tuple[str, int]]:
         """State and epoch of every key that is held for a node."""
-        (node,) = self.ask("nodes", uuid)["nodes"]
-        return [(key["state"], key["epoch"]) for key in node["keys"]]
+        with Store.open(self.home) as store:
+            return [(record.state, record.epoch) for record in store.keys(bytes.fromhex(uuid))]
+
+    def log_is_whole(self) -> bool:
+        """Whether the hash chain of the audit log holds."""
+        with Store.open(self.home) as store:
+            return store.audit.check().intact
 
 
 def _blank(row: tuple[Any, ...]) -> tuple[Any, ...]:
