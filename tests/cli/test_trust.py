@@ -116,3 +116,23 @@ def test_help_loads_no_cryptography(words: list[str]) -> None:
     done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True, timeout=60)
     assert done.stdout.splitlines()[-1] == "HEAVY [] 0"
     assert "Examples:" in done.stdout
+
+
+def test_each_key_of_a_folder_is_asked_for(home: Path, pem: Path) -> None:
+    import os
+    import subprocess
+    import sys
+
+    (pem.parent / "west.pem").write_text(to_pem(SoftwareKey(53).point))
+    main, side = os.openpty()
+    os.write(main, b"n\ny\n")
+    command = [sys.executable, "-m", "teds_provision", "--home", str(home), "trust", "add", "--from", str(pem.parent)]
+    try:
+        done = subprocess.run(command, stdin=side, capture_output=True, text=True, timeout=60, check=False)
+    finally:
+        os.close(main)
+        os.close(side)
+    assert done.returncode == 0, done
+    assert spoken(DIGITS) in done.stderr
+    assert done.stdout == "Trusted from now on: west.\n"
+    assert [one["name"] for one in call(home, "--json", "trust", "list").json["trusted"]] == ["west"]
