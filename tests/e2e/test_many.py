@@ -1,0 +1,82 @@
+"""More than one: several nodes on one bus, two stations on one node, one station run twice at a time."""
+
+from __future__ import annotations
+
+import pytest
+
+from .desk import ANGLE, Desk, Node, Station, results
+
+pytestmark = pytest.mark.link
+
+UUIDS = ("8d4d9da65281f7000000", "8d4d9da65281f7000001", "00112233445566778899")
+
+
+@pytest.fixture
+def bus(desk: Desk) -> list[Node]:
+    """Three nodes that have only a bus, in factory state."""
+    return [desk.node(f"node{at}", uuid=uuid).start(nfc=False, can=True) for at, uuid in enumerate(UUIDS)]
+
+
+def test_several_nodes_on_the_bus_are_listed_and_named(station: Station, bus: list[Node]) -> None:
+    links = station.desk.links.over("can")
+    found = station.ask("identify", *links)
+    assert sorted(node["uuid"] for node in found["nodes"]) == sorted(UUIDS)
+    assert len({node["can_address"] for node in found["nodes"]}) == 3
+    flashes = [node.octets for node in bus]
+    said = station.refuses("provision", "--profile", ANGLE, "--yes", *links, code=2)
+    assert all(uuid in said["message"] for uuid in UUIDS)
+    assert [node.octets for node in bus] == flashes
+
+
+def test_each_node_of_a_bus_is_provisioned_by_its_name(station: Station, bus: list[Node]) -> None:
+    links = station.desk.links.over("can")
+    for node, words in ((bus[0], [UUIDS[0]]), (bus[2], ["0x00112233445566778899"]), (bus[1], [])):
+        done = station.ask("provision", *words, "--profile", ANGLE, "--yes", *links)
+        assert (done["uuid"], done["verdict"]) == (node.uuid, "authentic")
+    assert [node.flash["provisioned"] for node in bus] == [True] * 3
+    assert {len(node.flash["key"]) for node in bus} == {32}
+    assert len({node.flash["key"] for node in bus}) == 3
+
+
+def test_one_node_of_the_bus_is_met_by_its_address(station: Station, bus: list[Node]) -> None:
+    address = bus[1].flash["can_address"]
+    spec = f"{station.desk.links.can}&node={address:#04x}"
+    found = station.ask("identify", "--via", "can", "--can", spec)
+    assert (found["uuid"], found["can_address"]) == (UUIDS[1], address)
+    assert "nodes" not in found
+
+
+def test_two_runs_of_one_station_at_once_end_well_one_after_the_other(station: Station, bus: list[Node]) -> None:
+    """The store is held by one; the other waits. Both get a source address of their own choice."""
+    words = ["--json", "provision", "--profile", ANGLE, "--yes", "--via", "can", "--can"]
+    first = station.start(*words, f"{station.desk.links.can}&source=0xF1", UUIDS[0])
+    second = station.start(*words, f"{station.desk.links.can}&source=0xF2", UUIDS[1])
+    for command, uuid in ((first, UUIDS[0]), (second, UUIDS[1])):
+        outcome = command.end(40)
+        assert outcome.code == 0, outcome
+        assert (outcome.json["uuid"], outcome.json["verdict"]) == (uuid, "authentic")
+    assert station.log_is_whole()
+
+
+def test_the_same_command_twice_at_once_provisions_once(station: Station, bus: list[Node]) -> None:
+    words = ["--json", "provision", UUIDS[0], "--profile", ANGLE, "--yes", "--via", "can", "--can"]
+    commands = [station.start(*words, f"{station.desk.links.can}&source={source}") for source in ("0xF1", "0xF2")]
+    outcomes = [command.end(40) for command in commands]
+    assert [outcome.code for outcome in outcomes] == [0, 0], outcomes
+    written = sorted(results(outcome.json)["write"] for outcome in outcomes)
+    assert written == ["done", "nothing to do"]
+    assert bus[0].flash["epoch"] == 1
+    assert station.keys(UUIDS[0]) == [("active", 1)]
+
+
+def test_two_owners_race_for_a_new_node_and_one_has_it(desk: Desk, bus: list[Node]) -> None:
+    owners = desk.station(), desk.station("rival")
+    words = ["--json", "provision", UUIDS[0], "--profile", ANGLE, "--yes", "--via", "can", "--can"]
+    commands = [
+        owner.start(*words, f"{desk.links.can}&source={source}")
+        for owner, source in zip(owners, ("0xF1", "0xF2"), strict=True)
+    ]
+    outcomes = [command.end(40) for command in commands]
+    assert sorted(outcome.code for outcome in outcomes) == [0, 6], outcomes
+    winner = owners[[outcome.code for outcome in outcomes].index(0)]
+    assert winner.ask("verify", UUIDS[0], *desk.links.over("can"))["verdict"] == "authentic"
