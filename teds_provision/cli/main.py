@@ -8,7 +8,7 @@ import json
 import os
 import sys
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 import click
 
@@ -19,6 +19,7 @@ from teds_provision.errors import BadData, TedsProvisionError
 
 ENVIRONMENT_PREFIX = "TEDS_PROVISION"
 INTERRUPTED = 130
+_COMPLETE = "_TEDS_PROVISION_COMPLETE"
 
 
 class LazyGroup(click.Group):
@@ -36,6 +37,7 @@ class LazyGroup(click.Group):
         module = importlib.import_module(f"teds_provision.cli.{entry.module}")
         command = getattr(module, entry.attribute)
         assert isinstance(command, click.Command)
+        _read_by_name(command)
         return command
 
     def resolve_command(
@@ -58,6 +60,20 @@ class LazyGroup(click.Group):
         for title, entries in SECTIONS.items():
             with formatter.section(title):
                 formatter.write_dl([(name.ljust(width), entry.help) for name, entry in entries.items()])
+
+
+_PARAMETERS: Final = {"json": "as_json", "format": "form", "to": "receivers", "all": "everything"}
+"""Options that the code calls otherwise than the command line does."""
+
+
+def _read_by_name(command: click.Command) -> None:
+    """Have such options read TEDS_PROVISION_<NAME>, where the name is the command line's."""
+    names = {parameter: name for name, parameter in _PARAMETERS.items()}
+    for option in command.params:
+        if option.name in names and isinstance(option, click.Option):
+            option.envvar = f"{ENVIRONMENT_PREFIX}_{names[option.name].upper()}"
+    for inner in command.commands.values() if isinstance(command, click.Group) else ():
+        _read_by_name(inner)
 
 
 class Defaults(dict[str, Any]):
@@ -90,7 +106,7 @@ def _of_command(values: dict[str, Any], name: str, make: type[dict[str, Any]]) -
 def _as_parameters(values: dict[str, Any]) -> dict[str, Any]:
     """Spell the keys as click names parameters, in every table."""
     return {
-        name.replace("-", "_"): _as_parameters(value) if isinstance(value, dict) else value
+        _PARAMETERS.get(name, name.replace("-", "_")): _as_parameters(value) if isinstance(value, dict) else value
         for name, value in values.items()
     }
 
@@ -101,7 +117,7 @@ def _read_config(ctx: click.Context, _parameter: click.Parameter, home: Path | N
         import tomllib
 
         try:
-            values = tomllib.loads(path.read_text())
+            values = tomllib.loads(path.read_text(encoding="utf-8"))
         except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
             raise BadData(f"{path} is not valid TOML: {error}.", hint="Mend or remove the file.") from error
         except OSError as error:
@@ -145,6 +161,9 @@ def cli(ctx: click.Context, /, as_json: bool, **options: Any) -> None:
 def run(arguments: list[str]) -> int:
     """Run one command line; returns the exit code. Every error is told in at most three lines."""
     app: App | None = None
+    asked = os.environ.get(_COMPLETE)
+    if asked:
+        return _complete(asked)
     try:
         with cli.make_context("teds-provision", list(arguments)) as ctx:
             cli.invoke(ctx)
@@ -153,6 +172,8 @@ def run(arguments: list[str]) -> int:
         return finished.exit_code
     except (click.Abort, KeyboardInterrupt):
         return _fail(arguments, INTERRUPTED, "interrupted", "Interrupted: the same command carries on from here.", "")
+    except click.exceptions.NoArgsIsHelpError as error:
+        return _help_instead(arguments, error)
     except click.ClickException as error:
         return _fail(arguments, 2, "usage", _usage(error), _usage_hint(error))
     except TedsProvisionError as error:
@@ -169,6 +190,22 @@ def run(arguments: list[str]) -> int:
         app = App.current
         if app is not None:
             app.close()
+
+
+def _complete(instruction: str) -> int:
+    """Answer a shell that completes a command line (``bash_source``, ``bash_complete``, zsh, fish alike)."""
+    from click.shell_completion import shell_complete
+
+    return shell_complete(cli, {}, "teds-provision", _COMPLETE, instruction)
+
+
+def _help_instead(arguments: list[str], error: click.exceptions.NoArgsIsHelpError) -> int:
+    """Show the help of a group that was called without a command."""
+    if _wants(arguments, "--json"):
+        path = error.ctx.command_path if error.ctx is not None else "teds-provision"
+        return _fail(arguments, 2, "usage", "A command is missing.", f"See: {path} --help")
+    print(error.format_message(), file=sys.stderr)
+    return 2
 
 
 def _usage(error: click.ClickException) -> str:

@@ -116,3 +116,18 @@ def test_an_interrupted_command_says_so_in_json_too(
     assert (said.code, said.json["error"]["code"]) == (130, "interrupted")
     told = call(tmp_path, "nodes")
     assert (told.code, told.out, told.err) == (130, "", "Interrupted: the same command carries on from here.\n")
+
+
+def test_options_are_read_from_environment_and_config_by_the_name_that_people_type(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    make_station(tmp_path).close()
+    (tmp_path / "config.toml").write_text("json = true\n")
+    assert call(tmp_path, "nodes").json == {"nodes": []}
+    (tmp_path / "config.toml").write_text('format = "json"\n')
+    assert call(tmp_path, "whitelist", "export", tmp_path / "list").code == 0
+    assert json.loads((tmp_path / "list").read_text()) == {"whitelist": []}
+    (tmp_path / "config.toml").unlink()
+    monkeypatch.setenv("TEDS_PROVISION_FORMAT", "csv")
+    assert call(tmp_path, "whitelist", "export", tmp_path / "list").code == 0
+    assert (tmp_path / "list").read_text().startswith("uuid,")
