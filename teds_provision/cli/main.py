@@ -202,8 +202,7 @@ def _complete(instruction: str) -> int:
 def _help_instead(arguments: list[str], error: click.exceptions.NoArgsIsHelpError) -> int:
     """Show the help of a group that was called without a command."""
     if _wants(arguments, "--json"):
-        path = error.ctx.command_path if error.ctx is not None else "teds-provision"
-        return _fail(arguments, 2, "usage", "A command is missing.", f"See: {path} --help")
+        return _fail(arguments, 2, "usage", f"Missing command. (see: {error.ctx.command_path} --help)", "")
     print(error.format_message(), file=sys.stderr)
     return 2
 

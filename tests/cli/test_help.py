@@ -14,7 +14,7 @@ import pytest
 from teds_provision.cli.main import cli
 from teds_provision.cli.table import COMMANDS, GROUPS
 
-from .shell import clean_environment
+from .shell import clean_environment, spawn
 
 HEAVY = ("nfc", "can", "isotp", "keyring", "rich", "cryptography", "pint", "numpy", "matplotlib", "pkcs11", "sqlite3")
 PROGRAM = "teds-provision"
@@ -125,3 +125,27 @@ def test_the_help_of_no_command_loads_anything_heavy() -> None:
     )
     assert done.stderr.strip() == "[]"
     assert done.stdout.count("Usage: ") == len(ALL)
+
+
+@pytest.mark.parametrize(("words", "path"), [([], PROGRAM), (["trust"], f"{PROGRAM} trust")], ids=["none", "group"])
+def test_a_command_that_is_missing_shows_the_help(words: list[str], path: str) -> None:
+    shown = spawn(*words)
+    assert (shown.code, shown.out) == (2, "")
+    assert shown.err.startswith(f"Usage: {path} [OPTIONS] COMMAND")
+    told = spawn("--json", *words)
+    assert told.code == 2
+    assert told.json["error"]["message"] == f"Missing command. (see: {path} --help)"
+
+
+@pytest.mark.parametrize(
+    ("typed", "offered"),
+    [("teds-provision pro", ["profile", "provision"]), ("teds-provision provision --via c", ["can"])],
+)
+def test_a_shell_is_told_how_a_line_goes_on(typed: str, offered: list[str]) -> None:
+    asked = {"_TEDS_PROVISION_COMPLETE": "bash_complete", "COMP_WORDS": typed}
+    told = spawn(environment=clean_environment(**asked, COMP_CWORD=str(len(typed.split()) - 1)))
+    assert told.code == 0
+    assert told.out.splitlines() == [f"plain,{word}" for word in offered]
+    assert (
+        "_teds_provision_completion" in spawn(environment=clean_environment(_TEDS_PROVISION_COMPLETE="bash_source")).out
+    )
