@@ -114,8 +114,8 @@ class HandoverTables:
 
     def holders(self, uuid: bytes | None = None) -> list[Holder]:
         """Return who else holds keys: of this node, or of all."""
-        statement = "SELECT * FROM holders WHERE ?1 IS NULL OR uuid = ?1 ORDER BY uuid, since, fingerprint"
-        return self._database.read(Holder, statement, (uuid,))
+        statement = "SELECT * FROM holders WHERE ? IS NULL OR uuid = ? ORDER BY uuid, since, fingerprint"
+        return self._database.read(Holder, statement, (uuid, uuid))
 
     def put_holder(self, holder: Holder) -> None:
         """Note that another station holds a key of this node."""
