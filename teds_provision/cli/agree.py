@@ -40,8 +40,8 @@ def agree(app: App, uuid: str, links: LinkSettings, rotate: bool, yes: bool, dry
             {"uuid": octets.hex(), "plan": plan, "held": held}, f"Plan: {plan} ({', '.join(held) or 'no key held'})."
         )
         return
-    station.unlock()
-    with meet(station, links, octets, reporter_for(app)) as node, station.lock("agree", app.note):
+    meeting = meet(station, links, octets, reporter_for(app), before=station.unlock)
+    with meeting as node, station.lock("agree", app.note):
         agreed = run(station, node, identify(station, node), rotate=rotate)
     app.emit(
         {"uuid": octets.hex(), "epoch": agreed.epoch, "key_id": agreed.key_id, "fresh": agreed.fresh},

@@ -65,7 +65,7 @@ class App:
         """
         self.live_line()
         if self.json:
-            print(json.dumps(result, ensure_ascii=False), flush=True)
+            print(to_json(result), flush=True)
         elif human is not None:
             console = self.console()
             if callable(human):
@@ -115,7 +115,7 @@ class App:
         self.live_line()
         if self.json:
             told = {"code": error.code, "message": error.message, "hint": error.hint}
-            print(json.dumps({"error": told}, ensure_ascii=False), flush=True)
+            print(to_json({"error": told}), flush=True)
         else:
             told_lines = f"Error: {error.message}" + (f"\n  → {error.hint}" if error.hint else "")
             print(harmless(told_lines), file=sys.stderr, flush=True)
@@ -172,6 +172,12 @@ class App:
         self.live_line()
         while self._closers:
             self._closers.pop()()
+
+
+def to_json(value: object, *, indent: int | None = None) -> str:
+    """JSON for stdout: characters as they are where it takes UTF-8, escaped where it does not."""
+    wide = (sys.stdout.encoding or "utf-8").lower().replace("-", "") == "utf8"
+    return json.dumps(value, ensure_ascii=not wide, indent=indent)
 
 
 def harmless(text: str) -> str:

@@ -56,11 +56,11 @@ def provision(
         with meet(station, links, wanted, reporter) as node:
             _plan(app, station, node)
         return
-    station.unlock()
     if watch:
+        station.unlock()
         _watch(app, station, links, run, reporter)
         return
-    with meet(station, links, wanted, reporter) as node:
+    with meet(station, links, wanted, reporter, before=station.unlock) as node:
         done = run(node)
     _tell(app, done)
 
@@ -153,6 +153,7 @@ def _summary(console: Console, done: Provisioned) -> None:
     from rich.markup import escape
     from rich.table import Table
 
+    from teds_provision.cli.rendering import print_table
     from teds_provision.workflow.summary import summarise
 
     summary = summarise(done.image)
@@ -165,4 +166,4 @@ def _summary(console: Console, done: Provisioned) -> None:
         table.add_row(f"channel {channel.number}", f"{escape(channel.name)}  {channel.range}{calibrated}".strip())
     verdict = done.verified.verdict
     table.add_row("verdict", f"[bold {'green' if verdict == 'authentic' else 'red'}]{verdict}[/]")
-    console.print(table)
+    print_table(console, table)

@@ -30,8 +30,7 @@ def read(app: App, uuid: str, output: Path | None, links: LinkSettings) -> None:
 
     station = app.station()
     octets = station.store.resolve(uuid)
-    station.unlock(octets)
-    with meet(station, links, octets, reporter_for(app)) as node:
+    with meet(station, links, octets, reporter_for(app), before=lambda: station.unlock(octets)) as node:
         identify(station, node)
         with station.lock("read", app.note):
             session_if_keyed(station, node)

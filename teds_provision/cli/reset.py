@@ -31,8 +31,8 @@ def reset(app: App, uuid: str, yes: bool, dry_run: bool, links: LinkSettings) ->
         app.emit({"uuid": octets.hex(), "plan": "reset"}, f"Plan: reset {octets.hex()} to factory state.")
         return
     app.confirm(f"Reset node {octets.hex()}? Its key is erased and its datasheet counts as unsigned.", yes=yes)
-    station.unlock(octets)
-    with meet(station, links, octets, reporter_for(app)) as node, station.lock("reset", app.note):
+    meeting = meet(station, links, octets, reporter_for(app), before=lambda: station.unlock(octets))
+    with meeting as node, station.lock("reset", app.note):
         receipt = reset_node(station, node, identify(station, node))
     app.emit(
         {

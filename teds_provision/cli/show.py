@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import sys
 from collections.abc import Sequence
 from dataclasses import asdict
@@ -12,6 +11,7 @@ from typing import TYPE_CHECKING, cast
 import click
 
 from teds_provision.cli.context import App, pass_app
+from teds_provision.cli.context import to_json as dumps
 from teds_provision.cli.options import command
 from teds_provision.errors import BadData, UsageFailure
 
@@ -81,7 +81,7 @@ def _tell(app: App, files: Sequence[ShownFile], form: str) -> None:
         from teds_provision.cli.show_json import to_json
 
         result = to_json(files)
-        print(json.dumps(result, ensure_ascii=False, indent=None if app.json else 1), flush=True)
+        print(dumps(result, indent=None if app.json else 1), flush=True)
     elif form == "table":
         from teds_provision.cli.show_table import print_files
 
@@ -134,7 +134,7 @@ def _diff(app: App, before: str, after: str, *, as_json: bool) -> None:
         "guard": [guard_to_json(finding) for finding in guard],
     }
     if as_json and not app.json:
-        print(json.dumps(result, ensure_ascii=False, indent=1), flush=True)
+        print(dumps(result, indent=1), flush=True)
         return
     lines = [change.text for change in changes] or ["no difference"]
     lines += [f"{finding.severity}: guard, channel {finding.channel}: {finding.message}" for finding in guard]

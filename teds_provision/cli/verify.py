@@ -77,8 +77,7 @@ def _node(app: App, what: str, links: LinkSettings) -> tuple[Image, Verified]:
 
     station = app.station()
     uuid = station.store.resolve(what)
-    station.unlock(uuid)
-    with meet(station, links, uuid, reporter_for(app)) as node:
+    with meet(station, links, uuid, reporter_for(app), before=lambda: station.unlock(uuid)) as node:
         who = identify(station, node)
         with station.lock("verify", app.note):
             held = session_if_keyed(station, node)
@@ -93,10 +92,12 @@ def _table(console: Console, verified: Verified) -> None:
     from rich.markup import escape
     from rich.table import Table
 
+    from teds_provision.cli.rendering import print_table
+
     style = {"passed": "green", "failed": "bold red", "skipped": "dim"}
     table = Table("check", "result", "found", box=None, pad_edge=False)
     for check in verified.checks:
         table.add_row(check.name, f"[{style[check.result]}]{check.result}[/]", escape(check.why))
-    console.print(table)
+    print_table(console, table)
     colour = "bold green" if verified.verdict == "authentic" else "bold red"
     console.print(f"[{colour}]{verified.uuid.hex()}: {verified.verdict}[/]")

@@ -54,8 +54,8 @@ def write(app: App, uuid: str, image: Path | None, yes: bool, dry_run: bool, lin
         plan = {"uuid": octets.hex(), "plan": "write", "blocks": len(wanted.blocks), "octets": total}
         app.emit(plan, f"Plan: write {len(wanted.blocks)} TEDS, {total} octets, to {octets.hex()}.")
         return
-    station.unlock(octets)
-    with meet(station, links, octets, reporter) as node, station.lock("write", app.note):
+    meeting = meet(station, links, octets, reporter, before=lambda: station.unlock(octets))
+    with meeting as node, station.lock("write", app.note):
         identify(station, node)
         require_session(station, node)
         written = run(station, node, wanted, progress=reporter.written)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 
 from teds_provision.errors import UsageFailure
@@ -16,10 +16,18 @@ _SHOWN = 5
 
 
 @contextmanager
-def meet(station: Station, links: LinkSettings, uuid: bytes | None, reporter: Reporter) -> Iterator[Conversation]:
+def meet(
+    station: Station,
+    links: LinkSettings,
+    uuid: bytes | None,
+    reporter: Reporter,
+    *,
+    before: Callable[[], object] = lambda: None,
+) -> Iterator[Conversation]:
     """Wait for node ``uuid`` (None: any node) on the chosen link and give a conversation with it.
 
-    Of several nodes on a bus that is the one which is not finished yet. Raises NoReader, NoNode after
+    Of several nodes on a bus that is the one which is not finished yet. ``before`` is called when the link is open and
+    nothing is waited for yet: the time to ask for a passphrase. Raises NoReader, NoNode after
     ``links.timeout`` seconds, AddressConflict, UsageFailure where several could be meant.
     """
 
@@ -30,6 +38,7 @@ def meet(station: Station, links: LinkSettings, uuid: bytes | None, reporter: Re
     address = known.can_address if known is not None and known.can_address else None
     port = open_port(links)
     try:
+        before()
         if uuid is None:
             contact = _the_one(station, port.everyone(seconds=links.timeout, notice=reporter.notice))
         else:

@@ -22,7 +22,7 @@ from teds_provision.workflow.progress import Silent
 from teds_provision.workflow.signing import SignOrder, sign_image
 
 from ..workflow.bench import Board, make_station, talk
-from .shell import call
+from .shell import call, clean_environment, spawn
 
 ANGLE = BuildOrder(profile="magnetic-angular-position-sensor")
 
@@ -131,3 +131,20 @@ def test_options_are_read_from_environment_and_config_by_the_name_that_people_ty
     monkeypatch.setenv("TEDS_PROVISION_FORMAT", "csv")
     assert call(tmp_path, "whitelist", "export", tmp_path / "list").code == 0
     assert (tmp_path / "list").read_text().startswith("uuid,")
+
+
+def test_json_is_json_whatever_stdout_can_write(tmp_path: Path) -> None:
+    make_station(tmp_path).close()
+    environment = clean_environment(PYTHONIOENCODING="ascii")
+    name = "fräse \N{GEAR} \U0001f916"
+    for words in (["whitelist", "add", "8d4d9da65281f7000000", "--name", name], ["whitelist", "list"]):
+        said = spawn("--home", tmp_path, "--json", *words, environment=environment)
+        assert said.json["whitelist"][0]["name"] == name
+
+
+def test_what_is_wrong_with_a_link_is_told_before_anyone_is_asked_for_a_passphrase(tmp_path: Path) -> None:
+    station = make_station(tmp_path)
+    station.store.put_whitelist(WhitelistEntry(Board.uuid))
+    station.close()
+    for words in (["agree", Board.uuid.hex()], ["provision", "--profile", "load-cell", "--yes"]):
+        assert call(tmp_path, "--json", *words, "--via", "can").json["error"]["code"] == "usage"
