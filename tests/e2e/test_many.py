@@ -69,14 +69,20 @@ def test_the_same_command_twice_at_once_provisions_once(station: Station, bus: l
     assert station.keys(UUIDS[0]) == [("active", 1)]
 
 
-def test_two_owners_race_for_a_new_node_and_one_has_it(desk: Desk, bus: list[Node]) -> None:
+@pytest.mark.parametrize("delay", ["0", "200"])
+def test_two_owners_race_for_a_new_node_and_one_has_it(desk: Desk, delay: str) -> None:
+    node = desk.node(uuid=UUIDS[0]).start("--crypto-delay", delay, nfc=False, can=True)
     owners = desk.station(), desk.station("rival")
-    words = ["--json", "provision", UUIDS[0], "--profile", ANGLE, "--yes", "--via", "can", "--can"]
+    words = ["--json", "provision", node.uuid, "--profile", ANGLE, "--yes", "--via", "can", "--can"]
     commands = [
         owner.start(*words, f"{desk.links.can}&source={source}")
         for owner, source in zip(owners, ("0xF1", "0xF2"), strict=True)
     ]
     outcomes = [command.end(40) for command in commands]
     assert sorted(outcome.code for outcome in outcomes) == [0, 6], outcomes
-    winner = owners[[outcome.code for outcome in outcomes].index(0)]
-    assert winner.ask("verify", UUIDS[0], *desk.links.over("can"))["verdict"] == "authentic"
+    won = [outcome.code for outcome in outcomes].index(0)
+    assert owners[won].ask("verify", node.uuid, *desk.links.over("can"))["verdict"] == "authentic"
+    flash = node.octets
+    said = owners[1 - won].refuses("provision", "--profile", ANGLE, "--yes", *desk.links.over("can"), code=6)
+    assert said["code"] in ("node-refused", "refused")  # the latter where it holds the key of its unconfirmed attempt
+    assert node.octets == flash
