@@ -9,9 +9,11 @@ import click
 
 from teds_provision.cli.context import App, pass_app
 from teds_provision.cli.options import COMMAND_SETTINGS, command, dry_run_option, examples, link_options, yes_option
+from teds_provision.errors import PolicyRefused
 from teds_provision.links import LinkSettings
 
 if TYPE_CHECKING:
+    from teds_provision.store import StoreLock
     from teds_provision.workflow.handover_export import ExportPlan
     from teds_provision.workflow.handover_import import Imported, ImportPlan
     from teds_provision.workflow.station import Station
@@ -78,14 +80,17 @@ def export_keys(
     order = ExportOrder(receivers, nodes, mode, expires, ca)
     if not dry_run:
         station.unlock()
+    shown = plan_export(station, order)
+    if dry_run:
+        told = _exported(shown, output, station)
+        app.emit({**told, "id": None if shown.earlier is None else shown.id, "plan": True}, _plan_text(shown, station))
+        return
+    app.note(_plan_text(shown, station))
+    app.confirm(f"{mode.capitalize()} {_count(len(shown.nodes))}?", yes=yes)
     with station.lock("export-keys", app.note):
         plan = plan_export(station, order)
+        _require_same(plan.content == shown.content)
         told = _exported(plan, output, station)
-        if dry_run:
-            app.emit({**told, "id": None if plan.earlier is None else plan.id, "plan": True}, _plan_text(plan, station))
-            return
-        app.note(_plan_text(plan, station))
-        app.confirm(f"{mode.capitalize()} {_count(len(plan.nodes))}?", yes=yes)
         done = run(station, plan, output)
     told |= {"sha256": done.sha256, "octets": done.octets, "fresh": done.fresh}
     again = "" if done.fresh else " (nothing to do, it is there already)"
@@ -168,25 +173,34 @@ def import_keys(
     receipt = receipt or file.with_name(file.name + ".receipt")
     octets = read_limited(file, MAX_BUNDLE_OCTETS, "bundle")
     station.unlock()
+    shown = plan_import(station, octets)
+    told, text = _import_plan(station, shown)
+    if dry_run:
+        app.emit({**told, "receipt": None, "plan": True}, text)
+        return
+    if not isinstance(shown, Imported):
+        _require_receipt_place(receipt)
+        app.note(text)
+        app.confirm(f"Take {_count(len(shown.taken))} in?", yes=yes)
     with station.lock("import-keys", app.note):
         plan = plan_import(station, octets)
-        told, text = _import_plan(station, plan)
-        if dry_run:
-            app.emit({**told, "receipt": None, "plan": True}, text)
-            return
         if isinstance(plan, Imported):
             done = plan
         else:
-            _require_receipt_place(receipt)
-            app.note(text)
-            app.confirm(f"Take {_count(len(plan.taken))} in?", yes=yes)
+            _require_same(not isinstance(shown, Imported) and plan.nodes == shown.nodes)
             done = run(station, plan)
         _write_receipt(receipt, done.receipt)
-        given = any(ctx.get_parameter_source(name) != click.core.ParameterSource.DEFAULT for name in _LINK_OPTIONS)
-        outcomes = _prove(app, station, done, links) if (given if prove is None else prove) else []
+    given = any(ctx.get_parameter_source(name) != click.core.ParameterSource.DEFAULT for name in _LINK_OPTIONS)
+    outcomes = _prove(app, station, done, links) if (given if prove is None else prove) else []
     _tell_import(app, station, done, receipt, told, outcomes)
     if prove and any(outcome["why"] for outcome in outcomes):
         ctx.exit(5)
+
+
+def _require_same(same: bool) -> None:
+    """What a person was shown must still be so under the lock."""
+    if not same:
+        raise PolicyRefused("Another command changed the plan while this one waited.", hint="Run it again.")
 
 
 def _import_plan(station: Station, plan: ImportPlan | Imported) -> tuple[dict[str, Any], str]:
@@ -255,7 +269,11 @@ def _prove(app: App, station: Station, done: Imported, links: LinkSettings) -> l
     from teds_provision.workflow.handover_prove import Proven, is_proven, prove_nodes
 
     waiting = [uuid for uuid in done.uuids if not is_proven(station, uuid)]
-    outcomes = prove_nodes(station, links, waiting, reporter_for(app)) if waiting else []
+
+    def hold() -> StoreLock:
+        return station.lock("import-keys", app.note)
+
+    outcomes = prove_nodes(station, links, waiting, reporter_for(app), hold=hold) if waiting else []
     return [
         {"uuid": one.uuid.hex(), "rotated": one.rotated, "why": ""}
         if isinstance(one, Proven)
@@ -378,13 +396,13 @@ def undo(app: App, id_: str, yes: bool, dry_run: bool) -> None:
     from teds_provision.workflow.handover import undo as run
 
     station = app.station()
+    row = find_handover(station, id_)
+    if dry_run:
+        app.emit({"id": row.id, "state": row.state, "plan": "undo"}, f"Plan: take the {row.mode} {row.id} back.")
+        return
+    app.confirm("Take this move back? The receiver may have the keys all the same until they are rotated.", yes=yes)
     with station.lock("handover undo", app.note):
-        row = find_handover(station, id_)
-        if dry_run:
-            app.emit({"id": row.id, "state": row.state, "plan": "undo"}, f"Plan: take the {row.mode} {row.id} back.")
-            return
-        app.confirm("Take this move back? The receiver may have the keys all the same until they are rotated.", yes=yes)
-        done = run(station, row)
+        done = run(station, find_handover(station, id_))
     told = {"id": row.id, "state": "undone", "nodes": [uuid.hex() for uuid in done.uuids], "fresh": done.fresh}
     text = f"{_count(len(done.uuids))} back here; the next contact with each rotates its key first."
     app.emit(told, text if done.fresh else "Nothing to do: this move was taken back before.")

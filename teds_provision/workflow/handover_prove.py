@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
 
 from teds_provision.errors import LinkFailure, NoNode, TedsProvisionError
@@ -56,8 +57,12 @@ def prove_nodes(
     reporter: Reporter,
     *,
     opened: Callable[[LinkSettings], Port] = open_port,
+    hold: Callable[[], AbstractContextManager[object]] = nullcontext,
 ) -> list[Proven | NotProven]:
-    """Meet each of these nodes on the chosen link, in whatever order they come; ends when none comes in time."""
+    """Meet each of these nodes on the chosen link, in whatever order they come; ends when none comes in time.
+
+    ``hold`` holds the store for as long as one node is worked on, never while one is waited for.
+    """
     waiting, outcomes = set(uuids), dict[bytes, Proven | NotProven]()
     try:
         port = opened(links)
@@ -74,7 +79,7 @@ def prove_nodes(
             uuid = contact.identity.uuid
             waiting.discard(uuid)
             try:
-                with Conversation(contact, notice=reporter.notice) as node:
+                with Conversation(contact, notice=reporter.notice) as node, hold():
                     outcomes[uuid] = prove_node(station, node)
             except TedsProvisionError as error:
                 outcomes[uuid] = NotProven(uuid, error.message)
