@@ -148,3 +148,13 @@ def test_what_is_wrong_with_a_link_is_told_before_anyone_is_asked_for_a_passphra
     station.close()
     for words in (["agree", Board.uuid.hex()], ["provision", "--profile", "load-cell", "--yes"]):
         assert call(tmp_path, "--json", *words, "--via", "can").json["error"]["code"] == "usage"
+
+
+def test_files_are_written_in_utf_8_whatever_the_locale(tmp_path: Path) -> None:
+    station = make_station(tmp_path)
+    station.store.put_whitelist(WhitelistEntry(Board.uuid, name="fräse \N{GEAR}"))
+    station.close()
+    environment = clean_environment(LC_ALL="C", PYTHONUTF8="0", PYTHONCOERCECLOCALE="0")
+    exported = spawn("--home", tmp_path, "whitelist", "export", tmp_path / "list.xml", environment=environment)
+    assert exported.code == 0, exported
+    assert "fräse \N{GEAR}" in (tmp_path / "list.xml").read_text(encoding="utf-8")
