@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import signal
+
 from teds_provision.cli.context import App, pass_app
 from teds_provision.cli.options import command
 
@@ -16,6 +18,7 @@ def demo(app: App) -> None:
     from teds_provision.cli.rendering import reporter_for
     from teds_provision.workflow.demo import run_demo
 
+    signal.signal(signal.SIGTERM, signal.default_int_handler)  # as Ctrl-C: a folder and a process are to be taken away
     done = run_demo(reporter_for(app), lambda text: app.note(f"\n{text}"))
     steps = [{"name": step.name, "result": step.result, "seconds": step.seconds} for step in done.steps]
     app.emit(
