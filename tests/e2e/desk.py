@@ -48,6 +48,16 @@ class Links:
         return ["--via", "nfc", "--nfc", self.nfc] if via == "nfc" else ["--via", "can", "--can", self.can]
 
 
+def limited(octets: int) -> tuple[str, ...]:
+    """The program on a disk on which no file may grow beyond so many octets."""
+    code = (
+        "import resource, runpy, sys;"
+        f"resource.setrlimit(resource.RLIMIT_FSIZE, ({octets}, {octets}));"
+        "sys.argv[0] = 'teds-provision'; runpy.run_module('teds_provision', run_name='__main__')"
+    )
+    return (PROGRAM[0], "-c", code)
+
+
 class Running:
     """A process whose lines are waited for; ended by its id at the latest when the test ends."""
 
@@ -180,11 +190,11 @@ class Node:
     uuid: str
     process: Running | None = None
 
-    def start(self, *options: object, nfc: bool = True, can: bool = False) -> Node:
+    def start(self, *options: object, nfc: bool = True, can: bool = False, **more: Any) -> Node:
         """Power on, and wait until its links are up."""
         links = self.desk.links
         where = [*(["--nfc", links.nfc] if nfc else []), *(["--can", links.can] if can else [])]
-        self.process = self.desk.start("--json", "node", "run", self.folder, *where, *options)
+        self.process = self.desk.start("--json", "node", "run", self.folder, *where, *options, **more)
         (ready,) = self.process.wait_for_lines(1)
         assert ready.get("ready") is True, ready
         return self

@@ -14,7 +14,7 @@ import pytest
 
 from teds_provision.store import StoreLock
 
-from .desk import ANGLE, PROGRAM, Desk, Node, Station, results
+from .desk import ANGLE, Desk, Node, Station, limited, results
 
 pytestmark = pytest.mark.link
 
@@ -144,6 +144,21 @@ def test_a_node_that_moves_away_in_the_transfer_is_5(station: Station, node: Nod
     assert 1 <= outcome.err[outcome.err.index("Error:") :].count("\n") <= 3
     assert node.flash["provisioned"] is False
     assert station.tables()["steps"]
+
+
+@pytest.mark.parametrize("room", [100, 2500])
+def test_a_node_whose_flash_fails_is_refused_by_it_and_stays_as_it_was(station: Station, node: Node, room: int) -> None:
+    """No room for the key, or for the datasheet: old state whole, and the same command finishes on a mended board."""
+    node.start(program=limited(room))
+    before = node.octets
+    said = station.refuses("provision", "-p", ANGLE, "--yes", *station.desk.links.over("nfc"), code=6)
+    assert said["code"] == "node-refused"
+    assert "flash" in said["message"]
+    assert (node.octets == before) == (room == 100)
+    assert node.flash["provisioned"] is False
+    node.kill()
+    node.start()
+    assert station.provision("nfc", "--profile", ANGLE)["verdict"] == "authentic"
 
 
 # -- datasheets --------------------------------------------------------------------------------------------------------
@@ -331,16 +346,6 @@ def test_a_second_process_says_at_last_who_holds_the_store(station: Station, fin
         said = station.refuses("provision", "--yes", *station.desk.links.over("can"), code=7)
         assert said["code"] == "store-locked"
         assert f"pid {os.getpid()} (backup)" in said["message"]
-
-
-def limited(octets: int) -> tuple[str, ...]:
-    """The program on a disk on which no file may grow beyond so many octets."""
-    code = (
-        "import resource, runpy, sys;"
-        f"resource.setrlimit(resource.RLIMIT_FSIZE, ({octets}, {octets}));"
-        "sys.argv[0] = 'teds-provision'; runpy.run_module('teds_provision', run_name='__main__')"
-    )
-    return (PROGRAM[0], "-c", code)
 
 
 def test_a_full_disk_is_7_and_the_same_command_carries_on(station: Station, node: Node) -> None:

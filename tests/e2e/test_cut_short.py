@@ -171,6 +171,19 @@ def test_ctrl_c_while_waiting_for_a_node(station: Station, node: Node) -> None:
     carries_on(station, node, "nfc")
 
 
+@pytest.mark.parametrize("via", ["nfc", "can"])
+def test_a_station_that_fell_asleep_in_the_write_wakes_up_well(station: Station, node: Node, via: str) -> None:
+    node.start(*SLOW, nfc=via == "nfc", can=via == "can")
+    command = start(station, via)
+    until(MOMENTS["in the write"], station, node, command)
+    command.signal(signal.SIGSTOP)
+    time.sleep(2.5)
+    command.signal(signal.SIGCONT)
+    outcome = command.end(40)
+    assert outcome.code in (0, 5), outcome
+    carries_on(station, node, via)
+
+
 def kill_after_growing_delays(station: Station, node: Node, via: str, *, first: float, step: float) -> int:
     """Kill the command after ever longer; returns how often it was killed before it ended by itself."""
     kills, delay = 0, first
