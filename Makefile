@@ -22,7 +22,7 @@ types: $(VENV)/.dev
 	$(BIN)/mypy
 
 unit: $(VENV)/.dev
-	$(BIN)/python -m pytest -n 2 --dist worksteal
+	$(BIN)/python -m pytest -n 2 --dist worksteal -rs
 
 bench: $(VENV)/.dev
 	$(BIN)/python -m benchmarks.provisioning
@@ -38,19 +38,21 @@ fuzz: .venv-fuzz/.ready
 	@mkdir -p build/fuzz
 	.venv-fuzz/bin/python tests/fuzz/fuzz_teds.py -max_total_time=$(or $(SECONDS),600) -artifact_prefix=build/ build/fuzz tests/fuzz/corpus
 
-$(VENV)/bin/python:
+# Stamps, not the files that are made: what was cut short is made anew.
+$(VENV)/.made:
 	@$(PYTHON) -c 'import sys; sys.exit(not (3, 11) <= sys.version_info[:2] <= (3, 13))' || \
 	  { echo "Python 3.11 to 3.13 is needed; name one with: make PYTHON=python3.12 $(MAKECMDGOALS)"; exit 1; }
 	@echo "Making the virtual environment $(VENV) …"
 	@$(PYTHON) -m venv $(VENV)
 	@$(BIN)/python -m pip install --quiet --upgrade pip
+	@touch $@
 
-$(VENV)/.run: $(VENV)/bin/python pyproject.toml
+$(VENV)/.run: $(VENV)/.made pyproject.toml
 	@echo "Installing teds-provision …"
 	@$(BIN)/python -m pip install --quiet --editable .
 	@touch $@
 
-$(VENV)/.dev: $(VENV)/bin/python pyproject.toml
+$(VENV)/.dev: $(VENV)/.made pyproject.toml
 	@echo "Installing teds-provision and what its tests need …"
 	@$(BIN)/python -m pip install --quiet --editable '.[dev]'
 	@touch $@ $(VENV)/.run
