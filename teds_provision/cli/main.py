@@ -133,8 +133,8 @@ def _read_config(ctx: click.Context, _parameter: click.Parameter, home: Path | N
         "auto_envvar_prefix": ENVIRONMENT_PREFIX,
         "max_content_width": 100,
     },
-    epilog="A node is named by its UUID, by four or more of its first digits, or by its name. Every option can also stand in "
-    "TEDS_PROVISION_<NAME> or in config.toml in the home.\n\nStart with: teds-provision demo",
+    epilog="A node is named by its UUID, by four or more of its first digits, or by its name. Every option can also "
+    "stand in TEDS_PROVISION_<NAME> or in config.toml in the home.\n\nStart with: teds-provision demo",
 )
 @click.option(
     "--home",
