@@ -15,7 +15,7 @@ from teds_provision.workflow.doctor import Finding, Place, check
 
 _MIN_PYTHON: Final = (3, 11)
 _LIBRARIES: Final = {
-    "click": "8.1.7",
+    "click": "8.2.1",
     "cryptography": "44.0.0",
     "nfcpy": "1.0.4",
     "ndeflib": "0.3.3",
