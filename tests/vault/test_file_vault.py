@@ -316,6 +316,7 @@ def test_a_change_killed_at_any_instant_leaves_the_old_or_the_new(tmp_path: Path
         "while True: vault.add_master(); vault.retire_masters()"
     )
     numbers = []
+    left = 1
     for attempt in range(8):
         process = subprocess.Popen([sys.executable, "-c", code, str(tmp_path)], stdout=subprocess.PIPE, text=True)
         assert process.stdout is not None
@@ -325,7 +326,9 @@ def test_a_change_killed_at_any_instant_leaves_the_old_or_the_new(tmp_path: Path
         process.communicate()
         again = FileVault.open(tmp_path, STORE, Person())
         assert again.identity().point == vault.identity().point
-        assert 1 <= len(again._material.masters.keys) <= 2
+        # killed between the two, one more is left, and the next one begins with that many
+        assert 1 <= len(again._material.masters.keys) <= left + 1
+        left = len(again._material.masters.keys)
         numbers.append(again._material.masters.current)
     assert numbers == sorted(numbers)
     assert numbers[-1] > 1
