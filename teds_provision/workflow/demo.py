@@ -107,7 +107,7 @@ def _node(folder: Path, nfc: str, can: str) -> Iterator[bytes]:
     command = [sys.executable, "-m", "teds_provision", "--json", "node"]
     made = subprocess.run([*command, "create", str(folder)], capture_output=True, text=True, check=False)
     if made.returncode:
-        raise LinkFailure(f"The virtual node could not be made: {made.stdout.strip()}")
+        raise _failure("The virtual node could not be made", made.stdout)
     process = subprocess.Popen(
         [*command, "run", str(folder), "--nfc", nfc, "--can", can], stdout=subprocess.PIPE, text=True
     )
@@ -133,4 +133,13 @@ def _ready(process: subprocess.Popen[str]) -> bytes:
         said = json.loads(line)
         return bytes.fromhex(said["uuid"])
     except (ValueError, KeyError, TypeError):
-        raise LinkFailure(f"The virtual node did not start: {line.strip() or 'no answer'}") from None
+        raise _failure("The virtual node did not start", line) from None
+
+
+def _failure(what: str, said: str) -> LinkFailure:
+    """Tell what the node's process said on its stdout: an error as JSON, or nothing that can be read."""
+    try:
+        error = json.loads(said)["error"]
+        return LinkFailure(f"{what}: {error['message']}", hint=error["hint"])
+    except (ValueError, KeyError, TypeError):
+        return LinkFailure(f"{what}: {said.strip() or 'no answer'}")
