@@ -86,7 +86,7 @@ def test_a_station_of_another_owner_cannot_take_a_node(desk: Desk, via: str) -> 
     owner.provision(via, "--profile", ANGLE)
     flash, links = node.octets, desk.links.over(via)
     said = rival.refuses("provision", "--profile", ANGLE, "--yes", *links, code=6)
-    assert said["code"] == "node-refused"
+    assert said["code"] in ("node-refused", "refused")  # by the node, or before it is asked: no tap, no pin
     assert said["hint"]
     for words in (["agree", node.uuid, "--rotate"], ["write", node.uuid], ["reset", node.uuid, "--yes"]):
         rival.refuses(*words, *links, code=3 if words[0] == "write" else 6)
