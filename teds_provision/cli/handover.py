@@ -1,4 +1,4 @@
-"""``export-keys``, ``import-keys``, ``handover``: node keys from one base station to another."""
+"""``export-keys``, ``import-keys``: node keys from one base station to another."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import click
 
 from teds_provision.cli.context import App, pass_app
-from teds_provision.cli.options import COMMAND_SETTINGS, command, dry_run_option, examples, link_options, yes_option
+from teds_provision.cli.options import command, dry_run_option, link_options, yes_option
 from teds_provision.errors import PolicyRefused
 from teds_provision.links import LinkSettings
 
@@ -86,7 +86,7 @@ def export_keys(
         app.emit({**told, "id": None if shown.earlier is None else shown.id, "plan": True}, _plan_text(shown, station))
         return
     app.note(_plan_text(shown, station))
-    app.confirm(f"{mode.capitalize()} {_count(len(shown.nodes))}?", yes=yes)
+    app.confirm(f"{mode.capitalize()} {count_of(len(shown.nodes))}?", yes=yes)
     with station.lock("export-keys", app.note):
         plan = plan_export(station, order)
         _require_same(plan.content == shown.content)
@@ -95,7 +95,7 @@ def export_keys(
     told |= {"sha256": done.sha256, "octets": done.octets, "fresh": done.fresh}
     again = "" if done.fresh else " (nothing to do, it is there already)"
     next_step = "\nIts receipt closes the move: teds-provision handover receipt FILE.receipt" if mode == "move" else ""
-    app.emit(told, f"{_count(len(plan.nodes))} in {output}, handover {plan.id}{again}.{next_step}")
+    app.emit(told, f"{count_of(len(plan.nodes))} in {output}, handover {plan.id}{again}.{next_step}")
 
 
 def _exported(plan: ExportPlan, output: Path, station: Station) -> dict[str, Any]:
@@ -117,7 +117,9 @@ def _plan_text(plan: ExportPlan, station: Station) -> str:
     from teds_provision.workflow.handover import peer_name
     from teds_provision.workflow.trust import spoken
 
-    lines = [f"{plan.mode.capitalize()} {_count(len(plan.nodes))}, to be imported by {plan.expires:%Y-%m-%d %H:%M} UTC"]
+    lines = [
+        f"{plan.mode.capitalize()} {count_of(len(plan.nodes))}, to be imported by {plan.expires:%Y-%m-%d %H:%M} UTC"
+    ]
     lines += [f"  {node.uuid.hex()}  epoch {key.epoch}  {node.name or ''}".rstrip() for node, key in plan.nodes[:20]]
     lines += [f"  … and {len(plan.nodes) - 20} more"] if len(plan.nodes) > 20 else []
     lines += [f"  not {uuid.hex()}: {why}" for uuid, why in plan.skipped]
@@ -181,7 +183,7 @@ def import_keys(
     if not isinstance(shown, Imported):
         _require_receipt_place(receipt)
         app.note(text)
-        app.confirm(f"Take {_count(len(shown.taken))} in?", yes=yes)
+        app.confirm(f"Take {count_of(len(shown.taken))} in?", yes=yes)
     with station.lock("import-keys", app.note):
         plan = plan_import(station, octets)
         if isinstance(plan, Imported):
@@ -219,7 +221,7 @@ def _import_plan(station: Station, plan: ImportPlan | Imported) -> tuple[dict[st
     nodes = [{"uuid": one.node.uuid.hex(), "decision": one.decision, "why": one.why} for one in plan.nodes]
     denied = [{"uuid": one.uuid.hex(), "why": one.why} for one in plan.denied]
     told = _import_result(bundle.sender, bundle.mode, bundle.id, nodes, denied)
-    lines = [f"A {bundle.mode} of {_count(len(nodes))} from {peer_name(station, bundle.sender)}"]
+    lines = [f"A {bundle.mode} of {count_of(len(nodes))} from {peer_name(station, bundle.sender)}"]
     lines += [f"  {node['decision']:<8} {node['uuid']}  {node['why']}".rstrip() for node in nodes[:40]]
     lines += [f"  … and {len(nodes) - 40} more"] if len(nodes) > 40 else []
     lines += [f"  revoked  {one['uuid']}  {one['why']}" for one in denied]
@@ -291,118 +293,17 @@ def _tell_import(
     pending = [uuid.hex() for uuid in done.uuids if uuid.hex() not in set(proven)]
     not_met = {one["uuid"]: one["why"] for one in outcomes if one["why"]}
     told |= {"receipt": str(receipt), "fresh": done.fresh, "proven": proven, "pending": pending, "not_proven": not_met}
-    lines = [f"{_count(len(done.uuids))} taken in" + ("." if done.fresh else " before; nothing changed.")]
+    lines = [f"{count_of(len(done.uuids))} taken in" + ("." if done.fresh else " before; nothing changed.")]
     lines += [f"  refused {uuid}: {why}" for uuid, why in done.notes.refused]
     lines += [f"  not met {uuid}: {why}" for uuid, why in not_met.items()]
     rotated = sum(bool(one["rotated"]) for one in outcomes)
-    lines += [f"{_count(rotated)} rotated: the sender is locked out for certain."] if rotated else []
+    lines += [f"{count_of(rotated)} rotated: the sender is locked out for certain."] if rotated else []
     if pending:
-        lines.append(f"{_count(len(pending))} not proven yet: their first contact here proves them (agree UUID).")
+        lines.append(f"{count_of(len(pending))} not proven yet: their first contact here proves them (agree UUID).")
     lines.append(f"Receipt for the sender: {receipt}")
     app.emit(told, "\n".join(lines))
 
 
-def _count(number: int) -> str:
+def count_of(number: int) -> str:
+    """``1 node``, ``2 nodes``."""
     return f"{number} node{'' if number == 1 else 's'}"
-
-
-@click.group(
-    context_settings=COMMAND_SETTINGS,
-    epilog=examples("teds-provision handover list", "teds-provision handover receipt lab.jwe.receipt"),
-)
-def handover() -> None:
-    """Handovers under way: list them, close them by their receipt, take a move back."""
-
-
-@handover.command("list", context_settings=COMMAND_SETTINGS, epilog=examples("teds-provision handover list"))
-@pass_app
-def list_(app: App) -> None:
-    """Every bundle that left or came."""
-    from datetime import UTC, datetime
-
-    from teds_provision.workflow.handover import list_handovers
-
-    listed = list_handovers(app.station(), datetime.now(UTC))
-    rows = [
-        {
-            "id": one.row.id,
-            "direction": one.row.direction,
-            "mode": one.row.mode,
-            "state": one.row.state,
-            "peers": list(one.row.peers),
-            "names": list(one.peers),
-            "count": one.count,
-            "created": one.row.created,
-            "expires": one.expires,
-            "expired": one.expired,
-        }
-        for one in listed
-    ]
-    lines = [
-        f"{row['id']}  {row['direction']:<3} {row['mode']}  {row['state']:<8} {row['count']:>5}"
-        f"  {', '.join(row['names'])}  {row['created']}{'  expired' if row['expired'] else ''}"  # type: ignore[arg-type]
-        for row in rows
-    ]
-    app.emit({"handovers": rows}, "\n".join(lines) or "No bundle has left or come.")
-
-
-@handover.command(
-    context_settings=COMMAND_SETTINGS,
-    short_help="Close a handover with the receiver's signed receipt.",
-    epilog=examples("teds-provision handover receipt lab.jwe.receipt"),
-)
-@click.argument("file", type=click.Path(path_type=Path, dir_okay=False))
-@pass_app
-def receipt(app: App, file: Path) -> None:
-    """Close a handover with the receiver's signed receipt; the keys of a move are then deleted here."""
-    from teds_provision.protocol.receipt import MAX_RECEIPT_OCTETS
-    from teds_provision.workflow.handover import close, peer_name
-    from teds_provision.workflow.handover_files import read_limited
-
-    station = app.station()
-    octets = read_limited(file, MAX_RECEIPT_OCTETS, "receipt")
-    with station.lock("handover receipt", app.note):
-        done = close(station, octets)
-    imported, refused = done.receipt.imported, done.receipt.refused
-    told = {
-        "id": done.row.id,
-        "from": done.receipt.sender,
-        "mode": done.row.mode,
-        "state": done.row.state,
-        "imported": [uuid.hex() for uuid in imported],
-        "refused": [{"uuid": one.uuid.hex(), "why": one.why} for one in refused],
-        "fresh": done.fresh,
-    }
-    text = f"Station {peer_name(station, done.receipt.sender)} took {_count(len(imported))} in"
-    text += ("; their keys are deleted here." if done.row.mode == "move" else ".") if done.fresh else " (known before)."
-    lines = [f"  refused {one.uuid.hex()}: {one.why}" for one in refused]
-    if refused and done.row.mode == "move":
-        lines.append("What was refused is this station's again, to be rotated at the next contact.")
-    app.emit(told, "\n".join([text, *lines]))
-
-
-@handover.command(
-    context_settings=COMMAND_SETTINGS,
-    short_help="Take a move back before its receipt.",
-    epilog=examples("teds-provision handover undo 3d1a4d1c --yes"),
-)
-@click.argument("id_", metavar="ID")
-@yes_option
-@dry_run_option
-@pass_app
-def undo(app: App, id_: str, yes: bool, dry_run: bool) -> None:
-    """Take a move back before its receipt; each node's key is rotated at the next contact, before anything else."""
-    from teds_provision.workflow.handover import find_handover
-    from teds_provision.workflow.handover import undo as run
-
-    station = app.station()
-    row = find_handover(station, id_)
-    if dry_run:
-        app.emit({"id": row.id, "state": row.state, "plan": "undo"}, f"Plan: take the {row.mode} {row.id} back.")
-        return
-    app.confirm("Take this move back? The receiver may have the keys all the same until they are rotated.", yes=yes)
-    with station.lock("handover undo", app.note):
-        done = run(station, find_handover(station, id_))
-    told = {"id": row.id, "state": "undone", "nodes": [uuid.hex() for uuid in done.uuids], "fresh": done.fresh}
-    text = f"{_count(len(done.uuids))} back here; the next contact with each rotates its key first."
-    app.emit(told, text if done.fresh else "Nothing to do: this move was taken back before.")

@@ -34,9 +34,9 @@ def read(app: App, uuid: str, output: Path | None, links: LinkSettings) -> None:
         identify(station, node)
         with station.lock("read", app.note):
             session_if_keyed(station, node)
-            image = read_image(node)
-            if node.sealed:
-                station.store.put_node_image(octets, image.to_json())
+        image = read_image(node)
+        if node.sealed:
+            station.store.put_node_image(octets, image.to_json())
     text = image.to_json()
     if output is not None:
         write_file(output, text)

@@ -44,7 +44,7 @@ SECTIONS: Final[dict[str, dict[str, Entry]]] = {
     "A key's life": {
         "export-keys": Entry("handover", "export_keys", "Hand node keys to another base station in a sealed bundle."),
         "import-keys": Entry("handover", "import_keys", "Take node keys over from another base station."),
-        "handover": Entry("handover", "handover", "Handovers under way: list, receipt, undo."),
+        "handover": Entry("handovers", "handover", "Handovers under way: list, receipt, undo."),
         "revoke": Entry("life", "revoke", "Ban a node's key, here and at every station that imports from here."),
         "decommission": Entry("life", "decommission", "Reset a node and take it out of service."),
         "replace": Entry("life", "replace", "Put a spare in the place of a broken node."),

@@ -84,7 +84,8 @@ def _node(app: App, what: str, links: LinkSettings) -> tuple[Image, Verified]:
             given_away = station.store.tombstone(uuid) is not None
             if held is None and station.has_keys(uuid) and not given_away and who.state != NodeState.FACTORY:
                 raise unknown_key(uuid)
-            image = read_image(node)
+        image = read_image(node)
+        with station.lock("verify", app.note):
             return image, verify_node(station, node, image, who.point)
 
 

@@ -96,12 +96,16 @@ def derive(shared: bytes, nonce: bytes, script: bytes) -> LinkKey:
 
 @dataclass(frozen=True)
 class AgreedKey:
-    """What the station has after a good Request: the key to store as pending, and the Confirm to send then."""
+    """What the station has after a good Request: the key to store as pending, and the Confirm to send then.
+
+    ``unsigned`` says that the node shows its initial Security TEDS: authentic, since the transcript covers it.
+    """
 
     key: bytes = field(repr=False)
     epoch: int
     node: bytes
     confirm: Command = field(repr=False)
+    unsigned: bool
 
     @property
     def key_id(self) -> bytes:
@@ -151,7 +155,8 @@ class StationAgreement:
         derived = derive(shared, nonce, script)
         if not hmac.compare_digest(derived.node_tag, tag):
             raise NotAuthentic("The node's confirmation tag is wrong: it does not hold the key that it shows.")
-        return AgreedKey(derived.key, offered, node, security_command(Function.CONFIRM, derived.station_tag))
+        confirm = security_command(Function.CONFIRM, derived.station_tag)
+        return AgreedKey(derived.key, offered, node, confirm, unsigned=not shown.signed)
 
 
 def other_key(pinned: str, node: bytes) -> OtherKey:

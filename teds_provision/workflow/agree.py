@@ -70,7 +70,7 @@ def session_if_keyed(station: Station, node: Conversation) -> NodeKey | None:
         _agree_anew(station, node, entry, station.ca_of(node.uuid))
     except SessionLost as lost:
         raise lost.cause from lost
-    return station.node_keys(node.uuid)[0]
+    return next(iter(station.node_keys(node.uuid)))
 
 
 def require_session(station: Station, node: Conversation) -> NodeKey:
@@ -102,9 +102,8 @@ def agree(station: Station, node: Conversation, who: Identified, *, rotate: bool
     ``rotate`` demands a new one: inside a session where a key is known, else by tap. Raises NotWhitelisted, OtherKey,
     PolicyRefused, NodeRefused, NotAuthentic, LinkFailure; whatever is cut, the same call carries on.
     """
-    if who.state == NodeState.FACTORY:
-        _welcome_back(station, node.uuid)
-    entry = station.require_whitelisted(node.uuid)
+    returning = who.state == NodeState.FACTORY and _may_return(station, node.uuid)
+    entry = station.require_whitelisted(node.uuid, returning=returning)
     held = open_session(station, node) if who.state != NodeState.FACTORY else None
     rotate = rotate or (held is not None and station.rotation_due(node.uuid) is not None)
     if held is not None and not rotate:
@@ -114,7 +113,7 @@ def agree(station: Station, node: Conversation, who: Identified, *, rotate: bool
     pinned = _pin_for(entry, node, who)
     ca = station.ca if who.state == NodeState.FACTORY else station.ca_of(node.uuid)
     try:
-        return _agree_anew(station, node, pinned, ca)
+        return _agree_anew(station, node, pinned, ca, returning=returning)
     except NodeRefused as refusal:
         # Identify may have been answered while the node was still storing the key of a run that was cut off
         late = refusal.reason == Reason.NOT_PERMITTED and who.state == NodeState.FACTORY and not rotate
@@ -126,14 +125,11 @@ def agree(station: Station, node: Conversation, who: Identified, *, rotate: bool
         raise lost.cause from lost
 
 
-def _welcome_back(station: Station, uuid: bytes) -> None:
-    """A node whose move was closed by its receipt, and that was reset since, may be keyed here again."""
+def _may_return(station: Station, uuid: bytes) -> bool:
+    """Whether a node whose move was closed by its receipt may be keyed here again, should it prove to be reset."""
     tombstone = station.store.tombstone(uuid)
     row = station.store.handover(tombstone.handover_id, "out") if tombstone is not None else None
-    if row is not None and row.state == "closed" and not station.has_keys(uuid):
-        with station.store.transaction():
-            station.store.remove_tombstone(uuid)
-            station.audit("handover", uuid, "came back after a reset", handover=row.id)
+    return row is not None and row.state == "closed" and not station.has_keys(uuid)
 
 
 def _pin_for(entry: WhitelistEntry, node: Conversation, who: Identified) -> WhitelistEntry:
@@ -150,8 +146,13 @@ def _pin_for(entry: WhitelistEntry, node: Conversation, who: Identified) -> Whit
     )
 
 
-def _agree_anew(station: Station, node: Conversation, entry: WhitelistEntry, ca: bytes) -> Agreed:
-    """Request, Confirm, Open; ``ca`` is the one that the node keeps, or shall keep from now on."""
+def _agree_anew(
+    station: Station, node: Conversation, entry: WhitelistEntry, ca: bytes, *, returning: bool = False
+) -> Agreed:
+    """Request, Confirm, Open; ``ca`` is the one that the node keeps, or shall keep from now on.
+
+    ``returning`` nodes were given away: only a signed-for initial Security TEDS shows that they were reset since.
+    """
     uuid = node.uuid
     agreement = StationAgreement(
         replace(station.credentials(), ca=ca, station_signature=station.signature_under(ca)), uuid
@@ -159,7 +160,12 @@ def _agree_anew(station: Station, node: Conversation, entry: WhitelistEntry, ca:
     reply = node.send(agreement.request(), "the key agreement")
     agreed = agreement.accept(reply, pinned=entry.fingerprint, epoch=epoch_to_exceed(station, uuid, entry.fingerprint))
     key_id = agreed.key_id.hex()
+    if returning and not agreed.unsigned:
+        station.require_not_given_away(uuid)
     with station.store.transaction():
+        if returning:
+            station.store.remove_tombstone(uuid)
+            station.audit("handover", uuid, "came back after a reset")
         station.add_pending(uuid, key=agreed.key, key_id=agreed.key_id, epoch=agreed.epoch)
         station.set_ca_of(uuid, ca)
         if entry != station.store.whitelisted(uuid):

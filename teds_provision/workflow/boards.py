@@ -14,6 +14,7 @@ def let_go(station: Station, uuid: bytes) -> None:
         pinned = fingerprint(node.point)
     if pinned is not None:
         station.store.set_setting(_setting(uuid), pinned)
+        station.store.drop_draft(uuid)  # it may hold the old board's calibration
 
 
 def epoch_to_exceed(station: Station, uuid: bytes, pinned: str | None) -> int:

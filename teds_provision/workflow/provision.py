@@ -13,6 +13,7 @@ from teds_provision.errors import NotAuthentic, PolicyRefused
 from teds_provision.protocol.datasheet import NodeKeys
 from teds_provision.protocol.identity import NodeState
 from teds_provision.store import Draft, WhitelistEntry
+from teds_provision.store.records import Assurance
 from teds_provision.teds.image import SECURITY, Image
 from teds_provision.workflow.agree import Agreed, agree
 from teds_provision.workflow.build import BuildOrder, Built, build, check_order
@@ -167,16 +168,19 @@ def require_authentic(verified: Verified) -> None:
     if verified.verdict == "authentic":
         return
     failed = next(check for check in verified.checks if check.result == "failed")
-    raise NotAuthentic(f"The node's datasheet is {verified.verdict}: {failed.name}: {failed.why}.")
+    raise NotAuthentic(f"The datasheet is {verified.verdict}: {failed.why or failed.name}.")
 
 
 def add_to_whitelist(station: Station, node: Conversation, who: Identified) -> WhitelistEntry:
-    """Whitelist a node that was just identified, pinned to its key; by tap, or by the bus of a CAN-only node.
+    """Whitelist a node that was just identified, pinned to its key: by tap, or by the bus of a new CAN-only node.
 
-    An entry that another process made meanwhile stays. Raises PolicyRefused (revoked), OtherKey.
+    A node that already has a key is not pinned over a bus, where anyone may show any UUID; its first tap does. An
+    entry that another process made meanwhile stays. Raises PolicyRefused (revoked), OtherKey.
     """
-    assurance = "tap" if node.tapped else "bus"
-    entry = WhitelistEntry(who.uuid, who.fingerprint, assurance=assurance)  # type: ignore[arg-type]
+    new = who.state == NodeState.FACTORY
+    assurance: Assurance = "tap" if node.tapped else "bus" if new else "uuid"
+    pinned = who.fingerprint if node.tapped or new else None
+    entry = WhitelistEntry(who.uuid, pinned, assurance=assurance)
     with station.store.transaction():
         revoked = station.store.revocation(who.uuid)
         if revoked is not None:
@@ -186,8 +190,9 @@ def add_to_whitelist(station: Station, node: Conversation, who: Identified) -> W
         if present is not None:
             return present
         station.store.put_whitelist(entry)
-        station.remember(who.uuid, point=who.point)
-        station.audit("whitelist", who.uuid, "added", fingerprint=who.fingerprint, assurance=assurance)
+        if pinned is not None:
+            station.remember(who.uuid, point=who.point)
+        station.audit("whitelist", who.uuid, "added", fingerprint=pinned, assurance=assurance)
     return entry
 
 

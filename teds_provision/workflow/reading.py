@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from dataclasses import dataclass
 
 from teds_provision.errors import BadData, Garbled, NodeRefused
@@ -23,17 +24,23 @@ LARGEST_TEDS = 1 << 20
 LARGEST_SECURITY = 4094 - 78
 """A Security TEDS fits into the sealed reply to Request, a frame of at most 4094 octets (wire, "maxMessage")."""
 LARGEST_IMAGE = 4 << 20
+READING_SECONDS = 300.0
+"""A whole image takes seconds, over a slow link a minute; who dawdles longer holds others up."""
 
 
-def read_block(node: Conversation, block: BlockId) -> bytes:
+def read_block(node: Conversation, block: BlockId, *, until: float | None = None) -> bytes:
     """Read one TEDS, segment by segment, as long as its Length says (or as the node has octets).
 
-    Raises NodeRefused (18: no such TEDS), Garbled, BadData for a Length beyond 1 MiB (of a Security TEDS, 4016 octets).
+    ``until`` is a monotonic time. Raises NodeRefused (18: no such TEDS), Garbled, BadData for a Length beyond 1 MiB
+    (of a Security TEDS, 4016 octets).
     """
     channel, access_code = block
     largest = LARGEST_SECURITY if block == SECURITY else LARGEST_TEDS
     octets = bytearray()
+    until = time.monotonic() + READING_SECONDS if until is None else until
     while True:
+        if time.monotonic() > until:
+            raise Garbled(f"The node hands out its TEDS too slowly: not done after {READING_SECONDS:.0f} s.")
         payload = node.ask(
             read_teds(channel, access_code, len(octets)), f"to read TEDS {access_code} of channel {channel}"
         )
@@ -56,9 +63,10 @@ def read_image(node: Conversation) -> Image:
     """Read every TEDS of a node."""
     blocks: dict[BlockId, bytes] = {}
     total = 0
+    until = time.monotonic() + READING_SECONDS
     for block in list_blocks(node):
         try:
-            blocks[block] = read_block(node, block)
+            blocks[block] = read_block(node, block, until=until)
         except NodeRefused as refusal:
             if refusal.reason != Reason.NO_SUCH_TEDS:
                 raise

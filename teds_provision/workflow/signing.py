@@ -47,7 +47,7 @@ def sign_image(station: Station, order: SignOrder, node: Conversation | None) ->
     if image is None:
         raise NotFound(f"Nothing is built for node {uuid.hex()}.", hint=f"Build it: teds-provision build {uuid.hex()}")
     record = station.store.node(uuid)
-    epoch = record.epoch if record else 0
+    epoch = station.active_epoch(uuid) or (record.epoch if record else 0)
     sequence = record.sequence if record else 0
     has = known_image(station, uuid)
     if node is not None:

@@ -2,12 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from teds_provision.errors import NotAuthentic, NotFound, NotWhitelisted, PolicyRefused
+from teds_provision.errors import (
+    NoKeyring,
+    NotAuthentic,
+    NotFound,
+    NotWhitelisted,
+    PolicyRefused,
+    VaultFailure,
+    WrongPassphrase,
+)
 from teds_provision.protocol.agreement import Credentials, other_key
 from teds_provision.protocol.keys import fingerprint, station_key_message, verify
 from teds_provision.store import KeyRecord, NodeRecord, Store, StoreLock, WhitelistEntry, utc_now
@@ -178,9 +186,23 @@ class Station:
 
     # -- link keys -------------------------------------------------------------------------------------------------
 
-    def node_keys(self, uuid: bytes) -> list[NodeKey]:
-        """Every key held for a node, in the order of trying: newest pending first, the active one last."""
-        return [NodeKey(record, self.unwrap(record)) for record in self.store.keys(uuid)]
+    def node_keys(self, uuid: bytes) -> Iterator[NodeKey]:
+        """Every key held for a node, in the order of trying: newest pending first, the active one last.
+
+        One that cannot be unwrapped does not hide the others; VaultFailure comes after the last.
+        """
+        damaged: VaultFailure | None = None
+        for record in self.store.keys(uuid):
+            try:
+                key = self.unwrap(record)
+            except (WrongPassphrase, NoKeyring):
+                raise
+            except VaultFailure as failure:
+                damaged = failure
+                continue
+            yield NodeKey(record, key)
+        if damaged is not None:
+            raise damaged
 
     def has_keys(self, uuid: bytes) -> bool:
         """Whether any key is held for a node."""
@@ -227,12 +249,16 @@ class Station:
         """Station keys that count here: its own, and those added."""
         return [self.point, *(record.point for record in self.store.trusted() if record.role == "station")]
 
-    def require_whitelisted(self, uuid: bytes) -> WhitelistEntry:
-        """Return the whitelist entry; raises NotWhitelisted, or PolicyRefused for a revoked node or one given away."""
+    def require_whitelisted(self, uuid: bytes, *, returning: bool = False) -> WhitelistEntry:
+        """Return the whitelist entry; raises NotWhitelisted, or PolicyRefused for a revoked node or one given away.
+
+        ``returning``: a node given away may come back here, if a key agreement shows that it was reset.
+        """
         revoked = self.store.revocation(uuid)
         if revoked is not None:
             raise PolicyRefused(f"Node {uuid.hex()} was revoked: {revoked.why}.")
-        self.require_not_given_away(uuid)
+        if not returning:
+            self.require_not_given_away(uuid)
         entry = self.store.whitelisted(uuid)
         if entry is None:
             raise NotWhitelisted(

@@ -1,78 +1,75 @@
-"""Which contacts pin a node's key: a tap and the owner's word do, a bus on which anyone may speak does not."""
+"""What a bus may not decide, and what one damaged key may not hide."""
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import pytest
 
-from teds_provision.errors import OtherKey, PolicyRefused
-from teds_provision.store import Revocation, WhitelistEntry
-from teds_provision.workflow.agree import agree
+from teds_provision.errors import Garbled, PolicyRefused, VaultFailure
+from teds_provision.workflow import reading
 from teds_provision.workflow.identify import identify
 from teds_provision.workflow.provision import add_to_whitelist
 from teds_provision.workflow.station import Station
-from teds_provision.workflow.whitelist import remove
 
-from .bench import Board, MemoryLink, talk
-
-
-def over_the_bus(board: Board) -> MemoryLink:
-    return MemoryLink(board, via="can", tapped=False)
+from .bench import Board, MemoryLink, make_station, talk
+from .test_agree import run as agree
+from .test_agree import whitelist
 
 
-def test_an_impostor_on_the_bus_does_not_keep_the_real_node_out(station: Station, board: Board) -> None:
-    identify(station, talk(impostor := Board(), over_the_bus(impostor)))
-    assert identify(station, talk(board)).point == board.key.point
-    with pytest.raises(OtherKey):
-        identify(station, talk(impostor, over_the_bus(impostor)))
-
-
-def test_an_impostor_on_the_bus_does_not_take_an_entry_without_key(station: Station, board: Board) -> None:
-    station.store.put_whitelist(WhitelistEntry(board.uuid))
-    identify(station, talk(impostor := Board(), over_the_bus(impostor)))
+def test_a_keyed_node_on_a_bus_is_listed_by_uuid_and_pinned_by_its_first_tap(
+    station: Station, board: Board, tmp_path: Path
+) -> None:
+    owner = make_station(tmp_path / "owner")
+    whitelist(owner, board)
+    agree(owner, board)
+    with talk(board, MemoryLink(board, via="can", tapped=False)) as node:
+        entry = add_to_whitelist(station, node, identify(station, node))
+    assert (entry.assurance, entry.fingerprint) == ("uuid", None)
     with talk(board) as node:
-        agree(station, node, identify(station, node))
-    entry, known = station.store.whitelisted(board.uuid), station.store.node(board.uuid)
-    assert entry is not None
-    assert known is not None
-    assert (entry.assurance, known.point) == ("tap", board.key.point)
+        shown = identify(station, node)
+    pinned = station.store.whitelisted(board.uuid)
+    assert pinned is not None
+    assert pinned.fingerprint == shown.fingerprint
 
 
-def test_what_an_impostor_showed_is_not_built_upon(station: Station, board: Board) -> None:
-    from teds_provision.workflow.sign import known_node_keys
-
-    identify(station, talk(impostor := Board(), over_the_bus(impostor)))
-    identify(station, talk(board))
-    assert known_node_keys(station, board.uuid).key == board.key.point
-
-
-def test_a_node_whitelisted_over_its_bus_is_pinned_from_then_on(station: Station, board: Board) -> None:
-    node = talk(board, over_the_bus(board))
-    add_to_whitelist(station, node, identify(station, node))
-    with pytest.raises(OtherKey):
-        identify(station, talk(Board()))
+def test_one_damaged_key_does_not_hide_the_good_one(station: Station, board: Board) -> None:
+    whitelist(station, board)
+    agree(station, board)
+    station.add_pending(board.uuid, key=bytes(16), key_id=bytes(8), epoch=9)
+    station.store._database.execute("UPDATE keys SET wrapped = x'00' WHERE state = 'pending'")
+    assert agree(station, board).epoch == 1
+    station.store._database.execute("UPDATE keys SET wrapped = x'00'")
+    with pytest.raises(VaultFailure):
+        agree(station, board)
 
 
-def test_an_entry_that_came_meanwhile_is_not_replaced(station: Station, board: Board) -> None:
-    node = talk(board)
-    who = identify(station, node)
-    station.store.put_whitelist(WhitelistEntry(board.uuid, who.fingerprint, assurance="import", name="left hand"))
-    assert add_to_whitelist(station, node, who).name == "left hand"
-    station.store.put_whitelist(WhitelistEntry(board.uuid, "ab" * 32, assurance="import"))
-    with pytest.raises(OtherKey):
-        add_to_whitelist(station, node, who)
+def test_a_node_that_hands_out_its_teds_too_slowly_is_left(
+    station: Station, board: Board, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(reading, "READING_SECONDS", -1.0)
+    with talk(board) as node, pytest.raises(Garbled, match="too slowly"):
+        reading.read_image(node)
 
 
-def test_a_revoked_node_is_not_whitelisted_again_by_a_tap(station: Station, board: Board) -> None:
-    station.store.put_revocation(Revocation(board.uuid, None, "lost", "signed elsewhere"))
-    node = talk(board)
-    with pytest.raises(PolicyRefused, match="revoked"):
-        add_to_whitelist(station, node, identify(station, node))
-    assert station.store.whitelisted(board.uuid) is None
+def test_a_node_given_away_and_provisioned_elsewhere_does_not_come_back_on_a_hint(
+    station: Station, board: Board
+) -> None:
+    from dataclasses import replace
 
+    from teds_provision.protocol.identity import NodeState
+    from teds_provision.store import Handover, Tombstone
+    from teds_provision.workflow.agree import agree as step
 
-def test_a_tapped_key_that_was_never_whitelisted_can_be_forgotten(station: Station, board: Board) -> None:
-    identify(station, talk(Board()))
-    with pytest.raises(OtherKey):
-        identify(station, talk(board))
-    assert remove(station, board.uuid)
-    assert identify(station, talk(board)).point == board.key.point
+    from .test_provision import run as provision
+
+    provision(station, board)
+    station.store.remove_keys(board.uuid)
+    station.store.put_handover(Handover("one", "out", "move", ("ab" * 32,), "closed", "{}"))
+    station.store.put_tombstone(Tombstone(board.uuid, "ab" * 32, "one"))
+    with talk(board) as node, pytest.raises(PolicyRefused, match="was moved"):
+        step(station, node, replace(identify(station, node), state=NodeState.FACTORY))
+    assert station.store.tombstone(board.uuid) is not None
+    board.tim.reset_by_hand()
+    assert agree(station, board).epoch == 2
+    assert station.store.tombstone(board.uuid) is None
