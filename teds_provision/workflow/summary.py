@@ -43,12 +43,12 @@ def _name(image: Image, channel: int) -> str | None:
 
 
 def _channel(image: Image, channel: int) -> ChannelSummary:
-    from teds_provision.teds.units import display_unit, format_units, format_value
+    from teds_provision.teds.units import display_unit, format_value
 
     decoded = teds.decode(image.blocks[channel, CHANNEL])
     units, low, high = decoded.get("PhyUnits"), decoded.get("LowLimit"), decoded.get("HiLimit")
     unit = text = ""
     if isinstance(units, teds.Units) and isinstance(low, float) and isinstance(high, float):
         shown = display_unit(units)
-        unit, text = format_units(units), f"{format_value(low, shown)} to {format_value(high, shown)}"
+        unit, text = shown.text, f"{format_value(low, shown)} to {format_value(high, shown)}"
     return ChannelSummary(channel, _name(image, channel) or "", unit, text, (channel, CALIBRATION) in image.blocks)
