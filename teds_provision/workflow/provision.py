@@ -116,7 +116,7 @@ class _Run:
                 epoch=present.identity.epoch,
                 node_sequence=present.identity.sequence,
                 on_node=present.image.security if intact and present.identity.state == NodeState.PROVISIONED else None,
-                earlier=earlier,
+                earlier=() if earlier is None else (earlier,),
             )
             self.station.store.put_draft(Draft(who.uuid, signed.image.to_json(), "signed", built.profile))
             step.result = NOTHING if signed.reused else DONE

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 from teds_provision.errors import BadData, NotFound, PolicyRefused
@@ -88,13 +89,13 @@ def sign(
     epoch: int,
     node_sequence: int,
     on_node: bytes | None = None,
-    earlier: bytes | None = None,
+    earlier: Sequence[bytes] = (),
     sequence: int | None = None,
 ) -> Signed:
     """Sign ``image`` for key epoch ``epoch``.
 
     ``node_sequence`` is the node's, as read in a session (or last known). ``on_node`` is the node's present Security
-    TEDS and ``earlier`` one that was signed but perhaps never written: where either says exactly the same by the same
+    TEDS and ``earlier`` those that were signed but perhaps never written: where one says exactly the same by the same
     signer, it is given back. ``sequence`` forces one (steps over more than 65536). The new sequence is durable in the
     store before the signature is made.
     """
@@ -102,7 +103,7 @@ def sign(
         if not can_be_stored(block) or not passes_own_check(block, teds):
             raise BadData(f"TEDS {block[1]} of channel {block[0]} is damaged: Length, checksum or class is wrong.")
     if sequence is None:
-        for octets in (on_node, earlier):
+        for octets in (on_node, *earlier):
             if octets is not None and _says_the_same(station, keys, image, octets, epoch):
                 number = security.decode(octets).sequence
                 if octets == on_node or number > node_sequence:

@@ -72,10 +72,11 @@ def sign_image(station: Station, order: SignOrder, node: Conversation | None) ->
         epoch=epoch,
         node_sequence=sequence if node is not None else _sequence_of(has),
         on_node=has.security if has is not None and intact else None,
-        earlier=image.security,
+        earlier=_signed_before(image, draft),
     )
-    if order.image is None:
-        assert draft is not None
+    if draft is not None and (
+        order.image is None or Image.from_json(draft.image).unsigned_blocks() == image.unsigned_blocks()
+    ):
         station.store.put_draft(Draft(uuid, signed.image.to_json(), "signed", draft.profile))
     return SignDone(signed, told)
 
@@ -86,3 +87,9 @@ def _sequence_of(has: Image | None) -> int:
 
     octets = has.blocks.get(SECURITY) if has is not None else None
     return security.decode(octets).sequence if octets is not None else 0
+
+
+def _signed_before(image: Image, draft: Draft | None) -> list[bytes]:
+    """Security TEDS of the image at hand and of the draft: either may hold the signature that still says the same."""
+    images = [image] if draft is None else [image, Image.from_json(draft.image)]
+    return [found.blocks[SECURITY] for found in images if SECURITY in found.blocks]

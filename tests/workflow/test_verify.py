@@ -167,3 +167,22 @@ def test_what_is_not_whitelisted_cannot_be_signed(station: Station, board: Board
     station.store.remove_whitelist(board.uuid)
     with pytest.raises(NotWhitelisted):
         sign_image(station, SignOrder(board.uuid, image), None)
+
+
+def test_the_same_build_signed_as_draft_and_as_file_has_one_signature(station: Station, board: Board) -> None:
+    from teds_provision.workflow.agree import agree
+    from teds_provision.workflow.build import build
+    from teds_provision.workflow.signing import SignOrder, sign_image
+
+    from .test_agree import whitelist
+    from .test_provision import ANGLE
+
+    whitelist(station, board)
+    with talk(board) as node:
+        agree(station, node, identify(station, node))
+    built = build(station, board.uuid, ANGLE)
+    first = sign_image(station, SignOrder(board.uuid), None).signed
+    second = sign_image(station, SignOrder(board.uuid, built.image), None).signed
+    assert (second.signature, second.sequence, second.reused) == (first.signature, 1, True)
+    again = sign_image(station, SignOrder(board.uuid), None).signed
+    assert (again.signature, again.reused) == (first.signature, True)
