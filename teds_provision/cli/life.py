@@ -39,9 +39,9 @@ def revoke(app: App, uuid: str, why: str, yes: bool, dry_run: bool) -> None:
         )
         return
     station.unlock()
+    if station.store.revocation(octets) is None:
+        app.confirm(f"Revoke node {octets.hex()} for good?", yes=yes)
     with station.lock("revoke", app.note):
-        if station.store.revocation(octets) is None:
-            app.confirm(f"Revoke node {octets.hex()} for good?", yes=yes)
         done = run(station, octets, why)
     told = {
         "uuid": octets.hex(),
@@ -74,13 +74,11 @@ def decommission(app: App, uuid: str, force: bool, yes: bool, dry_run: bool, lin
         app.emit({"uuid": octets.hex(), "plan": "decommission"}, f"Plan: reset {octets.hex()}, take it out of service.")
         return
     station.unlock(octets)
+    if is_finished(station, octets):
+        app.emit(_result(octets, None) | {"confirmed": True, "fresh": False}, "Nothing to do: it is out of service.")
+        return
+    app.confirm(f"Take node {octets.hex()} out of service? Its key is erased, there and here.", yes=yes)
     with station.lock("decommission", app.note):
-        if is_finished(station, octets):
-            app.emit(
-                _result(octets, None) | {"confirmed": True, "fresh": False}, "Nothing to do: it is out of service."
-            )
-            return
-        app.confirm(f"Take node {octets.hex()} out of service? Its key is erased, there and here.", yes=yes)
         receipt = _reset(app, station, octets, links, force=force)
         retire(station, octets, receipt)
     state = "is out of service; it signed that it is in factory state" if receipt else "is out of service, unconfirmed"

@@ -116,15 +116,15 @@ def remove(app: App, name: str, yes: bool, dry_run: bool) -> None:
     from teds_provision.workflow.trust import remove as run
 
     station = app.station()
+    record = find_trusted(station, name)
+    told = {"removed": _record(record)}
+    text = f"{record.role} {record.name}, {record.fingerprint[:16]}"
+    if dry_run:
+        app.emit({**told, "plan": True}, f"Plan: trust the {text} no more.")
+        return
+    app.confirm(f"Trust the {text} no more?", yes=yes)
     with station.lock("trust remove", app.note):
-        record = find_trusted(station, name)
-        told = {"removed": _record(record)}
-        text = f"{record.role} {record.name}, {record.fingerprint[:16]}"
-        if dry_run:
-            app.emit({**told, "plan": True}, f"Plan: trust the {text} no more.")
-            return
-        app.confirm(f"Trust the {text} no more?", yes=yes)
-        run(station, record)
+        run(station, find_trusted(station, name))
     app.emit(told, f"Not trusted any more: {text}.")
 
 
@@ -205,9 +205,9 @@ def sign(app: App, request: Path, output: Path, yes: bool, dry_run: bool) -> Non
         app.emit({**told, "plan": True}, f"Plan: certify\n{shown}")
         return
     station.unlock()
+    app.note(shown)
+    app.confirm("Certify it? Whoever holds its key can then write and rekey every node of this owner.", yes=yes)
     with station.lock("trust ca sign", app.note):
-        app.note(shown)
-        app.confirm("Certify it? Whoever holds its key can then write and rekey every node of this owner.", yes=yes)
         octets = write_certificate(sign_request(station, wanted))
         fresh = not (output.is_file() and output.read_bytes() == octets)
         if fresh:
@@ -247,8 +247,8 @@ def drop(app: App, yes: bool) -> None:
 
     station = app.station()
     station.unlock()
+    app.confirm("Delete the CA key from this vault? Only its exported file can bring it back.", yes=yes)
     with station.lock("trust ca drop", app.note):
-        app.confirm("Delete the CA key from this vault? Only its exported file can bring it back.", yes=yes)
         dropped = drop_ca(station)
     app.emit({"dropped": dropped}, "The CA key is not in this vault any more." if dropped else "Nothing to do.")
 
