@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from enum import StrEnum
 from fractions import Fraction
-from typing import Literal
+from typing import Final, Literal
 
 Edition = Literal[2007, 2024]
 Severity = Literal["error", "warning", "note"]
@@ -59,6 +59,20 @@ class Units:
     moles: Fraction = Fraction(0)
     candelas: Fraction = Fraction(0)
     extension: int = 0
+
+
+UNIT_PARTS: Final = (
+    "radians",
+    "steradians",
+    "meters",
+    "kilograms",
+    "seconds",
+    "amperes",
+    "kelvins",
+    "moles",
+    "candelas",
+)
+"""Names of the exponents of Units, in the order of the wire."""
 
 
 @dataclass(frozen=True)

@@ -17,9 +17,8 @@ from functools import cache
 from typing import TYPE_CHECKING, Any, Final
 
 from teds_provision.errors import BadData
-from teds_provision.teds.model import Units
+from teds_provision.teds.model import UNIT_PARTS, Units
 from teds_provision.teds.units_table import (
-    BASES,
     LOG_RATIO,
     NAME_OF,
     NAMED,
@@ -37,7 +36,6 @@ if TYPE_CHECKING:
     import pint
 
 __all__ = [
-    "BASES",
     "LOG_RATIO",
     "PRODUCT",
     "RATIO",
@@ -130,7 +128,7 @@ def _ratio(text: str) -> WrittenUnit | None:
         return None
     if above.units != below.units or above.units.interpretation != PRODUCT or above.units == Units():
         return None
-    exponents = {base: getattr(above.units, base) for base in BASES}
+    exponents = {base: getattr(above.units, base) for base in UNIT_PARTS}
     return WrittenUnit(text, Units(RATIO, **exponents), above.scale / below.scale)
 
 
@@ -153,7 +151,7 @@ def _by_pint(text: str) -> WrittenUnit:
     light = ("steradian", "lumen", "lux")  # pint counts these as rad²
     steradians = sum((n for name, n in _exponents(parsed._units).items() if name.endswith(light)), Fraction(0))
     exponents["radian"] = exponents.get("radian", Fraction(0)) - 2 * steradians
-    out = dict.fromkeys(BASES, Fraction(0)) | {"steradians": steradians}
+    out = dict.fromkeys(UNIT_PARTS, Fraction(0)) | {"steradians": steradians}
     for name, power in exponents.items():
         if name in _PINT_BASES:
             out[_PINT_BASES[name]] = power
@@ -203,7 +201,7 @@ def _power(exponent: Fraction) -> str:
 
 
 def _product(units: Units) -> str:
-    exponents = [(symbol, getattr(units, base)) for symbol, base in zip(_SYMBOLS, BASES, strict=True)]
+    exponents = [(symbol, getattr(units, base)) for symbol, base in zip(_SYMBOLS, UNIT_PARTS, strict=True)]
     above = "·".join(symbol + _power(power) for symbol, power in exponents if power > 0)
     below = [symbol + _power(-power) for symbol, power in exponents if power < 0]
     if not below:
@@ -216,7 +214,7 @@ def format_units(units: Units) -> str:
 
     The joule and the newton metre have the same exponents; it is called N·m here.
     """
-    exponents = {base: getattr(units, base) for base in BASES}
+    exponents = {base: getattr(units, base) for base in UNIT_PARTS}
     plain = Units(**exponents)
     name = NAME_OF.get(plain) or _product(plain)
     if units.extension not in (0, 128):

@@ -7,16 +7,14 @@ from collections.abc import Mapping
 from fractions import Fraction
 from typing import Final
 
-from teds_provision.teds.model import Units
+from teds_provision.teds.model import UNIT_PARTS, Units
 
 PRODUCT, RATIO, LOG_PRODUCT, LOG_RATIO, DIGITAL, ARBITRARY = range(6)
-
-BASES: Final = ("radians", "steradians", "meters", "kilograms", "seconds", "amperes", "kelvins", "moles", "candelas")
 
 
 def from_exponents(interpretation: int, exponents: Mapping[str, Fraction]) -> Units:
     """Units of exponents by base name; a base that is left out is absent."""
-    rad, sr, m, kg, s, a, k, mol, cd = (exponents.get(base, Fraction(0)) for base in BASES)
+    rad, sr, m, kg, s, a, k, mol, cd = (exponents.get(base, Fraction(0)) for base in UNIT_PARTS)
     return Units(interpretation, rad, sr, m, kg, s, a, k, mol, cd)
 
 

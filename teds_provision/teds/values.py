@@ -11,7 +11,7 @@ from numbers import Integral, Rational, Real
 from typing import Any, Final
 
 from teds_provision.errors import BadData
-from teds_provision.teds.model import Edition, TimeInstance, Units, Value
+from teds_provision.teds.model import UNIT_PARTS, Edition, TimeInstance, Units, Value
 from teds_provision.teds.tables import FieldSpec
 
 NOT_AVAILABLE: Final = bytes.fromhex("7fffffff")
@@ -19,17 +19,6 @@ NOT_AVAILABLE: Final = bytes.fromhex("7fffffff")
 
 _INTEGERS: Final = {"u8": 1, "u16": 2, "u32": 4}
 _F32 = struct.Struct(">f")
-_UNIT_PARTS: Final = (
-    "radians",
-    "steradians",
-    "meters",
-    "kilograms",
-    "seconds",
-    "amperes",
-    "kelvins",
-    "moles",
-    "candelas",
-)
 NO_EXTENSION: Final = (0x00, 0x80)
 """What peers write where no Units Extension TEDS exists."""
 
@@ -238,12 +227,12 @@ def as_units(spec: FieldSpec, value: object) -> Units:
     if isinstance(value, Units):
         return value
     if isinstance(value, Mapping):
-        unknown = set(value) - {"interpretation", "extension", *_UNIT_PARTS}
+        unknown = set(value) - {"interpretation", "extension", *UNIT_PARTS}
         if unknown:
             raise _refuse(spec.name, f"has no part {sorted(map(str, unknown))[0]}")
         try:
             parts: dict[str, Any] = {
-                key: Fraction(part) if key in _UNIT_PARTS else int(part) for key, part in value.items()
+                key: Fraction(part) if key in UNIT_PARTS else int(part) for key, part in value.items()
             }
         except (TypeError, ValueError, OverflowError, ZeroDivisionError) as error:
             raise _refuse(spec.name, "holds something that is no number") from error
@@ -256,7 +245,7 @@ def as_units(spec: FieldSpec, value: object) -> Units:
 def pack_units(spec: FieldSpec, units: Units) -> bytes:
     """Packed spelling B: interpretation, nine exponents (2 x + 128), extension; 11 octets."""
     octets = [units.interpretation]
-    for part in _UNIT_PARTS:
+    for part in UNIT_PARTS:
         doubled = getattr(units, part) * 2 + 128
         if doubled != int(doubled) or not 0 <= doubled <= 255:
             raise _refuse(spec.name, f"cannot hold the exponent {getattr(units, part)} of {part}")

@@ -13,12 +13,12 @@ from hypothesis import strategies as st
 
 from teds_provision.errors import BadData
 from teds_provision.teds import units as u
-from teds_provision.teds.model import Units
+from teds_provision.teds.model import UNIT_PARTS, Units
 
 
 def exponents(text: str) -> dict[str, Fraction]:
     units = u.parse_units(text)
-    return {base: getattr(units, base) for base in u.BASES if getattr(units, base)}
+    return {base: getattr(units, base) for base in UNIT_PARTS if getattr(units, base)}
 
 
 @pytest.mark.parametrize(

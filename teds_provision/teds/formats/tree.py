@@ -17,23 +17,12 @@ from typing import Final, Literal
 from teds_provision.errors import BadData
 from teds_provision.teds import compose, decode
 from teds_provision.teds.formats.block import Block
-from teds_provision.teds.model import Decoded, Edition, Field, TimeInstance, Units
+from teds_provision.teds.model import UNIT_PARTS, Decoded, Edition, Field, TimeInstance, Units
 from teds_provision.teds.tables import TEXT_BASED, FieldSpec, name_of, table
 
 Kind = Literal["integer", "number", "text", "octets", "units", "time", "integers", "numbers", "fields"]
 EntryValue = int | float | str | bytes | Units | TimeInstance | tuple[int, ...] | tuple[float, ...] | None
 
-UNIT_PARTS: Final = (
-    "radians",
-    "steradians",
-    "meters",
-    "kilograms",
-    "seconds",
-    "amperes",
-    "kelvins",
-    "moles",
-    "candelas",
-)
 MAX_DEPTH: Final = 8
 _F32: Final = struct.Struct(">f")
 _FLOAT32_MAXIMUM: Final = 3.4028234663852886e38
