@@ -127,7 +127,8 @@ def unseal(passphrase: str, sealed: Mapping[str, Any], *, context: bytes) -> tup
         return AESGCM(key.key).decrypt(nonce, ciphertext, context), key
     except InvalidTag:
         raise WrongPassphrase(
-            "The passphrase does not open it (or the file was changed).", hint="Try again; mind the keyboard layout."
+            "The passphrase does not open the sealed file, or the file was changed.",
+            hint="Try again; mind the keyboard layout.",
         ) from None
 
 

@@ -70,7 +70,7 @@ class NfcPort:
         if self._reader is None:
             raise NoReader("The reader was unplugged and did not come back.", hint="Plug it in again.")
         raise NoNode(
-            f"No node that is wanted was held to the reader within {seconds:.0f} s.",
+            f"The node was not held to the reader within {seconds:.0f} s.",
             hint="Hold the node's NFC antenna flat on the reader, or give it more time with --timeout.",
         )
 
