@@ -18,16 +18,16 @@ from pathlib import Path
 
 from jwcrypto import jwe, jwk, jws
 
-from teds_provision.protocol import jose
+from teds_provision.handover.export_keys import ExportOrder, export_keys, plan_export
+from teds_provision.handover.import_keys import Imported, import_keys, plan_import
 from teds_provision.protocol.agreement import key_id
-from teds_provision.protocol.bundle import TYPE, _to_json, open_bundle
+from teds_provision.protocol.handover import jose
+from teds_provision.protocol.handover.bundle import TYPE, _to_json, open_bundle
+from teds_provision.protocol.handover.strict_json import dump, load_object
 from teds_provision.protocol.keys import SoftwareKey, fingerprint
-from teds_provision.protocol.strict_json import dump, load_object
+from teds_provision.station.station import Station, initialise
 from teds_provision.store import NodeRecord, TrustRecord, WhitelistEntry
 from teds_provision.vault import passphrase
-from teds_provision.workflow.handover_export import ExportOrder, export_keys, plan_export
-from teds_provision.workflow.handover_import import Imported, import_keys, plan_import
-from teds_provision.workflow.station import Station, initialise
 
 ROUNDS = 3
 AIM = 2.0

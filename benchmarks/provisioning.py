@@ -24,12 +24,12 @@ from pathlib import Path
 from teds_provision.links import Contact, LinkSettings, Notice, open_port
 from teds_provision.links.can.pacing import classic_bits
 from teds_provision.node.nfc_air import answer_seconds, command_seconds
+from teds_provision.station.station import Station, initialise
+from teds_provision.steps.build import BuildOrder
+from teds_provision.steps.provision import provision
+from teds_provision.talk.conversation import Conversation
+from teds_provision.talk.progress import Silent
 from teds_provision.vault.passphrase import THROWAWAY
-from teds_provision.workflow.build import BuildOrder
-from teds_provision.workflow.conversation import Conversation
-from teds_provision.workflow.progress import Silent
-from teds_provision.workflow.provision import provision
-from teds_provision.workflow.station import Station, initialise
 
 PROFILE = BuildOrder("magnetic-angular-position-sensor")
 FRAME_DELAY = (9 * 128 + 84 + 1172) / 13.56e6  # seconds: ISO/IEC 14443-3 clause 6.2, both directions

@@ -23,7 +23,7 @@ from pathlib import Path
 from statistics import median
 
 from teds_provision import teds
-from teds_provision.teds import security
+from teds_provision.teds.codec import security
 from teds_provision.teds.image import Image
 
 Set = list[bytes]

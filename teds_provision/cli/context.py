@@ -16,7 +16,7 @@ from teds_provision.errors import TedsProvisionError, UsageFailure, WrongPassphr
 if TYPE_CHECKING:
     from rich.console import Console, RenderableType
 
-    from teds_provision.workflow.station import Station
+    from teds_provision.station.station import Station
 
 
 class App:
@@ -157,7 +157,7 @@ class App:
 
     def station(self) -> Station:
         """Open this base station (store now, vault when a key is first needed); NotFound says to run init."""
-        from teds_provision.workflow.station import Station
+        from teds_provision.station.station import Station
 
         station = Station.open(self.home, ask=self.ask_secret)
         self.closing(station.close)

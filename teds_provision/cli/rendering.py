@@ -7,7 +7,7 @@ import time
 from typing import TYPE_CHECKING
 
 from teds_provision.cli.context import harmless
-from teds_provision.workflow.progress import NOTHING, Reporter, Silent, StepResult
+from teds_provision.talk.progress import NOTHING, Reporter, Silent, StepResult
 
 if TYPE_CHECKING:
     from rich.console import Console, RenderableType

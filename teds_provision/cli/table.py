@@ -18,42 +18,48 @@ class Entry(NamedTuple):
 
 SECTIONS: Final[dict[str, dict[str, Entry]]] = {
     "Set up": {
-        "init": Entry("station", "init", "Make this base station's identity and CA key, or show them."),
-        "trust": Entry("trust", "trust", "Public keys of other stations and CAs that count here."),
-        "profile": Entry("profile", "profile", "Datasheets by transducer type: list, show, check, new."),
-        "doctor": Entry("doctor", "doctor", "Look at reader, CAN, keyring, clock and store: cause and fix."),
+        "init": Entry("station.init", "init", "Make this base station's identity and CA key, or show them."),
+        "trust": Entry("handover.trust", "trust", "Public keys of other stations and CAs that count here."),
+        "profile": Entry("datasheet.profile", "profile", "Datasheets by transducer type: list, show, check, new."),
+        "doctor": Entry("station.doctor", "doctor", "Look at reader, CAN, keyring, clock and store: cause and fix."),
     },
     "Nodes": {
         "provision": Entry(
-            "provision", "provision", "All of it in one: identify, whitelist, agree, build, sign, write, verify."
+            "steps.provision", "provision", "All of it in one: identify, whitelist, agree, build, sign, write, verify."
         ),
-        "identify": Entry("identify", "identify", "Wait for a tap; read UUID and key, and have the node prove it."),
-        "whitelist": Entry("whitelist", "whitelist", "The nodes that may be keyed and written."),
-        "agree": Entry("agree", "agree", "Agree on a key with a node, or rotate it."),
-        "build": Entry("build", "build", "Build a node's datasheet from its profile and calibration."),
-        "sign": Entry("sign", "sign", "Sign a built datasheet; say what changes on the node."),
-        "write": Entry("write", "write", "Write a signed datasheet to the node's flash, commit, read back."),
-        "verify": Entry("verify", "verify", "Check a node or an image against everything the profile demands."),
-        "read": Entry("read", "read", "Read every TEDS of a node."),
-        "reset": Entry("reset", "reset", "Take a node back to factory state, with its signed receipt."),
-        "address": Entry("address", "address", "Give a node another CAN address."),
-        "nodes": Entry("nodes", "nodes", "What this station knows of its nodes."),
-        "log": Entry("log", "log", "The audit log, and whether its hash chain holds."),
-        "show": Entry("show", "show", "Decode TEDS, images, profiles, bundles and messages."),
+        "identify": Entry(
+            "steps.identify", "identify", "Wait for a tap; read UUID and key, and have the node prove it."
+        ),
+        "whitelist": Entry("steps.whitelist", "whitelist", "The nodes that may be keyed and written."),
+        "agree": Entry("steps.agree", "agree", "Agree on a key with a node, or rotate it."),
+        "build": Entry("steps.build", "build", "Build a node's datasheet from its profile and calibration."),
+        "sign": Entry("steps.sign", "sign", "Sign a built datasheet; say what changes on the node."),
+        "write": Entry("steps.write", "write", "Write a signed datasheet to the node's flash, commit, read back."),
+        "verify": Entry("steps.verify", "verify", "Check a node or an image against everything the profile demands."),
+        "read": Entry("steps.read", "read", "Read every TEDS of a node."),
+        "reset": Entry("steps.reset", "reset", "Take a node back to factory state, with its signed receipt."),
+        "address": Entry("steps.address", "address", "Give a node another CAN address."),
+        "nodes": Entry("station.nodes", "nodes", "What this station knows of its nodes."),
+        "log": Entry("station.log", "log", "The audit log, and whether its hash chain holds."),
+        "show": Entry("datasheet.show", "show", "Decode TEDS, images, profiles, bundles and messages."),
     },
     "A key's life": {
-        "export-keys": Entry("handover", "export_keys", "Hand node keys to another base station in a sealed bundle."),
-        "import-keys": Entry("handover", "import_keys", "Take node keys over from another base station."),
-        "handover": Entry("handovers", "handover", "Handovers under way: list, receipt, undo."),
-        "revoke": Entry("life", "revoke", "Ban a node's key, here and at every station that imports from here."),
-        "decommission": Entry("life", "decommission", "Reset a node and take it out of service."),
-        "replace": Entry("life", "replace", "Put a spare in the place of a broken node."),
-        "backup": Entry("backup", "backup", "Write the whole store to a sealed file."),
-        "restore": Entry("backup", "restore", "Bring a sealed store back; never rolls epochs or sequences back."),
+        "export-keys": Entry(
+            "handover.bundles", "export_keys", "Hand node keys to another base station in a sealed bundle."
+        ),
+        "import-keys": Entry("handover.bundles", "import_keys", "Take node keys over from another base station."),
+        "handover": Entry("handover.pending", "handover", "Handovers under way: list, receipt, undo."),
+        "revoke": Entry(
+            "handover.life", "revoke", "Ban a node's key, here and where bundles from here go."
+        ),
+        "decommission": Entry("handover.life", "decommission", "Reset a node and take it out of service."),
+        "replace": Entry("handover.life", "replace", "Put a spare in the place of a broken node."),
+        "backup": Entry("station.backup", "backup", "Write the whole store to a sealed file."),
+        "restore": Entry("station.backup", "restore", "Bring a sealed store back; no epoch or sequence goes back."),
     },
     "Try it": {
-        "demo": Entry("demo", "demo", "Two stations and a virtual node on this machine, start to end."),
-        "node": Entry("node", "node", "A virtual transducer: create, run."),
+        "demo": Entry("station.demo", "demo", "Two stations and a virtual node on this machine, start to end."),
+        "node": Entry("node.node", "node", "A virtual transducer: create, run."),
     },
 }
 

@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import Literal, Protocol
 
-from teds_provision.protocol.identity import Identity
+from teds_provision.protocol.messages.identity import Identity
 
 NoticeKind = Literal["waiting", "foreign-tag", "reader-ready", "reader-lost", "node-left", "conflict", "retry"]
 

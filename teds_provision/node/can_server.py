@@ -14,7 +14,7 @@ from teds_provision.links.can.bus import Bus, Frame
 from teds_provision.links.can.isotp import FUNCTIONAL, Pair, addresses, read_single
 from teds_provision.links.can.spec import FIRST_STATION, LAST_STATION, parse_spec
 from teds_provision.node.handler import NodeHandler
-from teds_provision.protocol.frames import Function, Reply, security_command
+from teds_provision.protocol.messages.frames import Function, Reply, security_command
 from teds_provision.protocol.repetition import Repetition
 
 _IDENTIFY: Final = security_command(Function.IDENTIFY).encode()

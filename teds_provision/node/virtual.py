@@ -10,8 +10,8 @@ from pathlib import Path
 from typing import Protocol
 
 from teds_provision.node.flash_file import FlashFile
-from teds_provision.protocol.identity import NodeState
 from teds_provision.protocol.keys import PrivateKey
+from teds_provision.protocol.messages.identity import NodeState
 from teds_provision.protocol.tim import Tim
 
 

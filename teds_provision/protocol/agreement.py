@@ -15,7 +15,6 @@ from cryptography.hazmat.primitives import hashes
 from cryptography.hazmat.primitives.kdf.hkdf import HKDF
 
 from teds_provision.errors import BadData, Garbled, NotAuthentic, OtherKey, PolicyRefused
-from teds_provision.protocol.frames import Command, Function, security_command
 from teds_provision.protocol.keys import (
     PrivateKey,
     SoftwareKey,
@@ -25,7 +24,8 @@ from teds_provision.protocol.keys import (
     public_key,
     verify,
 )
-from teds_provision.teds import security
+from teds_provision.protocol.messages.frames import Command, Function, security_command
+from teds_provision.teds.codec import security
 
 REQUEST_OCTETS = 65 + 64 + 65 + 65
 REPLY_HEAD_OCTETS = 16 + 4 + 16

@@ -8,10 +8,10 @@ from dataclasses import replace
 
 from teds_provision.protocol import datasheet
 from teds_provision.protocol.flash import Flash
-from teds_provision.protocol.frames import Reason
-from teds_provision.teds import security
+from teds_provision.protocol.messages.frames import Reason
+from teds_provision.teds.codec import security
+from teds_provision.teds.codec.security import NotCanonical, SecurityTeds
 from teds_provision.teds.image import SECURITY, BlockId
-from teds_provision.teds.security import NotCanonical, SecurityTeds
 
 
 class Refused(Exception):

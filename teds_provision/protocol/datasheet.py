@@ -9,9 +9,9 @@ from dataclasses import dataclass
 from teds_provision.errors import BadData
 from teds_provision.protocol.agreement import Credentials
 from teds_provision.protocol.keys import is_point, station_key_message, verify
-from teds_provision.teds import frame, security
+from teds_provision.teds.codec import frame, security
+from teds_provision.teds.codec.security import SecurityTeds
 from teds_provision.teds.image import BlockId
-from teds_provision.teds.security import SecurityTeds
 
 META = 1
 UUID_FIELD = 4

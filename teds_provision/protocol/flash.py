@@ -6,8 +6,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Protocol
 
-from teds_provision.protocol.identity import NodeState
-from teds_provision.teds import security
+from teds_provision.protocol.messages.identity import NodeState
+from teds_provision.teds.codec import security
 from teds_provision.teds.image import SECURITY, BlockId
 
 

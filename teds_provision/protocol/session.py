@@ -16,7 +16,7 @@ from cryptography.hazmat.primitives.kdf.hkdf import HKDF
 
 from teds_provision.errors import Garbled, NotAuthentic
 from teds_provision.protocol.agreement import key_id
-from teds_provision.protocol.frames import Command, Function, Reply, decode_reply, security_command
+from teds_provision.protocol.messages.frames import Command, Function, Reply, decode_reply, security_command
 
 NONCE_OCTETS = 16
 TAG_OCTETS = 16

@@ -22,7 +22,8 @@ from teds_provision.protocol.agreement import (
 )
 from teds_provision.protocol.commit import Refused
 from teds_provision.protocol.flash import Flash, FlashFailure, FlashMemory
-from teds_provision.protocol.frames import (
+from teds_provision.protocol.keys import PrivateKey, prove_message, reset_message, station_key_message, verify
+from teds_provision.protocol.messages.frames import (
     COMMAND_HEADER,
     COMMON,
     SECURITY,
@@ -33,8 +34,7 @@ from teds_provision.protocol.frames import (
     TedsFunction,
     refusal,
 )
-from teds_provision.protocol.identity import Identity, NodeState
-from teds_provision.protocol.keys import PrivateKey, prove_message, reset_message, station_key_message, verify
+from teds_provision.protocol.messages.identity import Identity, NodeState
 from teds_provision.protocol.session import BLOCK_OCTETS, LAST_COUNTER, OPEN_OCTETS, SEALED_HEAD_OCTETS, NodeSession
 from teds_provision.protocol.tim_teds import TedsAccess
 

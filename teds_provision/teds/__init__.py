@@ -9,8 +9,8 @@ from __future__ import annotations
 from importlib import import_module
 from typing import TYPE_CHECKING, Final
 
-from teds_provision.teds.decode import decode
-from teds_provision.teds.model import (
+from teds_provision.teds.codec.decode import decode
+from teds_provision.teds.codec.model import (
     Decoded,
     Edition,
     Field,
@@ -21,13 +21,13 @@ from teds_provision.teds.model import (
     Value,
     Verdict,
 )
-from teds_provision.teds.tables import FieldSpec, Table, name_of, table
+from teds_provision.teds.codec.tables import FieldSpec, Table, name_of, table
 
 if TYPE_CHECKING:
-    from teds_provision.teds.composer import compose, encode, recompose
-    from teds_provision.teds.editions import convert
-    from teds_provision.teds.keyforms import ReadKey, read_key
-    from teds_provision.teds.uuid import UuidParts, pack_uuid, unpack_uuid
+    from teds_provision.teds.codec.composer import compose, encode, recompose
+    from teds_provision.teds.codec.editions import convert
+    from teds_provision.teds.codec.keyforms import ReadKey, read_key
+    from teds_provision.teds.codec.uuid import UuidParts, pack_uuid, unpack_uuid
 
 __all__ = [
     "Decoded",
@@ -56,15 +56,15 @@ __all__ = [
 ]
 
 _LAZY: Final = {
-    "compose": "composer",
-    "encode": "composer",
-    "recompose": "composer",
-    "convert": "editions",
-    "ReadKey": "keyforms",
-    "read_key": "keyforms",
-    "UuidParts": "uuid",
-    "pack_uuid": "uuid",
-    "unpack_uuid": "uuid",
+    "compose": "codec.composer",
+    "encode": "codec.composer",
+    "recompose": "codec.composer",
+    "convert": "codec.editions",
+    "ReadKey": "codec.keyforms",
+    "read_key": "codec.keyforms",
+    "UuidParts": "codec.uuid",
+    "pack_uuid": "codec.uuid",
+    "unpack_uuid": "codec.uuid",
 }
 
 

@@ -160,7 +160,7 @@ def test_a_bug_is_told_as_one_without_a_traceback(home: Path, monkeypatch: pytes
     def broken(*_: object) -> None:
         raise ZeroDivisionError("secret detail")
 
-    monkeypatch.setattr("teds_provision.workflow.inventory.inventory", broken)
+    monkeypatch.setattr("teds_provision.station.inventory.inventory", broken)
     told = call(home, "--json", "nodes")
     assert (told.code, told.json["error"]["code"]) == (1, "bug")
     assert "secret detail" not in told.out + told.err

@@ -15,10 +15,10 @@ import pytest
 from cryptography.hazmat.primitives.asymmetric import ec, rsa
 from cryptography.hazmat.primitives.serialization import Encoding, NoEncryption, PrivateFormat, PublicFormat
 
-from teds_provision.protocol import jose
-from teds_provision.protocol.bundle import TYPE, Bundle, BundledNode, _to_json, seal_bundle
+from teds_provision.protocol.handover import jose
+from teds_provision.protocol.handover.bundle import TYPE, Bundle, BundledNode, _to_json, seal_bundle
+from teds_provision.protocol.handover.strict_json import base64url, decode_base64url, dump
 from teds_provision.protocol.keys import SoftwareKey, fingerprint, station_key_message, to_pem
-from teds_provision.protocol.strict_json import base64url, decode_base64url, dump
 from teds_provision.vault import forget_vaults
 from tests.workflow.bench import PASSPHRASE
 from tests.workflow.handover_desk import Pair, everything, session
@@ -143,7 +143,7 @@ def test_a_dry_run_tells_and_changes_nothing(homes: Homes) -> None:
 
 
 def test_people_are_shown_both_fingerprints_in_fours_and_what_it_means(homes: Homes) -> None:
-    from teds_provision.workflow.trust import spoken
+    from teds_provision.handover.trust import spoken
 
     station = open_station(homes.north)
     both = [spoken(station.fingerprint), *(spoken(record.fingerprint) for record in station.store.trusted())]

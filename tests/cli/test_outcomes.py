@@ -10,16 +10,16 @@ import pytest
 from rich.spinner import Spinner
 
 from teds_provision.cli.context import App
-from teds_provision.cli.provision import _plan, _runner
 from teds_provision.cli.rendering import LiveReporter
+from teds_provision.cli.steps.provision import _plan, _runner
 from teds_provision.errors import NotAuthentic
 from teds_provision.links.nfc.message import Record
+from teds_provision.steps.agree import agree
+from teds_provision.steps.build import BuildOrder, build
+from teds_provision.steps.identify import identify
+from teds_provision.steps.sign_command import SignOrder, sign_image
 from teds_provision.store import StoreLock, WhitelistEntry
-from teds_provision.workflow.agree import agree
-from teds_provision.workflow.build import BuildOrder, build
-from teds_provision.workflow.identify import identify
-from teds_provision.workflow.progress import Silent
-from teds_provision.workflow.signing import SignOrder, sign_image
+from teds_provision.talk.progress import Silent
 
 from ..workflow.bench import Board, make_station, talk
 from .shell import call, clean_environment, spawn
@@ -111,7 +111,7 @@ def test_an_interrupted_command_says_so_in_json_too(
     def end(_home: Path, **_: object) -> None:
         raise ended
 
-    monkeypatch.setattr("teds_provision.workflow.station.Station.open", end)
+    monkeypatch.setattr("teds_provision.station.station.Station.open", end)
     said = call(tmp_path, "--json", "nodes")
     assert (said.code, said.json["error"]["code"]) == (130, "interrupted")
     told = call(tmp_path, "nodes")

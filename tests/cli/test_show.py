@@ -9,10 +9,10 @@ import pytest
 
 from teds_provision import teds
 from teds_provision.cli.main import run
+from teds_provision.teds.codec.security import initial
 from teds_provision.teds.formats import Block, read_blocks, write_blocks
 from teds_provision.teds.image import Image
 from teds_provision.teds.profile import load_profile
-from teds_provision.teds.security import initial
 
 ROOT = Path(__file__).parent.parent.parent
 VECTORS = ROOT / "tests" / "vectors" / "ieee1451"
@@ -178,7 +178,7 @@ def test_a_message_is_shown_with_the_teds_inside(show):
 
 
 def test_a_bundle_shows_its_header_alone(show, show_json, tmp_path):
-    from teds_provision.protocol import jose
+    from teds_provision.protocol.handover import jose
     from teds_provision.protocol.keys import SoftwareKey
 
     sealed = jose.encrypt(b"x", [SoftwareKey.generate().point], cty="JWS")

@@ -8,8 +8,8 @@ import pytest
 from cryptography.hazmat.primitives.asymmetric import ec
 from cryptography.hazmat.primitives.serialization import Encoding, NoEncryption, PrivateFormat
 
+from teds_provision.handover.trust import spoken
 from teds_provision.protocol.keys import SoftwareKey, fingerprint, to_pem
-from teds_provision.workflow.trust import spoken
 from tests.workflow.bench import PASSPHRASE
 
 from .shell import Outcome, call, spawn

@@ -20,7 +20,7 @@ def check(data: bytes) -> None:
     """Read one input in every way there is; raises AssertionError, or whatever should not have come out."""
     from teds_provision import teds
     from teds_provision.errors import BadData
-    from teds_provision.teds.frame import frame
+    from teds_provision.teds.codec.frame import frame
 
     if not data:
         return
@@ -59,14 +59,14 @@ def main() -> None:
 
     sys.path.insert(0, str(ROOT))
     with atheris.instrument_imports(include=["teds_provision"]):
-        import teds_provision.teds.composer
-        import teds_provision.teds.content
-        import teds_provision.teds.editions
-        import teds_provision.teds.keyforms
-        import teds_provision.teds.security
-        import teds_provision.teds.tables_calibration
-        import teds_provision.teds.text
-        import teds_provision.teds.uuid  # noqa: F401
+        import teds_provision.teds.codec.composer
+        import teds_provision.teds.codec.content
+        import teds_provision.teds.codec.editions
+        import teds_provision.teds.codec.keyforms
+        import teds_provision.teds.codec.security
+        import teds_provision.teds.codec.tables.calibration
+        import teds_provision.teds.codec.text
+        import teds_provision.teds.codec.uuid  # noqa: F401
     atheris.Setup([sys.argv[0], *LIMITS, *sys.argv[1:]], check)
     atheris.Fuzz()
 

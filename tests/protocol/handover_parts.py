@@ -8,10 +8,10 @@ from dataclasses import replace
 from datetime import UTC, datetime, timedelta
 from typing import Any
 
-from teds_provision.protocol import jose
-from teds_provision.protocol.bundle import TYPE, Bundle, BundledNode, _to_json
+from teds_provision.protocol.handover import jose
+from teds_provision.protocol.handover.bundle import TYPE, Bundle, BundledNode, _to_json
+from teds_provision.protocol.handover.strict_json import base64url, dump
 from teds_provision.protocol.keys import SoftwareKey, fingerprint, station_key_message
-from teds_provision.protocol.strict_json import base64url, dump
 
 NOW = datetime(2026, 3, 1, 12, 0, tzinfo=UTC)
 SENDER, RECEIVER, THIRD, OWNER, STRANGER = (SoftwareKey(number) for number in (11, 12, 13, 14, 15))

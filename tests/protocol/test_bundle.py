@@ -10,11 +10,11 @@ from datetime import timedelta
 import pytest
 
 from teds_provision.errors import BadData, NotAuthentic, PolicyRefused
-from teds_provision.protocol import jose
-from teds_provision.protocol.bundle import CLOCK_TOLERANCE, TYPE, open_bundle, peek_bundle, seal_bundle
+from teds_provision.protocol.handover import jose
+from teds_provision.protocol.handover.bundle import CLOCK_TOLERANCE, TYPE, open_bundle, peek_bundle, seal_bundle
+from teds_provision.protocol.handover.revocation import seal_revocation
+from teds_provision.protocol.handover.strict_json import dump, encode_base64url
 from teds_provision.protocol.keys import SoftwareKey, fingerprint, station_key_message
-from teds_provision.protocol.revocation import seal_revocation
-from teds_provision.protocol.strict_json import dump, encode_base64url
 from tests.protocol.handover_parts import (
     NODE_KEY,
     NOW,

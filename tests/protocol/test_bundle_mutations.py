@@ -10,8 +10,8 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from teds_provision.errors import BadData, NotAuthentic, PolicyRefused
-from teds_provision.protocol.bundle import BundleHeader, open_bundle, peek_bundle, seal_bundle
-from teds_provision.protocol.receipt import open_receipt, seal_receipt
+from teds_provision.protocol.handover.bundle import BundleHeader, open_bundle, peek_bundle, seal_bundle
+from teds_provision.protocol.handover.receipt import open_receipt, seal_receipt
 from tests.protocol.handover_parts import NOW, RECEIVER, SENDER, THIRD, bundle, members_of, sealed, trusts
 from tests.protocol.test_bundle_receipt import receipt
 

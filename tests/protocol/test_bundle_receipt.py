@@ -7,11 +7,11 @@ from dataclasses import replace
 import pytest
 
 from teds_provision.errors import BadData, NotAuthentic
-from teds_provision.protocol import jose
+from teds_provision.protocol.handover import jose
+from teds_provision.protocol.handover.receipt import Receipt, RefusedNode, open_receipt, seal_receipt
+from teds_provision.protocol.handover.revocation import open_revocation, seal_revocation
+from teds_provision.protocol.handover.strict_json import dump, load_object
 from teds_provision.protocol.keys import fingerprint
-from teds_provision.protocol.receipt import Receipt, RefusedNode, open_receipt, seal_receipt
-from teds_provision.protocol.revocation import open_revocation, seal_revocation
-from teds_provision.protocol.strict_json import dump, load_object
 from tests.protocol.handover_parts import NODE_KEY, NOW, RECEIVER, SENDER, STRANGER, trusts
 
 

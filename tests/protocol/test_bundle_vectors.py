@@ -9,10 +9,10 @@ from __future__ import annotations
 from dataclasses import replace
 from pathlib import Path
 
-from teds_provision.protocol.bundle import open_bundle, peek_bundle, seal_bundle
+from teds_provision.protocol.handover.bundle import open_bundle, peek_bundle, seal_bundle
+from teds_provision.protocol.handover.receipt import open_receipt, seal_receipt
+from teds_provision.protocol.handover.revocation import open_revocation, seal_revocation
 from teds_provision.protocol.keys import fingerprint
-from teds_provision.protocol.receipt import open_receipt, seal_receipt
-from teds_provision.protocol.revocation import open_revocation, seal_revocation
 from tests.protocol.handover_parts import NOW, RECEIVER, SENDER, THIRD, bundle, node, trusts
 from tests.protocol.test_bundle_receipt import receipt
 

@@ -9,12 +9,12 @@ import subprocess
 import pytest
 
 from teds_provision.errors import NotAuthentic
-from teds_provision.protocol import jose
-from teds_provision.protocol.bundle import TYPE, _to_json, open_bundle, seal_bundle
-from teds_provision.protocol.jwk import public_jwk
+from teds_provision.protocol.handover import jose
+from teds_provision.protocol.handover.bundle import TYPE, _to_json, open_bundle, seal_bundle
+from teds_provision.protocol.handover.jwk import public_jwk
+from teds_provision.protocol.handover.receipt import open_receipt, seal_receipt
+from teds_provision.protocol.handover.strict_json import dump, encode_base64url
 from teds_provision.protocol.keys import fingerprint
-from teds_provision.protocol.receipt import open_receipt, seal_receipt
-from teds_provision.protocol.strict_json import dump, encode_base64url
 from tests.protocol.handover_parts import NOW, RECEIVER, SENDER, THIRD, bundle, trusts
 from tests.protocol.test_bundle_receipt import receipt
 

@@ -10,10 +10,10 @@ from teds_provision.protocol import keys
 from teds_provision.protocol.agreement import Credentials, StationAgreement
 from teds_provision.protocol.datasheet import NodeKeys, sign_datasheet, unsigned_datasheet
 from teds_provision.protocol.flash import Flash
-from teds_provision.protocol.frames import Command, decode_reply
+from teds_provision.protocol.messages.frames import Command, decode_reply
 from teds_provision.protocol.session import StationSession, pad
 from teds_provision.protocol.tim import Tim
-from teds_provision.teds import security
+from teds_provision.teds.codec import security
 
 from .kat import KAT, UUID, key, octets
 from .memory import RamFlash

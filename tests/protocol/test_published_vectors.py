@@ -16,13 +16,13 @@ from teds_provision.links.can.isotp import Pair
 from teds_provision.links.nfc import message, tnep
 from teds_provision.links.nfc.pieces import Piece, Requester, room
 from teds_provision.protocol.agreement import Credentials, StationAgreement
-from teds_provision.protocol.bundle import open_bundle
-from teds_provision.protocol.frames import Command, decode_reply
+from teds_provision.protocol.handover.bundle import open_bundle
+from teds_provision.protocol.handover.receipt import open_receipt
 from teds_provision.protocol.keys import SoftwareKey, fingerprint, station_key_message
-from teds_provision.protocol.receipt import open_receipt
+from teds_provision.protocol.messages.frames import Command, decode_reply
 from teds_provision.protocol.repetition import Repetition
 from teds_provision.protocol.session import StationSession
-from teds_provision.teds import security
+from teds_provision.teds.codec import security
 from tests.vectors import generate
 from tests.vectors.recipes_links import Mailbox, TagHandler, node
 from tests.vectors.scene import BLOCKS
@@ -446,8 +446,8 @@ def test_another_jose_opens_every_good_bundle(document: Entry, entry: Entry) -> 
 
     def key(name: str, *, private: bool) -> Any:
         held = SoftwareKey(int(document["keys"][name]["d"], 16))
-        from teds_provision.protocol.jwk import public_jwk
-        from teds_provision.protocol.strict_json import encode_base64url
+        from teds_provision.protocol.handover.jwk import public_jwk
+        from teds_provision.protocol.handover.strict_json import encode_base64url
 
         members = public_jwk(held.point) | ({"d": encode_base64url(held.secret())} if private else {})
         return jwk.JWK(**members)

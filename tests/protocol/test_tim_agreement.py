@@ -5,9 +5,9 @@ from __future__ import annotations
 import pytest
 
 from teds_provision.protocol.agreement import AgreedKey, Credentials, RequestPayload, StationAgreement
-from teds_provision.protocol.frames import Function, Reason, Reply, refusal, security_command
-from teds_provision.protocol.identity import NodeState
 from teds_provision.protocol.keys import GROUP_ORDER, SoftwareKey, station_key_message
+from teds_provision.protocol.messages.frames import Function, Reason, Reply, refusal, security_command
+from teds_provision.protocol.messages.identity import NodeState
 
 from .desk import CA, CREDENTIALS, NODE, STATION, UUID, Desk
 from .memory import PowerCut

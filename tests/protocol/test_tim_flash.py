@@ -8,7 +8,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from teds_provision.protocol.frames import (
+from teds_provision.protocol.keys import GROUP_ORDER, SoftwareKey, station_key_message
+from teds_provision.protocol.messages.frames import (
     Attribute,
     Function,
     Reason,
@@ -21,9 +22,8 @@ from teds_provision.protocol.frames import (
     update_teds,
     write_teds,
 )
-from teds_provision.protocol.keys import GROUP_ORDER, SoftwareKey, station_key_message
-from teds_provision.teds import security
-from teds_provision.teds.frame import frame
+from teds_provision.teds.codec import security
+from teds_provision.teds.codec.frame import frame
 from teds_provision.teds.image import SECURITY
 
 from .desk import CA, META, NAME, STATION, UUID, Desk, digest

@@ -5,7 +5,8 @@ from __future__ import annotations
 import pytest
 
 from teds_provision.protocol.agreement import StationAgreement, key_id
-from teds_provision.protocol.frames import (
+from teds_provision.protocol.keys import prove_message, reset_message, verify
+from teds_provision.protocol.messages.frames import (
     Command,
     Function,
     Reason,
@@ -17,10 +18,9 @@ from teds_provision.protocol.frames import (
     update_teds,
     write_teds,
 )
-from teds_provision.protocol.identity import Identity, NodeState
-from teds_provision.protocol.keys import prove_message, reset_message, verify
+from teds_provision.protocol.messages.identity import Identity, NodeState
 from teds_provision.protocol.session import StationSession
-from teds_provision.teds import security
+from teds_provision.teds.codec import security
 from teds_provision.teds.image import SECURITY
 
 from .desk import CREDENTIALS, META, NODE, UUID, Desk

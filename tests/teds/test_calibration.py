@@ -29,7 +29,7 @@ from teds_provision.teds.calibration import (
     sentence,
 )
 from teds_provision.teds.profile import Profile, load_profile
-from teds_provision.teds.units import parse_unit
+from teds_provision.teds.units.units import parse_unit
 
 
 @pytest.fixture(scope="module")
@@ -238,7 +238,7 @@ def test_a_foreign_calibration_is_bad_data_and_nothing_else() -> None:
 
 @given(st.binary(max_size=200))
 def test_any_octets_of_a_calibration_teds_give_a_calibration_or_bad_data(block: bytes) -> None:
-    from teds_provision.teds.frame import frame
+    from teds_provision.teds.codec.frame import frame
 
     decoded = teds.decode(frame(bytes.fromhex("030400050101") + block))
     with suppress(BadData):

@@ -8,7 +8,7 @@ import pytest
 
 from teds_provision import teds
 from teds_provision.errors import BadData
-from teds_provision.teds.frame import unframe
+from teds_provision.teds.codec.frame import unframe
 from tests.teds.vectors import octets_of
 
 META = {"UUID": "94A964323E81FA8003E8", "OholdOff": 0.5, "TestTime": 5, "MaxChan": 2}

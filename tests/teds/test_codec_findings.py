@@ -9,7 +9,7 @@ import pytest
 
 from teds_provision import teds
 from teds_provision.errors import BadData
-from teds_provision.teds.frame import frame, raw_tuple
+from teds_provision.teds.codec.frame import frame, raw_tuple
 from tests.teds.vectors import octets_of
 
 CHANNEL = {

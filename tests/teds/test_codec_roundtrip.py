@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from teds_provision import teds
 from teds_provision.errors import BadData
-from teds_provision.teds.frame import frame
+from teds_provision.teds.codec.frame import frame
 from tests.teds.strategies import some_fields
 from tests.teds.vectors import ALL, TEDS, octets_of
 

@@ -9,8 +9,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from teds_provision import teds
-from teds_provision.teds import security
-from teds_provision.teds.frame import frame
+from teds_provision.teds.codec import security
+from teds_provision.teds.codec.frame import frame
 
 POINT = b"\x04" + bytes(range(64))
 SPKI = bytes.fromhex("3059301306072a8648ce3d020106082a8648ce3d030107034200") + POINT

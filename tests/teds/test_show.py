@@ -9,8 +9,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from teds_provision import teds
+from teds_provision.teds.codec.model import TimeInstance, Units
 from teds_provision.teds.formats import Block, read_blocks
-from teds_provision.teds.model import TimeInstance, Units
 from teds_provision.teds.show import describe, shown_to_json
 from teds_provision.teds.show.values import hexadecimal, instant, seconds, span
 
@@ -114,7 +114,7 @@ def test_damage_never_raises(path, data):
 
 @given(st.integers(1, 255), st.binary(max_size=120), st.sampled_from([2007, 2024]))
 def test_any_content_of_any_class_never_raises(code, content, edition):
-    from teds_provision.teds.frame import frame
+    from teds_provision.teds.codec.frame import frame
 
     head = bytes([3, 4, 0, code, 1, 1]) if edition == 2007 else bytes([3, 5, 0, 255, code, 2, 1])
     octets = frame(head + content)

@@ -8,11 +8,11 @@ from dataclasses import replace
 import pytest
 
 from teds_provision.errors import PolicyRefused, VaultFailure
-from teds_provision.protocol.bundle import _to_json, open_bundle, seal_bundle
+from teds_provision.protocol.handover.bundle import _to_json, open_bundle, seal_bundle
+from teds_provision.protocol.handover.receipt import open_receipt, seal_receipt
+from teds_provision.protocol.handover.revocation import open_revocation, seal_revocation
+from teds_provision.protocol.handover.strict_json import dump
 from teds_provision.protocol.keys import fingerprint, station_key_message
-from teds_provision.protocol.receipt import open_receipt, seal_receipt
-from teds_provision.protocol.revocation import open_revocation, seal_revocation
-from teds_provision.protocol.strict_json import dump
 from teds_provision.vault.pkcs11 import Pkcs11Vault
 from tests.protocol.handover_parts import NOW, RECEIVER, SENDER, bundle, trusts
 from tests.protocol.test_bundle_receipt import receipt

@@ -133,7 +133,7 @@ def test_an_agreement_leaves_no_secret_object_behind(vault):
 
 def test_a_key_agreement_of_the_profile_with_the_key_in_the_token(vault):
     from teds_provision.protocol.keys import node_key_message
-    from teds_provision.teds.security import SecurityTeds
+    from teds_provision.teds.codec.security import SecurityTeds
 
     node, uuid = SoftwareKey(31), bytes(range(10))
     shown = SecurityTeds(node_key=node.point, node_key_signature=node.sign(node_key_message(uuid, node.point))).encode()

@@ -9,7 +9,7 @@ from dataclasses import replace
 from cryptography.hazmat.primitives.ciphers.aead import AESCCM
 
 from teds_provision.protocol.agreement import RequestPayload
-from teds_provision.protocol.frames import (
+from teds_provision.protocol.messages.frames import (
     Command,
     Function,
     read_teds,

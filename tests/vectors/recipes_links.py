@@ -15,7 +15,7 @@ from teds_provision.links.nfc import message, tnep
 from teds_provision.links.nfc.pieces import Piece, Requester, room
 from teds_provision.node.nfc_tnep import TnepTag
 from teds_provision.protocol.agreement import StationAgreement
-from teds_provision.protocol.frames import Command, Function, read_teds, security_command
+from teds_provision.protocol.messages.frames import Command, Function, read_teds, security_command
 from teds_provision.protocol.tim import Tim
 from tests.protocol.memory import RamFlash
 

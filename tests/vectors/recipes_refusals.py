@@ -8,7 +8,7 @@ from dataclasses import replace
 from typing import Any
 
 from teds_provision.protocol.agreement import StationAgreement
-from teds_provision.protocol.frames import (
+from teds_provision.protocol.messages.frames import (
     Command,
     Function,
     query_teds,

@@ -6,8 +6,8 @@ from collections.abc import Iterator
 from dataclasses import replace
 
 from teds_provision.protocol.agreement import StationAgreement
-from teds_provision.protocol.frames import Command, Function, decode_reply, security_command
 from teds_provision.protocol.keys import fingerprint
+from teds_provision.protocol.messages.frames import Command, Function, decode_reply, security_command
 from teds_provision.protocol.repetition import Repetition
 from teds_provision.protocol.session import StationSession
 

@@ -8,9 +8,16 @@ from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from typing import Any
 
-from teds_provision.protocol.frames import Function, query_teds, read_teds, security_command, update_teds, write_teds
-from teds_provision.teds import security
-from teds_provision.teds.frame import frame, raw_tuple, tuples, unframe
+from teds_provision.protocol.messages.frames import (
+    Function,
+    query_teds,
+    read_teds,
+    security_command,
+    update_teds,
+    write_teds,
+)
+from teds_provision.teds.codec import security
+from teds_provision.teds.codec.frame import frame, raw_tuple, tuples, unframe
 from teds_provision.teds.image import SECURITY, BlockId
 
 from .recipes import CHALLENGE, IDENTIFY

@@ -10,13 +10,13 @@ from teds_provision.errors import NodeSilent
 from teds_provision.links import Contact
 from teds_provision.node.flash_file import default_can_address
 from teds_provision.protocol.flash import Flash
-from teds_provision.protocol.identity import Identity
 from teds_provision.protocol.keys import SoftwareKey, node_key_message
+from teds_provision.protocol.messages.identity import Identity
 from teds_provision.protocol.repetition import Repetition
 from teds_provision.protocol.tim import Tim
+from teds_provision.station.station import Station, initialise
+from teds_provision.talk.conversation import Conversation
 from teds_provision.vault import passphrase
-from teds_provision.workflow.conversation import Conversation
-from teds_provision.workflow.station import Station, initialise
 
 from ..protocol.memory import PowerCut, RamFlash
 

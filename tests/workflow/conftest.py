@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from teds_provision.workflow.station import Station
+from teds_provision.station.station import Station
 
 from .bench import Board, make_station
 

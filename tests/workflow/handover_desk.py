@@ -6,18 +6,18 @@ from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
+from teds_provision.handover.export_keys import Exported, ExportOrder, export_keys, plan_export
+from teds_provision.handover.import_keys import Imported, ImportPlan, import_keys, plan_import
 from teds_provision.protocol.agreement import key_id
-from teds_provision.protocol.bundle import Mode
+from teds_provision.protocol.handover.bundle import Mode
 from teds_provision.protocol.keys import SoftwareKey, fingerprint
+from teds_provision.station.station import Station
+from teds_provision.steps.agree import agree, require_session
+from teds_provision.steps.build import BuildOrder
+from teds_provision.steps.identify import identify
+from teds_provision.steps.provision import Provisioned, provision
 from teds_provision.store import Handover, TrustRecord, WhitelistEntry
-from teds_provision.workflow.agree import agree, require_session
-from teds_provision.workflow.build import BuildOrder
-from teds_provision.workflow.handover_export import Exported, ExportOrder, export_keys, plan_export
-from teds_provision.workflow.handover_import import Imported, ImportPlan, import_keys, plan_import
-from teds_provision.workflow.identify import identify
-from teds_provision.workflow.progress import Silent
-from teds_provision.workflow.provision import Provisioned, provision
-from teds_provision.workflow.station import Station
+from teds_provision.talk.progress import Silent
 
 from .bench import Board, MemoryLink, make_station, talk
 

@@ -11,11 +11,11 @@ from pathlib import Path
 from typing import Any
 from unittest.mock import patch
 
+from teds_provision.handover import files as handover_files
+from teds_provision.handover.export_keys import ExportOrder, export_keys, plan_export
+from teds_provision.handover.import_keys import ImportPlan, import_keys, plan_import
+from teds_provision.station.station import Station
 from teds_provision.store.database import Database
-from teds_provision.workflow import handover_files
-from teds_provision.workflow.handover_export import ExportOrder, export_keys, plan_export
-from teds_provision.workflow.handover_import import ImportPlan, import_keys, plan_import
-from teds_provision.workflow.station import Station
 
 from .bench import PASSPHRASE
 

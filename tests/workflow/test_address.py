@@ -5,8 +5,8 @@ from __future__ import annotations
 import pytest
 
 from teds_provision.errors import NodeRefused
-from teds_provision.workflow.address import set_address
-from teds_provision.workflow.station import Station
+from teds_provision.station.station import Station
+from teds_provision.steps.address import set_address
 
 from .bench import Board, MemoryLink, talk
 from .test_provision import run

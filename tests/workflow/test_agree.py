@@ -6,12 +6,12 @@ import pytest
 
 from teds_provision.errors import NodeRefused, NodeSilent, NotAuthentic, NotWhitelisted, OtherKey, PolicyRefused
 from teds_provision.protocol.agreement import key_id
-from teds_provision.protocol.frames import Reason, refusal
-from teds_provision.protocol.identity import NodeState
+from teds_provision.protocol.messages.frames import Reason, refusal
+from teds_provision.protocol.messages.identity import NodeState
+from teds_provision.station.station import Station
+from teds_provision.steps.agree import Agreed, agree
+from teds_provision.steps.identify import identify
 from teds_provision.store import WhitelistEntry
-from teds_provision.workflow.agree import Agreed, agree
-from teds_provision.workflow.identify import identify
-from teds_provision.workflow.station import Station
 
 from .bench import Board, MemoryLink, make_station, talk
 

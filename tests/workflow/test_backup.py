@@ -15,6 +15,10 @@ from pathlib import Path
 
 import pytest
 
+from teds_provision.backup import sealed_file as backup_file
+from teds_provision.backup.backup import BackedUp, backup
+from teds_provision.backup.restore import Restored, complete_vault, merge, open_present, rebuild
+from teds_provision.backup.sealed_file import Content, is_for_key, open_with_key, open_with_passphrase
 from teds_provision.errors import (
     BadData,
     NotAuthentic,
@@ -25,16 +29,12 @@ from teds_provision.errors import (
     WrongPassphrase,
 )
 from teds_provision.protocol.keys import SoftwareKey
+from teds_provision.station.station import Station, initialise
 from teds_provision.store import Draft, Holder, NodeRecord, Revocation, Store, Tombstone, TrustRecord, WhitelistEntry
 from teds_provision.store.snapshot import Relation, load, place, take
 from teds_provision.vault import forget_vaults
 from teds_provision.vault.passphrase import THROWAWAY
 from teds_provision.vault.software import SoftwareVault
-from teds_provision.workflow import backup_file
-from teds_provision.workflow.backup import BackedUp, backup
-from teds_provision.workflow.backup_file import Content, is_for_key, open_with_key, open_with_passphrase
-from teds_provision.workflow.restore import Restored, complete_vault, merge, open_present, rebuild
-from teds_provision.workflow.station import Station, initialise
 
 from ..vault.softhsm import PIN, loaded, unload
 from .bench import PASSPHRASE, make_station
@@ -176,8 +176,8 @@ def test_a_backup_that_another_key_has_signed_is_not_the_stations(station: Stati
 def test_the_jose_tool_opens_a_backup_with_the_recovery_key(station: Station, tmp_path: Path) -> None:
     if shutil.which("jose") is None:
         pytest.skip("the Debian package jose is not installed (scripts/install-test-packages)")
-    from teds_provision.protocol.jwk import public_jwk
-    from teds_provision.protocol.strict_json import encode_base64url
+    from teds_provision.protocol.handover.jwk import public_jwk
+    from teds_provision.protocol.handover.strict_json import encode_base64url
 
     recovery = SoftwareKey.generate()
     back_up(station, tmp_path / "b", recovery.point)
@@ -241,7 +241,7 @@ def test_killed_between_vault_and_store_the_same_command_carries_on(
     path, home = tmp_path / "station.backup", tmp_path / "new"
     back_up(station, path)
     with monkeypatch.context() as patch:
-        patch.setattr("teds_provision.workflow.restore.place", lambda *_: (_ for _ in ()).throw(KeyboardInterrupt))
+        patch.setattr("teds_provision.backup.restore.place", lambda *_: (_ for _ in ()).throw(KeyboardInterrupt))
         with pytest.raises(KeyboardInterrupt):
             restored_into(home, opened(path))
     with pytest.raises(NotFound):

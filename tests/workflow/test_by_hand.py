@@ -5,15 +5,15 @@ from __future__ import annotations
 import pytest
 
 from teds_provision.errors import NodeRefused, NodeSilent
-from teds_provision.protocol.frames import Reason, refusal
+from teds_provision.protocol.messages.frames import Reason, refusal
+from teds_provision.station.station import Station
+from teds_provision.steps.agree import agree, require_session
+from teds_provision.steps.build import BuildOrder, build
+from teds_provision.steps.identify import identify
+from teds_provision.steps.sign_command import SignOrder, sign_image
+from teds_provision.steps.write import write
 from teds_provision.store import WhitelistEntry
 from teds_provision.teds.image import Image
-from teds_provision.workflow.agree import agree, require_session
-from teds_provision.workflow.build import BuildOrder, build
-from teds_provision.workflow.identify import identify
-from teds_provision.workflow.signing import SignOrder, sign_image
-from teds_provision.workflow.station import Station
-from teds_provision.workflow.write import write
 
 from .bench import Board, MemoryLink, talk
 

@@ -14,13 +14,14 @@ from pathlib import Path
 
 import pytest
 
+from teds_provision.doctor import doctor
+from teds_provision.doctor import machine as doctor_machine
+from teds_provision.doctor.doctor import CHECKS, Finding, Place, examine, exit_code
+from teds_provision.doctor.links import READERS
+from teds_provision.doctor.station import holds_private_key
 from teds_provision.protocol.keys import SoftwareKey, to_pem
 from teds_provision.store import NodeRecord, Store, StoreLock
 from teds_provision.vault import forget_vaults
-from teds_provision.workflow import doctor, doctor_machine
-from teds_provision.workflow.doctor import CHECKS, Finding, Place, examine, exit_code
-from teds_provision.workflow.doctor_links import READERS
-from teds_provision.workflow.doctor_store import holds_private_key
 
 from .bench import make_station
 

@@ -8,12 +8,8 @@ from pathlib import Path
 import pytest
 
 from teds_provision.errors import BadData, NotAuthentic, NotFound, PolicyRefused
-from teds_provision.store import WhitelistEntry
-from teds_provision.teds.image import Image
-from teds_provision.vault import forget_vaults, passphrase
-from teds_provision.workflow import fleet
-from teds_provision.workflow.agree import agree
-from teds_provision.workflow.fleet import (
+from teds_provision.handover import certify as fleet
+from teds_provision.handover.certify import (
     adopt_certificate,
     ask_for_certificate,
     read_certificate,
@@ -21,12 +17,16 @@ from teds_provision.workflow.fleet import (
     sign_request,
     write_certificate,
 )
-from teds_provision.workflow.handover_export import ExportOrder, export_keys, plan_export
-from teds_provision.workflow.handover_import import ImportPlan, import_keys, plan_import
-from teds_provision.workflow.identify import identify
-from teds_provision.workflow.station import Station, initialise
-from teds_provision.workflow.trust import add, candidate
-from teds_provision.workflow.verify import Verified, verify_image
+from teds_provision.handover.export_keys import ExportOrder, export_keys, plan_export
+from teds_provision.handover.import_keys import ImportPlan, import_keys, plan_import
+from teds_provision.handover.trust import add, candidate
+from teds_provision.station.station import Station, initialise
+from teds_provision.steps.agree import agree
+from teds_provision.steps.identify import identify
+from teds_provision.steps.verify import Verified, verify_image
+from teds_provision.store import WhitelistEntry
+from teds_provision.teds.image import Image
+from teds_provision.vault import forget_vaults, passphrase
 
 from .bench import PASSPHRASE, Board, make_station, talk
 from .handover_desk import provisioned, session, trust
@@ -172,8 +172,8 @@ def test_a_certificate_is_for_one_station(tmp_path: Path, owner: Station) -> Non
 
 
 def forged() -> bytes:
+    from teds_provision.handover.certify import Certificate
     from teds_provision.protocol.keys import SoftwareKey
-    from teds_provision.workflow.fleet import Certificate
 
     station, stranger = SoftwareKey(31), SoftwareKey(32)
     return write_certificate(Certificate("x", station.point, stranger.point, station.sign(b"no")))

@@ -12,19 +12,19 @@ from pathlib import Path
 import pytest
 
 from teds_provision.errors import NodeRefused, NotAuthentic, NotFound, PolicyRefused, UsageFailure
+from teds_provision.handover.export_keys import ExportOrder, export_keys, plan_export
+from teds_provision.handover.import_keys import Imported, ImportPlan, import_keys, plan_import
+from teds_provision.handover.pending import close, find_handover, list_handovers, undo
+from teds_provision.handover.prove import is_proven, prove_node
 from teds_provision.protocol.agreement import key_id
-from teds_provision.protocol.bundle import open_bundle
-from teds_provision.protocol.receipt import open_receipt
+from teds_provision.protocol.handover.bundle import open_bundle
+from teds_provision.protocol.handover.receipt import open_receipt
+from teds_provision.steps.agree import agree
+from teds_provision.steps.identify import identify
+from teds_provision.steps.provision import verify_node
+from teds_provision.steps.read import read_image
+from teds_provision.steps.reset import reset_node
 from teds_provision.store import WhitelistEntry
-from teds_provision.workflow.agree import agree
-from teds_provision.workflow.handover import close, find_handover, list_handovers, undo
-from teds_provision.workflow.handover_export import ExportOrder, export_keys, plan_export
-from teds_provision.workflow.handover_import import Imported, ImportPlan, import_keys, plan_import
-from teds_provision.workflow.handover_prove import is_proven, prove_node
-from teds_provision.workflow.identify import identify
-from teds_provision.workflow.provision import verify_node
-from teds_provision.workflow.reading import read_image
-from teds_provision.workflow.reset import reset_node
 
 from .bench import Board, MemoryLink, make_station, talk
 from .handover_desk import Pair, everything, held, key_up, node_key_id, provisioned, row, session, trust
@@ -250,7 +250,7 @@ def test_a_receipt_is_for_this_bundle_from_its_receiver(pair: Pair, tmp_path: Pa
         close(pair.north, taken.receipt[:-4] + b"AAAA")
     stations = {pair.south.fingerprint: pair.south.point}
     receipt = open_receipt(taken.receipt, stations.get)
-    from teds_provision.protocol.receipt import seal_receipt
+    from teds_provision.protocol.handover.receipt import seal_receipt
 
     key = pair.south.vault.identity()
     forged = {

@@ -12,9 +12,9 @@ from pathlib import Path
 import pytest
 
 from teds_provision.errors import PolicyRefused
+from teds_provision.handover.pending import close
+from teds_provision.station.station import Station
 from teds_provision.vault import forget_vaults
-from teds_provision.workflow.handover import close
-from teds_provision.workflow.station import Station
 
 from .bench import Board
 from .handover_desk import Pair, everything, held, session

@@ -8,17 +8,17 @@ from pathlib import Path
 import pytest
 
 from teds_provision.errors import NotFound, NotWhitelisted, PolicyRefused, UsageFailure
-from teds_provision.protocol.identity import NodeState
+from teds_provision.handover.export_keys import ExportOrder, plan_export
+from teds_provision.handover.import_keys import ImportPlan, import_keys, plan_import
+from teds_provision.handover.life import is_finished, plan_takeover, retire, revoke, take_over
+from teds_provision.protocol.messages.identity import NodeState
+from teds_provision.station.station import Station
+from teds_provision.steps.agree import agree
+from teds_provision.steps.identify import identify
+from teds_provision.steps.reset import ResetReceipt, reset_node
+from teds_provision.steps.verify import verify_image
 from teds_provision.store import WhitelistEntry
 from teds_provision.teds.image import Image
-from teds_provision.workflow.agree import agree
-from teds_provision.workflow.handover_export import ExportOrder, plan_export
-from teds_provision.workflow.handover_import import ImportPlan, import_keys, plan_import
-from teds_provision.workflow.identify import identify
-from teds_provision.workflow.life import is_finished, plan_takeover, retire, revoke, take_over
-from teds_provision.workflow.reset import ResetReceipt, reset_node
-from teds_provision.workflow.station import Station
-from teds_provision.workflow.verify import verify_image
 
 from .bench import Board, talk
 from .handover_desk import Pair, held, key_up, provisioned, session
@@ -155,9 +155,9 @@ def test_a_spare_takes_over_name_groups_and_profile(pair: Pair) -> None:
 
 
 def calibrated(pair: Pair, tmp_path: Path) -> Board:
-    from teds_provision.workflow.build import BuildOrder
-    from teds_provision.workflow.progress import Silent
-    from teds_provision.workflow.provision import provision
+    from teds_provision.steps.build import BuildOrder
+    from teds_provision.steps.provision import provision
+    from teds_provision.talk.progress import Silent
 
     board = Board(uuid=bytes.fromhex("8d4d9da65281f700aaaa"))
     calibration = tmp_path / "calibration.csv"

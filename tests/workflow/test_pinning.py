@@ -7,10 +7,10 @@ from pathlib import Path
 import pytest
 
 from teds_provision.errors import Garbled, PolicyRefused, VaultFailure
-from teds_provision.workflow import reading
-from teds_provision.workflow.identify import identify
-from teds_provision.workflow.provision import add_to_whitelist
-from teds_provision.workflow.station import Station
+from teds_provision.station.station import Station
+from teds_provision.steps import read as reading
+from teds_provision.steps.identify import identify
+from teds_provision.steps.provision import add_to_whitelist
 
 from .bench import Board, MemoryLink, make_station, talk
 from .test_agree import run as agree
@@ -57,9 +57,9 @@ def test_a_node_given_away_and_provisioned_elsewhere_does_not_come_back_on_a_hin
 ) -> None:
     from dataclasses import replace
 
-    from teds_provision.protocol.identity import NodeState
+    from teds_provision.protocol.messages.identity import NodeState
+    from teds_provision.steps.agree import agree as step
     from teds_provision.store import Handover, Tombstone
-    from teds_provision.workflow.agree import agree as step
 
     from .test_provision import run as provision
 

@@ -17,16 +17,16 @@ from teds_provision.errors import (
     PolicyRefused,
     TedsProvisionError,
 )
-from teds_provision.protocol.frames import Reason
-from teds_provision.protocol.identity import NodeState
-from teds_provision.teds import security
-from teds_provision.teds.frame import frame
+from teds_provision.protocol.messages.frames import Reason
+from teds_provision.protocol.messages.identity import NodeState
+from teds_provision.station.station import Station
+from teds_provision.steps.build import BuildOrder
+from teds_provision.steps.identify import Identified
+from teds_provision.steps.provision import Provisioned, provision
+from teds_provision.talk.progress import Silent
+from teds_provision.teds.codec import security
+from teds_provision.teds.codec.frame import frame
 from teds_provision.teds.image import SECURITY
-from teds_provision.workflow.build import BuildOrder
-from teds_provision.workflow.identify import Identified
-from teds_provision.workflow.progress import Silent
-from teds_provision.workflow.provision import Provisioned, provision
-from teds_provision.workflow.station import Station
 
 from .bench import Board, MemoryLink, make_station, talk
 
@@ -147,8 +147,8 @@ def test_a_session_lost_in_the_middle_starts_the_staging_over(station: Station, 
 def test_a_node_that_is_always_busy_ends_with_the_link(
     station: Station, board: Board, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("teds_provision.workflow.conversation._BUSY_SECONDS", 0.3)
-    monkeypatch.setattr("teds_provision.workflow.conversation._BUSY_PAUSE", 0.05)
+    monkeypatch.setattr("teds_provision.talk.conversation._BUSY_SECONDS", 0.3)
+    monkeypatch.setattr("teds_provision.talk.conversation._BUSY_PAUSE", 0.05)
     busy = bytes([0, 0, 1, Reason.BUSY])
     with pytest.raises(TedsProvisionError):
         run(station, board, MemoryLink(board, tamper=lambda n, reply: busy))

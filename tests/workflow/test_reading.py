@@ -5,9 +5,9 @@ from __future__ import annotations
 import pytest
 
 from teds_provision.errors import BadData
-from teds_provision.protocol.frames import Reply
+from teds_provision.protocol.messages.frames import Reply
+from teds_provision.steps.read import LARGEST_SECURITY, read_block
 from teds_provision.teds.image import SECURITY
-from teds_provision.workflow.reading import LARGEST_SECURITY, read_block
 
 from .bench import Board, MemoryLink, talk
 

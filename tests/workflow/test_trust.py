@@ -12,9 +12,9 @@ from cryptography.hazmat.primitives.asymmetric import ec, ed25519, rsa
 from cryptography.hazmat.primitives.serialization import Encoding, NoEncryption, PrivateFormat, PublicFormat
 
 from teds_provision.errors import BadData, NotAuthentic, NotFound, PolicyRefused, UsageFailure
+from teds_provision.handover.trust import add, candidate, candidates_of, find_trusted, private_keys, remove, spoken
 from teds_provision.protocol.keys import SoftwareKey, fingerprint, to_pem
-from teds_provision.workflow.station import Station
-from teds_provision.workflow.trust import add, candidate, candidates_of, find_trusted, private_keys, remove, spoken
+from teds_provision.station.station import Station
 
 from .bench import make_station
 
@@ -165,7 +165,7 @@ def test_an_empty_or_missing_folder(north: Station, keys: Path) -> None:
 
 
 def test_a_certificate_that_does_not_verify(north: Station, keys: Path) -> None:
-    from teds_provision.workflow.fleet import Certificate, write_certificate
+    from teds_provision.handover.certify import Certificate, write_certificate
 
     forged = Certificate("lab", OTHER.point, north.ca, OTHER.sign(b"something else"))
     (keys / "lab.cert").write_bytes(write_certificate(forged))

@@ -8,18 +8,18 @@ from pathlib import Path
 import pytest
 
 from teds_provision.errors import NotWhitelisted
-from teds_provision.protocol.identity import Identity
 from teds_provision.protocol.keys import SoftwareKey, fingerprint, station_key_message
+from teds_provision.protocol.messages.identity import Identity
+from teds_provision.station.station import Station
+from teds_provision.steps.agree import require_session
+from teds_provision.steps.identify import identify
+from teds_provision.steps.provision import verify_node
+from teds_provision.steps.read import read_image
+from teds_provision.steps.verify import Verified, verify_image
 from teds_provision.store import TrustRecord
-from teds_provision.teds import security
-from teds_provision.teds.frame import frame
+from teds_provision.teds.codec import security
+from teds_provision.teds.codec.frame import frame
 from teds_provision.teds.image import SECURITY, Image
-from teds_provision.workflow.agree import require_session
-from teds_provision.workflow.identify import identify
-from teds_provision.workflow.provision import verify_node
-from teds_provision.workflow.reading import read_image
-from teds_provision.workflow.station import Station
-from teds_provision.workflow.verify import Verified, verify_image
 
 from .bench import Board, make_station, talk
 from .test_provision import run
@@ -162,7 +162,7 @@ def test_a_datasheet_of_a_later_epoch_is_caught(station: Station, board: Board, 
 
 
 def test_what_is_not_whitelisted_cannot_be_signed(station: Station, board: Board, image: Image) -> None:
-    from teds_provision.workflow.signing import SignOrder, sign_image
+    from teds_provision.steps.sign_command import SignOrder, sign_image
 
     station.store.remove_whitelist(board.uuid)
     with pytest.raises(NotWhitelisted):
@@ -170,9 +170,9 @@ def test_what_is_not_whitelisted_cannot_be_signed(station: Station, board: Board
 
 
 def test_the_same_build_signed_as_draft_and_as_file_has_one_signature(station: Station, board: Board) -> None:
-    from teds_provision.workflow.agree import agree
-    from teds_provision.workflow.build import build
-    from teds_provision.workflow.signing import SignOrder, sign_image
+    from teds_provision.steps.agree import agree
+    from teds_provision.steps.build import build
+    from teds_provision.steps.sign_command import SignOrder, sign_image
 
     from .test_agree import whitelist
     from .test_provision import ANGLE

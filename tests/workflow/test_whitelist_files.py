@@ -12,10 +12,10 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from teds_provision.errors import BadData, NotFound, OtherKey, PolicyRefused
+from teds_provision.station.station import Station
+from teds_provision.steps.whitelist import add, plan_addition, remove, render
+from teds_provision.steps.whitelist_files import FORMATS, Listed, read_whitelist
 from teds_provision.store import Revocation, WhitelistEntry
-from teds_provision.workflow.station import Station
-from teds_provision.workflow.whitelist import add, plan_addition, remove, render
-from teds_provision.workflow.whitelist_read import FORMATS, Listed, read_whitelist
 
 ONE, TWO = bytes.fromhex("8d4d9da65281f7000000"), bytes.fromhex("8d4d9da65281f7000001")
 KEY, OTHER = "ab" * 32, "cd" * 32

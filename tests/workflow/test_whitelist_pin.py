@@ -6,10 +6,10 @@ import pytest
 
 from teds_provision.errors import OtherKey
 from teds_provision.protocol.keys import fingerprint
-from teds_provision.workflow.identify import identify
-from teds_provision.workflow.station import Station
-from teds_provision.workflow.whitelist import add, plan_addition, remove
-from teds_provision.workflow.whitelist_read import Listed
+from teds_provision.station.station import Station
+from teds_provision.steps.identify import identify
+from teds_provision.steps.whitelist import add, plan_addition, remove
+from teds_provision.steps.whitelist_files import Listed
 
 from .bench import Board, MemoryLink, talk
 

@@ -10,8 +10,8 @@ from teds_provision.errors import Garbled
 from teds_provision.links.can.bus import Bus, Frame
 from teds_provision.links.can.gathering import Gathering
 from teds_provision.links.can.isotp import FUNCTIONAL, single
-from teds_provision.protocol.frames import Function, decode_reply, security_command
-from teds_provision.protocol.identity import Identity
+from teds_provision.protocol.messages.frames import Function, decode_reply, security_command
+from teds_provision.protocol.messages.identity import Identity
 
 IDENTIFY: Final = security_command(Function.IDENTIFY).encode()
 _SLICE: Final = 0.02

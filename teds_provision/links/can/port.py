@@ -24,7 +24,7 @@ from teds_provision.links.can.gathering import Gathering
 from teds_provision.links.can.isotp import Pair
 from teds_provision.links.can.spec import LAST_NODE, parse_spec
 from teds_provision.links.ports import Contact, Notice, NoticeSink
-from teds_provision.protocol.identity import Identity, NodeState
+from teds_provision.protocol.messages.identity import Identity, NodeState
 
 REPLY_SECONDS: Final = 5.0
 REPEAT_SECONDS: Final = 15.0

@@ -16,7 +16,7 @@ from teds_provision.links.nfc.poller import Poller
 from teds_provision.links.nfc.tag import FieldLost, ReaderLost
 from teds_provision.links.nfc.visit import Foreign, Visit, look
 from teds_provision.links.ports import Contact, Notice, NoticeSink
-from teds_provision.protocol.identity import Identity
+from teds_provision.protocol.messages.identity import Identity
 
 REPEATS = 2  # of one transaction
 REPEAT_WITHIN = 15.0  # seconds

@@ -9,7 +9,7 @@ from teds_provision.errors import BadData, Garbled
 from teds_provision.links.nfc import message, tnep
 from teds_provision.links.nfc.message import Record
 from teds_provision.links.nfc.tag import ReaderTag
-from teds_provision.protocol.identity import Identity
+from teds_provision.protocol.messages.identity import Identity
 
 
 @dataclass(frozen=True)

@@ -8,9 +8,9 @@ from datetime import UTC, datetime, timedelta
 
 from teds_provision.errors import BadData
 from teds_provision.teds.calibration.model import METHODS, MONOTONE, Calibration, CalibrationInput, Method, Monotone
+from teds_provision.teds.codec.model import Decoded, Field, TimeInstance, Units
 from teds_provision.teds.image import BlockId
-from teds_provision.teds.model import Decoded, Field, TimeInstance, Units
-from teds_provision.teds.units import WrittenUnit, recognize
+from teds_provision.teds.units.units import WrittenUnit, recognize
 
 
 def from_decoded(
@@ -64,7 +64,7 @@ def calibrations_of(blocks: Mapping[BlockId, bytes]) -> dict[int, Calibration]:
 
     Channels whose calibration is not understood here are left out.
     """
-    from teds_provision.teds.decode import decode
+    from teds_provision.teds.codec.decode import decode
 
     out: dict[int, Calibration] = {}
     for (channel, access_code), octets in sorted(blocks.items()):

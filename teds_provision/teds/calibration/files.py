@@ -13,9 +13,9 @@ from pathlib import Path
 from typing import Final
 
 from teds_provision.errors import BadData
+from teds_provision.teds.calibration.csv_text import CsvTable, read_csv
 from teds_provision.teds.calibration.model import Calibration
 from teds_provision.teds.calibration.order import Order, calibration_of
-from teds_provision.teds.calibration_csv import CsvTable, read_csv
 from teds_provision.teds.profile.model import ChannelProfile, Profile
 from teds_provision.teds.profile.source import Item, Table, Where, parse, read_text
 

@@ -16,8 +16,8 @@ from datetime import UTC, datetime, timedelta
 from typing import TYPE_CHECKING, Final, Generic, Literal, TypeVar, overload
 
 from teds_provision.errors import BadData
-from teds_provision.teds.model import Decoded, Edition, TimeInstance, Units
-from teds_provision.teds.units import WrittenUnit, parse_unit
+from teds_provision.teds.codec.model import Decoded, Edition, TimeInstance, Units
+from teds_provision.teds.units.units import WrittenUnit, parse_unit
 
 if TYPE_CHECKING:
     import numpy as np

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Final, NamedTuple
 
-from teds_provision.teds.frame import MINIMUM_OCTETS, checksum, teds_class
+from teds_provision.teds.codec.frame import MINIMUM_OCTETS, checksum, teds_class
 
 MAX_FILE: Final = 32 << 20
 """Octets of the largest file that is read."""

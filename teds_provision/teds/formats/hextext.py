@@ -64,7 +64,7 @@ def _finish(place: tuple[int | None, int | None] | None, parts: list[str]) -> li
 
 def write_hex(blocks: Sequence[Block]) -> str:
     """Write one comment and the digits of each TEDS; nothing is lost."""
-    from teds_provision.teds.tables import name_of
+    from teds_provision.teds.codec.tables import name_of
 
     lines: list[str] = []
     for channel, code, octets in blocks:

@@ -8,6 +8,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any, Final
 
 from teds_provision.errors import BadData
+from teds_provision.teds.codec.model import TimeInstance, Units
 from teds_provision.teds.formats.block import Block
 from teds_provision.teds.formats.tree import (
     MAX_DEPTH,
@@ -20,7 +21,6 @@ from teds_provision.teds.formats.tree import (
     units_from_parts,
     units_to_parts,
 )
-from teds_provision.teds.model import TimeInstance, Units
 
 FORMAT: Final = "teds/1"
 _HEAD: Final = {

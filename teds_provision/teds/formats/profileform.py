@@ -14,9 +14,10 @@ from typing import Final
 
 from teds_provision.errors import BadData
 from teds_provision.teds import decode
+from teds_provision.teds.codec.model import UNIT_PARTS, Decoded, Edition, Field, Units
+from teds_provision.teds.codec.tables import name_of
 from teds_provision.teds.formats.block import Block
 from teds_provision.teds.formats.tree import shortest
-from teds_provision.teds.model import UNIT_PARTS, Decoded, Edition, Field, Units
 from teds_provision.teds.profile.interpret import TEXT_CLASSES, interpret
 from teds_provision.teds.profile.keys import (
     CALIBRATION_KEYS,
@@ -34,8 +35,7 @@ from teds_provision.teds.profile.load import load_profile
 from teds_provision.teds.profile.model import Profile
 from teds_provision.teds.profile.reader import Problems
 from teds_provision.teds.profile.source import parse
-from teds_provision.teds.tables import name_of
-from teds_provision.teds.units import display_unit, format_units, parse_unit
+from teds_provision.teds.units.units import display_unit, format_units, parse_unit
 
 META, CHANNEL, CALIBRATION, NAME, PHY, SECURITY = 1, 3, 5, 12, 13, 128
 NO_UUID: Final = bytes(10)

@@ -16,9 +16,9 @@ from typing import Final, Literal
 
 from teds_provision.errors import BadData
 from teds_provision.teds import compose, decode
+from teds_provision.teds.codec.model import UNIT_PARTS, Decoded, Edition, Field, TimeInstance, Units
+from teds_provision.teds.codec.tables import TEXT_BASED, FieldSpec, name_of, table
 from teds_provision.teds.formats.block import Block
-from teds_provision.teds.model import UNIT_PARTS, Decoded, Edition, Field, TimeInstance, Units
-from teds_provision.teds.tables import TEXT_BASED, FieldSpec, name_of, table
 
 Kind = Literal["integer", "number", "text", "octets", "units", "time", "integers", "numbers", "fields"]
 EntryValue = int | float | str | bytes | Units | TimeInstance | tuple[int, ...] | tuple[float, ...] | None

@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Final
 
 from teds_provision.errors import BadData
+from teds_provision.teds.codec.model import Edition, TimeInstance, Units
 from teds_provision.teds.formats.block import MAX_FILE, Block
 from teds_provision.teds.formats.tree import (
     MAX_DEPTH,
@@ -25,7 +26,6 @@ from teds_provision.teds.formats.tree import (
     units_from_parts,
     units_to_parts,
 )
-from teds_provision.teds.model import Edition, TimeInstance, Units
 
 NAMESPACE: Final = "urn:teds-provision:teds:1"
 SCHEMA: Final = Path(__file__).resolve().parent.parent / "schema" / "teds-1.xsd"

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 from teds_provision.errors import BadData
+from teds_provision.teds.codec.model import Edition, Finding
 from teds_provision.teds.messages.arguments import (
     Argument,
     Blocks,
@@ -30,7 +31,6 @@ from teds_provision.teds.messages.tables import (
     STATUS,
     Spec,
 )
-from teds_provision.teds.model import Edition, Finding
 
 __all__ = ["Argument", "Message", "compose_command", "compose_service", "decode_message", "looks_like_message"]
 

@@ -13,7 +13,7 @@ from __future__ import annotations
 
 from typing import Final, NamedTuple
 
-from teds_provision.protocol.frames import SECURITY, Function, Reason
+from teds_provision.protocol.messages.frames import SECURITY, Function, Reason
 
 
 class Spec(NamedTuple):

@@ -7,7 +7,7 @@ from datetime import UTC, datetime
 from typing import TYPE_CHECKING, Final
 
 from teds_provision.errors import BadData
-from teds_provision.teds.model import Edition
+from teds_provision.teds.codec.model import Edition
 from teds_provision.teds.profile.model import BuiltDatasheet, ChannelProfile, Profile
 
 if TYPE_CHECKING:

@@ -6,7 +6,7 @@ import re
 from typing import Final, cast
 
 from teds_provision.errors import BadData
-from teds_provision.teds.model import Units
+from teds_provision.teds.codec.model import Units
 from teds_provision.teds.profile.keys import (
     CALIBRATION_KEYS,
     CHANNEL_KEYS,
@@ -31,7 +31,7 @@ from teds_provision.teds.profile.model import (
 )
 from teds_provision.teds.profile.reader import FLOAT32_MAXIMUM, Problems, Section
 from teds_provision.teds.profile.source import Table
-from teds_provision.teds.units import WrittenUnit, parse_seconds, parse_unit
+from teds_provision.teds.units.units import WrittenUnit, parse_seconds, parse_unit
 
 TOP_KEYS: Final = (
     "extends",

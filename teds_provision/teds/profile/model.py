@@ -6,9 +6,9 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Literal
 
-from teds_provision.teds.calibration_raw import raw_range
-from teds_provision.teds.model import Edition, Units
-from teds_provision.teds.units import WrittenUnit
+from teds_provision.teds.calibration.raw_range import raw_range
+from teds_provision.teds.codec.model import Edition, Units
+from teds_provision.teds.units.units import WrittenUnit
 
 if TYPE_CHECKING:
     from datetime import datetime

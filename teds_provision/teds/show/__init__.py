@@ -8,13 +8,13 @@ from datetime import UTC, datetime
 from typing import Any
 
 from teds_provision.teds import decode
+from teds_provision.teds.codec.model import Decoded, Field, Finding, Units
+from teds_provision.teds.codec.tables import FieldSpec, Table, table
 from teds_provision.teds.formats import Block
 from teds_provision.teds.formats.jsonform import teds_to_json
-from teds_provision.teds.model import Decoded, Field, Finding, Units
 from teds_provision.teds.show.summary import CALIBRATION, CHANNEL, Line, summary_of
 from teds_provision.teds.show.values import Context, meaning_of, text_of
-from teds_provision.teds.tables import FieldSpec, Table, table
-from teds_provision.teds.units import WrittenUnit, display_unit
+from teds_provision.teds.units.units import WrittenUnit, display_unit
 
 __all__ = ["Shown", "ShownField", "describe", "finding_to_json", "shown_to_json"]
 
@@ -99,7 +99,7 @@ def _unit(block: Block, decoded: Decoded, beside: Mapping[tuple[int, int], bytes
         return display_unit(units) if isinstance(units, Units) else None
     if decoded.access_code != CALIBRATION:
         return None
-    from teds_provision.teds.units import recognize
+    from teds_provision.teds.units.units import recognize
 
     own = beside.get((block.channel or 1, CHANNEL))
     units = decode(own).get("PhyUnits") if own is not None else None

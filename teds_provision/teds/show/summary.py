@@ -6,7 +6,7 @@ from collections.abc import Iterator
 from datetime import datetime
 
 from teds_provision.errors import BadData
-from teds_provision.teds.model import Decoded, Units
+from teds_provision.teds.codec.model import Decoded, Units
 from teds_provision.teds.show.values import FINGERPRINT_DIGITS, Context, fingerprint, instant
 
 META, CHANNEL, CALIBRATION, SECURITY = 1, 3, 5, 128
@@ -24,7 +24,7 @@ def summary_of(decoded: Decoded, context: Context, now: datetime) -> tuple[Line,
 
 
 def _uuid(decoded: Decoded, _context: Context) -> Iterator[Line]:
-    from teds_provision.teds.uuid import unpack_uuid
+    from teds_provision.teds.codec.uuid import unpack_uuid
 
     value = decoded.get("UUID")
     parts = unpack_uuid(value) if isinstance(value, bytes) else None
@@ -43,7 +43,7 @@ def _uuid(decoded: Decoded, _context: Context) -> Iterator[Line]:
 
 
 def _range(decoded: Decoded, context: Context) -> Iterator[Line]:
-    from teds_provision.teds.units import format_value
+    from teds_provision.teds.units.units import format_value
 
     low, high, error = (decoded.get(name) for name in ("LowLimit", "HiLimit", "OError"))
     if context.unit is None or not isinstance(low, float) or not isinstance(high, float):
@@ -84,8 +84,8 @@ def _channel_of(octets: bytes | None) -> tuple[Units | None, bool]:
 
 
 def _security(decoded: Decoded, context: Context) -> Iterator[Line]:
-    from teds_provision.teds.keyforms import read_key
-    from teds_provision.teds.model import TimeInstance
+    from teds_provision.teds.codec.keyforms import read_key
+    from teds_provision.teds.codec.model import TimeInstance
 
     ours = decoded.field(_PROFILE_VERSION) is not None
     if not ours:
@@ -111,7 +111,7 @@ def _security(decoded: Decoded, context: Context) -> Iterator[Line]:
 
 
 def _form(decoded: Decoded) -> Iterator[Line]:
-    from teds_provision.teds import security
+    from teds_provision.teds.codec import security
 
     try:
         security.decode(decoded.octets)

@@ -9,11 +9,11 @@ from dataclasses import field as dataclass_field
 from datetime import UTC, datetime, timedelta
 from typing import TYPE_CHECKING, Final
 
-from teds_provision.teds.model import Field, TimeInstance, Units
-from teds_provision.teds.tables import FieldSpec, name_of
+from teds_provision.teds.codec.model import Field, TimeInstance, Units
+from teds_provision.teds.codec.tables import FieldSpec, name_of
 
 if TYPE_CHECKING:
-    from teds_provision.teds.units import WrittenUnit
+    from teds_provision.teds.units.units import WrittenUnit
 
 SHOWN_NUMBERS: Final = 8
 SHOWN_OCTETS: Final = 24
@@ -57,7 +57,7 @@ def text_of(field: Field, context: Context, spec: FieldSpec | None) -> str:
     """Value of a field for people; hex digits where nothing better is known."""
     value = field.value
     if isinstance(value, Units):
-        from teds_provision.teds.units import format_units
+        from teds_provision.teds.units.units import format_units
 
         return format_units(value) or "plain number"
     if isinstance(value, TimeInstance):
@@ -82,7 +82,7 @@ def _integer(value: int, spec: FieldSpec | None) -> str:
 
 def _number(field: Field, value: float, context: Context, spec: FieldSpec | None) -> str:
     from teds_provision.teds.formats.tree import shortest
-    from teds_provision.teds.units import format_value
+    from teds_provision.teds.units.units import format_value
 
     value = shortest(value)
     if field.name in _IN_CHANNEL_UNIT and context.unit is not None:
@@ -136,7 +136,7 @@ def hexadecimal(octets: bytes) -> str:
 
 def key(field: Field) -> str:
     """A key or signature: the form it came in, and the fingerprint of a P-256 point."""
-    from teds_provision.teds.keyforms import read_key
+    from teds_provision.teds.codec.keyforms import read_key
 
     found = read_key(field.raw)
     if found.point is not None:

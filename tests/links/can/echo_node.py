@@ -12,7 +12,7 @@ import threading
 import time
 
 from teds_provision.node.can_server import CanServer
-from teds_provision.protocol.identity import Identity, NodeState
+from teds_provision.protocol.messages.identity import Identity, NodeState
 
 
 class EchoNode:

@@ -16,7 +16,7 @@ from teds_provision.links.can import port as port_module
 from teds_provision.links.can.port import CanPort
 from teds_provision.links.ports import Contact, Notice
 from teds_provision.node.can_server import CanServer
-from teds_provision.protocol.identity import Identity, NodeState
+from teds_provision.protocol.messages.identity import Identity, NodeState
 from tests.links.can.echo_node import EchoNode
 from tests.links.can.hub import Hub
 

@@ -15,7 +15,7 @@ import time
 from typing import Any
 
 from teds_provision.node.nfc_server import NfcServer
-from teds_provision.protocol.identity import Identity, NodeState
+from teds_provision.protocol.messages.identity import Identity, NodeState
 
 
 class Echo:

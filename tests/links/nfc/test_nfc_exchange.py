@@ -14,7 +14,7 @@ from teds_provision.links import Contact, LinkSettings, Notice, Port, open_port
 from teds_provision.links.nfc import message
 from teds_provision.links.nfc.message import EXTERNAL, WELL_KNOWN, Record
 from teds_provision.links.nfc.tnep import ID_TYPE, SERVICE, ServiceParameters
-from teds_provision.protocol.identity import NodeState
+from teds_provision.protocol.messages.identity import NodeState
 
 from .conftest import UUID, StartNode
 
@@ -180,7 +180,7 @@ def test_a_tag_that_says_nonsense_is_a_foreign_tag(
 
 
 def test_other_records_and_services_beside_ours_do_not_matter(start_node: StartNode, port: Port, notices: list) -> None:
-    from teds_provision.protocol.identity import Identity
+    from teds_provision.protocol.messages.identity import Identity
 
     identity = Identity(bytes.fromhex(OTHER), NodeState.FACTORY, 0, 0, 1024, 0).encode()
     records = [

@@ -1,0 +1,1 @@
+"""The whole store of a station, sealed into one file, and back."""

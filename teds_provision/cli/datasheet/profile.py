@@ -1,0 +1,237 @@
+"""``profile``: datasheets by transducer type."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from itertools import groupby
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from teds_provision.cli.context import App, pass_app
+from teds_provision.cli.options import COMMAND_SETTINGS, command, dry_run_option, examples
+from teds_provision.errors import BadData, UsageFailure
+
+if TYPE_CHECKING:
+    from rich.console import Console
+    from rich.table import Table
+
+    from teds_provision.teds.profile import Problem
+
+
+@click.group(
+    context_settings=COMMAND_SETTINGS,
+    epilog=examples("teds-provision profile list", "teds-provision profile show magnetic-angular-position-sensor"),
+)
+def profile() -> None:
+    """Transducer types: one TOML file each, in ./profiles, in the home's profiles, or shipped."""
+
+
+@profile.command("list", context_settings=COMMAND_SETTINGS, epilog=examples("teds-provision profile list"))
+@pass_app
+def list_(app: App) -> None:
+    """Name every known type."""
+    from teds_provision.teds.profile import default_folders, list_profiles, listed
+
+    entries = [listed(entry) for entry in list_profiles(default_folders(app.home))]
+
+    def human(console: Console) -> None:
+        from rich.markup import escape
+        from rich.table import Table
+
+        from teds_provision.cli.rendering import print_table
+
+        table = Table(box=None, pad_edge=False)
+        for title in ("Profile", "Channels", "Links"):
+            table.add_column(title, no_wrap=True)
+        table.add_column("Title", overflow="fold")
+        for entry in entries:
+            if "error" in entry:
+                table.add_row(entry["name"], "", "", escape(f"cannot be read: {entry['error']}"))
+            elif not entry["abstract"]:
+                title = escape(entry["title"])
+                table.add_row(entry["name"], str(entry["channels"]), ", ".join(entry["links"]), title)
+        print_table(console, table)
+
+    app.emit({"profiles": entries}, human)
+
+
+@profile.command(
+    context_settings=COMMAND_SETTINGS,
+    short_help="Show one type: channels, units, ranges, calibration.",
+    epilog=examples("teds-provision profile show tactile-finger-sensor"),
+)
+@click.argument("name")
+@pass_app
+def show(app: App, name: str) -> None:
+    """Show one type: channels with units, ranges, and what is asked of a calibration."""
+    from teds_provision.teds.profile import default_folders, describe, load_profile
+
+    data = describe(load_profile(name, default_folders(app.home)))
+    app.emit({"profiles": [data]}, lambda console: _show(console, data))
+
+
+def _show(console: Console, data: dict[str, Any]) -> None:
+    from rich.markup import escape
+
+    from teds_provision.cli.rendering import print_table
+
+    console.print(f"[bold]{escape(data['title'])}[/bold]  {escape(data['file'])}")
+    if data["extends"]:
+        console.print(f"extends {' -> '.join(data['extends'])}", markup=False)
+    if data["description"]:
+        console.print(data["description"] + "\n", markup=False)
+    if data["links"]:
+        console.print(f"Links: {', '.join(data['links'])}", markup=False)
+    print_table(console, _channels(data["channels"]))
+    for warning in data["warnings"]:
+        console.print(f"Warning: {warning}", markup=False)
+
+
+def _channels(channels: list[dict[str, Any]]) -> Table:
+    from rich.table import Table
+    from rich.text import Text
+
+    from teds_provision.teds.diff.datasheets import show_seconds
+    from teds_provision.teds.units.units import short_unit
+
+    table = Table(box=None, pad_edge=False)
+    for title in ("Ch", "Name", "Type", "Range", "Uncertainty", "Period"):
+        table.add_column(title, no_wrap=True)
+    table.add_column("Calibration")
+    for channel, last in _alike(channels):
+        unit, period = short_unit(channel["unit"]), channel["sampling_period"]
+        several = last is not channel
+        row = (
+            f"{channel['number']}-{last['number']}" if several else str(channel["number"]),
+            f"{channel['name']} to {last['name']}" if several else channel["name"],
+            channel["type"],
+            f"{channel['low_limit']:.6g} to {channel['high_limit']:.6g} {unit}",
+            f"{channel['uncertainty']:.6g} {unit}",
+            show_seconds(period) if period is not None else "",
+            _demand(channel["calibration"]),
+        )
+        table.add_row(*map(Text, row))
+    return table
+
+
+def _alike(channels: list[dict[str, Any]]) -> Iterator[tuple[dict[str, Any], dict[str, Any]]]:
+    """First and last of each run of channels that differ in number and name only."""
+
+    def same(channel: dict[str, Any]) -> str:
+        return str({key: value for key, value in channel.items() if key not in ("number", "name")})
+
+    for _, run in groupby(channels, key=same):
+        members = list(run)
+        yield members[0], members[-1]
+
+
+def _demand(demand: dict[str, Any]) -> str:
+    parts = ["required" if demand["required"] else "", demand["method"] or "", demand["monotone"] or ""]
+    if demand["monotone"] == "either":
+        parts[2] = "monotone"
+    if demand["interval"]:
+        parts.append(f"every {demand['interval'] / 86_400:.0f} d")
+    return ", ".join(part for part in parts if part)
+
+
+@command("teds-provision profile check profiles/tactile-finger-sensor.toml")
+@click.argument("names", metavar="NAME...", nargs=-1, required=True)
+@pass_app
+def check(app: App, names: tuple[str, ...]) -> None:
+    """Look for every mistake: file, line, field, and what is wrong. Exits 8 where there is one."""
+    from teds_provision.teds.profile import check as check_profile
+    from teds_provision.teds.profile import default_folders, find_profile
+
+    folders = default_folders(app.home)
+    told: list[dict[str, Any]] = []
+    first: Problem | None = None
+    for name in names:
+        path = find_profile(name, folders)
+        _, problems = check_profile(path, folders)
+        errors = [problem for problem in problems if problem.severity == "error"]
+        first = first or (errors[0] if errors else None)
+        found = [
+            {"file": p.where.file, "line": p.where.line, "field": p.field, "message": p.message, "severity": p.severity}
+            for p in problems
+        ]
+        told.append({"name": path.stem, "file": str(path), "ok": not errors, "problems": found})
+        for problem in problems if not app.json else ():
+            app.note(f"{problem.severity}: {problem}")
+    if first is not None:
+        count = sum(problem["severity"] == "error" for entry in told for problem in entry["problems"])
+        more = f" ({count - 1} more, all above)" if count > 1 and not app.json else ""
+        raise BadData(f"{first}{more}")
+    good = ", ".join(entry["name"] for entry in told)
+    app.emit({"profiles": told}, _plain(f"{good}: no mistakes."))
+
+
+profile.add_command(check)
+
+
+@command(
+    "teds-provision profile new wrist-torque", "teds-provision profile new my-finger --extends tactile-finger-sensor"
+)
+@click.argument("name")
+@click.option("--extends", metavar="PROFILE", help="Begin with another type and say only what differs.")
+@click.option(
+    "--output",
+    "-o",
+    type=click.Path(path_type=Path, dir_okay=False),
+    metavar="FILE",
+    help="Where to write it (default: ./profiles where there is such a folder, else the home's profiles).",
+)
+@dry_run_option
+@pass_app
+def new(app: App, name: str, extends: str | None, output: Path | None, dry_run: bool) -> None:
+    """Write a commented template of a new type, every key in it."""
+    import re
+
+    from teds_provision.teds.profile import default_folders, find_profile, template
+
+    if not re.fullmatch(r"[a-z0-9][a-z0-9._-]{0,63}", name):
+        raise UsageFailure(
+            f'"{name}" is no name of a profile.', hint="Use lower-case letters, digits and dashes, like wrist-torque."
+        )
+    text = template(name)
+    if extends is not None:
+        base = find_profile(extends, default_folders(app.home)).stem
+        text = (
+            f"# Transducer type {name}: as {base}, but for what is said here.\n"
+            f'# What can be said: teds-provision profile new --dry-run {name}\n\nextends = "{base}"\ntitle = "{name}"\n'
+            f"\n[channel.1]\n# high-limit = 20.0\n"
+        )
+    path = output or _place(app.home, name)
+    done = path.exists() and path.read_text(encoding="utf-8", errors="replace") == text
+    if path.exists() and not done:
+        raise UsageFailure(f"{path} exists already and says something else.", hint="Take another name, or --output.")
+    if dry_run:
+        app.emit({"profiles": [{"name": name, "file": str(path)}], "text": text}, _plain(text.rstrip("\n")))
+        return
+    if not done:
+        _write(path, text)
+    said = _plain(f"{path} {'is there already' if done else 'written'}.")
+    app.emit({"profiles": [{"name": name, "file": str(path)}]}, said)
+
+
+profile.add_command(new)
+
+
+def _plain(text: str) -> Callable[[Console], None]:
+    """Text as it is: brackets are no markup, lines stay whole."""
+    return lambda _console: click.echo(text)
+
+
+def _place(home: Path, name: str) -> Path:
+    folder = Path("profiles") if Path("profiles").is_dir() else home / "profiles"
+    return folder / f"{name}.toml"
+
+
+def _write(path: Path, text: str) -> None:
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True, mode=0o700)
+        with path.open("x", encoding="utf-8") as stream:
+            stream.write(text)
+    except OSError as error:
+        raise UsageFailure(f"{path} cannot be written: {error.strerror}.") from error

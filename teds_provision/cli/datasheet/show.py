@@ -1,0 +1,151 @@
+"""``show``: decode TEDS, images, profiles, bundle headers and messages; turn TEDS from any format into any other."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Sequence
+from dataclasses import asdict
+from pathlib import Path
+from typing import TYPE_CHECKING, cast
+
+import click
+
+from teds_provision.cli.context import App, pass_app
+from teds_provision.cli.context import to_json as dumps
+from teds_provision.cli.options import command
+from teds_provision.errors import BadData, UsageFailure
+
+if TYPE_CHECKING:
+    from teds_provision.cli.datasheet.show_files import ShownFile
+    from teds_provision.teds.codec.model import Edition
+    from teds_provision.teds.formats import Format
+
+CHOICES = ["table", "json", "xml", "hex", "ihex", "toml", "binary", "image"]
+_BAD_DATA = BadData.exit_code
+_POLICY = 6
+
+
+@command(
+    "teds-provision show meta.hex",
+    "teds-provision show image.json --format xml > image.xml",
+    "teds-provision show image.json --edition 2024",
+    "teds-provision show --diff before.json after.json",
+    "teds-provision show image.json --plot curve.svg",
+)
+@click.argument("files", metavar="FILE…", nargs=-1)
+@click.option("--format", "form", type=click.Choice(CHOICES), default="table", show_default=True, help="Of the output.")
+@click.option(
+    "--edition", type=click.Choice(["2007", "2024"]), help="Convert to this edition; say what it cannot hold."
+)
+@click.option("--diff", nargs=2, metavar="A B", help="Say in physical terms what changes from A to B.")
+@click.option("--plot", metavar="FILE", type=click.Path(path_type=Path), help="Draw the calibrations, .png or .svg.")
+@click.option("--strict", is_flag=True, help="Exit 8 for any error finding, 6 for a calibration that would hurt.")
+@pass_app
+def show(
+    app: App,
+    files: tuple[str, ...],
+    form: str,
+    edition: str | None,
+    diff: tuple[str, str] | None,
+    plot: Path | None,
+    strict: bool,
+) -> None:
+    """Decode TEDS (binary, hex, Intel HEX, JSON, XML), images, profiles, bundle headers and messages.
+
+    A file of - is standard input. Exits 0 where it could decode, 8 where not even the tuples close, 3 for no such file.
+    """
+    from teds_provision.cli.datasheet.show_files import load
+
+    if diff is not None and (files or plot or form not in {"table", "json"}):
+        raise UsageFailure("--diff compares two files and goes with nothing else.")
+    if diff is not None:
+        _diff(app, *diff, as_json=form == "json")
+        return
+    if not files:
+        raise UsageFailure("There is nothing to show.", hint="Name a file, or - for standard input.")
+    if app.json and form not in {"table", "json"}:
+        raise UsageFailure("--json and --format ask for different outputs.", hint="Leave one of them out.")
+    wanted = cast("Edition", int(edition)) if edition else None
+    shown = [load(name, wanted) for name in files]
+    if plot is not None:
+        _plot(app, shown, plot)
+    _tell(app, shown, form)
+    _judge(shown, strict)
+
+
+def _tell(app: App, files: Sequence[ShownFile], form: str) -> None:
+    for file in files:
+        for note in file.notes:
+            app.note(f"{file.name}: {note}")
+    if app.json or form == "json":
+        from teds_provision.cli.datasheet.show_json import to_json
+
+        result = to_json(files)
+        print(dumps(result, indent=None if app.json else 1), flush=True)
+    elif form == "table":
+        from teds_provision.cli.datasheet.show_table import print_files
+
+        print_files(app.console(), files)
+    else:
+        _convert(app, files, cast("Format", form))
+
+
+def _convert(app: App, files: Sequence[ShownFile], form: Format) -> None:
+    from teds_provision.teds.formats import lost, write_blocks
+
+    for file in files:
+        if file.bundle is not None:
+            raise BadData(f"{file.name} holds no TEDS that could be written as {form}.")
+        for said in file.conversions.values():
+            for finding in said:
+                if finding.severity == "error":
+                    app.warn(f"{file.name}: {finding.message}")
+    blocks = [block for file in files for block in file.blocks]
+    written = write_blocks(blocks, form)
+    if isinstance(written, bytes) and sys.stdout.isatty():
+        raise UsageFailure("Octets are not for a terminal.", hint="Send them to a file: … --format binary > FILE")
+    for sentence in lost(blocks, form):
+        app.warn(f"{form} cannot hold {sentence}")
+    octets = written if isinstance(written, bytes) else written.encode()
+    sys.stdout.buffer.write(octets)
+    sys.stdout.flush()
+
+
+def _judge(files: Sequence[ShownFile], strict: bool) -> None:
+    """Exit code after everything has been told."""
+    found = [finding for file in files for shown in file.teds for finding in shown.decoded.findings]
+    found += [finding for file in files if file.message is not None for finding in file.message.findings]
+    if any(file.malformed for file in files) or (strict and any(finding.severity == "error" for finding in found)):
+        raise click.exceptions.Exit(_BAD_DATA)
+    if strict and any(guarded.severity == "error" for file in files for guarded in file.guard):
+        raise click.exceptions.Exit(_POLICY)
+
+
+def _diff(app: App, before: str, after: str, *, as_json: bool) -> None:
+    from teds_provision.cli.datasheet.show_files import guard_to_json, load, placed
+    from teds_provision.teds.diff.datasheets import diff_blocks
+    from teds_provision.teds.guard.guard import check_calibration
+
+    old, new = (placed(load(name).blocks) for name in (before, after))
+    changes = diff_blocks(old, new)
+    guard = check_calibration(new, old)
+    result = {
+        "changes": [asdict(change) for change in changes],
+        "guard": [guard_to_json(finding) for finding in guard],
+    }
+    if as_json and not app.json:
+        print(dumps(result, indent=1), flush=True)
+        return
+    lines = [change.text for change in changes] or ["no difference"]
+    lines += [f"{finding.severity}: guard, channel {finding.channel}: {finding.message}" for finding in guard]
+    app.emit(result, lambda console: console.print("\n".join(lines), markup=False))
+
+
+def _plot(app: App, files: Sequence[ShownFile], path: Path) -> None:
+    from teds_provision.cli.datasheet.show_files import placed
+    from teds_provision.teds.show.plot import plot_blocks
+
+    if len(files) != 1:
+        raise UsageFailure("A plot shows the calibrations of one file.", hint="Call show once for each.")
+    channels = plot_blocks(placed(files[0].blocks), path)
+    app.note(f"Drawn in {path}: channel {', '.join(map(str, channels))}.")

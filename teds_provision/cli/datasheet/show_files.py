@@ -1,0 +1,154 @@
+"""What ``show`` was given: files read, told apart and put into words, before anything is printed."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from teds_provision.errors import BadData, NotFound
+from teds_provision.teds.codec.model import Decoded, Edition, Finding, Verdict
+from teds_provision.teds.formats import Block, Kind, class_of, detect, read_blocks
+from teds_provision.teds.formats.block import MAX_FILE
+from teds_provision.teds.messages import Message, decode_message, looks_like_message
+from teds_provision.teds.show import Shown, describe
+
+if TYPE_CHECKING:
+    from teds_provision.protocol.handover.bundle import BundleHeader
+    from teds_provision.teds.guard.guard import GuardFinding
+
+STDIN = "-"
+_CALIBRATION = 5
+
+
+@dataclass(frozen=True)
+class ShownFile:
+    """One file: its TEDS, or the message or the bundle's header that it holds; ``notes`` are said on stderr."""
+
+    name: str
+    kind: Kind
+    teds: tuple[Shown, ...] = ()
+    message: Message | None = None
+    bundle: BundleHeader | None = None
+    guard: tuple[GuardFinding, ...] = ()
+    notes: tuple[str, ...] = ()
+    conversions: Mapping[int, tuple[Finding, ...]] = field(default_factory=dict)
+
+    @property
+    def blocks(self) -> list[Block]:
+        """The blocks of its TEDS; a message is one block without a place."""
+        if self.message is not None:
+            return [Block(None, None, self.message.octets)]
+        return [shown.block for shown in self.teds]
+
+    @property
+    def malformed(self) -> bool:
+        """Whether the tuples of a TEDS do not even close, or a message is none."""
+        unreadable = self.message is not None and self.message.kind == "unknown"
+        return unreadable or any(shown.decoded.verdict is Verdict.MALFORMED for shown in self.teds)
+
+
+def read_file(name: str) -> bytes:
+    """Octets of a file or, for ``-``, of standard input; raises NotFound and, for more than 32 MiB, BadData."""
+    try:
+        if name == STDIN:
+            octets = sys.stdin.buffer.read(MAX_FILE + 1)
+        else:
+            with Path(name).open("rb") as stream:
+                octets = stream.read(MAX_FILE + 1)
+    except IsADirectoryError as error:
+        raise NotFound(f"{name} is a folder, not a file.") from error
+    except OSError as error:
+        raise NotFound(f"{name} cannot be read: {error.strerror}.") from error
+    except ValueError as error:
+        raise NotFound(f"{name!r} is no name of a file.") from error
+    if len(octets) > MAX_FILE:
+        raise BadData(f"{name} has more than {MAX_FILE >> 20} MiB; no file of TEDS has.")
+    return octets
+
+
+def load(name: str, edition: Edition | None = None) -> ShownFile:
+    """Read one file and put it into words, converted to ``edition`` where one is asked."""
+    octets = read_file(name)
+    try:
+        kind = detect(octets)
+        if kind == "bundle":
+            from teds_provision.protocol.handover.bundle import peek_bundle
+
+            return ShownFile(name, kind, bundle=peek_bundle(octets))
+        path = Path(name) if name != STDIN else None
+        blocks = read_blocks(octets, kind, path=path)
+    except BadData as error:
+        raise BadData(f"{name}: {error.message}", hint=error.hint) from error
+    if not blocks:
+        raise BadData(f"{name} holds no TEDS.")
+    if len(blocks) == 1 and is_message(blocks[0].octets):
+        return ShownFile(name, kind, message=decode_message(blocks[0].octets))
+    notes = ("The UUID is all zeros: a profile has none.",) if kind == "toml" else ()
+    file = ShownFile(name, kind, notes=notes)
+    if edition is not None:
+        blocks, conversions = _converted(blocks, edition)
+        file = replace(file, conversions=conversions)
+    beside = placed(blocks)
+    shown = tuple(describe(block, beside) for block in blocks)
+    return replace(file, teds=shown, guard=_guard(beside))
+
+
+def is_message(octets: bytes) -> bool:
+    """Whether octets are a message rather than a TEDS."""
+    if looks_like_message(octets):
+        return True
+    from teds_provision.teds import decode
+
+    return class_of(octets) is None and decode(octets).verdict is Verdict.MESSAGE
+
+
+def placed(blocks: Sequence[Block]) -> dict[tuple[int, int], bytes]:
+    """TEDS by (channel, access code); lone channel TEDS and calibrations without a channel count as channel 1."""
+    out: dict[tuple[int, int], bytes] = {}
+    for channel, code, octets in blocks:
+        if code is not None:
+            out.setdefault((_usual_channel(code) if channel is None else channel, code), octets)
+    return out
+
+
+def _usual_channel(code: int) -> int:
+    return 1 if code in {3, _CALIBRATION} else 0
+
+
+def _guard(beside: dict[tuple[int, int], bytes]) -> tuple[GuardFinding, ...]:
+    if not any(code == _CALIBRATION for _, code in beside):
+        return ()
+    from datetime import UTC, datetime
+
+    from teds_provision.teds.guard.guard import check_calibration
+
+    return tuple(check_calibration(beside, now=datetime.now(UTC)))
+
+
+def _converted(blocks: Sequence[Block], edition: Edition) -> tuple[list[Block], dict[int, tuple[Finding, ...]]]:
+    from teds_provision.teds import convert, decode
+
+    out: list[Block] = []
+    said: dict[int, tuple[Finding, ...]] = {}
+    for number, block in enumerate(blocks):
+        decoded: Decoded = decode(block.octets)
+        try:
+            octets, findings = convert(decoded, edition)
+        except BadData as error:
+            octets, findings = block.octets, [Finding("error", "not-converted", error.message)]
+        out.append(block._replace(octets=octets))
+        said[number] = tuple(findings)
+    return out, said
+
+
+def guard_to_json(finding: GuardFinding) -> dict[str, Any]:
+    """One finding of the guard as a JSON object."""
+    return {
+        "severity": finding.severity,
+        "channel": finding.channel,
+        "code": finding.code,
+        "message": finding.message,
+    }

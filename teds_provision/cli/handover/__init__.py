@@ -1,0 +1,1 @@
+"""Commands that move keys and trust between base stations."""

@@ -1,0 +1,309 @@
+"""``export-keys``, ``import-keys``: node keys from one base station to another."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
+
+import click
+
+from teds_provision.cli.context import App, pass_app
+from teds_provision.cli.options import command, dry_run_option, link_options, yes_option
+from teds_provision.errors import PolicyRefused
+from teds_provision.links import LinkSettings
+
+if TYPE_CHECKING:
+    from teds_provision.handover.export_keys import ExportPlan
+    from teds_provision.handover.import_keys import Imported, ImportPlan
+    from teds_provision.station.station import Station
+    from teds_provision.store import StoreLock
+
+_LINK_OPTIONS = ("via", "nfc", "can", "ble")
+_MEANS = {
+    "copy": "A copy: both stations hold the same keys from now on, and either can pose as a node to the other.",
+    "move": "A move: the keys rest here at once. Only when the other station has rotated them at its first contact is"
+    " this one locked out for certain.",
+}
+
+
+@command(
+    "teds-provision export-keys --to lab --all --output lab.jwe",
+    "teds-provision export-keys --to lab 8d4d --mode move --output finger.jwe",
+)
+@click.argument("uuids", metavar="[UUID]…", nargs=-1)
+@click.option("--to", "receivers", multiple=True, required=True, metavar="STATION", help="Name, fingerprint or PEM.")
+@click.option("--all", "everything", is_flag=True, help="Every node whose key is held and proven.")
+@click.option("--mode", type=click.Choice(["copy", "move"]), default="copy", show_default=True, help="Share, or give.")
+@click.option(
+    "--output",
+    type=click.Path(path_type=Path, dir_okay=False),
+    required=True,
+    metavar="FILE",
+    help="Where the sealed bundle goes.",
+)
+@click.option(
+    "--expires",
+    type=click.IntRange(1, 365),
+    default=7,
+    show_default=True,
+    metavar="DAYS",
+    help="How long it can be imported.",
+)
+@click.option("--ca", metavar="FINGERPRINT", help="Only the nodes that keep this CA key.")
+@yes_option
+@dry_run_option
+@pass_app
+def export_keys(
+    app: App,
+    uuids: tuple[str, ...],
+    receivers: tuple[str, ...],
+    everything: bool,
+    mode: Literal["copy", "move"],
+    output: Path,
+    expires: int,
+    ca: str | None,
+    yes: bool,
+    dry_run: bool,
+) -> None:
+    """Hand node keys to other base stations in one bundle, sealed to them and signed by this one.
+
+    Nothing is ever written unsealed. A move marks the nodes as given away before the file exists; its receipt closes
+    it ("handover receipt"); before that "handover undo" takes it back.
+    """
+    from teds_provision.handover.export_keys import ExportOrder, plan_export
+    from teds_provision.handover.export_keys import export_keys as run
+
+    if everything == bool(uuids):
+        raise click.UsageError("Name the nodes, or say --all.")
+    station = app.station()
+    nodes = None if everything else tuple(station.store.resolve(uuid) for uuid in uuids)
+    order = ExportOrder(receivers, nodes, mode, expires, ca)
+    if not dry_run:
+        station.unlock()
+    shown = plan_export(station, order)
+    if dry_run:
+        told = _exported(shown, output, station)
+        app.emit({**told, "id": None if shown.earlier is None else shown.id, "plan": True}, _plan_text(shown, station))
+        return
+    app.note(_plan_text(shown, station))
+    app.confirm(f"{mode.capitalize()} {count_of(len(shown.nodes))}?", yes=yes)
+    with station.lock("export-keys", app.note):
+        plan = plan_export(station, order)
+        _require_same(plan.content == shown.content)
+        told = _exported(plan, output, station)
+        done = run(station, plan, output)
+    told |= {"sha256": done.sha256, "octets": done.octets, "fresh": done.fresh}
+    again = "" if done.fresh else " (nothing to do, it is there already)"
+    next_step = "\nIts receipt closes the move: teds-provision handover receipt FILE.receipt" if mode == "move" else ""
+    app.emit(told, f"{count_of(len(plan.nodes))} in {output}, handover {plan.id}{again}.{next_step}")
+
+
+def _exported(plan: ExportPlan, output: Path, station: Station) -> dict[str, Any]:
+    return {
+        "bundle": str(output),
+        "from": station.fingerprint,
+        "to": [{"name": record.name, "fingerprint": record.fingerprint} for record in plan.receivers],
+        "mode": plan.mode,
+        "count": len(plan.nodes),
+        "id": plan.id,
+        "expires": plan.expires.strftime("%Y-%m-%dT%H:%M:%SZ"),
+        "nodes": [node.uuid.hex() for node, _ in plan.nodes],
+        "skipped": [{"uuid": uuid.hex(), "why": why} for uuid, why in plan.skipped],
+        "also_held_by": list(plan.also_held_by),
+    }
+
+
+def _plan_text(plan: ExportPlan, station: Station) -> str:
+    from teds_provision.handover.pending import peer_name
+    from teds_provision.handover.trust import spoken
+
+    lines = [
+        f"{plan.mode.capitalize()} {count_of(len(plan.nodes))}, to be imported by {plan.expires:%Y-%m-%d %H:%M} UTC"
+    ]
+    lines += [f"  {node.uuid.hex()}  epoch {key.epoch}  {node.name or ''}".rstrip() for node, key in plan.nodes[:20]]
+    lines += [f"  … and {len(plan.nodes) - 20} more"] if len(plan.nodes) > 20 else []
+    lines += [f"  not {uuid.hex()}: {why}" for uuid, why in plan.skipped]
+    if plan.also_held_by:
+        names = ", ".join(peer_name(station, digits) for digits in plan.also_held_by)
+        lines.append(f"  also held, by an earlier copy, by {names}: until the keys are rotated")
+    lines.append("For comparison by voice:")
+    lines += [f"  to   {record.name}\n       {spoken(record.fingerprint)}" for record in plan.receivers]
+    lines.append(f"  from {station.name}\n       {spoken(station.fingerprint)}")
+    return "\n".join([*lines, _MEANS[plan.mode]])
+
+
+@command(
+    "teds-provision import-keys lab.jwe --no-prove",
+    "teds-provision import-keys lab.jwe --via can --can udp_multicast:239.74.163.2 --yes",
+)
+@click.argument("file", type=click.Path(path_type=Path, dir_okay=False))
+@click.option(
+    "--prove/--no-prove", default=None, help="Meet each node and open a session (default: with link options)."
+)
+@click.option(
+    "--receipt",
+    type=click.Path(path_type=Path, dir_okay=False),
+    metavar="FILE",
+    help="Where the signed receipt goes (default: FILE.receipt).",
+)
+@yes_option
+@dry_run_option
+@link_options
+@click.pass_context
+def import_keys(
+    ctx: click.Context,
+    file: Path,
+    prove: bool | None,
+    receipt: Path | None,
+    yes: bool,
+    dry_run: bool,
+    links: LinkSettings,
+) -> None:
+    """Take node keys over from a trusted base station: check, show the plan, take in, write the receipt.
+
+    A node counts as taken over when it opened a session here; after a move its key is rotated in it, and only then is
+    the sender locked out. The same bundle again changes nothing and gives the same receipt.
+    """
+    from teds_provision.handover.files import read_limited
+    from teds_provision.handover.import_keys import Imported, plan_import
+    from teds_provision.handover.import_keys import import_keys as run
+    from teds_provision.protocol.handover.bundle import MAX_BUNDLE_OCTETS
+
+    app = ctx.find_object(App)
+    assert app is not None
+    station = app.station()
+    receipt = receipt or file.with_name(file.name + ".receipt")
+    octets = read_limited(file, MAX_BUNDLE_OCTETS, "bundle")
+    station.unlock()
+    shown = plan_import(station, octets)
+    told, text = _import_plan(station, shown)
+    if dry_run:
+        app.emit({**told, "receipt": None, "plan": True}, text)
+        return
+    if not isinstance(shown, Imported):
+        _require_receipt_place(receipt)
+        app.note(text)
+        app.confirm(f"Take {count_of(len(shown.taken))} in?", yes=yes)
+    with station.lock("import-keys", app.note):
+        plan = plan_import(station, octets)
+        if isinstance(plan, Imported):
+            done = plan
+        else:
+            _require_same(not isinstance(shown, Imported) and plan.nodes == shown.nodes)
+            done = run(station, plan)
+        _write_receipt(receipt, done.receipt)
+    given = any(ctx.get_parameter_source(name) != click.core.ParameterSource.DEFAULT for name in _LINK_OPTIONS)
+    outcomes = _prove(app, station, done, links) if (given if prove is None else prove) else []
+    _tell_import(app, station, done, receipt, told, outcomes)
+    if prove and any(outcome["why"] for outcome in outcomes):
+        ctx.exit(5)
+
+
+def _require_same(same: bool) -> None:
+    """What a person was shown must still be so under the lock."""
+    if not same:
+        raise PolicyRefused("Another command changed the plan while this one waited.", hint="Run it again.")
+
+
+def _import_plan(station: Station, plan: ImportPlan | Imported) -> tuple[dict[str, Any], str]:
+    """The result as far as it is known before anything happens, and the plan for people."""
+    from teds_provision.handover.import_keys import Imported
+    from teds_provision.handover.pending import peer_name
+    from teds_provision.handover.trust import spoken
+
+    if isinstance(plan, Imported):
+        sender, mode, handover_id = plan.row.peers[0], plan.row.mode, plan.row.id
+        nodes = [{"uuid": uuid.hex(), "decision": "same", "why": ""} for uuid in plan.uuids]
+        nodes += [{"uuid": uuid, "decision": "refused", "why": why} for uuid, why in plan.notes.refused]
+        told = _import_result(sender, mode, handover_id, nodes, [])
+        return told, f"This bundle was taken in on {plan.row.created}; nothing is left to do."
+    bundle = plan.opened.bundle
+    nodes = [{"uuid": one.node.uuid.hex(), "decision": one.decision, "why": one.why} for one in plan.nodes]
+    denied = [{"uuid": one.uuid.hex(), "why": one.why} for one in plan.denied]
+    told = _import_result(bundle.sender, bundle.mode, bundle.id, nodes, denied)
+    lines = [f"A {bundle.mode} of {count_of(len(nodes))} from {peer_name(station, bundle.sender)}"]
+    lines += [f"  {node['decision']:<8} {node['uuid']}  {node['why']}".rstrip() for node in nodes[:40]]
+    lines += [f"  … and {len(nodes) - 40} more"] if len(nodes) > 40 else []
+    lines += [f"  revoked  {one['uuid']}  {one['why']}" for one in denied]
+    lines += [f"For comparison by voice:\n  from {spoken(bundle.sender)}\n  to   {spoken(station.fingerprint)}"]
+    if not plan.ca_is_known:
+        from teds_provision.protocol.keys import fingerprint
+
+        lines.append(f"The CA {fingerprint(bundle.ca)[:16]} will be trusted for these nodes, and for no others.")
+    lines.append(
+        "A copy: the sender keeps the same keys, and either can pose as a node to the other."
+        if bundle.mode == "copy"
+        else "A move: each key is rotated at the first contact; until then the sender can still use it."
+    )
+    return told, "\n".join(lines)
+
+
+def _import_result(
+    sender: str, mode: str, handover_id: str, nodes: list[dict[str, str]], denied: list[dict[str, str]]
+) -> dict[str, Any]:
+    return {
+        "from": sender,
+        "id": handover_id,
+        "mode": mode,
+        "count": len(nodes),
+        "imported": [node["uuid"] for node in nodes if node["decision"] != "refused"],
+        "refused": [{"uuid": node["uuid"], "why": node["why"]} for node in nodes if node["decision"] == "refused"],
+        "decisions": {node["uuid"]: node["decision"] for node in nodes},
+        "revoked": denied,
+    }
+
+
+def _require_receipt_place(receipt: Path) -> None:
+    from teds_provision.handover.files import require_new
+
+    require_new(receipt)
+
+
+def _write_receipt(receipt: Path, octets: bytes) -> None:
+    from teds_provision.handover.files import write_new
+
+    if not (receipt.is_file() and receipt.read_bytes().strip() == octets):
+        write_new(receipt, octets + b"\n")
+
+
+def _prove(app: App, station: Station, done: Imported, links: LinkSettings) -> list[dict[str, Any]]:
+    from teds_provision.cli.rendering import reporter_for
+    from teds_provision.handover.prove import Proven, is_proven, prove_nodes
+
+    waiting = [uuid for uuid in done.uuids if not is_proven(station, uuid)]
+
+    def hold() -> StoreLock:
+        return station.lock("import-keys", app.note)
+
+    outcomes = prove_nodes(station, links, waiting, reporter_for(app), hold=hold) if waiting else []
+    return [
+        {"uuid": one.uuid.hex(), "rotated": one.rotated, "why": ""}
+        if isinstance(one, Proven)
+        else {"uuid": one.uuid.hex(), "rotated": False, "why": one.why}
+        for one in outcomes
+    ]
+
+
+def _tell_import(
+    app: App, station: Station, done: Imported, receipt: Path, told: dict[str, Any], outcomes: list[dict[str, Any]]
+) -> None:
+    from teds_provision.handover.prove import is_proven
+
+    proven = [uuid.hex() for uuid in done.uuids if is_proven(station, uuid)]
+    pending = [uuid.hex() for uuid in done.uuids if uuid.hex() not in set(proven)]
+    not_met = {one["uuid"]: one["why"] for one in outcomes if one["why"]}
+    told |= {"receipt": str(receipt), "fresh": done.fresh, "proven": proven, "pending": pending, "not_proven": not_met}
+    lines = [f"{count_of(len(done.uuids))} taken in" + ("." if done.fresh else " before; nothing changed.")]
+    lines += [f"  refused {uuid}: {why}" for uuid, why in done.notes.refused]
+    lines += [f"  not met {uuid}: {why}" for uuid, why in not_met.items()]
+    rotated = sum(bool(one["rotated"]) for one in outcomes)
+    lines += [f"{count_of(rotated)} rotated: the sender is locked out for certain."] if rotated else []
+    if pending:
+        lines.append(f"{count_of(len(pending))} not proven yet: their first contact here proves them (agree UUID).")
+    lines.append(f"Receipt for the sender: {receipt}")
+    app.emit(told, "\n".join(lines))
+
+
+def count_of(number: int) -> str:
+    """``1 node``, ``2 nodes``."""
+    return f"{number} node{'' if number == 1 else 's'}"

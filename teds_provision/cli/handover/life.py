@@ -1,0 +1,170 @@
+"""``revoke``, ``decommission``, ``replace``: the end of a node's life."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from teds_provision.cli.context import App, pass_app
+from teds_provision.cli.options import command, dry_run_option, link_options, yes_option
+from teds_provision.links import LinkSettings
+
+if TYPE_CHECKING:
+    from teds_provision.station.station import Station
+    from teds_provision.steps.reset import ResetReceipt
+
+_LINK_OPTIONS = ("via", "nfc", "can", "ble")
+
+
+@command('teds-provision revoke 8d4d --why "stolen with the arm"')
+@click.argument("uuid")
+@click.option("--why", required=True, metavar="TEXT", help="Told to everyone who meets the node; goes into the log.")
+@yes_option
+@dry_run_option
+@pass_app
+def revoke(app: App, uuid: str, why: str, yes: bool, dry_run: bool) -> None:
+    """Ban a node: off the whitelist, its keys deleted here, and a signed statement in every bundle from now on.
+
+    Stations that trust this one honour it when they import: the node is refused there too. This cannot be undone.
+    """
+    from teds_provision.handover.life import revoke as run
+
+    station = app.station()
+    octets = station.store.resolve(uuid)
+    if dry_run:
+        keys = len(station.store.keys(octets))
+        app.emit(
+            {"uuid": octets.hex(), "plan": "revoke", "keys": keys}, f"Plan: revoke {octets.hex()}, delete {keys} keys."
+        )
+        return
+    station.unlock()
+    if station.store.revocation(octets) is None:
+        app.confirm(f"Revoke node {octets.hex()} for good?", yes=yes)
+    with station.lock("revoke", app.note):
+        done = run(station, octets, why)
+    told = {
+        "uuid": octets.hex(),
+        "fingerprint": done.entry.fingerprint,
+        "why": done.entry.why,
+        "created": done.entry.created,
+        "fresh": done.fresh,
+    }
+    app.emit(told, f"Node {octets.hex()} is revoked: {done.entry.why}" + ("" if done.fresh else " (known before)."))
+
+
+@command("teds-provision decommission 8d4d --yes --via can --can udp_multicast:239.74.163.2")
+@click.argument("uuid")
+@click.option("--force", is_flag=True, help="Take it out of service even where it does not answer: unconfirmed.")
+@yes_option
+@dry_run_option
+@link_options
+@pass_app
+def decommission(app: App, uuid: str, force: bool, yes: bool, dry_run: bool, links: LinkSettings) -> None:
+    """Reset a node in a session, keep its signed receipt, and take it out of service.
+
+    One that does not answer is recorded as unconfirmed with --force; its keys stay, and the same command tries again.
+    """
+    from teds_provision.handover.life import is_finished, retire
+
+    station = app.station()
+    octets = station.store.resolve(uuid)
+    station.require_not_given_away(octets)
+    if dry_run:
+        app.emit({"uuid": octets.hex(), "plan": "decommission"}, f"Plan: reset {octets.hex()}, take it out of service.")
+        return
+    station.unlock(octets)
+    if is_finished(station, octets):
+        app.emit(_result(octets, None) | {"confirmed": True, "fresh": False}, "Nothing to do: it is out of service.")
+        return
+    app.confirm(f"Take node {octets.hex()} out of service? Its key is erased, there and here.", yes=yes)
+    with station.lock("decommission", app.note):
+        receipt = _reset(app, station, octets, links, force=force)
+        retire(station, octets, receipt)
+    state = "is out of service; it signed that it is in factory state" if receipt else "is out of service, unconfirmed"
+    app.emit(_result(octets, receipt) | {"fresh": True}, f"Node {octets.hex()} {state}.")
+
+
+def _result(uuid: bytes, receipt: ResetReceipt | None) -> dict[str, Any]:
+    return {
+        "uuid": uuid.hex(),
+        "confirmed": receipt is not None,
+        "epoch": receipt.epoch if receipt else None,
+        "challenge": receipt.challenge.hex() if receipt else None,
+        "proof": receipt.proof.hex() if receipt else None,
+    }
+
+
+def _reset(app: App, station: Station, uuid: bytes, links: LinkSettings, *, force: bool) -> ResetReceipt | None:
+    """Reset the node; None where it cannot be had and that is to be recorded as unconfirmed."""
+    from teds_provision.cli.rendering import reporter_for
+    from teds_provision.errors import LinkFailure, PolicyRefused
+    from teds_provision.steps.identify import identify
+    from teds_provision.steps.reset import reset_node
+    from teds_provision.talk.meeting import meet
+
+    try:
+        with meet(station, links, uuid, reporter_for(app)) as node:
+            return reset_node(station, node, identify(station, node))
+    except (LinkFailure, PolicyRefused) as error:
+        if not force and not app.interactive:
+            error.hint = "Bring it near, or add --force to record it as unconfirmed."
+            raise
+        app.note(f"The node cannot be reset: {error.message}")
+        app.confirm("Take it out of service all the same, unconfirmed?", yes=force)
+        return None
+
+
+@command(
+    "teds-provision replace 8d4d9da65281f7000000 8d4d9da65281f7000001 --yes",
+    "teds-provision replace old-finger 8d4d --copy-calibration",
+)
+@click.argument("old")
+@click.argument("new")
+@click.option("--copy-calibration", is_flag=True, help="Build OLD's calibration into NEW: only for the same sensor.")
+@yes_option
+@dry_run_option
+@link_options
+@click.pass_context
+def replace(
+    ctx: click.Context, old: str, new: str, copy_calibration: bool, yes: bool, dry_run: bool, links: LinkSettings
+) -> None:
+    """Put the whitelisted spare NEW in the place of OLD: its name, groups and profile.
+
+    A calibration belongs to one sensor and is not copied unless told. With link options OLD is reset when it can be
+    reached, else it goes out of service unconfirmed.
+    """
+    from teds_provision.handover.life import plan_takeover, take_over
+
+    app = ctx.find_object(App)
+    assert app is not None
+    station = app.station()
+    octets, spare = station.store.resolve(old), station.store.resolve(new)
+    station.unlock(octets)
+    with station.lock("replace", app.note):
+        plan = plan_takeover(station, octets, spare, copy_calibration=copy_calibration)
+        taken = plan.new if plan.done else plan.old
+        told: dict[str, Any] = {
+            "old": octets.hex(),
+            "new": spare.hex(),
+            "name": taken.name,
+            "groups": list(taken.groups),
+            "profile": taken.profile,
+            "calibration_copied": bool(plan.calibration),
+        }
+        text = f"{spare.hex()} takes over from {octets.hex()}: name {taken.name}, profile {taken.profile}"
+        if dry_run:
+            app.emit({**told, "plan": True}, f"Plan: {text}.")
+            return
+        if plan.done:
+            app.emit({**told, "fresh": False}, "Nothing to do: it has taken over before.")
+            return
+        app.confirm(f"{text}?", yes=yes)
+        given = any(ctx.get_parameter_source(name) != click.core.ParameterSource.DEFAULT for name in _LINK_OPTIONS)
+        receipt = _reset(app, station, octets, links, force=True) if given else None
+        warnings = take_over(station, plan, receipt)
+    for warning in warnings:
+        app.warn(warning)
+    confirmed = receipt is not None
+    next_step = f"Then: teds-provision provision (or sign and write) for {spare.hex()}."
+    app.emit({**told, "confirmed": confirmed, "fresh": True, "warnings": list(warnings)}, f"{text}.\n{next_step}")

@@ -1,0 +1,113 @@
+"""``handover``: what became of the bundles that left here and came here."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import click
+
+from teds_provision.cli.context import App, pass_app
+from teds_provision.cli.handover.bundles import count_of
+from teds_provision.cli.options import COMMAND_SETTINGS, dry_run_option, examples, yes_option
+
+
+@click.group(
+    context_settings=COMMAND_SETTINGS,
+    epilog=examples("teds-provision handover list", "teds-provision handover receipt lab.jwe.receipt"),
+)
+def handover() -> None:
+    """Handovers under way: list them, close them by their receipt, take a move back."""
+
+
+@handover.command("list", context_settings=COMMAND_SETTINGS, epilog=examples("teds-provision handover list"))
+@pass_app
+def list_(app: App) -> None:
+    """Every bundle that left or came."""
+    from datetime import UTC, datetime
+
+    from teds_provision.handover.pending import list_handovers
+
+    listed = list_handovers(app.station(), datetime.now(UTC))
+    rows = [
+        {
+            "id": one.row.id,
+            "direction": one.row.direction,
+            "mode": one.row.mode,
+            "state": one.row.state,
+            "peers": list(one.row.peers),
+            "names": list(one.peers),
+            "count": one.count,
+            "created": one.row.created,
+            "expires": one.expires,
+            "expired": one.expired,
+        }
+        for one in listed
+    ]
+    lines = [
+        f"{row['id']}  {row['direction']:<3} {row['mode']}  {row['state']:<8} {row['count']:>5}"
+        f"  {', '.join(row['names'])}  {row['created']}{'  expired' if row['expired'] else ''}"  # type: ignore[arg-type]
+        for row in rows
+    ]
+    app.emit({"handovers": rows}, "\n".join(lines) or "No bundle has left or come.")
+
+
+@handover.command(
+    context_settings=COMMAND_SETTINGS,
+    short_help="Close a handover with the receiver's signed receipt.",
+    epilog=examples("teds-provision handover receipt lab.jwe.receipt"),
+)
+@click.argument("file", type=click.Path(path_type=Path, dir_okay=False))
+@pass_app
+def receipt(app: App, file: Path) -> None:
+    """Close a handover with the receiver's signed receipt; the keys of a move are then deleted here."""
+    from teds_provision.handover.files import read_limited
+    from teds_provision.handover.pending import close, peer_name
+    from teds_provision.protocol.handover.receipt import MAX_RECEIPT_OCTETS
+
+    station = app.station()
+    octets = read_limited(file, MAX_RECEIPT_OCTETS, "receipt")
+    with station.lock("handover receipt", app.note):
+        done = close(station, octets)
+    imported, refused = done.receipt.imported, done.receipt.refused
+    told = {
+        "id": done.row.id,
+        "from": done.receipt.sender,
+        "mode": done.row.mode,
+        "state": done.row.state,
+        "imported": [uuid.hex() for uuid in imported],
+        "refused": [{"uuid": one.uuid.hex(), "why": one.why} for one in refused],
+        "fresh": done.fresh,
+    }
+    text = f"Station {peer_name(station, done.receipt.sender)} took {count_of(len(imported))} in"
+    text += ("; their keys are deleted here." if done.row.mode == "move" else ".") if done.fresh else " (known before)."
+    lines = [f"  refused {one.uuid.hex()}: {one.why}" for one in refused]
+    if refused and done.row.mode == "move":
+        lines.append("What was refused is this station's again, to be rotated at the next contact.")
+    app.emit(told, "\n".join([text, *lines]))
+
+
+@handover.command(
+    context_settings=COMMAND_SETTINGS,
+    short_help="Take a move back before its receipt.",
+    epilog=examples("teds-provision handover undo 3d1a4d1c --yes"),
+)
+@click.argument("id_", metavar="ID")
+@yes_option
+@dry_run_option
+@pass_app
+def undo(app: App, id_: str, yes: bool, dry_run: bool) -> None:
+    """Take a move back before its receipt; each node's key is rotated at the next contact, before anything else."""
+    from teds_provision.handover.pending import find_handover
+    from teds_provision.handover.pending import undo as run
+
+    station = app.station()
+    row = find_handover(station, id_)
+    if dry_run:
+        app.emit({"id": row.id, "state": row.state, "plan": "undo"}, f"Plan: take the {row.mode} {row.id} back.")
+        return
+    app.confirm("Take this move back? The receiver may have the keys all the same until they are rotated.", yes=yes)
+    with station.lock("handover undo", app.note):
+        done = run(station, find_handover(station, id_))
+    told = {"id": row.id, "state": "undone", "nodes": [uuid.hex() for uuid in done.uuids], "fresh": done.fresh}
+    text = f"{count_of(len(done.uuids))} back here; the next contact with each rotates its key first."
+    app.emit(told, text if done.fresh else "Nothing to do: this move was taken back before.")

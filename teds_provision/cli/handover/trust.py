@@ -1,0 +1,270 @@
+"""``trust``: public keys of other stations and CAs that count here, and this owner's CA key."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Literal
+
+import click
+
+from teds_provision.cli.context import App, pass_app
+from teds_provision.cli.options import COMMAND_SETTINGS, dry_run_option, examples, yes_option
+
+if TYPE_CHECKING:
+    from teds_provision.handover.trust import Candidate
+    from teds_provision.store import TrustRecord
+
+_FILE = click.Path(path_type=Path, dir_okay=False)
+
+
+@click.group(
+    context_settings=COMMAND_SETTINGS,
+    epilog=examples("teds-provision trust add lab keys/lab.pem", "teds-provision trust list"),
+)
+def trust() -> None:
+    """Public keys of other stations and CAs that count here; nothing else does.
+
+    Files, also those under version control in keys/, count only once they were added.
+    """
+
+
+@trust.command(
+    context_settings=COMMAND_SETTINGS,
+    short_help="Trust the public key of a station or CA.",
+    epilog=examples("teds-provision trust add lab keys/lab.pem", "teds-provision trust add --from keys/ --yes"),
+)
+@click.argument("name", required=False)
+@click.argument("file", type=_FILE, required=False)
+@click.option("--from", "folder", type=click.Path(path_type=Path), metavar="DIR", help="Every key of a folder.")
+@click.option("--role", type=click.Choice(["station", "ca"]), default="station", show_default=True, help="Whose key.")
+@yes_option
+@dry_run_option
+@pass_app
+def add(
+    app: App,
+    name: str | None,
+    file: Path | None,
+    folder: Path | None,
+    role: Literal["station", "ca"],
+    yes: bool,
+    dry_run: bool,
+) -> None:
+    """Trust the public key of a station or CA: a PEM file, or the certificate that "trust ca sign" gave.
+
+    Compare the fingerprint with its owner by voice. In a folder NAME.pem and NAME.cert are stations, NAME.ca.pem CAs.
+    """
+    from teds_provision.handover.trust import add as run
+    from teds_provision.handover.trust import candidate, candidates_of
+
+    if (folder is None) == (name is None) or (name is not None and file is None):
+        raise click.UsageError("Give NAME and FILE, or --from DIR.")
+    station = app.station()
+    with station.lock("trust add", app.note):
+        if folder is not None:
+            found = candidates_of(station, folder, role)
+        else:
+            assert name is not None
+            assert file is not None
+            found = [candidate(station, name, file, role)]
+        fresh = [one for one in found if not one.known]
+        told = {"trusted": [_record(one.record) for one in found], "added": len(fresh)}
+        if dry_run:
+            app.emit({**told, "plan": True}, _shown(found))
+            return
+        chosen = [one for one in found if one.known or _agreed(app, one, yes)]
+        added = run(station, chosen)
+    told = {"trusted": [_record(one.record) for one in chosen], "added": added}
+    names = ", ".join(one.record.name for one in chosen if not one.known)
+    app.emit(told, f"Trusted from now on: {names}." if added else "Nothing to do.")
+
+
+def _agreed(app: App, one: Candidate, yes: bool) -> bool:
+    """Show one fingerprint and ask; a folder goes on after a no."""
+    app.note(_shown([one]))
+    if yes or not app.interactive:
+        app.confirm("", yes=yes)
+        return True
+    return click.confirm(f"Trust the {one.record.role} {one.record.name!r}?", err=True)
+
+
+def _shown(found: list[Candidate]) -> str:
+    from teds_provision.handover.trust import spoken
+
+    lines = []
+    for one in found:
+        lines.append(f"{one.record.role} {one.record.name}  ({one.path}){'  trusted already' if one.known else ''}")
+        lines.append(f"  {spoken(one.record.fingerprint)}")
+        if one.certificate is not None:
+            from teds_provision.protocol.keys import fingerprint
+
+            lines.append(f"  certified by the CA {fingerprint(one.certificate.ca)[:16]}")
+    return "\n".join(lines)
+
+
+def _record(record: TrustRecord) -> dict[str, str]:
+    return {"name": record.name, "role": record.role, "fingerprint": record.fingerprint}
+
+
+@trust.command(context_settings=COMMAND_SETTINGS, epilog=examples("teds-provision trust remove lab --yes"))
+@click.argument("name", metavar="NAME|FINGERPRINT")
+@yes_option
+@dry_run_option
+@pass_app
+def remove(app: App, name: str, yes: bool, dry_run: bool) -> None:
+    """Trust a key no more; what it signed counts no more either."""
+    from teds_provision.handover.trust import find_trusted
+    from teds_provision.handover.trust import remove as run
+
+    station = app.station()
+    record = find_trusted(station, name)
+    told = {"removed": _record(record)}
+    text = f"{record.role} {record.name}, {record.fingerprint[:16]}"
+    if dry_run:
+        app.emit({**told, "plan": True}, f"Plan: trust the {text} no more.")
+        return
+    app.confirm(f"Trust the {text} no more?", yes=yes)
+    with station.lock("trust remove", app.note):
+        run(station, find_trusted(station, name))
+    app.emit(told, f"Not trusted any more: {text}.")
+
+
+@trust.command("list", context_settings=COMMAND_SETTINGS, epilog=examples("teds-provision trust list"))
+@pass_app
+def list_(app: App) -> None:
+    """Every key that counts here besides this station's own."""
+    from teds_provision.protocol.keys import fingerprint
+
+    station = app.station()
+    records = station.store.trusted()
+    certified = {record.fingerprint: station.certificate(station.ca, record.point) is not None for record in records}
+    told = [
+        {**_record(record), "added": record.added, "certified": certified[record.fingerprint]}
+        if record.role == "station"
+        else {**_record(record), "added": record.added}
+        for record in records
+    ]
+    own = {"name": station.name, "fingerprint": station.fingerprint, "ca": fingerprint(station.ca)}
+    lines = [f"this station   {station.name}  {station.fingerprint[:16]}, CA {own['ca'][:16]}"]
+    for record in records:
+        mark = "  certified by this station's CA" if record.role == "station" and certified[record.fingerprint] else ""
+        lines.append(f"{record.role:<14} {record.name}  {record.fingerprint[:16]}{mark}")
+    app.emit({"trusted": told, "own": own}, "\n".join(lines))
+
+
+@trust.group(
+    "ca",
+    context_settings=COMMAND_SETTINGS,
+    short_help="The owner's CA key: show, sign with it, export, drop, import.",
+    epilog=examples("teds-provision trust ca sign lab.request --output lab.cert"),
+)
+def ca() -> None:
+    """The owner's CA key: it signs station keys, so that stations of one owner write and rekey each other's nodes.
+
+    The public key is no secret; the private one stays in the vault, or in the encrypted file that export makes.
+    """
+
+
+@ca.command(
+    context_settings=COMMAND_SETTINGS, short_help="Show the CA key.", epilog=examples("teds-provision trust ca create")
+)
+@pass_app
+def create(app: App) -> None:
+    """Show the CA key, which init made; a station that another CA certified has none."""
+    from teds_provision.handover.certify import require_ca
+    from teds_provision.protocol.keys import fingerprint, to_pem
+
+    station = app.station()
+    require_ca(station)
+    digits, pem = fingerprint(station.ca), to_pem(station.ca)
+    app.emit({"fingerprint": digits, "public_key": pem, "here": True}, f"CA key {digits[:16]}, in this vault\n\n{pem}")
+
+
+@ca.command(
+    context_settings=COMMAND_SETTINGS,
+    short_help="Certify the station that made REQUEST with init --request.",
+    epilog=examples("teds-provision trust ca sign lab.request --output lab.cert --yes"),
+)
+@click.argument("request", type=_FILE)
+@click.option("--output", type=_FILE, required=True, metavar="CERT", help="Where the certificate goes.")
+@yes_option
+@dry_run_option
+@pass_app
+def sign(app: App, request: Path, output: Path, yes: bool, dry_run: bool) -> None:
+    """Certify the station that made REQUEST (init --request): it may then key and write this owner's nodes."""
+    from teds_provision.handover.certify import MAX_OCTETS, read_request, sign_request, write_certificate
+    from teds_provision.handover.files import read_limited, write_new
+    from teds_provision.handover.trust import spoken
+    from teds_provision.protocol.keys import fingerprint
+
+    station = app.station()
+    wanted = read_request(read_limited(request, MAX_OCTETS, "request"))
+    digits = fingerprint(wanted.station)
+    told = {"name": wanted.name, "fingerprint": digits, "ca": fingerprint(station.ca), "certificate": str(output)}
+    shown = f"Station {wanted.name}\n  {spoken(digits)}"
+    if dry_run:
+        app.emit({**told, "plan": True}, f"Plan: certify\n{shown}")
+        return
+    station.unlock()
+    app.note(shown)
+    app.confirm("Certify it? Whoever holds its key can then write and rekey every node of this owner.", yes=yes)
+    with station.lock("trust ca sign", app.note):
+        octets = write_certificate(sign_request(station, wanted))
+        fresh = not (output.is_file() and output.read_bytes() == octets)
+        if fresh:
+            write_new(output, octets)
+    text = f"{wanted.name} ({digits[:16]}) is certified: {output}. There: teds-provision init --certificate {output}"
+    app.emit({**told, "fresh": fresh}, text if fresh else f"Nothing to do, {output} is there already.")
+
+
+@ca.command(
+    context_settings=COMMAND_SETTINGS,
+    short_help="Write the CA key to a new file, encrypted under a passphrase.",
+    epilog=examples("teds-provision trust ca export owner-ca.pem"),
+)
+@click.argument("file", type=_FILE)
+@pass_app
+def export(app: App, file: Path) -> None:
+    """Write the CA key to a new file, encrypted under a passphrase (PKCS #8).
+
+    The vault keeps it until "trust ca drop".
+    """
+    from teds_provision.handover.certify import export_ca
+
+    station = app.station()
+    vault = station.vault
+    passphrase = app.ask_secret("New passphrase for the CA key's file", confirm=True)
+    with station.lock("trust ca export", app.note):
+        export_ca(station, vault, file, passphrase)
+    app.emit({"file": str(file)}, f"The CA key is in {file}. Keep it away, then: teds-provision trust ca drop")
+
+
+@ca.command(context_settings=COMMAND_SETTINGS, epilog=examples("teds-provision trust ca drop --yes"))
+@yes_option
+@pass_app
+def drop(app: App, yes: bool) -> None:
+    """Take the CA key out of the vault for good. Export it first: without it no station can be certified any more."""
+    from teds_provision.handover.certify import drop_ca
+
+    station = app.station()
+    station.unlock()
+    app.confirm("Delete the CA key from this vault? Only its exported file can bring it back.", yes=yes)
+    with station.lock("trust ca drop", app.note):
+        dropped = drop_ca(station)
+    app.emit({"dropped": dropped}, "The CA key is not in this vault any more." if dropped else "Nothing to do.")
+
+
+@ca.command("import", context_settings=COMMAND_SETTINGS, epilog=examples("teds-provision trust ca import owner-ca.pem"))
+@click.argument("file", type=_FILE)
+@pass_app
+def import_(app: App, file: Path) -> None:
+    """Bring the CA key back from the file that "trust ca export" wrote."""
+    from teds_provision.handover.certify import import_ca
+    from teds_provision.protocol.keys import fingerprint
+
+    station = app.station()
+    vault = station.vault
+    passphrase = app.ask_secret("Passphrase of the CA key's file")
+    with station.lock("trust ca import", app.note):
+        import_ca(station, vault, file, passphrase)
+    digits = fingerprint(station.ca)
+    app.emit({"fingerprint": digits}, f"The CA key {digits[:16]} is in this vault.")

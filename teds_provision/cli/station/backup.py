@@ -1,0 +1,212 @@
+"""``backup`` and ``restore``: the whole store of this station, sealed into one file and back."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from teds_provision.cli.context import App, pass_app, read_line
+from teds_provision.cli.options import command, dry_run_option, yes_option
+
+if TYPE_CHECKING:
+    from teds_provision.backup.restore import Restored
+    from teds_provision.backup.sealed_file import Content
+
+_KEY_HINT = (
+    "A recovery key is an encrypted PEM: openssl genpkey -algorithm EC -pkeyopt ec_paramgen_curve:P-256 "
+    "-aes256 -out recovery.pem"
+)
+_fd_option = click.option(
+    "--backup-passphrase-fd",
+    type=int,
+    metavar="N",
+    help="Read the passphrase of the backup (or recovery key) from this file descriptor; --passphrase-fd serves both "
+    "where this is not given.",
+)
+
+
+@command("teds-provision backup station.backup", "teds-provision backup station.backup --to recovery-public.pem")
+@click.argument("file", type=click.Path(path_type=Path, dir_okay=False))
+@click.option(
+    "--to",
+    "recovery",
+    type=click.Path(path_type=Path, dir_okay=False),
+    metavar="PEM",
+    help="Seal to this public recovery key (P-256) instead of a passphrase.",
+)
+@_fd_option
+@yes_option
+@dry_run_option
+@pass_app
+def backup(
+    app: App, file: Path, recovery: Path | None, backup_passphrase_fd: int | None, yes: bool, dry_run: bool
+) -> None:
+    """Write the whole store, and what the vault keeps secret, to one sealed file (mode 0600).
+
+    Whitelist, nodes, keys, trust, handovers and the audit log, at one moment, also while the station is at work.
+    With a PKCS #11 keystore the keys in the token are not in it. config.toml is not in it.
+    """
+    from teds_provision.backup.backup import backup as run
+    from teds_provision.cli.steps.build import read_file
+    from teds_provision.protocol.keys import fingerprint, from_pem
+
+    station = app.station()
+    point = from_pem(read_file(recovery)) if recovery is not None else None
+    to = f"recovery key {fingerprint(point)[:16]}" if point is not None else "a passphrase"
+    if dry_run:
+        plan = {"backup": str(file), "to": to, "replaces": file.exists(), "dry_run": True}
+        app.emit(plan, f"Plan: seal the store of {station.name} to {to}, into {file}.")
+        return
+    _require_place(app.home, file)
+    if file.exists():
+        app.confirm(f"{file} exists. Replace it?", yes=yes)
+    done = run(station, file, _asker(app, backup_passphrase_fd), recovery=point)
+    for warning in done.warnings:
+        app.warn(warning)
+    result = {
+        "backup": str(file),
+        "station": station.fingerprint,
+        "octets": done.octets,
+        "sha256": done.sha256,
+        "nodes": done.nodes,
+        "keys": done.keys,
+        "to": done.sealed_to,
+        "warnings": list(done.warnings),
+    }
+    app.emit(result, f"Sealed {done.nodes} nodes and {done.keys} keys to {to}: {file} ({done.octets} octets).")
+
+
+@command(
+    "teds-provision restore station.backup",
+    "teds-provision --home new restore station.backup --recovery-key recovery.pem",
+)
+@click.argument("file", type=click.Path(path_type=Path, dir_okay=False))
+@click.option(
+    "--recovery-key",
+    type=click.Path(path_type=Path, dir_okay=False),
+    metavar="PEM",
+    help="The recovery key it was sealed to, as an encrypted PEM.",
+)
+@click.option("--keystore", metavar="keyring|file|pkcs11:URI", help="Where the keys shall lie (default: as before).")
+@_fd_option
+@yes_option
+@dry_run_option
+@pass_app
+def restore(
+    app: App,
+    file: Path,
+    recovery_key: Path | None,
+    keystore: str | None,
+    backup_passphrase_fd: int | None,
+    yes: bool,
+    dry_run: bool,
+) -> None:
+    """Bring a sealed store back: into an empty home the whole station, else what the station here lacks.
+
+    Nothing goes back: epochs and sequences keep the greater value, newer keys stay, tombstones and revocations stay,
+    the audit log only grows. A backup of another station is refused (exit 6). A wrong passphrase is exit 7, a file
+    that was changed 4, one that is cut off or something else 8.
+    """
+    from teds_provision.backup.restore import open_present, rebuild
+
+    content = _open(app, file, recovery_key, _asker(app, backup_passphrase_fd))
+    present = open_present(app.home, content)
+    told = f"{content.name} (key {content.station[:16]}) of {content.created}"
+    if present is not None:
+        app.closing(present.close)
+        _merge(app, present, content, told, yes=yes, dry_run=dry_run)
+        return
+    if dry_run:
+        app.emit(
+            {"action": "rebuild", "station": content.station, "created": content.created, "dry_run": True},
+            f"Plan: make the station {told} in {app.home}.",
+        )
+        return
+    if recovery_key is not None:  # whoever has the public key can seal: only the fingerprint tells whose this is
+        app.confirm(f"This backup says that it is {told}. Is that your station?", yes=yes)
+    done = rebuild(app.home, content, app.ask_secret, keystore=keystore)
+    if done.set_aside is not None:
+        app.warn(f"The damaged store is kept as {done.set_aside}.")
+    _emit(app, content, done, f"The station {told} is back in {app.home}, its keys in the keystore {done.keystore}.")
+
+
+def _require_place(home: Path, file: Path) -> None:
+    """Refuse a folder that is not there, and the station's own files, before anyone is asked for a passphrase."""
+    from teds_provision.errors import NotFound, UsageFailure
+
+    folder = file.absolute().parent
+    if not folder.is_dir():
+        raise NotFound(f"There is no folder {folder}.")
+    own = file.name.startswith(("store.", "vault", "config.toml")) and folder.resolve() == home.resolve()
+    if own:
+        raise UsageFailure(f"{file} is a file of the station itself.", hint="Give the backup another name or place.")
+
+
+def _merge(app: App, store: Any, content: Content, told: str, *, yes: bool, dry_run: bool) -> None:
+    from teds_provision.backup.restore import complete_vault, merge
+    from teds_provision.store import StoreLock
+
+    plan = merge(store, content, dry_run=True)
+    how = plan.relation.value if plan.relation is not None else ""
+    head = f"The backup {told} is {how} of this station."
+    app.note("\n".join([head, *_lines(plan)]))
+    if dry_run:
+        _emit(app, content, plan, f"Plan: {'bring back what is listed' if plan.back else 'nothing to do'}.", dry=True)
+        return
+    if plan.back:
+        app.confirm("Bring this back?", yes=yes)
+    with StoreLock(app.home, command="restore", notice=app.note):
+        complete_vault(store, content, app.ask_secret)
+        done = merge(store, content, dry_run=False)
+    _emit(app, content, done, "Brought back." if done.back else "The store lacks nothing of it (nothing to do).")
+
+
+def _lines(done: Restored) -> list[str]:
+    back = [f"  comes back: {what}: {count}" for what, count in done.back.items()]
+    return back + [f"  stays as it is: {kept}" for kept in done.kept]
+
+
+def _emit(app: App, content: Content, done: Restored, text: str, *, dry: bool = False) -> None:
+    result = {
+        "action": done.action,
+        "station": content.station,
+        "name": content.name,
+        "created": content.created,
+        "relation": done.relation.name.lower() if done.relation is not None else None,
+        "back": done.back,
+        "kept": list(done.kept),
+        "keystore": done.keystore,
+        "dry_run": dry,
+    }
+    app.emit(result, lambda console: console.print(text, markup=False))
+
+
+def _open(app: App, file: Path, recovery_key: Path | None, ask: Callable[[str, bool], str]) -> Content:
+    from teds_provision.backup.sealed_file import is_for_key, open_with_key, open_with_passphrase, read
+    from teds_provision.errors import UsageFailure, VaultFailure, WrongPassphrase
+    from teds_provision.protocol.keys import SoftwareKey
+    from teds_provision.vault.ca_file import read_ca
+
+    octets = read(file)
+    if not is_for_key(octets):
+        return open_with_passphrase(octets, ask("Passphrase of the backup", False))
+    if recovery_key is None:
+        raise UsageFailure("This backup is sealed to a recovery key.", hint="Give it with --recovery-key PEM.")
+    passphrase = ask(f"Passphrase of {recovery_key}", False)
+    try:
+        key = SoftwareKey.from_secret(read_ca(recovery_key, passphrase))
+    except WrongPassphrase:
+        raise
+    except VaultFailure as failure:
+        raise VaultFailure(failure.message, hint=_KEY_HINT) from failure
+    return open_with_key(octets, key)
+
+
+def _asker(app: App, descriptor: int | None) -> Callable[[str, bool], str]:
+    """Who gives the backup's passphrase: its own file descriptor, else whoever gives the station's."""
+    if descriptor is None:
+        return app.ask_secret
+    return lambda prompt, confirm: read_line(descriptor)

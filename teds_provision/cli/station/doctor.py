@@ -1,0 +1,53 @@
+"""``doctor``: what is wrong on this machine, why, and the command that mends it."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import click
+
+from teds_provision.cli.context import App, pass_app
+from teds_provision.cli.options import command
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+    from teds_provision.doctor.doctor import Finding
+
+_STYLES = {"ok": "green", "warning": "yellow", "failed": "bold red", "skipped": "dim"}
+
+
+@command("teds-provision doctor", "teds-provision doctor --nfc udp:localhost:54321 --can udp_multicast:239.74.163.2")
+@click.option("--nfc", metavar="PATH", help="Also open this reader: usb, tty:USB0:pn532, udp:localhost:54321.")
+@click.option("--can", metavar="INTERFACE:CHANNEL", help="Also open this bus: socketcan:can0, …")
+@pass_app
+def doctor(app: App, nfc: str | None, can: str | None) -> None:
+    """Look at Python, libraries, readers, buses, clock, keyring, vault and store; name cause and cure of each trouble.
+
+    Opens no reader and no bus unless it is named, and asks for no passphrase. Exits 0 unless something failed
+    (warnings are no failure): 7 for the store, the keyring or the vault, 5 for a named reader or bus, 1 for the rest.
+    """
+    from teds_provision.doctor.doctor import Place, examine, exit_code
+
+    found = list(examine(Place(app.home, nfc, can)))
+    findings = [finding for _, finding in found]
+    checks = [{"name": one.name, "result": one.result, "why": one.why, "fix": one.fix} for one in findings]
+    code = exit_code(found)
+    counts = {word: sum(one.result == word for one in findings) for word in _STYLES}
+    app.emit({"checks": checks, **counts}, lambda console: _print(console, findings))
+    app.note(", ".join(f"{count} {word}" for word, count in counts.items()) + ".")
+    if code:
+        raise click.exceptions.Exit(code)
+
+
+def _print(console: Console, findings: list[Finding]) -> None:
+    from rich.padding import Padding
+    from rich.text import Text
+
+    width = max(len(one.name) for one in findings)
+    for one in findings:
+        line = Text(f"{one.result:<8}", style=_STYLES[one.result])
+        line.append(f" {one.name:<{width}}  {one.why}", style="not bold default")
+        console.print(line)
+        if one.fix and one.result != "ok":
+            console.print(Padding(Text(f"→ {one.fix}"), (0, 0, 0, 9)) if console.is_terminal else f"  → {one.fix}")

@@ -1,0 +1,110 @@
+"""``init``: this base station's keys."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import click
+
+from teds_provision.cli.context import App, pass_app
+from teds_provision.cli.options import command, yes_option
+
+_FILE = click.Path(path_type=Path, dir_okay=False)
+
+
+@command(
+    "teds-provision init --name bench",
+    "teds-provision init --keystore file",
+    "teds-provision init --name lab --request lab.request",
+    "teds-provision init --certificate lab.cert",
+)
+@click.option("--name", help="The station's name, shown in every datasheet that it signs.")
+@click.option(
+    "--keystore", metavar="keyring|file|pkcs11:URI", help="Where the keys lie (default: the keyring if one works)."
+)
+@click.option("--request", type=_FILE, metavar="FILE", help="Make no CA key; ask for another's signature in FILE.")
+@click.option("--certificate", type=_FILE, metavar="CERT", help='Take in what "trust ca sign" gave for that request.')
+@yes_option
+@pass_app
+def init(
+    app: App, name: str | None, keystore: str | None, request: Path | None, certificate: Path | None, yes: bool
+) -> None:
+    """Make this base station's identity and its CA key; a second run shows them.
+
+    The keys lie in the OS keyring, in a PKCS #11 token, or sealed under a passphrase. Stations of one owner share one
+    CA: --request here, "trust ca sign" where the CA key is, --certificate here.
+    """
+    from teds_provision.protocol.keys import fingerprint, to_pem
+    from teds_provision.station.station import initialise
+
+    if request is not None and certificate is not None:
+        raise click.UsageError("--request comes first, --certificate when the CA has signed it.")
+    if request is not None:
+        _request(app, name, keystore, request)
+        return
+    if certificate is not None:
+        _adopt(app, certificate, yes)
+        why = "this station was certified"
+        station = app.station()
+    else:
+        station, why = initialise(app.home, name=name, keystore=keystore, ask=app.ask_secret)
+        app.closing(station.close)
+    ca = fingerprint(station.ca)
+    app.emit(
+        {
+            "name": station.name,
+            "public_key": to_pem(station.point),
+            "fingerprint": station.fingerprint,
+            "ca": {"public_key": to_pem(station.ca), "fingerprint": ca},
+            "keystore": station.keystore,
+            "why": why,
+        },
+        f"Station  {station.name}\n  key      {station.fingerprint[:16]}\n  CA key   {ca[:16]}\n"
+        f"  keystore {station.keystore} ({why})\n  home     {app.home}\n\n{to_pem(station.point)}",
+    )
+
+
+def _request(app: App, name: str | None, keystore: str | None, path: Path) -> None:
+    from teds_provision.handover.certify import ask_for_certificate, read_request
+    from teds_provision.handover.files import require_new, write_new
+    from teds_provision.handover.trust import spoken
+    from teds_provision.protocol.keys import fingerprint, to_pem
+
+    if not path.exists():
+        require_new(path)
+    octets = ask_for_certificate(app.home, name=name, keystore=keystore, ask=app.ask_secret)
+    asked = read_request(octets)
+    fresh = not _is_request_of(path, asked.station)
+    if fresh:
+        write_new(path, octets)
+    digits = fingerprint(asked.station)
+    told = {"name": asked.name, "public_key": to_pem(asked.station), "fingerprint": digits, "request": str(path)}
+    app.emit(
+        {**told, "ca": None},
+        f"Station {asked.name} asks for a certificate in {path}.\nFor comparison by voice:\n  {spoken(digits)}\n"
+        f"Where the CA key is: teds-provision trust ca sign {path.name} --output {path.stem}.cert",
+    )
+
+
+def _is_request_of(path: Path, point: bytes) -> bool:
+    """Whether the file is a request of this very station already (a token signs it differently each time)."""
+    from teds_provision.errors import TedsProvisionError
+    from teds_provision.handover.certify import MAX_OCTETS, read_request
+    from teds_provision.handover.files import read_limited
+
+    try:
+        return path.exists() and read_request(read_limited(path, MAX_OCTETS, "request")).station == point
+    except TedsProvisionError:
+        return False
+
+
+def _adopt(app: App, path: Path, yes: bool) -> None:
+    from teds_provision.handover.certify import MAX_OCTETS, adopt_certificate, read_certificate
+    from teds_provision.handover.files import read_limited
+    from teds_provision.handover.trust import spoken
+    from teds_provision.protocol.keys import fingerprint
+
+    certificate = read_certificate(read_limited(path, MAX_OCTETS, "certificate"))
+    app.note(f"The CA of this certificate, for comparison by voice:\n  {spoken(fingerprint(certificate.ca))}")
+    app.confirm("Trust this CA as the owner of this station's nodes?", yes=yes)
+    adopt_certificate(app.home, certificate, ask=app.ask_secret).close()

@@ -1,0 +1,206 @@
+"""``whitelist``: the nodes that may be keyed and written."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from teds_provision.cli.context import App, pass_app
+from teds_provision.cli.options import COMMAND_SETTINGS, dry_run_option, examples, yes_option
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+    from teds_provision.station.station import Station
+    from teds_provision.steps.whitelist import Plan
+
+
+@click.group(
+    context_settings=COMMAND_SETTINGS,
+    epilog=examples(
+        "teds-provision whitelist add 8d4d9da65281f7000000 --name finger-1",
+        "teds-provision whitelist import ncap.xml",
+        "teds-provision whitelist export whitelist.csv",
+    ),
+)
+def whitelist() -> None:
+    """The nodes that may be keyed and written: UUID, and the fingerprint of the node's key.
+
+    An entry without fingerprint is pinned at the first tapped contact in which the node proves its key.
+    """
+
+
+def _fingerprint(_ctx: click.Context, _parameter: click.Parameter, text: str | None) -> str | None:
+    if text is None:
+        return None
+    digits = re.sub(r"[\s:]", "", text).lower().removeprefix("0x")
+    if not re.fullmatch("[0-9a-f]{64}", digits):
+        raise click.BadParameter("a fingerprint is 64 hex digits.")
+    return digits
+
+
+@whitelist.command(
+    context_settings=COMMAND_SETTINGS,
+    short_help="Whitelist one node.",
+    epilog=examples("teds-provision whitelist add 8d4d9da65281f7000000 --name finger-1"),
+)
+@click.argument("uuid")
+@click.option(
+    "--fingerprint", "-f", callback=_fingerprint, metavar="F", help="Fingerprint of the node's key, 64 hex digits."
+)
+@click.option("--name", help="What people call it.")
+@dry_run_option
+@pass_app
+def add(app: App, uuid: str, fingerprint: str | None, name: str | None, dry_run: bool) -> None:
+    """Whitelist one node; a key that is pinned already is never replaced (exit 6)."""
+    from teds_provision.steps.whitelist import add as run
+    from teds_provision.steps.whitelist import plan_addition
+    from teds_provision.steps.whitelist_files import Listed, require_name
+
+    station = app.station()
+    octets = station.store.resolve(uuid)
+    require_name(name)
+    wanted = Listed(0, octets, fingerprint, name)
+    if dry_run:
+        _emit_plan(app, station, plan_addition(station, [wanted]), dry_run=True)
+        return
+    with station.lock("whitelist add", app.note):
+        plan = plan_addition(station, [wanted])
+        run(station, plan)
+    _emit_plan(app, station, plan, dry_run=False)
+
+
+@whitelist.command(
+    context_settings=COMMAND_SETTINGS,
+    short_help="Take a node off the whitelist and forget its pinned key.",
+    epilog=examples("teds-provision whitelist remove 8d4d --yes"),
+)
+@click.argument("uuid")
+@yes_option
+@dry_run_option
+@pass_app
+def remove(app: App, uuid: str, yes: bool, dry_run: bool) -> None:
+    """Take a node off the whitelist and forget its pinned key, so that a replaced board can be pinned anew."""
+    from teds_provision.steps.whitelist import is_pinned
+    from teds_provision.steps.whitelist import remove as run
+
+    station = app.station()
+    octets = station.store.resolve(uuid)
+    entry = station.store.whitelisted(octets)
+    told = f"{octets.hex()}{f' ({entry.name})' if entry and entry.name else ''}"
+    pinned = entry.fingerprint if entry is not None else None
+    if entry is None and not is_pinned(station, octets):
+        text = f"{told} is not on the whitelist (nothing to do)."
+    elif dry_run:
+        text = f"Plan: take {told} off the whitelist, forget its key {(pinned or 'that it showed')[:16]}."
+    else:
+        app.confirm(f"Take {told} off the whitelist and forget its pinned key?", yes=yes)
+        with station.lock("whitelist remove", app.note):
+            run(station, octets)
+        text = f"{told} is off the whitelist{'' if entry else ' as before, and its key is forgotten'}."
+    _emit(app, station, text, removed=entry is not None and not dry_run)
+
+
+@whitelist.command("list", context_settings=COMMAND_SETTINGS, epilog=examples("teds-provision whitelist list"))
+@pass_app
+def list_entries(app: App) -> None:
+    """Show every entry.
+
+    UUID, the pinned key, how well it was proven, when the entry was added, and the node's name.
+    """
+    station = app.station()
+    entries = station.store.whitelist()
+
+    def human(console: Console) -> None:
+        from rich.table import Table
+        from rich.text import Text
+
+        from teds_provision.cli.rendering import print_table, shown
+
+        if not entries:
+            console.print("The whitelist is empty.")
+            return
+        table = Table("UUID", "key", "assurance", "added", "name", box=None, pad_edge=False)
+        for entry in entries:
+            key = entry.fingerprint[:16] if entry.fingerprint else "not pinned yet"
+            table.add_row(entry.uuid.hex(), key, entry.assurance, entry.added, Text(shown(entry.name)))
+        print_table(console, table)
+
+    from teds_provision.steps.whitelist import as_dict
+
+    app.emit({"whitelist": [as_dict(entry) for entry in entries]}, human)
+
+
+@whitelist.command(
+    "import",
+    context_settings=COMMAND_SETTINGS,
+    epilog=examples("teds-provision whitelist import ncap.xml --dry-run", "teds-provision whitelist import ncap.xml"),
+)
+@click.argument("file", type=click.Path(path_type=Path))
+@click.option("--format", "form", type=click.Choice(["xml", "csv", "json"]), help="Default: by extension or content.")
+@dry_run_option
+@pass_app
+def import_file(app: App, file: Path, form: str | None, dry_run: bool) -> None:
+    """Add every entry of an XML (NCAP), CSV or JSON file, all or none.
+
+    One wrong line refuses the whole file (exit 8), one UUID that is pinned to another key too (exit 6). Taken are UUID,
+    fingerprint and name; when it was added, and with which assurance, is this station's to say.
+    """
+    from teds_provision.steps.whitelist import add as run
+    from teds_provision.steps.whitelist import plan_addition
+    from teds_provision.steps.whitelist_files import read_whitelist
+
+    station = app.station()
+    listed = read_whitelist(file, form)
+    if dry_run:
+        _emit_plan(app, station, plan_addition(station, listed), dry_run=True)
+        return
+    with station.lock("whitelist import", app.note):
+        plan = plan_addition(station, listed)
+        run(station, plan, source=str(file))
+    _emit_plan(app, station, plan, dry_run=False)
+
+
+@whitelist.command(
+    "export",
+    context_settings=COMMAND_SETTINGS,
+    short_help="Write every entry to a file.",
+    epilog=examples("teds-provision whitelist export whitelist.csv"),
+)
+@click.argument("file", type=click.Path(path_type=Path, dir_okay=False))
+@click.option("--format", "form", type=click.Choice(["xml", "csv", "json"]), help="Default: by extension, else xml.")
+@dry_run_option
+@pass_app
+def export_file(app: App, file: Path, form: str | None, dry_run: bool) -> None:
+    """Write every entry, sorted, to a file in one piece; a file of that name is replaced."""
+    from teds_provision.cli.steps.build import write_file
+    from teds_provision.steps.whitelist import as_dict, form_of, render
+
+    station = app.station()
+    form = form_of(file, form)
+    entries = station.store.whitelist()
+    if not dry_run:
+        write_file(file, render(entries, form))
+    verb = "Would write" if dry_run else "Wrote"
+    app.emit(
+        {"whitelist": [as_dict(entry) for entry in entries], "file": str(file), "format": form},
+        f"{verb} {len(entries)} entries as {form} to {file}.",
+    )
+
+
+def _emit_plan(app: App, station: Station, plan: Plan, *, dry_run: bool) -> None:
+    changed = len(plan.write) - plan.new
+    what = f"{plan.new} new, {changed} changed, {plan.unchanged} as they were"
+    text = f"Plan: {what}." if dry_run else f"Whitelist: {what}{'' if plan.write else ' (nothing to do)'}."
+    _emit(app, station, text, added=plan.new, changed=changed, unchanged=plan.unchanged, dry_run=dry_run)
+
+
+def _emit(app: App, station: Station, text: str, **more: Any) -> None:
+    """Tell a change in one line; with --json the whole whitelist as it stands now."""
+    from teds_provision.steps.whitelist import as_dict
+
+    listed = [as_dict(entry) for entry in station.store.whitelist()] if app.json else []
+    app.emit({"whitelist": listed, **more}, lambda console: console.print(text, markup=False))

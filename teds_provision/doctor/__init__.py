@@ -1,0 +1,1 @@
+"""Named checks of this machine, its links and the station, each with its cause and the cure."""

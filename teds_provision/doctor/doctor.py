@@ -1,0 +1,84 @@
+"""``doctor``: named checks of this machine, its links and the station, each with its cause and the cure.
+
+A check is a function from a :class:`Place` to findings, registered under a name. It opens no reader and no bus unless
+the user named one, changes nothing, and looks at the system below ``Place.system`` only, so that tests can show it a
+machine with any hardware.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, field
+from importlib import import_module
+from pathlib import Path
+from typing import Final, Literal
+
+from teds_provision.errors import TedsProvisionError
+
+Result = Literal["ok", "warning", "failed", "skipped"]
+Room = Literal["machine", "link", "store"]
+
+
+@dataclass(frozen=True)
+class Finding:
+    """One line of the doctor's report; ``fix`` is a command or one sentence, "" where nothing is wrong."""
+
+    name: str
+    result: Result
+    why: str
+    fix: str = ""
+
+
+@dataclass(frozen=True)
+class Place:
+    """Where to look: the station's home, the root of the file system, the environment, and the links asked for."""
+
+    home: Path
+    nfc: str | None = None
+    can: str | None = None
+    workspace: Path = field(default_factory=Path.cwd)
+    system: Path = Path("/")
+    environment: Mapping[str, str] = field(default_factory=lambda: os.environ)
+
+    def at(self, path: str) -> Path:
+        """A path of the system, below the root that is looked at."""
+        return self.system / path.lstrip("/")
+
+
+Look = Callable[[Place], Iterator[Finding]]
+CHECKS: Final[dict[str, tuple[Room, Look]]] = {}
+_MODULES: Final = ("machine", "links", "station")
+
+
+def check(name: str, room: Room) -> Callable[[Look], Look]:
+    """Register a check under its name; ``room`` decides the exit code where it fails."""
+
+    def register(look: Look) -> Look:
+        CHECKS[name] = (room, look)
+        return look
+
+    return register
+
+
+def examine(place: Place) -> Iterator[tuple[Room, Finding]]:
+    """Run every check in turn; one that fails in an unforeseen way is itself a finding, and the next one runs."""
+    for module in _MODULES:
+        import_module(f"teds_provision.doctor.{module}")  # fills the registry
+    for name, (room, look) in CHECKS.items():
+        try:
+            for finding in look(place):
+                yield room, finding
+        except TedsProvisionError as error:
+            yield room, Finding(name, "failed", error.message, error.hint)
+        except Exception as error:  # noqa: BLE001  libraries and systems that are broken raise anything
+            yield (
+                room,
+                Finding(name, "failed", f"the check itself failed: {type(error).__name__}: {error}.", "Report this."),
+            )
+
+
+def exit_code(found: list[tuple[Room, Finding]]) -> int:
+    """0 unless a check failed; else 7 for store or vault, 5 for a link that was asked for, 1 for the machine."""
+    rooms = {room for room, finding in found if finding.result == "failed"}
+    return 7 if "store" in rooms else 5 if "link" in rooms else 1 if rooms else 0

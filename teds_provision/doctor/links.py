@@ -1,0 +1,271 @@
+"""What the doctor looks at around readers and buses: from sysfs and the file system, opening what was asked for only.
+
+Known readers are those of nfcpy 1.0.4 (nfc/clf/device.py). A partial path such as ``usb`` hides why a reader does not
+open, so each one is looked at by itself.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import socket
+import stat
+import subprocess
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any, Final
+
+from teds_provision.doctor.doctor import Finding, Place, Result, check
+from teds_provision.errors import LinkFailure, NoReader, UsageFailure
+
+READERS: Final = {
+    (0x054C, 0x0193): "Sony PN531",
+    (0x04CC, 0x0531): "Philips PN531",
+    (0x04CC, 0x2533): "NXP PN533",
+    (0x04E6, 0x5591): "SCM SCL3711",
+    (0x04E6, 0x5593): "SCM SCL3712",
+    (0x054C, 0x02E1): "Sony RC-S330/360/370",
+    (0x054C, 0x06C1): "Sony RC-S380/S",
+    (0x054C, 0x06C3): "Sony RC-S380/P",
+    (0x072F, 0x2200): "ACS ACR122U",
+}
+_ACR122U: Final = (0x072F, 0x2200)
+_ARPHRD_CAN: Final = 280  # linux/if_arp.h
+_IFF_UP: Final = 1
+_SENSES: Final = 8
+
+
+@check("nfc readers", "link")
+def readers(place: Place) -> Iterator[Finding]:
+    """Every USB reader that nfcpy knows: may this user open it, and does something else hold it.
+
+    What is wrong with one is a failure only where a USB reader was asked for.
+    """
+    found = False
+    for device in sorted(place.at("/sys/bus/usb/devices").glob("*")):
+        ids = _ids(device)
+        if ids not in READERS:
+            continue
+        found = True
+        yield _reader(place, device, ids)
+    if not found:
+        yield Finding("nfc readers", "skipped", f"No USB reader of the {len(READERS)} that nfcpy knows is plugged in.")
+    yield from _pcscd(place, found)
+
+
+def _reader(place: Place, device: Path, ids: tuple[int, int]) -> Finding:
+    vendor, product = ids
+    name = f"reader usb:{vendor:04x}:{product:04x}"
+    what = READERS[ids]
+    bad: Result = "failed" if (place.nfc or "").startswith("usb") else "warning"
+    try:
+        bus, number = (int((device / part).read_text()) for part in ("busnum", "devnum"))
+    except (OSError, ValueError):
+        return Finding(name, "warning", f"{what} is going away or was just plugged in.", "Run the doctor again.")
+    node = place.at(f"/dev/bus/usb/{bus:03}/{number:03}")
+    held = {os.path.basename(os.path.realpath(link)) for link in device.parent.glob(f"{device.name}:*/driver")}
+    driver = next(iter(held - {"usbfs"}), None)
+    if driver is not None:
+        fix = f"sudo modprobe -r {driver}; echo blacklist {driver} | sudo tee /etc/modprobe.d/nfc-blacklist.conf"
+        return Finding(name, bad, f"{what} is held by the kernel driver {driver}.", fix)
+    if "usbfs" in held:
+        fix = "End it; for pcscd: sudo systemctl stop pcscd.socket pcscd"
+        return Finding(name, bad, f"{what} is held by another program.", fix)
+    if not os.access(node, os.R_OK | os.W_OK):
+        rule = (
+            f'SUBSYSTEM=="usb", ATTRS{{idVendor}}=="{vendor:04x}", ATTRS{{idProduct}}=="{product:04x}", '
+            'TAG+="uaccess", GROUP="plugdev", MODE="0660"'
+        )
+        fix = f"echo '{rule}' | sudo tee /etc/udev/rules.d/70-nfc.rules, then plug the reader in again"
+        return Finding(name, bad, f"This user may not open {what} at {_shown(place, node)}.", fix)
+    return Finding(name, "ok", f"{what} at {_shown(place, node)}: --nfc usb:{vendor:04x}:{product:04x}.")
+
+
+def _pcscd(place: Place, found: bool) -> Iterator[Finding]:
+    for name in place.at("/proc").glob("[0-9]*/comm"):
+        try:
+            running = name.read_text().strip() == "pcscd"
+        except OSError:
+            continue
+        if running:
+            yield Finding(
+                "pcscd",
+                "warning" if found else "ok",
+                "pcscd is running; it takes the ACR122U and other readers for itself.",
+                "sudo systemctl stop pcscd.socket pcscd" if found else "",
+            )
+            return
+
+
+@check("serial ports", "machine")
+def serial_ports(place: Place) -> Iterator[Finding]:
+    """May this user open the serial ports that a reader or a CAN adapter could be behind."""
+    ports = sorted(path for kind in ("USB", "ACM", "AMA") for path in place.at("/dev").glob(f"tty{kind}*"))
+    if not ports:
+        yield Finding("serial ports", "skipped", "There is none that a reader could be behind.")
+        return
+    closed = [port.name for port in ports if not os.access(port, os.R_OK | os.W_OK)]
+    if closed:
+        why = f"This user may not open {', '.join(closed)}."
+        yield Finding("serial ports", "warning", why, "sudo adduser $USER dialout, then log in again")
+    else:
+        yield Finding("serial ports", "ok", f"{', '.join(port.name for port in ports)} can be opened.")
+
+
+@check("nfc loopback", "machine")
+def nfc_loopback(place: Place) -> Iterator[Finding]:
+    """Do datagrams reach this machine's own loopback: simulated readers need nothing else."""
+    with (
+        socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as receiver,
+        socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender,
+    ):
+        receiver.settimeout(2)
+        try:
+            receiver.bind(("127.0.0.1", 0))
+            sender.sendto(b"doctor", receiver.getsockname())
+            arrived = receiver.recv(16) == b"doctor"
+        except OSError as error:
+            fix = "sudo ip link set lo up; allow loopback in the firewall"
+            yield Finding("nfc loopback", "warning", f"Simulated readers cannot work: {error}.", fix)
+            return
+    yield Finding("nfc loopback", "ok" if arrived else "warning", "Simulated readers (udp:) can be used.")
+
+
+@check("nfc", "link")
+def nfc(place: Place) -> Iterator[Finding]:
+    """Open the reader that was asked for, and look what lies on it."""
+    if place.nfc is None:
+        yield Finding("nfc", "skipped", "No reader was named, so none was opened.", "")
+        return
+    from teds_provision.links.nfc.frontend import open_reader
+    from teds_provision.links.nfc.tag import ReaderLost
+
+    try:
+        reader = open_reader(place.nfc)
+    except (NoReader, UsageFailure) as failure:
+        yield Finding("nfc", "failed", failure.message, failure.hint)
+        return
+    try:
+        tag = any(reader.sense() is not None for _ in range(_SENSES))
+    except ReaderLost as error:
+        yield Finding("nfc", "failed", f"{reader.name} opened, but failed at once: {error}.", "Unplug it, plug it in.")
+        return
+    finally:
+        reader.close()
+    lies = "a tag lies on it" if tag else "nothing lies on it"
+    fix = "" if tag or not place.nfc.startswith("udp") else f"teds-provision node run DIR --nfc {place.nfc}"
+    yield Finding("nfc", "ok" if tag or not fix else "warning", f"{reader.name} on {place.nfc} opens; {lies}.", fix)
+
+
+@check("can interfaces", "machine")
+def can_interfaces(place: Place) -> Iterator[Finding]:
+    """Every CAN interface of the kernel: is it up, and at which bit rate."""
+    found = False
+    for interface in sorted(place.at("/sys/class/net").glob("*")):
+        try:
+            kind, flags = int((interface / "type").read_text()), int((interface / "flags").read_text(), 16)
+        except (OSError, ValueError):
+            continue
+        if kind != _ARPHRD_CAN:
+            continue
+        found = True
+        name, up = f"can {interface.name}", bool(flags & _IFF_UP)
+        rate, state = _bitrate(place, interface.name)
+        at = f", {rate} bit/s" if rate else ""
+        if not up:
+            fix = f"sudo ip link set {interface.name} up type can bitrate {rate or 500000}"
+            yield Finding(name, "warning", f"{interface.name} is down{at}.", fix)
+        elif state == "BUS-OFF":
+            fix = f"Check wiring, termination and bit rate; then: sudo ip link set {interface.name} type can restart"
+            yield Finding(name, "warning", f"{interface.name} is bus-off{at}.", fix)
+        else:
+            yield Finding(name, "ok", f"{interface.name} is up{at}: --can socketcan:{interface.name}.")
+    if not found:
+        yield Finding("can interfaces", "skipped", "The kernel has no CAN interface; other kinds of --can can be used.")
+
+
+def _bitrate(place: Place, name: str) -> tuple[int, str]:
+    """Bit rate (0: unknown) and state as ``ip`` tells them; sysfs has neither."""
+    if place.system != Path("/"):
+        return 0, ""
+    words = ["ip", "-details", "-json", "link", "show", name]
+    try:
+        shown = json.loads(subprocess.run(words, capture_output=True, timeout=5, check=True).stdout)
+        data: dict[str, Any] = shown[0]["linkinfo"]["info_data"]
+        return int(data.get("bittiming", {}).get("bitrate", 0)), str(data.get("state", ""))
+    except (OSError, subprocess.SubprocessError, ValueError, LookupError, TypeError):
+        return 0, ""
+
+
+@check("can loopback", "machine")
+def can_loopback(place: Place) -> Iterator[Finding]:
+    """Do frames of a simulated bus come back, without leaving this machine (hop limit 0)."""
+    channel = f"239.74.{os.getpid() >> 8 & 255}.{os.getpid() & 255 or 1}"
+    arrived, why, fix = _self_test(f"udp_multicast:{channel}?hop_limit=0&port={_free_port()}")
+    told = "Simulated buses (udp_multicast:) can be used." if arrived else why
+    yield Finding("can loopback", "ok" if arrived else "warning", told, fix)
+
+
+def _self_test(spec: str) -> tuple[bool, str, str]:
+    from teds_provision.links.can.bus import Bus, Frame
+    from teds_provision.links.can.spec import parse_spec
+
+    sent = Frame(0x18DAF101, b"doctor")
+    buses: list[Bus] = []
+    try:
+        buses += [Bus(parse_spec(spec)), Bus(parse_spec(spec))]
+        buses[0].send(sent)
+        arrived = buses[1].receive(2.0) == sent
+    except LinkFailure as failure:
+        return False, failure.message, failure.hint
+    finally:
+        for bus in buses:
+            bus.close()
+    why = "" if arrived else "A frame sent to a simulated bus did not come back."
+    return arrived, why, "" if arrived else "sudo ip route add 239.0.0.0/8 dev lo; allow multicast in the firewall"
+
+
+@check("can", "link")
+def can(place: Place) -> Iterator[Finding]:
+    """Open the bus that was asked for, and listen for errors for a moment."""
+    if place.can is None:
+        yield Finding("can", "skipped", "No bus was named, so none was opened.", "")
+        return
+    from teds_provision.links.can.bus import Bus
+    from teds_provision.links.can.spec import parse_spec
+
+    try:
+        bus = Bus(parse_spec(place.can))
+    except (LinkFailure, UsageFailure) as failure:
+        yield Finding("can", "failed", failure.message, failure.hint)
+        return
+    try:
+        bus.receive(0.2)
+    except LinkFailure as failure:
+        yield Finding("can", "failed", failure.message, failure.hint)
+        return
+    finally:
+        bus.close()
+    yield Finding("can", "ok", f"{bus.spec.text} opens.")
+
+
+def _ids(device: Path) -> tuple[int, int]:
+    try:
+        vendor, product = (int((device / name).read_text(), 16) for name in ("idVendor", "idProduct"))
+    except (OSError, ValueError):
+        return 0, 0
+    return vendor, product
+
+
+def _shown(place: Place, node: Path) -> str:
+    shown = f"/{node.relative_to(place.system)}"
+    try:
+        return f"{shown} (mode {stat.S_IMODE(node.stat().st_mode):04o})"
+    except OSError:
+        return shown
+
+
+def _free_port() -> int:
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+        probe.bind(("127.0.0.1", 0))
+        return int(probe.getsockname()[1])

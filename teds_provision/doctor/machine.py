@@ -1,0 +1,161 @@
+"""What the doctor looks at on any machine: Python, the libraries, libusb, the clock."""
+
+from __future__ import annotations
+
+import ctypes
+import platform
+import sys
+import time
+from collections.abc import Iterator
+from datetime import UTC, datetime
+from importlib import metadata
+from typing import Final
+
+from teds_provision.doctor.doctor import Finding, Place, check
+
+_MIN_PYTHON: Final = (3, 11)
+_LIBRARIES: Final = {
+    "click": "8.2.1",
+    "cryptography": "44.0.0",
+    "nfcpy": "1.0.4",
+    "ndeflib": "0.3.3",
+    "python-can": "4.5",
+    "can-isotp": "2.0.6",
+    "msgpack": "1.0",
+    "keyring": "25.2",
+    "pint": "0.24",
+    "numpy": "1.26",
+    "defusedxml": "0.7.1",
+}
+_LIBUSB: Final = ("libusb-1.0.so.0", "libusb-1.0.dylib", "libusb-1.0.dll")
+_FIRST_YEAR: Final = 2025
+_LAST_YEAR: Final = 2099
+_TOLERANCE_SECONDS: Final = 120
+
+
+@check("python", "machine")
+def python(place: Place) -> Iterator[Finding]:
+    """Is this Python new enough."""
+    version = platform.python_version()
+    enough = sys.version_info[:2] >= _MIN_PYTHON
+    fix = "" if enough else "Install Python 3.11 or newer and make the virtual environment anew."
+    yield Finding("python", "ok" if enough else "failed", f"Python {version} on {platform.platform()}.", fix)
+
+
+@check("libraries", "machine")
+def libraries(place: Place) -> Iterator[Finding]:
+    """Are the libraries there, new enough, and not shadowed."""
+    present, missing, old = [], [], []
+    for name, least in _LIBRARIES.items():
+        try:
+            version = metadata.version(name)
+        except metadata.PackageNotFoundError:
+            missing.append(name)
+            continue
+        present.append(f"{name} {version}")
+        if _numbers(version) < _numbers(least):
+            old.append(f"{name} {version} (needs {least})")
+    if missing or old:
+        wrong = ", ".join([*(f"{name} is missing" for name in missing), *old])
+        names = " ".join(f"'{name}>={_LIBRARIES[name]}'" for name in _LIBRARIES if name in missing or name in str(old))
+        yield Finding("libraries", "failed", f"{wrong}.", f"pip install {names}")
+    else:
+        yield Finding("libraries", "ok", f"{', '.join(present)}.")
+    yield from _shadowed()
+
+
+def _shadowed() -> Iterator[Finding]:
+    """The package ``ndef`` of PyPI installs a module of the name that nfcpy needs from ``ndeflib``."""
+    try:
+        version = metadata.version("ndef")
+    except metadata.PackageNotFoundError:
+        yield Finding("ndeflib", "ok", "No other package hides it.")
+        return
+    yield Finding(
+        "ndeflib",
+        "failed",
+        f"The package ndef {version} hides ndeflib, which nfcpy needs.",
+        "pip uninstall --yes ndef; pip install --force-reinstall ndeflib",
+    )
+
+
+@check("argon2id", "machine")
+def argon2id(place: Place) -> Iterator[Finding]:
+    """Can this OpenSSL derive keys from passphrases."""
+    from teds_provision.vault.passphrase import THROWAWAY, SealingKey
+
+    SealingKey.derive("a self-test, no secret", costs=THROWAWAY)
+    yield Finding("argon2id", "ok", "Passphrases can be used.")
+
+
+@check("libusb", "machine")
+def libusb(place: Place) -> Iterator[Finding]:
+    """Is the C library of USB readers there."""
+    for name in _LIBUSB:
+        try:
+            ctypes.CDLL(name)
+        except OSError:
+            continue
+        yield Finding("libusb", "ok", f"{name} loads.")
+        return
+    asked = (place.nfc or "").startswith("usb")
+    why = "The C library libusb is missing: USB readers cannot be used (simulated and serial ones can)."
+    yield Finding("libusb", "failed" if asked else "warning", why, "sudo apt install libusb-1.0-0")
+
+
+@check("clock", "machine")
+def clock(place: Place) -> Iterator[Finding]:
+    """Is the time one that a signature may carry: plausible, and not before what was signed already."""
+    now = datetime.now(UTC)
+    fix = "sudo timedatectl set-ntp true, or: sudo date --utc --set '2026-01-31 12:00'"
+    if not _FIRST_YEAR <= now.year <= _LAST_YEAR:
+        yield Finding("clock", "failed", f"The clock says {now:%Y-%m-%d}, which cannot be.", fix)
+        return
+    last = _last_entry(place)
+    if last is not None and (last - now).total_seconds() > _TOLERANCE_SECONDS:
+        yield Finding(
+            "clock", "failed", f"The clock says {now:%Y-%m-%d %H:%M} UTC, before the last entry of the audit log.", fix
+        )
+        return
+    drift = _drift(place)
+    if drift is not None and abs(drift) > _TOLERANCE_SECONDS:
+        why = f"The hardware clock differs from the system's by {drift:.0f} s."
+        yield Finding("clock", "warning", why, "sudo hwclock --systohc, once the system's time is right")
+        return
+    yield Finding("clock", "ok", f"{now:%Y-%m-%d %H:%M} UTC.")
+
+
+def _last_entry(place: Place) -> datetime | None:
+    from teds_provision.errors import StoreFailure
+    from teds_provision.store import Store
+
+    if not (place.home / "store.sqlite3").exists():
+        return None
+    try:
+        with Store.open(place.home) as store:
+            stamps = [entry.at for entry in store.audit.entries()]
+        return datetime.strptime(max(stamps), "%Y-%m-%dT%H:%M:%SZ").replace(tzinfo=UTC) if stamps else None
+    except (StoreFailure, ValueError):  # the checks of the store say so
+        return None
+
+
+def _drift(place: Place) -> float | None:
+    """Seconds that the hardware clock is ahead; it is assumed to run in UTC, else a whole time zone shows."""
+    try:
+        seconds = int(place.at("/sys/class/rtc/rtc0/since_epoch").read_text())
+    except (OSError, ValueError):
+        return None
+    drift = seconds - time.time()
+    zone = -time.timezone if time.localtime().tm_isdst == 0 else -time.altzone
+    return drift - zone if abs(drift - zone) < abs(drift) else drift
+
+
+def _numbers(version: str) -> tuple[int, ...]:
+    """The leading numbers of a version: enough to compare releases."""
+    numbers = []
+    for part in version.split("."):
+        digits = "".join(character for character in part if character.isdigit())
+        if not part[:1].isdigit():
+            break
+        numbers.append(int(digits))
+    return tuple(numbers)

@@ -1,0 +1,240 @@
+"""What the doctor looks at in the station: home, store, audit log, vault, keyring, and the workspace's ``keys/``."""
+
+from __future__ import annotations
+
+import fcntl
+import os
+import shutil
+import stat
+from collections.abc import Iterator
+from contextlib import contextmanager
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Final
+
+from teds_provision.doctor.doctor import Finding, Place, check
+from teds_provision.errors import NoKeyring, StoreFailure, VaultFailure
+from teds_provision.store import Store
+
+_STORE: Final = "store.sqlite3"
+_LOCK: Final = "store.lock"
+_MIN_FREE: Final = 64 * 1024 * 1024
+_BACKUP_DAYS: Final = 90
+_MAX_KEY_FILE: Final = 64 * 1024
+_NO_STATION: Final = "There is no station yet."
+_INIT: Final = "teds-provision init"
+
+
+@check("home", "store")
+def home(place: Place) -> Iterator[Finding]:
+    """Is the home this user's alone, and each file in it too. Looked at before anything opens (and mends) it."""
+    if not place.home.is_dir():
+        yield Finding("home", "skipped", f"There is no station in {place.home} yet.", _INIT)
+        return
+    status = place.home.stat()
+    if status.st_uid != os.geteuid():
+        why = f"{place.home} belongs to another user."
+        yield Finding("home", "warning", why, f"sudo chown -R $USER {place.home}, or use another --home")
+    elif status.st_mode & 0o022:
+        yield Finding("home", "failed", f"Others may write in {place.home}.", f"chmod 700 {place.home}")
+    elif status.st_mode & 0o055:
+        yield Finding("home", "warning", f"Others may look into {place.home}.", f"chmod 700 {place.home}")
+    else:
+        yield Finding("home", "ok", f"{place.home} is this user's alone.")
+    open_files = [path for path in sorted(place.home.iterdir()) if _open_to_others(path)]
+    if open_files:
+        names = " ".join(str(path) for path in open_files)
+        why = f"Others may read {', '.join(path.name for path in open_files)}."
+        yield Finding("files", "failed", why, f"chmod 600 {names}")
+
+
+def _open_to_others(path: Path) -> bool:
+    private = path.name.startswith(("store.", "vault")) and path.is_file()
+    return private and bool(stat.S_IMODE(path.stat().st_mode) & 0o077)
+
+
+@check("disk", "store")
+def disk(place: Place) -> Iterator[Finding]:
+    """Is there room to write."""
+    where = next(path for path in (place.home, *place.home.absolute().parents) if path.is_dir())
+    free = shutil.disk_usage(where).free
+    enough = free >= _MIN_FREE
+    fix = "" if enough else "Free some space: a full disk stops every command that changes something."
+    yield Finding("disk", "ok" if enough else "warning", f"{free >> 20} MiB free at {where}.", fix)
+
+
+@check("store", "store")
+def store(place: Place) -> Iterator[Finding]:
+    """Is the store whole, does its audit log hold, does anyone hold it, and is there a backup."""
+    if not (place.home / _STORE).exists():
+        yield Finding("store", "skipped", _NO_STATION, _INIT)
+        return
+    with Store.open(place.home) as opened:
+        damage = opened.damage()
+        if damage is not None:
+            yield Finding("store", "failed", f"The store is damaged: {damage}.", "teds-provision restore FILE")
+            return
+        if opened.setting("station_point") is None:
+            yield Finding("store", "warning", "An init was begun here and not finished.", _INIT)
+            return
+        count = len(opened.nodes())
+        yield Finding("store", "ok", f"Whole; {count} nodes, {len(opened.whitelist())} whitelisted.")
+        yield from _audit(opened)
+        yield from _backups(opened, count)
+    yield from _lock(place)
+
+
+def _audit(opened: Store) -> Iterator[Finding]:
+    verdict = opened.audit.check()
+    if verdict.intact:
+        yield Finding("audit log", "ok", f"{verdict.count} entries, chain intact.")
+    else:
+        fix = "Keep a copy, see teds-provision log, and find out who wrote the file."
+        yield Finding("audit log", "failed", f"The chain does not hold: {verdict.why}.", fix)
+
+
+def _backups(opened: Store, nodes: int) -> Iterator[Finding]:
+    taken = [entry.at for entry in opened.audit.entries() if entry.act == "backup"]
+    fix = "teds-provision backup FILE"
+    if not taken:
+        why = "There is no backup: if this machine is lost, every node has to come back to the bench."
+        yield Finding(
+            "backup", "warning" if nodes else "ok", why if nodes else "Nothing to back up yet.", fix * bool(nodes)
+        )
+        return
+    days = (datetime.now(UTC) - datetime.strptime(taken[-1], "%Y-%m-%dT%H:%M:%SZ").replace(tzinfo=UTC)).days
+    old = days > _BACKUP_DAYS
+    yield Finding("backup", "warning" if old else "ok", f"The last one is {days} days old.", fix if old else "")
+
+
+def _lock(place: Place) -> Iterator[Finding]:
+    try:
+        descriptor = os.open(place.home / _LOCK, os.O_RDWR | os.O_NOFOLLOW)
+    except OSError:
+        yield Finding("lock", "ok", "Nobody holds the store.")
+        return
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        yield Finding("lock", "ok", "Nobody holds the store.")
+    except OSError:
+        said = os.pread(descriptor, 500, 0).decode("utf-8", "replace")
+        yield Finding(
+            "lock", "warning", f"The store is held by {said or 'another process'}.", "Wait until it has ended."
+        )
+    finally:
+        os.close(descriptor)
+
+
+@check("keyring", "store")
+def keyring(place: Place) -> Iterator[Finding]:
+    """Which keyring would hold the keys, is it one that may, and does it answer; a failure only where it is used."""
+    from teds_provision.vault.keyring_vault import inspect
+
+    used = _keystore(place)
+    try:
+        with _quiet_logging():
+            name = inspect()
+    except VaultFailure as failure:
+        if used == "keyring":
+            yield Finding("keyring", "failed", failure.message, failure.hint)
+        elif used is not None:
+            yield Finding("keyring", "skipped", f"This station does not use it. {failure.message}")
+        else:
+            none = isinstance(failure, NoKeyring)
+            fix = "teds-provision init --keystore file" if none else failure.hint
+            yield Finding("keyring", "warning", f"{failure.message} init will take a passphrase file.", fix)
+        return
+    yield Finding("keyring", "ok", f"{name}.")
+
+
+@contextmanager
+def _quiet_logging() -> Iterator[None]:
+    """Backends log what they could not load; that is the finding's business."""
+    import logging
+
+    logger = logging.getLogger("keyring")
+    before, logger.disabled = logger.disabled, True
+    try:
+        yield
+    finally:
+        logger.disabled = before
+
+
+@check("vault", "store")
+def vault(place: Place) -> Iterator[Finding]:
+    """Is what holds the station's keys there; nobody is asked for a passphrase or PIN."""
+    used = _keystore(place)
+    if used is None:
+        yield Finding("vault", "skipped", _NO_STATION, _INIT)
+    elif used == "file":
+        yield _file_vault(place)
+    elif used == "keyring":
+        from teds_provision.vault.keyring_vault import KeyringVault
+
+        with Store.open(place.home) as opened:
+            yield Finding("vault", "ok", f"{KeyringVault.open(opened.id).description}.")
+    else:
+        from teds_provision.vault.pkcs11_token import find_token
+        from teds_provision.vault.pkcs11_uri import Pkcs11Uri
+
+        token = find_token(Pkcs11Uri.parse(used))
+        if not (place.home / "vault-pkcs11.json").exists():
+            raise VaultFailure("The file vault-pkcs11.json is missing.", hint="teds-provision restore FILE")
+        yield Finding("vault", "ok", f"The token {token.label.strip()!r} is there.")
+
+
+def _file_vault(place: Place) -> Finding:
+    from teds_provision.vault.file_vault import read_sealed
+
+    with Store.open(place.home) as opened:
+        content = read_sealed(place.home / "vault.json")
+        if content.get("store") != opened.id:
+            raise VaultFailure("vault.json belongs to another store.", hint="teds-provision restore FILE")
+    memory = content.get("memory_kib")
+    if not isinstance(memory, int) or memory < 19 * 1024:  # OWASP's least for Argon2id
+        return Finding(
+            "vault", "warning", "The passphrase file is sealed cheaply, as for a demo.", "Make a new station."
+        )
+    return Finding("vault", "ok", f"The passphrase file is there (Argon2id, {memory >> 10} MiB).")
+
+
+def _keystore(place: Place) -> str | None:
+    if not (place.home / _STORE).exists():
+        return None
+    try:
+        with Store.open(place.home) as opened:
+            return opened.setting("keystore")
+    except StoreFailure:  # the check of the store says so
+        return None
+
+
+@check("keys folder", "machine")
+def keys_folder(place: Place) -> Iterator[Finding]:
+    """Does the workspace's ``keys/`` hold public keys only."""
+    folder = place.workspace / "keys"
+    if not folder.is_dir():
+        yield Finding("keys folder", "skipped", "There is no folder keys/ here.")
+        return
+    files = [path for path in sorted(folder.rglob("*")) if path.is_file()]
+    private = [str(path.relative_to(place.workspace)) for path in files if holds_private_key(path)]
+    if private:
+        fix = f"git rm --cached {' '.join(private)}; take it away, and make a new key: this one is no secret any more"
+        yield Finding("keys folder", "failed", f"Private keys: {', '.join(private)}.", fix)
+    else:
+        yield Finding("keys folder", "ok", f"{len(files)} files, no private key.")
+
+
+def holds_private_key(path: Path) -> bool:
+    """Say whether a file holds a private key in PEM, a private JWK, or a private key of SSH or PKCS #8 in DER."""
+    try:
+        with path.open("rb") as file:
+            octets = file.read(_MAX_KEY_FILE)
+    except OSError:
+        return False
+    if b"PRIVATE KEY" in octets or b"PuTTY-User-Key-File" in octets:
+        return True
+    if b'"kty"' in octets and (b'"d"' in octets or b'"k"' in octets):
+        return True
+    # SEC 1 ECPrivateKey, or PKCS #8 PrivateKeyInfo with id-ecPublicKey or rsaEncryption, in DER
+    inside = octets[:48]
+    return octets[:1] == b"\x30" and (b"\x02\x01\x01\x04\x20" in inside or b"\x02\x01\x00\x30" in inside)

@@ -1,0 +1,1 @@
+"""Keys from one base station to another, and whom this one trusts."""

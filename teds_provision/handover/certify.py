@@ -1,0 +1,255 @@
+"""One CA for several stations: a station asks for its signature, the CA's keeper gives it (profile section 2).
+
+Two small JSON files travel, neither secret. The *request*: name, public key, and the station's own signature over
+``"TEDS1 station request" ‖ 00 ‖ P(station) ‖ name``, so that nobody asks in another's name. The *certificate*: the
+CA's key and SIG104 over the station's. Both formats are this tool's, the profile knows only SIG104.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from teds_provision.errors import BadData, NotAuthentic, NotFound, PolicyRefused, VaultFailure
+from teds_provision.protocol.handover.jwk import point_of, public_jwk
+from teds_provision.protocol.handover.strict_json import decode_base64url, dump, encode_base64url, load_object
+from teds_provision.protocol.keys import PrivateKey, fingerprint, station_key_message, verify
+from teds_provision.station.station import DEFAULT_NAME, Station
+from teds_provision.store import Store, StoreLock
+
+if TYPE_CHECKING:
+    from teds_provision.vault import Ask, Vault
+
+REQUEST_FORMAT = "teds-station-request/1"
+CERTIFICATE_FORMAT = "teds-station-certificate/1"
+MAX_OCTETS = 16384
+_LABEL = b"TEDS1 station request\0"
+
+
+@dataclass(frozen=True)
+class Request:
+    """A station that wants to be certified: its name and point; it has proved that it holds the key."""
+
+    name: str
+    station: bytes
+
+
+@dataclass(frozen=True)
+class Certificate:
+    """SIG104 (64 octets) of ``ca`` over ``station``, both points; verified."""
+
+    name: str
+    station: bytes
+    ca: bytes
+    signature: bytes
+
+
+def make_request(name: str, key: PrivateKey) -> bytes:
+    """Return the request of a station, as the octets of a file."""
+    proof = key.sign(_LABEL + key.point + name.encode())
+    members = {"format": REQUEST_FORMAT, "name": name, "station": public_jwk(key.point)}
+    return dump(members | {"proof": encode_base64url(proof)}) + b"\n"
+
+
+def read_request(octets: bytes) -> Request:
+    """Read and check a request; raises BadData, NotAuthentic (the proof does not verify)."""
+    if b"PRIVATE KEY" in octets:
+        raise BadData("This file holds a private key where a request belongs.")
+    members = load_object(octets, "The request")
+    if members.get("format") != REQUEST_FORMAT:
+        raise BadData(f"This is not a station's request ({REQUEST_FORMAT}).", hint="Make one: init --request FILE")
+    name = _name(members.get("name"))
+    station = point_of(members.get("station"), "The station's key")
+    if not verify(station, _LABEL + station + name.encode(), decode_base64url(members.get("proof"), "The proof")):
+        raise NotAuthentic("The request is not signed by the key that it names.")
+    return Request(name, station)
+
+
+def write_certificate(certificate: Certificate) -> bytes:
+    """Return a certificate as the octets of a file."""
+    members = {
+        "format": CERTIFICATE_FORMAT,
+        "name": certificate.name,
+        "station": public_jwk(certificate.station),
+        "ca": public_jwk(certificate.ca),
+        "signature": encode_base64url(certificate.signature),
+    }
+    return dump(members) + b"\n"
+
+
+def read_certificate(octets: bytes) -> Certificate:
+    """Read and check a certificate; raises BadData, NotAuthentic (the CA's signature does not verify)."""
+    members = load_object(octets, "The certificate")
+    if members.get("format") != CERTIFICATE_FORMAT:
+        raise BadData(f"This is not a station's certificate ({CERTIFICATE_FORMAT}).", hint="See: trust ca sign")
+    station, ca = point_of(members.get("station"), "The station's key"), point_of(members.get("ca"), "The CA's key")
+    signature = decode_base64url(members.get("signature"), "The signature")
+    if not verify(ca, station_key_message(station), signature):
+        raise NotAuthentic("The certificate's signature does not verify under the CA key that it names.")
+    return Certificate(_name(members.get("name")), station, ca, signature)
+
+
+def sign_request(station: Station, request: Request) -> Certificate:
+    """Certify a station under this owner's CA, and remember that; raises NotFound where the CA key is not here."""
+    if request.station == station.ca:
+        raise PolicyRefused("The request names the CA's own key as a station.")
+    known = station.certificate(station.ca, request.station)
+    signature = known or station.certify(request.station)
+    if known is None:
+        with station.store.transaction():
+            station.keep_certificate(station.ca, request.station, signature)
+            station.audit("certify", None, "done", name=request.name, key=fingerprint(request.station))
+    return Certificate(request.name, request.station, station.ca, signature)
+
+
+def ask_for_certificate(home: Path, *, name: str | None, keystore: str | None, ask: Ask) -> bytes:
+    """Make a station key without a CA key, or take the one that is there, and return its request.
+
+    A station that is complete asks with the key that it has. Run again it gives a request for the same key.
+    """
+    with Store.open(home, create=True) as store, StoreLock(home, command="init"):
+        station = Station(store, ask)
+        if store.setting("station_point") is not None:
+            return make_request(station.name, station.vault.identity())
+        if store.setting("requested_point") is None:
+            vault, why = _vault_without_ca(home, store.id, keystore, ask)
+            facts = {
+                "station_name": name or DEFAULT_NAME,
+                "requested_point": vault.identity().point.hex(),
+                "keystore": keystore if keystore and keystore.startswith("pkcs11:") else vault.kind,
+                "keystore_why": why,
+            }
+            with store.transaction():
+                for fact, value in facts.items():
+                    store.set_setting(fact, value)
+                store.audit.append("init", None, "requested", {"fingerprint": fingerprint(vault.identity().point)})
+        else:
+            vault = station.vault
+        return make_request(store.setting("station_name") or DEFAULT_NAME, vault.identity())
+
+
+def _vault_without_ca(home: Path, store_id: str, keystore: str | None, ask: Ask) -> tuple[Vault, str]:
+    from teds_provision.vault import create_vault
+
+    if keystore is not None and keystore.startswith("pkcs11:"):
+        from teds_provision.vault.pkcs11 import Pkcs11Vault
+
+        return Pkcs11Vault.create(home, store_id, keystore, ask, with_ca=False), "the token was asked for"
+    vault, why = create_vault(home, store_id, keystore, ask)
+    vault.drop_ca()  # type: ignore[attr-defined]  # made a moment ago and never used
+    return vault, why
+
+
+def adopt_certificate(home: Path, certificate: Certificate, *, ask: Ask) -> Station:
+    """Complete a station that asked for a certificate; one that has it already is opened as it is.
+
+    Raises NotFound (no station asked here), PolicyRefused (a certificate for another key, or another CA already).
+    """
+    if not (home / "store.sqlite3").exists():
+        raise NotFound("No station has asked for a certificate here.", hint="First: init --request FILE")
+    station = Station(Store.open(home), ask)
+    store = station.store
+    try:
+        with StoreLock(home, command="init"):
+            _adopt(station, certificate)
+    except BaseException:
+        store.close()
+        raise
+    return station
+
+
+def _adopt(station: Station, certificate: Certificate) -> None:
+    store = station.store
+    own = store.setting("station_point") or store.setting("requested_point")
+    if own is None:
+        raise NotFound("No station has asked for a certificate here.", hint="First: init --request FILE")
+    if certificate.station.hex() != own:
+        raise PolicyRefused(
+            f"The certificate is for station {fingerprint(certificate.station)[:16]},"
+            f" this one is {fingerprint(bytes.fromhex(own))[:16]}."
+        )
+    facts: dict[str, str] = {}
+    if store.setting("station_point") is None:
+        facts = {
+            "station_point": own,
+            "ca_point": certificate.ca.hex(),
+            "station_signature": certificate.signature.hex(),
+        }
+    elif station.certificate(certificate.ca, station.point) is not None:
+        return
+    with store.transaction():
+        for fact, value in facts.items():
+            store.set_setting(fact, value)
+        if not facts:  # a station with a CA of its own: certified by another one too, for the nodes of that one
+            station.keep_certificate(certificate.ca, station.point, certificate.signature)
+        detail = {"ca": fingerprint(certificate.ca), "own": bool(facts)}
+        store.audit.append("init", None, "certified", detail)
+
+
+def _name(value: object) -> str:
+    if not isinstance(value, str) or not value.isprintable() or not 0 < len(value) <= 100:
+        raise BadData("A station's name is printable text of at most 100 characters.")
+    return value
+
+
+# -- the CA key itself ------------------------------------------------------------------------------------------------
+
+
+def require_ca(station: Station) -> PrivateKey:
+    """Return the CA key; raises PolicyRefused where this station's CA is kept elsewhere."""
+    ca = station.vault.ca()
+    if ca is None or ca.point != station.ca:
+        raise PolicyRefused(
+            f"The key of this station's CA {fingerprint(station.ca)[:16]} is not in this vault.",
+            hint="Bring it: trust ca import FILE. A CA of its own has a station made by init in another --home.",
+        )
+    return ca
+
+
+def export_ca(station: Station, vault: Vault, path: Path, passphrase: str) -> None:
+    """Write the CA key to a new file under a passphrase; raises PolicyRefused, VaultFailure (token, file)."""
+    require_ca(station)
+    _software(vault).export_ca(path, passphrase)
+    station.audit("ca", None, "exported", ca=fingerprint(station.ca))
+
+
+def drop_ca(station: Station) -> bool:
+    """Delete the CA key from the vault; False if it is not there."""
+    dropped: bool = _software(station.vault).drop_ca()
+    if dropped:
+        station.audit("ca", None, "dropped", ca=fingerprint(station.ca))
+    return dropped
+
+
+def import_ca(station: Station, vault: Vault, path: Path, passphrase: str) -> None:
+    """Bring the CA key back; raises WrongPassphrase, NotFound, VaultFailure, PolicyRefused (another CA's key)."""
+    from teds_provision.protocol.keys import SoftwareKey
+    from teds_provision.vault.ca_file import read_ca
+
+    if SoftwareKey.from_secret(read_ca(path, passphrase)).point != station.ca:
+        raise PolicyRefused(f"{path} holds another CA key than that of this station ({fingerprint(station.ca)[:16]}).")
+    _software(vault).import_ca(path, passphrase)
+    station.audit("ca", None, "imported", ca=fingerprint(station.ca))
+
+
+def _software(vault: Vault) -> Any:
+    """The vault's own methods for its CA key, which not every kind has."""
+    if not all(hasattr(vault, name) for name in ("export_ca", "drop_ca")):
+        raise VaultFailure(f"The {vault.kind} vault cannot do that with its CA key.")
+    if vault.kind == "pkcs11" and not hasattr(vault, "import_ca"):
+        return _Token(vault)
+    return vault
+
+
+class _Token:
+    """A token's CA key: it can be destroyed, but neither leave nor come."""
+
+    def __init__(self, vault: Any) -> None:
+        self.export_ca, self.drop_ca = vault.export_ca, vault.drop_ca
+
+    def import_ca(self, path: Path, passphrase: str) -> None:
+        """Refuse."""
+        raise VaultFailure(
+            "A CA key from a file cannot be put into a token.", hint="Use --keystore file in another home."
+        )

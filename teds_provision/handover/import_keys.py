@@ -1,0 +1,330 @@
+"""``import-keys``: take node keys over from a trusted station (profile section 6).
+
+Everything is checked before anything is kept, and one transaction keeps all of it: keys as pending, whitelist, nodes,
+the CA's signature over this station, the deny list and the receipt. The same bundle again gives the same receipt.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
+from datetime import UTC, datetime
+from typing import Literal
+
+from teds_provision.errors import NotAuthentic, PolicyRefused
+from teds_provision.handover.pending import IMPORTED, Notes, digest_of
+from teds_provision.protocol.agreement import key_id
+from teds_provision.protocol.handover.bundle import BundledNode, OpenedBundle, open_bundle
+from teds_provision.protocol.handover.payload import time_text
+from teds_provision.protocol.handover.receipt import Receipt, RefusedNode, seal_receipt
+from teds_provision.protocol.handover.revocation import Revocation as Statement
+from teds_provision.protocol.keys import fingerprint, station_key_message, verify
+from teds_provision.protocol.messages.identity import NodeState
+from teds_provision.station.station import CA_OF, NEXT_CA, ROTATION, Station
+from teds_provision.store import Batch, Handover, Holder, KeyRecord, NodeRecord, Revocation, WhitelistEntry, utc_now
+
+Decision = Literal["new", "newer", "same", "refused"]
+
+
+@dataclass(frozen=True)
+class PlannedNode:
+    """What becomes of one node of the bundle, and why where it is refused."""
+
+    node: BundledNode
+    decision: Decision
+    why: str = ""
+
+
+@dataclass(frozen=True)
+class ImportPlan:
+    """What an import would do; ``ca_is_known`` False: that CA would be trusted for these nodes from now on."""
+
+    opened: OpenedBundle
+    content: str
+    nodes: tuple[PlannedNode, ...]
+    denied: tuple[Statement, ...]
+    ca_is_known: bool
+
+    @property
+    def taken(self) -> tuple[PlannedNode, ...]:
+        """The nodes that are not refused."""
+        return tuple(node for node in self.nodes if node.decision != "refused")
+
+
+@dataclass(frozen=True)
+class Imported:
+    """A bundle that was taken in, now or before (``fresh`` False), with its receipt as the octets of a file."""
+
+    row: Handover
+    notes: Notes
+    receipt: bytes
+    fresh: bool
+
+    @property
+    def refused_uuids(self) -> set[str]:
+        """The nodes that were not taken in, in hex."""
+        return {uuid for uuid, _ in self.notes.refused}
+
+    @property
+    def uuids(self) -> tuple[bytes, ...]:
+        """The nodes that were taken in."""
+        return tuple(bytes.fromhex(uuid) for uuid in self.notes.uuids if uuid not in self.refused_uuids)
+
+
+def plan_import(station: Station, octets: bytes, now: datetime | None = None) -> ImportPlan | Imported:
+    """Open and check a bundle, and say what would become of each node; changes nothing.
+
+    A bundle that was taken in before is returned as such, even when it has expired since. Raises what
+    :func:`open_bundle` raises, and PolicyRefused: an id seen with other content, no signature of the bundle's CA over
+    this station, or every node refused.
+    """
+    digest = hashlib.sha256(octets).hexdigest()
+    came = [row for row in station.store.handovers() if row.direction == "in"]
+    for row in came:
+        if row.bundle_sha256 == digest:
+            return _before(row)
+    stations = {record.fingerprint: record.point for record in station.store.trusted() if record.role == "station"}
+    opened = open_bundle(octets, station.vault.identity(), stations.get, now or datetime.now(UTC))
+    bundle, content = opened.bundle, digest_of(opened.bundle)
+    for row in came:
+        if row.id == bundle.id:
+            if Notes.from_json(row.nodes).content != content:
+                raise PolicyRefused(
+                    f"The bundle {bundle.id} was taken in before with other content: it is replayed or forged.",
+                    hint="Ask its sender, by voice, what was sent.",
+                )
+            return _before(row)
+    _check_certified(station, opened)
+    denied = tuple(one for one in opened.revocations if station.store.revocation(one.uuid) is None)
+    nodes = tuple(_Judge(station, denied, bundle.sender).each(bundle.nodes))
+    if nodes and all(node.decision == "refused" for node in nodes):
+        first = nodes[0]
+        raise PolicyRefused(
+            f"No node of the bundle can be taken in; {first.node.uuid.hex()}: {first.why}.",
+            hint="Nothing was imported. Tell the sender.",
+        )
+    known = bundle.ca in station.trusted_cas() or station.certificate(bundle.ca, station.point) is not None
+    return ImportPlan(opened, content, nodes, denied, known)
+
+
+def import_keys(station: Station, plan: ImportPlan, now: datetime | None = None) -> Imported:
+    """Take the bundle in, all of it in one transaction, and sign its receipt."""
+    bundle = plan.opened.bundle
+    receipt = Receipt(
+        id=bundle.id,
+        bundle_sha256=plan.opened.sha256,
+        sender=station.fingerprint,
+        to=bundle.sender,
+        imported=tuple(node.node.uuid for node in plan.taken),
+        refused=tuple(RefusedNode(n.node.uuid, n.why) for n in plan.nodes if n.decision == "refused"),
+        created=(now or datetime.now(UTC)).replace(microsecond=0),
+    )
+    text = seal_receipt(receipt, station.vault.identity())
+    notes = Notes(
+        tuple(node.uuid.hex() for node in bundle.nodes),
+        plan.content,
+        bundle.ca.hex(),
+        time_text(bundle.expires),
+        (plan.opened.sha256,),
+        tuple((refused.uuid.hex(), refused.why) for refused in receipt.refused),
+    )
+    row = Handover(
+        bundle.id,
+        "in",
+        bundle.mode,
+        (bundle.sender,),
+        IMPORTED,
+        notes.to_json(),
+        plan.opened.sha256,
+        text.decode("ascii"),
+    )
+    with station.store.transaction():
+        _keep_ca(station, plan)
+        for statement in plan.denied:
+            deny(station, statement)
+        _Arrivals(station, plan).take_in()
+        station.store.put_handover(row)
+        taken = [node.node.uuid.hex() for node in plan.taken]
+        detail = {"handover": bundle.id, "mode": bundle.mode, "from": bundle.sender, "nodes": taken}
+        station.audit("import", None, "done", refused=len(receipt.refused), **detail)
+    return Imported(row, notes, text, fresh=True)
+
+
+def deny(station: Station, statement: Statement) -> None:
+    """Put a signed statement on the deny list; one that is there already stays."""
+    if station.store.revocation(statement.uuid) is None:
+        created = time_text(statement.created)
+        entry = Revocation(statement.uuid, statement.fingerprint, statement.why, statement.statement, created)
+        station.store.put_revocation(entry)
+        station.audit("revoke", statement.uuid, "on the deny list", why=statement.why, by=statement.sender)
+
+
+def _before(row: Handover) -> Imported:
+    assert row.receipt is not None
+    return Imported(row, Notes.from_json(row.nodes), row.receipt.encode("ascii"), fresh=False)
+
+
+def _check_certified(station: Station, opened: OpenedBundle) -> None:
+    """The receiver must be able to write and rotate: it needs the CA's signature over its key."""
+    ca = opened.bundle.ca
+    if opened.station_signature is None and station.certificate(ca, station.point) is None:
+        raise PolicyRefused(
+            f"The bundle brings no signature of the CA {fingerprint(ca)[:16]} over this station's key.",
+            hint="Ask the sender to export it again, where that CA key is kept.",
+        )
+
+
+class _Judge:
+    """Holds a bundle's nodes against the store, whose tables are read once."""
+
+    def __init__(self, station: Station, denied: Iterable[Statement], sender: str) -> None:
+        store = station.store
+        self.sender = sender
+        self.nodes = {node.uuid: node for node in store.nodes()}
+        self.pins = {entry.uuid: entry.fingerprint for entry in store.whitelist()}
+        self.denied = {entry.uuid: entry.why for entry in store.revocations()} | {one.uuid: one.why for one in denied}
+        self.tombstones = {tombstone.uuid: tombstone for tombstone in store.tombstones()}
+        self.held: dict[bytes, dict[str, tuple[str, int]]] = {}
+        for key in store.all_keys():
+            self.held.setdefault(key.uuid, {})[key.key_id] = (key.state, key.epoch)
+
+    def each(self, nodes: Iterable[BundledNode]) -> Iterable[PlannedNode]:
+        """Judge every node."""
+        for node in nodes:
+            why = self._obstacle(node)
+            yield PlannedNode(node, "refused", why) if why else PlannedNode(node, self._decision(node))
+
+    def _obstacle(self, node: BundledNode) -> str:
+        known, pin = self.nodes.get(node.uuid), self.pins.get(node.uuid)
+        if node.uuid in self.denied:
+            return f"it is revoked: {self.denied[node.uuid]}"
+        if (known is not None and known.point not in (None, node.node_key)) or (
+            pin is not None and pin != fingerprint(node.node_key)
+        ):
+            return "this UUID is known here with another node key"
+        held = self.held.get(node.uuid, {})
+        if key_id(node.key).hex() in held:
+            return ""
+        active = max((epoch for state, epoch in held.values() if state == "active"), default=0)
+        latest = max(active, known.epoch if known is not None else 0)
+        if node.epoch < latest:
+            return f"its key epoch {node.epoch} is older than {latest}, which is known here"
+        if node.epoch == active:
+            return f"another key of epoch {node.epoch} is in use here"
+        return ""
+
+    def _decision(self, node: BundledNode) -> Decision:
+        held = self.held.get(node.uuid, {})
+        if key_id(node.key).hex() in held:
+            return "new" if node.uuid in self.tombstones else "same"
+        return "newer" if held else "new"
+
+
+def _keep_ca(station: Station, plan: ImportPlan) -> None:
+    """Keep the CA's signatures that the bundle brings: over this station, and over those it names that are known."""
+    bundle, signature = plan.opened.bundle, plan.opened.station_signature
+    if signature is not None:
+        station.keep_certificate(bundle.ca, station.point, signature)
+    points = {record.fingerprint: record.point for record in station.store.trusted() if record.role == "station"}
+    for digits, signature in bundle.station_signatures.items():
+        point = points.get(digits)
+        if point is None or digits == station.fingerprint:
+            continue
+        if not verify(bundle.ca, station_key_message(point), signature):
+            raise NotAuthentic(f"The bundle's CA signature over station {digits[:16]} does not verify.")
+        station.keep_certificate(bundle.ca, point, signature)
+
+
+class _Arrivals:
+    """The rows of every node that is taken in, made from the tables as they are (read once), written at once."""
+
+    def __init__(self, station: Station, plan: ImportPlan) -> None:
+        store, bundle = station.store, plan.opened.bundle
+        self.station, self.plan, self.bundle = station, plan, bundle
+        self.known = {node.uuid: node for node in store.nodes()}
+        self.pins = {entry.uuid: entry for entry in store.whitelist()}
+        self.slots = store.slots()
+        self.cas = station.cas_of_nodes()
+        self.resting = {tombstone.uuid for tombstone in store.tombstones()}
+        self.others = sorted({bundle.sender, *bundle.to} - {station.fingerprint})
+        self.now = utc_now()
+
+    def take_in(self) -> None:
+        """Write all of them."""
+        taken, store, now = self.plan.taken, self.station.store, self.now
+        back = [one.node.uuid for one in taken if one.node.uuid in self.resting]
+        store.remove_tombstones(back)
+        for uuid in back:
+            self.station.audit("handover", uuid, "came back", handover=self.bundle.id)
+        mode = self.bundle.mode
+        store.put_batch(
+            Batch(
+                nodes=[self._node(one.node) for one in taken],
+                whitelist=[entry for entry in (self._entry(one.node) for one in taken) if entry is not None],
+                keys=[self._key(one.node) for one in taken if one.decision != "same"],
+                holders=[Holder(one.node.uuid, other, now, mode) for one in taken for other in self.others],
+                settings=self._settings(),
+            )
+        )
+
+    def _key(self, node: BundledNode) -> KeyRecord:
+        return self.station.wrapped(
+            node.uuid,
+            key=node.key,
+            key_id=key_id(node.key),
+            epoch=node.epoch,
+            slot=self.slots.get(node.uuid, 0) + 1,
+            source="import",
+            created=self.now,
+        )
+
+    def _entry(self, node: BundledNode) -> WhitelistEntry | None:
+        """The whitelist entry, pinned to the node's key; None where it is pinned already."""
+        pin, digits = self.pins.get(node.uuid), fingerprint(node.node_key)
+        if pin is None:
+            return WhitelistEntry(node.uuid, digits, self.now, "import", node.name)
+        return None if pin.fingerprint is not None else replace(pin, fingerprint=digits, assurance="import")
+
+    def _node(self, node: BundledNode) -> NodeRecord:
+        state = int(NodeState.PROVISIONED if node.teds_sha256 else NodeState.KEYED)
+        known = self.known.get(node.uuid)
+        if known is None:
+            return NodeRecord(
+                node.uuid,
+                node.node_key,
+                node.name,
+                node.profile,
+                state,
+                node.epoch,
+                node.sequence,
+                groups=node.groups,
+                teds_sha256=node.teds_sha256,
+            )
+        return replace(
+            known,
+            point=node.node_key,
+            name=known.name or node.name,
+            profile=known.profile or node.profile,
+            groups=tuple(dict.fromkeys((*known.groups, *node.groups))),
+            state=known.state or state,
+            epoch=max(known.epoch, node.epoch),
+            sequence=max(known.sequence, node.sequence),
+            teds_sha256=node.teds_sha256 if node.sequence >= known.sequence else known.teds_sha256,
+        )
+
+    def _settings(self) -> dict[str, str]:
+        """Which CA each node keeps, and after a move that its key has to be rotated."""
+        ca, own, taken = self.bundle.ca, self.station.ca, self.plan.taken
+        why = f"moved here by {self.bundle.id}: the sender has had this key"
+        due = {ROTATION + one.node.uuid.hex(): why for one in taken} if self.bundle.mode == "move" else {}
+        said = "" if ca == own else ca.hex()
+        for one in taken:
+            uuid = one.node.uuid
+            if one.decision == "same" or self.cas.get(uuid, own) == ca:
+                continue
+            if one.decision == "newer":  # the key held now stays good, under its CA, until the new one is proven
+                due[NEXT_CA + uuid.hex()] = f"{key_id(one.node.key).hex()}:{ca.hex()}"
+            else:
+                due[CA_OF + uuid.hex()] = said
+        return due

@@ -1,0 +1,145 @@
+"""The rest of a node's life: banned, taken out of service, or replaced by a spare."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from datetime import UTC, datetime
+from typing import TYPE_CHECKING
+
+from teds_provision.errors import BadData, NotFound, UsageFailure
+from teds_provision.handover.import_keys import deny
+from teds_provision.protocol.handover.payload import is_label
+from teds_provision.protocol.handover.revocation import seal_revocation
+from teds_provision.protocol.keys import fingerprint
+from teds_provision.station.station import Station
+from teds_provision.steps.build import CALIBRATION, BuildOrder, build
+from teds_provision.steps.sign import known_image
+from teds_provision.store import NodeRecord, Revocation
+from teds_provision.teds.image import Image
+
+if TYPE_CHECKING:
+    from teds_provision.steps.reset import ResetReceipt
+
+DECOMMISSIONED = "decommissioned"
+REPLACED = "replaced by"
+UNCONFIRMED = ", unconfirmed"
+
+
+@dataclass(frozen=True)
+class Revoked:
+    """A node on the deny list; ``fresh`` False where there was nothing left to do."""
+
+    entry: Revocation
+    fresh: bool
+
+
+def revoke(station: Station, uuid: bytes, why: str) -> Revoked:
+    """Ban a node's key: off the whitelist, its keys deleted, and a signed statement that travels in every bundle."""
+    if not why.strip() or not is_label(why):
+        raise UsageFailure("Say why, in printable text of at most 1,024 characters.")
+    store, present = station.store, station.store.revocation(uuid)
+    if present is not None and not station.has_keys(uuid) and store.whitelisted(uuid) is None:
+        return Revoked(present, fresh=False)
+    statement = None
+    if present is None:
+        now = datetime.now(UTC)
+        key = station.vault.identity()
+        statement = seal_revocation(key, uuid=uuid, node=_pinned(station, uuid), why=why, created=now)
+    with store.transaction():
+        if statement is not None:
+            deny(station, statement)
+        store.remove_whitelist(uuid)
+        keys = store.remove_keys(uuid)
+        store.drop_draft(uuid)
+        station.audit("revoke", uuid, "done", why=why, keys=keys)
+    entry = store.revocation(uuid)
+    assert entry is not None
+    return Revoked(entry, fresh=True)
+
+
+def _pinned(station: Station, uuid: bytes) -> str | None:
+    """Fingerprint of the node's key as far as it is known."""
+    entry, node = station.store.whitelisted(uuid), station.store.node(uuid)
+    if entry is not None and entry.fingerprint is not None:
+        return entry.fingerprint
+    return fingerprint(node.point) if node is not None and node.point is not None else None
+
+
+def is_retired(record: NodeRecord | None) -> bool:
+    """Whether a node was taken out of service."""
+    return record is not None and (record.verdict or "").startswith((DECOMMISSIONED, REPLACED))
+
+
+def is_finished(station: Station, uuid: bytes) -> bool:
+    """Whether a node was taken out of service and signed that it is in factory state."""
+    record = station.store.node(uuid)
+    return record is not None and is_retired(record) and not (record.verdict or "").endswith(UNCONFIRMED)
+
+
+def retire(station: Station, uuid: bytes, receipt: ResetReceipt | None, *, as_: str = DECOMMISSIONED) -> None:
+    """Take a node out of service. Without its receipt that is unconfirmed, and its keys stay for another try."""
+    store, record = station.store, station.store.node(uuid)
+    verdict = as_ if receipt is not None else as_ + UNCONFIRMED
+    with store.transaction():
+        store.remove_whitelist(uuid)
+        store.drop_draft(uuid)
+        station.remember(uuid, name=None, groups=(), verdict=verdict)
+        detail = {"proof": receipt.proof.hex()} if receipt is not None else {}
+        station.audit("decommission", uuid, verdict, name=record.name if record else None, **detail)
+
+
+@dataclass(frozen=True)
+class TakeOver:
+    """What a spare takes over; ``calibration`` counts the channels whose calibration goes along."""
+
+    old: NodeRecord
+    new: NodeRecord
+    calibration: dict[tuple[int, int], bytes]
+
+    @property
+    def done(self) -> bool:
+        """Whether the spare is in its place already."""
+        return (self.old.verdict or "").startswith(f"{REPLACED} {self.new.uuid.hex()}")
+
+
+def plan_takeover(station: Station, old: bytes, new: bytes, *, copy_calibration: bool) -> TakeOver:
+    """Look at both nodes; raises NotFound (OLD unknown, no calibration known), UsageFailure, NotWhitelisted (NEW)."""
+    if old == new:
+        raise UsageFailure("A node cannot replace itself.")
+    before = station.store.node(old)
+    if before is None:
+        raise NotFound(f"Nothing is known of node {old.hex()}.", hint="See: teds-provision nodes")
+    station.require_not_given_away(old)
+    station.require_whitelisted(new)
+    after = station.store.node(new) or NodeRecord(new)
+    blocks: dict[tuple[int, int], bytes] = {}
+    if copy_calibration:
+        image = known_image(station, old) or Image(old, {})
+        blocks = {block: octets for block, octets in image.blocks.items() if block[1] == CALIBRATION and block[0]}
+        if not blocks:
+            raise NotFound(f"No calibration of node {old.hex()} is known here.", hint="Leave --copy-calibration away.")
+        if before.profile is None:
+            raise BadData("The profile of the old node is not known, so its calibration cannot be built in.")
+    return TakeOver(before, after, blocks)
+
+
+def take_over(station: Station, plan: TakeOver, receipt: ResetReceipt | None) -> tuple[str, ...]:
+    """Give the spare name, groups and profile, and take the old node out of service, in one transaction.
+
+    Returns warnings: with a calibration the spare's datasheet is built, to be signed and written.
+    """
+    store, old, new = station.store, plan.old, plan.new.uuid
+    warnings: tuple[str, ...] = ()
+    with store.transaction():
+        if not plan.done:
+            entry, former = store.whitelisted(new), store.whitelisted(old.uuid)
+            if entry is not None and former is not None and former.name is not None:
+                store.put_whitelist(replace(entry, name=former.name))
+            store.drop_draft(new)
+            station.remember(new, name=old.name, groups=old.groups, profile=old.profile)
+            if plan.calibration:
+                order = BuildOrder(old.profile, name=old.name)
+                warnings = build(station, new, order, has=Image(new, plan.calibration)).warnings
+            station.audit("replace", new, "done", old=old.uuid.hex(), calibration=bool(plan.calibration))
+        retire(station, old.uuid, receipt, as_=f"{REPLACED} {new.hex()}")
+    return warnings

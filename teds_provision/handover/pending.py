@@ -1,0 +1,224 @@
+"""Handovers under way: what the store remembers of a bundle, the receipt that closes it, and undoing a move.
+
+A bundle that left is ``open`` until its receipt comes (``closed``) or it is taken back (``undone``); one that came is
+``imported``. What belongs to it beyond the columns of the table is in :class:`Notes`.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
+from datetime import datetime
+from typing import Any
+
+from teds_provision.errors import NotAuthentic, NotFound, PolicyRefused
+from teds_provision.protocol.agreement import key_id
+from teds_provision.protocol.handover.bundle import Bundle
+from teds_provision.protocol.handover.receipt import Receipt, open_receipt
+from teds_provision.station.station import Station
+from teds_provision.store import Handover, Holder
+
+OPEN, CLOSED, UNDONE, IMPORTED = "open", "closed", "undone", "imported"
+
+
+@dataclass(frozen=True)
+class Notes:
+    """What is kept with a bundle: its nodes (UUIDs in hex), what it says in one digest, and its files.
+
+    ``files`` are the SHA-256 of every file that was sealed with this content: sealing again gives other octets.
+    """
+
+    uuids: tuple[str, ...]
+    content: str
+    ca: str
+    expires: str
+    files: tuple[str, ...] = ()
+    refused: tuple[tuple[str, str], ...] = ()
+
+    def to_json(self) -> str:
+        """Return what the store keeps."""
+        return json.dumps(vars(self))
+
+    @classmethod
+    def from_json(cls, text: str) -> Notes:
+        """Read what :meth:`to_json` gave."""
+        members: dict[str, Any] = json.loads(text)
+        refused = tuple((str(uuid), str(why)) for uuid, why in members["refused"])
+        return cls(
+            tuple(members["uuids"]),
+            members["content"],
+            members["ca"],
+            members["expires"],
+            tuple(members["files"]),
+            refused,
+        )
+
+
+def content_digest(
+    sender: str, to: Iterable[str], mode: str, ca: bytes, nodes: Iterable[tuple[bytes, str, int]]
+) -> str:
+    """Return what tells one handover from another: who gives which keys (UUID, keyId, epoch) of which CA to whom.
+
+    No time and no id: the same command gives the same digest again. Key ids are public, keys are not in it.
+    """
+    listed = sorted((uuid.hex(), identifier, epoch) for uuid, identifier, epoch in nodes)
+    said = [sender, sorted(to), mode, ca.hex(), listed]
+    return hashlib.sha256(json.dumps(said, separators=(",", ":")).encode()).hexdigest()
+
+
+def digest_of(bundle: Bundle) -> str:
+    """:func:`content_digest` of an opened bundle."""
+    nodes = ((node.uuid, key_id(node.key).hex(), node.epoch) for node in bundle.nodes)
+    return content_digest(bundle.sender, bundle.to, bundle.mode, bundle.ca, nodes)
+
+
+def peer_name(station: Station, fingerprint: str) -> str:
+    """Name under which a station is trusted, else the first digits of its fingerprint."""
+    for record in station.store.trusted():
+        if record.fingerprint == fingerprint and record.role == "station":
+            return record.name
+    return fingerprint[:16]
+
+
+def find_handover(station: Station, text: str) -> Handover:
+    """Return the bundle that left under this id, or its first digits; raises NotFound."""
+    fits = [row for row in station.store.handovers() if row.direction == "out" and row.id.startswith(text.lower())]
+    if len(fits) != 1 or len(text) < 4:
+        raise NotFound(f"No handover that left here is known as {text!r}.", hint="See: teds-provision handover list")
+    return fits[0]
+
+
+@dataclass(frozen=True)
+class Undone:
+    """A move taken back: its nodes, and whether there was anything to do."""
+
+    row: Handover
+    uuids: tuple[bytes, ...]
+    fresh: bool
+
+
+def undo(station: Station, row: Handover) -> Undone:
+    """Take a move back before its receipt: the keys may be used again, and the next contact rotates them.
+
+    The receiver may have the bundle all the same; until the rotation it can use the keys. Raises PolicyRefused for a
+    copy and for a move whose receipt came.
+    """
+    uuids = tuple(bytes.fromhex(uuid) for uuid in Notes.from_json(row.nodes).uuids)
+    if row.mode == "copy":
+        raise PolicyRefused(
+            "A copy cannot be taken back: the other station holds the keys.",
+            hint="Make new ones: teds-provision agree UUID --rotate",
+        )
+    if row.state == CLOSED:
+        raise PolicyRefused(
+            f"The receipt of this move came: station {peer_name(station, row.peers[0])} holds the keys now.",
+            hint="Have the nodes handed back: export-keys there, import-keys here.",
+        )
+    if row.state == UNDONE:
+        return Undone(row, uuids, fresh=False)
+    with station.store.transaction():
+        for uuid in uuids:
+            _lift(station, uuid, row)
+        station.store.put_handover(replace(row, state=UNDONE))
+        station.audit("handover", None, "undone", handover=row.id, nodes=[uuid.hex() for uuid in uuids])
+    return Undone(row, uuids, fresh=True)
+
+
+@dataclass(frozen=True)
+class Closed:
+    """A bundle whose receipt came: what the receiver took in and what not; ``fresh`` False when it came before."""
+
+    row: Handover
+    receipt: Receipt
+    fresh: bool
+
+
+def close(station: Station, octets: bytes) -> Closed:
+    """Take in the receipt of a bundle that left here; a move is then over: its keys are deleted.
+
+    A copy for several stations is closed when each has sent its receipt.
+
+    What the receiver refused comes back to this station, to be rotated at the next contact. Raises NotAuthentic
+    (signature, sender, another file), PolicyRefused (not ours, undone), NotFound (unknown id), BadData.
+    """
+    stations = {record.fingerprint: record.point for record in station.store.trusted() if record.role == "station"}
+    receipt = open_receipt(octets, stations.get)
+    row = station.store.handover(receipt.id, "out")
+    if row is None:
+        raise NotFound(f"No bundle {receipt.id} left this station.", hint="Give the receipt to the bundle's sender.")
+    _check_receipt(station, row, receipt)
+    text = octets.strip().decode("ascii")
+    texts = (row.receipt or "").split()
+    if text in texts or (row.state == CLOSED and row.mode == "move"):
+        return Closed(row, receipt, fresh=False)
+    if row.state == UNDONE:
+        station.audit("handover", None, "receipt of an undone move", handover=row.id)
+        raise PolicyRefused(
+            f"This move was undone here, but station {peer_name(station, receipt.sender)} took"
+            f" {len(receipt.imported)} keys in all the same.",
+            hint="Rotate them at once: teds-provision agree UUID --rotate. Or export the move anew.",
+        )
+    with station.store.transaction():
+        for uuid in receipt.imported if row.mode == "move" else ():
+            station.store.remove_keys(uuid)
+            station.store.drop_draft(uuid)
+        for refused in receipt.refused:
+            if row.mode == "move":
+                _lift(station, refused.uuid, row)
+            else:
+                station.store.remove_holder(refused.uuid, receipt.sender)
+        texts.append(text)
+        state = CLOSED if len(texts) >= len(row.peers) else row.state
+        row = replace(row, state=state, receipt="\n".join(texts))
+        station.store.put_handover(row)
+        detail = {"handover": row.id, "imported": len(receipt.imported), "refused": len(receipt.refused)}
+        station.audit("handover", None, "receipt", state=state, **{"from": receipt.sender}, **detail)
+    return Closed(row, receipt, fresh=True)
+
+
+def _check_receipt(station: Station, row: Handover, receipt: Receipt) -> None:
+    notes = Notes.from_json(row.nodes)
+    if receipt.to != station.fingerprint or receipt.sender not in row.peers:
+        raise PolicyRefused(
+            f"The receipt is between {receipt.to[:16]} and {receipt.sender[:16]}, not between this station and one"
+            " that the bundle was sealed to."
+        )
+    if receipt.bundle_sha256 not in notes.files:
+        raise NotAuthentic("The receipt is for another file than any that left here under this id.")
+    named = [uuid.hex() for uuid in receipt.imported] + [refused.uuid.hex() for refused in receipt.refused]
+    if sorted(named) != sorted(notes.uuids):
+        raise NotAuthentic("The receipt names other nodes than the bundle held.")
+
+
+def _lift(station: Station, uuid: bytes, row: Handover) -> None:
+    """Let a resting key be used again; as another station may have it, a new one is due first."""
+    tombstone = station.store.tombstone(uuid)
+    if tombstone is not None and tombstone.handover_id == row.id:
+        station.store.remove_tombstone(uuid)
+        station.demand_rotation(uuid, f"the move {row.id} did not happen")
+        station.store.put_holder(Holder(uuid, row.peers[0], mode="move"))
+
+
+@dataclass(frozen=True)
+class Listed:
+    """One line of ``handover list``."""
+
+    row: Handover
+    peers: tuple[str, ...]
+    count: int
+    expires: str
+    expired: bool
+
+
+def list_handovers(station: Station, now: datetime) -> list[Listed]:
+    """Every bundle that left or came, oldest first; ``expired`` says that an open one can be imported no more."""
+    names = {record.fingerprint: record.name for record in station.store.trusted() if record.role == "station"}
+    listed = []
+    for row in station.store.handovers():
+        notes = Notes.from_json(row.nodes)
+        expired = row.state == OPEN and datetime.fromisoformat(notes.expires) <= now
+        peers = tuple(names.get(peer, peer[:16]) for peer in row.peers)
+        listed.append(Listed(row, peers, len(notes.uuids), notes.expires, expired))
+    return listed

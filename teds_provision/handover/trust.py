@@ -1,0 +1,198 @@
+"""Whose keys count here: stations and CAs, added by a person who compared the fingerprint (profile section 2)."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+from teds_provision.errors import BadData, NotFound, PolicyRefused, UsageFailure
+from teds_provision.handover.certify import CERTIFICATE_FORMAT, Certificate, read_certificate
+from teds_provision.handover.files import read_limited
+from teds_provision.protocol.keys import fingerprint, from_pem
+from teds_provision.station.station import Station
+from teds_provision.store import TrustRecord
+from teds_provision.store.records import TrustRole
+
+MAX_KEY_FILE = 64 * 1024
+_MIN_PREFIX = 8
+_CA_SUFFIXES = (".ca.pem", ".ca.pub")
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """A key that someone wants trusted, where it came from, and the CA's signature over it if the file brings one."""
+
+    record: TrustRecord
+    path: Path
+    certificate: Certificate | None = None
+    known: bool = False
+
+
+def spoken(digits: str) -> str:
+    """A fingerprint as people read it to each other: in fours, sixteen fours in all."""
+    return " ".join(digits[start : start + 4] for start in range(0, len(digits), 4))
+
+
+def candidate(station: Station, name: str, path: Path, role: TrustRole) -> Candidate:
+    """Read one public key (PEM) or a station's certificate.
+
+    Raises NotFound, BadData (private key, RSA, P-384, nothing of the kind), PolicyRefused (its own key, a name that
+    stands for another key).
+    """
+    point, certificate = _read(path)
+    if certificate is not None and role == "ca":
+        raise UsageFailure(f"{path} is a station's certificate, not a CA's key.", hint="Leave --role away.")
+    digits = fingerprint(point)
+    if point == station.point or (role == "ca" and point == station.ca):
+        raise PolicyRefused(f"{path} holds this station's own key ({digits[:16]}); it needs no trust.")
+    _check_name(name)
+    record = TrustRecord(name, role, point, digits)
+    present = [known for known in station.store.trusted() if known.name == name or known.fingerprint == digits]
+    known = any((old.name, old.role, old.point) == (name, role, point) for old in present)
+    for old in present:
+        if old.name == name and (old.role, old.point) != (role, point):
+            raise PolicyRefused(
+                f"The name {name!r} already stands for the {old.role} {old.fingerprint[:16]}.",
+                hint=f"Choose another name, or run teds-provision trust remove {name} first.",
+            )
+    return Candidate(record, path, certificate, known)
+
+
+def candidates_of(station: Station, folder: Path, role: TrustRole) -> list[Candidate]:
+    """Read every key of a folder such as ``keys/``: ``NAME.pem``, ``NAME.ca.pem`` (a CA), ``NAME.cert`` (certificate).
+
+    A folder that holds a private key anywhere is refused whole (PolicyRefused).
+    """
+    if not folder.is_dir():
+        raise NotFound(f"There is no folder {folder}.")
+    refuse_private_keys(folder)
+    found: list[Candidate] = []
+    for path in sorted(folder.rglob("*")):
+        kind = _kind(path)
+        if kind is None:
+            continue
+        name, of_ca = kind
+        if _read(path)[0] in (station.point, station.ca):
+            continue
+        found.append(candidate(station, name, path, "ca" if of_ca else role))
+    if not found:
+        raise NotFound(f"{folder} holds no key of another station or CA.", hint="Keys are NAME.pem or NAME.ca.pem.")
+    return found
+
+
+def refuse_private_keys(folder: Path) -> None:
+    """Raise PolicyRefused where any file below ``folder`` holds a private key; such a folder is shared and kept."""
+    for path, why in private_keys(folder):
+        raise PolicyRefused(
+            f"{path} holds {why}; this folder is for public keys.",
+            hint="Remove it there and from the version history, and treat that key as lost.",
+        )
+
+
+def private_keys(folder: Path) -> Iterator[tuple[Path, str]]:
+    """Give every file below ``folder`` that holds a private or secret key, and what it is."""
+    for path in sorted(folder.rglob("*")):
+        if not path.is_file() or ".git" in path.parts:
+            continue
+        octets = read_limited(path, 16 << 20, "key")
+        if b"PRIVATE KEY" in octets:
+            yield path, "a private key"
+        elif path.suffix in (".der", ".key", ".p8", ".pk8", ".p12", ".pfx") and octets[:1] == b"\x30":
+            if not _is_public_der(octets):
+                yield path, "a private key"
+        elif b'"kty"' in octets and (b'"d"' in octets or b'"k"' in octets):
+            yield path, "a private or secret JSON Web Key"
+        elif b'"teds-provision-vault' in octets or b'"teds-vault' in octets:
+            yield path, "a vault"
+
+
+def add(station: Station, chosen: list[Candidate]) -> int:
+    """Trust these keys, in one transaction; returns how many were new."""
+    new = 0
+    with station.store.transaction():
+        for one in chosen:
+            if one.certificate is not None:
+                station.keep_certificate(one.certificate.ca, one.certificate.station, one.certificate.signature)
+            if one.known:
+                continue
+            station.store.put_trust(one.record)
+            station.audit(
+                "trust", None, "added", name=one.record.name, role=one.record.role, key=one.record.fingerprint
+            )
+            new += 1
+    return new
+
+
+def find_trusted(station: Station, text: str, role: TrustRole | None = None) -> TrustRecord:
+    """Return the trusted key that ``text`` means: a name, the first digits of a fingerprint, or a PEM file.
+
+    Raises NotFound, UsageFailure (several fit), BadData (file), PolicyRefused (the file's key is not trusted).
+    """
+    known = [record for record in station.store.trusted() if role in (None, record.role)]
+    digits = text.replace(" ", "").lower()
+    by_digits = len(digits) >= _MIN_PREFIX and not set(digits) - set("0123456789abcdef")
+    fits = [record for record in known if record.name == text] or [
+        record for record in known if by_digits and record.fingerprint.startswith(digits)
+    ]
+    if len(fits) > 1:
+        raise UsageFailure(f"{text!r} fits {len(fits)} trusted keys.", hint="Give the name, or more digits.")
+    if fits:
+        return fits[0]
+    if Path(text).is_file():
+        point = _read(Path(text))[0]
+        for record in known:
+            if record.point == point:
+                return record
+        raise PolicyRefused(
+            f"The key {fingerprint(point)[:16]} of {text} is not trusted here.",
+            hint=f"Compare its fingerprint by voice, then: teds-provision trust add NAME {text}",
+        )
+    what = "station" if role == "station" else "key"
+    raise NotFound(
+        f"No trusted {what} is known as {text!r}.", hint="teds-provision trust add NAME FILE; see trust list"
+    )
+
+
+def remove(station: Station, record: TrustRecord) -> None:
+    """Trust a key no more. What it signed before is not trusted any more either."""
+    with station.store.transaction():
+        station.store.remove_trust(record.name)
+        station.audit("trust", None, "removed", name=record.name, role=record.role, key=record.fingerprint)
+
+
+def _read(path: Path) -> tuple[bytes, Certificate | None]:
+    octets = read_limited(path, MAX_KEY_FILE, "key")
+    if CERTIFICATE_FORMAT.encode() in octets:
+        certificate = read_certificate(octets)
+        return certificate.station, certificate
+    try:
+        return from_pem(octets), None
+    except BadData as error:
+        raise BadData(f"{path}: {error.message}", hint="Give the public key (PEM) that init shows.") from error
+
+
+def _check_name(name: str) -> None:
+    if not name.strip() or name != name.strip() or not name.isprintable() or len(name) > 100:
+        raise UsageFailure(f"{name!r} is no name for a key.", hint="Give printable text of at most 100 characters.")
+
+
+def _kind(path: Path) -> tuple[str, bool] | None:
+    """Name, and whether it is a CA's, of a file of a key folder; None for a file that is no key."""
+    if not path.is_file() or path.name.startswith("."):
+        return None
+    for suffix in _CA_SUFFIXES:
+        if path.name.endswith(suffix):
+            return path.name.removesuffix(suffix), True
+    return (path.stem, False) if path.suffix in (".pem", ".pub", ".cert") else None
+
+
+def _is_public_der(octets: bytes) -> bool:
+    from cryptography.exceptions import UnsupportedAlgorithm
+    from cryptography.hazmat.primitives.serialization import load_der_public_key
+
+    try:
+        load_der_public_key(octets)
+    except (ValueError, UnsupportedAlgorithm):
+        return False
+    return True

@@ -1,0 +1,1 @@
+"""What travels between base stations: bundles, receipts, revocations, and the JOSE forms around them."""

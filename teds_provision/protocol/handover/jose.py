@@ -1,0 +1,321 @@
+"""The two JOSE forms of a handover: compact JWS with ES256, and JWE (JSON) with ECDH-ES+A256KW and A256GCM.
+
+RFC 7515, 7516 and 7518 sections 3.4, 4.6 and 5.3, on ``cryptography``, for keys that may lie in a token: a
+:class:`PrivateKey` signs and agrees, nothing here sees its scalar. Exactly these algorithms exist; a header cannot ask
+for another one, for compression, or for anything "critical". Every octet string ends in a value or in
+:class:`NotAuthentic` (signature, tag), :class:`PolicyRefused` (algorithm, extension, recipient) or :class:`BadData`
+(form, size). What a key in a token raises (``VaultFailure``) passes through.
+
+The profile's rule that s must be low does not hold in JOSE: other people's signers give either s.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+from cryptography.exceptions import InvalidSignature, InvalidTag
+from cryptography.hazmat.primitives import hashes
+from cryptography.hazmat.primitives.asymmetric import ec
+from cryptography.hazmat.primitives.asymmetric.utils import encode_dss_signature
+from cryptography.hazmat.primitives.ciphers.aead import AESGCM
+from cryptography.hazmat.primitives.kdf.concatkdf import ConcatKDFHash
+from cryptography.hazmat.primitives.keywrap import InvalidUnwrap, aes_key_unwrap, aes_key_wrap
+
+from teds_provision.errors import BadData, NotAuthentic, PolicyRefused
+from teds_provision.protocol.handover.jwk import point_of, public_jwk
+from teds_provision.protocol.handover.strict_json import (
+    base64url,
+    decode_base64url,
+    dump,
+    encode_base64url,
+    load_object,
+)
+from teds_provision.protocol.keys import SIGNATURE_OCTETS, PrivateKey, SoftwareKey, fingerprint, public_key
+
+SIGNATURE_ALGORITHM = "ES256"
+KEY_ALGORITHM = "ECDH-ES+A256KW"
+CONTENT_ALGORITHM = "A256GCM"
+MAX_RECIPIENTS = 256
+
+_KEY_OCTETS = 32
+_WRAPPED_OCTETS = _KEY_OCTETS + 8
+_IV_OCTETS = 12
+_TAG_OCTETS = 16
+_MAX_HEADER_CHARACTERS = 8192
+_MAX_PARTY_INFO_OCTETS = 256
+# A JWE has about ten members per recipient; a flood of tiny values would cost a hundred times its size to parse.
+_MAX_SEPARATORS = 20 * MAX_RECIPIENTS
+
+FindKey = Callable[[str], bytes | None]
+"""From a ``kid`` to the 65-octet point of a trusted key, None where there is none."""
+
+
+@dataclass(frozen=True)
+class Verified:
+    """What stands under a good signature: ``kid`` and point of the signer, and the payload."""
+
+    kid: str
+    signer: bytes
+    payload: bytes = field(repr=False)
+
+
+@dataclass(frozen=True)
+class JweHeader:
+    """What a JWE says in the clear, authenticated by nothing; ``recipients`` are the ``kid`` of each, "" for none."""
+
+    algorithm: str
+    encryption: str
+    content_type: str
+    recipients: tuple[str, ...]
+
+
+def sign_compact(payload: bytes, key: PrivateKey, *, typ: str) -> bytes:
+    """Return a compact JWS: ES256, ``kid`` the fingerprint of ``key``."""
+    header = {"alg": SIGNATURE_ALGORITHM, "kid": fingerprint(key.point), "typ": typ}
+    signed = base64url(dump(header)) + b"." + base64url(payload)
+    return signed + b"." + base64url(key.sign(signed))
+
+
+def verify_compact(octets: bytes, find_key: FindKey, *, typ: str, max_octets: int) -> Verified:
+    """Check a compact JWS of this ``typ`` whose ``kid`` is the fingerprint of a key that ``find_key`` trusts.
+
+    The payload is decoded only under a good signature. Raises NotAuthentic, PolicyRefused or BadData.
+    """
+    check_size(octets, max_octets, "The signed document")
+    parts = octets.split(b".", 3)
+    if len(parts) != 3:
+        raise BadData("A compact JWS has three parts.")
+    header = _header(parts[0], "The JWS header")
+    _only(header, "alg", (SIGNATURE_ALGORITHM,), "signature algorithm")
+    _no_extensions(header)
+    if str(header.get("typ", "")).lower().removeprefix("application/") != typ:
+        raise BadData(f"This document says that it is {_shown(header.get('typ'))}, not {typ}.")
+    kid = header.get("kid")
+    if not isinstance(kid, str):
+        raise BadData("The JWS header names no signer (kid).")
+    signer = find_key(kid)
+    if signer is None or fingerprint(signer) != kid:
+        raise NotAuthentic(
+            f"Nobody trusted here has the key {kid[:16]!r} that signed this.",
+            hint="Compare the fingerprint with its owner by voice, then: teds-provision trust add NAME FILE.",
+        )
+    signature = decode_base64url(parts[2], "The signature")
+    if not _es256_good(signer, octets[: len(octets) - len(parts[2]) - 1], signature):
+        raise NotAuthentic(f"The signature does not verify under the key {kid[:16]}: the content was changed.")
+    return Verified(kid, signer, decode_base64url(parts[1], "The payload"))
+
+
+def _es256_good(point: bytes, message: bytes, signature: bytes) -> bool:
+    """RFC 7518 section 3.4: r ‖ s of 32 octets each; either s."""
+    if len(signature) != SIGNATURE_OCTETS:
+        return False
+    der = encode_dss_signature(int.from_bytes(signature[:32], "big"), int.from_bytes(signature[32:], "big"))
+    try:
+        public_key(point).verify(der, message, ec.ECDSA(hashes.SHA256()))
+    except InvalidSignature:
+        return False
+    return True
+
+
+def encrypt(payload: bytes, recipients: Sequence[bytes], *, cty: str) -> bytes:
+    """Return a JWE in the General JSON serialization for the points ``recipients``; raises BadData for a bad point.
+
+    Algorithms and ``cty`` are in the protected header, ``kid`` (the fingerprint) and ``epk`` with each recipient.
+    """
+    if not 1 <= len(recipients) <= MAX_RECIPIENTS:
+        raise BadData(f"A JWE here has 1 to {MAX_RECIPIENTS} recipients, not {len(recipients)}.")
+    protected = encode_base64url(dump({"alg": KEY_ALGORITHM, "cty": cty, "enc": CONTENT_ALGORITHM}))
+    content_key, iv = os.urandom(_KEY_OCTETS), os.urandom(_IV_OCTETS)
+    entries = [_recipient_entry(point, content_key) for point in recipients]
+    sealed = AESGCM(content_key).encrypt(iv, payload, protected.encode())
+    head = dump(
+        {
+            "protected": protected,
+            "recipients": entries,
+            "iv": encode_base64url(iv),
+            "tag": encode_base64url(sealed[-_TAG_OCTETS:]),
+        }
+    )
+    # Base64url needs no escape, and a JSON writer would copy the megabytes twice more.
+    return b"".join((head[:-1], b',"ciphertext":"', base64url(sealed[:-_TAG_OCTETS]), b'"}'))
+
+
+def _recipient_entry(point: bytes, content_key: bytes) -> dict[str, object]:
+    one_time = SoftwareKey.generate()
+    wrapping = _wrapping_key(one_time.ecdh(point), b"", b"")
+    return {
+        "header": {"kid": fingerprint(point), "epk": public_jwk(one_time.point)},
+        "encrypted_key": encode_base64url(aes_key_wrap(wrapping, content_key)),
+    }
+
+
+def _wrapping_key(shared: bytes, party_u: bytes, party_v: bytes) -> bytes:
+    """RFC 7518 section 4.6.2: Concat KDF over Z with AlgorithmID, PartyUInfo, PartyVInfo and SuppPubInfo."""
+    parts = [len(part).to_bytes(4, "big") + part for part in (KEY_ALGORITHM.encode(), party_u, party_v)]
+    info = b"".join(parts) + (8 * _KEY_OCTETS).to_bytes(4, "big")
+    return ConcatKDFHash(hashes.SHA256(), _KEY_OCTETS, info).derive(shared)
+
+
+def decrypt(octets: bytes, key: PrivateKey, *, cty: str, max_octets: int) -> bytes:
+    """Open a JWE that names ``key`` among its recipients; General or Flattened JSON serialization.
+
+    A recipient entry is ours where its ``kid`` is our fingerprint, or where it has no ``kid``. Size is looked at before
+    anything is parsed. Raises NotAuthentic, PolicyRefused or BadData.
+    """
+    document = _document(octets, max_octets)
+    protected = document.get("protected")
+    shared = _shared_header(document)
+    own = fingerprint(key.point)
+    named = False
+    for entry in _entries(document):
+        header = _merged(shared, _mapping(entry.get("header"), "The header of a recipient"))
+        if header.get("kid", own) != own:
+            continue
+        named = True
+        _check_header(header, cty)
+        content_key = _content_key(header, entry, key)
+        if content_key is not None:
+            return _content(document, content_key, str(protected))
+    if not named:
+        raise PolicyRefused(
+            f"This was not sealed for this station ({own[:16]}).",
+            hint="Ask the sender to export it for this station; teds-provision show FILE names the recipients.",
+        )
+    raise NotAuthentic("The sealed key does not open: it was changed, or made for another key under this name.")
+
+
+def read_header(octets: bytes, *, max_octets: int) -> JweHeader:
+    """Read what a JWE says in the clear, without any key; raises BadData."""
+    document = _document(octets, max_octets)
+    shared = _shared_header(document)
+    headers = [
+        _merged(shared, _mapping(entry.get("header"), "The header of a recipient")) for entry in _entries(document)
+    ]
+    first = headers[0]
+    return JweHeader(
+        _text(first.get("alg")),
+        _text(first.get("enc")),
+        _text(first.get("cty")),
+        tuple(_text(header.get("kid")) for header in headers),
+    )
+
+
+def check_size(octets: bytes, max_octets: int, what: str) -> None:
+    """Raise BadData where there are more octets than the caller will read."""
+    if len(octets) > max_octets:
+        raise BadData(f"{what} has {len(octets)} octets; more than {max_octets} are not read.")
+
+
+def _document(octets: bytes, max_octets: int) -> dict[str, Any]:
+    check_size(octets, max_octets, "The sealed document")
+    if octets[:64].lstrip(b" \t\r\n")[:1] != b"{":
+        raise BadData("This is not a JWE in a JSON serialization.")
+    if sum(octets.count(separator) for separator in (b",", b"[", b"{")) > _MAX_SEPARATORS:
+        raise BadData("This JSON has far more members than a JWE.")
+    return load_object(octets, "The sealed document")
+
+
+def _shared_header(document: Mapping[str, Any]) -> dict[str, Any]:
+    protected = _header(document.get("protected"), "The protected header")
+    if "enc" not in protected:
+        raise BadData("The protected header names no content encryption (enc).")
+    return _merged(protected, _mapping(document.get("unprotected"), "The unprotected header"))
+
+
+def _entries(document: Mapping[str, Any]) -> Iterator[Mapping[str, Any]]:
+    """Recipient entries of the General form, or the one of the Flattened form (RFC 7516 section 7.2)."""
+    if "recipients" not in document:
+        return iter((document,))
+    entries = document["recipients"]
+    if not isinstance(entries, list) or not 1 <= len(entries) <= MAX_RECIPIENTS:
+        raise BadData(f"A JWE here has 1 to {MAX_RECIPIENTS} recipients.")
+    if "encrypted_key" in document or "header" in document:
+        raise BadData("A JWE is in the General or in the Flattened form, not in both.")
+    return iter([_mapping(entry, "A recipient") for entry in entries])
+
+
+def _check_header(header: Mapping[str, Any], cty: str) -> None:
+    _only(header, "alg", (KEY_ALGORITHM,), "key management algorithm")
+    _only(header, "enc", (CONTENT_ALGORITHM,), "content encryption")
+    _no_extensions(header)
+    if str(header.get("cty", "")).lower() != cty.lower():
+        raise BadData(f"The sealed content says that it is {_shown(header.get('cty'))}, not {cty}.")
+
+
+def _content_key(header: Mapping[str, Any], entry: Mapping[str, Any], key: PrivateKey) -> bytes | None:
+    """Agree and unwrap; None where the wrapped key is not for this key."""
+    one_time = point_of(header.get("epk"), "The one-time key (epk)")
+    wrapped = decode_base64url(entry.get("encrypted_key"), "The encrypted key")
+    party_u, party_v = _party_info(header, "apu"), _party_info(header, "apv")
+    if len(wrapped) != _WRAPPED_OCTETS:
+        raise BadData(f"The encrypted key has {len(wrapped)} octets, not {_WRAPPED_OCTETS}.")
+    try:
+        return aes_key_unwrap(_wrapping_key(key.ecdh(one_time), party_u, party_v), wrapped)
+    except InvalidUnwrap:
+        return None
+
+
+def _party_info(header: Mapping[str, Any], name: str) -> bytes:
+    octets = decode_base64url(header[name], name) if name in header else b""
+    if len(octets) > _MAX_PARTY_INFO_OCTETS:
+        raise BadData(f"The header {name} is longer than {_MAX_PARTY_INFO_OCTETS} octets.")
+    return octets
+
+
+def _content(document: Mapping[str, Any], content_key: bytes, protected: str) -> bytes:
+    iv, tag = decode_base64url(document.get("iv"), "The iv"), decode_base64url(document.get("tag"), "The tag")
+    if len(iv) != _IV_OCTETS or len(tag) != _TAG_OCTETS:
+        raise BadData(f"The iv has {_IV_OCTETS} octets and the tag {_TAG_OCTETS}; these have {len(iv)} and {len(tag)}.")
+    additional = protected
+    if "aad" in document:
+        decode_base64url(document["aad"], "The aad")
+        additional = f"{protected}.{document['aad']}"
+    ciphertext = decode_base64url(document.get("ciphertext"), "The ciphertext")
+    try:
+        return AESGCM(content_key).decrypt(iv, ciphertext + tag, additional.encode())
+    except InvalidTag as error:
+        raise NotAuthentic("The sealed content was changed: its tag does not fit.") from error
+
+
+def _header(text: object, what: str) -> dict[str, Any]:
+    if isinstance(text, str | bytes) and len(text) > _MAX_HEADER_CHARACTERS:
+        raise BadData(f"{what} is longer than {_MAX_HEADER_CHARACTERS} characters.")
+    return load_object(decode_base64url(text, what), what)
+
+
+def _mapping(value: object, what: str) -> dict[str, Any]:
+    if value is None:
+        return {}
+    if not isinstance(value, dict):
+        raise BadData(f"{what} is not an object.")
+    return value
+
+
+def _merged(first: dict[str, Any], second: dict[str, Any]) -> dict[str, Any]:
+    """Join two headers, which must share no name (RFC 7516 section 7.2.1)."""
+    if not first.keys().isdisjoint(second):
+        raise BadData("A header parameter stands in two headers.")
+    return first | second
+
+
+def _only(header: Mapping[str, Any], name: str, allowed: tuple[str, ...], what: str) -> None:
+    if header.get(name) not in allowed:
+        raise PolicyRefused(f"The {what} {_shown(header.get(name))} is not accepted; only {', '.join(allowed)} is.")
+
+
+def _no_extensions(header: Mapping[str, Any]) -> None:
+    for name in ("crit", "zip", "b64"):
+        if name in header:
+            raise PolicyRefused(f"The header parameter {name} is not accepted.")
+
+
+def _text(value: object) -> str:
+    return value if isinstance(value, str) else ""
+
+
+def _shown(value: object) -> str:
+    """A value from outside, short and printable, for a message."""
+    return ascii(value)[:40]

@@ -1,0 +1,93 @@
+"""The signed receipt of a handover (profile section 6): it tells the sender of a bundle what became of it.
+
+Compact JWS, ``typ`` ``teds-receipt+jws``. ``from`` is the station that took the keys in and signs, ``to`` the one that
+sent the bundle: a receipt is a message of its own.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from datetime import datetime
+
+from teds_provision.errors import BadData, NotAuthentic
+from teds_provision.protocol.handover import jose
+from teds_provision.protocol.handover.payload import Members, time_text
+from teds_provision.protocol.handover.strict_json import dump, load_object
+from teds_provision.protocol.keys import PrivateKey, fingerprint
+
+FORMAT = "teds-receipt/1"
+TYPE = "teds-receipt+jws"
+MAX_RECEIPT_OCTETS = 64 * 1024 * 1024
+
+
+@dataclass(frozen=True)
+class RefusedNode:
+    """A node (UUID, 10 octets) that was not taken in, and why."""
+
+    uuid: bytes
+    why: str
+
+
+@dataclass(frozen=True)
+class Receipt:
+    """``id`` and ``bundle_sha256`` are those of the bundle; ``sender`` signs, ``to`` sent the bundle (fingerprints)."""
+
+    id: str
+    bundle_sha256: str
+    sender: str
+    to: str
+    imported: tuple[bytes, ...]
+    refused: tuple[RefusedNode, ...]
+    created: datetime
+
+
+def seal_receipt(receipt: Receipt, signer: PrivateKey) -> bytes:
+    """Sign a receipt; returns the octets of the file. Raises BadData where ``sender`` is not the signer."""
+    if receipt.sender != fingerprint(signer.point):
+        raise BadData("The receipt names another sender than the key that signs it.")
+    members = {
+        "format": FORMAT,
+        "id": receipt.id,
+        "bundle_sha256": receipt.bundle_sha256,
+        "from": receipt.sender,
+        "to": receipt.to,
+        "imported": [uuid.hex() for uuid in receipt.imported],
+        "refused": [{"uuid": node.uuid.hex(), "why": node.why} for node in receipt.refused],
+        "created": time_text(receipt.created),
+    }
+    return jose.sign_compact(dump(members), signer, typ=TYPE)
+
+
+def open_receipt(
+    octets: bytes, trusted: Callable[[str], bytes | None], *, max_octets: int = MAX_RECEIPT_OCTETS
+) -> Receipt:
+    """Check a receipt; whether it answers a bundle of ours is for the caller to compare (id, digest, to).
+
+    White space around it (an editor's last line) does no harm. Raises NotAuthentic, PolicyRefused or BadData.
+    """
+    jose.check_size(octets, max_octets, "The receipt")
+    verified = jose.verify_compact(octets.strip(), trusted, typ=TYPE, max_octets=max_octets)
+    members = Members(load_object(verified.payload, "The receipt"), "The receipt")
+    if members.get("format") != FORMAT:
+        raise BadData(f"The receipt's format is not {FORMAT}.")
+    receipt = Receipt(
+        id=members.random_id("id"),
+        bundle_sha256=members.sha256("bundle_sha256"),
+        sender=members.sha256("from"),
+        to=members.sha256("to"),
+        imported=tuple(Members({"uuid": uuid}, "The receipt").uuid("uuid") for uuid in members.list_of("imported")),
+        refused=tuple(_refused(node) for node in members.list_of("refused")),
+        created=members.time("created"),
+    )
+    if receipt.sender != verified.kid:
+        raise NotAuthentic("The receipt names another sender than the one who signed it.")
+    uuids = [*receipt.imported, *(node.uuid for node in receipt.refused)]
+    if len(set(uuids)) != len(uuids):
+        raise BadData("The receipt names an UUID twice.")
+    return receipt
+
+
+def _refused(value: object) -> RefusedNode:
+    members = Members(value, "A refused node of the receipt")
+    return RefusedNode(members.uuid("uuid"), members.text("why"))

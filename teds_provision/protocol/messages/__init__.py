@@ -1,0 +1,1 @@
+"""The octets between NCAP and TIM: command and reply frames, Identify."""

@@ -1,0 +1,1 @@
+"""The base station over store and vault: identity, node keys, pins, policy."""

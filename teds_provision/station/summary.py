@@ -1,0 +1,54 @@
+"""A node in a few lines: its name, and each channel with unit and range."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from teds_provision import teds
+from teds_provision.harmless import printable
+from teds_provision.teds.image import Image
+
+NAME, CHANNEL, CALIBRATION = 12, 3, 5
+
+
+@dataclass(frozen=True)
+class ChannelSummary:
+    """One TransducerChannel: its name, unit and range as people write them, and whether a calibration is there."""
+
+    number: int
+    name: str
+    unit: str
+    range: str
+    calibrated: bool
+
+
+@dataclass(frozen=True)
+class Summary:
+    """Name of the node and its channels, as its datasheet says."""
+
+    name: str | None
+    channels: tuple[ChannelSummary, ...]
+
+
+def summarise(image: Image) -> Summary:
+    """Decode what a person wants to see; never raises on any octets."""
+    channels = [_channel(image, channel) for channel, code in image if code == CHANNEL]
+    return Summary(_name(image, 0), tuple(channels))
+
+
+def _name(image: Image, channel: int) -> str | None:
+    octets = image.blocks.get((channel, NAME))
+    found = teds.decode(octets).get("TCName") if octets is not None else None
+    return printable(found) if isinstance(found, str) else None
+
+
+def _channel(image: Image, channel: int) -> ChannelSummary:
+    from teds_provision.teds.units.units import display_unit, format_value
+
+    decoded = teds.decode(image.blocks[channel, CHANNEL])
+    units, low, high = decoded.get("PhyUnits"), decoded.get("LowLimit"), decoded.get("HiLimit")
+    unit = text = ""
+    if isinstance(units, teds.Units) and isinstance(low, float) and isinstance(high, float):
+        shown = display_unit(units)
+        unit, text = shown.text, f"{format_value(low, shown)} to {format_value(high, shown)}"
+    return ChannelSummary(channel, _name(image, channel) or "", unit, text, (channel, CALIBRATION) in image.blocks)

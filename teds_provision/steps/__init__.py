@@ -1,0 +1,1 @@
+"""Each step of provisioning: identify, whitelist, agree, build, sign, write, verify, provision, reset, address."""

@@ -1,0 +1,41 @@
+"""Set CAN address (128.10): plainly by tap, or in a session (profile: wire)."""
+
+from __future__ import annotations
+
+from teds_provision.errors import Garbled
+from teds_provision.protocol.messages.frames import Function, security_command
+from teds_provision.station.station import Station
+from teds_provision.steps.agree import open_session
+from teds_provision.steps.identify import identify
+from teds_provision.steps.journal import recorded
+from teds_provision.talk.conversation import Conversation, SessionLost
+
+
+@recorded("address")
+def set_address(station: Station, node: Conversation, address: int) -> bool:
+    """Give the node another CAN address, 1 to 239, durably; False where it has it already.
+
+    Its reply still leaves from the old address; the node is met at the new one from then on. Raises NodeRefused
+    (3: neither tapped nor in a session), OtherKey, LinkFailure.
+    """
+    identify(station, node)
+    if node.identity.can_address == address:
+        return False
+    open_session(station, node)
+    try:
+        node.send(security_command(Function.SET_CAN_ADDRESS, bytes([address])), "the new CAN address")
+    except SessionLost as lost:
+        raise lost.cause from lost
+    if node.contact.link.via == "can":
+        node.forget()  # a link is one pair of addresses: this session ended with the old one
+    elif node.sealed and _address_of(node) != address:
+        raise Garbled("The node took the new CAN address and still shows the old one.")
+    station.remember(node.uuid, can_address=address)
+    station.audit("address", node.uuid, "done", address=address)
+    return True
+
+
+def _address_of(node: Conversation) -> int:
+    from teds_provision.steps.read import read_identity
+
+    return read_identity(node).can_address

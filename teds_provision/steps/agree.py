@@ -1,0 +1,190 @@
+"""Step 3: agree on a link key, or find that one is agreed (profile section 3). Lost messages heal here."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+from teds_provision.errors import NodeRefused, NotAuthentic, PolicyRefused
+from teds_provision.protocol.agreement import StationAgreement
+from teds_provision.protocol.messages.frames import Reason
+from teds_provision.protocol.messages.identity import NodeState
+from teds_provision.station.boards import epoch_to_exceed, settled
+from teds_provision.station.station import NodeKey, Station
+from teds_provision.steps.identify import Identified
+from teds_provision.steps.journal import recorded
+from teds_provision.steps.read import read_identity
+from teds_provision.store import WhitelistEntry
+from teds_provision.talk.conversation import Conversation, SessionLost
+
+
+@dataclass(frozen=True)
+class Agreed:
+    """The key that a session is open under now; ``fresh`` says whether this run agreed on it."""
+
+    epoch: int
+    key_id: str
+    fresh: bool
+
+
+def open_session(station: Station, node: Conversation) -> NodeKey | None:
+    """Open a session under the first key that the node knows, newest pending first; None where it knows none.
+
+    The key that worked becomes the active one and all others go: that is the only thing that ever deletes a key.
+    Raises PolicyRefused for a node that was moved away, LinkFailure.
+    """
+    station.require_not_given_away(node.uuid)
+    for held in station.node_keys(node.uuid):
+        try:
+            node.open(held.key)
+        except NodeRefused as refusal:
+            if refusal.reason in (Reason.UNKNOWN_KEY, Reason.WRONG_STATE):
+                continue
+            raise
+        except NotAuthentic:
+            continue
+        with station.store.transaction():
+            settled(station, node.uuid)
+            station.remember(node.uuid, epoch=held.record.epoch)  # what is signed without the node is for this epoch
+            if held.record.state == "pending" or len(station.store.keys(node.uuid)) > 1:
+                station.promote(node.uuid, held.record.key_id)
+                if held.record.state == "pending" and held.record.source == "agreement":
+                    station.rotated(node.uuid)
+                station.audit("key", node.uuid, "active", key_id=held.record.key_id, epoch=held.record.epoch)
+        return held
+    return None
+
+
+def session_if_keyed(station: Station, node: Conversation) -> NodeKey | None:
+    """Open a session as :func:`open_session` does; where a handover demands a new key, go on under that new key.
+
+    None for a node whose keys this station does not hold, or gave away.
+    """
+    if station.store.tombstone(node.uuid) is not None:
+        return None
+    held = open_session(station, node)
+    entry = station.store.whitelisted(node.uuid)
+    due = station.rotation_due(node.uuid) is not None and entry is not None and entry.fingerprint is not None
+    if held is None or not due or entry is None:
+        return held
+    try:
+        _agree_anew(station, node, entry, station.ca_of(node.uuid))
+    except SessionLost as lost:
+        raise lost.cause from lost
+    return next(iter(station.node_keys(node.uuid)))
+
+
+def require_session(station: Station, node: Conversation) -> NodeKey:
+    """Open a session or say why there is none: given away, no key held (PolicyRefused), or the node has another."""
+    station.require_not_given_away(node.uuid)
+    held = session_if_keyed(station, node)
+    if held is not None:
+        return held
+    if not station.has_keys(node.uuid):
+        raise PolicyRefused(
+            f"This station holds no key of node {node.uuid.hex()}.",
+            hint=f"Tap it and agree on one: teds-provision agree {node.uuid.hex()}",
+        )
+    raise unknown_key(node.uuid)
+
+
+def unknown_key(uuid: bytes) -> PolicyRefused:
+    """The error for a node that knows none of the keys held here: the operator decides, never the tool."""
+    return PolicyRefused(
+        f"Node {uuid.hex()} knows none of the keys that this station holds for it.",
+        hint=f"Another station may have rotated it, or it was reset. To take it: tap it, agree {uuid.hex()} --rotate.",
+    )
+
+
+@recorded("agree")
+def agree(station: Station, node: Conversation, who: Identified, *, rotate: bool = False) -> Agreed:
+    """End with a session open under an agreed key: the present one, or a new one.
+
+    ``rotate`` demands a new one: inside a session where a key is known, else by tap. Raises NotWhitelisted, OtherKey,
+    PolicyRefused, NodeRefused, NotAuthentic, LinkFailure; whatever is cut, the same call carries on.
+    """
+    returning = who.state == NodeState.FACTORY and _may_return(station, node.uuid)
+    entry = station.require_whitelisted(node.uuid, returning=returning)
+    held = open_session(station, node) if who.state != NodeState.FACTORY else None
+    rotate = rotate or (held is not None and station.rotation_due(node.uuid) is not None)
+    if held is not None and not rotate:
+        return Agreed(held.record.epoch, held.record.key_id, fresh=False)
+    if held is None and who.state != NodeState.FACTORY and station.has_keys(node.uuid) and not rotate:
+        raise unknown_key(node.uuid)
+    pinned = _pin_for(entry, node, who)
+    ca = station.ca if who.state == NodeState.FACTORY else station.ca_of(node.uuid)
+    try:
+        return _agree_anew(station, node, pinned, ca, returning=returning)
+    except NodeRefused as refusal:
+        # Identify may have been answered while the node was still storing the key of a run that was cut off
+        late = refusal.reason == Reason.NOT_PERMITTED and who.state == NodeState.FACTORY and not rotate
+        held = open_session(station, node) if late else None
+        if held is None:
+            raise
+        return Agreed(held.record.epoch, held.record.key_id, fresh=True)
+    except SessionLost as lost:
+        raise lost.cause from lost
+
+
+def _may_return(station: Station, uuid: bytes) -> bool:
+    """Whether a node whose move was closed by its receipt may be keyed here again, should it prove to be reset."""
+    tombstone = station.store.tombstone(uuid)
+    row = station.store.handover(tombstone.handover_id, "out") if tombstone is not None else None
+    return row is not None and row.state == "closed" and not station.has_keys(uuid)
+
+
+def _pin_for(entry: WhitelistEntry, node: Conversation, who: Identified) -> WhitelistEntry:
+    """The entry with its fingerprint, pinned now where this contact may pin: tapped, or the bus of a new CAN node."""
+    if entry.fingerprint is not None:
+        return entry
+    if node.tapped:
+        return replace(entry, fingerprint=who.fingerprint, assurance="tap")
+    if who.state == NodeState.FACTORY:
+        return replace(entry, fingerprint=who.fingerprint, assurance="bus")
+    raise PolicyRefused(
+        f"The whitelist knows node {node.uuid.hex()} by UUID alone; only a tap can pin its key.",
+        hint="Tap it once (--via nfc), or add the fingerprint: whitelist add UUID --fingerprint F.",
+    )
+
+
+def _agree_anew(
+    station: Station, node: Conversation, entry: WhitelistEntry, ca: bytes, *, returning: bool = False
+) -> Agreed:
+    """Request, Confirm, Open; ``ca`` is the one that the node keeps, or shall keep from now on.
+
+    ``returning`` nodes were given away: only a signed-for initial Security TEDS shows that they were reset since.
+    """
+    uuid = node.uuid
+    agreement = StationAgreement(
+        replace(station.credentials(), ca=ca, station_signature=station.signature_under(ca)), uuid
+    )
+    reply = node.send(agreement.request(), "the key agreement")
+    agreed = agreement.accept(reply, pinned=entry.fingerprint, epoch=epoch_to_exceed(station, uuid, entry.fingerprint))
+    key_id = agreed.key_id.hex()
+    if returning and not agreed.unsigned:
+        station.require_not_given_away(uuid)
+    with station.store.transaction():
+        if returning:
+            station.store.remove_tombstone(uuid)
+            station.audit("handover", uuid, "came back after a reset")
+        station.add_pending(uuid, key=agreed.key, key_id=agreed.key_id, epoch=agreed.epoch)
+        station.set_ca_of(uuid, ca)
+        if entry != station.store.whitelisted(uuid):
+            station.store.put_whitelist(entry)
+        station.audit("agree", uuid, "pending", key_id=key_id, epoch=agreed.epoch, via=node.contact.link.via)
+    node.send(agreed.confirm, "the key confirmation")
+    node.forget()
+    node.open(agreed.key)
+    with station.store.transaction():
+        station.promote(uuid, key_id)
+        station.remember(uuid, epoch=agreed.epoch, point=agreed.node)
+        station.rotated(uuid)
+        settled(station, uuid)
+    identity = read_identity(node)
+    station.remember(
+        uuid,
+        sequence=identity.sequence,
+        state=int(identity.state),
+        can_address=identity.can_address,
+    )
+    station.audit("agree", uuid, "done", key_id=key_id, epoch=agreed.epoch)
+    return Agreed(agreed.epoch, key_id, fresh=True)

@@ -1,0 +1,141 @@
+"""Step 1: which node is this, which key does it hold, and can it prove it (Figure 3 of the paper, upper half)."""
+
+from __future__ import annotations
+
+import os
+from dataclasses import dataclass, replace
+
+from teds_provision.errors import BadData, NodeRefused, NotAuthentic
+from teds_provision.harmless import printable
+from teds_provision.protocol.keys import fingerprint, is_point, node_key_message, prove_message, verify
+from teds_provision.protocol.messages.frames import Function, security_command
+from teds_provision.protocol.messages.identity import NodeState
+from teds_provision.station.station import Station
+from teds_provision.steps.journal import recorded
+from teds_provision.steps.read import read_block
+from teds_provision.store import WhitelistEntry, utc_now
+from teds_provision.talk.conversation import Conversation
+from teds_provision.teds.codec import security
+from teds_provision.teds.image import SECURITY, Image
+
+CHALLENGE_OCTETS = 32
+
+
+@dataclass(frozen=True)
+class Identified:
+    """A node that proved possession of the key that it shows."""
+
+    uuid: bytes
+    point: bytes
+    key_signature: bytes
+    state: NodeState
+    tag_uid: bytes | None
+    address: int | None
+    security_teds: bytes
+    whitelisted: WhitelistEntry | None
+
+    @property
+    def fingerprint(self) -> str:
+        """Fingerprint of the node's key."""
+        return fingerprint(self.point)
+
+
+def prove(node: Conversation, point: bytes) -> None:
+    """Have the node sign a fresh challenge (128.8); raises NotAuthentic where it cannot."""
+    challenge = os.urandom(CHALLENGE_OCTETS)
+    proof = node.ask(security_command(Function.PROVE, challenge), "to prove its key")
+    if not verify(point, prove_message(node.uuid, challenge), proof):
+        raise NotAuthentic(
+            f"The node does not hold the key {fingerprint(point)[:16]} that it shows.",
+            hint="This may be a copied tag. Do not use it.",
+        )
+
+
+@recorded("identify")
+def identify(station: Station, node: Conversation) -> Identified:
+    """Read UUID and key, demand the proof, and hold both against what this station knows.
+
+    Raises OtherKey (a known UUID with another key), NotAuthentic, BadData, LinkFailure. Records what was seen. A tap
+    pins the key that it brought; over a bus, where anyone can call itself by any UUID, only a whitelisted key is kept.
+    """
+    who = examine(station, node)
+    pinned = who.whitelisted is not None and who.whitelisted.fingerprint is not None
+    station.remember(
+        node.uuid,
+        state=int(who.state),
+        can_address=node.identity.can_address,
+        last_seen=utc_now(),
+        **({"point": who.point} if node.tapped or pinned else {}),
+    )
+    if node.tapped and who.whitelisted is not None and not pinned:
+        who = replace(who, whitelisted=_pin(station, who.whitelisted, who.fingerprint))
+    known = known_key(station, node.uuid)
+    if known != who.point:
+        station.store.put_node_image(node.uuid, Image(node.uuid, {SECURITY: who.security_teds}).to_json())
+    return who
+
+
+def _pin(station: Station, entry: WhitelistEntry, key: str) -> WhitelistEntry:
+    """Give an entry that was made without a fingerprint the key that was just tapped and proven (section 2)."""
+    pinned = replace(entry, fingerprint=key, assurance="tap")
+    with station.store.transaction():
+        station.store.put_whitelist(pinned)
+        station.audit("whitelist", entry.uuid, "pinned", fingerprint=key, assurance="tap")
+    return pinned
+
+
+def examine(station: Station, node: Conversation) -> Identified:
+    """What :func:`identify` finds out, without a trace in the store (but of a wrong key in the audit log)."""
+    octets = read_block(node, SECURITY)
+    shown = security.decode(octets)
+    point = shown.node_key
+    if not is_point(point) or not verify(point, node_key_message(node.uuid, point), shown.node_key_signature):
+        raise NotAuthentic(f"The key that the node shows is not signed for UUID {node.uuid.hex()} (field 102).")
+    prove(node, point)
+    station.check_pin(node.uuid, point)
+    identity = node.identity
+    return Identified(
+        uuid=node.uuid,
+        point=point,
+        key_signature=shown.node_key_signature,
+        state=identity.state,
+        tag_uid=node.contact.tag_uid,
+        address=node.contact.address,
+        security_teds=octets,
+        whitelisted=station.store.whitelisted(node.uuid),
+    )
+
+
+def known_key(station: Station, uuid: bytes) -> bytes | None:
+    """P(node) of the Security TEDS that was last read from this UUID, None where there is none of this profile."""
+    text = station.store.node_image(uuid)
+    octets = Image.from_json(text).security if text is not None else None
+    try:
+        return security.decode(octets).node_key if octets is not None else None
+    except BadData:
+        return None
+
+
+@dataclass(frozen=True)
+class Description:
+    """What a node's own, so far unverified, datasheet says it is."""
+
+    name: str | None
+    channels: int
+
+
+def describe(node: Conversation) -> Description:
+    """Read name and number of channels from Meta-TEDS and XdcrName, where the node has them; nothing is verified."""
+    from teds_provision import teds
+
+    name: str | None = None
+    channels = 0
+    for block in ((0, 1), (0, 12)):
+        try:
+            decoded = teds.decode(read_block(node, block))
+        except NodeRefused:
+            continue
+        found, count = decoded.get("TCName"), decoded.get("MaxChan")
+        name = printable(found) if isinstance(found, str) else name
+        channels = count if isinstance(count, int) else channels
+    return Description(name, channels)

@@ -1,0 +1,107 @@
+"""Reading TEDS off a node: one block, or all that it lists."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass
+
+from teds_provision.errors import BadData, Garbled, NodeRefused
+from teds_provision.protocol.messages.frames import (
+    Attribute,
+    Function,
+    Reason,
+    TedsStatus,
+    decode_list,
+    query_teds,
+    read_teds,
+    security_command,
+)
+from teds_provision.protocol.messages.identity import Identity
+from teds_provision.talk.conversation import Conversation
+from teds_provision.teds.image import SECURITY, BlockId, Image
+
+LARGEST_TEDS = 1 << 20
+LARGEST_SECURITY = 4094 - 78
+"""A Security TEDS fits into the sealed reply to Request, a frame of at most 4094 octets (wire, "maxMessage")."""
+LARGEST_IMAGE = 4 << 20
+READING_SECONDS = 300.0
+"""A whole image takes seconds, over a slow link a minute; who dawdles longer holds others up."""
+
+
+def read_block(node: Conversation, block: BlockId, *, until: float | None = None) -> bytes:
+    """Read one TEDS, segment by segment, as long as its Length says (or as the node has octets).
+
+    ``until`` is a monotonic time. Raises NodeRefused (18: no such TEDS), Garbled, BadData for a Length beyond 1 MiB
+    (of a Security TEDS, 4016 octets).
+    """
+    channel, access_code = block
+    largest = LARGEST_SECURITY if block == SECURITY else LARGEST_TEDS
+    octets = bytearray()
+    until = time.monotonic() + READING_SECONDS if until is None else until
+    while True:
+        if time.monotonic() > until:
+            raise Garbled(f"The node hands out its TEDS too slowly: not done after {READING_SECONDS:.0f} s.")
+        payload = node.ask(
+            read_teds(channel, access_code, len(octets)), f"to read TEDS {access_code} of channel {channel}"
+        )
+        if len(payload) < 4 or int.from_bytes(payload[:4], "big") != len(octets):
+            raise Garbled(f"The node read TEDS {access_code} of channel {channel} from another offset than was asked.")
+        octets += payload[4:]
+        total = 4 + int.from_bytes(octets[:4], "big") if len(octets) >= 4 else largest
+        if len(payload) == 4 or len(octets) >= total:
+            return bytes(octets)
+        if total > largest:
+            raise BadData(f"TEDS {access_code} of channel {channel} claims {total} octets; {largest} is the most read.")
+
+
+def list_blocks(node: Conversation) -> list[BlockId]:
+    """List (128.11): every TEDS on the node."""
+    return decode_list(node.ask(security_command(Function.LIST), "to list its TEDS"))
+
+
+def read_image(node: Conversation) -> Image:
+    """Read every TEDS of a node."""
+    blocks: dict[BlockId, bytes] = {}
+    total = 0
+    until = time.monotonic() + READING_SECONDS
+    for block in list_blocks(node):
+        try:
+            blocks[block] = read_block(node, block, until=until)
+        except NodeRefused as refusal:
+            if refusal.reason != Reason.NO_SUCH_TEDS:
+                raise
+            continue
+        total += len(blocks[block])
+        if total > LARGEST_IMAGE:
+            raise BadData("The node lists more than 4 MiB of TEDS.")
+    return Image(node.uuid, blocks)
+
+
+def read_identity(node: Conversation) -> Identity:
+    """Ask Identify again, inside the session where one is open (then it is authentic)."""
+    identity = Identity.decode(node.ask(security_command(Function.IDENTIFY), "to identify itself"))
+    if identity.uuid != node.uuid:
+        raise Garbled(f"The node called itself {node.uuid.hex()} before and {identity.uuid.hex()} now.")
+    return identity
+
+
+@dataclass(frozen=True)
+class Survey:
+    """What a node has now, read in its session: all TEDS, and which of those that are not ours are read-only."""
+
+    image: Image
+    read_only: frozenset[BlockId]
+    identity: Identity
+
+
+def survey(node: Conversation) -> Survey:
+    """Read all TEDS and, for those that the Security TEDS does not account for, whether they are read-only."""
+    identity = read_identity(node)
+    image = read_image(node)
+    read_only = frozenset(block for block in image.unsigned_blocks() if _is_read_only(node, block))
+    return Survey(image, read_only, identity)
+
+
+def _is_read_only(node: Conversation, block: BlockId) -> bool:
+    status = TedsStatus.decode(node.ask(query_teds(*block), f"to query TEDS {block[1]} of channel {block[0]}"))
+    return bool(status.attributes & Attribute.READ_ONLY)

@@ -1,0 +1,152 @@
+"""Step 5: sign a datasheet, or find that the existing signature still says the same (profile section 1)."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from teds_provision.errors import BadData, NotFound, PolicyRefused
+from teds_provision.protocol.datasheet import (
+    NodeKeys,
+    can_be_stored,
+    digests,
+    passes_own_check,
+    sign_datasheet,
+    signature_good,
+    unsigned_datasheet,
+)
+from teds_provision.protocol.keys import fingerprint, node_key_message, verify
+from teds_provision.station.station import Station
+from teds_provision.teds.codec import security
+from teds_provision.teds.image import SECURITY, Image
+
+LAST_SEQUENCE = 0xFFFFFFFF
+
+
+@dataclass(frozen=True)
+class Signed:
+    """A signed image, and whether its signature is the one that already existed."""
+
+    image: Image
+    sequence: int
+    reused: bool
+
+    @property
+    def signature(self) -> bytes:
+        """Field 100, 64 octets."""
+        signature = security.decode(self.image.blocks[SECURITY]).signature
+        assert signature is not None, "a signed image holds field 100"
+        return signature
+
+
+def node_keys_of(uuid: bytes, security_teds: bytes) -> NodeKeys:
+    """Take fields 101 and 102 from a Security TEDS of the node; raises BadData where 102 is not over this UUID."""
+    shown = security.decode(security_teds)
+    if not verify(shown.node_key, node_key_message(uuid, shown.node_key), shown.node_key_signature):
+        raise BadData(f"The Security TEDS of {uuid.hex()} belongs to another node (field 102).")
+    return NodeKeys(uuid, shown.node_key, shown.node_key_signature)
+
+
+def known_node_keys(station: Station, uuid: bytes, image: Image | None = None) -> NodeKeys:
+    """The node's key and its signature, from the image at hand or from what was last read; raises NotFound."""
+    for source in (image, known_image(station, uuid)):
+        if source is not None and source.security is not None:
+            keys = node_keys_of(uuid, source.security)
+            station.check_pin(uuid, keys.key)
+            return keys
+    raise NotFound(
+        f"The key of node {uuid.hex()} is not known yet.",
+        hint="Identify it first: teds-provision identify",
+    )
+
+
+def known_image(station: Station, uuid: bytes) -> Image | None:
+    """What the node had when it was last read, None if it never was."""
+    text = station.store.node_image(uuid)
+    return None if text is None else Image.from_json(text)
+
+
+def unsigned_security(station: Station, keys: NodeKeys, image: Image) -> bytes:
+    """The Security TEDS of a built image: everything but the signature, sequence and epoch as they are now."""
+    node = station.store.node(keys.uuid)
+    return unsigned_datasheet(
+        keys,
+        station.point,
+        station.signature_under(station.ca_of(keys.uuid)),
+        digests(image.blocks),
+        ca=security.ca_hint(station.name, fingerprint(station.ca_of(keys.uuid))),
+        sequence=node.sequence if node else 0,
+        key_epoch=node.epoch if node else 0,
+    ).encode()
+
+
+def sign(
+    station: Station,
+    keys: NodeKeys,
+    image: Image,
+    *,
+    epoch: int,
+    node_sequence: int,
+    on_node: bytes | None = None,
+    earlier: Sequence[bytes] = (),
+    sequence: int | None = None,
+) -> Signed:
+    """Sign ``image`` for key epoch ``epoch``.
+
+    ``node_sequence`` is the node's, as read in a session (or last known). ``on_node`` is the node's present Security
+    TEDS and ``earlier`` those that were signed but perhaps never written: where one says exactly the same by the same
+    signer, it is given back. ``sequence`` forces one (steps over more than 65536). The new sequence is durable in the
+    store before the signature is made.
+    """
+    for block, teds in image.unsigned_blocks().items():
+        if not can_be_stored(block) or not passes_own_check(block, teds):
+            raise BadData(f"TEDS {block[1]} of channel {block[0]} is damaged: Length, checksum or class is wrong.")
+    if sequence is None:
+        for octets in (on_node, *earlier):
+            if octets is not None and _says_the_same(station, keys, image, octets, epoch):
+                number = security.decode(octets).sequence
+                if octets == on_node or number > node_sequence:
+                    return Signed(image.with_block(SECURITY, octets), number, reused=True)
+    known = station.store.node(keys.uuid)
+    number = max(node_sequence, known.sequence if known else 0) + 1 if sequence is None else sequence
+    if number > LAST_SEQUENCE:
+        raise PolicyRefused("The sequence of this node is used up.")
+    unsigned = unsigned_datasheet(
+        keys,
+        station.point,
+        station.signature_under(station.ca_of(keys.uuid)),
+        digests(image.blocks),
+        ca=security.ca_hint(station.name, fingerprint(station.ca_of(keys.uuid))),
+        last_modified=_now(),
+        sequence=number,
+        key_epoch=epoch,
+    )
+    station.remember(keys.uuid, sequence=number)
+    octets = sign_datasheet(unsigned, keys.uuid, station.credentials(keys.uuid))
+    station.audit("sign", keys.uuid, "done", sequence=number, epoch=epoch, teds=image.digest())
+    return Signed(image.with_block(SECURITY, octets), number, reused=False)
+
+
+def _says_the_same(station: Station, keys: NodeKeys, image: Image, octets: bytes, epoch: int) -> bool:
+    """Unchanged content, epoch and signer."""
+    try:
+        found = security.decode(octets)
+    except BadData:
+        return False
+    ca = station.ca_of(keys.uuid)
+    return (
+        found.signed
+        and (found.node_key, found.node_key_signature) == (keys.key, keys.signature)
+        and (found.station_key, found.station_key_signature) == (station.point, station.signature_under(ca))
+        and found.ca == security.ca_hint(station.name, fingerprint(ca))
+        and found.key_epoch == epoch
+        and found.signed_blocks == digests(image.blocks)
+        and signature_good(found, octets, keys.uuid)
+    )
+
+
+def _now() -> bytes:
+    """TimeInstance of now: u32 s, u32 ns, UTC."""
+    seconds, nanoseconds = divmod(time.time_ns(), 1_000_000_000)
+    return seconds.to_bytes(4, "big") + nanoseconds.to_bytes(4, "big")

@@ -1,0 +1,95 @@
+"""The ``sign`` command's work: which image, against what the node has, guarded, with the changes in physical terms."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from teds_provision.errors import NotFound
+from teds_provision.station.station import Station
+from teds_provision.steps.agree import require_session
+from teds_provision.steps.build import guard
+from teds_provision.steps.read import survey
+from teds_provision.steps.sign import Signed, known_image, known_node_keys, sign
+from teds_provision.store import Draft
+from teds_provision.talk.conversation import Conversation
+from teds_provision.teds.image import SECURITY, Image
+
+
+@dataclass(frozen=True)
+class SignOrder:
+    """What to sign: ``image`` (None: the draft of ``uuid``); ``accept_calibration`` as at build; or only the plan."""
+
+    uuid: bytes
+    image: Image | None = None
+    accept_calibration: str | None = None
+    dry_run: bool = False
+
+
+@dataclass(frozen=True)
+class SignDone:
+    """The signed image (for a dry run: of the plan, unsigned), and what changes, a sentence each."""
+
+    signed: Signed
+    changes: tuple[str, ...]
+
+
+def sign_image(station: Station, order: SignOrder, node: Conversation | None) -> SignDone:
+    """Sign the draft or image of one node; with ``node`` against what it has, in a session, else as last known.
+
+    Raises NotFound (nothing built, key unknown), BadData, PolicyRefused (guard), NotWhitelisted.
+    """
+    from teds_provision.teds.diff.datasheets import diff_blocks
+
+    uuid = order.uuid
+    station.require_whitelisted(uuid)
+    draft = station.store.draft(uuid)
+    image = order.image or (Image.from_json(draft.image) if draft is not None else None)
+    if image is None:
+        raise NotFound(f"Nothing is built for node {uuid.hex()}.", hint=f"Build it: teds-provision build {uuid.hex()}")
+    record = station.store.node(uuid)
+    epoch = station.active_epoch(uuid) or (record.epoch if record else 0)
+    sequence = record.sequence if record else 0
+    has = known_image(station, uuid)
+    if node is not None:
+        if not order.dry_run:  # opening a session may settle or rotate keys
+            require_session(station, node)
+        found = survey(node)
+        has, epoch, sequence = found.image, found.identity.epoch, found.identity.sequence
+        keep = {block: has.blocks[block] for block in found.read_only if block not in image.blocks}
+        image = Image(uuid, {**image.blocks, **keep})
+    keys = known_node_keys(station, uuid, has or image)
+    guard(station, image, has, order.accept_calibration, record=not order.dry_run)
+    changes = diff_blocks(has.unsigned_blocks() if has else {}, image.unsigned_blocks())
+    told = tuple(change.text for change in changes)
+    if order.dry_run:
+        return SignDone(Signed(image, sequence, reused=False), told)
+    # a node whose TEDS are not what it was signed for takes them only under a newer sequence
+    intact = node is None or has is None or has.unsigned_blocks() == image.unsigned_blocks()
+    signed = sign(
+        station,
+        keys,
+        image,
+        epoch=epoch,
+        node_sequence=sequence if node is not None else _sequence_of(has),
+        on_node=has.security if has is not None and intact else None,
+        earlier=_signed_before(image, draft),
+    )
+    if draft is not None and (
+        order.image is None or Image.from_json(draft.image).unsigned_blocks() == image.unsigned_blocks()
+    ):
+        station.store.put_draft(Draft(uuid, signed.image.to_json(), "signed", draft.profile))
+    return SignDone(signed, told)
+
+
+def _sequence_of(has: Image | None) -> int:
+    """Sequence of the datasheet that the node was last read to have."""
+    from teds_provision.teds.codec import security
+
+    octets = has.blocks.get(SECURITY) if has is not None else None
+    return security.decode(octets).sequence if octets is not None else 0
+
+
+def _signed_before(image: Image, draft: Draft | None) -> list[bytes]:
+    """Security TEDS of the image at hand and of the draft: either may hold the signature that still says the same."""
+    images = [image] if draft is None else [image, Image.from_json(draft.image)]
+    return [found.blocks[SECURITY] for found in images if SECURITY in found.blocks]

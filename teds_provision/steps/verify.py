@@ -1,0 +1,181 @@
+"""Step 7: everything that the profile demands of a datasheet, check by check (profile section 1)."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Literal
+
+from teds_provision.errors import TedsProvisionError
+from teds_provision.protocol import datasheet
+from teds_provision.protocol.keys import fingerprint, is_point, node_key_message, verify
+from teds_provision.protocol.messages.identity import Identity
+from teds_provision.station.station import Station
+from teds_provision.teds.codec import security
+from teds_provision.teds.codec.security import NotCanonical, SecurityTeds
+from teds_provision.teds.image import SECURITY, Image
+
+Outcome = Literal["passed", "failed", "skipped"]
+Verdict = Literal["authentic", "unsigned", "not authentic"]
+_MERELY_UNSIGNED = {"signed", "every TEDS is signed"}
+
+
+@dataclass(frozen=True)
+class Check:
+    """One check of the datasheet; ``why`` says what was found."""
+
+    name: str
+    result: Outcome
+    why: str = ""
+
+
+@dataclass(frozen=True)
+class Verified:
+    """All checks and the one verdict: ``unsigned`` where nothing is wrong but that nobody signed (all of) it."""
+
+    uuid: bytes
+    checks: tuple[Check, ...]
+
+    @property
+    def verdict(self) -> Verdict:
+        """One word for all checks."""
+        failed = {check.name for check in self.checks if check.result == "failed"}
+        if failed - _MERELY_UNSIGNED:
+            return "not authentic"
+        return "unsigned" if failed else "authentic"
+
+
+def verify_image(station: Station, image: Image, *, identity: Identity | None = None) -> list[Check]:
+    """Check an image as far as octets and this station's trust go; ``identity`` is the node's, read in a session.
+
+    Never raises on any octets.
+    """
+    checks = [_form(image)]
+    octets = image.security
+    if octets is None:
+        return [*checks, Check("signed", "failed", "the image holds no Security TEDS")]
+    if not security.has_profile_version(octets):
+        why = "the Security TEDS is not of this profile: shown, never trusted"
+        return [*checks, Check("canonical form", "failed", why)]
+    try:
+        shown = security.decode(octets)
+    except NotCanonical as error:
+        return [*checks, Check("canonical form", "failed", error.message)]
+    checks += [Check("canonical form", "passed"), _algorithms(shown), _node_key(station, image.uuid, shown)]
+    if identity is not None:
+        checks += [_epoch(shown, identity), _sequence(shown, identity)]
+    checks.append(_not_revoked(station, image.uuid))
+    if not shown.signed:
+        return [*checks, Check("signed", "failed", "this is the initial Security TEDS: nobody has signed it yet")]
+    checks += [
+        Check("signed", "passed"),
+        _station(station, image.uuid, shown),
+        _certificate(station, image.uuid, shown),
+        _signature(image, octets, shown),
+        _blocks(image, shown),
+        _unlisted(image, shown),
+        _meta(image),
+    ]
+    return checks
+
+
+def possession(prove: Callable[[], None]) -> Check:
+    """Run the challenge and tell it as a check; a link that fails is raised, not judged."""
+    from teds_provision.errors import NotAuthentic
+
+    try:
+        prove()
+    except NotAuthentic as error:
+        return Check("possession", "failed", error.message)
+    return Check("possession", "passed", "the node signed a fresh challenge")
+
+
+def _check(name: str, holds: bool, why: str, good: str = "") -> Check:
+    return Check(name, "passed", good) if holds else Check(name, "failed", why)
+
+
+def _form(image: Image) -> Check:
+    bad = [block for block in image if not datasheet.passes_own_check(block, image.blocks[block])]
+    why = ", ".join(f"TEDS {code} of channel {channel}" for channel, code in bad)
+    return _check("form", not bad, f"Length, checksum or class is wrong: {why}", f"{len(image.blocks)} TEDS")
+
+
+def _algorithms(shown: SecurityTeds) -> Check:
+    wrong = [number for number, value in security.OUR_VALUES.items() if shown.values[number] != value]
+    why = "weak or unknown choice in field " + ", ".join(map(str, wrong))
+    return _check("algorithms", not wrong, why, "ECDSA P-256, SHA-256, AES-128")
+
+
+def _node_key(station: Station, uuid: bytes, shown: SecurityTeds) -> Check:
+    name = "node key"
+    signed = is_point(shown.node_key) and verify(
+        shown.node_key, node_key_message(uuid, shown.node_key), shown.node_key_signature
+    )
+    if not signed:
+        return Check(name, "failed", "field 102 does not sign this key for this UUID")
+    try:
+        station.check_pin(uuid, shown.node_key)
+    except TedsProvisionError as error:
+        return Check(name, "failed", error.message)
+    entry = station.store.whitelisted(uuid)
+    pinned = "pinned" if entry is not None and entry.fingerprint else "not pinned here"
+    return Check(name, "passed", f"{fingerprint(shown.node_key)[:16]}, {pinned}")
+
+
+def _epoch(shown: SecurityTeds, identity: Identity) -> Check:
+    why = f"signed for epoch {shown.key_epoch}, the node is at {identity.epoch}"
+    return _check("key epoch", shown.key_epoch <= identity.epoch, why, str(shown.key_epoch))
+
+
+def _sequence(shown: SecurityTeds, identity: Identity) -> Check:
+    why = f"sequence {shown.sequence} is older than the node's own {identity.sequence}: an old datasheet was put back"
+    return _check("sequence", shown.sequence >= identity.sequence, why, str(shown.sequence))
+
+
+def _not_revoked(station: Station, uuid: bytes) -> Check:
+    revoked = station.store.revocation(uuid)
+    return _check("not revoked", revoked is None, f"revoked: {revoked.why}" if revoked else "")
+
+
+def _station(station: Station, uuid: bytes, shown: SecurityTeds) -> Check:
+    key = shown.station_key or b""
+    certified = any(datasheet.station_signature_good(shown, ca) for ca in station.trusted_cas(uuid))
+    return _check(
+        "signing station",
+        key in station.trusted_stations() or certified,
+        f"station {fingerprint(key)[:16]} is not trusted here, nor certified by a trusted CA",
+        fingerprint(key)[:16],
+    )
+
+
+def _certificate(station: Station, uuid: bytes, shown: SecurityTeds) -> Check:
+    name = "station certificate"
+    for ca in station.trusted_cas(uuid):
+        if datasheet.station_signature_good(shown, ca):
+            return Check(name, "passed", f"CA {fingerprint(ca)[:16]}")
+    if shown.station_key == station.point or shown.station_key not in station.trusted_stations():
+        return Check(name, "failed", "field 104 does not verify under any trusted CA")
+    return Check(name, "skipped", "the station is trusted itself; its CA is not known here")
+
+
+def _signature(image: Image, octets: bytes, shown: SecurityTeds) -> Check:
+    why = "field 100 does not verify: the datasheet was changed, or is another node's"
+    return _check("signature", datasheet.signature_good(shown, octets, image.uuid), why)
+
+
+def _blocks(image: Image, shown: SecurityTeds) -> Check:
+    found = datasheet.digests(image.blocks)
+    wrong = [block for block, digest in shown.signed_blocks.items() if found.get(block) != digest]
+    why = ", ".join(f"TEDS {code} of channel {channel} is absent or changed" for channel, code in wrong)
+    return _check("signed TEDS", not wrong, why, f"{len(shown.signed_blocks)} digests")
+
+
+def _unlisted(image: Image, shown: SecurityTeds) -> Check:
+    extra = [block for block in image if block != SECURITY and block not in shown.signed_blocks]
+    why = ", ".join(f"TEDS {code} of channel {channel} is unsigned" for channel, code in extra)
+    return _check("every TEDS is signed", not extra, why)
+
+
+def _meta(image: Image) -> Check:
+    metas = [teds for (_, code), teds in image.blocks.items() if code == datasheet.META]
+    return _check("UUID", all(datasheet.meta_names(teds, image.uuid) for teds in metas), "the Meta-TEDS names another")

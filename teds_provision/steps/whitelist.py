@@ -1,0 +1,176 @@
+"""The whitelist: which nodes may be keyed and written, each by UUID and by the fingerprint of its key.
+
+A pinned key is never replaced by a command that adds; the entry has to be removed first (profile: security-teds.md
+section 2).
+"""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+from xml.sax.saxutils import quoteattr
+
+from teds_provision.errors import OtherKey, PolicyRefused, UsageFailure
+from teds_provision.protocol.keys import fingerprint
+from teds_provision.station.boards import let_go
+from teds_provision.station.station import Station
+from teds_provision.steps.whitelist_files import FIELDS, FORMATS, Listed
+from teds_provision.store import WhitelistEntry
+
+_SHOWN = 5
+
+
+@dataclass(frozen=True)
+class Plan:
+    """What adding some entries would do: the ones to write, how many of them are new, and how many stay."""
+
+    write: tuple[WhitelistEntry, ...]
+    new: int
+    unchanged: int
+
+
+def plan_addition(station: Station, listed: Sequence[Listed]) -> Plan:
+    """Hold entries against what is known; changes nothing.
+
+    Raises OtherKey where a UUID is pinned to another key, PolicyRefused for a revoked node: then none may be added.
+    """
+    pinned = {record.uuid: fingerprint(record.point) for record in station.store.nodes() if record.point is not None}
+    present = {entry.uuid: entry for entry in station.store.whitelist()}
+    revoked = {revocation.uuid: revocation.why for revocation in station.store.revocations()}
+    _refuse_revoked([entry.uuid for entry in listed if entry.uuid in revoked], revoked)
+    write: list[WhitelistEntry] = []
+    conflicts: list[tuple[Listed, str]] = []
+    for entry in listed:
+        known = present.get(entry.uuid)
+        pin = (known.fingerprint if known else None) or pinned.get(entry.uuid)
+        if entry.fingerprint is not None and pin not in (None, entry.fingerprint):
+            conflicts.append((entry, str(pin)))
+            continue
+        wanted = _merged(known, entry)
+        if wanted != known:
+            write.append(wanted)
+    _refuse_conflicts(conflicts)
+    new = sum(entry.uuid not in present for entry in write)
+    return Plan(tuple(write), new, len(listed) - len(write))
+
+
+def _merged(known: WhitelistEntry | None, entry: Listed) -> WhitelistEntry:
+    if known is None:
+        assurance = "uuid" if entry.fingerprint is None else "import"
+        return WhitelistEntry(entry.uuid, entry.fingerprint, assurance=assurance, name=entry.name)  # type: ignore[arg-type]
+    gains = known.fingerprint is None and entry.fingerprint is not None
+    return replace(
+        known,
+        fingerprint=known.fingerprint or entry.fingerprint,
+        assurance="import" if gains and known.assurance == "uuid" else known.assurance,
+        name=known.name or entry.name,
+    )
+
+
+def _refuse_revoked(uuids: list[bytes], why: dict[bytes, str]) -> None:
+    if uuids:
+        shown = ", ".join(f"{uuid.hex()} ({why[uuid]})" for uuid in uuids[:_SHOWN])
+        raise PolicyRefused(f"Revoked nodes are not whitelisted: {shown}{_more(uuids)}.", hint="Nothing was added.")
+
+
+def _refuse_conflicts(conflicts: list[tuple[Listed, str]]) -> None:
+    if conflicts:
+        shown = "; ".join(
+            f"{entry.uuid.hex()} is pinned to the key {pin[:16]}, not {str(entry.fingerprint)[:16]}"
+            for entry, pin in conflicts[:_SHOWN]
+        )
+        first = conflicts[0][0].uuid.hex()
+        raise OtherKey(
+            f"{shown}{_more(conflicts)}.",
+            hint=f"Nothing was added. If a board was really replaced: teds-provision whitelist remove {first}",
+        )
+
+
+def _more(items: Sequence[object]) -> str:
+    return f" and {len(items) - _SHOWN} more" if len(items) > _SHOWN else ""
+
+
+def add(station: Station, plan: Plan, *, source: str | None = None) -> None:
+    """Carry out a plan in one transaction, with one entry of the audit log; ``source`` is the file it came from."""
+    if not plan.write:
+        return
+    with station.store.transaction():
+        for entry in plan.write:
+            station.store.put_whitelist(entry)
+        if source is None:
+            (entry,) = plan.write
+            station.audit("whitelist", entry.uuid, "added", fingerprint=entry.fingerprint, assurance=entry.assurance)
+        else:
+            station.audit("whitelist", None, "imported", file=source, entries=len(plan.write), new=plan.new)
+
+
+def remove(station: Station, uuid: bytes) -> bool:
+    """Take a node off the whitelist and forget its pinned key; False where there was neither.
+
+    Epoch, sequence and link keys stay: they still count when the node comes back. A replaced board under the same UUID
+    can be pinned anew from here on.
+    """
+    with station.store.transaction():
+        let_go(station, uuid)
+        removed = station.store.remove_whitelist(uuid)
+        pinned = is_pinned(station, uuid)
+        station.store.unpin_node(uuid)
+        if removed or pinned:
+            station.audit("whitelist", uuid, "removed" if removed else "unpinned")
+    return removed or pinned
+
+
+def is_pinned(station: Station, uuid: bytes) -> bool:
+    """Whether the key of this UUID is known from a contact, be it whitelisted or not."""
+    node = station.store.node(uuid)
+    return node is not None and node.point is not None
+
+
+def as_dict(entry: WhitelistEntry) -> dict[str, Any]:
+    """One entry as the command-line contract shows it."""
+    return {
+        "uuid": entry.uuid.hex(),
+        "fingerprint": entry.fingerprint,
+        "added": entry.added,
+        "assurance": entry.assurance,
+        "name": entry.name,
+    }
+
+
+def form_of(path: Path, form: str | None) -> str:
+    """Format to write: ``form``, else by extension, else XML; raises UsageFailure for an extension that is none."""
+    suffix = path.suffix.lower().removeprefix(".")
+    if form is not None or suffix in FORMATS:
+        return form or suffix
+    if suffix:
+        raise UsageFailure(f"{path.name} does not say which format is meant.", hint="Add --format xml, csv or json.")
+    return "xml"
+
+
+def render(entries: Iterable[WhitelistEntry], form: str) -> str:
+    """The whitelist as text, by UUID: XML of the NCAP with our attributes, CSV with a header, or JSON."""
+    rows = [as_dict(entry) for entry in sorted(entries, key=lambda entry: entry.uuid)]
+    if form == "json":
+        return json.dumps({"whitelist": rows}, indent=1, ensure_ascii=False) + "\n"
+    if form == "csv":
+        out = io.StringIO(newline="")
+        writer = csv.DictWriter(out, FIELDS, lineterminator="\n")
+        writer.writeheader()
+        writer.writerows(rows)
+        return out.getvalue()
+    lines = ['<?xml version="1.0" encoding="UTF-8"?>', "<whitelist>"]
+    for row in rows:
+        attributes = {**row, "uuid": f"0x{row['uuid']}"}
+        shown = " ".join(f"{key}={quoteattr(_legal(value))}" for key, value in attributes.items() if value is not None)
+        lines.append(f"  <transducer {shown}/>")
+    return "\n".join([*lines, "</whitelist>", ""])
+
+
+def _legal(text: str) -> str:
+    """What XML 1.0 can hold; a name that a node or an older version brought may have control characters."""
+    return "".join(character if character.isprintable() else "\ufffd" for character in text)

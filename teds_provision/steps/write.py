@@ -1,0 +1,123 @@
+"""Step 6: stage every TEDS, commit, read back, compare (profile section 5)."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+
+from teds_provision.errors import BadData, NodeRefused, NotAuthentic, PolicyRefused
+from teds_provision.protocol.datasheet import SEQUENCE_WINDOW
+from teds_provision.protocol.messages.frames import Reason, update_teds, write_teds
+from teds_provision.station.station import Station
+from teds_provision.steps.journal import recorded
+from teds_provision.steps.read import read_block, read_identity, read_image
+from teds_provision.steps.sign import known_image, node_keys_of, sign
+from teds_provision.talk.conversation import Conversation, SessionLost
+from teds_provision.teds.codec import security
+from teds_provision.teds.image import SECURITY, BlockId, Image
+
+WRITE_OVERHEAD = 53
+_STARTS = 3
+
+Progress = Callable[[int, int], None]
+"""``progress(octets written, octets to write)``."""
+
+
+@dataclass(frozen=True)
+class Written:
+    """What a write did: octets staged (0 where the node had it all), seconds, and what was read back."""
+
+    octets: int
+    seconds: float
+    on_node: Image
+
+
+@recorded("write")
+def write(
+    station: Station, node: Conversation, image: Image, *, has: Image | None = None, progress: Progress | None = None
+) -> Written:
+    """Bring a signed image onto the node, inside the open session, and prove by reading that it is there.
+
+    ``has`` is what the node was read to hold in this session: blocks that are the same are not sent again. Raises
+    NodeRefused with the node's reason, PolicyRefused where the image is older than what the node has, NotAuthentic
+    where the read-back differs.
+    """
+    started = time.monotonic()
+    signed = security.decode(image.blocks[SECURITY])
+    if not signed.signed:
+        raise BadData("The image is not signed.", hint="Sign it first: teds-provision sign UUID")
+    if read_block(node, SECURITY) == image.security:
+        present = has or read_image(node)
+        if all(present.blocks.get(block) == image.blocks[block] for block in image):
+            return Written(0, time.monotonic() - started, present)
+    identity = read_identity(node)
+    if signed.sequence <= identity.sequence:
+        raise PolicyRefused(
+            f"The image has sequence {signed.sequence}; the node is at {identity.sequence} already.",
+            hint="Sign again against the node: teds-provision sign UUID --read-node",
+        )
+    if signed.key_epoch != identity.epoch:
+        raise PolicyRefused(
+            f"The image was signed for key epoch {signed.key_epoch}; the node is at {identity.epoch}.",
+            hint="Sign again for this key: teds-provision sign UUID --read-node",
+        )
+    octets = 0
+    for step in range(identity.sequence + SEQUENCE_WINDOW, signed.sequence, SEQUENCE_WINDOW):
+        keys = node_keys_of(image.uuid, image.blocks[SECURITY])
+        between = sign(station, keys, image, epoch=identity.epoch, node_sequence=0, sequence=step).image
+        octets += _commit(station, node, between, has, progress)
+        has = between
+    octets += _commit(station, node, image, has, progress)
+    back = read_image(node)
+    station.store.put_node_image(image.uuid, back.to_json())
+    differing = [block for block in image if back.blocks.get(block) != image.blocks[block]]
+    if differing:
+        channel, access_code = differing[0]
+        station.audit("write", image.uuid, "read-back differs", block=[channel, access_code])
+        raise NotAuthentic(
+            f"The node gives back another TEDS {access_code} of channel {channel} than was written.",
+            hint="Try again; if it stays, the board's flash is broken.",
+        )
+    seconds = time.monotonic() - started
+    station.audit("write", image.uuid, "done", octets=octets, sequence=signed.sequence)
+    return Written(octets, seconds, back)
+
+
+def _commit(station: Station, node: Conversation, image: Image, has: Image | None, progress: Progress | None) -> int:
+    """Stage what is not there yet and commit; starts over where the session (and the staging with it) is lost."""
+    has = has or known_image(station, image.uuid)
+    skip = {block for block in image if has is not None and has.blocks.get(block) == image.blocks[block]}
+    for attempt in range(_STARTS):
+        try:
+            octets = _stage(node, image, skip - {SECURITY}, progress)
+            node.send(update_teds(*SECURITY), "the commit")
+            return octets
+        except NodeRefused as refusal:
+            if refusal.reason != Reason.DIGEST_MISMATCH or not skip - {SECURITY} or attempt == _STARTS - 1:
+                raise
+            skip = set()  # the node does not hold what it was last read to hold: send everything
+        except SessionLost as lost:
+            if attempt == _STARTS - 1:
+                raise lost.cause from lost
+            node.reopen()
+            if read_block(node, SECURITY) == image.security:  # the commit happened, its reply was lost
+                return 0
+    raise AssertionError("every attempt returns or raises")
+
+
+def _stage(node: Conversation, image: Image, skip: set[BlockId], progress: Progress | None) -> int:
+    """Write every block but those of ``skip`` into the node's staging; returns the octets written."""
+    segment = node.identity.max_message - WRITE_OVERHEAD
+    blocks = [block for block in image if block not in skip]
+    total = sum(len(image.blocks[block]) for block in blocks)
+    done = 0
+    for channel, access_code in blocks:
+        teds = image.blocks[channel, access_code]
+        for offset in range(0, len(teds), segment):
+            part = teds[offset : offset + segment]
+            node.send(write_teds(channel, access_code, offset, part), f"TEDS {access_code} of channel {channel}")
+            done += len(part)
+            if progress is not None:
+                progress(done, total)
+    return done

@@ -1,0 +1,1 @@
+"""One node, plain or sealed: conversation, sessions, meeting, watching."""

@@ -1,0 +1,184 @@
+"""Talking to one node: plain or sealed commands over whichever link, and what refusals mean for a person."""
+
+from __future__ import annotations
+
+import logging
+import time
+from types import TracebackType
+
+from teds_provision.errors import LinkFailure, NodeRefused, NotAuthentic, TedsProvisionError
+from teds_provision.links import Contact, Notice
+from teds_provision.links.ports import NoticeSink
+from teds_provision.protocol.messages.frames import Command, Function, Reason, Reply, decode_reply, security_command
+from teds_provision.protocol.session import StationSession
+
+_log = logging.getLogger(__name__)
+_BUSY_PAUSE = 0.25
+_BUSY_SECONDS = 10.0
+_REOPENINGS = 2
+
+_MEANING = {
+    Reason.UNKNOWN_COMMAND: "it does not know the command",
+    Reason.WRONG_STATE: "its state does not allow that now",
+    Reason.NOT_PERMITTED: "that is not permitted here (a tap or a session is needed)",
+    Reason.BAD_FORM: "length, checksum or form is wrong",
+    Reason.BAD_SIGNATURE: "a signature does not verify",
+    Reason.DIGEST_MISMATCH: "a TEDS does not match its signed digest",
+    Reason.STALE_SEQUENCE: "the datasheet's sequence is not newer than its own, or too far ahead",
+    Reason.WRONG_EPOCH: "the datasheet was signed for another key epoch",
+    Reason.WRONG_UUID: "the Meta-TEDS names another UUID",
+    Reason.TOO_LARGE: "the TEDS is too large for it",
+    Reason.FLASH_FAILURE: "its flash failed",
+    Reason.BAD_TAG: "a tag is wrong",
+    Reason.REPLAY: "a counter was used before",
+    Reason.UNTRUSTED_STATION: "it belongs to another owner's CA",
+    Reason.BAD_POINT: "a public key is not a valid point",
+    Reason.UNKNOWN_KEY: "it does not know this station's key",
+    Reason.BUSY: "it is busy with another station",
+    Reason.NO_SUCH_TEDS: "it has no such TEDS",
+}
+_CURE = {
+    Reason.UNTRUSTED_STATION: "Have this station signed by that CA, or reset the node by hand (button held 5 s).",
+    Reason.NOT_PERMITTED: "Tap the node on the NFC reader (--via nfc), or reset it by hand.",
+    Reason.UNKNOWN_KEY: "Another station may have rotated the key. To take the node back: tap it, agree UUID --rotate.",
+    Reason.STALE_SEQUENCE: "Sign again against the node: sign UUID --read-node.",
+    Reason.WRONG_EPOCH: "Sign again after the key agreement: sign UUID --read-node.",
+    Reason.TOO_LARGE: "Use a smaller calibration table, or a node with more flash.",
+    Reason.FLASH_FAILURE: "Try again; if it stays, the board is broken.",
+}
+
+
+def refused(reason: int | None, doing: str) -> NodeRefused:
+    """The error for a node's refusal while ``doing`` something; unauthenticated refusals are hints, nothing more."""
+    try:
+        known = Reason(reason if reason is not None else 0)
+    except ValueError:
+        return NodeRefused(f"The node refused {doing} without a known reason ({reason}).", reason=reason or 0)
+    return NodeRefused(
+        f"The node refused {doing}: {_MEANING[known]} (reason {int(known)}).",
+        reason=int(known),
+        hint=_CURE.get(known, ""),
+    )
+
+
+class SessionLost(Exception):
+    """The session is gone at the node; ``cause`` is what to tell when opening a new one does not help."""
+
+    def __init__(self, cause: TedsProvisionError) -> None:
+        super().__init__(cause.message)
+        self.cause = cause
+
+
+class Conversation:
+    """One node on one link. Commands go plain until :meth:`open` succeeded, sealed from then on."""
+
+    def __init__(self, contact: Contact, *, notice: NoticeSink) -> None:
+        self.contact = contact
+        self.identity = contact.identity
+        self.uuid = contact.identity.uuid
+        self._notice = notice
+        self._key: bytes | None = None
+        self._session: StationSession | None = None
+
+    def __enter__(self) -> Conversation:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        if kind is None:
+            self.leave()
+        self.contact.link.close()
+
+    @property
+    def tapped(self) -> bool:
+        """Whether commands of this conversation arrive over NFC."""
+        return self.contact.link.via == "nfc"
+
+    @property
+    def sealed(self) -> bool:
+        """Whether a session is open."""
+        return self._session is not None
+
+    # -- sessions --------------------------------------------------------------------------------------------------
+
+    def open(self, key: bytes) -> None:
+        """Open a session under a link key; raises NodeRefused (16: unknown key) or NotAuthentic (wrong node tag)."""
+        session = StationSession(key, self.uuid)
+        session.accept(self.plain(session.open(), "to open a session"))
+        self._session, self._key = session, key
+
+    def reopen(self) -> None:
+        """Open a new session under the same key, after the old one was lost."""
+        assert self._key is not None, "reopen() before open()"
+        self._session = None
+        self.open(self._key)
+
+    def forget(self) -> None:
+        """The node ended the session (Confirm, Reset): go on plain."""
+        self._session = self._key = None
+
+    def leave(self) -> None:
+        """Close the session politely; a node that does not answer any more is left as it is."""
+        if self._session is None:
+            return
+        try:
+            self.send(security_command(Function.CLOSE), "to close the session")
+        except (LinkFailure, SessionLost, NodeRefused):
+            pass
+        finally:
+            self.forget()
+
+    # -- commands --------------------------------------------------------------------------------------------------
+
+    def plain(self, command: Command, doing: str) -> bytes:
+        """Send a plain command and return its payload; raises NodeRefused, LinkFailure."""
+        reply = self._exchange(command)
+        if not reply.ok:
+            raise refused(reply.reason, doing)
+        return reply.payload
+
+    def send(self, command: Command, doing: str) -> bytes:
+        """Send sealed where a session is open, else plain. Raises SessionLost where the session is gone."""
+        session = self._session
+        if session is None:
+            return self.plain(command, doing)
+        outer = self._exchange(session.seal(command))
+        if not outer.ok:
+            raise SessionLost(refused(outer.reason, doing))
+        try:
+            inner = session.unseal(outer.payload)
+        except TedsProvisionError as error:
+            raise SessionLost(error) from error
+        if not inner.ok:
+            raise refused(inner.reason, doing)
+        return inner.payload
+
+    def ask(self, command: Command, doing: str) -> bytes:
+        """Send a command that may be repeated without harm, over a new session where the old one was lost."""
+        for _ in range(_REOPENINGS):
+            try:
+                return self.send(command, doing)
+            except SessionLost:
+                self.reopen()
+        try:
+            return self.send(command, doing)
+        except SessionLost as lost:
+            raise lost.cause from lost
+
+    def _exchange(self, command: Command) -> Reply:
+        until = time.monotonic() + _BUSY_SECONDS
+        while True:
+            frame = command.encode()
+            raw = self.contact.link.exchange(frame)
+            _log.debug("%d.%d: %d octets out, %d back", command.command_class, command.function, len(frame), len(raw))
+            reply = decode_reply(raw)
+            if reply.ok or reply.reason != Reason.BUSY or time.monotonic() >= until:
+                return reply
+            self._notice(Notice("retry", "The node is busy with another station", until - time.monotonic()))
+            time.sleep(_BUSY_PAUSE)
+
+
+def wrong_reply(what: str) -> NotAuthentic:
+    """The error for a sealed or signed answer that does not say what it must."""
+    return NotAuthentic(f"The node's answer to {what} is wrong.")

@@ -1,0 +1,78 @@
+"""Meeting a node: open the port that the user chose, wait for the node, talk, and leave everything closed."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
+
+from teds_provision.errors import UsageFailure
+from teds_provision.links import Contact, LinkSettings, open_port
+from teds_provision.protocol.messages.identity import Identity, NodeState
+from teds_provision.station.station import Station
+from teds_provision.talk.conversation import Conversation
+from teds_provision.talk.progress import Reporter
+
+_SHOWN = 5
+
+
+@contextmanager
+def meet(
+    station: Station,
+    links: LinkSettings,
+    uuid: bytes | None,
+    reporter: Reporter,
+    *,
+    before: Callable[[], object] = lambda: None,
+) -> Iterator[Conversation]:
+    """Wait for node ``uuid`` (None: any node) on the chosen link and give a conversation with it.
+
+    Of several nodes on a bus that is the one which is not finished yet. ``before`` is called when the link is open and
+    nothing is waited for yet: the time to ask for a passphrase. Raises NoReader, NoNode after
+    ``links.timeout`` seconds, AddressConflict, UsageFailure where several could be meant.
+    """
+
+    def wanted(identity: Identity) -> bool:
+        return uuid is None or identity.uuid == uuid
+
+    known = station.store.node(uuid) if uuid is not None else None
+    address = known.can_address if known is not None and known.can_address else None
+    port = open_port(links)
+    try:
+        before()
+        if uuid is None:
+            contact = _the_one(station, port.everyone(seconds=links.timeout, notice=reporter.notice))
+        else:
+            contact = port.find(wanted, seconds=links.timeout, notice=reporter.notice, address=address)
+        with Conversation(contact, notice=reporter.notice) as node:
+            yield node
+    finally:
+        port.close()
+
+
+@contextmanager
+def meet_everyone(links: LinkSettings, reporter: Reporter) -> Iterator[list[Conversation]]:
+    """Wait for any node and give a conversation with each that is there: the tapped one, or all on the bus."""
+    port = open_port(links)
+    try:
+        contacts = port.everyone(seconds=links.timeout, notice=reporter.notice)
+        with ExitStack() as stack:
+            yield [stack.enter_context(Conversation(contact, notice=reporter.notice)) for contact in contacts]
+    finally:
+        port.close()
+
+
+def _the_one(station: Station, contacts: list[Contact]) -> Contact:
+    """The only node, or the only one that is not provisioned and verified yet."""
+    unfinished = [contact for contact in contacts if not _finished(station, contact.identity)]
+    for choice in (contacts, unfinished):
+        if len(choice) == 1:
+            return choice[0]
+    listed = ", ".join(f"{c.identity.uuid.hex()} at 0x{c.address or 0:02x}" for c in (unfinished or contacts)[:_SHOWN])
+    raise UsageFailure(
+        f"{len(contacts)} nodes answer on the bus: {listed}.", hint="Name one by its UUID, or by node=ADDRESS in --can."
+    )
+
+
+def _finished(station: Station, identity: Identity) -> bool:
+    known = station.store.node(identity.uuid)
+    return identity.state == NodeState.PROVISIONED and known is not None and known.verdict == "authentic"

@@ -1,0 +1,196 @@
+"""What is wrong with values that are well formed: enumerations, limits, swapped octets, weak algorithms."""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Callable, Iterable
+from math import isinf, isnan
+from typing import Final
+
+from teds_provision.teds.codec.model import Field, TimeInstance, Units
+from teds_provision.teds.codec.tables import FieldSpec, Table
+
+Find = Callable[..., None]
+
+PROFILE_VERSION: Final = 105
+_CHANNEL, _CALIBRATION, _NAME, _SECURITY_2024, _SECURITY = 3, 5, 12, 16, 128
+# Octets that one sample of these data models must have; the other models take any number in their range.
+_MODEL_OCTETS: Final = {1: (4, 4), 2: (8, 8), 0: (0, 8), 7: (8, 8), 5: (9, 255), 6: (9, 255)}
+_TINY, _HUGE, _PLAUSIBLE = 1e-30, 1e300, (1e-9, 1e12)
+
+
+def check(table: Table, fields: tuple[Field, ...], find: Find, octets: bytes, framed: bool) -> None:
+    """Look at the values of a decoded TEDS and report through ``find``."""
+    _values(fields, table.by_type.get, table, find)
+    code = table.access_code
+    if code in (_CHANNEL, _CALIBRATION):
+        _limits(fields, find)
+    if code == _CHANNEL:
+        _sample(fields, find)
+    elif code == _SECURITY:
+        _security(fields, find, octets, framed)
+    elif code == _SECURITY_2024:
+        _level(fields, find)
+    if not table.verified:
+        find("note", "unverified", f"The field numbers of {table.name} are not checked against the standard.", None)
+
+
+def _values(fields: Iterable[Field], spec_of: Callable[[int], FieldSpec | None], table: Table, find: Find) -> None:
+    for field in fields:
+        value = field.value
+        if field.children:
+            spec = spec_of(field.type) or table.inner.get(field.type)
+            if spec is not None:
+                _values(field.children, spec.by_type.get, table, find)
+        elif value.__class__ is float:
+            if not _TINY <= abs(value) <= _HUGE:  # NaN, infinite, tiny, zero
+                _float(field, find)
+        elif value.__class__ is int:
+            spec = spec_of(field.type) or table.inner.get(field.type)
+            if spec is not None and spec.enumeration and (value not in spec.enumeration or spec.weak):
+                _enumeration(field, spec, find)
+        elif value.__class__ is Units:
+            _interpretation(field, find)
+        elif value.__class__ is TimeInstance:
+            _time(field, find)
+        elif value.__class__ is str or value.__class__ is bytes:
+            _text(field, spec_of(field.type), find)
+
+
+def _float(field: Field, find: Find) -> None:
+    value = field.value
+    if not isinstance(value, float) or value == 0:
+        return
+    if isnan(value):
+        find(
+            "warning",
+            "not-available",
+            f"{field.name} is not available (NaN).",
+            field.offset,
+            field.name,
+            "a number",
+            "NaN",
+        )
+    elif isinf(value):
+        find("warning", "infinite", f"{field.name} is infinite.", field.offset, field.name, "a number", value)
+    elif len(field.raw) == 4:
+        other = struct.unpack("<f", field.raw)[0]
+        if _PLAUSIBLE[0] < abs(other) < _PLAUSIBLE[1]:
+            message = f"{field.name} = {value:.5g} looks like swapped octets of {other:.5g}."
+            find("warning", "swapped", message, field.offset, field.name, f"{other:.5g}", f"{value:.5g}")
+
+
+def _enumeration(field: Field, spec: FieldSpec, find: Find) -> None:
+    if not isinstance(field.value, int):
+        return
+    if field.value in spec.weak:
+        name = spec.enumeration[field.value]
+        message = f"{field.name} is {name}, which is weak or protects nothing."
+        find("warning", "weak", message, field.offset, field.name, "", name)
+    elif field.value not in spec.enumeration:
+        severity = "error" if spec.enumeration_confidence == "H" and spec.name != "Format" else "warning"
+        known = ", ".join(map(str, spec.enumeration))
+        message = f"{field.name} is {field.value}; known are {known}."
+        find(severity, "enumeration", message, field.offset, field.name, known, field.value)
+
+
+def _interpretation(field: Field, find: Find) -> None:
+    units = field.value
+    if not isinstance(units, Units):
+        return
+    if units.interpretation > 5:
+        message = f"{field.name} has interpretation {units.interpretation}; 0 to 5 are known."
+        find("error", "enumeration", message, field.offset, field.name, "0 to 5", units.interpretation)
+    if units.interpretation in (4, 5) and units != Units(units.interpretation, extension=units.extension):
+        message = f"{field.name} is digital data or arbitrary and yet has exponents."
+        find("warning", "units", message, field.offset, field.name, "no exponents", "some")
+
+
+def _time(field: Field, find: Find) -> None:
+    if isinstance(field.value, TimeInstance) and field.value.nanoseconds > 999_999_999:
+        message = f"{field.name} has {field.value.nanoseconds} nanoseconds, a second or more."
+        find("warning", "time", message, field.offset, field.name, "<= 999999999", field.value.nanoseconds)
+
+
+def _text(field: Field, spec: FieldSpec | None, find: Find) -> None:
+    if spec is None or spec.kind != "text":
+        return
+    if isinstance(field.value, bytes):
+        find("warning", "text", f"{field.name} is not UTF-8.", field.offset, field.name, "UTF-8", field.raw[:16].hex())
+    elif field.raw[-1:] == b"\0":
+        find("warning", "text", f"{field.name} ends in NUL.", field.offset, field.name, "no NUL", "NUL")
+
+
+def _limits(fields: tuple[Field, ...], find: Find) -> None:
+    low = high = None
+    for field in fields:
+        if field.name == "LowLimit":
+            low = field
+        elif field.name == "HiLimit":
+            high = field
+        elif field.name == "OError" and isinstance(field.value, float) and field.value < 0:
+            find(
+                "warning",
+                "negative",
+                "The uncertainty OError is negative.",
+                field.offset,
+                "OError",
+                ">= 0",
+                field.value,
+            )
+    if low is None or high is None or not isinstance(low.value, float) or not isinstance(high.value, float):
+        return
+    if low.value > high.value:
+        message = f"LowLimit {low.value:g} lies above HiLimit {high.value:g}."
+        find("error", "limits", message, low.offset, "LowLimit", f"<= {high.value:g}", f"{low.value:g}")
+
+
+def _sample(fields: tuple[Field, ...], find: Find) -> None:
+    for field in fields:
+        if field.type == 31:
+            _sampling(field, find)
+        if field.type != 18:
+            continue
+        parts = {child.type: child.value for child in field.children}
+        model, octets, bits = parts.get(40), parts.get(41), parts.get(42)
+        low, high = _MODEL_OCTETS.get(model, (0, 255)) if isinstance(model, int) else (0, 255)
+        if isinstance(octets, int) and not low <= octets <= high:
+            message = f"Sample has {octets} octets; data model {model!r} takes {low} to {high}."
+            find("warning", "sample", message, field.offset, "ModLenth", f"{low} to {high}", octets)
+        elif isinstance(octets, int) and isinstance(bits, int) and model in (0, 3, 5, 6) and bits > 8 * octets:
+            message = f"Sample claims {bits} significant bits in {octets} octets."
+            find("warning", "sample", message, field.offset, "SigBits", f"<= {8 * octets}", bits)
+
+
+def _level(fields: tuple[Field, ...], find: Find) -> None:
+    from teds_provision.teds.codec.tables.other import LEVELS
+
+    for field in fields:
+        if field.name == "Level" and isinstance(field.value, str) and field.value not in LEVELS:
+            message = f"Level is {str(field.value)!r}; A to E and N are known."
+            find("warning", "enumeration", message, field.offset, "Level", "A to E, N", field.value)
+
+
+def _sampling(field: Field, find: Find) -> None:
+    """SDefault is one bit of the mask in some sources, the number 1 to 5 of a mode in others: either will do."""
+    parts = {child.type: child.value for child in field.children}
+    modes, default = parts.get(48), parts.get(49)
+    if not isinstance(modes, int) or not isinstance(default, int) or 1 <= default <= 5:
+        return
+    if default not in (8, 16) or not default & modes:
+        message = f"SDefault {default} is neither a mode from 1 to 5 nor one bit of SampMode {modes:#04x}."
+        find("warning", "sampling", message, field.offset, "SDefault", "1 to 5, or a bit of SampMode", default)
+
+
+def _security(fields: tuple[Field, ...], find: Find, octets: bytes, framed: bool) -> None:
+    """A Security TEDS with field 105 is canonical or in error; other people's are shown as they are."""
+    if not any(field.type == PROFILE_VERSION for field in fields):
+        find("note", "foreign", "This Security TEDS is not of our profile (no field 105).", None)
+        return
+    from teds_provision.teds.codec import security
+    from teds_provision.teds.codec.frame import frame
+
+    try:
+        security.decode(frame(octets[4:-2] if framed else octets))
+    except security.NotCanonical as error:
+        find("error", "not-canonical", error.message, None, "", "the canonical form", "")

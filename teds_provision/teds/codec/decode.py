@@ -1,0 +1,293 @@
+"""Octets -> values and findings; nothing that comes in can raise anything here (ieee-1451.0.md sections 1 to 6).
+
+Memory stays in proportion to the octets: a TEDS is refused beyond ``MAX_OCTETS``, a walk stops at ``MAX_TUPLES``, and
+structures nest only as deep as the field tables do (four levels).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Final
+
+from teds_provision.errors import BadData
+from teds_provision.teds.codec.frame import TEDSID
+from teds_provision.teds.codec.head import MAX_TUPLES, Head
+from teds_provision.teds.codec.model import Decoded, Field, Severity, Value, Verdict
+from teds_provision.teds.codec.shape import shape_of, verdict_of
+from teds_provision.teds.codec.tables import MANUFACTURER, TEXT_BASED, FieldSpec, Table, name_of
+from teds_provision.teds.codec.values import READERS, is_packed_units, units_of
+
+SECURITY: Final = 128
+END_USER: Final = 7
+SUB_SUM: Final = 12
+
+_new = Field.__new__
+
+
+def decode(octets: bytes, *, strict: bool = False) -> Decoded:
+    """Decode a framed TEDS or a bare data block, 2007 or 2024 edition (told by the length of the TEDSID).
+
+    Never raises, whatever the octets, unless ``strict``: then BadData with the first finding of severity error. A
+    message is recognised and not taken apart here. Offsets in findings and fields count from the first octet given.
+    """
+    octets = bytes(octets)
+    shape = shape_of(octets)
+    if shape == "message":
+        return Decoded(octets, False, None, None, "message", (), (), Verdict.MESSAGE)
+    walk = _Walk(octets, framed=shape == "framed")
+    decoded = walk.decode()
+    if strict:
+        for finding in decoded.findings:
+            if finding.severity == "error":
+                where = "" if finding.offset is None else f" (octet {finding.offset})"
+                raise BadData(f"{finding.message}{where}", hint=f"The verdict of this TEDS is {decoded.verdict}.")
+    return decoded
+
+
+def _field(kind: int, name: str, value: Value, raw: bytes, offset: int, children: tuple[Field, ...] = ()) -> Field:
+    # A frozen dataclass sets each attribute through object.__setattr__; filling the dictionary takes half the time.
+    made = _new(Field)
+    made.__dict__.update(type=kind, name=name, value=value, raw=raw, offset=offset, children=children)
+    return made
+
+
+class _Walk(Head):
+    """One decoding: what the head gave, then tuple for tuple."""
+
+    def decode(self) -> Decoded:
+        start, end = self.frame()
+        fields: tuple[Field, ...] = ()
+        if end > start:
+            self.tedsid(start, end)
+            fields = self.block(start, end)
+        if self.table is not None and fields:
+            from teds_provision.teds.codec.content import check
+
+            check(self.table, fields, self.find, self.octets, self.framed)
+        name = name_of(self.access_code) if self.access_code is not None else ""
+        findings = tuple(self.findings)
+        return Decoded(
+            self.octets,
+            self.framed,
+            self.edition,
+            self.access_code,
+            name,
+            fields,
+            findings,
+            verdict_of(self.framed, findings),
+            self.text,
+        )
+
+    def block(self, start: int, end: int) -> tuple[Field, ...]:
+        """Walk the data block; the first tuple of type 3 is the TEDSID."""
+        spec_of: Mapping[int, FieldSpec] = self.table.by_type if self.table is not None else {}
+        text_based = self.table is not None and self.table.access_code in TEXT_BASED
+        fields: list[Field] = []
+        seen: set[int] = set()
+        at, last, width, octets = start, 0, self.width, self.octets
+        tedsid_at = self.tedsid_at
+        while at < end:
+            kind = octets[at]
+            is_tedsid = at == tedsid_at
+            body = at + 2 if is_tedsid else at + 1 + width
+            size = octets[at + 1] if body == at + 2 and body <= end else int.from_bytes(octets[at + 1 : body], "big")
+            stop = body + size
+            if stop > end or self.left <= 0:
+                self.stopped(kind, at, body, size, end, fields)
+                break
+            self.left -= 1
+            raw = octets[body:stop]
+            if is_tedsid:
+                fields.append(_field(kind, "TEDSID", tuple(raw), raw, at))
+            else:
+                spec = spec_of.get(kind)
+                if kind <= last:
+                    self.order(kind, last, spec, at, seen)
+                last = kind
+                seen.add(kind)
+                if spec is None or spec.children or len(raw) not in spec.octets:
+                    fields.append(self.special(kind, spec, raw, at, body))
+                else:
+                    fields.append(_field(kind, spec.name, READERS[spec.kind](raw), raw, at))
+            at = stop
+            if text_based and kind == SUB_SUM:
+                self.text_area(fields, at, end)
+                break
+        if self.table is not None and not self.table.required <= seen:
+            self.missing(self.table, seen, start)
+        return tuple(fields)
+
+    def stopped(self, kind: int, at: int, body: int, size: int, end: int, fields: list[Field]) -> None:
+        """The walk cannot go on: a tuple runs past the end, or there are too many."""
+        if self.left <= 0:
+            self.find("error", "too-many", f"There are more than {MAX_TUPLES} tuples; the rest is not read.", at)
+        elif self.access_code == END_USER:
+            self.text = (self.octets[at:end],)
+            self.find("note", "free-form", "The end user's part is no run of tuples; it is kept as it stands.", at)
+        elif body > end:
+            self.find(
+                "error", "not-closed", f"The header of a tuple of type {kind} runs past the end.", at, "", "", kind
+            )
+        else:
+            message = f"The tuple of type {kind} needs {size} octets, {end - body} are left."
+            self.find("error", "not-closed", message, at, "", end - body, size)
+
+    def order(self, kind: int, last: int, spec: FieldSpec | None, at: int, seen: set[int]) -> None:
+        name = spec.name if spec is not None else ""
+        if kind in seen and not (spec is not None and spec.repeats) and kind < MANUFACTURER:
+            self.find(
+                "warning", "repeated", f"The field {kind} {name} occurs more than once.", at, name, "once", "again"
+            )
+        if kind < last:
+            message = f"The field {kind} {name} stands behind {last}."
+            self.find("warning", "order", message, at, name, "ascending types", f"{kind} behind {last}")
+
+    def missing(self, known: Table, seen: set[int], start: int) -> None:
+        present = {known.aliases[kind].name for kind in seen if kind in known.aliases}
+        for kind in sorted(known.required - seen):
+            name = known.by_type[kind].name
+            if name not in present:
+                self.find(
+                    "warning", "missing", f"The required field {kind} {name} is missing.", start, name, "present", ""
+                )
+
+    def special(self, kind: int, spec: FieldSpec | None, raw: bytes, at: int, body: int) -> Field:
+        """A field that is nested, of variable or wrong length, or not in the table."""
+        if spec is None:
+            return self.stranger(kind, raw, at, body)
+        if spec.kind == "units":
+            return self.units(spec, raw, at, body)
+        if spec.children:
+            return _field(kind, spec.name, None, raw, at, self.nested(spec, body, body + len(raw)))
+        return _field(kind, spec.name, self.value(spec, raw, body), raw, at)
+
+    def value(self, spec: FieldSpec, raw: bytes, body: int) -> Value:
+        """Value of a leaf whose length needs looking at."""
+        size, kind = len(raw), spec.kind
+        if kind == "uuid":
+            wanted = 16 if self.edition == 2024 else 10
+            if size != wanted:
+                self.length(spec, size, (wanted,), body, "error")
+        elif kind in {"f32[]", "u16[]"} and size % (4 if kind == "f32[]" else 2):
+            self.length(spec, size, ("a multiple of 4" if kind == "f32[]" else "a multiple of 2",), body, "error")
+        elif spec.octets and size not in spec.octets:
+            tolerated = size in spec.also or not self.firm()
+            self.length(spec, size, spec.octets, body, "warning" if tolerated else "error")
+            return int.from_bytes(raw, "big") if kind in {"u8", "u16", "u32"} and 0 < size <= 8 else None
+        return READERS[kind](raw)
+
+    def firm(self) -> bool:
+        """Whether a wrong length is an error: not where the table is unverified or the class belongs to somebody."""
+        return self.table is not None and self.table.verified and self.table.access_code != SECURITY
+
+    def length(self, spec: FieldSpec, size: int, asked: tuple[object, ...], body: int, severity: Severity) -> None:
+        wanted = " or ".join(str(number) for number in asked)
+        message = f"{spec.name} ({spec.type}) has {size} octets, the table says {wanted}."
+        self.find(severity, "length", message, body, spec.name, wanted, size)
+
+    def stranger(self, kind: int, raw: bytes, at: int, body: int) -> Field:
+        """A type that the table of this class does not have at top level."""
+        known = self.table
+        if known is None or not known.by_type:
+            return _field(kind, "", None, raw, at)
+        if kind == TEDSID:
+            message = f"The type 3 occurs again with {len(raw)} octets (clash with the TEDSID)."
+            self.find("error", "tedsid-again", message, at, "TEDSID", "once", "again")
+            return _field(kind, "", None, raw, at)
+        alias = known.aliases.get(kind)
+        if alias is not None:
+            message = f"{alias.name} has the number {kind} of the clause's text, not that of its table."
+            self.find("warning", "numbering", message, at, alias.name, "4 or 5", kind)
+            return _field(kind, alias.name, self.value(alias, raw, body), raw, at)
+        inner = known.inner.get(kind)
+        if inner is not None:
+            parent = known.parents[kind]
+            message = (
+                f"The sub-field {kind} {inner.name} stands at top level; it belongs inside {parent.type} {parent.name}."
+            )
+            self.find("error", "top-level", message, at, inner.name, f"inside {parent.name}", "at top level")
+            return self.special(kind, inner, raw, at, body)
+        self.unknown(kind, at)
+        return _field(kind, "", None, raw, at)
+
+    def unknown(self, kind: int, at: int) -> None:
+        known = self.table
+        if kind >= MANUFACTURER and known is not None and known.access_code != SECURITY:
+            self.find("note", "manufacturer", f"The field {kind} is in the manufacturers' range.", at, "", "", kind)
+        elif self.firm():
+            self.find("error", "unknown", f"The field {kind} is not in the table of this class.", at, "", "", kind)
+        else:
+            self.find(
+                "note", "unknown", f"The field {kind} has no name that we know; it is kept as it is.", at, "", "", kind
+            )
+
+    def units(self, spec: FieldSpec, raw: bytes, at: int, body: int) -> Field:
+        """Physical units in any of three spellings."""
+        if is_packed_units(raw):
+            return _field(spec.type, spec.name, units_of(raw), raw, at)
+        packed = bytearray([0, *[128] * 9, 0])
+        children = self.nested(spec, body, body + len(raw))
+        for child in children:
+            if 50 <= child.type <= 60 and len(child.raw) == 1:
+                packed[child.type - 50] = child.raw[0]
+        if not any(child.type == 50 for child in children):
+            self.find(
+                "warning", "units", f"{spec.name} does not say its interpretation.", body, spec.name, "UnitType", ""
+            )
+        return _field(spec.type, spec.name, units_of(bytes(packed)), raw, at, children)
+
+    def nested(self, parent: FieldSpec, start: int, end: int) -> tuple[Field, ...]:
+        """Tuples inside a structure, only those of its own table."""
+        octets, width, by_type = self.octets, self.width, parent.by_type
+        fields: list[Field] = []
+        seen: set[int] = set()
+        at = start
+        while at < end:
+            kind = octets[at]
+            body = at + 1 + width
+            size = octets[at + 1] if body == at + 2 <= end else int.from_bytes(octets[at + 1 : body], "big")
+            stop = body + size
+            if body > end or stop > end or self.left <= 0:
+                what = "too many tuples" if self.left <= 0 else f"a tuple of type {kind} that runs past the end"
+                self.find("error", "nested", f"{parent.name} holds {what}.", at, parent.name, end - at, stop - at)
+                break
+            self.left -= 1
+            raw = octets[body:stop]
+            spec = by_type.get(kind)
+            if spec is not None and len(raw) in spec.octets and kind not in seen:
+                fields.append(_field(kind, spec.name, READERS[spec.kind](raw), raw, at))
+            else:
+                fields.append(self.nested_special(parent, kind, spec, raw, at, body, kind in seen))
+            seen.add(kind)
+            at = stop
+        if not parent.required <= seen:
+            for kind in sorted(parent.required - seen):
+                name = by_type[kind].name
+                self.find("warning", "missing", f"{parent.name} holds no {name}.", start, name, "present", "")
+        return tuple(fields)
+
+    def nested_special(
+        self, parent: FieldSpec, kind: int, spec: FieldSpec | None, raw: bytes, at: int, body: int, again: bool
+    ) -> Field:
+        if again:
+            self.find(
+                "warning", "repeated", f"{parent.name} holds the field {kind} twice.", at, parent.name, "once", "again"
+            )
+        if spec is not None:
+            return self.special(kind, spec, raw, at, body)
+        known = self.table
+        other = known.inner.get(kind) or known.by_type.get(kind) if known is not None else None
+        if other is not None:
+            message = f"{other.name} ({kind}) does not belong inside {parent.name}."
+            self.find("error", "misplaced", message, at, other.name, "elsewhere", f"inside {parent.name}")
+            if not other.children:
+                return _field(kind, other.name, self.value(other, raw, body), raw, at)
+            return _field(kind, other.name, None, raw, at)
+        self.unknown(kind, at)
+        return _field(kind, "", None, raw, at)
+
+    def text_area(self, fields: list[Field], at: int, end: int) -> None:
+        """What stands behind the directory of a text-based TEDS."""
+        from teds_provision.teds.codec.text import split_text
+
+        self.text = split_text(fields, self.octets[at:end], at, self.find)

@@ -1,0 +1,209 @@
+"""The Security TEDS of the profile: canonical form, fields, and what its signature covers (profile section 1).
+
+Pure octets: no cryptography here. Signing and verifying is ``protocol.datasheet``. Access code 128 (ours); the Security
+TEDS of the 2024 edition (access code 16) is another thing.
+"""
+
+from __future__ import annotations
+
+import base64
+import binascii
+from dataclasses import dataclass, field, fields, replace
+from typing import Final
+
+from teds_provision.errors import BadData
+from teds_provision.teds.codec.frame import frame, raw_tuple, tuples, unframe
+from teds_provision.teds.image import BlockId
+
+ACCESS_CODE: Final = 128
+TEDSID_TUPLE: Final = bytes.fromhex("030400800101")
+
+SIGNATURE, NODE_KEY, NODE_KEY_SIGNATURE, STATION_KEY, STATION_KEY_SIGNATURE = 100, 101, 102, 103, 104
+SIGNED_BLOCK, PROFILE_VERSION = 108, 105
+
+# Our values of Tables 2 to 5, ProfileVersion, SessionSuite and KeyAgreement: the only ones built, accepted or trusted.
+OUR_VALUES: Final = {1: 4, 2: 2, 3: 0, 4: 1, 105: 1, 109: 1, 110: 1}
+_U8 = (1, 2, 3, 4, 105, 109, 110)
+_BASE64 = {100: 64, 101: 65, 102: 64, 103: 65, 104: 64}
+_KNOWN = {1, 2, 3, 4, 5, 6, *range(100, 111)}
+INITIAL_FIELDS: Final = frozenset({1, 2, 3, 4, 5, 6, 101, 102, 105, 106, 107, 109, 110})
+SIGNED_FIELDS: Final = INITIAL_FIELDS | {100, 103, 104}
+
+CA_OCTETS = 64
+CA_NAME_OCTETS = 47
+
+
+class NotCanonical(BadData):
+    """The octets are not a canonical Security TEDS of profile version 1."""
+
+    code = "not-canonical"
+
+
+@dataclass(frozen=True)
+class SecurityTeds:
+    """Fields of a canonical Security TEDS, keys and signatures raw (points 65 octets, signatures 64).
+
+    ``last_modified`` is the 8-octet TimeInstance (u32 s, u32 ns, UTC); ``signed_blocks`` maps (channel, access code) to
+    the 32-octet SHA-256 of that TEDS; ``extra`` holds types 111 to 255, which are skipped but covered by the signature.
+    A field that is None or absent is not written: the initial Security TEDS has no 100, 103, 104.
+    """
+
+    node_key: bytes
+    node_key_signature: bytes
+    sequence: int = 0
+    key_epoch: int = 0
+    ca: str = ""
+    last_modified: bytes = bytes(8)
+    signature: bytes | None = None
+    station_key: bytes | None = None
+    station_key_signature: bytes | None = None
+    signed_blocks: dict[BlockId, bytes] = field(default_factory=dict)
+    values: dict[int, int] = field(default_factory=lambda: dict(OUR_VALUES))
+    extra: dict[int, bytes] = field(default_factory=dict)
+
+    @property
+    def signed(self) -> bool:
+        """Whether it holds the signature and the keys that a signed one must hold."""
+        return None not in (self.signature, self.station_key, self.station_key_signature)
+
+    def block(self) -> bytes:
+        """Return the data block, TEDSID tuple included."""
+        out = {number: bytes([value]) for number, value in self.values.items()}
+        out |= {5: self.ca.encode(), 6: self.last_modified}
+        out |= {106: self.sequence.to_bytes(4, "big"), 107: self.key_epoch.to_bytes(4, "big")}
+        keys = (self.signature, self.node_key, self.node_key_signature, self.station_key, self.station_key_signature)
+        out |= {n: base64.b64encode(key) for n, key in zip(range(100, 105), keys, strict=True) if key is not None}
+        parts = [(number, value) for number, value in {**out, **self.extra}.items()]
+        parts += [
+            (SIGNED_BLOCK, channel.to_bytes(2, "big") + bytes([access_code]) + digest)
+            for (channel, access_code), digest in self.signed_blocks.items()
+        ]
+        return TEDSID_TUPLE + b"".join(raw_tuple(number, value) for number, value in sorted(parts))
+
+    def encode(self) -> bytes:
+        """Return the framed TEDS."""
+        return frame(self.block())
+
+    def with_signature(self, signature: bytes) -> SecurityTeds:
+        """Return this TEDS with field 100 filled in."""
+        return replace(self, signature=signature)
+
+    def __repr__(self) -> str:
+        shown = (f.name for f in fields(self) if f.name in {"sequence", "key_epoch", "ca"})
+        return f"SecurityTeds({', '.join(f'{name}={getattr(self, name)!r}' for name in shown)})"
+
+
+def initial(node_key: bytes, node_key_signature: bytes, *, sequence: int, key_epoch: int) -> bytes:
+    """Return the initial Security TEDS that a node shows until the first commit after its last reset."""
+    return SecurityTeds(node_key, node_key_signature, sequence=sequence, key_epoch=key_epoch).encode()
+
+
+def ca_hint(name: str, ca_fingerprint: str) -> str:
+    """Field 5: ``name:`` and the first 16 hex digits; the name is cut to 47 octets at a character's border."""
+    cut = name.encode()[:CA_NAME_OCTETS].decode(errors="ignore")
+    return f"{cut}:{ca_fingerprint[:16]}"
+
+
+def decode(teds: bytes) -> SecurityTeds:
+    """Read a framed Security TEDS in canonical form; raises NotCanonical with the rule that it breaks."""
+    try:
+        block = unframe(teds)
+        parts = [(part.type, part.value) for part in tuples(block)]
+    except BadData as error:
+        raise NotCanonical(error.message) from error
+    if block[:6] != TEDSID_TUPLE:
+        raise NotCanonical("The first tuple of the Security TEDS is not exactly 03 04 00 80 01 01.")
+    values = _ascending(parts[1:])
+    for number, value in values.items():
+        _check_length(number, value)
+    blocks = _signed_blocks([value for number, value in parts[1:] if number == SIGNED_BLOCK])
+    missing = INITIAL_FIELDS - values.keys()
+    if missing:
+        raise NotCanonical(f"The Security TEDS lacks field {min(missing)}.")
+    raw = {number: _base64(number, values[number]) for number in _BASE64 if number in values}
+    return SecurityTeds(
+        node_key=raw[NODE_KEY],
+        node_key_signature=raw[NODE_KEY_SIGNATURE],
+        sequence=int.from_bytes(values[106], "big"),
+        key_epoch=int.from_bytes(values[107], "big"),
+        ca=_text(values[5]),
+        last_modified=values[6],
+        signature=raw.get(SIGNATURE),
+        station_key=raw.get(STATION_KEY),
+        station_key_signature=raw.get(STATION_KEY_SIGNATURE),
+        signed_blocks=blocks,
+        values={number: values[number][0] for number in _U8},
+        extra={number: value for number, value in values.items() if number >= 111},
+    )
+
+
+def tbs(uuid: bytes, teds: bytes) -> bytes:
+    """What field 100 signs: label ‖ UUID ‖ the data block without the tuple of type 100, cut from the octets."""
+    block = unframe(teds)
+    kept = bytearray()
+    for part in tuples(block):
+        if part.type != SIGNATURE:
+            kept += raw_tuple(part.type, part.value)
+    return b"TEDS1 datasheet\0" + uuid + bytes(kept)
+
+
+def has_profile_version(teds: bytes) -> bool:
+    """Say whether the tuples close and field 105 is there: such a TEDS is canonical or refused."""
+    try:
+        return any(part.type == PROFILE_VERSION for part in tuples(unframe(teds)))
+    except BadData:
+        return False
+
+
+def _ascending(parts: list[tuple[int, bytes]]) -> dict[int, bytes]:
+    values: dict[int, bytes] = {}
+    last = 0
+    for number, value in parts:
+        if number not in _KNOWN and number < 111:
+            raise NotCanonical(f"The Security TEDS holds a field {number} that the profile does not know.")
+        if number < last or (number == last and number != SIGNED_BLOCK):
+            raise NotCanonical(f"Field {number} of the Security TEDS stands out of ascending order or twice.")
+        last = number
+        if number != SIGNED_BLOCK:
+            values[number] = value
+    return values
+
+
+def _check_length(number: int, value: bytes) -> None:
+    wanted = 1 if number in _U8 else 88 if number in _BASE64 else {6: 8, 106: 4, 107: 4}.get(number)
+    if wanted is not None and len(value) != wanted:
+        raise NotCanonical(f"Field {number} of the Security TEDS has {len(value)} octets, not {wanted}.")
+    if number == 5 and len(value) > CA_OCTETS:
+        raise NotCanonical(f"Field 5 (CA) has {len(value)} octets; {CA_OCTETS} is the most.")
+
+
+def _signed_blocks(values: list[bytes]) -> dict[BlockId, bytes]:
+    blocks: dict[BlockId, bytes] = {}
+    last = b""
+    for value in values:
+        if len(value) != 35:
+            raise NotCanonical(f"A SignedBlock has {len(value)} octets, not 35.")
+        if value[:3] <= last:
+            raise NotCanonical("The SignedBlocks do not ascend by channel and access code.")
+        last = value[:3]
+        if value[:3] == b"\x00\x00\x80":
+            raise NotCanonical("The Security TEDS lists itself as a SignedBlock.")
+        blocks[int.from_bytes(value[:2], "big"), value[2]] = value[3:]
+    return blocks
+
+
+def _base64(number: int, value: bytes) -> bytes:
+    try:
+        raw = base64.b64decode(value, validate=True)
+    except (binascii.Error, ValueError) as error:
+        raise NotCanonical(f"Field {number} of the Security TEDS is not base64.") from error
+    if len(raw) != _BASE64[number] or base64.b64encode(raw) != value:
+        raise NotCanonical(f"Field {number} of the Security TEDS is not canonical base64 of {_BASE64[number]} octets.")
+    return raw
+
+
+def _text(value: bytes) -> str:
+    try:
+        return value.decode()
+    except UnicodeDecodeError as error:
+        raise NotCanonical("Field 5 (CA) of the Security TEDS is not UTF-8.") from error

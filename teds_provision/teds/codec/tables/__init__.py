@@ -1,0 +1,43 @@
+"""Field tables of every TEDS class, one per access code, open to inspection (ieee-1451.0.md sections 3 and 4).
+
+The rows stand in ``tables_standard`` (Meta, TransducerChannel, names), ``tables_more`` (PHY, text-based, security) and
+the data file ``calibration_fields.toml``, whose numbers nobody has checked against the standard.
+"""
+
+from __future__ import annotations
+
+from functools import cache
+
+from teds_provision.teds.codec.tables.form import (
+    MANUFACTURER,
+    NAMES,
+    OCTETS,
+    ONLY_2024,
+    TEXT_BASED,
+    FieldSpec,
+    Table,
+    name_of,
+)
+
+__all__ = ["MANUFACTURER", "NAMES", "OCTETS", "ONLY_2024", "TEXT_BASED", "FieldSpec", "Table", "name_of", "table"]
+
+CALIBRATION = 5
+
+
+@cache
+def table(access_code: int) -> Table:
+    """Field table of a TEDS class; one without rows where no fields are known (their tuples stay raw)."""
+    from teds_provision.teds.codec.tables import other as tables_more
+    from teds_provision.teds.codec.tables import standard as tables_standard
+
+    name = name_of(access_code)
+    if access_code == CALIBRATION:
+        from teds_provision.teds.codec.tables.calibration import calibration_table
+
+        return calibration_table()
+    if access_code in TEXT_BASED:
+        return Table(access_code, name, tables_more.TEXT, source="ieee-1451.0.md section 4.6")
+    entry = tables_standard.TABLES.get(access_code) or tables_more.TABLES.get(access_code)
+    if entry is None:
+        return Table(access_code, name, verified=False)
+    return Table(access_code, name, **entry)

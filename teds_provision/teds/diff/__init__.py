@@ -1,0 +1,1 @@
+"""What changes between two datasheets, in physical terms."""

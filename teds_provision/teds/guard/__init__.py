@@ -1,0 +1,1 @@
+"""The guard: refuses calibrations of the kinds that have hurt robots before."""

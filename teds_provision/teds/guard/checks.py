@@ -1,0 +1,232 @@
+"""The single checks of the guard on a curve that can be computed."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import replace
+from typing import Final, Literal
+
+import numpy as np
+
+from teds_provision.teds.calibration.model import Calibration
+from teds_provision.teds.guard.curve import FLOAT32_STEP, Curve
+
+Raised = tuple[str, Literal["error", "warning"], str]
+"""Code, severity, message."""
+
+ALIKE: Final = 0.25
+LARGE_CHANGE: Final = 0.1
+
+
+def check(curve: Curve, before: Curve | None, given: Calibration | None) -> Iterator[Raised]:
+    """All findings of one channel; ``before`` is what the node has now, ``given`` the calibration with its points."""
+    if not np.isfinite(curve.result).all():
+        at = int(np.argmin(np.isfinite(curve.result)))
+        yield "overflow", "error", f"{_at(curve, curve.inputs_at(at))} gives no finite value."
+        return
+    if float(np.ptp(curve.result)) <= curve.noise:
+        shown = _show(curve, float(curve.result.flat[0]))
+        yield "flat", "error", f"every reading becomes {shown}: the gain is zero."
+        return
+    swapped = before is not None and _swapped(curve.calibration, before.calibration)
+    if swapped:
+        yield "swapped", "error", "gain and offset are exchanged against what the node has now."
+    turned = list(_reversed(curve, before))
+    yield from turned
+    if not turned:
+        yield from _not_monotone(curve, before)
+    yield from _limits(curve)
+    yield from _jumps(curve)
+    yield from _residual(curve, given)
+    if before is not None and not swapped and not turned:
+        yield from _changed(curve, before)
+
+
+def _show(curve: Curve, value: float, *, difference: bool = False) -> str:
+    if curve.channel.actuator:
+        return f"raw {value:.6g}"
+    return curve.channel.show(value, difference=difference, like=curve.calibration.unit)
+
+
+def _at(curve: Curve, inputs: tuple[float, ...]) -> str:
+    """``raw 512``, or for several inputs ``raw 512 with channel 2 at raw 100``."""
+    own = inputs[curve.main]
+    text = f"{own:.6g} {curve.calibration.unit.text}" if curve.channel.actuator else f"raw {own:.8g}"
+    others = [
+        f"channel {part.channel} at raw {value:.8g}"
+        for number, (part, value) in enumerate(zip(curve.calibration.inputs, inputs, strict=True))
+        if number != curve.main
+    ]
+    return f"{text} with {', '.join(others)}" if others else text
+
+
+def _reversed(curve: Curve, before: Curve | None) -> Iterator[Raised]:
+    span = f"from {_at(curve, _ends(curve)[0])} to {_at(curve, _ends(curve)[1])}"
+    change = _show(curve, abs(curve.net), difference=True)
+    demand = curve.channel.monotone
+    wrong = {"increasing": curve.net < 0, "decreasing": curve.net > 0}.get(demand or "", False)
+    way = "falls" if curve.net < 0 else "rises"
+    if wrong and abs(curve.net) > curve.noise:
+        yield "reversed", "error", f"the result {way} by {change} {span}; its type says that it must be {demand}."
+    elif before is not None and _opposite(curve, before):
+        had = "fell" if before.net < 0 else "rose"
+        other = _show(before, abs(before.net), difference=True)
+        yield (
+            "reversed",
+            "error",
+            f"the result {way} by {change} {span}; with what the node has now it {had} by {other}.",
+        )
+
+
+def _opposite(curve: Curve, before: Curve) -> bool:
+    least = max(curve.channel.tolerance, curve.noise)
+    if curve.channel.actuator:
+        least = curve.noise
+    return curve.net * before.net < 0 and min(abs(curve.net), abs(before.net)) > least
+
+
+def _ends(curve: Curve) -> tuple[tuple[float, ...], tuple[float, ...]]:
+    middle = [float(axis[len(axis) // 2]) for axis in curve.axes]
+    low, high = list(middle), list(middle)
+    low[curve.main], high[curve.main] = float(curve.axes[curve.main][0]), float(curve.axes[curve.main][-1])
+    return tuple(low), tuple(high)
+
+
+def _not_monotone(curve: Curve, before: Curve | None) -> Iterator[Raised]:
+    demand, severity, why = curve.channel.monotone, "error", "its type says that it must be monotone"
+    if demand in ("increasing", "decreasing"):
+        why = f"its type says that it must be {demand}"
+    if demand is None:
+        demand = "either"
+        if before is not None and before.monotone("either"):
+            why = "what the node has now is monotone"
+        else:
+            severity, why = "warning", "nothing here says whether it may"
+    if curve.monotone(demand):
+        return
+    inputs, step = curve.worst_step(demand)
+    way = "falls" if step < 0 else "rises"
+    after = curve.after(inputs[curve.main])
+    amount = _show(curve, abs(step), difference=True)
+    text = f"the result {way} by {amount} from {_at(curve, inputs)} to {after:.8g}; {why}."
+    yield "not-monotone", "error" if severity == "error" else "warning", text
+
+
+def _limits(curve: Curve) -> Iterator[Raised]:
+    channel = curve.channel
+    if channel.actuator:
+        if channel.raw is None:
+            return
+        low, high, tolerance = *channel.raw, max(0.5, curve.noise)
+        values, names = curve.result, ("lowest raw value", "highest raw value")
+    else:
+        low, high, tolerance = channel.low, channel.high, channel.tolerance
+        values, names = (curve.unshifted if channel.full_turn else curve.result), ("low limit", "high limit")
+    if not math.isfinite(low) or not math.isfinite(high):
+        yield "unlimited", "warning", "the channel states no limits: the results were not held against them."
+    slack = tolerance + 4 * FLOAT32_STEP * max(abs(low), abs(high), 0.0) if math.isfinite(low + high) else tolerance
+    for limit, over, name, where in (
+        (low, low - values, names[0], "below"),
+        (high, values - high, names[1], "above"),
+    ):
+        at = int(np.argmax(over))
+        worst = float(over.flat[at])
+        if math.isfinite(limit) and worst > slack:
+            yield "limits", "error", _beyond(curve, at, float(values.flat[at]), worst, limit, f"{where} the {name}")
+
+
+def _beyond(curve: Curve, at: int, value: float, worst: float, limit: float, where: str) -> str:
+    inputs = curve.inputs_at(at)
+    text = f"{_at(curve, inputs)} gives {_show(curve, value)}, {_show(curve, worst, difference=True)} {where}"
+    text += f" of {_show(curve, limit)}"
+    if not curve.channel.actuator:
+        text += f"; the stated uncertainty is {_show(curve, curve.channel.tolerance, difference=True)}"
+    part = curve.calibration.inputs[curve.main]
+    own = inputs[curve.main]
+    if not part.boundaries[0] <= own <= part.boundaries[-1] and not curve.channel.actuator:
+        text += (
+            f" (the calibration covers raw {part.boundaries[0]:.8g} to {part.boundaries[-1]:.8g};"
+            " say raw-range in the profile if the channel gives no others)"
+        )
+    return text + "."
+
+
+def _jumps(curve: Curve) -> Iterator[Raised]:
+    """Jumps between the segments of a table, which by its nature has none."""
+    calibration = curve.calibration
+    if calibration.method != "table" or len(calibration.inputs) != 1 or calibration.inputs[0].segments < 2:
+        return
+    part = calibration.inputs[0]
+    edges = np.asarray(part.boundaries[1:-1])
+    table = np.asarray(calibration.coefficients).reshape(part.segments, part.degree + 1)
+    offsets = np.asarray(part.offsets)
+    powers = np.arange(part.degree + 1)
+    left = (table[:-1] * (edges - offsets[:-1])[:, None] ** powers).sum(axis=1)
+    right = (table[1:] * (edges - offsets[1:])[:, None] ** powers).sum(axis=1)
+    scale = 1.0 if curve.channel.actuator else abs(calibration.unit.scale)
+    jumps = np.abs(right - left) * scale
+    at = int(np.argmax(jumps))
+    worst = float(jumps[at])
+    least = max(curve.noise, 0.5 if curve.channel.actuator else curve.channel.tolerance)
+    if worst > least:
+        amount = _show(curve, worst, difference=True)
+        edge = f"{edges[at]:.8g}"
+        yield "jump", "error", f"the table jumps by {amount} at {edge}, between its segments {at + 1} and {at + 2}."
+
+
+def _residual(curve: Curve, given: Calibration | None) -> Iterator[Raised]:
+    channel, calibration = curve.channel, curve.calibration
+    if channel.actuator or not channel.uncertainty > 0:
+        return
+    stated = _show(curve, channel.uncertainty, difference=True)
+    left = given.residuals() if given is not None and not given.actuator else None
+    limit = channel.uncertainty * (1 + 1e-6)
+    if given is not None and left is not None:
+        worst = given.unit.difference_to_si(left.maximum)
+        if worst > limit:
+            place, _ = left.worst
+            shown = _show(curve, worst, difference=True)
+            yield (
+                "residual",
+                "error",
+                f"the fit misses its point at raw {place:.8g} by {shown}; the stated uncertainty is {stated}.",
+            )
+            return
+    if calibration.uncertainty is not None:
+        own = calibration.unit.difference_to_si(calibration.uncertainty)
+        if own > limit:
+            shown = _show(curve, own, difference=True)
+            yield "residual", "error", f"the calibration is good to {shown} only; the stated uncertainty is {stated}."
+
+
+def _swapped(new: Calibration, old: Calibration) -> bool:
+    """Whether coefficients 0 and 1 of every cell are exchanged (to a quarter), and were different before."""
+    shape = [(part.segments, part.degree) for part in new.inputs]
+    if shape != [(part.segments, part.degree) for part in old.inputs] or len(shape) != 1 or shape[0][1] < 1:
+        return False
+    columns = shape[0][1] + 1
+    one = np.asarray(new.coefficients).reshape(-1, columns)
+    other = np.asarray(old.coefficients).reshape(-1, columns)
+    exchanged = _alike(one[:, 0], other[:, 1]) and _alike(one[:, 1], other[:, 0])
+    return exchanged and not (_alike(one[:, 0], other[:, 0]) and _alike(one[:, 1], other[:, 1]))
+
+
+def _alike(
+    one: np.ndarray[tuple[int], np.dtype[np.float64]], other: np.ndarray[tuple[int], np.dtype[np.float64]]
+) -> bool:
+    return bool(np.allclose(one, other, rtol=ALIKE, atol=1e-30))
+
+
+def _changed(curve: Curve, before: Curve) -> Iterator[Raised]:
+    if len(curve.axes) != len(before.axes) or curve.channel.actuator:
+        return
+    same = replace(before, axes=curve.axes)
+    over = np.abs(curve.result - same.result)
+    at = int(np.argmax(over))
+    worst, span = float(over.flat[at]), curve.channel.high - curve.channel.low
+    if math.isfinite(span) and worst > LARGE_CHANGE * span > 0:
+        amount = _show(curve, worst, difference=True)
+        share = 100 * worst / span
+        text = f"against what the node has now it differs by up to {amount} ({share:.0f} % of the range), at "
+        yield "changed", "warning", text + f"{_at(curve, curve.inputs_at(at))}."

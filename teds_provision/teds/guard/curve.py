@@ -1,0 +1,232 @@
+"""The curve of a calibration over everything that the channel can give, as the guard looks at it."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+
+from teds_provision.teds.calibration.model import Calibration
+from teds_provision.teds.calibration.raw_range import raw_range
+from teds_provision.teds.codec.decode import decode
+from teds_provision.teds.codec.model import Decoded, Units
+from teds_provision.teds.image import BlockId
+from teds_provision.teds.units.units import WrittenUnit, display_unit, format_value, parse_unit
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from teds_provision.teds.profile.model import ChannelProfile, Profile
+
+SAMPLES: Final = 65_537
+GRID: Final = 250_000
+FLOAT32_STEP: Final = 2.0**-23
+
+Range = tuple[float, float]
+
+
+@dataclass(frozen=True)
+class Channel:
+    """What is known of a channel, in SI units; NaN where it is not stated."""
+
+    number: int
+    units: Units
+    low: float
+    high: float
+    uncertainty: float
+    raw: Range | None
+    actuator: bool
+    integer: bool
+    display: str | None = None
+    monotone: str | None = None
+
+    @property
+    def full_turn(self) -> bool:
+        """Whether its limits span one turn, so that a zero offset only turns the scale."""
+        return self.units == parse_unit("rad").units and math.isclose(self.high - self.low, 2 * math.pi, rel_tol=1e-4)
+
+    @property
+    def tolerance(self) -> float:
+        """Stated uncertainty, 0 where none is stated."""
+        return self.uncertainty if self.uncertainty > 0 else 0.0
+
+    def show(self, value: float, *, difference: bool = False, like: WrittenUnit | None = None) -> str:
+        """Value in SI units in the unit that people use for this channel."""
+        preferred = like if like is not None and self.display is None and like.text[:1] != "(" else None
+        unit = preferred or display_unit(self.units, self.display)
+        return format_value(value, unit, difference=difference, digits=5)
+
+
+def channel_of(number: int, blocks: Mapping[BlockId, bytes], profile: Profile | None) -> Channel:
+    """What TEDS and profile say of a channel; the limits are those of the TEDS."""
+    own = decode(blocks[number, 3]) if (number, 3) in blocks else None
+    said = profile.channel(number) if profile is not None else None
+    units = own.get("PhyUnits") if own else None
+    model = _integer(own, "DatModel")
+    ends = None
+    if said is not None:
+        ends = said.raw_range
+    elif own is not None and own.get("ModLenth") is not None:
+        ends = raw_range(model, _integer(own, "ModLenth"), _integer(own, "SigBits"))
+    return Channel(
+        number,
+        units if isinstance(units, Units) else _units(said),
+        _float(own, "LowLimit"),
+        _float(own, "HiLimit"),
+        _float(own, "OError"),
+        ends,
+        _integer(own, "ChanType") == 1,
+        model in (0, 5),
+        said.display or said.unit.text if said else None,
+        said.calibration.monotone if said else None,
+    )
+
+
+def _units(said: ChannelProfile | None) -> Units:
+    return said.units if said else Units()
+
+
+def _float(decoded: Decoded | None, name: str) -> float:
+    value = decoded.get(name) if decoded else None
+    return float(value) if isinstance(value, (int, float)) else math.nan
+
+
+def _integer(decoded: Decoded | None, name: str) -> int:
+    value = decoded.get(name) if decoded else None
+    return value if isinstance(value, int) else 0
+
+
+@dataclass(frozen=True)
+class Curve:
+    """A calibration evaluated over the whole range of its channel.
+
+    ``axes`` are the samples of each input; ``main`` is the axis of the channel's own input. Results are in SI units for
+    sensors and raw for actuators, an array with one dimension per input.
+    """
+
+    calibration: Calibration
+    channel: Channel
+    axes: tuple[NDArray[np.float64], ...]
+    main: int
+
+    @cached_property
+    def result(self) -> NDArray[np.float64]:
+        """Results with the zero offset."""
+        return self._converted(self._plain + self.calibration.zero_offset)
+
+    @cached_property
+    def unshifted(self) -> NDArray[np.float64]:
+        """Results with the zero offset left out."""
+        return self._converted(self._plain)
+
+    @cached_property
+    def _plain(self) -> NDArray[np.float64]:
+        grid = np.meshgrid(*self.axes, indexing="ij")
+        return self.calibration.evaluate(*grid).value - self.calibration.zero_offset
+
+    def _converted(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
+        if self.channel.actuator:
+            return values
+        return values * self.calibration.unit.scale + self.calibration.unit.offset
+
+    def inputs_at(self, index: int) -> tuple[float, ...]:
+        """Inputs of a flat index into the results."""
+        places = np.unravel_index(index, self.result.shape)
+        return tuple(float(axis[place]) for axis, place in zip(self.axes, places, strict=True))
+
+    @property
+    def noise(self) -> float:
+        """Differences below this come from Float32 rounding."""
+        finite = self.result[np.isfinite(self.result)]
+        return float(8 * FLOAT32_STEP * np.abs(finite).max(initial=0.0))
+
+    @cached_property
+    def steps(self) -> NDArray[np.float64]:
+        """Differences of neighbouring results along the channel's own input."""
+        return np.diff(self.result, axis=self.main)
+
+    @property
+    def net(self) -> float:
+        """Median change from the low to the high end of the channel's own input."""
+        first = np.take(self.result, 0, axis=self.main)
+        last = np.take(self.result, -1, axis=self.main)
+        return float(np.median(last - first))
+
+    def monotone(self, direction: str) -> bool:
+        """Whether the results never go the other way; ``direction`` is increasing, decreasing or either."""
+        rises = bool((self.steps >= -self.noise).all())
+        falls = bool((self.steps <= self.noise).all())
+        return {"increasing": rises, "decreasing": falls}.get(direction, rises or falls)
+
+    def worst_step(self, direction: str) -> tuple[tuple[float, ...], float]:
+        """Inputs before the largest step the wrong way, and that step (signed)."""
+        rising = direction == "increasing" or (direction == "either" and self.net >= 0)
+        at = int(np.argmin(self.steps) if rising else np.argmax(self.steps))
+        places = np.unravel_index(at, self.steps.shape)
+        inputs = tuple(float(axis[place]) for axis, place in zip(self.axes, places, strict=True))
+        return inputs, float(self.steps[places])
+
+    def after(self, value: float) -> float:
+        """The sample of the channel's own input that follows one."""
+        axis = self.axes[self.main]
+        return float(axis[min(int(np.searchsorted(axis, value, side="right")), len(axis) - 1)])
+
+
+def curve_of(
+    calibration: Calibration,
+    channel: Channel,
+    channels: Mapping[int, Channel],
+    *,
+    also: Calibration | None = None,
+    dense: bool = False,
+) -> Curve:
+    """Evaluate a calibration (finite, boundaries ascending) over what all its inputs can give.
+
+    One input is sampled at every integer, or at 65537 places and both sides of each boundary. Where the curve (and that
+    of ``also``, which it is to be compared with) is straight between its boundaries, these and the ends are enough
+    unless ``dense``.
+    """
+    main = next((n for n, part in enumerate(calibration.inputs) if part.channel == channel.number), 0)
+    count = len(calibration.inputs)
+    each = SAMPLES if count == 1 else max(9, int(GRID ** (1 / count)))
+    if count == 1 and not dense and _straight(calibration) and (also is None or _straight(also)):
+        each = 2
+    axes = []
+    for number, part in enumerate(calibration.inputs):
+        source = channel if number == main else channels.get(part.channel)
+        edges = part.boundaries
+        if also is not None and len(also.inputs) == count:
+            edges = tuple(sorted({*edges, *also.inputs[number].boundaries}))
+        axes.append(_axis(edges, source, each, channel.actuator and number == main, calibration.unit))
+    return Curve(calibration, channel, tuple(axes), main)
+
+
+def _straight(calibration: Calibration) -> bool:
+    return len(calibration.inputs) == 1 and calibration.inputs[0].degree <= 1
+
+
+def _axis(
+    boundaries: tuple[float, ...], source: Channel | None, count: int, actuator: bool, unit: WrittenUnit
+) -> NDArray[np.float64]:
+    """Samples of one input: every integer where there are few, else evenly spread; and both sides of each boundary."""
+    ends = source.raw if source else None
+    whole = source is not None and source.integer
+    if actuator and source is not None and math.isfinite(source.low) and math.isfinite(source.high):
+        ends, whole = (unit.from_si(source.low), unit.from_si(source.high)), False
+    low, high = ends or (boundaries[0], boundaries[-1])
+    if whole and high - low < SAMPLES and count == SAMPLES:
+        return np.arange(math.ceil(low), math.floor(high) + 1, dtype=np.float64)
+    spread = np.linspace(low, high, count)
+    if whole:
+        spread = np.rint(spread)
+    edges = np.asarray(boundaries)
+    below = np.ceil(edges) - 1 if whole else np.nextafter(edges, -np.inf)
+    at = np.ceil(edges) if whole else edges
+    if 2 < count < SAMPLES and len(edges) > count:
+        below, at = below[:: len(edges) // count + 1], at[:: len(edges) // count + 1]
+    samples = np.concatenate([spread, below, at])
+    return np.unique(samples[(samples >= low) & (samples <= high)])

@@ -1,0 +1,1 @@
+"""Units as the standard writes them, and as people do."""

@@ -1,0 +1,350 @@
+"""Units as people write them, and the standard's exponents of SI units (ieee-1451.0.md section 4.3).
+
+``parse_unit("degC")`` gives the exponents that go into a TEDS together with scale and offset into SI;
+``format_units`` gives the way back. The units people use every day stand in a table here, so that building a datasheet
+need not load ``pint`` (0.4 s); every other spelling goes to ``pint``. The tests hold the table against ``pint``.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass
+from difflib import get_close_matches
+from fractions import Fraction
+from functools import cache
+from typing import TYPE_CHECKING, Any, Final
+
+from teds_provision.errors import BadData
+from teds_provision.teds.codec.model import UNIT_PARTS, Units
+from teds_provision.teds.units.names import (
+    LOG_RATIO,
+    NAME_OF,
+    NAMED,
+    PRODUCT,
+    RATIO,
+    ROWS,
+    SPECIAL,
+    SPECIAL_ROWS,
+    TABLE,
+    from_exponents,
+    units_of,
+)
+
+if TYPE_CHECKING:
+    import pint
+
+__all__ = [
+    "LOG_RATIO",
+    "PRODUCT",
+    "RATIO",
+    "WrittenUnit",
+    "display_unit",
+    "format_units",
+    "format_value",
+    "in_display_units",
+    "parse_seconds",
+    "parse_unit",
+    "parse_units",
+    "recognize",
+    "short_unit",
+]
+
+_SYMBOLS: Final = ("rad", "sr", "m", "kg", "s", "A", "K", "mol", "cd")
+_PINT_BASES: Final = {
+    "radian": "radians",
+    "meter": "meters",
+    "gram": "kilograms",
+    "second": "seconds",
+    "ampere": "amperes",
+    "kelvin": "kelvins",
+    "mole": "moles",
+    "candela": "candelas",
+}
+_COUNTS: Final = {"count", "bit", "number", "dimensionless"}
+
+
+@dataclass(frozen=True)
+class WrittenUnit:
+    """A unit as somebody wrote it: ``SI value = scale × value + offset``."""
+
+    text: str
+    units: Units
+    scale: float = 1.0
+    offset: float = 0.0
+
+    def to_si(self, value: float) -> float:
+        """Value in SI units of a value in this unit."""
+        return value * self.scale + self.offset
+
+    def from_si(self, value: float) -> float:
+        """Value in this unit of a value in SI units."""
+        return (value - self.offset) / self.scale
+
+    def difference_to_si(self, value: float) -> float:
+        """A difference (an uncertainty, a step) in SI units: scaled, the offset left out."""
+        return value * abs(self.scale)
+
+    def difference_from_si(self, value: float) -> float:
+        """A difference given in SI units, in this unit."""
+        return value / abs(self.scale)
+
+
+@cache
+def parse_unit(text: str) -> WrittenUnit:
+    """Read a unit as people write it: ``degree``, ``N``, ``mm``, ``degC``, ``1/s``, ``mV/V``, ``%``, ``count``.
+
+    ``%``, ``mV/V``, ``mm/mm`` become ratios (interpretation 1, exponents of one side), ``dB`` the log of a power ratio
+    (3), ``dBm`` the log of a power (2), ``digital`` and ``arbitrary`` interpretations 4 and 5. ``g`` is the gram,
+    ``g_n`` the standard acceleration of free fall. Raises BadData naming the text and how to write it.
+    """
+    text = text.strip()
+    if text in SPECIAL:
+        return WrittenUnit(text, *SPECIAL[text])
+    if text in NAMED:
+        return WrittenUnit(text, NAMED[text])
+    if text in TABLE:
+        name, scale, offset = TABLE[text]
+        return WrittenUnit(text, NAMED[name], scale, offset)
+    if not text:
+        raise _unknown(text)
+    return _ratio(text) or _by_pint(text)
+
+
+def parse_units(text: str) -> Units:
+    """Exponents alone of a unit as people write it; raises BadData."""
+    return parse_unit(text).units
+
+
+def _ratio(text: str) -> WrittenUnit | None:
+    """``mm/m``, ``mV/V``: both sides of the same kind, which ``pint`` would cancel to nothing."""
+    if text.count("/") != 1:
+        return None
+    upper, lower = (part.strip() for part in text.split("/"))
+    try:
+        above, below = parse_unit(upper), parse_unit(lower)
+    except BadData:
+        return None
+    if above.units != below.units or above.units.interpretation != PRODUCT or above.units == Units():
+        return None
+    exponents = {base: getattr(above.units, base) for base in UNIT_PARTS}
+    return WrittenUnit(text, Units(RATIO, **exponents), above.scale / below.scale)
+
+
+@cache
+def _registry() -> pint.UnitRegistry[Any]:
+    import pint
+
+    return pint.UnitRegistry()
+
+
+def _by_pint(text: str) -> WrittenUnit:
+    registry = _registry()
+    try:
+        parsed = registry.parse_units(text)
+        scale = registry.Quantity(1.0, parsed).to_root_units()
+        zero = registry.Quantity(0.0, parsed).to_root_units()
+    except Exception as error:  # pint raises its own, tokenizer's and arithmetic errors on a text that is no unit
+        raise _unknown(text) from error
+    exponents = _exponents(scale.u._units)
+    light = ("steradian", "lumen", "lux")  # pint counts these as rad²
+    steradians = sum((n for name, n in _exponents(parsed._units).items() if name.endswith(light)), Fraction(0))
+    exponents["radian"] = exponents.get("radian", Fraction(0)) - 2 * steradians
+    out = dict.fromkeys(UNIT_PARTS, Fraction(0)) | {"steradians": steradians}
+    for name, power in exponents.items():
+        if name in _PINT_BASES:
+            out[_PINT_BASES[name]] = power
+        elif name not in _COUNTS:
+            raise BadData(
+                f'The unit "{text}" holds {name}, which the SI units of a TEDS cannot say.',
+                hint='Use "arbitrary" for what has no SI unit, "count" for a number, "digital" for bits.',
+            )
+    _representable(text, out)
+    grams = float(out["kilograms"])  # pint's root unit is the gram
+    offset = float(zero.m)
+    return WrittenUnit(
+        text, from_exponents(PRODUCT, out), (float(scale.m) - offset) * 1000.0**-grams, offset * 1000.0**-grams
+    )
+
+
+def _exponents(container: Mapping[str, Any]) -> dict[str, Fraction]:
+    return {name: Fraction(float(power)).limit_denominator(1000) for name, power in container.items()}
+
+
+def _representable(text: str, exponents: dict[str, Fraction]) -> None:
+    for name, power in exponents.items():
+        if (2 * power).denominator != 1 or not -128 <= 2 * power <= 127:
+            raise BadData(
+                f'The unit "{text}" has the exponent {power} of {name}; a TEDS can say halves from -64 to 63.5.',
+                hint='Describe the channel in another unit, or as "arbitrary".',
+            )
+
+
+def _unknown(text: str) -> BadData:
+    near = get_close_matches(text, [*NAMED, *TABLE, *SPECIAL], n=1, cutoff=0.6)
+    guess = f'Did you mean "{near[0]}"? ' if near else ""
+    return BadData(
+        f'"{text}" is not a unit.', hint=f'{guess}Write it like "degree", "N", "mm", "degC", "m/s²", "mV/V" or "count".'
+    )
+
+
+_SUPER: Final = str.maketrans("0123456789-/.", "⁰¹²³⁴⁵⁶⁷⁸⁹⁻ᐟ·")
+
+
+def _power(exponent: Fraction) -> str:
+    if exponent == 1:
+        return ""
+    if exponent.denominator == 1:
+        return str(exponent.numerator).translate(_SUPER)
+    return f"^{float(exponent):g}"
+
+
+def _product(units: Units) -> str:
+    exponents = [(symbol, getattr(units, base)) for symbol, base in zip(_SYMBOLS, UNIT_PARTS, strict=True)]
+    above = "·".join(symbol + _power(power) for symbol, power in exponents if power > 0)
+    below = [symbol + _power(-power) for symbol, power in exponents if power < 0]
+    if not below:
+        return above
+    return f"{above or '1'}/{below[0] if len(below) == 1 else '(' + '·'.join(below) + ')'}"
+
+
+def format_units(units: Units) -> str:
+    """Name of the SI unit as people write it: ``rad``, ``N``, ``m/s²``; ``""`` for plain numbers (counts).
+
+    The joule and the newton metre have the same exponents; it is called N·m here.
+    """
+    exponents = {base: getattr(units, base) for base in UNIT_PARTS}
+    plain = Units(**exponents)
+    name = NAME_OF.get(plain) or _product(plain)
+    if units.extension not in (0, 128):
+        name = f"{name} (unit extension TEDS {units.extension})".strip()
+    match units.interpretation:
+        case 0:
+            return name
+        case 1:
+            return f"{name}/{name}" if name else "ratio"
+        case 2:
+            return f"log10({name or '1'})"
+        case 3:
+            return f"log10({name}/{name})" if name else "log10(ratio)"
+        case 4:
+            return "digital"
+        case 5:
+            return "arbitrary"
+        case other:
+            return f"interpretation {other} (reserved) {name}".strip()
+
+
+_FRIENDLY: Final = {
+    NAMED["rad"]: "degree",
+    NAMED["rad/s"]: "degree/s",
+    NAMED["K"]: "degC",
+    units_of(RATIO): "%",
+    units_of(LOG_RATIO): "dB",
+    SPECIAL["dBm"][0]: "dBm",
+}
+_SHORT: Final = {
+    "degree": "°",
+    "degrees": "°",
+    "deg": "°",
+    "degree/s": "°/s",
+    "deg/s": "°/s",
+    "degC": "°C",
+    "degF": "°F",
+}
+
+
+def display_unit(units: Units, preferred: str | None = None) -> WrittenUnit:
+    """Unit in which to show values of these exponents: the preferred one where it fits, else friendly, else SI."""
+    for text in (preferred, _FRIENDLY.get(units)):
+        if text:
+            unit = parse_unit(text)
+            if unit.units == units:
+                return WrittenUnit(_SHORT.get(unit.text, unit.text), units, unit.scale, unit.offset)
+    return WrittenUnit(format_units(units), units)
+
+
+def in_display_units(value: float, units: Units, preferred: str | None = None) -> tuple[float, str]:
+    """``(value, unit)`` for people, of a value in SI units."""
+    unit = display_unit(units, preferred)
+    return unit.from_si(value), unit.text
+
+
+def format_value(value: float, unit: WrittenUnit, *, difference: bool = False, digits: int = 6) -> str:
+    """Show a value given in SI units: ``360 °``, ``0.35 N``; a difference leaves the offset of the unit out."""
+    if math.isnan(value):
+        return "not available"
+    shown = unit.difference_from_si(value) if difference else unit.from_si(value)
+    if difference and value < 0:
+        shown = -abs(shown)
+    text = f"{shown:.{digits}g}"
+    return f"{text} {unit.text}".strip()
+
+
+_QUANTITY: Final = re.compile(r"\s*([-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)\s*(.*?)\s*\Z")
+_TIMES: Final = {
+    "d": 86_400.0,
+    "day": 86_400.0,
+    "days": 86_400.0,
+    "week": 604_800.0,
+    "weeks": 604_800.0,
+    "month": 2_629_746.0,
+    "months": 2_629_746.0,
+    "year": 31_556_952.0,
+    "years": 31_556_952.0,
+    "hours": 3600.0,
+    "hour": 3600.0,
+    "minutes": 60.0,
+    "minute": 60.0,
+    "seconds": 1.0,
+    "second": 1.0,
+}
+
+
+def parse_seconds(value: object) -> float:
+    """Seconds of ``"100 us"``, ``"1 year"`` (365.2425 days), ``"10 kHz"`` (its period) or a bare number of seconds.
+
+    Raises BadData.
+    """
+    if isinstance(value, (int, float)) and not isinstance(value, bool) and abs(value) < 1e300:
+        return float(value)
+    match = _QUANTITY.match(value) if isinstance(value, str) else None
+    if match is None:
+        raise BadData(
+            f"{value!r} is not a time.", hint='Write a number of seconds, or a text like "100 us" or "1 year".'
+        )
+    number, text = float(match[1]), match[2]
+    if not text or text in _TIMES:
+        return number * _TIMES.get(text, 1.0)
+    unit = parse_unit(text)
+    if unit.units == NAMED["s"]:
+        return unit.to_si(number)
+    if unit.units == NAMED["1/s"] and number:
+        return 1.0 / unit.to_si(number)
+    raise BadData(
+        f'"{value}" is not a time: {text} is no unit of time.', hint='Write it like "100 us", "5 s" or "10 kHz".'
+    )
+
+
+def short_unit(text: str) -> str:
+    """Sign of a unit where it has one (``°`` for ``degree``), for showing."""
+    return _SHORT.get(text, text)
+
+
+def recognize(units: Units, scale: float, offset: float) -> WrittenUnit:
+    """Unit of these exponents that converts into SI this way; one without a usual name is called after its scale."""
+
+    def close(one: float, other: float) -> bool:
+        return math.isclose(one, other, rel_tol=1e-6, abs_tol=1e-30)
+
+    if close(scale, 1.0) and offset == 0:
+        return WrittenUnit(format_units(units), units)
+    for texts, name, its_scale, its_offset in ROWS:
+        if NAMED[name] == units and close(scale, its_scale) and close(offset, its_offset):
+            return WrittenUnit(_SHORT.get(texts.split()[0], texts.split()[0]), units, its_scale, its_offset)
+    for texts, special, its_scale, its_offset in SPECIAL_ROWS:
+        if special == units and close(scale, its_scale) and close(offset, its_offset):
+            return WrittenUnit(texts.split()[0], units, its_scale, its_offset)
+    name = f"× {scale:.7g} {format_units(units)}".strip()
+    return WrittenUnit(f"({name} + {offset:.7g})" if offset else f"({name})", units, scale, offset)
