@@ -49,9 +49,7 @@ SECTIONS: Final[dict[str, dict[str, Entry]]] = {
         ),
         "import-keys": Entry("handover.bundles", "import_keys", "Take node keys over from another base station."),
         "handover": Entry("handover.pending", "handover", "Handovers under way: list, receipt, undo."),
-        "revoke": Entry(
-            "handover.life", "revoke", "Ban a node's key, here and where bundles from here go."
-        ),
+        "revoke": Entry("handover.life", "revoke", "Ban a node's key, here and where bundles from here go."),
         "decommission": Entry("handover.life", "decommission", "Reset a node and take it out of service."),
         "replace": Entry("handover.life", "replace", "Put a spare in the place of a broken node."),
         "backup": Entry("station.backup", "backup", "Write the whole store to a sealed file."),

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 from teds_provision.errors import BadData
 from teds_provision.teds.codec.model import UNIT_PARTS, Units
-from teds_provision.teds.units.units import units as u
+from teds_provision.teds.units import units as u
 
 
 def exponents(text: str) -> dict[str, Fraction]:

@@ -138,8 +138,8 @@ class _Judge:
                 yield self._error("inconsistent", f"the segment boundaries of input {number} do not ascend.")
 
     def _judged(self, calibration: Calibration) -> Iterator[GuardFinding]:
-        from teds_provision.teds.guard.curve import curve_of
         from teds_provision.teds.guard import checks as guard_checks
+        from teds_provision.teds.guard.curve import curve_of
 
         channel = self._demanded(self._channel(self.number, self.new), calibration)
         numbers = {part.channel for part in calibration.inputs}
