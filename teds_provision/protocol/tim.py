@@ -93,6 +93,7 @@ class Tim:
         self._pending: _Pending | None = None
         self._ending: list[Callable[[], None]] = []
         self._teds = TedsAccess(self.max_message, self.max_teds)
+        self._taken_address: int | None = None
 
     # -- what links call -------------------------------------------------------------------------------------------
 
@@ -104,7 +105,16 @@ class Tim:
     def identity(self) -> Identity:
         """What Identify says now."""
         flash = self._flash
-        return Identity(flash.uuid, flash.state, flash.epoch, flash.sequence, self.max_message, flash.can_address)
+        return Identity(flash.uuid, flash.state, flash.epoch, flash.sequence, self.max_message, self.can_address)
+
+    @property
+    def can_address(self) -> int:
+        """The present CAN address: the durable one, or one taken in a claim of addresses, which lasts to the restart."""
+        return self._flash.can_address if self._taken_address is None else self._taken_address
+
+    def take_can_address(self, address: int) -> None:
+        """Move to another CAN address because another node claimed this one (profile: wire, "Claim")."""
+        self._taken_address = address
 
     def handle(self, frame: bytes, *, link: str, tapped: bool) -> bytes:
         """Run one whole command frame and return the whole reply frame. Never raises on any octets."""
@@ -331,6 +341,7 @@ class Tim:
         if not 1 <= payload[0] <= LAST_CAN_ADDRESS:
             raise Refused(Reason.BAD_FORM)
         self._commit(replace(self._flash, can_address=payload[0]))
+        self._taken_address = None
         return Reply(True)
 
     def _commit(self, state: Flash) -> None:

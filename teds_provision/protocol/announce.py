@@ -1,0 +1,131 @@
+"""Announce on CAN, and how nodes that meet on one address sort themselves out (profile: wire, "CAN"). Pure.
+
+An Announce says "here I am, in this state, and this is the CRC-32 of my UUID". Where two nodes have one address, the
+one with the smaller CRC keeps it, the other takes the next address from which it has heard nothing.
+"""
+
+from __future__ import annotations
+
+import random
+import struct
+import zlib
+from collections import deque
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Final
+
+from teds_provision.protocol.messages.identity import NodeState
+
+ANNOUNCE: Final = 0x1CFF0000
+"""Identifier of an Announce without the node's address in its low octet."""
+LAST_ADDRESS: Final = 239
+START_SPREAD: Final = 0.5
+"""An Announce after start or bus-off waits a random time of up to so many seconds."""
+CLAIM_SPREAD: Final = 0.05
+A_MINUTE: Final = 60.0
+MOST_A_MINUTE: Final = 20
+_LAYOUT: Final = struct.Struct(">BBI2s")
+_VERSION: Final = 1
+
+
+def uuid_crc(uuid: bytes) -> int:
+    """CRC-32 (IEEE 802.3) of a UUID."""
+    return zlib.crc32(uuid)
+
+
+@dataclass(frozen=True)
+class Announce:
+    """An Announce: ``address`` 1 to 239, ``crc`` = CRC-32 of the UUID. A hint, proves nothing."""
+
+    address: int
+    state: int
+    crc: int
+
+    @property
+    def identifier(self) -> int:
+        """The 29-bit identifier."""
+        return ANNOUNCE | self.address
+
+    def encode(self) -> bytes:
+        """Return the 8 octets: 1 ‖ state ‖ CRC ‖ 00 00."""
+        return _LAYOUT.pack(_VERSION, self.state, self.crc, b"\0\0")
+
+    @classmethod
+    def decode(cls, identifier: int, data: bytes) -> Announce | None:
+        """Read a frame; None for what is no Announce of version 1 of a node."""
+        address = identifier & 0xFF
+        if identifier & 0x1FFFFF00 != ANNOUNCE or not 1 <= address <= LAST_ADDRESS or len(data) != _LAYOUT.size:
+            return None
+        version, state, crc, _ = _LAYOUT.unpack(data)
+        return cls(address, state, crc) if version == _VERSION and state <= NodeState.PROVISIONED else None
+
+
+def is_announce(identifier: int) -> bool:
+    """Whether a frame's identifier is that of an Announce."""
+    return identifier & 0x1FFFFF00 == ANNOUNCE
+
+
+@dataclass
+class Claim:
+    """One node's part: when to announce, and when to move. Times are monotonic seconds.
+
+    ``crc`` of the node's UUID; ``uniform`` gives a random number between two bounds. :meth:`due` is asked before each
+    wait, :meth:`announced` is told of each Announce that left.
+    """
+
+    crc: int
+    uniform: Callable[[float, float], float] = random.uniform
+    conflict: bool = False
+    """Another node with the same CRC has announced itself from the same address: a matter for a person."""
+    _heard: set[int] = field(default_factory=set)
+    _due: float | None = None
+    _sent: deque[float] = field(default_factory=deque)
+
+    def start(self, now: float) -> None:
+        """The node started, or came back from bus-off: announce after a random 0 to 500 ms."""
+        self._due = now + self.uniform(0, START_SPREAD)
+
+    def hear(self, source: int) -> None:
+        """A frame of any kind came from this address."""
+        self._heard.add(source)
+
+    def take(self, announce: Announce, own: int, now: float, *, pinned: bool = False) -> int:
+        """An Announce came in; return the address that the node has from now on, ``own`` where it stays.
+
+        ``pinned``: an actuator of the node is claimed, so it stays and goes on announcing.
+        """
+        self._heard.add(announce.address)
+        if announce.address != own:
+            return own
+        if announce.crc == self.crc:
+            self.conflict = True
+            return own
+        self._due = now + self.uniform(0, CLAIM_SPREAD)
+        if announce.crc > self.crc or pinned:
+            return own
+        return self._next(own)
+
+    def due(self, now: float) -> float | None:
+        """Monotonic time at which the next Announce is to leave, None for none.
+
+        One beyond the twenty of a minute is left out.
+        """
+        if self._due is None:
+            return None
+        while self._sent and self._sent[0] <= self._due - A_MINUTE:
+            self._sent.popleft()
+        if len(self._sent) >= MOST_A_MINUTE:
+            self._due = None
+        return self._due
+
+    def announced(self, now: float) -> None:
+        """The Announce that was due has left."""
+        self._sent.append(now)
+        self._due = None
+
+    def _next(self, own: int) -> int:
+        for step in range(1, LAST_ADDRESS):
+            address = (own - 1 + step) % LAST_ADDRESS + 1
+            if address not in self._heard:
+                return address
+        return own  # every address is taken: nothing is better than here

@@ -1,0 +1,138 @@
+"""Announce and the claim of addresses: octets, each rule, and whole buses of random nodes that sort themselves out."""
+
+from __future__ import annotations
+
+import random
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from teds_provision.protocol.announce import LAST_ADDRESS, MOST_A_MINUTE, Announce, Claim, uuid_crc
+
+
+def soon(low: float, high: float) -> float:
+    return low
+
+
+def test_an_announce_has_the_octets_of_the_page() -> None:
+    announce = Announce(0x21, 2, uuid_crc(b"123456789"))
+    assert announce.identifier == 0x1CFF0021
+    assert announce.encode().hex() == "0102cbf439260000"  # the check value of CRC-32 of IEEE 802.3
+
+
+@given(st.integers(1, 239), st.integers(0, 2), st.integers(0, 2**32 - 1))
+def test_what_is_encoded_is_decoded(address: int, state: int, crc: int) -> None:
+    announce = Announce(address, state, crc)
+    assert Announce.decode(announce.identifier, announce.encode()) == announce
+
+
+@given(st.integers(0, 2**29 - 1), st.binary(max_size=64))
+def test_no_frame_is_taken_for_an_announce_that_is_none(identifier: int, data: bytes) -> None:
+    announce = Announce.decode(identifier, data)
+    assert announce is None or (announce.identifier == identifier and announce.encode()[:6] == data[:6])
+
+
+@pytest.mark.parametrize(
+    ("identifier", "data"),
+    [
+        (0x1CFF0000, "0100000000010000"),  # nobody's address
+        (0x1CFF00F0, "0100000000010000"),  # a station's address
+        (0x1CFF2021, "0100000000010000"),  # a data frame
+        (0x1CFF0021, "0200000000010000"),  # another version
+        (0x1CFF0021, "0103000000010000"),  # no such state
+        (0x1CFF0021, "01000000000100"),
+    ],
+)
+def test_other_frames_are_none(identifier: int, data: str) -> None:
+    assert Announce.decode(identifier, bytes.fromhex(data)) is None
+
+
+def test_the_first_announce_waits_up_to_half_a_second_and_leaves_once() -> None:
+    claim = Claim(5, uniform=lambda low, high: high)
+    claim.start(10.0)
+    assert claim.due(10.0) == 10.5
+    claim.announced(10.5)
+    assert claim.due(10.5) is None
+
+
+def test_the_smaller_crc_stays_and_announces_again() -> None:
+    claim = Claim(5, uniform=lambda low, high: high)
+    assert claim.take(Announce(33, 0, 6), 33, 1.0) == 33
+    assert claim.due(1.0) == 1.05
+
+
+def test_the_greater_crc_moves_to_the_next_address_that_it_has_not_heard() -> None:
+    claim = Claim(6, uniform=soon)
+    for source in (239, 1, 3):
+        claim.hear(source)
+    assert claim.take(Announce(238, 0, 5), 238, 1.0) == 2
+    assert claim.due(1.0) == 1.0
+
+
+def test_with_an_actuator_claimed_it_stays_and_announces() -> None:
+    claim = Claim(6, uniform=soon)
+    assert claim.take(Announce(33, 0, 5), 33, 1.0, pinned=True) == 33
+    assert claim.due(1.0) == 1.0
+
+
+def test_other_addresses_and_equal_crcs_move_nobody() -> None:
+    claim = Claim(6, uniform=soon)
+    assert claim.take(Announce(34, 0, 5), 33, 1.0) == 33
+    assert not claim.conflict
+    assert claim.take(Announce(33, 0, 6), 33, 1.0) == 33
+    assert claim.conflict
+    assert claim.due(1.0) is None
+
+
+def test_an_address_from_which_an_announce_came_is_taken() -> None:
+    claim = Claim(6, uniform=soon)
+    claim.take(Announce(34, 0, 5), 33, 1.0)
+    assert claim.take(Announce(33, 0, 5), 33, 1.0) == 35
+
+
+def test_at_most_twenty_announces_a_minute() -> None:
+    claim, left = Claim(5, uniform=soon), 0
+    for attempt in range(100):
+        claim.take(Announce(33, 0, 6), 33, attempt * 0.1)
+        if claim.due(attempt * 0.1) is not None:
+            claim.announced(attempt * 0.1)
+            left += 1
+    assert left == MOST_A_MINUTE
+    claim.take(Announce(33, 0, 6), 33, 60.05)
+    assert claim.due(60.05) == 60.05
+
+
+def bus_of(nodes: int, seed: int, addresses: int = LAST_ADDRESS) -> list[int]:
+    """Addresses of ``nodes`` on one bus once nobody announces any more."""
+    dice = random.Random(seed)
+    crcs = dice.sample(range(2**32), nodes)
+    claims = [Claim(crc, uniform=dice.uniform) for crc in crcs]
+    at = [1 + crc % addresses for crc in crcs]
+    for claim in claims:
+        claim.start(0.0)
+    for _ in range(100 * nodes):
+        pending = [(due, index) for index, claim in enumerate(claims) if (due := claim.due(0.0)) is not None]
+        if not pending:
+            break
+        now, speaker = min(pending)
+        claims[speaker].announced(now)
+        announce = Announce(at[speaker], 0, crcs[speaker])
+        for index, claim in enumerate(claims):
+            if index != speaker:
+                at[index] = claim.take(announce, at[index], now)
+    return at
+
+
+@settings(deadline=None, max_examples=60)
+@given(st.integers(2, 60), st.integers(0, 2**32))
+def test_nodes_with_random_addresses_sort_themselves_out(nodes: int, seed: int) -> None:
+    at = bus_of(nodes, seed)
+    assert len(set(at)) == nodes
+    assert all(1 <= address <= LAST_ADDRESS for address in at)
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_even_200_nodes_and_24_on_one_address_sort_themselves_out(seed: int) -> None:
+    assert len(set(bus_of(200, seed))) == 200
+    assert len(set(bus_of(24, seed, addresses=1))) == 24
