@@ -109,7 +109,7 @@ class Tim:
 
     @property
     def can_address(self) -> int:
-        """The present CAN address: the durable one, or one taken in a claim of addresses, which lasts to the restart."""
+        """The present CAN address: the durable one, or one taken in a claim of addresses, which lasts till restart."""
         return self._flash.can_address if self._taken_address is None else self._taken_address
 
     def take_can_address(self, address: int) -> None:
