@@ -30,16 +30,18 @@ ARROWS = {
     "talk": _BELOW_TALK,
     "steps": _BELOW_TALK | {"talk"},
     "handover": _BELOW_TALK | {"talk", "steps"},
+    "measure": _BELOW_TALK | {"talk", "steps", "handover"},
     "backup": {"station", "vault", "store", "protocol", "teds"},
     "doctor": {"station", "links", "vault", "store", "protocol", "teds"},
     "demo": _BELOW_TALK | {"talk", "steps", "handover"},
-    "cli": _BELOW_TALK | {"talk", "steps", "handover", "backup", "doctor", "demo", "node"},
+    "cli": _BELOW_TALK | {"talk", "steps", "handover", "backup", "doctor", "demo", "node", "measure"},
     "__main__": {"cli"},
 }
 # `teds` names the commands that it shows: numbers and names, from modules which import nothing of `teds` themselves.
 NAMES_FOR_TEDS = {"teds_provision.protocol.messages.frames"}
 # Too slow to load before they are needed: --help, --version and a pure decode must not wait for them.
 HEAVY = {"nfc", "ndef", "can", "isotp", "keyring", "rich", "cryptography", "pint", "numpy", "matplotlib", "pkcs11"}
+HEAVY |= {"mcap", "zstandard", "cyclonedds", "paho"}
 PURE = ("protocol", "teds")
 IO = {"socket", "sqlite3", "subprocess", "threading", "time", "click", "serial"}
 

@@ -1,0 +1,162 @@
+"""What passes from the runner to the sinks: facts of channels, blocks of samples, rows of a group, reports.
+
+One vocabulary for every sink, so that a sink never asks a node, the store or a datasheet. All of it is frozen, and a
+block's arrays are never written to after they were handed on: several sinks read them in threads of their own.
+
+Values are in the SI unit of the datasheet (``ChannelFacts.unit``); times are unix seconds.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any, Literal
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    from numpy.typing import NDArray
+
+    from teds_provision.teds import Units
+
+Kind = Literal["sensor", "event", "actuator"]
+State = Literal["waiting", "running", "lost", "refused", "ended"]
+
+
+@dataclass(frozen=True)
+class ChannelFacts:
+    """What the signed datasheet and the plan say of one TransducerChannel; does not change while it is measured.
+
+    ``unit`` is the SI unit of ``Block.value`` as text (``rad``, ``K``, ``m/s²``; empty for counts), ``units`` its
+    exponents, ``shown_unit`` the one for people (``°``, ``°C``). ``uncertainty`` (OError, worst case), ``low`` and
+    ``high`` are in ``unit``; None means that the datasheet does not say. ``calibrated`` and ``due`` are ISO dates.
+    """
+
+    uuid: str  # 20 hex digits, lower case
+    node: str  # name of the node in the store; empty where it has none
+    number: int  # of the TransducerChannel, 1 to 255
+    name: str  # from the datasheet; empty where it has none
+    kind: Kind = "sensor"
+    unit: str = ""
+    units: Units | None = None
+    shown_unit: str = ""
+    low: float | None = None
+    high: float | None = None
+    uncertainty: float | None = None
+    calibrated: str | None = None
+    due: str | None = None
+    overdue: bool = False
+    fingerprint: str = ""  # SHA-256 of the signed datasheet, 64 hex digits; empty where it is unsigned
+    sample_form: str = ""  # of the raw value: uint16, float32 …
+    period: float | None = None  # seconds between samples as measured; None for events
+    quantity: str = ""  # what the profile or the name calls it, e.g. "relative humidity"; empty where nobody said
+    vector: str = ""  # name of the vector group of the datasheet; empty where the channel is in none
+    kind_of_group: str = ""  # meaning of that vector group: "magnetic field", "wrench", "imu"; empty if not said
+
+    @property
+    def key(self) -> tuple[str, int]:
+        """Node and channel: what tells channels apart in a whole station."""
+        return self.uuid, self.number
+
+    @property
+    def label(self) -> str:
+        """Name for people: the channel's, else its number."""
+        return self.name or f"channel {self.number}"
+
+
+@dataclass(frozen=True)
+class Block:
+    """Samples of one stream, checked and calibrated: n instants of c channels.
+
+    ``raw`` is n × c of a dtype that holds every raw value exactly (integer, float64, else object). ``value`` is
+    n × c float64, NaN exactly where ``valid`` is False. With ``test_pattern`` there are no measurements in it: every
+    value is NaN, and each sink marks what it writes.
+    """
+
+    uuid: str
+    stream: int
+    channels: tuple[int, ...]
+    index: int  # sample number of the first row in its run
+    time: NDArray[Any]  # (n) float64, unix seconds; never goes back within a stream
+    tick: NDArray[Any]  # (n) uint64, nanoseconds of the node's clock
+    raw: NDArray[Any]  # (n, c)
+    value: NDArray[Any]  # (n, c) float64
+    valid: NDArray[Any]  # (n, c) bool
+    age: float = 0.0  # seconds from the last instant to the moment when the block was handed on
+    clock_error: float | None = None  # bound of the error of `time` in seconds; None where none is known
+    test_pattern: bool = False
+    run: int = 0  # number of the run of the stream in its session
+
+
+@dataclass(frozen=True)
+class GroupRows:
+    """Rows of a group on one grid of times: the "synchronized data" of all its channels.
+
+    ``value`` (n × c) holds each channel's last value that is not newer than the row, ``age`` how much older it is;
+    both NaN after two periods without a value.
+    """
+
+    group: str
+    channels: tuple[tuple[str, int], ...]  # (uuid, channel number) of each column
+    time: NDArray[Any]  # (n) float64, unix seconds, one period apart
+    value: NDArray[Any]  # (n, c) float64
+    age: NDArray[Any]  # (n, c) float64, seconds
+    test_pattern: bool = False
+
+
+@dataclass(frozen=True)
+class NodeReport:
+    """How one node does; once a second, and when its state changes."""
+
+    uuid: str
+    state: State
+    why: str = ""
+    samples: int = 0
+    lost: int = 0
+    late: int = 0
+    bad: int = 0
+    invalid: int = 0
+    clock_error: float | None = None
+    time: float = 0.0  # unix seconds
+
+
+@dataclass(frozen=True)
+class StationFacts:
+    """Who measures: what a file's header, a topic's prefix and a metadata message say of the station.
+
+    ``names`` maps (uuid, channel) to the topic that the user chose, channel 0 to the node's part of it;
+    ``frame_ids`` maps a uuid to a frame. ``scalar_rate`` limits topics of one value (Hz), 0 leaves them out.
+    """
+
+    name: str
+    group: str = ""
+    started: float = 0.0  # unix seconds
+    clock: str = "host's wall clock, node ticks mapped to it"
+    names: Mapping[tuple[str, int], str] = field(default_factory=dict)
+    frame_ids: Mapping[str, str] = field(default_factory=dict)
+    scalar_rate: float = 10.0
+    test_pattern: bool = False
+
+
+@dataclass(frozen=True)
+class Command:
+    """A set point for an actuator that came by a sink (a ROS topic), in the SI unit of the datasheet."""
+
+    uuid: str
+    channel: int
+    value: float
+    received: float  # time.monotonic() when it was taken
+
+
+@dataclass(frozen=True)
+class SinkStats:
+    """What became of what a sink was given. ``error`` is for people: the sink has ended and takes nothing more."""
+
+    written: int = 0  # samples (values) that went out
+    dropped: int = 0  # samples that a slow consumer cost; 0 for a recorder, always
+    octets: int = 0
+    messages: int = 0
+    lag: float = 0.0  # seconds by which the last item waited in the queue
+    state: Literal["starting", "running", "waiting", "ended", "failed"] = "starting"
+    detail: str = ""  # e.g. "waits for a ROS master at http://localhost:11311"
+    error: str = ""
+    hint: str = ""

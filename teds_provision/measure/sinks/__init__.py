@@ -1,0 +1,34 @@
+"""Where measured values go: text, MCAP and JSON-line files, ROS 1, ROS 2, MQTT. One file each, one line below.
+
+:func:`open_sink` makes a sink from the words of the command line. A new sink is a module with a class that follows
+:class:`Sink` (most easily a :class:`ThreadedSink`), and a line in FILES or SERVICES.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+from teds_provision.errors import UsageFailure
+from teds_provision.measure.sinks.base import CommandTaker, Sink, ThreadedSink, as_sink_failure
+
+__all__ = ["CommandTaker", "Sink", "ThreadedSink", "as_sink_failure", "open_sink"]
+
+FILES: dict[str, Callable[[Path], Sink]] = {}
+SERVICES: dict[str, Callable[[str, CommandTaker | None], Sink]] = {}
+
+
+def open_sink(spec: str, commands: CommandTaker | None = None) -> Sink:
+    """The sink of a spec, not yet opened: a file name, ``ros1[:URL]``, ``ros2[:DOMAIN]``, ``mqtt://HOST[:PORT]``.
+
+    ``commands`` takes set points that come by the sink; None where no actuator may be moved. Raises UsageFailure.
+    """
+    service = spec.partition(":")[0]
+    if service in SERVICES:
+        return SERVICES[service](spec, commands)
+    path = Path(spec)
+    if path.suffix.lower() not in FILES:
+        raise UsageFailure(
+            f"No sink writes {spec!r}.", hint=f"Name a file that ends in {', '.join(FILES)}, or {', '.join(SERVICES)}."
+        )
+    return FILES[path.suffix.lower()](path)

@@ -1,0 +1,263 @@
+"""The interface of a sink, and its thread: the measuring loop never waits for a disk, a broker or a subscriber.
+
+A *recorder* drops nothing. If it cannot keep up, or the disk is full, the recording ends with an error that stays in
+its statistics, and what was written until then is whole. A *live* sink drops the oldest waiting block and counts it.
+"""
+
+from __future__ import annotations
+
+import threading
+import time
+from abc import ABC, abstractmethod
+from collections import deque
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from typing import Protocol
+
+from teds_provision.errors import TedsProvisionError
+from teds_provision.measure.blocks import Block, ChannelFacts, Command, GroupRows, NodeReport, SinkStats, StationFacts
+
+Item = Block | GroupRows | NodeReport | tuple[ChannelFacts, ...]
+CommandTaker = Callable[[Command], None]
+
+RECORDER_WAITING = 2_000_000  # values that a recorder may owe: some 200 MB, 40 s at 50,000 values a second
+LIVE_WAITING = 256  # items that a live sink may owe: newest wins
+TICK = 0.1  # seconds between looks at the clock while nothing comes
+CLOSING = 30.0  # seconds for a recorder to write what it owes
+
+
+class Sink(Protocol):
+    """Takes what is measured. ``write``, ``write_group``, ``describe`` and ``report`` return at once, from any thread.
+
+    ``open`` raises TedsProvisionError where the sink cannot work at all (no folder, no library). What goes wrong later
+    stands in ``stats``; the measurement goes on.
+    """
+
+    @property
+    def name(self) -> str:
+        """For people and events: ``run.csv``, ``ROS 1``, ``mqtt://host``."""
+
+    @property
+    def files(self) -> tuple[str, ...]:
+        """Paths that it wrote so far."""
+
+    @property
+    def stats(self) -> SinkStats:
+        """A snapshot."""
+
+    def open(self, facts: Sequence[ChannelFacts], station: StationFacts) -> None:
+        """Begin; ``facts`` are those of the channels that are known by now."""
+
+    def describe(self, facts: Sequence[ChannelFacts]) -> None:
+        """Facts of channels that came later, or changed since (a new datasheet)."""
+
+    def write(self, block: Block) -> None:
+        """Take samples of one stream."""
+
+    def write_group(self, rows: GroupRows) -> None:
+        """Take rows of the group's grid; a sink that has no use for them ignores them."""
+
+    def report(self, report: NodeReport) -> None:
+        """Take the state of a node."""
+
+    def close(self) -> None:
+        """Write out what is owed, end, give back what was opened. A second call does nothing."""
+
+
+class ThreadedSink(ABC):
+    """A sink whose work is done by one thread of its own; subclasses fill in four steps and the name.
+
+    The steps are called on that thread alone, one after another: ``_begin`` before anything else, ``_take`` for each
+    item, ``_idle`` at least every TICK, ``_finish`` at the end (also after an error of ``_take``).
+    """
+
+    recorder = False
+
+    def __init__(self, name: str) -> None:
+        self.name = name
+        self._lock = threading.Condition()
+        self._items: deque[tuple[float, int, Item]] = deque()
+        self._owed = 0
+        self._closing = False
+        self._stats = SinkStats()
+        self._thread: threading.Thread | None = None
+
+    @property
+    def files(self) -> tuple[str, ...]:
+        """Paths that it wrote; a sink without files has none."""
+        return ()
+
+    @property
+    def stats(self) -> SinkStats:
+        """A snapshot of the counters."""
+        with self._lock:
+            return self._stats
+
+    def open(self, facts: Sequence[ChannelFacts], station: StationFacts) -> None:
+        """Do what can fail at once, then start the thread. Raises TedsProvisionError."""
+        self._prepare(tuple(facts), station)
+        self._thread = threading.Thread(target=self._work, name=f"sink {self.name}", daemon=True)
+        self._thread.start()
+
+    def describe(self, facts: Sequence[ChannelFacts]) -> None:
+        """Facts that came later; never dropped."""
+        self._put(tuple(facts), 0)
+
+    def write(self, block: Block) -> None:
+        """Samples of one stream."""
+        self._put(block, int(block.value.size))
+
+    def write_group(self, rows: GroupRows) -> None:
+        """Rows of the grid."""
+        self._put(rows, int(rows.value.size))
+
+    def report(self, report: NodeReport) -> None:
+        """State of a node."""
+        self._put(report, 0)
+
+    def close(self) -> None:
+        """Let the thread write what it owes and end."""
+        with self._lock:
+            self._closing = True
+            self._lock.notify_all()
+        thread = self._thread
+        if thread is not None:
+            thread.join(CLOSING)
+            if thread.is_alive():
+                self._fail(TedsProvisionError(f"{self.name} did not end within {CLOSING:.0f} s."))
+
+    @abstractmethod
+    def _prepare(self, facts: tuple[ChannelFacts, ...], station: StationFacts) -> None:
+        """On the caller's thread: check and open. Raises TedsProvisionError."""
+
+    def _begin(self) -> None:  # noqa: B027  may be left out
+        """First step on the sink's own thread."""
+
+    @abstractmethod
+    def _take(self, item: Item) -> None:
+        """One item."""
+
+    def _idle(self, now: float) -> None:  # noqa: B027  may be left out
+        """Something to do by the clock (time.monotonic); at least every TICK."""
+
+    @abstractmethod
+    def _finish(self) -> None:
+        """Close files and connections."""
+
+    def _count(self, *, written: int = 0, dropped: int = 0, octets: int = 0, messages: int = 0) -> None:
+        with self._lock:
+            old = self._stats
+            self._stats = replace(
+                old,
+                written=old.written + written,
+                dropped=old.dropped + dropped,
+                octets=old.octets + octets,
+                messages=old.messages + messages,
+            )
+
+    def _say(self, state: str, detail: str = "") -> None:
+        """Set the state that people see; a failure stays."""
+        with self._lock:
+            if self._stats.state != "failed":
+                self._stats = replace(self._stats, state=state, detail=detail)  # type: ignore[arg-type]
+
+    def _fail(self, error: TedsProvisionError) -> None:
+        with self._lock:
+            if self._stats.state != "failed":
+                self._stats = replace(self._stats, state="failed", error=error.message, hint=error.hint)
+
+    def _put(self, item: Item, values: int) -> None:
+        with self._lock:
+            if self._closing or self._stats.state == "failed":
+                return
+            if self.recorder:
+                if self._owed + values > RECORDER_WAITING:
+                    # Waiting would stop the measurement, dropping would leave a hole that nobody sees: so it ends.
+                    error = "The disk is too slow"
+                    self._stats = replace(
+                        self._stats,
+                        state="failed",
+                        error=f"{error}: {self.name} owes {self._owed} values. The recording has ended.",
+                        hint="Record to a faster disk, or fewer channels.",
+                    )
+                    self._lock.notify_all()
+                    return
+            elif len(self._items) >= LIVE_WAITING:
+                self._drop_oldest()
+            self._items.append((time.monotonic(), values, item))
+            self._owed += values
+            self._lock.notify_all()
+
+    def _drop_oldest(self) -> None:
+        """Of what waits, the oldest samples go; facts and reports stay, they are few."""
+        for place, (_, values, item) in enumerate(self._items):
+            if isinstance(item, Block | GroupRows):
+                del self._items[place]
+                self._owed -= values
+                self._stats = replace(self._stats, dropped=self._stats.dropped + values)
+                return
+        self._items.popleft()
+
+    def _next(self) -> tuple[Item | None, bool]:
+        """The next item, or None after TICK; and whether all is done."""
+        with self._lock:
+            if not self._items and not self._closing:
+                self._lock.wait(TICK)
+            if self._stats.state == "failed":
+                self._items.clear()
+                return None, True
+            if not self._items:
+                return None, self._closing
+            stamp, values, item = self._items.popleft()
+            self._owed -= values
+            self._stats = replace(self._stats, lag=time.monotonic() - stamp)
+            return item, False
+
+    def _work(self) -> None:
+        try:
+            self._begin()
+            self._say("running")
+            self._run()
+        except TedsProvisionError as error:
+            self._fail(error)
+        except OSError as error:
+            self._fail(as_sink_failure(error, self.name))
+        finally:
+            self._end()
+
+    def _run(self) -> None:
+        looked = time.monotonic()
+        done = False
+        while not done:
+            item, done = self._next()
+            if item is not None:
+                self._take(item)
+            now = time.monotonic()
+            if item is None or now - looked >= TICK:
+                self._idle(now)
+                looked = now
+
+    def _end(self) -> None:
+        try:
+            self._finish()
+        except TedsProvisionError as error:
+            self._fail(error)
+        except OSError as error:
+            self._fail(as_sink_failure(error, self.name))
+        self._say("ended")
+
+
+def as_sink_failure(error: OSError, name: str) -> TedsProvisionError:
+    """What the system refused, in the words of the tool."""
+    import errno
+
+    cures = {
+        errno.ENOSPC: ("the disk is full", "Free some space; what was written until now is whole."),
+        errno.EDQUOT: ("the disk quota is used up", "Free some space; what was written until now is whole."),
+        errno.EFBIG: ("the file may not grow any more", "Record to another disk, or in shorter runs."),
+        errno.EACCES: ("it may not be written", "Check the owner and mode of the folder."),
+        errno.EROFS: ("the disk is read-only", "Record to another disk."),
+        errno.ENOENT: ("its folder is not there", "Make the folder first."),
+    }
+    cause, cure = cures.get(error.errno or 0, (error.strerror or type(error).__name__, "Check the path."))
+    return TedsProvisionError(f"{name} cannot be written: {cause}.", hint=cure)
