@@ -10,6 +10,7 @@ from teds_provision.protocol import datasheet
 from teds_provision.protocol.flash import Flash
 from teds_provision.protocol.messages.frames import Reason
 from teds_provision.teds.codec import security
+from teds_provision.teds.codec.codes import AccessCode
 from teds_provision.teds.codec.security import NotCanonical, SecurityTeds
 from teds_provision.teds.image import SECURITY, BlockId
 
@@ -43,7 +44,7 @@ def verified_commit(flash: Flash, staged: Mapping[BlockId, bytes]) -> Flash:
     _demand(datasheet.signature_good(signed, staged[SECURITY], flash.uuid), Reason.BAD_SIGNATURE)
     blocks = _listed_blocks(flash, staged, signed)
     for (_, access_code), teds in blocks.items():
-        _demand(access_code != datasheet.META or datasheet.meta_names(teds, flash.uuid), Reason.WRONG_UUID)
+        _demand(access_code != AccessCode.META or datasheet.meta_names(teds, flash.uuid), Reason.WRONG_UUID)
     ahead = signed.sequence - flash.sequence
     _demand(0 < ahead <= datasheet.SEQUENCE_WINDOW, Reason.STALE_SEQUENCE)
     _demand(signed.key_epoch == flash.epoch, Reason.WRONG_EPOCH)

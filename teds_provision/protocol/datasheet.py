@@ -10,10 +10,10 @@ from teds_provision.errors import BadData
 from teds_provision.protocol.agreement import Credentials
 from teds_provision.protocol.keys import is_point, station_key_message, verify
 from teds_provision.teds.codec import frame, security
+from teds_provision.teds.codec.codes import AccessCode
 from teds_provision.teds.codec.security import SecurityTeds
 from teds_provision.teds.image import BlockId
 
-META = 1
 UUID_FIELD = 4
 SEQUENCE_WINDOW = 65536
 STORED_CODES = frozenset({*range(1, 18), *range(128, 136)})
@@ -36,7 +36,7 @@ def can_be_stored(block: BlockId) -> bool:
 
 def digests(blocks: Mapping[BlockId, bytes]) -> dict[BlockId, bytes]:
     """SHA-256 of every TEDS (Length to Checksum inclusive), the Security TEDS left out."""
-    return {key: hashlib.sha256(teds).digest() for key, teds in blocks.items() if key != (0, security.ACCESS_CODE)}
+    return {key: hashlib.sha256(teds).digest() for key, teds in blocks.items() if key != (0, AccessCode.SECURITY)}
 
 
 def unsigned_datasheet(

@@ -6,9 +6,8 @@ from dataclasses import dataclass
 
 from teds_provision import teds
 from teds_provision.harmless import printable
+from teds_provision.teds.codec.codes import AccessCode
 from teds_provision.teds.image import Image
-
-NAME, CHANNEL, CALIBRATION = 12, 3, 5
 
 
 @dataclass(frozen=True)
@@ -32,12 +31,12 @@ class Summary:
 
 def summarise(image: Image) -> Summary:
     """Decode what a person wants to see; never raises on any octets."""
-    channels = [_channel(image, channel) for channel, code in image if code == CHANNEL]
+    channels = [_channel(image, channel) for channel, code in image if code == AccessCode.CHANNEL]
     return Summary(_name(image, 0), tuple(channels))
 
 
 def _name(image: Image, channel: int) -> str | None:
-    octets = image.blocks.get((channel, NAME))
+    octets = image.blocks.get((channel, AccessCode.NAME))
     found = teds.decode(octets).get("TCName") if octets is not None else None
     return printable(found) if isinstance(found, str) else None
 
@@ -45,10 +44,12 @@ def _name(image: Image, channel: int) -> str | None:
 def _channel(image: Image, channel: int) -> ChannelSummary:
     from teds_provision.teds.units.units import display_unit, format_value
 
-    decoded = teds.decode(image.blocks[channel, CHANNEL])
+    decoded = teds.decode(image.blocks[channel, AccessCode.CHANNEL])
     units, low, high = decoded.get("PhyUnits"), decoded.get("LowLimit"), decoded.get("HiLimit")
     unit = text = ""
     if isinstance(units, teds.Units) and isinstance(low, float) and isinstance(high, float):
         shown = display_unit(units)
         unit, text = shown.text, f"{format_value(low, shown)} to {format_value(high, shown)}"
-    return ChannelSummary(channel, _name(image, channel) or "", unit, text, (channel, CALIBRATION) in image.blocks)
+    return ChannelSummary(
+        channel, _name(image, channel) or "", unit, text, (channel, AccessCode.CALIBRATION) in image.blocks
+    )

@@ -18,8 +18,6 @@ if TYPE_CHECKING:
     from teds_provision.teds.calibration import Calibration
     from teds_provision.teds.profile import Profile
 
-CALIBRATION = 5
-
 
 @dataclass(frozen=True)
 class BuildOrder:

@@ -16,6 +16,7 @@ from teds_provision.steps.read import read_block
 from teds_provision.store import WhitelistEntry, utc_now
 from teds_provision.talk.conversation import Conversation
 from teds_provision.teds.codec import security
+from teds_provision.teds.codec.codes import AccessCode
 from teds_provision.teds.image import SECURITY, Image
 
 CHALLENGE_OCTETS = 32
@@ -130,7 +131,7 @@ def describe(node: Conversation) -> Description:
 
     name: str | None = None
     channels = 0
-    for block in ((0, 1), (0, 12)):
+    for block in ((0, AccessCode.META), (0, AccessCode.NAME)):
         try:
             decoded = teds.decode(read_block(node, block))
         except NodeRefused:

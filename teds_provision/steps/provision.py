@@ -25,6 +25,7 @@ from teds_provision.store import Draft, WhitelistEntry
 from teds_provision.store.records import Assurance
 from teds_provision.talk.conversation import Conversation
 from teds_provision.talk.progress import DONE, NOTHING, Reporter, StepResult, Steps
+from teds_provision.teds.codec.codes import AccessCode
 from teds_provision.teds.image import SECURITY, Image
 
 Accept = Callable[[Identified], None]
@@ -145,7 +146,10 @@ def verify_node(station: Station, node: Conversation, image: Image, point: bytes
     checks.append(possession(lambda: prove(node, point)))
     verified = Verified(node.uuid, tuple(checks))
     security = image.security
-    facts: dict[str, object] = {"verdict": verified.verdict, "channels": len({c for c, code in image if code == 3})}
+    facts: dict[str, object] = {
+        "verdict": verified.verdict,
+        "channels": len({c for c, code in image if code == AccessCode.CHANNEL}),
+    }
     if security is not None:
         from hashlib import sha256
 

@@ -12,6 +12,7 @@ from teds_provision.protocol.keys import fingerprint, is_point, node_key_message
 from teds_provision.protocol.messages.identity import Identity
 from teds_provision.station.station import Station
 from teds_provision.teds.codec import security
+from teds_provision.teds.codec.codes import AccessCode
 from teds_provision.teds.codec.security import NotCanonical, SecurityTeds
 from teds_provision.teds.image import SECURITY, Image
 
@@ -177,5 +178,5 @@ def _unlisted(image: Image, shown: SecurityTeds) -> Check:
 
 
 def _meta(image: Image) -> Check:
-    metas = [teds for (_, code), teds in image.blocks.items() if code == datasheet.META]
+    metas = [teds for (_, code), teds in image.blocks.items() if code == AccessCode.META]
     return _check("UUID", all(datasheet.meta_names(teds, image.uuid) for teds in metas), "the Meta-TEDS names another")

@@ -9,6 +9,7 @@ from __future__ import annotations
 from importlib import import_module
 from typing import TYPE_CHECKING, Final
 
+from teds_provision.teds.codec.codes import AccessCode
 from teds_provision.teds.codec.decode import decode
 from teds_provision.teds.codec.model import (
     Decoded,
@@ -30,6 +31,7 @@ if TYPE_CHECKING:
     from teds_provision.teds.codec.uuid import UuidParts, pack_uuid, unpack_uuid
 
 __all__ = [
+    "AccessCode",
     "Decoded",
     "Edition",
     "Field",

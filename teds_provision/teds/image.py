@@ -6,14 +6,17 @@ import hashlib
 import json
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
+from typing import Final
 
 from teds_provision.errors import BadData
+from teds_provision.teds.codec.codes import AccessCode
 
 FORMAT = "teds-image/1"
-SECURITY = (0, 128)
 
 BlockId = tuple[int, int]
 """(TransducerChannel, access code), the order in which blocks are listed and signed."""
+SECURITY: Final[BlockId] = (0, AccessCode.SECURITY)
+"""Place of the Security TEDS of the profile."""
 
 
 @dataclass(frozen=True)

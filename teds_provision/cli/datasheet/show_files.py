@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from teds_provision.errors import BadData, NotFound
+from teds_provision.teds.codec.codes import AccessCode
 from teds_provision.teds.codec.model import Decoded, Edition, Finding, Verdict
 from teds_provision.teds.formats import Block, Kind, class_of, detect, read_blocks
 from teds_provision.teds.formats.block import MAX_FILE
@@ -20,7 +21,6 @@ if TYPE_CHECKING:
     from teds_provision.teds.guard.guard import GuardFinding
 
 STDIN = "-"
-_CALIBRATION = 5
 
 
 @dataclass(frozen=True)
@@ -115,11 +115,11 @@ def placed(blocks: Sequence[Block]) -> dict[tuple[int, int], bytes]:
 
 
 def _usual_channel(code: int) -> int:
-    return 1 if code in {3, _CALIBRATION} else 0
+    return 1 if code in {AccessCode.CHANNEL, AccessCode.CALIBRATION} else 0
 
 
 def _guard(beside: dict[tuple[int, int], bytes]) -> tuple[GuardFinding, ...]:
-    if not any(code == _CALIBRATION for _, code in beside):
+    if not any(code == AccessCode.CALIBRATION for _, code in beside):
         return ()
     from datetime import UTC, datetime
 

@@ -8,6 +8,7 @@ from datetime import UTC, datetime, timedelta
 
 from teds_provision.errors import BadData
 from teds_provision.teds.calibration.model import METHODS, MONOTONE, Calibration, CalibrationInput, Method, Monotone
+from teds_provision.teds.codec.codes import AccessCode
 from teds_provision.teds.codec.model import Decoded, Field, TimeInstance, Units
 from teds_provision.teds.image import BlockId
 from teds_provision.teds.units.units import WrittenUnit, recognize
@@ -68,9 +69,9 @@ def calibrations_of(blocks: Mapping[BlockId, bytes]) -> dict[int, Calibration]:
 
     out: dict[int, Calibration] = {}
     for (channel, access_code), octets in sorted(blocks.items()):
-        if access_code != 5:
+        if access_code != AccessCode.CALIBRATION:
             continue
-        own = decode(blocks[channel, 3]) if (channel, 3) in blocks else None
+        own = decode(blocks[channel, AccessCode.CHANNEL]) if (channel, AccessCode.CHANNEL) in blocks else None
         units = own.get("PhyUnits") if own else None
         actuator = own is not None and own.get("ChanType") == 1
         try:

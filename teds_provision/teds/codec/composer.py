@@ -7,6 +7,7 @@ from typing import Final
 
 from teds_provision.errors import BadData
 from teds_provision.teds.codec import values
+from teds_provision.teds.codec.codes import AccessCode
 from teds_provision.teds.codec.frame import TEDSID, frame, raw_tuple
 from teds_provision.teds.codec.model import Decoded, Edition, Field, Units
 from teds_provision.teds.codec.tables import TEXT_BASED, FieldSpec, Table, table
@@ -100,7 +101,11 @@ class Composer:
         spec = known.get(name)
         if spec is not None:
             return spec.type, self.value(spec, value), spec.repeats
-        if not name.isdecimal() or not 0 <= int(name) <= 255 or (int(name) == TEDSID and self.table.access_code != 128):
+        if (
+            not name.isdecimal()
+            or not 0 <= int(name) <= 255
+            or (int(name) == TEDSID and self.table.access_code != AccessCode.SECURITY)
+        ):
             raise BadData(f"{self.table.name} has no field {name!r}.", hint=f"It has {', '.join(known) or 'no names'}.")
         if not isinstance(value, bytes | bytearray):
             raise BadData(f"Field {name} of {self.table.name} is raw octets, not {values.shown(value)}.")

@@ -7,13 +7,13 @@ from collections.abc import Callable, Iterable
 from math import isinf, isnan
 from typing import Final
 
+from teds_provision.teds.codec.codes import AccessCode
 from teds_provision.teds.codec.model import Field, TimeInstance, Units
 from teds_provision.teds.codec.tables import FieldSpec, Table
 
 Find = Callable[..., None]
 
 PROFILE_VERSION: Final = 105
-_CHANNEL, _CALIBRATION, _NAME, _SECURITY_2024, _SECURITY = 3, 5, 12, 16, 128
 # Octets that one sample of these data models must have; the other models take any number in their range.
 _MODEL_OCTETS: Final = {1: (4, 4), 2: (8, 8), 0: (0, 8), 7: (8, 8), 5: (9, 255), 6: (9, 255)}
 _TINY, _HUGE, _PLAUSIBLE = 1e-30, 1e300, (1e-9, 1e12)
@@ -23,13 +23,13 @@ def check(table: Table, fields: tuple[Field, ...], find: Find, octets: bytes, fr
     """Look at the values of a decoded TEDS and report through ``find``."""
     _values(fields, table.by_type.get, table, find)
     code = table.access_code
-    if code in (_CHANNEL, _CALIBRATION):
+    if code in (AccessCode.CHANNEL, AccessCode.CALIBRATION):
         _limits(fields, find)
-    if code == _CHANNEL:
+    if code == AccessCode.CHANNEL:
         _sample(fields, find)
-    elif code == _SECURITY:
+    elif code == AccessCode.SECURITY:
         _security(fields, find, octets, framed)
-    elif code == _SECURITY_2024:
+    elif code == AccessCode.SECURITY_2024:
         _level(fields, find)
     if not table.verified:
         find("note", "unverified", f"The field numbers of {table.name} are not checked against the standard.", None)

@@ -10,6 +10,7 @@ from collections.abc import Mapping
 from typing import Final
 
 from teds_provision.errors import BadData
+from teds_provision.teds.codec.codes import AccessCode
 from teds_provision.teds.codec.frame import TEDSID
 from teds_provision.teds.codec.head import MAX_TUPLES, Head
 from teds_provision.teds.codec.model import Decoded, Field, Severity, Value, Verdict
@@ -17,8 +18,6 @@ from teds_provision.teds.codec.shape import shape_of, verdict_of
 from teds_provision.teds.codec.tables import MANUFACTURER, TEXT_BASED, FieldSpec, Table, name_of
 from teds_provision.teds.codec.values import READERS, is_packed_units, units_of
 
-SECURITY: Final = 128
-END_USER: Final = 7
 SUB_SUM: Final = 12
 
 _new = Field.__new__
@@ -121,7 +120,7 @@ class _Walk(Head):
         """The walk cannot go on: a tuple runs past the end, or there are too many."""
         if self.left <= 0:
             self.find("error", "too-many", f"There are more than {MAX_TUPLES} tuples; the rest is not read.", at)
-        elif self.access_code == END_USER:
+        elif self.access_code == AccessCode.END_USER:
             self.text = (self.octets[at:end],)
             self.find("note", "free-form", "The end user's part is no run of tuples; it is kept as it stands.", at)
         elif body > end:
@@ -178,7 +177,7 @@ class _Walk(Head):
 
     def firm(self) -> bool:
         """Whether a wrong length is an error: not where the table is unverified or the class belongs to somebody."""
-        return self.table is not None and self.table.verified and self.table.access_code != SECURITY
+        return self.table is not None and self.table.verified and self.table.access_code != AccessCode.SECURITY
 
     def length(self, spec: FieldSpec, size: int, asked: tuple[object, ...], body: int, severity: Severity) -> None:
         wanted = " or ".join(str(number) for number in asked)
@@ -212,7 +211,7 @@ class _Walk(Head):
 
     def unknown(self, kind: int, at: int) -> None:
         known = self.table
-        if kind >= MANUFACTURER and known is not None and known.access_code != SECURITY:
+        if kind >= MANUFACTURER and known is not None and known.access_code != AccessCode.SECURITY:
             self.find("note", "manufacturer", f"The field {kind} is in the manufacturers' range.", at, "", "", kind)
         elif self.firm():
             self.find("error", "unknown", f"The field {kind} is not in the table of this class.", at, "", "", kind)

@@ -7,13 +7,13 @@ from dataclasses import dataclass, field
 from typing import Final
 
 from teds_provision.errors import BadData
+from teds_provision.teds.codec.codes import AccessCode
 from teds_provision.teds.codec.composer import NO_SUBFAMILY, Composer, recompose, tuple_width
 from teds_provision.teds.codec.frame import TEDSID, frame, raw_tuple
 from teds_provision.teds.codec.model import Decoded, Edition, Field, Finding, Severity, TimeInstance, Units
 from teds_provision.teds.codec.tables import ONLY_2024, TEXT_BASED, FieldSpec, Table, table
 
 _VERSIONS: Final = {(2007, 1): 2, (2024, 2): 1}
-_SECURITY: Final = 128
 _UUID_OCTETS: Final = {2007: 10, 2024: 16}
 
 
@@ -29,7 +29,7 @@ def convert(decoded: Decoded, edition: Edition, *, uuid: bytes | None = None) ->
     if decoded.edition == edition:
         return decoded.octets, []
     conversion = _Conversion(decoded, table(decoded.access_code), edition, uuid)
-    if decoded.access_code == _SECURITY:
+    if decoded.access_code == AccessCode.SECURITY:
         conversion.say("note", "one-form", "The Security TEDS of the profile has one form in both editions.", None)
         return decoded.octets, conversion.findings
     return conversion.octets(), conversion.findings

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Final
 
+from teds_provision.teds.codec.codes import AccessCode
 from teds_provision.teds.codec.frame import MINIMUM_OCTETS, TEDSID, checksum
 from teds_provision.teds.codec.model import Edition, Finding, Severity
 from teds_provision.teds.codec.shape import MALFORMED_CODES
@@ -109,7 +110,7 @@ class Head:
         self.table = table(self.access_code)
         if size == 4 and self.access_code in ONLY_2024:
             self.find("note", "class", f"The 2007 edition has no {self.table.name}.", at + 3, "TEDSID")
-        elif self.access_code == 0 or 17 < self.access_code < MANUFACTURER:
+        elif self.access_code == 0 or AccessCode.TIME_SYNC < self.access_code < MANUFACTURER:
             self.find("note", "class", f"The class {self.access_code} is reserved.", at, "TEDSID", "", self.access_code)
         if 1 <= width <= 4:
             self.width = width if at == start else 1

@@ -15,7 +15,6 @@ from teds_provision.errors import BadData
 from teds_provision.teds.codec.frame import frame, raw_tuple, tuples, unframe
 from teds_provision.teds.image import BlockId
 
-ACCESS_CODE: Final = 128
 TEDSID_TUPLE: Final = bytes.fromhex("030400800101")
 
 SIGNATURE, NODE_KEY, NODE_KEY_SIGNATURE, STATION_KEY, STATION_KEY_SIGNATURE = 100, 101, 102, 103, 104

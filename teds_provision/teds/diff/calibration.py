@@ -10,6 +10,7 @@ from teds_provision.errors import BadData
 from teds_provision.teds.calibration.decoded import from_decoded, is_finite
 from teds_provision.teds.calibration.describe import kind_of
 from teds_provision.teds.calibration.model import Calibration
+from teds_provision.teds.codec.codes import AccessCode
 from teds_provision.teds.codec.decode import decode
 from teds_provision.teds.image import BlockId
 
@@ -48,7 +49,7 @@ def curve_change(channel: int, old: Mapping[BlockId, bytes], new: Mapping[BlockI
 
 def _calibration(channel: int, blocks: Mapping[BlockId, bytes], own: Channel) -> Calibration | None:
     try:
-        decoded = decode(blocks[channel, 5])
+        decoded = decode(blocks[channel, AccessCode.CALIBRATION])
         found = from_decoded(decoded, channel=channel, units=own.units, actuator=own.actuator)
     except BadData:
         return None

@@ -7,6 +7,7 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import Final
 
+from teds_provision.teds.codec.codes import AccessCode
 from teds_provision.teds.codec.decode import decode
 from teds_provision.teds.codec.model import Decoded, Field, TimeInstance, Units
 from teds_provision.teds.codec.tables import FieldSpec, name_of, table
@@ -14,13 +15,13 @@ from teds_provision.teds.image import BlockId
 from teds_provision.teds.units.units import display_unit, format_units, format_value
 
 _BLOCKS: Final = {
-    1: "Meta-TEDS",
-    3: "channel description",
-    5: "calibration",
-    7: "end-user TEDS",
-    12: "name",
-    13: "PHY TEDS",
-    128: "Security TEDS",
+    AccessCode.META: "Meta-TEDS",
+    AccessCode.CHANNEL: "channel description",
+    AccessCode.CALIBRATION: "calibration",
+    AccessCode.END_USER: "end-user TEDS",
+    AccessCode.NAME: "name",
+    AccessCode.PHY: "PHY TEDS",
+    AccessCode.SECURITY: "Security TEDS",
 }
 _CHANNEL_VALUES: Final = {"LowLimit": False, "HiLimit": False, "OError": True}
 _LABELS: Final = {
@@ -76,7 +77,7 @@ def diff_blocks(old: Mapping[BlockId, bytes], new: Mapping[BlockId, bytes]) -> l
 def _where(channel: int, old: Mapping[BlockId, bytes], new: Mapping[BlockId, bytes]) -> str:
     if channel == 0:
         return "node"
-    octets = new.get((channel, 12), old.get((channel, 12)))
+    octets = new.get((channel, AccessCode.NAME), old.get((channel, AccessCode.NAME)))
     name = decode(octets).get("TCName") if octets else None
     return f"channel {channel} ({name})" if isinstance(name, str) and name.isprintable() else f"channel {channel}"
 
@@ -90,7 +91,7 @@ def _block(key: BlockId, where: str, old: Mapping[BlockId, bytes], new: Mapping[
     before, after = decode(old[key]), decode(new[key])
     skip: frozenset[str] = frozenset()
     found = False
-    if access_code == 5:
+    if access_code == AccessCode.CALIBRATION:
         from teds_provision.teds.diff.calibration import CURVE_FIELDS, curve_change
 
         text = curve_change(channel, old, new)
@@ -144,7 +145,7 @@ def _flat(decoded: Decoded) -> dict[_Path, Field]:
 
 
 def _units(channel: int, blocks: Mapping[BlockId, bytes]) -> Units | None:
-    octets = blocks.get((channel, 3))
+    octets = blocks.get((channel, AccessCode.CHANNEL))
     units = decode(octets).get("PhyUnits") if octets else None
     return units if isinstance(units, Units) else None
 
@@ -168,7 +169,7 @@ def _shown(field: Field, access_code: int, path: _Path, units: Units | None) -> 
     if isinstance(value, TimeInstance):
         return _moment(value, spec)
     if isinstance(value, float):
-        if access_code == 3 and field.name in _CHANNEL_VALUES and units is not None:
+        if access_code == AccessCode.CHANNEL and field.name in _CHANNEL_VALUES and units is not None:
             return format_value(value, display_unit(units), difference=_CHANNEL_VALUES[field.name])
         return show_seconds(value) if spec is not None and _is_time(access_code, spec) else f"{value:.6g}"
     if isinstance(value, int) and spec is not None and value in spec.enumeration:
@@ -196,9 +197,9 @@ def _spec(access_code: int, path: _Path) -> FieldSpec | None:
 
 def _is_time(access_code: int, spec: FieldSpec) -> bool:
     """Whether a Float32 of Meta or TransducerChannel TEDS counts seconds."""
-    if access_code == 1:
+    if access_code == AccessCode.META:
         return spec.type in (10, 11, 12)
-    return access_code == 3 and (20 <= spec.type <= 26 or 28 <= spec.type <= 30)
+    return access_code == AccessCode.CHANNEL and (20 <= spec.type <= 26 or 28 <= spec.type <= 30)
 
 
 def _moment(value: TimeInstance, spec: FieldSpec | None) -> str:

@@ -14,6 +14,7 @@ from typing import Final
 
 from teds_provision.errors import BadData
 from teds_provision.teds import decode
+from teds_provision.teds.codec.codes import AccessCode
 from teds_provision.teds.codec.model import UNIT_PARTS, Decoded, Edition, Field, Units
 from teds_provision.teds.codec.tables import name_of
 from teds_provision.teds.formats.block import Block
@@ -37,9 +38,8 @@ from teds_provision.teds.profile.reader import Problems
 from teds_provision.teds.profile.source import parse
 from teds_provision.teds.units.units import display_unit, format_units, parse_unit
 
-META, CHANNEL, CALIBRATION, NAME, PHY, SECURITY = 1, 3, 5, 12, 13, 128
 NO_UUID: Final = bytes(10)
-_PLACES: Final = {META: 0, NAME: 0, PHY: 0}
+_PLACES: Final = {AccessCode.META: 0, AccessCode.NAME: 0, AccessCode.PHY: 0}
 _KINDS: Final = {code: kind for kind, code in TEXT_CLASSES.items()}
 _SPELLING: Final = ("rad", "sr", "m", "kg", "s", "A", "K", "mol", "cd")
 
@@ -94,21 +94,21 @@ def _lines(decoded: Mapping[tuple[int, int], Decoded]) -> Iterator[str]:
     if name:
         yield f"name = {_quoted(name)}"
     yield from ("", "[meta]")
-    yield from _meta(decoded.get((0, META)))
+    yield from _meta(decoded.get((0, AccessCode.META)))
     for channel, code in sorted(decoded):
-        if code == CHANNEL and channel:
+        if code == AccessCode.CHANNEL and channel:
             yield from ("", f"[channel.{channel}]")
             yield from _channel(decoded[channel, code], _name(decoded, channel), channel)
-    if (0, PHY) in decoded:
+    if (0, AccessCode.PHY) in decoded:
         yield from ("", "[phy]")
-        yield from _keys(PHY_KEYS, decoded[0, PHY].fields)
+        yield from _keys(PHY_KEYS, decoded[0, AccessCode.PHY].fields)
     for (channel, code), teds in sorted(decoded.items()):
         if code in _KINDS and len(teds.text) == 1:
             yield from _text(channel, code, teds)
 
 
 def _name(decoded: Mapping[tuple[int, int], Decoded], channel: int) -> str:
-    teds = decoded.get((channel, NAME))
+    teds = decoded.get((channel, AccessCode.NAME))
     value = teds.get("TCName") if teds else None
     return value if isinstance(value, str) else ""
 
@@ -242,9 +242,9 @@ def _differences(body: str, placed: Placed, decoded: Mapping[tuple[int, int], De
 
 
 def _because(code: int) -> str:
-    if code == CALIBRATION:
+    if code == AccessCode.CALIBRATION:
         return " (calibrations come from a file of their own)"
-    return " (made when a datasheet is signed)" if code == SECURITY else ""
+    return " (made when a datasheet is signed)" if code == AccessCode.SECURITY else ""
 
 
 def _built(body: str, decoded: Mapping[tuple[int, int], Decoded]) -> tuple[Placed, str]:
@@ -253,7 +253,7 @@ def _built(body: str, decoded: Mapping[tuple[int, int], Decoded]) -> tuple[Place
         profile = interpret(parse(body, "profile"), "profile", "profile", ("profile",), problems)
         if profile is None:
             return {}, str(problems.errors[0])
-        meta = decoded.get((0, META))
+        meta = decoded.get((0, AccessCode.META))
         uuid = meta.get("UUID") if meta else None
         edition: Edition = next((teds.edition for teds in decoded.values() if teds.edition), 2007)
         zero = bytes(10 if edition == 2007 else 16)

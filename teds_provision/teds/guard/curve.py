@@ -12,6 +12,7 @@ import numpy as np
 
 from teds_provision.teds.calibration.model import Calibration
 from teds_provision.teds.calibration.raw_range import raw_range
+from teds_provision.teds.codec.codes import AccessCode
 from teds_provision.teds.codec.decode import decode
 from teds_provision.teds.codec.model import Decoded, Units
 from teds_provision.teds.image import BlockId
@@ -63,7 +64,7 @@ class Channel:
 
 def channel_of(number: int, blocks: Mapping[BlockId, bytes], profile: Profile | None) -> Channel:
     """What TEDS and profile say of a channel; the limits are those of the TEDS."""
-    own = decode(blocks[number, 3]) if (number, 3) in blocks else None
+    own = decode(blocks[number, AccessCode.CHANNEL]) if (number, AccessCode.CHANNEL) in blocks else None
     said = profile.channel(number) if profile is not None else None
     units = own.get("PhyUnits") if own else None
     model = _integer(own, "DatModel")

@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Final, Literal
 from teds_provision.errors import BadData
 from teds_provision.teds.calibration.decoded import from_decoded
 from teds_provision.teds.calibration.model import Calibration
+from teds_provision.teds.codec.codes import AccessCode
 from teds_provision.teds.codec.decode import decode
 from teds_provision.teds.codec.model import Decoded
 from teds_provision.teds.image import BlockId
@@ -24,7 +25,6 @@ if TYPE_CHECKING:
     from teds_provision.teds.guard.curve import Channel
     from teds_provision.teds.profile.model import Profile
 
-CALIBRATION: Final = 5
 _SMALLEST_NORMAL: Final = 2.0**-126
 
 
@@ -57,11 +57,11 @@ def check_calibration(
     """
     findings: list[GuardFinding] = []
     for channel, access_code in sorted(new):
-        if access_code == CALIBRATION:
+        if access_code == AccessCode.CALIBRATION:
             given = (calibrations or {}).get(channel)
             findings += _Judge(channel, new, old or {}, profile, given, now).findings()
     for channel, access_code in sorted(old or {}):
-        if access_code == CALIBRATION and (channel, CALIBRATION) not in new:
+        if access_code == AccessCode.CALIBRATION and (channel, AccessCode.CALIBRATION) not in new:
             findings.append(
                 GuardFinding(channel, "removed", "the calibration that the node has is taken away.", "warning")
             )
@@ -81,7 +81,7 @@ class _Judge:
     now: datetime | None
 
     def findings(self) -> Iterator[GuardFinding]:
-        octets = self.new[self.number, CALIBRATION]
+        octets = self.new[self.number, AccessCode.CALIBRATION]
         if not octets.strip(b"\xff") or not octets.strip(b"\x00"):
             yield self._error("erased", "the Calibration TEDS is erased flash, every octet of it.")
             return
@@ -161,7 +161,7 @@ class _Judge:
 
     def _before(self, channel: Channel) -> Calibration | None:
         """Calibration that the node has now; None where there is none that can be computed and compared."""
-        octets = self.old.get((self.number, CALIBRATION))
+        octets = self.old.get((self.number, AccessCode.CALIBRATION))
         if octets is None:
             return None
         had = self._channel(self.number, self.old)

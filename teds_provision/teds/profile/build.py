@@ -7,6 +7,7 @@ from datetime import UTC, datetime
 from typing import TYPE_CHECKING, Final
 
 from teds_provision.errors import BadData
+from teds_provision.teds.codec.codes import AccessCode
 from teds_provision.teds.codec.model import Edition
 from teds_provision.teds.profile.model import BuiltDatasheet, ChannelProfile, Profile
 
@@ -14,7 +15,6 @@ if TYPE_CHECKING:
     from teds_provision.teds.calibration import Calibration
     from teds_provision.teds.image import BlockId
 
-META, CHANNEL, CALIBRATION, NAME, PHY = 1, 3, 5, 12, 13
 USER_DEFINED_NAME: Final = 0
 _CAL_NONE, _CAL_SUPPLIED = 0, 1
 _UUID_OCTETS: Final = {2007: 10, 2024: 16}
@@ -46,19 +46,21 @@ def build(
     warnings: list[str] = []
     uuid = _uuid(uuid, edition, warnings)
     meta = (("UUID", uuid), *profile.meta, ("MaxChan", len(profile.channels)))
-    blocks: dict[BlockId, bytes] = {(0, META): compose(META, meta, edition=edition)}
+    blocks: dict[BlockId, bytes] = {(0, AccessCode.META): compose(AccessCode.META, meta, edition=edition)}
     for channel in profile.channels:
         given = calibration.get(channel.number)
         fields = {**channel.fields, "CalKey": _calibration_key(channel, given)}
-        blocks[channel.number, CHANNEL] = compose(CHANNEL, fields, edition=edition)
+        blocks[channel.number, AccessCode.CHANNEL] = compose(AccessCode.CHANNEL, fields, edition=edition)
         if given is not None:
-            blocks[channel.number, CALIBRATION] = compose(CALIBRATION, given.fields(edition), edition=edition)
+            blocks[channel.number, AccessCode.CALIBRATION] = compose(
+                AccessCode.CALIBRATION, given.fields(edition), edition=edition
+            )
         if channel.name:
-            blocks[channel.number, NAME] = _name(channel.name, edition)
+            blocks[channel.number, AccessCode.NAME] = _name(channel.name, edition)
         warnings += _calibration_warnings(channel, given, now or datetime.now(UTC))
-    blocks[0, NAME] = _name(name or profile.tim_name, edition)
+    blocks[0, AccessCode.NAME] = _name(name or profile.tim_name, edition)
     if profile.phy:
-        blocks[0, PHY] = compose(PHY, profile.phy, edition=edition)
+        blocks[0, AccessCode.PHY] = compose(AccessCode.PHY, profile.phy, edition=edition)
     for text in profile.texts:
         block = (("Text", {"LangCode": text.language, "Text": text.text}),)
         blocks[text.channel, text.access_code] = compose(text.access_code, block, edition=edition)
@@ -84,7 +86,7 @@ def _calibration_key(channel: ChannelProfile, given: Calibration | None) -> int:
 def _name(name: str, edition: Edition) -> bytes:
     from teds_provision.teds import compose
 
-    return compose(NAME, (("Format", USER_DEFINED_NAME), ("TCName", name)), edition=edition)
+    return compose(AccessCode.NAME, (("Format", USER_DEFINED_NAME), ("TCName", name)), edition=edition)
 
 
 def _calibration_warnings(channel: ChannelProfile, given: Calibration | None, now: datetime) -> list[str]:

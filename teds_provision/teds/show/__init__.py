@@ -8,11 +8,12 @@ from datetime import UTC, datetime
 from typing import Any
 
 from teds_provision.teds import decode
+from teds_provision.teds.codec.codes import AccessCode
 from teds_provision.teds.codec.model import Decoded, Field, Finding, Units
 from teds_provision.teds.codec.tables import FieldSpec, Table, table
 from teds_provision.teds.formats import Block
 from teds_provision.teds.formats.jsonform import teds_to_json
-from teds_provision.teds.show.summary import CALIBRATION, CHANNEL, Line, summary_of
+from teds_provision.teds.show.summary import Line, summary_of
 from teds_provision.teds.show.values import Context, meaning_of, text_of
 from teds_provision.teds.units.units import WrittenUnit, display_unit
 
@@ -87,21 +88,21 @@ def _context(block: Block, decoded: Decoded, beside: dict[tuple[int, int], bytes
         _unit(block, decoded, beside),
         display_unit(series) if isinstance(series, Units) else None,
         beside,
-        converted=decoded.access_code == CALIBRATION,
+        converted=decoded.access_code == AccessCode.CALIBRATION,
         channel=block.channel,
     )
 
 
 def _unit(block: Block, decoded: Decoded, beside: Mapping[tuple[int, int], bytes]) -> WrittenUnit | None:
     """Unit of LowLimit, HiLimit and OError: the channel's, or the calibrated one."""
-    if decoded.access_code == CHANNEL:
+    if decoded.access_code == AccessCode.CHANNEL:
         units = decoded.get("PhyUnits")
         return display_unit(units) if isinstance(units, Units) else None
-    if decoded.access_code != CALIBRATION:
+    if decoded.access_code != AccessCode.CALIBRATION:
         return None
     from teds_provision.teds.units.units import recognize
 
-    own = beside.get((block.channel or 1, CHANNEL))
+    own = beside.get((block.channel or 1, AccessCode.CHANNEL))
     units = decode(own).get("PhyUnits") if own is not None else None
     slope, intercept = decoded.get("Slope"), decoded.get("Intercept")
     if not isinstance(units, Units):

@@ -17,6 +17,7 @@ from teds_provision.errors import BadData, UsageFailure
 from teds_provision.teds.calibration.decoded import calibrations_of, is_finite
 from teds_provision.teds.calibration.describe import kind_of
 from teds_provision.teds.calibration.model import Calibration
+from teds_provision.teds.codec.codes import AccessCode
 from teds_provision.teds.codec.decode import decode
 from teds_provision.teds.image import BlockId
 
@@ -91,7 +92,7 @@ def _panels(
 
 
 def _name(number: int, blocks: Mapping[BlockId, bytes]) -> str:
-    octets = blocks.get((number, 12))
+    octets = blocks.get((number, AccessCode.NAME))
     name = decode(octets).get("TCName") if octets else None
     return f"channel {number}: {name}" if isinstance(name, str) and name.isprintable() else f"channel {number}"
 

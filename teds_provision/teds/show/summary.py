@@ -6,10 +6,10 @@ from collections.abc import Iterator
 from datetime import datetime
 
 from teds_provision.errors import BadData
+from teds_provision.teds.codec.codes import AccessCode
 from teds_provision.teds.codec.model import Decoded, Units
 from teds_provision.teds.show.values import FINGERPRINT_DIGITS, Context, fingerprint, instant
 
-META, CHANNEL, CALIBRATION, SECURITY = 1, 3, 5, 128
 _PROFILE_VERSION = "ProfileVersion"
 
 Line = tuple[str, str]
@@ -17,10 +17,12 @@ Line = tuple[str, str]
 
 def summary_of(decoded: Decoded, context: Context, now: datetime) -> tuple[Line, ...]:
     """Lines of (label, text) for people."""
-    lines = {META: _uuid, CHANNEL: _range, SECURITY: _security}.get(decoded.access_code or 0)
+    lines = {AccessCode.META: _uuid, AccessCode.CHANNEL: _range, AccessCode.SECURITY: _security}.get(
+        decoded.access_code or 0
+    )
     if lines is not None:
         return tuple(lines(decoded, context))
-    return tuple(_calibration(decoded, context, now)) if decoded.access_code == CALIBRATION else ()
+    return tuple(_calibration(decoded, context, now)) if decoded.access_code == AccessCode.CALIBRATION else ()
 
 
 def _uuid(decoded: Decoded, _context: Context) -> Iterator[Line]:
@@ -57,7 +59,7 @@ def _range(decoded: Decoded, context: Context) -> Iterator[Line]:
 def _calibration(decoded: Decoded, context: Context, now: datetime) -> Iterator[Line]:
     from teds_provision.teds.calibration.decoded import from_decoded
 
-    own = context.beside.get((context.channel or 1, CHANNEL))
+    own = context.beside.get((context.channel or 1, AccessCode.CHANNEL))
     units, actuator = _channel_of(own)
     try:
         calibration = from_decoded(decoded, channel=context.channel, units=units, actuator=actuator)

@@ -8,20 +8,16 @@ from __future__ import annotations
 
 from functools import cache
 
+from teds_provision.teds.codec.codes import MANUFACTURER, ONLY_2024, TEXT_BASED, AccessCode
 from teds_provision.teds.codec.tables.form import (
-    MANUFACTURER,
     NAMES,
     OCTETS,
-    ONLY_2024,
-    TEXT_BASED,
     FieldSpec,
     Table,
     name_of,
 )
 
 __all__ = ["MANUFACTURER", "NAMES", "OCTETS", "ONLY_2024", "TEXT_BASED", "FieldSpec", "Table", "name_of", "table"]
-
-CALIBRATION = 5
 
 
 @cache
@@ -31,7 +27,7 @@ def table(access_code: int) -> Table:
     from teds_provision.teds.codec.tables import standard as tables_standard
 
     name = name_of(access_code)
-    if access_code == CALIBRATION:
+    if access_code == AccessCode.CALIBRATION:
         from teds_provision.teds.codec.tables.calibration import calibration_table
 
         return calibration_table()

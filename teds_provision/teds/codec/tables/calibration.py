@@ -6,6 +6,7 @@ import tomllib
 from pathlib import Path
 from typing import Any
 
+from teds_provision.teds.codec.codes import AccessCode
 from teds_provision.teds.codec.tables.form import FieldSpec, Table, name_of
 
 
@@ -13,7 +14,13 @@ def calibration_table() -> Table:
     """Return the table of access code 5, marked unverified."""
     data = tomllib.loads(Path(__file__).with_name("calibration_fields.toml").read_text(encoding="utf-8"))
     rows = tuple(_row(row) for row in data["field"])
-    return Table(5, name_of(5), rows, verified=data["status"] != "unverified", source=data["source"])
+    return Table(
+        AccessCode.CALIBRATION,
+        name_of(AccessCode.CALIBRATION),
+        rows,
+        verified=data["status"] != "unverified",
+        source=data["source"],
+    )
 
 
 def _row(row: dict[str, Any]) -> FieldSpec:

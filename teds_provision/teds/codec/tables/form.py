@@ -6,33 +6,31 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Final, Literal
 
+from teds_provision.teds.codec.codes import MANUFACTURER, AccessCode
+
 Need = Literal["R", "R?", "O"]
 Confidence = Literal["H", "M", "L", "MEM", "unverified"]
 
 NAMES: Final[Mapping[int, str]] = {
-    1: "MetaTEDS",
-    2: "MetaIdTEDS",
-    3: "ChanTEDS",
-    4: "ChanIdTEDS",
-    5: "CalTEDS",
-    6: "CalIdTEDS",
-    7: "EUASTEDS",
-    8: "FreqRespTEDS",
-    9: "TransferTEDS",
-    10: "CommandTEDS",
-    11: "TitleTEDS",
-    12: "XdcrName",
-    13: "PHYTEDS",
-    14: "GeoLocTEDS",
-    15: "UnitsExtention",
-    16: "SecurityTEDS2024",
-    17: "TimeSyncTEDS",
-    128: "SecurityTEDS",
+    AccessCode.META: "MetaTEDS",
+    AccessCode.META_ID: "MetaIdTEDS",
+    AccessCode.CHANNEL: "ChanTEDS",
+    AccessCode.CHANNEL_ID: "ChanIdTEDS",
+    AccessCode.CALIBRATION: "CalTEDS",
+    AccessCode.CALIBRATION_ID: "CalIdTEDS",
+    AccessCode.END_USER: "EUASTEDS",
+    AccessCode.FREQUENCY_RESPONSE: "FreqRespTEDS",
+    AccessCode.TRANSFER: "TransferTEDS",
+    AccessCode.COMMANDS: "CommandTEDS",
+    AccessCode.TITLE: "TitleTEDS",
+    AccessCode.NAME: "XdcrName",
+    AccessCode.PHY: "PHYTEDS",
+    AccessCode.LOCATION: "GeoLocTEDS",
+    AccessCode.UNITS_EXTENSION: "UnitsExtention",
+    AccessCode.SECURITY_2024: "SecurityTEDS2024",
+    AccessCode.TIME_SYNC: "TimeSyncTEDS",
+    AccessCode.SECURITY: "SecurityTEDS",
 }
-TEXT_BASED: Final = frozenset({2, 4, 6, 10, 11, 14, 15})
-ONLY_2024: Final = frozenset({16, 17})
-MANUFACTURER: Final = 128
-"""First type and first access code of the manufacturers' range."""
 
 # Octets of the kinds of value that have a fixed number of them; UUID, TEDSID and TimeInstance depend on the edition.
 OCTETS: Final[Mapping[str, tuple[int, ...]]] = {

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any, Final
 
+from teds_provision.teds.codec.codes import AccessCode
 from teds_provision.teds.codec.tables.form import Confidence, FieldSpec, Need
 
 RADIO: Final = {0: "IEEE 802.11", 1: "Bluetooth", 2: "ZigBee", 3: "6LoWPAN", 255: "manufacturer"}
@@ -112,7 +113,10 @@ SECURITY: Final = (
 )
 
 TABLES: Final[dict[int, dict[str, Any]]] = {
-    13: {"rows": PHY, "family": 5, "source": "ieee-1451.0.md section 4.5"},
-    16: {"rows": LEVEL, "verified": False, "source": "ieee-1451.0.md section 9.3"},
-    128: {"rows": SECURITY, "source": "Mitterer et al. 2023, Table 1; security profile section 1 from 105 on"},
+    AccessCode.PHY: {"rows": PHY, "family": 5, "source": "ieee-1451.0.md section 4.5"},
+    AccessCode.SECURITY_2024: {"rows": LEVEL, "verified": False, "source": "ieee-1451.0.md section 9.3"},
+    AccessCode.SECURITY: {
+        "rows": SECURITY,
+        "source": "Mitterer et al. 2023, Table 1; security profile section 1 from 105 on",
+    },
 }

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Any, Final
 
+from teds_provision.teds.codec.codes import AccessCode
 from teds_provision.teds.codec.tables.form import FieldSpec, Need
 
 UNITS_NAMES: Final = {
@@ -171,7 +172,7 @@ NAME_ALIASES: Final = {
 }
 
 TABLES: Final[dict[int, dict[str, Any]]] = {
-    1: {"rows": META, "source": "ieee-1451.0.md section 4.1"},
-    3: {"rows": CHANNEL, "source": "ieee-1451.0.md section 4.2"},
-    12: {"rows": NAME, "aliases": NAME_ALIASES, "source": "ieee-1451.0.md section 4.4"},
+    AccessCode.META: {"rows": META, "source": "ieee-1451.0.md section 4.1"},
+    AccessCode.CHANNEL: {"rows": CHANNEL, "source": "ieee-1451.0.md section 4.2"},
+    AccessCode.NAME: {"rows": NAME, "aliases": NAME_ALIASES, "source": "ieee-1451.0.md section 4.4"},
 }
