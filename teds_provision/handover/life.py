@@ -12,9 +12,10 @@ from teds_provision.protocol.handover.payload import is_label
 from teds_provision.protocol.handover.revocation import seal_revocation
 from teds_provision.protocol.keys import fingerprint
 from teds_provision.station.station import Station
-from teds_provision.steps.build import CALIBRATION, BuildOrder, build
+from teds_provision.steps.build import BuildOrder, build
 from teds_provision.steps.sign import known_image
 from teds_provision.store import NodeRecord, Revocation
+from teds_provision.teds.codec.codes import AccessCode
 from teds_provision.teds.image import Image
 
 if TYPE_CHECKING:
@@ -115,7 +116,7 @@ def plan_takeover(station: Station, old: bytes, new: bytes, *, copy_calibration:
     blocks: dict[tuple[int, int], bytes] = {}
     if copy_calibration:
         image = known_image(station, old) or Image(old, {})
-        blocks = {block: octets for block, octets in image.blocks.items() if block[1] == CALIBRATION and block[0]}
+        blocks = {block: octets for block, octets in image.blocks.items() if block[1] == AccessCode.CALIBRATION and block[0]}
         if not blocks:
             raise NotFound(f"No calibration of node {old.hex()} is known here.", hint="Leave --copy-calibration away.")
         if before.profile is None:

@@ -14,7 +14,7 @@ from teds_provision.teds.codec.tables import FieldSpec, name_of, table
 from teds_provision.teds.image import BlockId
 from teds_provision.teds.units.units import display_unit, format_units, format_value
 
-_BLOCKS: Final = {
+_BLOCKS: Final[Mapping[int, str]] = {
     AccessCode.META: "Meta-TEDS",
     AccessCode.CHANNEL: "channel description",
     AccessCode.CALIBRATION: "calibration",

@@ -17,12 +17,17 @@ Line = tuple[str, str]
 
 def summary_of(decoded: Decoded, context: Context, now: datetime) -> tuple[Line, ...]:
     """Lines of (label, text) for people."""
-    lines = {AccessCode.META: _uuid, AccessCode.CHANNEL: _range, AccessCode.SECURITY: _security}.get(
-        decoded.access_code or 0
-    )
-    if lines is not None:
-        return tuple(lines(decoded, context))
-    return tuple(_calibration(decoded, context, now)) if decoded.access_code == AccessCode.CALIBRATION else ()
+    match decoded.access_code:
+        case AccessCode.META:
+            return tuple(_uuid(decoded, context))
+        case AccessCode.CHANNEL:
+            return tuple(_range(decoded, context))
+        case AccessCode.CALIBRATION:
+            return tuple(_calibration(decoded, context, now))
+        case AccessCode.SECURITY:
+            return tuple(_security(decoded, context))
+        case _:
+            return ()
 
 
 def _uuid(decoded: Decoded, _context: Context) -> Iterator[Line]:
