@@ -116,7 +116,9 @@ def plan_takeover(station: Station, old: bytes, new: bytes, *, copy_calibration:
     blocks: dict[tuple[int, int], bytes] = {}
     if copy_calibration:
         image = known_image(station, old) or Image(old, {})
-        blocks = {block: octets for block, octets in image.blocks.items() if block[1] == AccessCode.CALIBRATION and block[0]}
+        blocks = {
+            block: octets for block, octets in image.blocks.items() if block[1] == AccessCode.CALIBRATION and block[0]
+        }
         if not blocks:
             raise NotFound(f"No calibration of node {old.hex()} is known here.", hint="Leave --copy-calibration away.")
         if before.profile is None:
