@@ -9,13 +9,13 @@ from pathlib import Path
 
 from teds_provision.backup.sealed_file import Content, seal_to_key, seal_to_passphrase
 from teds_provision.errors import StoreFailure, VaultFailure
+from teds_provision.files import write_whole
 from teds_provision.protocol.keys import fingerprint
 from teds_provision.station.station import Station
 from teds_provision.store import utc_now
 from teds_provision.store.snapshot import load, take
 from teds_provision.store.store import Store
 from teds_provision.vault import Ask, node_key_context
-from teds_provision.vault.file_vault import write_whole
 from teds_provision.vault.passphrase import PRODUCT, Costs
 
 
@@ -57,7 +57,7 @@ def backup(
     else:
         sealed = seal_to_passphrase(content, vault.identity(), ask("New passphrase for the backup", True), costs)
         to = "passphrase"
-    write_whole(path, sealed, replace=True)
+    write_whole(path, sealed, failure=VaultFailure)
     digest = hashlib.sha256(sealed).hexdigest()
     warnings = _warnings(station, recovery, useless)
     with suppress(StoreFailure):  # a full disk is a reason for a backup, and must not make it fail

@@ -14,7 +14,7 @@ from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
 from teds_provision.errors import NotFound, PolicyRefused, UsageFailure
-from teds_provision.handover.files import require_new, write_new
+from teds_provision.files import require_new, write_new
 from teds_provision.handover.pending import OPEN, Notes, content_digest
 from teds_provision.handover.trust import find_trusted
 from teds_provision.protocol.handover.bundle import Bundle, BundledNode, Mode, seal_bundle

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from teds_provision.errors import BadData, NotFound, PolicyRefused, UsageFailure
+from teds_provision.files import read_limited
 from teds_provision.handover.certify import CERTIFICATE_FORMAT, Certificate, read_certificate
-from teds_provision.handover.files import read_limited
 from teds_provision.protocol.keys import fingerprint, from_pem
 from teds_provision.station.station import Station
 from teds_provision.store import TrustRecord

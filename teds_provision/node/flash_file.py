@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from teds_provision.errors import BadData, NotFound, StoreFailure, StoreLocked, UsageFailure
+from teds_provision.files import whole_file
 from teds_provision.protocol.flash import Flash, FlashFailure
 from teds_provision.protocol.keys import SoftwareKey, node_key_message
 from teds_provision.teds.image import BlockId
@@ -105,7 +106,9 @@ class FlashFile:
     def _hold(self) -> None:
         """Take the node for this process until it ends."""
         try:
-            self._lock = os.open(self.path.with_name("lock"), os.O_CREAT | os.O_RDWR | os.O_CLOEXEC, 0o600)
+            self._lock = os.open(
+                self.path.with_name("lock"), os.O_CREAT | os.O_RDWR | os.O_NOFOLLOW | os.O_CLOEXEC, 0o600
+            )
             fcntl.flock(self._lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
             raise StoreLocked(f"The node in {self.path.parent} is already running.") from None
@@ -181,15 +184,5 @@ def _flash_from_json(data: dict[str, Any]) -> Flash:
 
 
 def _replace(path: Path, document: dict[str, Any]) -> None:
-    temporary = path.with_suffix(".new")
-    descriptor = os.open(temporary, os.O_WRONLY | os.O_CREAT | os.O_TRUNC | os.O_CLOEXEC, 0o600)
-    with os.fdopen(descriptor, "w", encoding="utf-8") as stream:
-        json.dump(document, stream)
-        stream.flush()
-        os.fsync(stream.fileno())
-    os.replace(temporary, path)
-    folder = os.open(path.parent, os.O_RDONLY | os.O_DIRECTORY)
-    try:
-        os.fsync(folder)
-    finally:
-        os.close(folder)
+    with whole_file(path, replace=True) as file:
+        file.write(json.dumps(document).encode())

@@ -15,7 +15,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Final
 
-from teds_provision.errors import BadData, NotFound
+from teds_provision.errors import BadData
+from teds_provision.files import read_limited
 from teds_provision.store.records import UUID_OCTETS
 
 MAX_FILE_OCTETS: Final = 64 * 1024 * 1024
@@ -118,15 +119,7 @@ def _is_name(name: str | None) -> bool:
 
 
 def _text(path: Path) -> str:
-    try:
-        with path.open("rb") as file:
-            octets = file.read(MAX_FILE_OCTETS + 1)
-    except FileNotFoundError:
-        raise NotFound(f"There is no file {path}.") from None
-    except OSError as error:
-        raise NotFound(f"{path} cannot be read: {error.strerror}.") from error
-    if len(octets) > MAX_FILE_OCTETS:
-        raise BadData(f"{path} is larger than {MAX_FILE_OCTETS} octets.", hint="Is this a whitelist?")
+    octets = read_limited(path, MAX_FILE_OCTETS, "whitelist")
     try:
         return octets.decode("utf-8-sig")
     except UnicodeDecodeError as error:

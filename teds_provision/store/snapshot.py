@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import os
-import secrets
 import sqlite3
 import time
 from contextlib import closing, suppress
@@ -12,13 +10,13 @@ from pathlib import Path
 from typing import Final
 
 from teds_provision.errors import BadData, StoreFailure
+from teds_provision.files import whole_file
 from teds_provision.store.audit import AuditLog
 from teds_provision.store.database import FILE_NAME, Database, as_store_failure
 from teds_provision.store.store import Store
 
 _MAGIC: Final = b"SQLite format 3\0"
 _FORMAT_VERSIONS: Final = slice(18, 20)  # of the file header: 1 for a rollback journal, 2 for a write-ahead log
-_STALE_SECONDS: Final = 60
 _DAMAGE: Final = (sqlite3.SQLITE_CORRUPT, sqlite3.SQLITE_NOTADB)
 
 
@@ -74,26 +72,15 @@ def place(copy: Store, home: Path) -> None:
     Raises StoreFailure: a store is there already, or it cannot be written.
     """
     path = home / FILE_NAME
-    fresh = path.with_name(f"{FILE_NAME}.{secrets.token_hex(4)}.new")
     if path.exists():
         raise StoreFailure(f"There is a store in {home} already.", hint="Restore into another --home.")
     try:
-        with open(os.open(fresh, os.O_CREAT | os.O_EXCL | os.O_WRONLY | os.O_NOFOLLOW, 0o600), "wb") as file:
+        with whole_file(path, replace=False) as file:
             file.write(take(copy))
-            file.flush()
-            os.fsync(file.fileno())
-        for left in ("-wal", "-shm"):  # of a store that is gone: they would be replayed into this one
-            path.with_name(FILE_NAME + left).unlink(missing_ok=True)
-        os.replace(fresh, path)
-        directory = os.open(home, os.O_RDONLY)
-        try:
-            os.fsync(directory)
-        finally:
-            os.close(directory)
+            for left in ("-wal", "-shm"):  # of a store that is gone: they would be replayed into this one
+                path.with_name(FILE_NAME + left).unlink(missing_ok=True)
     except OSError as error:
         raise as_store_failure(error, path) from error
-    finally:
-        _sweep(path, fresh)
 
 
 def set_aside(home: Path) -> Path:
@@ -150,13 +137,3 @@ def _hash_at(store: Store, seq: int) -> str:
         return store.audit._root.hex()
     entry = next(store.audit.entries(seq - 1), None)
     return entry.hash if entry is not None and entry.seq == seq else ""
-
-
-def _sweep(path: Path, fresh: Path) -> None:
-    """Remove the file that was begun, and what killed restores left."""
-    with suppress(OSError):
-        fresh.unlink()
-    for left in path.parent.glob(f"{path.name}.*.new"):
-        with suppress(OSError):
-            if time.time() - left.stat().st_mtime > _STALE_SECONDS:
-                left.unlink()

@@ -8,12 +8,12 @@ from __future__ import annotations
 
 import base64
 import os
-from contextlib import suppress
 from pathlib import Path
 from textwrap import wrap
 from typing import Final
 
-from teds_provision.errors import NotFound, VaultFailure, WrongPassphrase
+from teds_provision.errors import VaultFailure, WrongPassphrase
+from teds_provision.files import read_limited, write_new
 from teds_provision.vault.passphrase import check_new
 
 ROUNDS: Final = 600_000
@@ -30,42 +30,22 @@ _SEQUENCE, _INTEGER, _OCTETS = 0x30, 0x02, 0x04
 def write_ca(path: Path, secret: bytes, passphrase: str) -> None:
     """Write the key of a 32-octet scalar, encrypted, into a new file of mode 0600.
 
-    Raises VaultFailure: passphrase too weak, the file exists, or cannot be written (then none is left behind).
+    Raises UsageFailure (the file exists), VaultFailure (weak passphrase; it cannot be written: then none is left).
     """
     check_new(passphrase)
     pem = _encrypted_pem(_plain_der(secret), passphrase)
-    try:
-        descriptor = os.open(path, os.O_CREAT | os.O_EXCL | os.O_WRONLY | os.O_NOFOLLOW, 0o600)
-    except FileExistsError:
-        raise VaultFailure(f"{path} exists already and is not overwritten.", hint="Choose another name.") from None
-    except OSError as error:
-        raise VaultFailure(f"{path} cannot be written: {error.strerror}.", hint="Choose another place.") from error
-    try:
-        with open(descriptor, "wb") as file:
-            file.write(pem)
-            file.flush()
-            os.fsync(file.fileno())
-    except OSError as error:
-        with suppress(OSError):
-            path.unlink()
-        raise VaultFailure(f"{path} cannot be written: {error.strerror}.", hint="Check the space there.") from error
+    write_new(path, pem, failure=VaultFailure)
 
 
 def read_ca(path: Path, passphrase: str) -> bytes:
     """Return the 32-octet scalar of an encrypted P-256 key in PEM.
 
-    Raises NotFound, WrongPassphrase, VaultFailure (not such a file).
+    Raises NotFound, WrongPassphrase, BadData (too large), VaultFailure (not such a file).
     """
     from cryptography.hazmat.primitives.asymmetric import ec
     from cryptography.hazmat.primitives.serialization import load_pem_private_key
 
-    try:
-        with path.open("rb") as file:
-            pem = file.read(_MAX_OCTETS)
-    except FileNotFoundError:
-        raise NotFound(f"There is no file {path}.") from None
-    except OSError as error:
-        raise VaultFailure(f"{path} cannot be read: {error.strerror}.", hint="Check its owner and mode.") from error
+    pem = read_limited(path, _MAX_OCTETS, "CA key", failure=VaultFailure)
     if _LABEL.encode() not in pem:
         raise VaultFailure(f"{path} holds no encrypted private key in PEM.", hint="Give the file of the CA's export.")
     try:

@@ -3,14 +3,11 @@
 from __future__ import annotations
 
 import json
-import os
-import secrets
-import time
-from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
-from teds_provision.errors import VaultFailure
+from teds_provision.errors import BadData, NotFound, VaultFailure
+from teds_provision.files import read_limited, write_new, write_whole
 from teds_provision.vault.base import Ask
 from teds_provision.vault.master import Material
 from teds_provision.vault.passphrase import PRODUCT, Costs, SealingKey, check_new, unseal
@@ -19,7 +16,6 @@ from teds_provision.vault.software import SoftwareVault, settle
 FILE_NAME = "vault.json"
 _FORMAT = "teds-provision-vault/1"
 _MAX_OCTETS = 64 * 1024
-_STALE_SECONDS = 60
 Stamp = tuple[int, int, int]
 
 
@@ -55,7 +51,7 @@ class FileVault(SoftwareVault):
         check_new(passphrase)
         material = settle(None, restored)
         key = SealingKey.derive(passphrase, costs=costs)
-        write_whole(path, _sealed(store_id, material, key), replace=False)
+        write_new(path, _sealed(store_id, material, key), failure=VaultFailure)
         return cls(path, store_id, material, key)
 
     @classmethod
@@ -77,12 +73,12 @@ class FileVault(SoftwareVault):
         passphrase = ask("New passphrase for this station's keys", True)
         check_new(passphrase)
         key = SealingKey.derive(passphrase, costs=costs)
-        write_whole(self._path, _sealed(self._store_id, self._material, key), replace=True)
+        write_whole(self._path, _sealed(self._store_id, self._material, key), failure=VaultFailure)
         self._key = key
         self.stamp = stamp(self._path)
 
     def _save(self, material: Material) -> None:
-        write_whole(self._path, _sealed(self._store_id, material, self._key), replace=True)
+        write_whole(self._path, _sealed(self._store_id, material, self._key), failure=VaultFailure)
         self.stamp = stamp(self._path)
 
 
@@ -107,57 +103,19 @@ def _sealed(store_id: str, material: Material, key: SealingKey) -> bytes:
 def read_sealed(path: Path) -> dict[str, Any]:
     """Read the file, still sealed; raises VaultFailure (missing, damaged)."""
     try:
-        with open(os.open(path, os.O_RDONLY | os.O_NOFOLLOW), "rb") as file:
-            octets = file.read(_MAX_OCTETS + 1)
-    except FileNotFoundError:
+        octets = read_limited(path, _MAX_OCTETS, "vault", failure=VaultFailure, follow=False)
+    except NotFound:
         raise VaultFailure(
             f"The passphrase file {path} is missing.", hint="Restore a backup of this station (teds-provision restore)."
         ) from None
-    except OSError as error:
-        raise VaultFailure(f"{path} cannot be read: {error.strerror}.", hint="Check its owner and mode.") from error
+    except BadData:
+        octets = b""
     try:
         content = json.loads(octets)
-        if len(octets) > _MAX_OCTETS or not isinstance(content, dict) or content.get("format") != _FORMAT:
+        if not isinstance(content, dict) or content.get("format") != _FORMAT:
             raise ValueError
     except (ValueError, RecursionError):
         raise VaultFailure(
             f"{path} is damaged or not a vault of this version.", hint="Restore a backup (teds-provision restore)."
         ) from None
     return content
-
-
-def write_whole(path: Path, content: bytes, *, replace: bool) -> None:
-    """Write whole or not at all: a new file (O_EXCL, 0600), fsync, then link or rename, then fsync the directory."""
-    fresh = path.with_name(f"{path.name}.{secrets.token_hex(4)}.new")
-    try:
-        with open(os.open(fresh, os.O_CREAT | os.O_EXCL | os.O_WRONLY | os.O_NOFOLLOW, 0o600), "wb") as file:
-            file.write(content)
-            file.flush()
-            os.fsync(file.fileno())
-        if replace:
-            os.replace(fresh, path)
-        else:
-            os.link(fresh, path)  # fails if the name is taken, unlike a rename
-        directory = os.open(path.parent, os.O_RDONLY)
-        try:
-            os.fsync(directory)
-        finally:
-            os.close(directory)
-    except FileExistsError:
-        raise VaultFailure(f"{path} exists already and is not overwritten.", hint="Run the command again.") from None
-    except OSError as error:
-        raise VaultFailure(
-            f"{path} cannot be written: {error.strerror}.", hint="Check space and permissions, then run it again."
-        ) from error
-    finally:
-        with suppress(OSError):
-            fresh.unlink()
-        _sweep(path)
-
-
-def _sweep(path: Path) -> None:
-    """Remove what killed writers left beside ``path``; one that may still be at work is left alone."""
-    for left in path.parent.glob(f"{path.name}.*.new"):
-        with suppress(OSError):
-            if time.time() - left.stat().st_mtime > _STALE_SECONDS:
-                left.unlink()

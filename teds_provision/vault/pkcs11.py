@@ -15,10 +15,10 @@ import os
 from pathlib import Path
 from typing import Any
 
-from teds_provision.errors import VaultFailure
+from teds_provision.errors import BadData, NotFound, VaultFailure
+from teds_provision.files import read_limited, write_new, write_whole
 from teds_provision.protocol.keys import PrivateKey, SoftwareKey, fingerprint, verify
 from teds_provision.vault.base import Ask
-from teds_provision.vault.file_vault import write_whole
 from teds_provision.vault.master import MasterKeys
 from teds_provision.vault.pkcs11_lock import exclusive
 from teds_provision.vault.pkcs11_token import TokenKey, TokenSession, ask_pin, find_token, log_in
@@ -63,7 +63,7 @@ class Pkcs11Vault:
         with exclusive(where.module_path):
             if restored is not None:
                 _content_of(_parsed(restored.encode(), store_id, "The backup"), session)
-                write_whole(home / FILE_NAME, restored.encode(), replace=False)
+                write_new(home / FILE_NAME, restored.encode(), failure=VaultFailure)
             elif not (home / FILE_NAME).exists():  # else another process was quicker
                 station = _find_or_make(session, store_id, where, "station")
                 ca = _find_or_make(session, store_id, where, "CA") if with_ca else None
@@ -195,7 +195,8 @@ def _save(home: Path, store_id: str, content: _Content, *, replace: bool) -> Non
     masters = json.dumps({number: master.hex() for number, master in content.masters.keys.items()})
     members["sealed"] = AESGCM(key).encrypt(nonce, masters.encode(), None).hex()
     members["signature"] = content.station.sign(_signed(members)).hex()
-    write_whole(home / FILE_NAME, json.dumps(members, indent=1).encode() + b"\n", replace=replace)
+    write = write_whole if replace else write_new
+    write(home / FILE_NAME, json.dumps(members, indent=1).encode() + b"\n", failure=VaultFailure)
 
 
 def _load(home: Path, store_id: str, session: TokenSession) -> _Content:
@@ -275,12 +276,11 @@ def _octets(members: dict[str, Any], name: str) -> bytes:
 def _read(home: Path, store_id: str) -> dict[str, Any]:
     path = home / FILE_NAME
     try:
-        with open(os.open(path, os.O_RDONLY | os.O_NOFOLLOW), "rb") as file:
-            octets = file.read(_MAX_OCTETS + 1)
-    except FileNotFoundError:
+        octets = read_limited(path, _MAX_OCTETS, "vault", failure=VaultFailure, follow=False)
+    except NotFound:
         raise VaultFailure(f"{path} is missing.", hint=_DAMAGED) from None
-    except OSError as error:
-        raise VaultFailure(f"{path} cannot be read: {error.strerror}.", hint="Check its owner and mode.") from error
+    except BadData:
+        octets = b""
     return _parsed(octets, store_id, str(path))
 
 

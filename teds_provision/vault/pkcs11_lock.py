@@ -10,14 +10,13 @@ from __future__ import annotations
 import fcntl
 import hashlib
 import os
-import stat
-import tempfile
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
 from teds_provision.errors import VaultFailure
+from teds_provision.files import private_folder
 
 _WAIT_SECONDS = 30.0
 _POLL_SECONDS = 0.02
@@ -54,16 +53,19 @@ def _wait(descriptor: int) -> None:
 
 
 def _folder() -> Path:
-    """Return a folder that only this user can write to: in /run/user, else in the folder for temporary files."""
+    """Return a folder that only this user can write to: in /run/user, else in the home.
+
+    Not in /tmp: there anybody could make a folder of that name first and keep this user out.
+    """
     user = os.getuid()
     session = Path(f"/run/user/{user}")
-    parent = session if os.access(session, os.W_OK) else Path(tempfile.gettempdir())
-    folder = parent / f"teds-provision-{user}"
+    parent = session if os.access(session, os.W_OK) else Path.home() / ".cache"
     try:
-        folder.mkdir(mode=0o700, exist_ok=True)
-        status = folder.lstat()
-    except OSError as error:
-        raise VaultFailure(f"{folder} cannot be made: {error.strerror}.", hint="Check the space there.") from error
-    if not stat.S_ISDIR(status.st_mode) or status.st_uid != user or status.st_mode & 0o077:
-        raise VaultFailure(f"{folder} is not a folder of this user alone.", hint="Remove it and run this again.")
-    return folder
+        parent.mkdir(parents=True, exist_ok=True)
+        return private_folder(parent / f"teds-provision-{user}")
+    except (OSError, RuntimeError) as error:
+        said = error.strerror if isinstance(error, OSError) else error
+        raise VaultFailure(
+            f"The folder {parent / f'teds-provision-{user}'} cannot be used: {said}.",
+            hint="Remove it and run it again.",
+        ) from error

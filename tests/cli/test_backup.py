@@ -249,7 +249,7 @@ def test_killed_while_it_writes_a_backup_is_the_old_or_the_new_one(
     )
     os.close(read)
     before = sealed.stat().st_ino
-    while process.poll() is None and not list(tmp_path.glob("station.backup.*.new")):
+    while process.poll() is None and not list(tmp_path.glob(".station.backup.*")):
         if sealed.stat().st_ino != before:
             break
     time.sleep(delay)

@@ -106,7 +106,7 @@ def test_the_file_is_private_whole_and_tells_nothing_secret(station: Station, tm
     assert station.vault.secret_material().encode() not in octets
     assert ONE not in octets
     assert ONE.hex().encode() not in octets
-    assert [left.name for left in tmp_path.iterdir() if ".new" in left.name] == []
+    assert [left.name for left in tmp_path.iterdir() if left.name.startswith(".")] == []
     assert "material" not in repr(opened(path))
 
 

@@ -133,7 +133,7 @@ def test_entity_bombs_and_external_entities_are_refused(tmp_path: Path, text: st
 def test_a_missing_file_and_other_encodings_are_told(tmp_path: Path) -> None:
     with pytest.raises(NotFound):
         read_whitelist(tmp_path / "none.xml")
-    with pytest.raises(NotFound, match="directory"):
+    with pytest.raises(NotFound, match="is a folder"):
         read_whitelist(tmp_path)
     (tmp_path / "latin.csv").write_bytes(b"uuid,name\n\xe4")
     with pytest.raises(BadData, match=r"latin\.csv:2: the text is not UTF-8"):

@@ -12,6 +12,7 @@ import click
 from teds_provision.cli.context import App, pass_app
 from teds_provision.cli.options import COMMAND_SETTINGS, command, dry_run_option, examples
 from teds_provision.errors import BadData, UsageFailure
+from teds_provision.files import SHARED, write_new
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -231,7 +232,6 @@ def _place(home: Path, name: str) -> Path:
 def _write(path: Path, text: str) -> None:
     try:
         path.parent.mkdir(parents=True, exist_ok=True, mode=0o700)
-        with path.open("x", encoding="utf-8") as stream:
-            stream.write(text)
     except OSError as error:
         raise UsageFailure(f"{path} cannot be written: {error.strerror}.") from error
+    write_new(path, text.encode("utf-8"), mode=SHARED, failure=UsageFailure)

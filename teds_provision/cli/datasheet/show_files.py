@@ -8,7 +8,8 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from teds_provision.errors import BadData, NotFound
+from teds_provision.errors import BadData
+from teds_provision.files import read_limited
 from teds_provision.teds.codec.codes import AccessCode
 from teds_provision.teds.codec.model import Decoded, Edition, Finding, Verdict
 from teds_provision.teds.formats import Block, Kind, class_of, detect, read_blocks
@@ -52,20 +53,11 @@ class ShownFile:
 
 def read_file(name: str) -> bytes:
     """Octets of a file or, for ``-``, of standard input; raises NotFound and, for more than 32 MiB, BadData."""
-    try:
-        if name == STDIN:
-            octets = sys.stdin.buffer.read(MAX_FILE + 1)
-        else:
-            with Path(name).open("rb") as stream:
-                octets = stream.read(MAX_FILE + 1)
-    except IsADirectoryError as error:
-        raise NotFound(f"{name} is a folder, not a file.") from error
-    except OSError as error:
-        raise NotFound(f"{name} cannot be read: {error.strerror}.") from error
-    except ValueError as error:
-        raise NotFound(f"{name!r} is no name of a file.") from error
+    if name != STDIN:
+        return read_limited(Path(name), MAX_FILE, "file of TEDS")
+    octets = sys.stdin.buffer.read(MAX_FILE + 1)
     if len(octets) > MAX_FILE:
-        raise BadData(f"{name} has more than {MAX_FILE >> 20} MiB; no file of TEDS has.")
+        raise BadData(f"Standard input gives more than {MAX_FILE >> 20} MiB; no file of TEDS has.")
     return octets
 
 

@@ -164,7 +164,7 @@ def import_keys(
     A node counts as taken over when it opened a session here; after a move its key is rotated in it, and only then is
     the sender locked out. The same bundle again changes nothing and gives the same receipt.
     """
-    from teds_provision.handover.files import read_limited
+    from teds_provision.files import read_limited
     from teds_provision.handover.import_keys import Imported, plan_import
     from teds_provision.handover.import_keys import import_keys as run
     from teds_provision.protocol.handover.bundle import MAX_BUNDLE_OCTETS
@@ -254,13 +254,13 @@ def _import_result(
 
 
 def _require_receipt_place(receipt: Path) -> None:
-    from teds_provision.handover.files import require_new
+    from teds_provision.files import require_new
 
     require_new(receipt)
 
 
 def _write_receipt(receipt: Path, octets: bytes) -> None:
-    from teds_provision.handover.files import write_new
+    from teds_provision.files import write_new
 
     if not (receipt.is_file() and receipt.read_bytes().strip() == octets):
         write_new(receipt, octets + b"\n")

@@ -60,7 +60,7 @@ def list_(app: App) -> None:
 @pass_app
 def receipt(app: App, file: Path) -> None:
     """Close a handover with the receiver's signed receipt; the keys of a move are then deleted here."""
-    from teds_provision.handover.files import read_limited
+    from teds_provision.files import read_limited
     from teds_provision.handover.pending import close, peer_name
     from teds_provision.protocol.handover.receipt import MAX_RECEIPT_OCTETS
 

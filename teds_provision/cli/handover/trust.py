@@ -191,8 +191,8 @@ def create(app: App) -> None:
 @pass_app
 def sign(app: App, request: Path, output: Path, yes: bool, dry_run: bool) -> None:
     """Certify the station that made REQUEST (init --request): it may then key and write this owner's nodes."""
+    from teds_provision.files import read_limited, write_new
     from teds_provision.handover.certify import MAX_OCTETS, read_request, sign_request, write_certificate
-    from teds_provision.handover.files import read_limited, write_new
     from teds_provision.handover.trust import spoken
     from teds_provision.protocol.keys import fingerprint
 

@@ -65,8 +65,8 @@ def init(
 
 
 def _request(app: App, name: str | None, keystore: str | None, path: Path) -> None:
+    from teds_provision.files import require_new, write_new
     from teds_provision.handover.certify import ask_for_certificate, read_request
-    from teds_provision.handover.files import require_new, write_new
     from teds_provision.handover.trust import spoken
     from teds_provision.protocol.keys import fingerprint, to_pem
 
@@ -89,8 +89,8 @@ def _request(app: App, name: str | None, keystore: str | None, path: Path) -> No
 def _is_request_of(path: Path, point: bytes) -> bool:
     """Whether the file is a request of this very station already (a token signs it differently each time)."""
     from teds_provision.errors import TedsProvisionError
+    from teds_provision.files import read_limited
     from teds_provision.handover.certify import MAX_OCTETS, read_request
-    from teds_provision.handover.files import read_limited
 
     try:
         return path.exists() and read_request(read_limited(path, MAX_OCTETS, "request")).station == point
@@ -99,8 +99,8 @@ def _is_request_of(path: Path, point: bytes) -> bool:
 
 
 def _adopt(app: App, path: Path, yes: bool) -> None:
+    from teds_provision.files import read_limited
     from teds_provision.handover.certify import MAX_OCTETS, adopt_certificate, read_certificate
-    from teds_provision.handover.files import read_limited
     from teds_provision.handover.trust import spoken
     from teds_provision.protocol.keys import fingerprint
 

@@ -11,6 +11,10 @@ import click
 
 from teds_provision.cli.context import App, pass_app
 from teds_provision.cli.options import command, dry_run_option, yes_option
+from teds_provision.errors import UsageFailure
+from teds_provision.files import SHARED, read_limited, write_whole
+
+MAX_INPUT_OCTETS = 32 << 20
 
 Function = TypeVar("Function", bound=Callable[..., Any])
 
@@ -95,24 +99,9 @@ def build(app: App, uuid: str, order: Any, output: Path | None, edition: str, ye
 
 def write_file(path: Path, text: str) -> None:
     """Write a result file whole or not at all."""
-    import os
-
-    from teds_provision.errors import UsageFailure
-
-    temporary = path.with_name(path.name + ".part")
-    try:
-        temporary.write_text(text, encoding="utf-8")
-        os.replace(temporary, path)
-    except OSError as error:
-        temporary.unlink(missing_ok=True)
-        raise UsageFailure(f"{path} cannot be written: {error.strerror}.") from error
+    write_whole(path, text.encode("utf-8"), mode=SHARED, failure=UsageFailure)
 
 
 def read_file(path: Path) -> bytes:
-    """Read an input file; raises NotFound."""
-    from teds_provision.errors import NotFound
-
-    try:
-        return path.read_bytes()
-    except OSError as error:
-        raise NotFound(f"{path} cannot be read: {error.strerror}.") from error
+    """Read an input file; raises NotFound, BadData (too large)."""
+    return read_limited(path, MAX_INPUT_OCTETS, "image")

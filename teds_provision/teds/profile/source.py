@@ -13,7 +13,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Final
 
-from teds_provision.errors import BadData, NotFound, StoreFailure
+from teds_provision.errors import BadData, StoreFailure
+from teds_provision.files import read_limited
 
 MAXIMUM_OCTETS: Final = 1 << 20
 
@@ -156,14 +157,7 @@ def _shown(path: KeyPath) -> str:
 
 def read_text(path: Path) -> str:
     """Text of a small UTF-8 file; raises NotFound, BadData or StoreFailure naming it."""
-    try:
-        octets = path.read_bytes()
-    except FileNotFoundError as error:
-        raise NotFound(f"There is no file {path}.") from error
-    except OSError as error:
-        raise StoreFailure(f"{path} cannot be read: {error.strerror}.") from error
-    if len(octets) > MAXIMUM_OCTETS:
-        raise BadData(f"{path} has {len(octets)} octets; {MAXIMUM_OCTETS} are read at most.")
+    octets = read_limited(path, MAXIMUM_OCTETS, "profile or calibration", failure=StoreFailure)
     try:
         return octets.decode("utf-8-sig")
     except UnicodeDecodeError as error:

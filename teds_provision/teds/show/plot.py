@@ -7,13 +7,13 @@ from __future__ import annotations
 
 import io
 import math
-import os
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 from teds_provision.errors import BadData, UsageFailure
+from teds_provision.files import SHARED, write_whole
 from teds_provision.teds.calibration.decoded import calibrations_of, is_finite
 from teds_provision.teds.calibration.describe import kind_of
 from teds_provision.teds.calibration.model import Calibration
@@ -57,7 +57,7 @@ def plot_blocks(
         raise BadData(f"There is no calibration of {which} that can be drawn.")
     if len(panels) > MAXIMUM_PANELS:
         raise UsageFailure(f"{len(panels)} channels do not fit one picture.", hint="Choose one channel.")
-    _write(path, _picture(panels, kind))
+    write_whole(path, _picture(panels, kind), mode=SHARED, failure=UsageFailure)
     return tuple(panel.curve.channel.number for panel in panels)
 
 
@@ -256,13 +256,3 @@ class _View:
         for end in (-width, width):
             axes.axhline(end, color=_RED, linewidth=0.9, linestyle="--")
         return f"; stated uncertainty {width:.3g} (dashed)"
-
-
-def _write(path: Path, octets: bytes) -> None:
-    temporary = path.with_name(path.name + ".part")
-    try:
-        temporary.write_bytes(octets)
-        os.replace(temporary, path)
-    except OSError as error:
-        temporary.unlink(missing_ok=True)
-        raise UsageFailure(f"{path} cannot be written: {error.strerror}.") from error

@@ -1,0 +1,187 @@
+"""Files written whole or not at all, and read with a limit: the one way for every room.
+
+A new file begins under a temporary name of our own in the same folder (``.NAME.<16 hex digits>.teds-part``), made with
+``O_EXCL``, so a planted link is never written through. It gets its name only when its octets are on the disk; the
+folder is brought to the disk after that. What a killed writer left is recognised by that name and by the lock that its
+writer held, and removed by the next one; nothing else in the folder is ever touched.
+"""
+
+from __future__ import annotations
+
+import errno
+import fcntl
+import os
+import re
+import secrets
+import stat
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from typing import BinaryIO, Final
+
+from teds_provision.errors import BadData, NotFound, StoreFailure, TedsProvisionError, UsageFailure
+
+PRIVATE: Final = 0o600
+"""Mode of what holds secrets, sealed or not."""
+SHARED: Final = 0o666
+"""Mode of results that are no secret; the user's umask takes away from it."""
+_SUFFIX: Final = ".teds-part"
+_STALE_SECONDS: Final = 60.0  # between making the file and locking it a living writer looks like a dead one
+_NO_FOLDER_SYNC: Final = frozenset({errno.EINVAL, errno.ENOTSUP, errno.ENOSYS, errno.EROFS, errno.EACCES})
+_NO_HARD_LINKS: Final = frozenset({errno.EPERM, errno.ENOTSUP, errno.ENOSYS, errno.EMLINK, errno.EXDEV, errno.EACCES})
+
+
+@contextmanager
+def whole_file(path: Path, *, replace: bool, mode: int = PRIVATE) -> Iterator[BinaryIO]:
+    """Give a new file to write (and read back); when the block ends well it becomes ``path``, else nothing is left.
+
+    Durable when it returns: file, then name. ``replace`` False never takes the place of another file. Raises OSError,
+    FileExistsError for a name that is taken.
+    """
+    draft = path.with_name(f".{path.name}.{secrets.token_hex(8)}{_SUFFIX}")
+    _sweep(path)
+    descriptor = os.open(draft, os.O_CREAT | os.O_EXCL | os.O_RDWR | os.O_NOFOLLOW | os.O_CLOEXEC, mode)
+    try:
+        with open(descriptor, "w+b") as file:
+            with suppress(OSError):  # some network folders have no locks: then only its age tells a left-over file
+                fcntl.flock(file.fileno(), fcntl.LOCK_EX | fcntl.LOCK_NB)
+            yield file
+            file.flush()
+            os.fsync(file.fileno())
+            _publish(draft, path, replace=replace)
+        sync_folder(path.parent)
+    finally:
+        with suppress(OSError):
+            draft.unlink()
+
+
+def write_whole(
+    path: Path, octets: bytes, *, mode: int = PRIVATE, failure: type[TedsProvisionError] = StoreFailure
+) -> None:
+    """Put a file in the place of ``path``, whole and durable; raises ``failure``, and then the old one is as it was."""
+    try:
+        with whole_file(path, replace=True, mode=mode) as file:
+            file.write(octets)
+    except OSError as error:
+        raise _cannot_write(path, error, failure) from error
+
+
+def write_new(
+    path: Path, octets: bytes, *, mode: int = PRIVATE, failure: type[TedsProvisionError] = StoreFailure
+) -> None:
+    """Write a new file, whole and durable, never over another.
+
+    Raises UsageFailure where something lies at ``path``, NotFound where its folder is missing, else ``failure``.
+    """
+    require_new(path)
+    try:
+        with whole_file(path, replace=False, mode=mode) as file:
+            file.write(octets)
+    except FileExistsError:
+        raise _taken(path) from None
+    except OSError as error:
+        raise _cannot_write(path, error, failure) from error
+
+
+def require_new(path: Path) -> None:
+    """Raise UsageFailure where something lies at ``path``, NotFound where there is no folder for it."""
+    if path.exists() or path.is_symlink():
+        raise _taken(path)
+    if not path.parent.is_dir():
+        raise NotFound(f"There is no folder {path.parent}.")
+
+
+def read_limited(
+    path: Path,
+    max_octets: int,
+    what: str,
+    *,
+    failure: type[TedsProvisionError] = NotFound,
+    follow: bool = True,
+) -> bytes:
+    """Return the octets of a file, reading no more than ``max_octets`` of it.
+
+    ``follow`` False refuses a symbolic link. Raises NotFound (no such file), BadData (larger than any ``what``), else
+    ``failure``.
+    """
+    try:
+        with open(os.open(path, os.O_RDONLY | os.O_CLOEXEC | (0 if follow else os.O_NOFOLLOW)), "rb") as file:
+            octets = file.read(max_octets + 1)
+    except FileNotFoundError:
+        raise NotFound(f"There is no file {path}.") from None
+    except IsADirectoryError:
+        raise NotFound(f"{path} is a folder, not a file.") from None
+    except ValueError as error:  # a zero octet in the name
+        raise NotFound(f"{str(path)!r} is no name of a file.") from error
+    except OSError as error:
+        raise failure(f"{path} cannot be read: {error.strerror}.", hint="Check its owner and mode.") from error
+    if len(octets) > max_octets:
+        raise BadData(f"{path} is larger than {max_octets} octets: that is no {what}.")
+    return octets
+
+
+def sync_folder(folder: Path) -> None:
+    """Bring a folder's names to the disk; file systems that cannot are left alone. Raises OSError."""
+    descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
+    try:
+        os.fsync(descriptor)
+    except OSError as error:
+        if error.errno not in _NO_FOLDER_SYNC:
+            raise
+    finally:
+        os.close(descriptor)
+
+
+def private_folder(folder: Path) -> Path:
+    """Make a folder that only this user can use, or check one that is there; raises OSError.
+
+    One that belongs to someone else, that others may enter, or that is a link raises PermissionError: it may be a trap.
+    """
+    with suppress(FileExistsError):
+        folder.mkdir(mode=0o700)
+    status = folder.lstat()
+    if not stat.S_ISDIR(status.st_mode) or status.st_uid != os.geteuid() or status.st_mode & 0o077:
+        raise PermissionError(errno.EPERM, "it is not a folder of this user alone", str(folder))
+    return folder
+
+
+def _publish(draft: Path, path: Path, *, replace: bool) -> None:
+    """Give the draft its name; a memory stick without hard links gets a rename after a look."""
+    if replace:
+        os.replace(draft, path)
+        return
+    try:
+        os.link(draft, path, follow_symlinks=False)
+    except OSError as error:
+        if error.errno not in _NO_HARD_LINKS:
+            raise
+        if path.exists() or path.is_symlink():
+            raise FileExistsError(errno.EEXIST, os.strerror(errno.EEXIST), str(path)) from None
+        os.rename(draft, path)
+
+
+def _sweep(path: Path) -> None:
+    """Remove what killed writers of ``path`` left: a name of our own, our file, old, and locked by nobody."""
+    ours = re.compile(re.escape(f".{path.name}.") + "[0-9a-f]{16}" + re.escape(_SUFFIX))
+    with suppress(OSError):
+        for name in os.listdir(path.parent):
+            if ours.fullmatch(name):
+                _remove_if_left(path.with_name(name))
+
+
+def _remove_if_left(left: Path) -> None:
+    with suppress(OSError), open(os.open(left, os.O_RDWR | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC), "rb") as file:
+        status = os.fstat(file.fileno())
+        mine = stat.S_ISREG(status.st_mode) and status.st_uid == os.geteuid()
+        if mine and time.time() - status.st_mtime > _STALE_SECONDS:
+            fcntl.flock(file.fileno(), fcntl.LOCK_EX | fcntl.LOCK_NB)
+            left.unlink()
+
+
+def _taken(path: Path) -> UsageFailure:
+    return UsageFailure(f"{path} exists already and is not overwritten.", hint="Choose another name.")
+
+
+def _cannot_write(path: Path, error: OSError, failure: type[TedsProvisionError]) -> TedsProvisionError:
+    return failure(f"{path} cannot be written: {error.strerror}.", hint="Mend that and run the same command again.")
