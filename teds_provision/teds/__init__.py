@@ -29,6 +29,7 @@ if TYPE_CHECKING:
     from teds_provision.teds.codec.editions import convert
     from teds_provision.teds.codec.keyforms import ReadKey, read_key
     from teds_provision.teds.codec.uuid import UuidParts, pack_uuid, unpack_uuid
+    from teds_provision.teds.sheet import Sheet
 
 __all__ = [
     "AccessCode",
@@ -39,6 +40,7 @@ __all__ = [
     "Finding",
     "ReadKey",
     "Severity",
+    "Sheet",
     "Table",
     "TimeInstance",
     "Units",
@@ -64,6 +66,7 @@ _LAZY: Final = {
     "convert": "codec.editions",
     "ReadKey": "codec.keyforms",
     "read_key": "codec.keyforms",
+    "Sheet": "sheet",
     "UuidParts": "codec.uuid",
     "pack_uuid": "codec.uuid",
     "unpack_uuid": "codec.uuid",

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 from teds_provision.teds.calibration.model import Calibration
-from teds_provision.teds.calibration.raw_range import raw_range
+from teds_provision.teds.calibration.samples import raw_range
 from teds_provision.teds.codec.codes import AccessCode
 from teds_provision.teds.codec.decode import decode
 from teds_provision.teds.codec.model import Decoded, Units

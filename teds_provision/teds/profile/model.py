@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Literal
 
-from teds_provision.teds.calibration.raw_range import raw_range
+from teds_provision.teds.calibration.samples import raw_range
 from teds_provision.teds.codec.model import Edition, Units
 from teds_provision.teds.units.units import WrittenUnit
 

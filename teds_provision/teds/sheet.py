@@ -1,0 +1,382 @@
+"""The typed datasheet: everything that the TEDS of one node say, as values with types and units.
+
+:meth:`Sheet.of` never raises, whatever the octets. What is missing is None, NaN or "", what is wrong stands in
+``findings`` beside the values. Who may be believed is another question: a Sheet is made from verified and foreign TEDS
+alike (``protocol.datasheet`` judges the signature).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, replace
+from datetime import datetime
+from enum import IntEnum
+from functools import cached_property
+from typing import Final
+
+from teds_provision.errors import BadData
+from teds_provision.teds.calibration.decoded import from_decoded, is_finite
+from teds_provision.teds.calibration.model import Calibration
+from teds_provision.teds.calibration.samples import SampleForm
+from teds_provision.teds.codec.codes import AccessCode
+from teds_provision.teds.codec.decode import decode
+from teds_provision.teds.codec.model import Decoded, Finding, Severity, Units, Verdict
+from teds_provision.teds.codec.tables import name_of
+from teds_provision.teds.image import BlockId, Image
+from teds_provision.teds.units.units import WrittenUnit, display_unit, format_units, format_value
+
+NOT_STATED: Final = math.nan
+"""Stands for a number that the TEDS do not give, or call not available: IEEE 1451.0 writes NaN for that itself."""
+
+_DAMAGED: Final = (Verdict.MALFORMED, Verdict.FRAME_BAD, Verdict.FRAME_AND_CONTENT_BAD, Verdict.MESSAGE)
+
+
+class Kind(IntEnum):
+    """ChanType (field 11 of the TransducerChannel TEDS): what a channel is."""
+
+    SENSOR = 0
+    ACTUATOR = 1
+    EVENT_SENSOR = 2
+
+    @property
+    def word(self) -> str:
+        """``sensor``, ``actuator``, ``event sensor``."""
+        return self.name.lower().replace("_", " ")
+
+
+@dataclass(frozen=True)
+class SheetFinding:
+    """What is wrong or strange in one TEDS of the sheet, or between them; ``offset`` counts from its first octet."""
+
+    channel: int
+    access_code: int
+    severity: Severity
+    code: str
+    message: str
+    offset: int | None = None
+
+
+@dataclass(frozen=True)
+class Meta:
+    """The node as a whole: Meta-TEDS and its name. Times in seconds, NaN where not stated.
+
+    ``uuid`` has 10 octets (2007) or 16 (2024), ``channels`` is MaxChan; None where not stated.
+    """
+
+    uuid: bytes | None = None
+    name: str = ""
+    channels: int | None = None
+    operation_timeout: float = NOT_STATED
+    slow_access_timeout: float = NOT_STATED
+    self_test_time: float = NOT_STATED
+
+
+@dataclass(frozen=True)
+class Sampling:
+    """How a channel samples: SampMode (a mask), SDefault as it stands (sources disagree on it); None: not stated."""
+
+    modes: int | None = None
+    default: int | None = None
+
+
+@dataclass(frozen=True)
+class Timing:
+    """Times of a channel in seconds, NaN where not stated; ``period`` is SPeriod."""
+
+    period: float = NOT_STATED
+    update: float = NOT_STATED
+    write_setup: float = NOT_STATED
+    read_setup: float = NOT_STATED
+    read_delay: float = NOT_STATED
+    warm_up: float = NOT_STATED
+
+
+@dataclass(frozen=True)
+class Channel:
+    """One TransducerChannel. Limits and uncertainty are in SI units as its own TEDS states them, NaN where it does not.
+
+    ``units`` are the exponents of PhyUnits, ``unit`` the unit in which people see its values. ``kind`` is None for a
+    ChanType that is not known, ``halt`` is ActHalt (field 36). ``described`` is False where there is no
+    TransducerChannel TEDS at all. ``calibration`` is None where there is none or none that can be computed;
+    ``calibration_problem`` then says why.
+    """
+
+    number: int
+    name: str = ""
+    described: bool = False
+    kind: Kind | None = None
+    units: Units = Units()  # noqa: RUF009 - frozen
+    low: float = NOT_STATED
+    high: float = NOT_STATED
+    uncertainty: float = NOT_STATED
+    sample: SampleForm | None = None
+    sampling: Sampling = Sampling()
+    timing: Timing = Timing()
+    halt: int | None = None
+    calibration_key: int | None = None
+    calibration: Calibration | None = None
+    calibration_problem: str = ""
+
+    @property
+    def actuator(self) -> bool:
+        """Whether it acts; everything else gives values."""
+        return self.kind is Kind.ACTUATOR
+
+    @property
+    def period(self) -> float:
+        """SPeriod in seconds, NaN where not stated."""
+        return self.timing.period
+
+    @cached_property
+    def unit(self) -> WrittenUnit:
+        """Unit in which people see its values: the calibrated one where that has a usual name, else a friendly one."""
+        if self.calibration is not None and self.calibration.unit.text[:1] not in ("", "("):
+            return self.calibration.unit
+        return display_unit(self.units)
+
+    @property
+    def si_unit(self) -> str:
+        """Name of the SI unit of limits and uncertainty: ``rad``, ``N``; ``count`` for plain numbers."""
+        return format_units(self.units) or "count"
+
+    @property
+    def has_range(self) -> bool:
+        """Whether both limits are stated."""
+        return math.isfinite(self.low) and math.isfinite(self.high)
+
+    @property
+    def stated_uncertainty(self) -> float:
+        """Uncertainty in SI units: that of the calibration where it states one, else that of the channel."""
+        own = self.calibration
+        if own is not None and own.uncertainty is not None and math.isfinite(own.uncertainty):
+            return own.unit.difference_to_si(own.uncertainty)
+        return self.uncertainty
+
+    @property
+    def calibrated_at(self) -> datetime | None:
+        """Date of the last calibration, None where there is none."""
+        return self.calibration.date if self.calibration is not None else None
+
+    @property
+    def due(self) -> datetime | None:
+        """When the next calibration is due, None where nothing says so."""
+        return self.calibration.due if self.calibration is not None else None
+
+    def overdue(self, now: datetime) -> bool:
+        """Whether the next calibration was due before ``now``."""
+        return self.calibration is not None and self.calibration.overdue(now)
+
+    def show(self, value: float, *, difference: bool = False, digits: int = 6) -> str:
+        """Value in SI units as people see it: ``360 °``, ``0.35 N``; a difference leaves the unit's offset out."""
+        return format_value(value, self.unit, difference=difference, digits=digits)
+
+
+@dataclass(frozen=True)
+class Sheet:
+    """The datasheet of one node; ``channels`` ascend by number and are those that have a TransducerChannel TEDS.
+
+    ``calibrations`` holds every calibration that can be computed, also of a channel that nothing describes.
+    """
+
+    uuid: bytes
+    meta: Meta
+    channels: tuple[Channel, ...]
+    calibrations: Mapping[int, Calibration]
+    findings: tuple[SheetFinding, ...] = ()
+
+    @classmethod
+    def of(cls, image: Image) -> Sheet:
+        """Datasheet of an image; never raises."""
+        return _Reader(image.uuid, image.blocks).sheet()
+
+    @classmethod
+    def of_blocks(cls, blocks: Mapping[BlockId, bytes]) -> Sheet:
+        """Datasheet of framed TEDS by (channel, access code); its UUID is what the Meta-TEDS says, or empty."""
+        return _Reader(b"", blocks).sheet()
+
+    def channel(self, number: int) -> Channel | None:
+        """Channel of that number, None where it is not described."""
+        return next((channel for channel in self.channels if channel.number == number), None)
+
+    def named(self, name: str) -> Channel | None:
+        """The one channel of that name, None where there is none or more than one."""
+        found = [channel for channel in self.channels if channel.name == name]
+        return found[0] if len(found) == 1 else None
+
+    @property
+    def errors(self) -> tuple[SheetFinding, ...]:
+        """Findings of severity error."""
+        return tuple(finding for finding in self.findings if finding.severity == "error")
+
+
+def channel_of(number: int, blocks: Mapping[BlockId, bytes]) -> Channel:
+    """One channel among framed TEDS by (channel, access code); one without a description states nothing."""
+    return _Reader(b"", blocks).channel(number)
+
+
+def channel_from(decoded: Decoded, number: int = 0) -> Channel:
+    """What a decoded TransducerChannel TEDS alone says of its channel."""
+    return _channel(number, "", decoded)
+
+
+def node_name(decoded: Decoded | None) -> str:
+    """TCName of a decoded name TEDS, "" where it has none that can be printed."""
+    name = decoded.get("TCName") if decoded is not None else None
+    return name if isinstance(name, str) and name.isprintable() else ""
+
+
+class _Reader:
+    """Reads the TEDS of one node, each decoded once."""
+
+    def __init__(self, uuid: bytes, blocks: Mapping[BlockId, bytes]) -> None:
+        self.uuid, self.blocks = uuid, blocks
+        self.seen: dict[BlockId, Decoded] = {}
+
+    def decoded(self, channel: int, access_code: int) -> Decoded | None:
+        """One TEDS decoded, None where it is not there."""
+        key = (channel, access_code)
+        if key not in self.seen:
+            octets = self.blocks.get(key)
+            if octets is None:
+                return None
+            self.seen[key] = decode(octets)
+        return self.seen[key]
+
+    def name(self, channel: int) -> str:
+        return node_name(self.decoded(channel, AccessCode.NAME))
+
+    def channel(self, number: int) -> Channel:
+        own = _channel(number, self.name(number), self.decoded(number, AccessCode.CHANNEL))
+        teds = self.decoded(number, AccessCode.CALIBRATION)
+        if teds is None:
+            return own
+        calibration, problem = _calibration(teds, own)
+        return _calibrated(own, calibration, problem)
+
+    def meta(self) -> Meta:
+        teds = self.decoded(0, AccessCode.META)
+        if teds is None:
+            return Meta(name=self.name(0))
+        uuid, channels = teds.get("UUID"), teds.get("MaxChan")
+        return Meta(
+            uuid if isinstance(uuid, bytes) else None,
+            self.name(0),
+            channels if isinstance(channels, int) else None,
+            *(_float(teds, name) for name in ("OholdOff", "SHoldOff", "TestTime")),
+        )
+
+    def sheet(self) -> Sheet:
+        meta = self.meta()
+        numbers = sorted({channel for channel, code in self.blocks if code in _OF_CHANNELS})
+        every = [self.channel(number) for number in numbers]
+        described = tuple(channel for channel in every if channel.described)
+        calibrations = {channel.number: channel.calibration for channel in every if channel.calibration is not None}
+        findings = (*self.of_blocks(), *_between(self.uuid, meta, every))
+        return Sheet(self.uuid or meta.uuid or b"", meta, described, calibrations, findings)
+
+    def of_blocks(self) -> Iterator[SheetFinding]:
+        """What the decoder found in each TEDS, and TEDS that stand in a place that is not theirs."""
+        for channel, code in sorted(self.blocks):
+            teds = self.decoded(channel, code)
+            if teds is None:
+                continue
+            for finding in teds.findings:
+                yield _placed(channel, code, finding)
+            if teds.access_code not in (code, None):
+                message = f"This stands where {name_of(code)} belongs; its TEDSID says {teds.name}."
+                yield SheetFinding(channel, code, "error", "class", message)
+
+
+_OF_CHANNELS: Final = (AccessCode.CHANNEL, AccessCode.CALIBRATION)
+
+
+def _placed(channel: int, code: int, finding: Finding) -> SheetFinding:
+    return SheetFinding(channel, code, finding.severity, finding.code, finding.message, finding.offset)
+
+
+def _between(uuid: bytes, meta: Meta, channels: list[Channel]) -> Iterator[SheetFinding]:
+    """What the TEDS of a node say against each other."""
+    if uuid and meta.uuid and meta.uuid[-len(uuid) :] != uuid:
+        message = f"The Meta-TEDS names the UUID {meta.uuid.hex()}, not {uuid.hex()}."
+        yield SheetFinding(0, AccessCode.META, "error", "uuid", message)
+    described = [channel for channel in channels if channel.described]
+    if meta.channels is not None and meta.channels != len(described):
+        message = f"The Meta-TEDS counts {meta.channels} channels; {len(described)} are described."
+        yield SheetFinding(0, AccessCode.META, "warning", "channels", message)
+    names: dict[str, int] = {}
+    for channel in channels:
+        if channel.calibration_problem:
+            yield SheetFinding(
+                channel.number, AccessCode.CALIBRATION, "warning", "calibration", channel.calibration_problem
+            )
+        if not channel.described:
+            message = "There is a calibration, and nothing that describes the channel."
+            yield SheetFinding(channel.number, AccessCode.CALIBRATION, "warning", "undescribed", message)
+        elif channel.name:
+            first = names.setdefault(channel.name, channel.number)
+            if first != channel.number:
+                message = f'Channels {first} and {channel.number} have the same name, "{channel.name}".'
+                yield SheetFinding(channel.number, AccessCode.NAME, "warning", "same-name", message)
+
+
+def _channel(number: int, name: str, teds: Decoded | None) -> Channel:
+    if teds is None:
+        return Channel(number, name)
+    units, kind = teds.get("PhyUnits"), _integer(teds, "ChanType")
+    model, octets = _integer(teds, "DatModel"), _integer(teds, "ModLenth")
+    return Channel(
+        number,
+        name,
+        described=True,
+        kind=Kind(kind) if kind in set(Kind) else None,
+        units=units if isinstance(units, Units) else Units(),
+        low=_float(teds, "LowLimit"),
+        high=_float(teds, "HiLimit"),
+        uncertainty=_float(teds, "OError"),
+        sample=None if model is None or octets is None else SampleForm(model, octets, _integer(teds, "SigBits") or 0),
+        sampling=Sampling(_integer(teds, "SampMode"), _integer(teds, "SDefault")),
+        timing=Timing(
+            *(_float(teds, name) for name in ("SPeriod", "UpdateT", "WSetupT", "RSetupT", "RDelayT", "WarmUpT"))
+        ),
+        halt=_integer(teds, "ActHalt"),
+        calibration_key=_integer(teds, "CalKey"),
+    )
+
+
+def _calibration(teds: Decoded, own: Channel) -> tuple[Calibration | None, str]:
+    """Calibration of a channel, or why there is none that can be computed."""
+    if teds.verdict in _DAMAGED:
+        return None, "The Calibration TEDS is damaged: its length, checksum or structure is wrong."
+    try:
+        found = from_decoded(teds, channel=own.number, units=own.units, actuator=own.actuator)
+    except BadData as error:
+        return None, error.message
+    problem = computable(found)
+    return (None, problem) if problem else (found, "")
+
+
+def computable(calibration: Calibration) -> str:
+    """Why nothing can be computed with a calibration; "" where it can."""
+    unit = calibration.unit
+    if not is_finite(calibration):
+        return "A number of the calibration is not finite."
+    if not all(part.ascending for part in calibration.inputs):
+        return "The segment boundaries of the calibration do not ascend."
+    if not math.isfinite(unit.scale) or not math.isfinite(unit.offset) or unit.scale == 0:
+        return "The calibrated unit has no way into SI units: its slope is 0 or not finite."
+    return ""
+
+
+def _calibrated(own: Channel, calibration: Calibration | None, problem: str) -> Channel:
+    return replace(own, calibration=calibration, calibration_problem=problem)
+
+
+def _float(teds: Decoded, name: str) -> float:
+    value = teds.get(name)
+    return float(value) if isinstance(value, (int, float)) else NOT_STATED
+
+
+def _integer(teds: Decoded, name: str) -> int | None:
+    value = teds.get(name)
+    return value if isinstance(value, int) else None
