@@ -1,8 +1,10 @@
-"""The node's end of a CAN bus: one line for each base station, and the answer to everyone's Identify."""
+"""The nodes' end of a CAN bus: one receiving loop for all nodes of the process, a crew of threads for their commands."""
 
 from __future__ import annotations
 
-import queue
+import heapq
+import itertools
+import logging
 import random
 import threading
 import time
@@ -12,98 +14,76 @@ from typing import Final
 from teds_provision.errors import LinkFailure, NoReader, TedsProvisionError
 from teds_provision.links.can.bus import Bus, Frame
 from teds_provision.links.can.isotp import FUNCTIONAL, Pair, addresses, read_single
-from teds_provision.links.can.spec import FIRST_STATION, LAST_STATION, parse_spec
+from teds_provision.links.can.spec import FIRST_STATION, LAST_NODE, LAST_STATION, parse_spec
+from teds_provision.node.can_seat import Line, Seat
 from teds_provision.node.handler import NodeHandler
+from teds_provision.node.workers import Crew
+from teds_provision.protocol.announce import Announce, is_announce
 from teds_provision.protocol.messages.frames import Function, Reply, security_command
-from teds_provision.protocol.repetition import Repetition
 
 _IDENTIFY: Final = security_command(Function.IDENTIFY).encode()
 _SPREAD_SECONDS: Final = 0.05
 _IDLE: Final = 0.02
+_LOOK_ROUND: Final = 0.05
+"""Seconds between two looks at transfers that wait for the other side."""
 _FLOW_CONTROL: Final = 3
-_REOPEN_SECONDS: Final = 1.0
+_FIRST_REOPEN, _LAST_REOPEN = 1.0, 30.0
+"""Seconds until the node comes back from bus-off, doubling while it recurs (operation.md, section 6)."""
+_TOLD: Final = logging.getLogger(__name__)
 
 
-class _Moved:
-    """A job: the node has another address now, so that the line to this station is a new one."""
-
-
-class _Line:
-    """One base station's line: its own session (by name), stored reply and worker.
-
-    A link is one pair of addresses: with a new own address it begins anew. ``pairs`` keeps the old Pair as long as it
-    still sends.
-    """
-
-    def __init__(self, server: CanServer, station: int) -> None:
-        self.station = station
-        self.name = f"can:{station:02x}"
-        self.pairs: dict[int, Pair] = {}
-        self.repetition = Repetition()
-        self.jobs: queue.Queue[tuple[Pair, bytes] | _Moved | None] = queue.Queue(maxsize=4)
-        self.worker = threading.Thread(target=self._work, args=(server,), name=self.name, daemon=True)
-        self.worker.start()
-
-    def moved(self) -> None:
-        """Begin anew, once what was asked before is done."""
-        try:
-            self.jobs.put_nowait(_Moved())
-        except queue.Full:
-            return
-
-    def put(self, pair: Pair, body: bytes) -> None:
-        """Queue a request; a station that asks on and on without waiting loses what does not fit."""
-        try:
-            self.jobs.put_nowait((pair, body))
-        except queue.Full:
-            return
-
-    def end(self) -> None:
-        """Let the worker finish what it does and go."""
-        while True:
-            try:
-                self.jobs.put_nowait(None)
-                break
-            except queue.Full:
-                try:
-                    self.jobs.get_nowait()
-                except queue.Empty:
-                    continue
-        self.worker.join(timeout=0.5)
-
-    def _work(self, server: CanServer) -> None:
-        while (job := self.jobs.get()) is not None:
-            if isinstance(job, _Moved):
-                server.begin_anew(self)
-            else:
-                server.run_request(self, *job)
+def _never() -> bool:
+    return False
 
 
 class CanServer:
-    """Serves a node on one CAN bus in threads of its own.
+    """Serves nodes on one CAN bus.
 
-    ``spec_text`` is the value of ``--can``; ``node=`` and ``source=`` mean nothing here, since the node's address is
-    ``handler.can_address()`` at any time and every base station is served. ``counts_as_tapped`` says whether a request
-    from the bus counts as one by tap (a node built without NFC, in factory state).
+    ``spec_text`` is the value of ``--can``; ``node=`` and ``source=`` mean nothing here, since a node's address is
+    ``handler.can_address()`` and every base station is served. ``counts_as_tapped`` says whether a request from the bus
+    counts as one by tap (a node built without NFC, in factory state). ``tell`` is given what a person should know.
     """
 
     def __init__(
-        self, spec_text: str, handler: NodeHandler, *, counts_as_tapped: Callable[[], bool] = lambda: False
+        self,
+        spec_text: str,
+        handler: NodeHandler | None = None,
+        *,
+        counts_as_tapped: Callable[[], bool] = _never,
+        tell: Callable[[str], None] = _TOLD.warning,
     ) -> None:
         self._spec = parse_spec(spec_text)
-        self._handler = handler
-        self._counts_as_tapped = counts_as_tapped
+        self._tell = tell
+        self._nodes: list[tuple[NodeHandler, Callable[[], bool]]] = []
         self._bus: Bus | None = None
-        self._lines: dict[int, _Line] = {}
-        self._later: list[tuple[float, _Line, int, bytes, bool]] = []
-        self._lock = threading.Lock()
+        self._crew: Crew | None = None
+        self._seats: list[Seat] = []
+        self._at: dict[int, list[Seat]] = {}
+        self._known: set[int] = set()
+        self._active: set[tuple[Seat, Pair]] = set()
+        self._looked = 0.0
+        self._later: list[tuple[float, int, Callable[[], None]]] = []
+        self._everyone_due: dict[Line, int] = {}
+        self._number = itertools.count()
+        self._lock = threading.RLock()
         self._stop = threading.Event()
         self._thread: threading.Thread | None = None
+        if handler is not None:
+            self.add(handler, counts_as_tapped=counts_as_tapped)
+
+    def add(self, handler: NodeHandler, *, counts_as_tapped: Callable[[], bool] = _never) -> None:
+        """Hang one more node on this bus, before :meth:`start`."""
+        self._nodes.append((handler, counts_as_tapped))
 
     def start(self) -> None:
         """Open the bus and listen; raises NoReader or UsageFailure where it cannot."""
         self._bus = Bus(self._spec)
         self._stop.clear()
+        self._crew = Crew()
+        self._known, self._active, self._later, self._everyone_due = set(), set(), [], {}
+        self._seats = [Seat(node, tapped, self._crew.turns(), self._out) for node, tapped in self._nodes]
+        self._find_seats()
+        self._announce_all()
         self._thread = threading.Thread(target=self._serve, name="can", daemon=True)
         self._thread.start()
 
@@ -113,42 +93,31 @@ class CanServer:
         if self._thread is not None:
             self._thread.join(timeout=3)
             self._thread = None
-        self._lose_lines()
+        if self._crew is not None:
+            self._crew.end()
+            self._crew = None
+        for seat in self._seats:
+            for line in seat.lines.values():
+                line.begin_anew()
+        self._seats, self._at = [], {}
         if self._bus is not None:
             self._bus.close()
             self._bus = None
 
-    def begin_anew(self, line: _Line) -> None:
-        """The pair of addresses is another one: session and stored reply of the old one are gone."""
-        line.repetition.forget()
-        self._handler.lost(line.name)
-
-    def run_request(self, line: _Line, pair: Pair, body: bytes) -> None:
-        """Run one request in the worker of its line and send the reply from the address that was asked."""
-        try:
-            reply = line.repetition.answer(
-                body[0],
-                body[1:],
-                lambda frame: self._handler.request(line.name, frame, tapped=self._counts_as_tapped()),
-                now=time.monotonic(),
-            )
-        except TedsProvisionError:
-            return  # a node in trouble (its flash file is gone) is silent
-        with self._lock:
-            if self._stop.is_set() or self._lines.get(line.station) is not line:
-                return  # lost meanwhile
-            try:
-                pair.send(body[:1] + reply)
-            except LinkFailure:
-                return  # the reading thread meets the same failure and deals with it
+    # -- the loop --------------------------------------------------------------------------------------------------
 
     def _serve(self) -> None:
+        reopen, came_back = _FIRST_REOPEN, time.monotonic()
         while not self._stop.is_set():
             try:
                 self._serve_one()
             except LinkFailure:
-                self._lose_lines()
-                self._reopen()
+                with self._lock:
+                    self._lose_lines()
+                if time.monotonic() - came_back > 2 * _LAST_REOPEN:
+                    reopen = _FIRST_REOPEN
+                self._reopen(reopen)
+                reopen, came_back = min(2 * reopen, _LAST_REOPEN), time.monotonic()
 
     def _serve_one(self) -> None:
         assert self._bus is not None
@@ -156,96 +125,210 @@ class CanServer:
         with self._lock:
             if frame is not None:
                 self._dispatch(frame)
-            self._answer_everyone()
-            for line in self._lines.values():
-                for pair in line.pairs.values():
-                    pair.run()
+            now = time.monotonic()
+            while self._later and self._later[0][0] <= now:
+                heapq.heappop(self._later)[2]()
+            self._run_transfers(now)
 
     def _wait(self) -> float:
-        """Seconds until a consecutive frame or an answer to everyone is due."""
+        """Seconds until a consecutive frame, an answer to everyone or an Announce is due."""
         with self._lock:
             wait = _IDLE
-            for line in self._lines.values():
-                for pair in line.pairs.values():
-                    wait = pair.due_in(wait)
-            for due, *_ in self._later:
-                wait = min(wait, max(0.0, due - time.monotonic()))
+            for _, pair in self._active:
+                wait = pair.due_in(wait)
+            if self._later:
+                wait = min(wait, max(0.0, self._later[0][0] - time.monotonic()))
             return wait
 
+    def _run_transfers(self, now: float) -> None:
+        """Send the consecutive frames that are due; look now and then at what the other side lets wait."""
+        look_round = now - self._looked >= _LOOK_ROUND
+        if look_round:
+            self._looked = now
+        for seat, pair in list(self._active):
+            if look_round or pair.due_in(1.0) <= 0:
+                pair.run()
+                self._note(seat, pair)
+
+    def _note(self, seat: Seat, pair: Pair) -> None:
+        """Keep a pair among those that are looked after as long as a message of either side is under way."""
+        if pair.sending or pair.receiving:
+            self._active.add((seat, pair))
+        else:
+            self._active.discard((seat, pair))
+
+    def _at_time(self, due: float, job: Callable[[], None]) -> None:
+        heapq.heappush(self._later, (due, next(self._number), job))
+
+    def _out(self, seat: Seat, frame: Frame) -> None:
+        """Put a node's frame on the bus; the other nodes of this process hear it as they hear those of the bus."""
+        assert self._bus is not None
+        self._bus.send(frame)
+        source = frame.identifier & 0xFF
+        if source not in seat.spoken_from:
+            seat.spoken_from.add(source)
+            for other in self._seats:
+                if other is not seat:
+                    other.claim.hear(source)
+        if is_announce(frame.identifier):
+            self._announced(frame, seat)
+
+    # -- frames ----------------------------------------------------------------------------------------------------
+
     def _dispatch(self, frame: Frame) -> None:
-        station = frame.identifier & 0xFF
-        if not FIRST_STATION <= station <= LAST_STATION:
-            return
+        source = frame.identifier & 0xFF
+        if 1 <= source <= LAST_NODE and source not in self._known:
+            self._known.add(source)
+            for seat in self._seats:
+                seat.claim.hear(source)
+        if is_announce(frame.identifier):
+            self._announced(frame, None)
+        elif FIRST_STATION <= source <= LAST_STATION:
+            self._from_station(source, frame)
+
+    def _from_station(self, station: int, frame: Frame) -> None:
         if frame.identifier & 0x1FFFFF00 == FUNCTIONAL:
-            self._everyone(station, frame)
+            body = read_single(frame.data)
+            if body is not None and body[1:] == _IDENTIFY:  # nothing else that is asked of everyone is answered
+                for seat in self._seats:
+                    self._everyone(seat, station, body[:1], fd=frame.fd)
             return
         ends = addresses(frame.identifier)
         if ends is None:
             return
         own = ends[0]
-        line = self._lines.get(station)
-        pair = line.pairs.get(own) if line else None
-        if own != self._handler.can_address():
-            # the address has changed: the reply that is still leaving from the old one needs its flow control
-            if pair is None or not pair.sending or not frame.data or frame.data[0] >> 4 != _FLOW_CONTROL:
-                return
-            pair.take(frame)
-            return
-        line, pair = self._pair(station, own)
-        pair.take(frame)
+        for seat in self._at.get(own, ()):
+            line, pair = seat.pair(station, own)
+            self._request(seat, line, pair, frame)
+        if frame.data and frame.data[0] >> 4 == _FLOW_CONTROL:
+            self._flow_control_of_old_address(station, own, frame)
+
+    def _request(self, seat: Seat, line: Line, pair: Pair, frame: Frame) -> None:
+        seat.take(pair, frame)
         while (body := pair.received()) is not None:
-            line.put(pair, body)
+            whole = body
+            seat.put(line, lambda: self._run_request(line, pair, whole))
+        self._note(seat, pair)
 
-    def _pair(self, station: int, own: int) -> tuple[_Line, Pair]:
-        assert self._bus is not None
-        line = self._lines.get(station)
-        if line is None:
-            line = self._lines[station] = _Line(self, station)
-        pair = line.pairs.get(own)
-        if pair is None:
-            if line.pairs:
-                line.moved()
-            line.pairs = {at: old for at, old in line.pairs.items() if old.sending}
-            pair = line.pairs[own] = Pair(own, station, self._bus.send)
-        return line, pair
+    def _flow_control_of_old_address(self, station: int, own: int, frame: Frame) -> None:
+        """A reply that is still leaving from the address before 128.10 needs its flow control."""
+        for seat, pair in list(self._active):
+            if pair.own == own and pair.peer == station and seat.address != own and pair.sending:
+                pair.take(frame)
+                self._note(seat, pair)
 
-    def _everyone(self, station: int, frame: Frame) -> None:
-        """Note a functional Identify; anything else that is asked of everyone is not answered."""
-        body = read_single(frame.data)
-        if body is None or body[1:] != _IDENTIFY:
+    def _run_request(self, line: Line, pair: Pair, body: bytes) -> None:
+        """Run one request in the turn of its node and send the reply from the address that was asked."""
+        try:
+            reply = line.answer(body)
+        except TedsProvisionError:
+            return  # a node in trouble (its flash file is gone) is silent
+        finally:
+            with self._lock:
+                line.waiting -= 1
+        with self._lock:
+            if line.seat.address != line.seat.handler.can_address():  # 128.10
+                line.seat.address = line.seat.handler.can_address()
+                self._find_seats()
+            if self._stop.is_set() or line.gone or line.pairs.get(pair.own) is not pair:
+                return  # lost meanwhile
+            try:
+                pair.send(reply)
+            except LinkFailure:
+                return  # the reading thread meets the same failure and deals with it
+            self._note(line.seat, pair)
+
+    # -- everyone --------------------------------------------------------------------------------------------------
+
+    def _everyone(self, seat: Seat, station: int, transaction: bytes, *, fd: bool) -> None:
+        """Answer a functional Identify after a random wait; a newer one of the same station takes its place."""
+        own = seat.address
+        line, _ = seat.pair(station, own)
+        number = self._everyone_due[line] = next(self._number)
+
+        def answer() -> None:
+            if self._everyone_due.get(line) == number and not line.gone and seat.address == own:
+                del self._everyone_due[line]
+                self._answer_everyone(seat, station, own, transaction, fd=fd)
+
+        self._at_time(time.monotonic() + random.uniform(0, _SPREAD_SECONDS), answer)
+
+    def _answer_everyone(self, seat: Seat, station: int, own: int, transaction: bytes, *, fd: bool) -> None:
+        """It leaves the stored reply alone."""
+        _, pair = seat.pair(station, own)
+        if pair.waits_for_flow:
+            pair.stop_sending()  # nobody has taken the answer before this one
+        pair.speak(fd=fd)
+        pair.send(transaction + Reply(True, seat.handler.identify()).encode())
+        self._note(seat, pair)
+
+    # -- addresses -------------------------------------------------------------------------------------------------
+
+    def _find_seats(self) -> None:
+        self._at = {}
+        for seat in self._seats:
+            self._at.setdefault(seat.address, []).append(seat)
+
+    def _announce_all(self) -> None:
+        for seat in self._seats:
+            seat.claim.start(time.monotonic())
+            self._announce_when_due(seat)
+
+    def _announce_when_due(self, seat: Seat) -> None:
+        due = seat.claim.due(time.monotonic())
+        if due is None:
             return
-        own = self._handler.can_address()
-        line, _ = self._pair(station, own)
-        due = time.monotonic() + random.uniform(0, _SPREAD_SECONDS)
-        self._later = [entry for entry in self._later if entry[1] is not line]
-        self._later.append((due, line, own, body[:1], frame.fd))
 
-    def _answer_everyone(self) -> None:
-        """Send the answers to functional Identifies that are due; they leave the stored reply alone."""
-        now = time.monotonic()
-        for entry in [entry for entry in self._later if entry[0] <= now]:
-            self._later.remove(entry)
-            _, line, own, transaction, fd = entry
-            _, pair = self._pair(line.station, own)
-            if pair.waits_for_flow:
-                pair.stop_sending()  # nobody has taken the answer before this one
-            pair.speak(fd=fd)
-            pair.send(transaction + Reply(True, self._handler.identify()).encode())
+        def announce() -> None:
+            if seat.claim.due(due) == due:
+                seat.announce()
+
+        self._at_time(due, announce)
+
+    def _announced(self, frame: Frame, speaker: Seat | None) -> None:
+        """An Announce was heard, from the bus or from a node of this process (``speaker``)."""
+        announce = Announce.decode(frame.identifier, frame.data)
+        if announce is None:
+            return
+        for seat in list(self._at.get(announce.address, ())):
+            if seat is not speaker and not (speaker is None and self._echo(seat, announce)):
+                self._contested(seat, announce)
+
+    def _echo(self, seat: Seat, announce: Announce) -> bool:
+        """Whether it is the node's own Announce, given back by a controller that does so."""
+        return announce.crc == seat.claim.crc and bool(dict(self._spec.options).get("receive_own_messages"))
+
+    def _contested(self, seat: Seat, announce: Announce) -> None:
+        now, before, told = time.monotonic(), seat.address, seat.claim.conflict
+        address = seat.claim.take(announce, before, now, pinned=seat.handler.actuator_claimed())
+        if seat.claim.conflict and not told:
+            self._tell(
+                f"Another node announces the UUID {seat.uuid.hex()} (or one of equal CRC-32) "
+                f"from the CAN address 0x{before:02x}: take one of the two from the bus."
+            )
+        if address != before:
+            self._active = {(other, pair) for other, pair in self._active if other is not seat}
+            seat.move(address)
+            self._find_seats()
+        self._announce_when_due(seat)
+
+    # -- losses ----------------------------------------------------------------------------------------------------
 
     def _lose_lines(self) -> None:
-        with self._lock:
-            lines, self._lines, self._later = self._lines, {}, []
-        for line in lines.values():
-            line.end()
-            line.repetition.forget()
-            self._handler.lost(line.name)
+        self._active.clear()
+        self._later.clear()
+        self._everyone_due.clear()
+        for seat in self._seats:
+            seat.lose_lines()
 
-    def _reopen(self) -> None:
+    def _reopen(self, seconds: float) -> None:
         if self._bus is not None:
             self._bus.close()
-        while not self._stop.wait(_REOPEN_SECONDS):
+        while not self._stop.wait(seconds):
             try:
                 self._bus = Bus(self._spec)
             except (LinkFailure, NoReader):
                 continue
+            with self._lock:
+                self._announce_all()
             return

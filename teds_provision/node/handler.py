@@ -6,7 +6,7 @@ from typing import Protocol
 
 
 class NodeHandler(Protocol):
-    """The node as its links see it. Thread-safe: each link server runs in its own thread."""
+    """The node as its links see it. Thread-safe: each link server runs in its own threads."""
 
     def request(self, link: str, frame: bytes, *, tapped: bool) -> bytes:
         """Run one whole command frame that arrived on ``link``; always returns a whole reply frame.
@@ -23,3 +23,9 @@ class NodeHandler(Protocol):
 
     def can_address(self) -> int:
         """Return the node's present CAN address, 1 to 239."""
+
+    def take_can_address(self, address: int) -> None:
+        """Have another CAN address until the restart: another node claimed this one (profile: wire, "Claim")."""
+
+    def actuator_claimed(self) -> bool:
+        """Whether a session claims an actuator, so that the node keeps its CAN address whoever claims it."""

@@ -93,7 +93,15 @@ class VirtualNode:
 
     def can_address(self) -> int:
         """Present CAN address; see NodeHandler."""
-        return self.tim.flash.can_address
+        return self.tim.can_address
+
+    def take_can_address(self, address: int) -> None:
+        """Move to another CAN address until the restart; see NodeHandler."""
+        self.tim.take_can_address(address)
+
+    def actuator_claimed(self) -> bool:
+        """Whether an actuator is claimed; see NodeHandler."""
+        return False
 
     def in_factory_state(self) -> bool:
         """Whether the node holds no key."""

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import threading
 import time
-from collections.abc import Iterator
+import zlib
+from collections.abc import Callable, Iterator
 
 import pytest
 
@@ -11,6 +13,9 @@ from teds_provision.links.can.bus import Bus, Frame
 from teds_provision.links.can.isotp import Pair, physical_id, single
 from teds_provision.links.can.spec import parse_spec
 from teds_provision.node.can_server import CanServer
+from teds_provision.node.workers import MOST_THREADS
+from teds_provision.protocol.announce import Announce
+from teds_provision.protocol.messages.identity import NodeState
 from tests.links.can.echo_node import EchoNode
 from tests.links.can.hub import Hub
 
@@ -119,7 +124,7 @@ def test_a_command_of_bad_form_gets_what_the_node_says_of_it(station: Stranger) 
 
 def test_other_addresses_are_not_its_own(station: Stranger, node: EchoNode) -> None:
     assert station.ask(0x22, b"\x01" + IDENTIFY, 0.2) == []
-    node.address = 0x22
+    assert station.ask(0x21, b"\x02\x00\x00\x80\x0a\x00\x01\x22", 0.2) == [b"\x02\x01\x00\x00"]
     assert len(station.ask(0x22, b"\x01" + IDENTIFY, 0.3)) == 1
     assert station.ask(0x21, b"\x01" + IDENTIFY, 0.2) == []
 
@@ -155,3 +160,146 @@ def test_stopping_ends_the_sessions(hub: Hub, node: EchoNode) -> None:
     station.bus.close()
     assert node.links_lost == ["can:f1"]
     assert node.seen == [("can:f1", False)]
+
+
+def announces(hub: Hub) -> list[Announce]:
+    found = (Announce.decode(identifier, data) for identifier, data in list(hub.frames))
+    return [announce for announce in found if announce is not None]
+
+
+def wait_for(what: Callable[[], bool], seconds: float = 8.0) -> bool:
+    until = time.monotonic() + seconds
+    while not what():
+        if time.monotonic() > until:
+            return False
+        time.sleep(0.005)
+    return True
+
+
+def test_announces_itself_once_after_its_start(hub: Hub, server: CanServer, node: EchoNode) -> None:
+    node.state = NodeState.PROVISIONED
+    assert wait_for(lambda: bool(announces(hub)), 1.5)
+    assert hub.frames[0][0] == 0x1CFF0021
+    assert not wait_for(lambda: len(announces(hub)) > 1, 0.3)
+    assert announces(hub)[0].crc == zlib.crc32(node.uuid)
+
+
+def test_moves_away_from_a_smaller_crc_and_ends_the_sessions_there(
+    station: Stranger, server: CanServer, node: EchoNode, hub: Hub
+) -> None:
+    assert len(station.ask(0x21, b"\x09" + COUNT)) == 1
+    station.bus.send(Frame(0x18DAF122, b"\x30\x00\x00"))  # somebody at 0x22 is heard
+    station.bus.send(Frame(0x1CFF0021, Announce(0x21, 0, zlib.crc32(node.uuid) - 1).encode()))
+    assert wait_for(lambda: node.address == 0x23)
+    assert wait_for(lambda: any(announce.address == 0x23 for announce in announces(hub)))
+    assert node.links_lost == ["can:f1"]
+    assert len(station.ask(0x23, b"\x0a" + COUNT)) == 1
+    assert station.ask(0x21, b"\x0b" + COUNT, 0.2) == []
+
+
+def test_stays_before_a_greater_crc_and_says_so(station: Stranger, hub: Hub, node: EchoNode) -> None:
+    assert wait_for(lambda: len(announces(hub)) == 1)
+    station.bus.send(Frame(0x1CFF0021, Announce(0x21, 0, zlib.crc32(node.uuid) + 1).encode()))
+    assert wait_for(lambda: len(announces(hub)) == 3)  # its own, the stranger's, its own again
+    assert node.address == 0x21
+
+
+def test_stays_with_an_actuator_claimed(station: Stranger, hub: Hub, node: EchoNode) -> None:
+    node.pinned = True
+    station.bus.send(Frame(0x1CFF0021, Announce(0x21, 0, zlib.crc32(node.uuid) - 1).encode()))
+    assert wait_for(lambda: len(announces(hub)) >= 2)
+    assert node.address == 0x21
+
+
+def test_an_equal_crc_is_told_to_a_person(hub: Hub, node: EchoNode) -> None:
+    told: list[str] = []
+    server = CanServer(hub.spec, node, tell=told.append)
+    server.start()
+    stranger = Stranger(hub.spec)
+    try:
+        for _ in range(2):
+            stranger.bus.send(Frame(0x1CFF0021, Announce(0x21, 0, zlib.crc32(node.uuid)).encode()))
+        assert wait_for(lambda: len(told) == 1)
+        assert node.uuid.hex() in told[0]
+        assert node.address == 0x21
+    finally:
+        server.stop()
+        stranger.bus.close()
+
+
+def test_24_nodes_on_one_address_in_two_processes_sort_themselves_out(hub: Hub) -> None:
+    nodes = [EchoNode(0x21, uuid=bytes([number]) * 10) for number in range(24)]
+    servers = [CanServer(hub.spec), CanServer(hub.spec)]
+    for number, node in enumerate(nodes):
+        servers[number % 2].add(node)
+    try:
+        for server in servers:
+            server.start()
+        assert wait_for(lambda: len({node.address for node in nodes}) == 24)
+    finally:
+        for server in servers:
+            server.stop()
+
+
+def test_200_nodes_in_one_process_answer_everyone_and_keep_to_few_threads(hub: Hub) -> None:
+    nodes = [EchoNode(1 + number, uuid=bytes([number]) * 10, delay=0.02) for number in range(200)]
+    server = CanServer(hub.spec)
+    for node in nodes:
+        server.add(node)
+    before = threading.active_count()
+    server.start()
+    stranger = Stranger(hub.spec)
+    try:
+        pairs = {node.address: Pair(0xF1, node.address, stranger.bus.send) for node in nodes}
+        stranger.everyone("0742000080070000")
+        answers: dict[int, bytes] = {}
+        until = time.monotonic() + 20
+        while len(answers) < 200 and time.monotonic() < until:
+            frame = stranger.bus.receive(0.05)
+            if frame is not None and (pair := pairs.get(frame.identifier & 0xFF)) and pair.take(frame):
+                while (message := pair.received()) is not None:
+                    answers[pair.peer] = message
+        assert len(answers) == 200
+        assert all(answers[node.address][5:15] == node.uuid for node in nodes)
+        for pair in pairs.values():
+            pair.send(b"\x01\x00\x00\x01\x03\x00\x00")
+        assert wait_for(lambda: all(node.runs for node in nodes))
+        assert threading.active_count() - before <= MOST_THREADS + 5
+    finally:
+        server.stop()
+        stranger.bus.close()
+
+
+def test_a_lost_flow_control_costs_the_next_request_nothing(station: Stranger, server: CanServer) -> None:
+    """The node waits for a flow control that never comes; the same request again gets the whole stored reply."""
+    request = b"\x05\x00\x00\x01\x03\x00\x1e" + bytes(30)
+    pair = Pair(0xF1, 0x21, station.bus.send)
+    pair.send(request)
+    until = time.monotonic() + 5
+    while time.monotonic() < until:  # our flow control for its reply is never sent
+        frame = station.bus.receive(0.05)
+        if frame is None or frame.identifier != 0x18DAF121:
+            continue
+        if frame.data[0] >> 4 == 3:
+            pair.take(frame)
+        elif frame.data[0] >> 4 == 1:
+            break
+    assert station.ask(0x21, request, 0.5) == [b"\x05" + bytes(30)]
+
+
+def test_comes_back_from_a_lost_bus_silent_and_announces_again(node: EchoNode) -> None:
+    hub = Hub()
+    server = CanServer(hub.spec, node)
+    server.start()
+    stranger = Stranger(hub.spec)
+    assert len(stranger.ask(0x21, b"\x09" + COUNT)) == 1
+    stranger.bus.close()
+    port = hub.port
+    hub.close()
+    assert wait_for(lambda: node.links_lost == ["can:f1"])
+    again = Hub(port=port)
+    try:
+        assert wait_for(lambda: bool(announces(again)))
+    finally:
+        server.stop()
+        again.close()

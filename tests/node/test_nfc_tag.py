@@ -49,6 +49,12 @@ class Handler:
     def can_address(self) -> int:
         return 1
 
+    def take_can_address(self, address: int) -> None:
+        raise AssertionError
+
+    def actuator_claimed(self) -> bool:
+        return False
+
 
 class Mailbox:
     """The reader's view of a Type 4 file, without frames."""

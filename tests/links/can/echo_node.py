@@ -21,6 +21,7 @@ class EchoNode:
         self.uuid = uuid or bytes([address]) * 10
         self.state = NodeState.FACTORY
         self.runs = 0
+        self.pinned = False
         self.seen: list[tuple[str, bool]] = []
         self.links_lost: list[str] = []
 
@@ -45,6 +46,12 @@ class EchoNode:
 
     def can_address(self) -> int:
         return self.address
+
+    def take_can_address(self, address: int) -> None:
+        self.address = address
+
+    def actuator_claimed(self) -> bool:
+        return self.pinned
 
 
 def main() -> None:

@@ -9,12 +9,12 @@ from collections.abc import Callable
 
 
 class Hub:
-    def __init__(self, lose: Callable[[int, bytes], bool] = lambda identifier, data: False) -> None:
+    def __init__(self, lose: Callable[[int, bytes], bool] = lambda identifier, data: False, port: int = 0) -> None:
         self.lose = lose
         self.frames: list[tuple[int, bytes]] = []
         self._clients: list[socket.socket] = []
         self._lock = threading.Lock()
-        self._socket = socket.create_server(("127.0.0.1", 0))
+        self._socket = socket.create_server(("127.0.0.1", port))
         self.port = self._socket.getsockname()[1]
         threading.Thread(target=self._accept, daemon=True).start()
 

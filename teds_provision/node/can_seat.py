@@ -1,0 +1,125 @@
+"""One node's seat on a CAN bus: a line for each base station, its answer to everyone, its Announces.
+
+Nothing here is thread-safe: the server of the bus calls it under its lock; only :meth:`Seat.run_request` and
+:meth:`Line.begin_anew` run in the node's own turns.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from typing import Final
+
+from teds_provision.links.can.bus import Frame
+from teds_provision.links.can.isotp import Pair
+from teds_provision.node.handler import NodeHandler
+from teds_provision.node.workers import Turns
+from teds_provision.protocol.announce import Announce, Claim, uuid_crc
+from teds_provision.protocol.messages.identity import Identity
+from teds_provision.protocol.repetition import Repetition
+
+_MOST_WAITING: Final = 4
+_FIRST_KINDS: Final = (0, 1)
+"""N_PDU types of a single and of a first frame: a new request begins."""
+
+
+class Line:
+    """One base station's line to one node: its own session (by name) and stored reply.
+
+    A link is one pair of addresses: with a new own address it begins anew. ``pairs`` keeps the old Pair as long as it
+    still sends.
+    """
+
+    def __init__(self, seat: Seat, station: int) -> None:
+        self.seat, self.station = seat, station
+        self.name = f"can:{station:02x}"
+        self.pairs: dict[int, Pair] = {}
+        self.waiting = 0
+        self.gone = False
+        self._repetition = Repetition()
+
+    def begin_anew(self) -> None:
+        """The pair of addresses is another one, or the bus was lost: session and stored reply are gone."""
+        self._repetition.forget()
+        self.seat.handler.lost(self.name)
+
+    def answer(self, body: bytes) -> bytes:
+        """Run a request (transaction ‖ command) and return transaction ‖ reply; raises what the node raises."""
+        seat = self.seat
+        reply = self._repetition.answer(
+            body[0],
+            body[1:],
+            lambda frame: seat.handler.request(self.name, frame, tapped=seat.counts_as_tapped()),
+            now=time.monotonic(),
+        )
+        return body[:1] + reply
+
+
+class Seat:
+    """One node on the bus. ``send`` puts one of its frames on the bus; ``claim`` is made anew with each start."""
+
+    def __init__(
+        self,
+        handler: NodeHandler,
+        counts_as_tapped: Callable[[], bool],
+        turns: Turns,
+        send: Callable[[Seat, Frame], None],
+    ) -> None:
+        self.handler, self.counts_as_tapped, self.turns = handler, counts_as_tapped, turns
+        self._send = send
+        self.address = handler.can_address()
+        identity = Identity.decode(handler.identify())
+        self.uuid = identity.uuid
+        self.claim = Claim(uuid_crc(identity.uuid))
+        self.lines: dict[int, Line] = {}
+        self.spoken_from: set[int] = set()
+
+    def announce(self) -> None:
+        """Announce the present address."""
+        state = Identity.decode(self.handler.identify()).state
+        announce = Announce(self.address, state, self.claim.crc)
+        self._send(self, Frame(announce.identifier, announce.encode()))
+        self.claim.announced(time.monotonic())
+
+    def pair(self, station: int, own: int) -> tuple[Line, Pair]:
+        """The pair of ``own`` and ``station``, made where there is none yet."""
+        line = self.lines.get(station)
+        if line is None:
+            line = self.lines[station] = Line(self, station)
+        pair = line.pairs.get(own)
+        if pair is None:
+            if line.pairs:
+                self.turns.put(line.begin_anew)
+            line.pairs = {at: old for at, old in line.pairs.items() if old.sending}
+            pair = line.pairs[own] = Pair(own, station, lambda frame: self._send(self, frame))
+        return line, pair
+
+    def move(self, address: int) -> None:
+        """Have another address from now on, because another node claimed this one: sessions of the old one end."""
+        self.handler.take_can_address(address)
+        self.address = address
+        for line in self.lines.values():
+            if line.pairs:
+                line.pairs.clear()
+                self.turns.put(line.begin_anew)
+
+    def lose_lines(self) -> None:
+        """The bus is gone: so are sessions and stored replies."""
+        lines, self.lines = self.lines, {}
+        for line in lines.values():
+            line.gone = True
+            self.turns.put(line.begin_anew)
+
+    @staticmethod
+    def take(pair: Pair, frame: Frame) -> None:
+        """Give a frame to its pair. A new request ends an answer for which no flow control came."""
+        if pair.sending and frame.data and frame.data[0] >> 4 in _FIRST_KINDS:
+            pair.stop_sending()
+        pair.take(frame)
+
+    def put(self, line: Line, job: Callable[[], None]) -> None:
+        """Queue a request; a station that asks on and on without waiting loses what does not fit."""
+        if line.waiting >= _MOST_WAITING:
+            return
+        line.waiting += 1
+        self.turns.put(job)
