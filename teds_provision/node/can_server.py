@@ -1,7 +1,8 @@
-"""The nodes' end of a CAN bus: one receiving loop for all nodes of the process, a crew of threads for their commands."""
+"""The nodes' end of a CAN bus: one receiving loop for all nodes of the process, and a crew of threads behind it."""
 
 from __future__ import annotations
 
+import functools
 import heapq
 import itertools
 import logging
@@ -206,8 +207,7 @@ class CanServer:
     def _request(self, seat: Seat, line: Line, pair: Pair, frame: Frame) -> None:
         seat.take(pair, frame)
         while (body := pair.received()) is not None:
-            whole = body
-            seat.put(line, lambda: self._run_request(line, pair, whole))
+            seat.put(line, functools.partial(self._run_request, line, pair, body))
         self._note(seat, pair)
 
     def _flow_control_of_old_address(self, station: int, own: int, frame: Frame) -> None:

@@ -169,6 +169,7 @@ def test_watch_survives_a_bus_that_goes_away() -> None:
 
 def test_two_nodes_under_one_address_are_a_conflict(hub: Hub) -> None:
     first, second = EchoNode(0x21, uuid=b"A" * 10), EchoNode(0x21, uuid=b"B" * 10)
+    first.pinned = second.pinned = True  # or they would sort themselves out
     with serving(hub.spec, first), serving(hub.spec, second), opened(hub.spec) as port:
         with pytest.raises(AddressConflict, match="0x21"):
             find(port, seconds=3)
