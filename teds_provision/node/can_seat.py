@@ -1,7 +1,7 @@
 """One node's seat on a CAN bus: a line for each base station, its answer to everyone, its Announces.
 
-Nothing here is thread-safe: the server of the bus calls it under its lock; only :meth:`Seat.run_request` and
-:meth:`Line.begin_anew` run in the node's own turns.
+Nothing here is thread-safe: the server of the bus calls it under its lock; only :meth:`Line.answer` and
+:meth:`Line.begin_anew` run in the line's turns.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from typing import Final
 from teds_provision.links.can.bus import Frame
 from teds_provision.links.can.isotp import Pair
 from teds_provision.node.handler import NodeHandler
-from teds_provision.node.workers import Turns
+from teds_provision.node.workers import Crew, Turns
 from teds_provision.protocol.announce import Announce, Claim, uuid_crc
 from teds_provision.protocol.messages.identity import Identity
 from teds_provision.protocol.repetition import Repetition
@@ -30,13 +30,19 @@ class Line:
     still sends.
     """
 
-    def __init__(self, seat: Seat, station: int) -> None:
-        self.seat, self.station = seat, station
+    def __init__(self, seat: Seat, station: int, turns: Turns) -> None:
+        self.seat, self.station, self.turns = seat, station, turns
         self.name = f"can:{station:02x}"
         self.pairs: dict[int, Pair] = {}
         self.waiting = 0
         self.gone = False
         self._repetition = Repetition()
+
+    def put(self, job: Callable[[], None]) -> None:
+        """Queue a request; a station that asks on and on without waiting loses what does not fit."""
+        if self.waiting < _MOST_WAITING:
+            self.waiting += 1
+            self.turns.put(job)
 
     def begin_anew(self) -> None:
         """The pair of addresses is another one, or the bus was lost: session and stored reply are gone."""
@@ -62,10 +68,10 @@ class Seat:
         self,
         handler: NodeHandler,
         counts_as_tapped: Callable[[], bool],
-        turns: Turns,
+        crew: Crew,
         send: Callable[[Seat, Frame], None],
     ) -> None:
-        self.handler, self.counts_as_tapped, self.turns = handler, counts_as_tapped, turns
+        self.handler, self.counts_as_tapped, self._crew = handler, counts_as_tapped, crew
         self._send = send
         self.address = handler.can_address()
         identity = Identity.decode(handler.identify())
@@ -85,11 +91,11 @@ class Seat:
         """The pair of ``own`` and ``station``, made where there is none yet."""
         line = self.lines.get(station)
         if line is None:
-            line = self.lines[station] = Line(self, station)
+            line = self.lines[station] = Line(self, station, self._crew.turns())
         pair = line.pairs.get(own)
         if pair is None:
             if line.pairs:
-                self.turns.put(line.begin_anew)
+                line.turns.put(line.begin_anew)
             line.pairs = {at: old for at, old in line.pairs.items() if old.sending}
             pair = line.pairs[own] = Pair(own, station, lambda frame: self._send(self, frame))
         return line, pair
@@ -101,14 +107,14 @@ class Seat:
         for line in self.lines.values():
             if line.pairs:
                 line.pairs.clear()
-                self.turns.put(line.begin_anew)
+                line.turns.put(line.begin_anew)
 
     def lose_lines(self) -> None:
         """The bus is gone: so are sessions and stored replies."""
         lines, self.lines = self.lines, {}
         for line in lines.values():
             line.gone = True
-            self.turns.put(line.begin_anew)
+            line.turns.put(line.begin_anew)
 
     @staticmethod
     def take(pair: Pair, frame: Frame) -> None:
@@ -116,10 +122,3 @@ class Seat:
         if pair.sending and frame.data and frame.data[0] >> 4 in _FIRST_KINDS:
             pair.stop_sending()
         pair.take(frame)
-
-    def put(self, line: Line, job: Callable[[], None]) -> None:
-        """Queue a request; a station that asks on and on without waiting loses what does not fit."""
-        if line.waiting >= _MOST_WAITING:
-            return
-        line.waiting += 1
-        self.turns.put(job)

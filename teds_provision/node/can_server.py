@@ -82,7 +82,7 @@ class CanServer:
         self._stop.clear()
         self._crew = Crew()
         self._known, self._active, self._later, self._everyone_due = set(), set(), [], {}
-        self._seats = [Seat(node, tapped, self._crew.turns(), self._out) for node, tapped in self._nodes]
+        self._seats = [Seat(node, tapped, self._crew, self._out) for node, tapped in self._nodes]
         self._find_seats()
         self._announce_all()
         self._thread = threading.Thread(target=self._serve, name="can", daemon=True)
@@ -207,7 +207,7 @@ class CanServer:
     def _request(self, seat: Seat, line: Line, pair: Pair, frame: Frame) -> None:
         seat.take(pair, frame)
         while (body := pair.received()) is not None:
-            seat.put(line, functools.partial(self._run_request, line, pair, body))
+            line.put(functools.partial(self._run_request, line, pair, body))
         self._note(seat, pair)
 
     def _flow_control_of_old_address(self, station: int, own: int, frame: Frame) -> None:

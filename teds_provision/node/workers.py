@@ -1,7 +1,6 @@
-"""A bounded crew of threads for all nodes of a process; what one node has to do is done one after another.
+"""A bounded crew of threads for all nodes of a process; what comes by one line is done one after another.
 
-Two hundred nodes on one bus in one process must not be two hundred threads; and one node is one small core, that does
-not run two commands at once.
+Two hundred nodes on one bus in one process must not be two hundred threads.
 """
 
 from __future__ import annotations
@@ -35,7 +34,7 @@ class Crew:
 
 
 class Turns:
-    """Jobs of one node in the order in which they came. Thread-safe."""
+    """Jobs of one line in the order in which they came. Thread-safe."""
 
     def __init__(self, pool: ThreadPoolExecutor) -> None:
         self._pool = pool
@@ -69,4 +68,4 @@ class Turns:
             self._busy = bool(self._jobs)
             more = self._busy
         if more:
-            self._next()  # a turn each, so that no node keeps a thread
+            self._next()  # a turn each, so that no line keeps a thread
