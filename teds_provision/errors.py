@@ -78,9 +78,15 @@ class Garbled(LinkFailure):
 
 
 class AddressConflict(LinkFailure):
-    """Two nodes answer under one CAN address."""
+    """Two nodes answer under one CAN address, or one UUID at two."""
 
     code = "address-conflict"
+
+
+class Unproven(LinkFailure):
+    """A key of the node is held here and no session came about, so nothing that was read counts."""
+
+    code = "unproven"
 
 
 class PolicyRefused(TedsProvisionError):

@@ -22,7 +22,8 @@ from teds_provision.demo.handover import hand_over
 from teds_provision.errors import LinkFailure
 from teds_provision.station.station import Station, initialise
 from teds_provision.steps.build import BuildOrder
-from teds_provision.steps.provision import Provisioned, provision, require_authentic
+from teds_provision.steps.provision import Provisioned, provision
+from teds_provision.steps.verify import require_authentic
 from teds_provision.talk.meeting import meet
 from teds_provision.talk.progress import Reporter, StepResult
 

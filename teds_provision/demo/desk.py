@@ -13,8 +13,8 @@ from teds_provision.links import LinkSettings
 from teds_provision.station.station import Station
 from teds_provision.steps.agree import require_session
 from teds_provision.steps.identify import identify
-from teds_provision.steps.provision import verify_node
 from teds_provision.steps.read import read_image
+from teds_provision.steps.verify_node import verify_node
 from teds_provision.talk.meeting import meet
 from teds_provision.talk.progress import Reporter, Steps
 

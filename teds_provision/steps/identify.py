@@ -56,15 +56,14 @@ def prove(node: Conversation, point: bytes) -> None:
 def identify(station: Station, node: Conversation) -> Identified:
     """Read UUID and key, demand the proof, and hold both against what this station knows.
 
-    Raises OtherKey (a known UUID with another key), NotAuthentic, BadData, LinkFailure. Records what was seen. A tap
-    pins the key that it brought; over a bus, where anyone can call itself by any UUID, only a whitelisted key is kept.
+    Raises OtherKey (a known UUID with another key), NotAuthentic, BadData, LinkFailure. A tap pins the key that it
+    brought; over a bus, where anyone can call itself by any UUID, only a whitelisted key is kept. State, epoch and
+    address of a plain Identify are hints: they change nothing in the store, a session does.
     """
     who = examine(station, node)
     pinned = who.whitelisted is not None and who.whitelisted.fingerprint is not None
     station.remember(
         node.uuid,
-        state=int(who.state),
-        can_address=node.identity.can_address,
         last_seen=utc_now(),
         **({"point": who.point} if node.tapped or pinned else {}),
     )

@@ -9,23 +9,23 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from teds_provision.errors import NotAuthentic, PolicyRefused
+from teds_provision.errors import PolicyRefused
 from teds_provision.protocol.datasheet import NodeKeys
 from teds_provision.protocol.messages.identity import NodeState
 from teds_provision.station.station import Station
 from teds_provision.steps.agree import Agreed, agree
 from teds_provision.steps.build import BuildOrder, Built, build, check_order
-from teds_provision.steps.identify import Identified, identify, prove
+from teds_provision.steps.identify import Identified, identify
 from teds_provision.steps.journal import recorded
-from teds_provision.steps.read import Survey, read_identity, survey
+from teds_provision.steps.read import Survey, survey
 from teds_provision.steps.sign import Signed, sign
-from teds_provision.steps.verify import Check, Verified, possession, verify_image
+from teds_provision.steps.verify import Verified
+from teds_provision.steps.verify_node import verify_node
 from teds_provision.steps.write import Written, write
 from teds_provision.store import Draft, WhitelistEntry
 from teds_provision.store.records import Assurance
 from teds_provision.talk.conversation import Conversation
 from teds_provision.talk.progress import DONE, NOTHING, Reporter, StepResult, Steps
-from teds_provision.teds.codec.codes import AccessCode
 from teds_provision.teds.image import SECURITY, Image
 
 Accept = Callable[[Identified], None]
@@ -136,43 +136,6 @@ class _Run:
             verified = verify_node(self.station, self.node, written.on_node, who.point)
             step.detail = verified.verdict
         return verified
-
-
-@recorded("verify")
-def verify_node(station: Station, node: Conversation, image: Image, point: bytes) -> Verified:
-    """Check what was read off a node, have it prove its key, and record the verdict. Raises only for the link."""
-    identity = read_identity(node) if node.sealed else None
-    checks: list[Check] = verify_image(station, image, identity=identity)
-    checks.append(possession(lambda: prove(node, point)))
-    verified = Verified(node.uuid, tuple(checks))
-    security = image.security
-    facts: dict[str, object] = {
-        "verdict": verified.verdict,
-        "channels": len({c for c, code in image if code == AccessCode.CHANNEL}),
-    }
-    if security is not None:
-        from hashlib import sha256
-
-        facts["teds_sha256"] = sha256(security).hexdigest()
-    if identity is not None:
-        facts |= {
-            "state": int(identity.state),
-            "epoch": identity.epoch,
-            "sequence": identity.sequence,
-            "can_address": identity.can_address,
-        }
-        station.store.put_node_image(node.uuid, image.to_json())
-    station.remember(node.uuid, **facts)
-    station.audit("verify", node.uuid, verified.verdict)
-    return verified
-
-
-def require_authentic(verified: Verified) -> None:
-    """Raise NotAuthentic (exit 4) unless the verdict is ``authentic``; names the first check that failed."""
-    if verified.verdict == "authentic":
-        return
-    failed = next(check for check in verified.checks if check.result == "failed")
-    raise NotAuthentic(f"The datasheet is {verified.verdict}: {failed.why or failed.name}.")
 
 
 def add_to_whitelist(station: Station, node: Conversation, who: Identified) -> WhitelistEntry:

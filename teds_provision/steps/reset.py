@@ -35,6 +35,20 @@ def reset_node(station: Station, node: Conversation, who: Identified) -> ResetRe
     """
     if who.state != NodeState.FACTORY:
         require_session(station, node)
+    receipt = proof_of_reset(node, who.point)
+    with station.store.transaction():
+        station.store.remove_keys(who.uuid)
+        station.remember(who.uuid, state=int(NodeState.FACTORY), verdict=None)
+        told = {"challenge": receipt.challenge.hex(), "proof": receipt.proof.hex()}
+        station.audit("reset", who.uuid, "done", epoch=receipt.epoch, **told)
+    return receipt
+
+
+def proof_of_reset(node: Conversation, point: bytes) -> ResetReceipt:
+    """Send Reset: in a session it resets, in factory state it changes nothing; either way the node signs its state.
+
+    A node that has a key refuses it plainly (NodeRefused). Raises NotAuthentic where the signature is wrong.
+    """
     epoch = read_identity(node).epoch
     challenge = os.urandom(CHALLENGE_OCTETS)
     command = security_command(Function.RESET, challenge)
@@ -44,10 +58,6 @@ def reset_node(station: Station, node: Conversation, who: Identified) -> ResetRe
         node.forget()
         proof = node.plain(command, "the proof of its reset")
     node.forget()
-    if not verify(who.point, reset_message(who.uuid, epoch, challenge), proof):
+    if not verify(point, reset_message(node.uuid, epoch, challenge), proof):
         raise NotAuthentic("The node's receipt of the reset does not verify; its keys are kept here.")
-    with station.store.transaction():
-        station.store.remove_keys(who.uuid)
-        station.remember(who.uuid, state=int(NodeState.FACTORY), verdict=None)
-        station.audit("reset", who.uuid, "done", epoch=epoch, challenge=challenge.hex(), proof=proof.hex())
     return ResetReceipt(epoch, challenge, proof)

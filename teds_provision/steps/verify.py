@@ -6,19 +6,23 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Literal
 
-from teds_provision.errors import TedsProvisionError
+from teds_provision.errors import BadData, NotAuthentic, TedsProvisionError, Unproven
 from teds_provision.protocol import datasheet
 from teds_provision.protocol.keys import fingerprint, is_point, node_key_message, verify
 from teds_provision.protocol.messages.identity import Identity
 from teds_provision.station.station import Station
+from teds_provision.steps.sign import known_image
 from teds_provision.teds.codec import security
 from teds_provision.teds.codec.codes import AccessCode
 from teds_provision.teds.codec.security import NotCanonical, SecurityTeds
 from teds_provision.teds.image import SECURITY, Image
 
 Outcome = Literal["passed", "failed", "skipped"]
-Verdict = Literal["authentic", "unsigned", "not authentic"]
+Verdict = Literal["authentic", "unsigned", "not authentic", "unproven"]
+Scope = Literal["node", "image"]
 _MERELY_UNSIGNED = {"signed", "every TEDS is signed"}
+_FRESHNESS = {"sequence", "key epoch"}
+_SESSION = "session"
 
 
 @dataclass(frozen=True)
@@ -32,22 +36,56 @@ class Check:
 
 @dataclass(frozen=True)
 class Verified:
-    """All checks and the one verdict: ``unsigned`` where nothing is wrong but that nobody signed (all of) it."""
+    """All checks and the one verdict. ``scope`` says what was judged: a node, or an image file alone.
+
+    ``unsigned``: nothing is wrong but that nobody signed (all of) it. ``unproven``: a key of the node is held and no
+    session came about, so that whoever answered may have recorded what it served (contract: cli.md, "Rules").
+    """
 
     uuid: bytes
     checks: tuple[Check, ...]
+    scope: Scope = "node"
 
     @property
     def verdict(self) -> Verdict:
         """One word for all checks."""
         failed = {check.name for check in self.checks if check.result == "failed"}
+        if _SESSION in failed:  # what came without a session proves nothing, except that it is too old
+            return "not authentic" if failed & _FRESHNESS else "unproven"
         if failed - _MERELY_UNSIGNED:
             return "not authentic"
         return "unsigned" if failed else "authentic"
 
 
-def verify_image(station: Station, image: Image, *, identity: Identity | None = None) -> list[Check]:
-    """Check an image as far as octets and this station's trust go; ``identity`` is the node's, read in a session.
+@dataclass(frozen=True)
+class Known:
+    """What a node's datasheet must not be older than: the node's own values, and those of the last one checked here.
+
+    ``identity`` was read in a session, None where there was none; ``sequence`` and ``key_epoch`` are fields 106 and
+    107 of the newest datasheet with a good signature that this station saw on the node, 0 for none.
+    """
+
+    identity: Identity | None = None
+    sequence: int = 0
+    key_epoch: int = 0
+
+
+def known_of(station: Station, uuid: bytes, identity: Identity | None) -> Known:
+    """What this station knows of a node's datasheet. Signed values alone count: anyone could serve the others."""
+    image = known_image(station, uuid)
+    octets = image.security if image is not None else None
+    try:
+        shown = security.decode(octets) if octets is not None else None
+    except BadData:
+        shown = None
+    if image is None or octets is None or shown is None or not shown.signed:
+        return Known(identity)
+    trusted = _station(station, uuid, shown).result == "passed" and datasheet.signature_good(shown, octets, uuid)
+    return Known(identity, shown.sequence, shown.key_epoch) if trusted else Known(identity)
+
+
+def verify_image(station: Station, image: Image, *, known: Known | None = None) -> list[Check]:
+    """Check an image as far as octets and this station's trust go; ``known`` is None for a file judged alone.
 
     Never raises on any octets.
     """
@@ -63,8 +101,7 @@ def verify_image(station: Station, image: Image, *, identity: Identity | None = 
     except NotCanonical as error:
         return [*checks, Check("canonical form", "failed", error.message)]
     checks += [Check("canonical form", "passed"), _algorithms(shown), _node_key(station, image.uuid, shown)]
-    if identity is not None:
-        checks += [_epoch(shown, identity), _sequence(shown, identity)]
+    checks += [_epoch(shown, known), _sequence(shown, known)]
     checks.append(_not_revoked(station, image.uuid))
     if not shown.signed:
         return [*checks, Check("signed", "failed", "this is the initial Security TEDS: nobody has signed it yet")]
@@ -82,13 +119,37 @@ def verify_image(station: Station, image: Image, *, identity: Identity | None = 
 
 def possession(prove: Callable[[], None]) -> Check:
     """Run the challenge and tell it as a check; a link that fails is raised, not judged."""
-    from teds_provision.errors import NotAuthentic
-
     try:
         prove()
     except NotAuthentic as error:
         return Check("possession", "failed", error.message)
     return Check("possession", "passed", "the node signed a fresh challenge")
+
+
+def session(opened: str, why: str) -> Check:
+    """Tell whether what was read is known to come from the node: ``opened`` says how, ``why`` why it is not.
+
+    Both empty: no key of the node is held here, and signatures alone count.
+    """
+    if opened:
+        return Check(_SESSION, "passed", opened)
+    if why:
+        return Check(_SESSION, "failed", why)
+    return Check(_SESSION, "skipped", "no key of this node is held here")
+
+
+def require_authentic(verified: Verified) -> None:
+    """Raise NotAuthentic (exit 4), or Unproven (5), unless the verdict is ``authentic``; names the first failure."""
+    if verified.verdict == "authentic":
+        return
+    failed = {check.name: check for check in reversed(verified.checks) if check.result == "failed"}
+    if verified.verdict == "unproven":
+        raise Unproven(
+            f"Nothing is proven of node {verified.uuid.hex()}: {failed[_SESSION].why}.",
+            hint="Whoever answered may have recorded this. Try at the reader; to take a node over: agree --rotate.",
+        )
+    told = next((failed[name] for name in _FRESHNESS if name in failed), next(iter(reversed(failed.values()))))
+    raise NotAuthentic(f"The datasheet is {verified.verdict}: {told.why or told.name}.")
 
 
 def _check(name: str, holds: bool, why: str, good: str = "") -> Check:
@@ -123,14 +184,30 @@ def _node_key(station: Station, uuid: bytes, shown: SecurityTeds) -> Check:
     return Check(name, "passed", f"{fingerprint(shown.node_key)[:16]}, {pinned}")
 
 
-def _epoch(shown: SecurityTeds, identity: Identity) -> Check:
-    why = f"signed for epoch {shown.key_epoch}, the node is at {identity.epoch}"
-    return _check("key epoch", shown.key_epoch <= identity.epoch, why, str(shown.key_epoch))
+_FILE_ALONE = "a file does not say what its node has now"
 
 
-def _sequence(shown: SecurityTeds, identity: Identity) -> Check:
-    why = f"sequence {shown.sequence} is older than the node's own {identity.sequence}: an old datasheet was put back"
-    return _check("sequence", shown.sequence >= identity.sequence, why, str(shown.sequence))
+def _epoch(shown: SecurityTeds, known: Known | None) -> Check:
+    name = "key epoch"
+    if known is None:
+        return Check(name, "skipped", _FILE_ALONE)
+    if known.identity is not None and shown.key_epoch > known.identity.epoch:
+        why = f"signed for epoch {shown.key_epoch}, the node is at {known.identity.epoch}"
+        return Check(name, "failed", why)
+    why = f"signed for epoch {shown.key_epoch}, older than the {known.key_epoch} that this station saw"
+    return _check(name, shown.key_epoch >= known.key_epoch, why, str(shown.key_epoch))
+
+
+def _sequence(shown: SecurityTeds, known: Known | None) -> Check:
+    name = "sequence"
+    if known is None:
+        return Check(name, "skipped", _FILE_ALONE)
+    if known.identity is not None and shown.sequence < known.identity.sequence:
+        own = known.identity.sequence
+        why = f"sequence {shown.sequence} is older than the node's own {own}: an old datasheet was put back"
+        return Check(name, "failed", why)
+    why = f"sequence {shown.sequence} is older than the {known.sequence} that this station saw on the node"
+    return _check(name, shown.sequence >= known.sequence, why, str(shown.sequence))
 
 
 def _not_revoked(station: Station, uuid: bytes) -> Check:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 
-from teds_provision.errors import UsageFailure
+from teds_provision.errors import AddressConflict, UsageFailure
 from teds_provision.links import Contact, LinkSettings, open_port
 from teds_provision.protocol.messages.identity import Identity, NodeState
 from teds_provision.station.station import Station
@@ -40,7 +40,7 @@ def meet(
     try:
         before()
         if uuid is None:
-            contact = _the_one(station, port.everyone(seconds=links.timeout, notice=reporter.notice))
+            contact = the_one(station, port.everyone(seconds=links.timeout, notice=reporter.notice))
         else:
             contact = port.find(wanted, seconds=links.timeout, notice=reporter.notice, address=address)
         with Conversation(contact, notice=reporter.notice) as node:
@@ -54,15 +54,30 @@ def meet_everyone(links: LinkSettings, reporter: Reporter) -> Iterator[list[Conv
     """Wait for any node and give a conversation with each that is there: the tapped one, or all on the bus."""
     port = open_port(links)
     try:
-        contacts = port.everyone(seconds=links.timeout, notice=reporter.notice)
+        contacts = refuse_twins(port.everyone(seconds=links.timeout, notice=reporter.notice))
         with ExitStack() as stack:
             yield [stack.enter_context(Conversation(contact, notice=reporter.notice)) for contact in contacts]
     finally:
         port.close()
 
 
-def _the_one(station: Station, contacts: list[Contact]) -> Contact:
+def refuse_twins(contacts: list[Contact]) -> list[Contact]:
+    """The contacts as they are; raises AddressConflict where one UUID answers at two addresses."""
+    seen: dict[bytes, Contact] = {}
+    for contact in contacts:
+        twin = seen.setdefault(contact.identity.uuid, contact)
+        if twin is not contact:
+            raise AddressConflict(
+                f"Node {contact.identity.uuid.hex()} answers at 0x{twin.address or 0:02x} and at "
+                f"0x{contact.address or 0:02x}: one of the two is not it.",
+                hint="Take one of them off the bus, or name it by node=ADDRESS in --can: its key shows which is real.",
+            )
+    return contacts
+
+
+def the_one(station: Station, contacts: list[Contact]) -> Contact:
     """The only node, or the only one that is not provisioned and verified yet."""
+    refuse_twins(contacts)
     unfinished = [contact for contact in contacts if not _finished(station, contact.identity)]
     for choice in (contacts, unfinished):
         if len(choice) == 1:

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import pytest
 
-from teds_provision.errors import NodeRefused, NodeSilent
+from teds_provision.errors import NodeRefused, NodeSilent, UsageFailure
+from teds_provision.links import Contact
 from teds_provision.protocol.messages.frames import Reason, refusal
 from teds_provision.station.station import Station
 from teds_provision.steps.agree import agree, require_session
@@ -13,9 +16,11 @@ from teds_provision.steps.identify import identify
 from teds_provision.steps.sign_command import SignOrder, sign_image
 from teds_provision.steps.write import write
 from teds_provision.store import WhitelistEntry
+from teds_provision.talk.meeting import the_one
 from teds_provision.teds.image import Image
 
-from .bench import Board, MemoryLink, talk
+from .bench import Board, MemoryLink, contact, talk
+from .test_provision import run as provision
 
 ANGLE = BuildOrder(profile="magnetic-angular-position-sensor")
 
@@ -64,3 +69,62 @@ def test_a_node_that_refuses_at_the_last_of_all_attempts_is_told_as_such(station
         with pytest.raises(NodeRefused) as refused:
             write(station, node, signed, has=Image(board.uuid, signed.unsigned_blocks()))
     assert (lost, refused.value.reason) == (0, Reason.DIGEST_MISMATCH)
+
+
+def test_what_the_node_lost_since_it_was_read_is_sent_again(station: Station, board: Board) -> None:
+    """The commit is refused (6) because a TEDS that was not sent is not what it was: then everything is sent."""
+    done = provision(station, board)
+    renamed = replace(ANGLE, name="renamed")
+    build(station, board.uuid, renamed)
+    signed = sign_image(station, SignOrder(board.uuid), None).signed.image
+    channel = (1, 3)
+    assert signed.blocks[channel] == done.image.blocks[channel], "not sent at first"
+    damaged = done.image.blocks[0, 12]
+    board.flash.state = replace(board.state, blocks={**board.state.blocks, channel: damaged})
+    board.power_on()
+    with talk(board) as node:
+        require_session(station, node)
+        write(station, node, signed)
+    assert board.state.blocks[channel] == signed.blocks[channel]
+    assert board.state.sequence == 2
+
+
+def test_a_digest_that_never_fits_is_told_and_nothing_is_sent_a_third_time(station: Station, board: Board) -> None:
+    provision(station, board)
+    build(station, board.uuid, replace(ANGLE, name="renamed"))
+    signed = sign_image(station, SignOrder(board.uuid), None).signed.image
+    wrong = signed.with_block((1, 3), signed.blocks[0, 12])
+    with talk(board) as node:
+        require_session(station, node)
+        with pytest.raises(NodeRefused):
+            write(station, node, wrong)
+    assert board.state.sequence == 1
+
+
+def _at(board: Board, address: int) -> Contact:
+    return replace(contact(board, MemoryLink(board, via="can")), address=address)
+
+
+def test_of_several_nodes_the_one_that_is_not_finished_is_meant(station: Station) -> None:
+    boards = [Board(uuid=bytes([number]) * 10) for number in range(3)]
+    contacts = [_at(board, 0x10 + number) for number, board in enumerate(boards)]
+    with pytest.raises(UsageFailure, match="3 nodes answer"):
+        the_one(station, contacts)
+    provision(station, boards[0])
+    provision(station, boards[2])
+    contacts = [_at(board, 0x10 + number) for number, board in enumerate(boards)]
+    assert the_one(station, contacts).identity.uuid == boards[1].uuid
+    provision(station, boards[1])
+    contacts = [_at(board, 0x10 + number) for number, board in enumerate(boards)]
+    with pytest.raises(UsageFailure, match="3 nodes answer"):
+        the_one(station, contacts)
+    assert the_one(station, contacts[1:2]).identity.uuid == boards[1].uuid
+
+
+def test_a_node_whose_last_verdict_was_not_good_is_not_finished(station: Station) -> None:
+    boards = [Board(uuid=bytes([number]) * 10) for number in range(2)]
+    for board in boards:
+        provision(station, board)
+    station.remember(boards[1].uuid, verdict="not authentic")
+    contacts = [_at(board, 0x10 + number) for number, board in enumerate(boards)]
+    assert the_one(station, contacts).identity.uuid == boards[1].uuid

@@ -21,9 +21,9 @@ from teds_provision.protocol.handover.bundle import open_bundle
 from teds_provision.protocol.handover.receipt import open_receipt
 from teds_provision.steps.agree import agree
 from teds_provision.steps.identify import identify
-from teds_provision.steps.provision import verify_node
 from teds_provision.steps.read import read_image
 from teds_provision.steps.reset import reset_node
+from teds_provision.steps.verify_node import verify_node
 from teds_provision.store import WhitelistEntry
 
 from .bench import Board, MemoryLink, make_station, talk

@@ -13,9 +13,9 @@ from teds_provision.protocol.messages.identity import Identity
 from teds_provision.station.station import Station
 from teds_provision.steps.agree import require_session
 from teds_provision.steps.identify import identify
-from teds_provision.steps.provision import verify_node
 from teds_provision.steps.read import read_image
-from teds_provision.steps.verify import Verified, verify_image
+from teds_provision.steps.verify import Known, Verified, verify_image
+from teds_provision.steps.verify_node import verify_node
 from teds_provision.store import TrustRecord
 from teds_provision.teds.codec import security
 from teds_provision.teds.codec.frame import frame
@@ -30,12 +30,13 @@ def image(station: Station, board: Board) -> Image:
     return run(station, board).image
 
 
-def verdict(station: Station, image: Image, identity: Identity | None = None) -> str:
-    return Verified(image.uuid, tuple(verify_image(station, image, identity=identity))).verdict
+def verdict(station: Station, image: Image) -> str:
+    return Verified(image.uuid, tuple(verify_image(station, image)), scope="image").verdict
 
 
 def failed(station: Station, image: Image, identity: Identity | None = None) -> list[str]:
-    return [check.name for check in verify_image(station, image, identity=identity) if check.result == "failed"]
+    known = Known(identity) if identity is not None else None
+    return [check.name for check in verify_image(station, image, known=known) if check.result == "failed"]
 
 
 def test_a_good_image_is_authentic(station: Station, image: Image) -> None:
@@ -125,6 +126,25 @@ def test_a_node_key_other_than_the_pinned_one_is_not_authentic(station: Station,
     key = station.credentials().key
     signed = shown.with_signature(key.sign(security.tbs(image.uuid, shown.encode()))).encode()
     assert failed(station, image.with_block(SECURITY, signed)) == ["node key"]
+
+
+def test_a_key_that_its_node_did_not_sign_for_this_uuid_is_not_authentic(station: Station, image: Image) -> None:
+    """Field 102 alone is wrong, and signed as it is by the station itself: nothing else gives it away."""
+    shown = security.decode(image.blocks[SECURITY])
+    wrong = replace(shown, node_key_signature=Board(uuid=bytes(10)).state.node_key_signature)
+    signed = wrong.with_signature(station.credentials().key.sign(security.tbs(image.uuid, wrong.encode()))).encode()
+    assert failed(station, image.with_block(SECURITY, signed)) == ["node key"]
+    assert verdict(station, image.with_block(SECURITY, signed)) == "not authentic"
+
+
+def test_a_file_is_judged_alone(station: Station, board: Board, image: Image) -> None:
+    """An older datasheet from an archive is as authentic as on its first day; what does not apply does no harm."""
+    from .test_provision import ANGLE
+
+    run(station, board, order=replace(ANGLE, name="renamed"))
+    assert verdict(station, image) == "authentic"
+    skipped = {check.name for check in verify_image(station, image) if check.result == "skipped"}
+    assert skipped == {"key epoch", "sequence"}
 
 
 # -- on the node -------------------------------------------------------------------------------------------------------

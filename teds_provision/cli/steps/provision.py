@@ -126,7 +126,7 @@ def _plan(app: App, station: Station, node: Conversation) -> None:
 def _tell(app: App, done: Provisioned, *, last: bool = True) -> None:
     """Tell one node's end; ``last`` ends the command with the error of a datasheet that is not authentic."""
     from teds_provision.station.summary import summarise
-    from teds_provision.steps.provision import require_authentic
+    from teds_provision.steps.verify import require_authentic
 
     error: TedsProvisionError | None = None
     try:

@@ -28,7 +28,8 @@ if TYPE_CHECKING:
 def verify(app: App, what: str, links: LinkSettings, accept_calibration: str | None) -> None:
     """Read a node (or an image file) and check its datasheet; a node must also sign a fresh challenge.
 
-    Exits 0 for "authentic", 4 for "unsigned" and "not authentic", 6 for a calibration that would hurt.
+    A file is judged alone. A node whose key is held here must open a session, else nothing is proven.
+    Exits 0 for "authentic", 4 for "unsigned" and "not authentic", 5 for "unproven", 6 for a harmful calibration.
     """
     from teds_provision.cli.steps.build import read_file
     from teds_provision.steps.verify import Verified, verify_image
@@ -38,11 +39,12 @@ def verify(app: App, what: str, links: LinkSettings, accept_calibration: str | N
     path = Path(what)
     if path.is_file():
         image = Image.from_json(read_file(path))
-        verified = Verified(image.uuid, tuple(verify_image(station, image)))
+        verified = Verified(image.uuid, tuple(verify_image(station, image)), scope="image")
     else:
         image, verified = _node(app, what, links)
     result = {
         "uuid": verified.uuid.hex(),
+        "scope": verified.scope,
         "verdict": verified.verdict,
         "checks": [{"name": check.name, "result": check.result, "why": check.why} for check in verified.checks],
     }
@@ -57,7 +59,7 @@ def _judged(
 ) -> tuple[tuple[str, ...], TedsProvisionError | None]:
     """Warnings, and what the verification ends with: not authentic (4), or a calibration that would hurt (6)."""
     from teds_provision.steps.build import guard
-    from teds_provision.steps.provision import require_authentic
+    from teds_provision.steps.verify import require_authentic
 
     try:
         require_authentic(verified)
@@ -68,11 +70,8 @@ def _judged(
 
 def _node(app: App, what: str, links: LinkSettings) -> tuple[Image, Verified]:
     from teds_provision.cli.rendering import reporter_for
-    from teds_provision.protocol.messages.identity import NodeState
-    from teds_provision.steps.agree import session_if_keyed, unknown_key
     from teds_provision.steps.identify import identify
-    from teds_provision.steps.provision import verify_node
-    from teds_provision.steps.read import read_image
+    from teds_provision.steps.verify_node import look_at_node
     from teds_provision.talk.meeting import meet
 
     station = app.station()
@@ -80,13 +79,8 @@ def _node(app: App, what: str, links: LinkSettings) -> tuple[Image, Verified]:
     with meet(station, links, uuid, reporter_for(app), before=lambda: station.unlock(uuid)) as node:
         who = identify(station, node)
         with station.lock("verify", app.note):
-            held = session_if_keyed(station, node)
-            given_away = station.store.tombstone(uuid) is not None
-            if held is None and station.has_keys(uuid) and not given_away and who.state != NodeState.FACTORY:
-                raise unknown_key(uuid)
-        image = read_image(node)
-        with station.lock("verify", app.note):
-            return image, verify_node(station, node, image, who.point)
+            looked = look_at_node(station, node, who)
+    return looked.image, looked.verified
 
 
 def _table(console: Console, verified: Verified) -> None:

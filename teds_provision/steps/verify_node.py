@@ -1,0 +1,89 @@
+"""Step 7 at a node: whether the session, or the node's own signature, vouches for what was read, and the verdict."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from hashlib import sha256
+
+from teds_provision.errors import LinkFailure, NodeRefused, NotAuthentic
+from teds_provision.protocol.messages.identity import NodeState
+from teds_provision.station.station import Station
+from teds_provision.steps.agree import session_if_keyed
+from teds_provision.steps.identify import Identified, prove
+from teds_provision.steps.journal import recorded
+from teds_provision.steps.read import read_identity, read_image
+from teds_provision.steps.reset import proof_of_reset
+from teds_provision.steps.verify import Check, Verified, known_of, possession, session, verify_image
+from teds_provision.talk.conversation import Conversation
+from teds_provision.teds.codec.codes import AccessCode
+from teds_provision.teds.image import Image
+
+
+@dataclass(frozen=True)
+class Looked:
+    """A node's TEDS as they were read, and what they are worth."""
+
+    image: Image
+    verified: Verified
+
+
+def look_at_node(station: Station, node: Conversation, who: Identified) -> Looked:
+    """Open a session where a key is held, read every TEDS and judge them; raises LinkFailure and what a read raises."""
+    why = ""
+    try:
+        held = session_if_keyed(station, node)
+    except NodeRefused as refusal:
+        if node.sealed:
+            raise
+        held, why = None, refusal.message.rstrip(".")
+    if held is None and not why and station.has_keys(node.uuid) and station.store.tombstone(node.uuid) is None:
+        why = "the node opens no session under any key that is held here"
+    image = read_image(node)
+    return Looked(image, verify_node(station, node, image, who.point, why=why))
+
+
+@recorded("verify")
+def verify_node(station: Station, node: Conversation, image: Image, point: bytes, *, why: str = "") -> Verified:
+    """Check what was read off a node, have it prove its key, and record the verdict. Raises only for the link.
+
+    ``why`` says why there is no session although a key is held: then nothing of what was read is recorded.
+    """
+    identity = read_identity(node) if node.sealed else None
+    checks: list[Check] = verify_image(station, image, known=known_of(station, node.uuid, identity))
+    checks.append(possession(lambda: prove(node, point)))
+    checks.append(_vouched(node, point, why))
+    verified = Verified(node.uuid, tuple(checks))
+    if verified.verdict == "unproven" or checks[-1].result == "failed":
+        station.audit("verify", node.uuid, verified.verdict, why=why)
+        return verified
+    security = image.security
+    facts: dict[str, object] = {
+        "verdict": verified.verdict,
+        "channels": len({c for c, code in image if code == AccessCode.CHANNEL}),
+    }
+    if security is not None:
+        facts["teds_sha256"] = sha256(security).hexdigest()
+    if identity is not None:
+        facts |= {
+            "state": int(identity.state),
+            "epoch": identity.epoch,
+            "sequence": identity.sequence,
+            "can_address": identity.can_address,
+        }
+        station.store.put_node_image(node.uuid, image.to_json())
+    station.remember(node.uuid, **facts)
+    station.audit("verify", node.uuid, verified.verdict)
+    return verified
+
+
+def _vouched(node: Conversation, point: bytes, why: str) -> Check:
+    """Whether the node itself is known to have said this: in a session, or by its signature that it was reset."""
+    if node.sealed:
+        return session("opened under the key that is held here", "")
+    if why and node.identity.state == NodeState.FACTORY:
+        try:
+            proof_of_reset(node, point)
+        except (NotAuthentic, NodeRefused, LinkFailure):
+            return session("", f"{why}, and it does not prove that it was reset")
+        return session("the node signed that it was reset: the key that is held here is gone from it", "")
+    return session("", why)

@@ -1,0 +1,169 @@
+"""An attacker on the bus without the key: he forges Identify, relays Prove to the real node, serves what he recorded.
+
+Where a key is held, no session means no verdict (contract: cli.md, "Rules for them"; profile: security-teds.md
+sections 1 and 4).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+
+import pytest
+
+from teds_provision.errors import AddressConflict, NotAuthentic, Unproven
+from teds_provision.links import Contact
+from teds_provision.protocol.messages.frames import (
+    COMMON,
+    Function,
+    Reason,
+    Reply,
+    refusal,
+)
+from teds_provision.protocol.messages.identity import Identity, NodeState
+from teds_provision.station.station import Station
+from teds_provision.steps.identify import identify
+from teds_provision.steps.reset import proof_of_reset
+from teds_provision.steps.verify import Verified, require_authentic
+from teds_provision.steps.verify_node import look_at_node
+from teds_provision.talk.conversation import Conversation
+from teds_provision.talk.meeting import refuse_twins
+from teds_provision.teds.image import SECURITY, Image
+
+from .bench import Board, MemoryLink, contact, make_station, talk
+from .test_provision import ANGLE, run
+
+FORGED_ADDRESS = 99
+
+
+@dataclass
+class Attacker:
+    """Answers in the place of ``board``: its own Identify, recorded TEDS, a refusal to open; Prove it relays."""
+
+    board: Board
+    recorded: Image
+    state: NodeState = NodeState.FACTORY
+    reason: Reason = Reason.WRONG_STATE
+    via: str = "can"
+    asked: list[int] = field(default_factory=list)
+
+    @property
+    def identity(self) -> Identity:
+        return replace(self.board.tim.identity(), state=self.state, can_address=FORGED_ADDRESS)
+
+    def exchange(self, octets: bytes) -> bytes:
+        function, payload = octets[3], octets[6:]
+        self.asked.append(function)
+        if octets[2] == COMMON:
+            code, offset = payload[0], int.from_bytes(payload[1:5], "big")
+            teds = self.recorded.blocks[int.from_bytes(octets[:2], "big"), code]
+            return Reply(True, offset.to_bytes(4, "big") + teds[offset : offset + 900]).encode()
+        listed = b"".join(channel.to_bytes(2, "big") + bytes([code]) for channel, code in sorted(self.recorded))
+        answers: dict[int, Callable[[], bytes]] = {
+            Function.IDENTIFY: lambda: Reply(True, self.identity.encode()).encode(),
+            Function.LIST: lambda: Reply(True, listed).encode(),
+            Function.PROVE: lambda: self.board.tim.handle(octets, link="can", tapped=False),
+            Function.RESET: lambda: self.board.tim.handle(octets, link="can", tapped=False),
+        }
+        return answers.get(function, lambda: refusal(self.reason).encode())()
+
+    def close(self) -> None:
+        """Nothing to leave."""
+
+
+def looked_at(station: Station, attacker: Attacker) -> Verified:
+    node = Conversation(Contact(attacker.identity, attacker, address=FORGED_ADDRESS), notice=lambda notice: None)
+    with node:
+        return look_at_node(station, node, identify(station, node)).verified
+
+
+@pytest.mark.parametrize("state", list(NodeState))
+@pytest.mark.parametrize("reason", [Reason.WRONG_STATE, Reason.UNKNOWN_KEY, Reason.NOT_PERMITTED])
+def test_the_very_datasheet_of_the_node_without_a_session_is_unproven(
+    station: Station, board: Board, state: NodeState, reason: Reason
+) -> None:
+    recorded = run(station, board).image
+    before = station.store.node(board.uuid)
+    attacker = Attacker(board, recorded, state, reason)
+    verified = looked_at(station, attacker)
+    assert verified.verdict == "unproven"
+    with pytest.raises(Unproven) as told:
+        require_authentic(verified)
+    assert told.value.exit_code == 5
+    assert (Function.RESET in attacker.asked) == (state == NodeState.FACTORY)
+    after = station.store.node(board.uuid)
+    assert before is not None
+    assert after is not None
+    assert replace(after, last_seen=before.last_seen) == before, "nothing of this is believed, its address least of all"
+
+
+def test_an_old_datasheet_without_a_session_is_not_authentic(station: Station, board: Board) -> None:
+    old = run(station, board).image
+    run(station, board, order=replace(ANGLE, name="renamed"))
+    verified = looked_at(station, Attacker(board, old))
+    assert verified.verdict == "not authentic"
+    with pytest.raises(NotAuthentic, match="sequence 1 is older than the 2"):
+        require_authentic(verified)
+
+
+def test_where_no_key_is_held_the_stores_own_values_still_count(station: Station, board: Board) -> None:
+    old = run(station, board).image
+    new = run(station, board, order=replace(ANGLE, name="renamed")).image
+    station.store.remove_keys(board.uuid)
+    assert looked_at(station, Attacker(board, new)).verdict == "authentic"
+    assert looked_at(station, Attacker(board, old)).verdict == "not authentic"
+    assert looked_at(station, Attacker(board, new)).verdict == "authentic", "the old one was not remembered"
+
+
+def test_a_forged_initial_teds_does_not_raise_what_a_node_must_show(station: Station, board: Board) -> None:
+    """106 and 107 of an unsigned TEDS are anyone's: remembered, they would lock the real datasheet out for ever."""
+    initial = board.state.security_teds()
+    from teds_provision.teds.codec import security
+
+    forged = replace(security.decode(initial), sequence=2**32 - 1, key_epoch=2**32 - 1).encode()
+    assert looked_at(station, Attacker(board, Image(board.uuid, {SECURITY: forged}))).verdict == "unsigned"
+    assert run(station, board).verified.verdict == "authentic"
+
+
+def test_a_node_that_was_reset_shows_it_by_its_signature(station: Station, board: Board) -> None:
+    run(station, board)
+    board.tim.reset_by_hand()
+    with talk(board) as node:
+        verified = look_at_node(station, node, identify(station, node)).verified
+    assert verified.verdict == "unsigned"
+    (check,) = [check for check in verified.checks if check.name == "session"]
+    assert (check.result, "was reset" in check.why) == ("passed", True)
+
+
+def test_a_proof_of_reset_with_another_key_is_none(station: Station, board: Board) -> None:
+    board.tim.reset_by_hand()
+    with talk(board) as node, pytest.raises(NotAuthentic):
+        proof_of_reset(node, Board().key.point)
+
+
+def test_in_its_session_a_node_is_held_against_what_this_station_saw(station: Station, board: Board) -> None:
+    """A flash put back from a copy, sequence and epoch with it: the node agrees with its own old datasheet."""
+    run(station, board)
+    copy = board.state
+    run(station, board, order=replace(ANGLE, name="renamed"))
+    board.flash.state = copy
+    board.power_on()
+    with talk(board) as node:
+        verified = look_at_node(station, node, identify(station, node)).verified
+    assert verified.verdict == "not authentic"
+    assert [check.name for check in verified.checks if check.result == "failed"] == ["sequence"]
+
+
+def test_one_uuid_at_two_addresses_is_a_conflict_that_names_both(board: Board) -> None:
+    here, there = (replace(contact(board, MemoryLink(board, via="can")), address=at) for at in (0x11, 0x22))
+    with pytest.raises(AddressConflict, match=f"{board.uuid.hex()} answers at 0x11 and at 0x22"):
+        refuse_twins([here, there])
+    other = replace(contact(Board(uuid=bytes(10))), address=0x22)
+    assert refuse_twins([here, other]) == [here, other]
+
+
+def test_a_stranger_without_the_key_judges_by_signatures(station: Station, board: Board, tmp_path) -> None:  # type: ignore[no-untyped-def]
+    recorded = run(station, board).image
+    stranger = make_station(tmp_path / "stranger")
+    verified = looked_at(stranger, Attacker(board, recorded, NodeState.PROVISIONED))
+    assert verified.verdict == "not authentic"
