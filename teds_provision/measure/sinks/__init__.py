@@ -11,10 +11,18 @@ from pathlib import Path
 
 from teds_provision.errors import UsageFailure
 from teds_provision.measure.sinks.base import CommandTaker, Sink, ThreadedSink, as_sink_failure
+from teds_provision.measure.sinks.jsonl import JsonLinesSink
+from teds_provision.measure.sinks.mcap import McapSink
+from teds_provision.measure.sinks.text import TextSink
 
 __all__ = ["CommandTaker", "Sink", "ThreadedSink", "as_sink_failure", "open_sink"]
 
-FILES: dict[str, Callable[[Path], Sink]] = {}
+FILES: dict[str, Callable[[Path], Sink]] = {
+    ".csv": TextSink,
+    ".txt": TextSink,
+    ".jsonl": JsonLinesSink,
+    ".mcap": McapSink,
+}
 SERVICES: dict[str, Callable[[str, CommandTaker | None], Sink]] = {}
 
 

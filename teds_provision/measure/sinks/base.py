@@ -22,7 +22,7 @@ CommandTaker = Callable[[Command], None]
 
 RECORDER_WAITING = 2_000_000  # values that a recorder may owe: some 200 MB, 40 s at 50,000 values a second
 LIVE_WAITING = 256  # items that a live sink may owe: newest wins
-TICK = 0.1  # seconds between looks at the clock while nothing comes
+TICK = 0.05  # seconds between looks at the clock while nothing comes
 CLOSING = 30.0  # seconds for a recorder to write what it owes
 
 

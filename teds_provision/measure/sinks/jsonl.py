@@ -1,0 +1,46 @@
+"""JSON lines: the first says who measures what, then the events of ``measure --json`` (cli.md), one line each."""
+
+from __future__ import annotations
+
+from teds_provision.measure.blocks import Block, NodeReport
+from teds_provision.measure.sinks.base import Item
+from teds_provision.measure.sinks.files import FileSink
+from teds_provision.measure.sinks.lines import as_line, data_lines, facts_as_json, iso, status_line
+
+
+class JsonLinesSink(FileSink):
+    """Recorder of JSON lines; see the module."""
+
+    def _begin(self) -> None:
+        station = self.station
+        head = {
+            "event": "recording",
+            "format": "teds-provision/measurement-1",
+            "station": station.name,
+            "group": station.group,
+            "started": iso(station.started),
+            "clock": station.clock,
+            "test_pattern": station.test_pattern,
+        }
+        self._add(as_line(head))
+        self._channels(tuple(self.facts.values()))
+
+    def _channels(self, item: Item) -> None:
+        if isinstance(item, tuple):
+            for one in item:
+                self.facts[one.key] = one
+                self._add(as_line({"event": "channel", **facts_as_json(one)}))
+
+    def _take(self, item: Item) -> None:
+        if isinstance(item, Block):
+            for line in data_lines(item, self.facts):
+                self._add(as_line(line))
+            self._count(written=item.value.size, messages=len(item.channels))
+        elif isinstance(item, NodeReport):
+            self._add(as_line(status_line(item)))
+        else:
+            self._channels(item)
+
+    def _add(self, line: bytes) -> None:
+        self.part.add(line)
+        self._count(octets=len(line))

@@ -1,0 +1,86 @@
+"""The JSON lines of ``measure``: events of the command-line contract, for ``--json`` and for ``.jsonl`` files alike."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import math
+from collections.abc import Iterator, Mapping
+from datetime import UTC, datetime
+from typing import Any
+
+from teds_provision.measure.blocks import Block, ChannelFacts, NodeReport
+
+
+def iso(seconds: float) -> str:
+    """ISO 8601 in UTC, to the millisecond, of unix seconds."""
+    try:
+        return datetime.fromtimestamp(seconds, UTC).isoformat(timespec="milliseconds").replace("+00:00", "Z")
+    except (OverflowError, OSError, ValueError):
+        return "unknown"
+
+
+def plain(value: Any) -> Any:
+    """A raw or calibrated value as JSON takes it: octets as hex, what is not a finite number as null."""
+    if isinstance(value, bytes):
+        return value.hex()
+    if isinstance(value, float) and not math.isfinite(value):
+        return None
+    return value
+
+
+def facts_as_json(facts: ChannelFacts) -> dict[str, Any]:
+    """Facts of a channel for a header or a metadata message: what is not known is left out."""
+    fields = {field.name: getattr(facts, field.name) for field in dataclasses.fields(facts) if field.name != "units"}
+    return {
+        name: plain(value) for name, value in fields.items() if value is not None and value is not False and value != ""
+    }
+
+
+def data_lines(block: Block, facts: Mapping[tuple[str, int], ChannelFacts]) -> Iterator[dict[str, Any]]:
+    """One ``data`` event for each channel of a block (cli.md, `measure`); an invalid value is null, never NaN."""
+    times = [round(instant, 6) for instant in block.time.tolist()]
+    for column, number in enumerate(block.channels):
+        known = facts.get((block.uuid, number))
+        valid = block.valid[:, column].tolist()
+        values = block.value[:, column].tolist()
+        line: dict[str, Any] = {
+            "event": "data",
+            "uuid": block.uuid,
+            "channel": number,
+            "name": known.name if known else "",
+            "unit": known.unit if known else "",
+            "index": block.index,
+            "time": times,
+            "raw": [plain(one) for one in block.raw[:, column].tolist()],
+            "value": [plain(one) if good else None for one, good in zip(values, valid, strict=True)],
+            "uncertainty": known.uncertainty if known else None,
+            "valid": valid,
+            "clock_error": block.clock_error,
+            "age": round(block.age, 6),
+        }
+        if block.test_pattern:
+            line["test_pattern"] = True
+        yield line
+
+
+def status_line(report: NodeReport) -> dict[str, Any]:
+    """The ``status`` event of a node."""
+    return {
+        "event": "status",
+        "uuid": report.uuid,
+        "state": report.state,
+        "why": report.why,
+        "samples": report.samples,
+        "lost": report.lost,
+        "late": report.late,
+        "bad": report.bad,
+        "invalid": report.invalid,
+        "clock_error": report.clock_error,
+        "time": report.time,
+    }
+
+
+def as_line(event: Mapping[str, Any]) -> bytes:
+    """One line of JSON; raises ValueError where a NaN is left in it."""
+    return json.dumps(event, allow_nan=False, separators=(",", ":")).encode() + b"\n"

@@ -1,0 +1,232 @@
+"""MCAP recorder: one topic for each stream at full rate, the datasheet's facts beside it, reports as diagnostics.
+
+A message holds one instant of a stream (definition SAMPLES below, CDR, described in the file itself, so that readers
+of ROS 2 messages decode it): calibrated values, NaN where not valid, and the raw values. Its log time is the instant.
+Chunks are 64 KiB and at most FLUSH old. The facts of channels stand in the metadata of their stream's topic, in a
+metadata record, and as a ``std_msgs/String`` on ``…/teds`` at the start of each file, where ``ros2 bag`` users look.
+"""
+
+from __future__ import annotations
+
+import json
+import struct
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from teds_provision import __version__
+from teds_provision.measure.blocks import Block, ChannelFacts, NodeReport
+from teds_provision.measure.sinks.base import Item
+from teds_provision.measure.sinks.files import FLUSH, FileSink
+from teds_provision.measure.sinks.lines import facts_as_json, iso
+from teds_provision.measure.sinks.mcap_file import MESSAGE, MESSAGE_HEAD, McapWriter
+from teds_provision.measure.sinks.names import Topics
+
+CHUNK_OCTETS = 1 << 16
+TYPE = "teds_provision_msgs/msg/Samples"
+SAMPLES = """\
+# One instant of one stream of a transducer node. Channels, units and calibration: metadata of this topic.
+builtin_interfaces/Time stamp  # of the instant; clock_error bounds its error
+uint64 index                   # sample number in the run of the stream
+uint64 tick                    # nanoseconds of the node's clock
+float64 clock_error            # seconds; NaN where no bound is known
+bool test_pattern              # true: no measurement
+float64[] value                # in the SI unit of each channel; NaN where not valid
+int64[] raw                    # raw integers (uint64 in two's complement); empty where they are floats
+float64[] raw_float            # raw floats; empty where they are integers
+================================================================================
+MSG: builtin_interfaces/Time
+int32 sec
+uint32 nanosec
+"""
+STRING = "string data\n"
+_LITTLE_ENDIAN = b"\x00\x01\x00\x00"  # how a CDR message begins
+
+
+class McapSink(FileSink):
+    """Recorder of MCAP; see the module."""
+
+    def __init__(self, path: Path) -> None:
+        super().__init__(path)
+        self._writer: McapWriter | None = None
+        self._opened = 0.0
+        self._schemas: dict[str, int] = {}
+        self._streams: dict[tuple[str, int, tuple[int, ...], str], tuple[int, np.dtype[Any]]] = {}
+        self._strings: dict[str, int] = {}
+        self._topics: Topics | None = None
+
+    @property
+    def _out(self) -> McapWriter:
+        assert self._writer is not None
+        return self._writer
+
+    @property
+    def _names(self) -> Topics:
+        assert self._topics is not None
+        return self._topics
+
+    def _begin(self) -> None:
+        station = self.station
+        self._topics = Topics(station)
+        self._streams, self._strings = {}, {}
+        self._writer = McapWriter(self._octets, profile="ros2", library=f"teds-provision {__version__}")
+        self._schemas = {
+            TYPE: self._writer.schema(TYPE, SAMPLES),
+            "": self._writer.schema("std_msgs/msg/String", STRING),
+        }
+        self._writer.metadata(
+            "measurement",
+            {
+                "station": station.name,
+                "group": station.group,
+                "started": iso(station.started),
+                "clock": station.clock,
+                "test_pattern": json.dumps(station.test_pattern),
+                "part": str(len(self.files)),
+            },
+        )
+        self._opened = time.monotonic()
+        self._describe(tuple(self.facts.values()))
+
+    def _octets(self, octets: bytes) -> None:
+        self.part.add(octets)
+        self.part.flush()
+        self._count(octets=len(octets))
+
+    def _take(self, item: Item) -> None:
+        if isinstance(item, Block):
+            self._block(item)
+        elif isinstance(item, NodeReport):
+            self._report(item)
+        elif isinstance(item, tuple):
+            changed = tuple(one for one in item if self.facts.get(one.key) != one)
+            self.facts.update((one.key, one) for one in changed)
+            self._describe(changed)
+        self._look(time.monotonic())
+
+    def _idle(self, now: float) -> None:
+        self._look(now)
+        super()._idle(now)
+
+    def _look(self, now: float) -> None:
+        if not self._out.chunk_octets:
+            self._opened = now
+        elif self._out.chunk_octets >= CHUNK_OCTETS or now - self._opened >= FLUSH:
+            self._out.close_chunk()
+            self._opened = now
+
+    def _describe(self, facts: tuple[ChannelFacts, ...]) -> None:
+        if not facts:
+            return
+        self._names.learn(facts)
+        for one in facts:
+            pairs = {
+                name: value if isinstance(value, str) else json.dumps(value)
+                for name, value in facts_as_json(one).items()
+            }
+            self._out.metadata("channel", pairs)
+        for uuid in dict.fromkeys(one.uuid for one in facts):
+            every = [facts_as_json(one) for one in self.facts.values() if one.uuid == uuid]
+            self._string(self._names.of_node(uuid, "teds"), json.dumps({"uuid": uuid, "channels": every}), time.time())
+        # A stream's topic carries facts in its metadata, so changed ones need a topic record of their own.
+        self._streams = {
+            key: value for key, value in self._streams.items() if key[0] not in {one.uuid for one in facts}
+        }
+
+    def _string(self, topic: str, words: str, at: float) -> None:
+        if topic not in self._strings:
+            self._strings[topic] = self._out.channel(topic, self._schemas[""], {})
+        octets = words.encode() + b"\0"
+        data = _LITTLE_ENDIAN + struct.pack("<I", len(octets)) + octets
+        self._out.add_message(self._strings[topic], 0, int(at * 1e9), data)
+
+    def _report(self, report: NodeReport) -> None:
+        words = {
+            name: getattr(report, name)
+            for name in ("uuid", "state", "why", "samples", "lost", "late", "bad", "invalid")
+        }
+        words["clock_error"] = report.clock_error
+        self._string(f"/{self._names.station}/reports", json.dumps(words), report.time or time.time())
+
+    def _stream(self, block: Block) -> tuple[int, np.dtype[Any]]:
+        integral = block.raw.dtype.kind in "uib"
+        key = (block.uuid, block.stream, block.channels, "i" if integral else "f")
+        if key not in self._streams:
+            known = [self.facts.get((block.uuid, number)) for number in block.channels]
+            labels = [
+                facts_as_json(one) if one else {"number": number}
+                for one, number in zip(known, block.channels, strict=True)
+            ]
+            topic = self._names.of_node(block.uuid, f"stream_{block.stream}")
+            metadata = {"uuid": block.uuid, "channels": json.dumps(labels)}
+            number = self._out.channel(topic, self._schemas[TYPE], metadata)
+            self._streams[key] = number, _layout(len(block.channels), integral)
+        return self._streams[key]
+
+    def _block(self, block: Block) -> None:
+        raw = block.raw
+        if raw.dtype.kind == "O":
+            # Octet strings have no place in this message; what is a number in them is kept as nearly as a float can.
+            raw = np.array(
+                [[one if isinstance(one, int | float) else np.nan for one in row] for row in raw.tolist()],
+                dtype=np.float64,
+            )
+        channel, layout = self._stream(block)
+        nanoseconds = np.rint(block.time * 1e9).astype(np.uint64)
+        rows = np.zeros(len(block.time), dtype=layout)
+        n, c = block.value.shape
+        rows["code"], rows["length"], rows["channel"] = MESSAGE, layout.itemsize - 9, channel
+        rows["sequence"] = np.arange(block.index, block.index + n) & 0xFFFFFFFF
+        rows["logged"] = rows["published"] = nanoseconds
+        rows["cdr"] = np.frombuffer(_LITTLE_ENDIAN, dtype="<u4")[0]
+        rows["sec"], rows["nanosec"] = np.divmod(nanoseconds, 10**9)
+        rows["index"] = np.arange(block.index, block.index + n)
+        rows["tick"] = block.tick
+        rows["clock_error"] = np.nan if block.clock_error is None else block.clock_error
+        rows["test"] = block.test_pattern
+        rows["values"] = c
+        rows["value"] = np.where(block.valid, block.value, np.nan)
+        rows["raws" if layout["raw"].base.kind == "i" else "floats"] = c
+        rows["raw"] = raw.astype(np.int64) if layout["raw"].base.kind == "i" else raw
+        self._out.add_messages(channel, rows.tobytes(), nanoseconds.tolist())
+        self._count(written=block.value.size, messages=n)
+
+    def _close_part(self) -> None:
+        # After a full disk the summary does not fit either; `measure recover` makes the file whole later.
+        if self._writer is not None and self._part is not None and self.stats.state != "failed":
+            writer, self._writer = self._writer, None
+            writer.finish()
+        super()._close_part()
+
+
+def _layout(channels: int, integral: bool) -> np.dtype[Any]:
+    """A message record of SAMPLES as a packed structure: CDR aligns to 8 octets, counted behind its first four."""
+    head: list[tuple[str, str] | tuple[str, str, tuple[int]]] = [
+        ("code", "u1"),
+        ("length", "<u8"),
+        ("channel", "<u2"),
+        ("sequence", "<u4"),
+        ("logged", "<u8"),
+        ("published", "<u8"),
+        ("cdr", "<u4"),
+        ("sec", "<i4"),
+        ("nanosec", "<u4"),
+        ("index", "<u8"),
+        ("tick", "<u8"),
+        ("clock_error", "<f8"),
+        ("test", "u1"),
+        ("pad", "V3"),
+        ("values", "<u4"),
+        ("value", "<f8", (channels,)),
+    ]
+    if integral:
+        tail: list[tuple[str, str] | tuple[str, str, tuple[int]]] = [
+            ("raws", "<u4"), ("pad2", "V4"), ("raw", "<i8", (channels,)), ("floats", "<u4"),
+        ]  # fmt: skip
+    else:
+        tail = [("raws", "<u4"), ("floats", "<u4"), ("raw", "<f8", (channels,))]
+    layout = np.dtype(head + tail)
+    assert MESSAGE_HEAD.size == layout.fields["cdr"][1] if layout.fields else True
+    return layout

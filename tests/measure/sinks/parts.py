@@ -1,0 +1,86 @@
+"""Facts, blocks and strategies for the tests of the sinks."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from hypothesis import strategies as st
+
+from teds_provision.measure.blocks import Block, ChannelFacts, StationFacts
+
+ARM = "8d4d9da65281f7000001"
+HAND = "8d4d9da65281f7000002"
+ANGLE = ChannelFacts(
+    ARM,
+    "arm",
+    1,
+    "angle",
+    unit="rad",
+    shown_unit="°",
+    low=0.0,
+    high=6.283185,
+    uncertainty=0.0087,
+    calibrated="2026-03-01",
+    due="2027-03-01",
+    fingerprint="ab" * 32,
+    sample_form="uint16",
+    period=0.01,
+)
+FORCE = ChannelFacts(HAND, "hand", 2, "force", unit="N", uncertainty=0.1, fingerprint="cd" * 32, period=0.01)
+STATION = StationFacts("bench", group="crane", started=1_795_000_000.0)
+
+
+def block(
+    raw: Any = ((1,), (2,), (3,)),
+    value: Any = None,
+    valid: Any = None,
+    *,
+    uuid: str = ARM,
+    channels: tuple[int, ...] = (1,),
+    index: int = 0,
+    start: float = 1_795_000_000.0,
+    period: float = 0.01,
+    clock_error: float | None = 1e-4,
+    test_pattern: bool = False,
+) -> Block:
+    """A block of raw values (n × c); the calibrated ones are a tenth of them unless given."""
+    raws = np.asarray(raw) if not isinstance(raw, np.ndarray) else raw
+    values = np.asarray(raws / 10 if value is None else value, dtype=np.float64)
+    good = np.ones(values.shape, dtype=bool) if valid is None else np.asarray(valid)
+    n = len(raws)
+    return Block(
+        uuid,
+        0,
+        channels,
+        index,
+        start + (index % 10**6 + np.arange(n)) * period,
+        ((index % 10**6 + np.arange(n)) * int(period * 1e9)).astype(np.uint64),
+        raws,
+        np.where(good, values, np.nan),
+        good,
+        0.02,
+        clock_error,
+        test_pattern,
+    )
+
+
+_DTYPES = ["uint8", "int8", "uint16", "int16", "uint32", "int32", "int64", "float32", "float64"]
+
+
+@st.composite
+def blocks(draw: st.DrawFn) -> Block:
+    """Any block of one to four channels, integers or floats, some values invalid."""
+    n, c = draw(st.integers(1, 5)), draw(st.integers(1, 4))
+    dtype = np.dtype(draw(st.sampled_from(_DTYPES)))
+    if dtype.kind == "f":
+        cell: st.SearchStrategy[Any] = st.floats(allow_nan=False, allow_infinity=False, width=8 * dtype.itemsize)  # type: ignore[arg-type]
+    else:
+        limits = np.iinfo(dtype)
+        cell = st.integers(int(limits.min), int(limits.max))
+    raw = np.array(draw(st.lists(st.lists(cell, min_size=c, max_size=c), min_size=n, max_size=n)), dtype=dtype)
+    finite = st.floats(-1e12, 1e12)
+    value = draw(st.lists(st.lists(finite, min_size=c, max_size=c), min_size=n, max_size=n))
+    valid = draw(st.lists(st.lists(st.booleans(), min_size=c, max_size=c), min_size=n, max_size=n))
+    channels = tuple(draw(st.lists(st.integers(1, 255), min_size=c, max_size=c, unique=True)))
+    return block(raw, value, valid, channels=channels, index=draw(st.integers(0, 2**40)))

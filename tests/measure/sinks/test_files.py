@@ -1,0 +1,359 @@
+"""Recorders: what stands in a file is what was measured, whatever the names, the raw values, the disk or a kill do."""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterable
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import example, given, settings
+from mcap.reader import make_reader
+from mcap.stream_reader import StreamReader
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+
+from teds_provision.errors import BadData, NotFound, TedsProvisionError, UsageFailure
+from teds_provision.measure.blocks import Block, ChannelFacts, NodeReport, StationFacts
+from teds_provision.measure.sinks import open_sink
+from teds_provision.measure.sinks.mcap import SAMPLES, TYPE
+from teds_provision.measure.sinks.recover import recover
+from tests.measure.sinks.parts import ANGLE, ARM, FORCE, HAND, STATION, block, blocks
+
+
+def record(
+    path: Path,
+    items: Iterable[Block | NodeReport | list[ChannelFacts]],
+    facts: Any = (ANGLE,),
+    station: StationFacts = STATION,
+) -> tuple[str, ...]:
+    sink = open_sink(str(path))
+    sink.open(facts, station)
+    for item in items:
+        if isinstance(item, Block):
+            sink.write(item)
+        elif isinstance(item, NodeReport):
+            sink.report(item)
+        else:
+            sink.describe(item)
+    sink.close()
+    assert sink.stats.error == ""
+    assert sink.stats.dropped == 0
+    return sink.files
+
+
+def rows(text: str, comma: str = ",") -> list[dict[str, str]]:
+    lines = [line for line in text.splitlines() if not line.startswith("#")]
+    return list(csv.DictReader(io.StringIO("\n".join(lines)), delimiter=comma))
+
+
+def samples(path: Path) -> list[tuple[str, Any, int]]:
+    """Topic, decoded message and log time of each message of streams, read by mcap's own reader and by rosbags."""
+    store = get_typestore(Stores.ROS2_JAZZY)
+    store.register(get_types_from_msg(SAMPLES, TYPE))
+    with path.open("rb") as file:
+        found = list(make_reader(file).iter_messages())
+    return [
+        (channel.topic, store.deserialize_cdr(message.data, TYPE), message.log_time)
+        for schema, channel, message in found
+        if schema is not None and schema.name == TYPE
+    ]
+
+
+def test_a_csv_says_what_a_reader_needs_then_has_raw_beside_calibrated(tmp_path: Path) -> None:
+    record(tmp_path / "run.csv", [block([[10], [20]], valid=[[True], [False]])])
+    text = (tmp_path / "run.csv").read_text()
+    [facts] = [json.loads(line.partition(": ")[2]) for line in text.splitlines() if line.startswith("# channel: ")]
+    assert facts["uuid"] == ARM
+    assert facts["unit"] == "rad"
+    assert facts["low"] == 0.0, "a limit of nought is one"
+    assert (facts["calibrated"], facts["uncertainty"], facts["fingerprint"]) == ("2026-03-01", 0.0087, "ab" * 32)
+    assert "clock" in text.splitlines()[0]
+    first, second = rows(text)
+    assert first["arm/angle [rad]"] == "1"
+    assert first["arm/angle raw"] == "10"
+    assert float(second["time"]) == pytest.approx(1_795_000_000.01, abs=1e-6)
+    assert second["arm/angle [rad]"] == "", "an invalid value is empty"
+    assert second["arm/angle raw"] == "20", "its raw value is kept"
+    assert first["clock_error"] == "0.0001"
+
+
+@given(blocks())
+@example(block(np.array([[2**63 + 1]], dtype=np.uint64), [[1.0]]))
+@example(block(np.array([[b"\x01\xff"]], dtype=object), [[0.0]], [[False]]))
+@settings(max_examples=40)
+def test_every_block_comes_back_from_text(one: Block) -> None:
+    with TemporaryDirectory() as folder:
+        path = Path(folder) / "run.txt"
+        record(path, [one], facts=())
+        got = rows(path.read_text(), "\t")
+    assert len(got) == len(one.time)
+    for k, row in enumerate(got):
+        assert int(row["index"]) == one.index + k
+        for column, number in enumerate(one.channels):
+            name = f"{ARM}/channel {number}"
+            raw = one.raw[k, column]
+            if isinstance(raw, bytes):
+                assert bytes.fromhex(row[f"{name} raw"]) == raw
+            elif one.raw.dtype.kind == "f":
+                assert float(row[f"{name} raw"]) == raw
+            else:
+                assert int(row[f"{name} raw"]) == raw
+            assert (row[name] != "") == one.valid[k, column]
+            if one.valid[k, column]:
+                assert float(row[name]) == pytest.approx(one.value[k, column], rel=1e-11)
+
+
+@given(blocks())
+@settings(max_examples=25)
+def test_every_block_comes_back_from_mcap_by_foreign_readers(one: Block) -> None:
+    with TemporaryDirectory() as folder:
+        path = Path(folder) / "run.mcap"
+        record(path, [one])
+        got = samples(path)
+    assert [topic for topic, _, _ in got] == ["/bench/arm/stream_0"] * len(one.time)
+    for k, (_, message, logged) in enumerate(got):
+        assert (message.index, message.tick) == (one.index + k, one.tick[k])
+        assert abs(logged / 1e9 - one.time[k]) < 1e-6
+        assert message.stamp.sec == logged // 10**9
+        np.testing.assert_array_equal(message.value, one.value[k])
+        raw = message.raw_float if one.raw.dtype.kind == "f" else message.raw
+        np.testing.assert_array_equal(raw, one.raw[k])
+        assert message.clock_error == one.clock_error
+
+
+@given(blocks())
+@settings(max_examples=25)
+def test_every_block_comes_back_from_json_lines(one: Block) -> None:
+    with TemporaryDirectory() as folder:
+        path = Path(folder) / "run.jsonl"
+        record(path, [one])
+        lines = [json.loads(line) for line in path.read_text().splitlines()]
+    data = [line for line in lines if line["event"] == "data"]
+    assert [line["channel"] for line in data] == list(one.channels)
+    for column, line in enumerate(data):
+        assert line["valid"] == one.valid[:, column].tolist()
+        assert line["raw"] == one.raw[:, column].tolist()
+        expected = [v if g else None for v, g in zip(one.value[:, column].tolist(), line["valid"], strict=True)]
+        assert line["value"] == expected
+        assert len(line["time"]) == len(one.time)
+
+
+def test_channels_in_any_order_keep_their_columns(tmp_path: Path) -> None:
+    record(tmp_path / "run.csv", [block([[30, 10]], channels=(3, 1))], facts=())
+    [row] = rows((tmp_path / "run.csv").read_text())
+    assert (row[f"{ARM}/channel 1 raw"], row[f"{ARM}/channel 3 raw"]) == ("10", "30")
+    assert (row[f"{ARM}/channel 1"], row[f"{ARM}/channel 3"]) == ("1", "3")
+
+
+@pytest.mark.parametrize("suffix", ["csv", "jsonl", "mcap"])
+def test_a_recording_is_never_written_over(tmp_path: Path, suffix: str) -> None:
+    path = tmp_path / f"run.{suffix}"
+    path.write_text("the last run")
+    assert record(path, [block()]) == (str(tmp_path / f"run.2.{suffix}"),)
+    assert path.read_text() == "the last run"
+
+
+def test_a_node_that_comes_late_begins_a_part_that_is_complete_in_itself(tmp_path: Path) -> None:
+    late = block([[7]], uuid=HAND, channels=(2,))
+    files = record(tmp_path / "run.csv", [block(), [FORCE], late, block([[9]], index=3)])
+    assert files == (str(tmp_path / "run.csv"), str(tmp_path / "run.2.csv"))
+    got = rows(Path(files[1]).read_text())
+    assert [row["uuid"] for row in got] == [HAND, ARM]
+    assert got[0]["hand/force [N]"] == "0.7"
+    assert got[0]["arm/angle [rad]"] == ""
+    assert Path(files[1]).read_text().count("# channel: ") == 2
+
+
+def test_another_datasheet_begins_a_part_and_the_same_one_does_not(tmp_path: Path) -> None:
+    other = ChannelFacts(ARM, "arm", 1, "angle", unit="rad", fingerprint="ef" * 32)
+    files = record(tmp_path / "run.csv", [block(), [ANGLE], block(index=3), [other], block(index=6)])
+    assert len(files) == 2
+    assert "ef" * 32 in Path(files[1]).read_text()
+
+
+def test_names_from_datasheets_break_neither_csv_nor_spreadsheet(tmp_path: Path) -> None:
+    hostile = ChannelFacts(ARM, '=cmd|"x"', 1, "a,b\n\x1b[31m")
+    record(tmp_path / "run.csv", [block()], facts=[hostile])
+    text = (tmp_path / "run.csv").read_text()
+    assert "\x1b" not in text
+    heads = next(csv.reader([line for line in text.splitlines() if not line.startswith("#")]))
+    assert len(heads) == 7
+    assert heads[5].startswith("'=")
+
+
+@pytest.mark.parametrize("suffix", ["csv", "jsonl", "mcap"])
+def test_a_test_pattern_is_marked_in_every_line(tmp_path: Path, suffix: str) -> None:
+    nothing = [[False]] * 3
+    station = StationFacts("bench", test_pattern=True)
+    path = tmp_path / f"run.{suffix}"
+    record(path, [block(valid=nothing, test_pattern=True)], station=station)
+    if suffix == "csv":
+        assert [row["note"] for row in rows(path.read_text())] == ["test pattern"] * 3
+        assert "TEST PATTERN" in path.read_text()
+    elif suffix == "jsonl":
+        lines = [json.loads(line) for line in path.read_text().splitlines()]
+        assert all(line["test_pattern"] for line in lines if line["event"] in ("data", "recording"))
+    else:
+        assert all(message.test_pattern for _, message, _ in samples(path))
+
+
+def test_an_mcap_holds_the_facts_where_its_users_look(tmp_path: Path) -> None:
+    path = tmp_path / "run.mcap"
+    record(path, [block(), NodeReport(ARM, "lost", "no frame for 1 s", lost=3, time=1_795_000_001.0)])
+    with path.open("rb") as file:
+        reader = make_reader(file)
+        summary = reader.get_summary()
+        metadata = {one.name: one.metadata for one in reader.iter_metadata()}
+        strings = {
+            c.topic: m.data[8:-1].decode()
+            for s, c, m in reader.iter_messages()
+            if s and s.name == "std_msgs/msg/String"
+        }
+    assert summary is not None
+    [stream] = [one for one in summary.channels.values() if one.topic == "/bench/arm/stream_0"]
+    assert json.loads(stream.metadata["channels"])[0]["fingerprint"] == "ab" * 32
+    assert metadata["channel"]["unit"] == "rad"
+    assert metadata["measurement"]["group"] == "crane"
+    assert json.loads(strings["/bench/arm/teds"])["channels"][0]["calibrated"] == "2026-03-01"
+    assert json.loads(strings["/bench/reports"])["lost"] == 3
+
+
+def test_chunks_of_an_mcap_are_small(tmp_path: Path) -> None:
+    path = tmp_path / "run.mcap"
+    record(path, [block(np.full((100, 8), 5), channels=tuple(range(1, 9)), index=100 * k) for k in range(20)])
+    with path.open("rb") as file:
+        chunks = [one for one in StreamReader(file, emit_chunks=True).records if type(one).__name__ == "Chunk"]
+    assert len(chunks) > 3
+    assert all(one.uncompressed_size < (1 << 16) + 100 * 300 for one in chunks), "64 KiB, and the block that filled it"
+
+
+@pytest.mark.parametrize("octets", [30, 400, 3000, None])
+def test_an_mcap_that_was_cut_anywhere_is_made_whole(tmp_path: Path, octets: int | None) -> None:
+    path = tmp_path / "run.mcap"
+    record(path, [block(index=3 * k) for k in range(50)])
+    whole = path.read_bytes()
+    before = len(samples(path))
+    footer = whole.rfind(b"\x0f\x04\x00\x00\x00\x00\x00\x00\x00")
+    path.write_bytes(whole[: footer if octets is None else octets])
+    done = recover(path)
+    assert not done.was_whole
+    got = samples(path)
+    with path.open("rb") as file:
+        summary = make_reader(file).get_summary()
+    assert summary is not None
+    assert summary.statistics is not None
+    assert summary.statistics.message_count == done.messages
+    if octets is None:
+        assert len(got) == before
+        assert done.until is not None
+    again = recover(path)
+    assert again.was_whole
+    assert again.messages == done.messages
+
+
+def test_what_is_no_recording_is_refused_by_recover(tmp_path: Path) -> None:
+    with pytest.raises(NotFound):
+        recover(tmp_path / "nothing.mcap")
+    (tmp_path / "words.mcap").write_text("these are words, not records")
+    with pytest.raises(BadData):
+        recover(tmp_path / "words.mcap")
+
+
+@pytest.mark.parametrize("offset", range(200, 2000, 150))
+def test_damage_inside_a_recording_leaves_what_is_before_it(tmp_path: Path, offset: int) -> None:
+    path = tmp_path / "run.mcap"
+    record(path, [block(index=3 * k) for k in range(50)])
+    octets = bytearray(path.read_bytes()[:-60])
+    octets[min(offset, len(octets) - 1)] ^= 0xFF
+    path.write_bytes(bytes(octets))
+    recover(path)
+    assert recover(path).was_whole
+
+
+def test_a_folder_that_is_not_there_is_told_before_anything_is_measured(tmp_path: Path) -> None:
+    with pytest.raises(TedsProvisionError, match="folder"):
+        open_sink(str(tmp_path / "no" / "run.csv")).open([ANGLE], STATION)
+    with pytest.raises(UsageFailure, match="No sink"):
+        open_sink("run.xlsx")
+
+
+RECORDER = """
+import sys, time, resource
+sys.path.insert(0, {root!r})
+from pathlib import Path
+from tests.measure.sinks.parts import ANGLE, STATION, block
+from teds_provision.measure.sinks import open_sink
+if {limit}: resource.setrlimit(resource.RLIMIT_FSIZE, ({limit}, {limit}))
+sinks = [open_sink({folder!r} + "/run." + suffix) for suffix in ("csv", "jsonl", "mcap")]
+for sink in sinks: sink.open([ANGLE], STATION)
+print("ready", flush=True)
+k, begin = 0, time.monotonic()
+while time.monotonic() - begin < {seconds} and not any(sink.stats.error for sink in sinks):
+    one = block([[k % 60000 + i] for i in range(10)], index=10 * k, start=time.time() - k / 100, period=0.001)
+    for sink in sinks: sink.write(one)
+    k += 1
+    time.sleep(max(0, begin + k * 0.01 - time.monotonic()))
+    if k % 10 == 0: print("sent", one.time[-1], flush=True)
+for sink in sinks: sink.close()
+for sink in sinks: print("sink", sink.stats.error, sink.stats.hint, flush=True)
+"""
+ROOT = str(Path(__file__).parents[3])
+
+
+def recorder(folder: Path, *, limit: int = 0, seconds: float = 20) -> subprocess.Popen[str]:
+    code = RECORDER.format(root=ROOT, folder=str(folder), limit=limit, seconds=seconds)
+    return subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, text=True)
+
+
+def test_a_killed_recorder_leaves_files_that_are_readable_to_the_end(tmp_path: Path) -> None:
+    child = recorder(tmp_path)
+    assert child.stdout is not None
+    sent = [line for line, _ in zip(child.stdout, range(16), strict=False)][-1]
+    os.kill(child.pid, signal.SIGKILL)
+    child.wait()
+    child.stdout.close()
+    until = (
+        float(sent.split()[1]) - 1.0
+    )  # the machine of the tests is loaded; benchmarks/sinks.py measures how much is lost
+    assert recover(tmp_path / "run.mcap").messages > 0
+    assert samples(tmp_path / "run.mcap")[-1][2] / 1e9 > until
+    assert float(rows((tmp_path / "run.csv").read_text())[-1]["time"]) > until
+    *_, last = (tmp_path / "run.jsonl").read_text().splitlines()
+    assert json.loads(last)["time"][-1] > until
+
+
+def test_a_full_disk_ends_the_recording_with_an_error_and_whole_lines(tmp_path: Path) -> None:
+    child = recorder(tmp_path, limit=20_000)
+    output, _ = child.communicate(timeout=60)
+    errors = [line for line in output.splitlines() if line.startswith("sink")]
+    assert any("cannot be written" in line for line in errors), "the file size is limited in place of the disk"
+    text = (tmp_path / "run.csv").read_bytes()
+    assert text.endswith(b"\n")
+    for line in (tmp_path / "run.jsonl").read_text().splitlines():
+        json.loads(line)
+    recover(tmp_path / "run.mcap")
+
+
+def test_writing_never_waits_for_the_disk(tmp_path: Path) -> None:
+    sink = open_sink(str(tmp_path / "run.csv"))
+    sink.open([ANGLE], STATION)
+    begin = time.perf_counter()
+    for k in range(200):
+        sink.write(block(index=3 * k))
+    waited = time.perf_counter() - begin
+    sink.close()
+    sink.close()
+    sink.write(block())
+    assert waited < 2.0
+    assert sink.stats.written == 600
+    assert len(rows((tmp_path / "run.csv").read_text())) == 600
