@@ -8,6 +8,7 @@ import os
 import secrets
 import time
 import zlib
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -15,9 +16,10 @@ from teds_provision.errors import BadData, NotFound, StoreFailure, StoreLocked, 
 from teds_provision.files import whole_file
 from teds_provision.protocol.flash import Flash, FlashFailure
 from teds_provision.protocol.keys import SoftwareKey, node_key_message
-from teds_provision.teds.image import BlockId
+from teds_provision.teds.image import SECURITY, BlockId
 
-FORMAT = "teds-virtual-node/1"
+FORMAT = "teds-virtual-node/2"
+_OLDER = "teds-virtual-node/1"
 FILE = "flash.json"
 
 
@@ -128,6 +130,7 @@ class FlashFile:
         except ValueError as error:
             raise BadData(f"{self.path} is not a virtual node's flash.") from error
         try:
+            document = _migrated(document)
             whole = document["format"] == FORMAT and "name" in document and int(document["max_message"]) > 0
             SoftwareKey.from_secret(bytes.fromhex(document["key"]))
             _flash_from_json(document["flash"])
@@ -136,6 +139,19 @@ class FlashFile:
         if not whole:
             raise BadData(f"{self.path} is not a virtual node's flash, or it is damaged.", hint="Make a new node.")
         return dict(document)
+
+
+def _migrated(document: dict[str, Any]) -> dict[str, Any]:
+    """A flash of the first round, whose node spoke SessionSuite 1: as a board is after the firmware that speaks 2.
+
+    Keys, epoch, sequence and the other TEDS stay. The signed Security TEDS names the older suite and counts no more, so
+    the node is keyed and shows its initial one until the next commit. Written with the next commit.
+    """
+    if document["format"] != _OLDER:
+        return document
+    flash = _flash_from_json(document["flash"])
+    blocks = {block: teds for block, teds in flash.blocks.items() if block != SECURITY}
+    return {**document, "format": FORMAT, "flash": _flash_to_json(replace(flash, blocks=blocks, provisioned=False))}
 
 
 def _unusable(folder: Path, error: OSError) -> StoreFailure:

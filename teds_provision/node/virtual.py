@@ -10,14 +10,14 @@ from pathlib import Path
 from typing import Protocol
 
 from teds_provision.node.flash_file import FlashFile
-from teds_provision.protocol.keys import PrivateKey
+from teds_provision.protocol.keys import PrivateKey, SoftwareKey
 from teds_provision.protocol.messages.identity import NodeState
 from teds_provision.protocol.tim import Tim
 
 
 @dataclass(frozen=True)
 class Delays:
-    """Seconds that a real node would need: for one signature or ECDH, and for one flash commit."""
+    """Seconds that a board would need: for one point operation (signature, ECDH, key pair), for one flash commit."""
 
     crypto: float = 0.0
     flash: float = 0.0
@@ -41,6 +41,12 @@ class _SlowKey:
     def ecdh(self, peer: bytes) -> bytes:
         time.sleep(self.delay)
         return self.key.ecdh(peer)
+
+
+def _slow_one_time(delay: float) -> PrivateKey:
+    """A key pair for one Open, made on a slow chip."""
+    time.sleep(delay)
+    return _SlowKey(SoftwareKey.generate(), delay)
 
 
 class LinkServer(Protocol):
@@ -75,6 +81,7 @@ class VirtualNode:
             self.flash_file,
             clock,
             max_message=self.flash_file.max_message,
+            one_time=lambda: _slow_one_time(delays.crypto),
         )
 
     def request(self, link: str, frame: bytes, *, tapped: bool) -> bytes:

@@ -1,12 +1,14 @@
-"""Sessions under a link key: Open, Sealed, counters (profile section 4). Pure, both roles.
+"""Sessions under a link key: Open, Sealed, counters (profile section 4, SessionSuite 2). Pure, both roles.
 
-AES-128-CCM of RFC 3610 with a 16-octet tag, PKCS #7 padding, HKDF and HMAC as in the key agreement.
+Open makes session keys from one-time P-256 keys of both sides, so K alone, stolen later, opens no recorded session.
+AES-128-CCM of RFC 3610 with a 16-octet tag, PKCS #7 padding, HKDF and HMAC as in the key agreement. Python cannot wipe
+memory reliably: Z and OKM live in local names only, and a one-time key goes with the object that made it.
 """
 
 from __future__ import annotations
 
 import hmac
-import os
+from collections.abc import Callable
 from dataclasses import dataclass, field
 
 from cryptography.exceptions import InvalidTag
@@ -15,15 +17,20 @@ from cryptography.hazmat.primitives.ciphers.aead import AESCCM
 from cryptography.hazmat.primitives.kdf.hkdf import HKDF
 
 from teds_provision.errors import Garbled, NotAuthentic
-from teds_provision.protocol.agreement import key_id
+from teds_provision.protocol.agreement import good_point, key_id
+from teds_provision.protocol.keys import POINT_OCTETS, PrivateKey, SoftwareKey
 from teds_provision.protocol.messages.frames import Command, Function, Reply, decode_reply, security_command
 
-NONCE_OCTETS = 16
+COUNTER_OCTETS = 8
+KEY_ID_OCTETS = 8
 TAG_OCTETS = 16
-OPEN_OCTETS = 8 + NONCE_OCTETS
+OPEN_OCTETS = KEY_ID_OCTETS + POINT_OCTETS + TAG_OCTETS
+OPEN_REPLY_OCTETS = POINT_OCTETS + TAG_OCTETS
 SEALED_HEAD_OCTETS = 4 + TAG_OCTETS
 LAST_COUNTER = 0xFFFFFFFF
 BLOCK_OCTETS = 16
+OneTime = Callable[[], PrivateKey]
+"""Makes a one-time key pair; each is for one Open."""
 
 
 def pad(octets: bytes) -> bytes:
@@ -40,20 +47,30 @@ def unpad(octets: bytes) -> bytes | None:
     return octets[:-count]
 
 
+def open_mac(key: bytes, uuid: bytes, counter: bytes, station: bytes) -> bytes:
+    """The mac of Open: HMAC-SHA-256(K, "station open" ‖ UUID ‖ c ‖ Es)[0:16].
+
+    ``counter`` is c as the node gave it (8 octets), ``station`` Es (65 octets). It makes each Open good once, and lets
+    a node refuse a stranger without point arithmetic.
+    """
+    return hmac.digest(key, b"station open" + uuid + counter + station, "sha256")[:TAG_OCTETS]
+
+
 @dataclass(frozen=True)
 class SessionKeys:
-    """k_sn, k_ns (16 octets each) and the node's tag of one Open."""
+    """What one Open gives: k_sn, k_ns (16 octets each), k_m (32, for operation messages) and the node's tag."""
 
     to_node: bytes = field(repr=False)
     to_station: bytes = field(repr=False)
+    messages: bytes = field(repr=False)
     node_tag: bytes = field(repr=False)
 
     @classmethod
-    def derive(cls, key: bytes, uuid: bytes, station_nonce: bytes, node_nonce: bytes) -> SessionKeys:
-        """HKDF-SHA-256(K, salt = nonceS ‖ nonceN, info = "TEDS1 session" ‖ 00 ‖ UUID, 64 octets)."""
-        okm = HKDF(hashes.SHA256(), 64, station_nonce + node_nonce, b"TEDS1 session\0" + uuid).derive(key)
-        tag = hmac.digest(okm[32:], b"node open" + key_id(key) + station_nonce + node_nonce, "sha256")
-        return cls(okm[:16], okm[16:32], tag[:TAG_OCTETS])
+    def derive(cls, key: bytes, uuid: bytes, shared: bytes, station: bytes, node: bytes) -> SessionKeys:
+        """HKDF-SHA-256(Z, salt = K, info = "TEDS1 session" ‖ 00 ‖ UUID ‖ Es ‖ En, 96 octets); ``shared`` is Z."""
+        okm = HKDF(hashes.SHA256(), 96, key, b"TEDS1 session\0" + uuid + station + node).derive(shared)
+        tag = hmac.digest(okm[32:64], b"node open" + key_id(key) + station + node, "sha256")
+        return cls(okm[:16], okm[16:32], okm[64:], tag[:TAG_OCTETS])
 
 
 def _seal(key: bytes, counter: int, octets: bytes) -> bytes:
@@ -70,26 +87,48 @@ def _unseal(key: bytes, payload: bytes) -> bytes | None:
 
 
 class StationSession:
-    """The station's half: one Open, then sealed commands with rising counters."""
+    """The station's half: :meth:`ask` for c, :meth:`open` once, then sealed commands with rising counters.
 
-    def __init__(self, key: bytes, uuid: bytes, *, nonce: bytes | None = None) -> None:
+    One object is one Open; after a refusal with reason 12 a new one asks for c again (another station was faster).
+    """
+
+    def __init__(self, key: bytes, uuid: bytes, *, one_time: PrivateKey | None = None) -> None:
         self._key, self._uuid = key, uuid
-        self._nonce = os.urandom(NONCE_OCTETS) if nonce is None else nonce
+        self._one_time: PrivateKey | None = one_time or SoftwareKey.generate()
         self._keys: SessionKeys | None = None
         self._counter = 0
 
-    def open(self) -> Command:
-        """Return the Open to send."""
-        return security_command(Function.OPEN, key_id(self._key) + self._nonce)
+    def ask(self) -> Command:
+        """Return the empty Open, whose reply is c."""
+        return security_command(Function.OPEN)
+
+    def open(self, counter: bytes) -> Command:
+        """Return the Open to send for the node's c; raises Garbled where c has not 8 octets."""
+        assert self._one_time is not None, "open() after accept()"
+        if len(counter) != COUNTER_OCTETS:
+            raise Garbled(f"The node's counter for Open has {len(counter)} octets, not {COUNTER_OCTETS}.")
+        station = self._one_time.point
+        mac = open_mac(self._key, self._uuid, counter, station)
+        return security_command(Function.OPEN, key_id(self._key) + station + mac)
 
     def accept(self, payload: bytes) -> None:
         """Check the reply to Open; raises Garbled or NotAuthentic (the node does not hold the key)."""
-        if len(payload) != NONCE_OCTETS + TAG_OCTETS:
-            raise Garbled(f"The reply to Open has {len(payload)} octets, not {NONCE_OCTETS + TAG_OCTETS}.")
-        keys = SessionKeys.derive(self._key, self._uuid, self._nonce, payload[:NONCE_OCTETS])
-        if not hmac.compare_digest(keys.node_tag, payload[NONCE_OCTETS:]):
+        assert self._one_time is not None, "accept() twice"
+        if len(payload) != OPEN_REPLY_OCTETS:
+            raise Garbled(f"The reply to Open has {len(payload)} octets, not {OPEN_REPLY_OCTETS}.")
+        node, station = payload[:POINT_OCTETS], self._one_time.point
+        if not good_point(node, station):
+            raise NotAuthentic("The node's one-time key in its reply to Open is not a valid point, or is our own.")
+        keys = SessionKeys.derive(self._key, self._uuid, self._one_time.ecdh(node), station, node)
+        if not hmac.compare_digest(keys.node_tag, payload[POINT_OCTETS:]):
             raise NotAuthentic("The node's tag on Open is wrong: it does not hold the key.")
-        self._keys = keys
+        self._keys, self._one_time = keys, None
+
+    @property
+    def message_key(self) -> bytes:
+        """k_m, 32 octets: the root of the keys of streams and of Drive (operation.md section 3)."""
+        assert self._keys is not None, "message_key before a good accept()"
+        return self._keys.messages
 
     def seal(self, command: Command) -> Command:
         """Seal one inner command under the next counter."""
@@ -111,15 +150,23 @@ class StationSession:
 
 
 class NodeSession:
-    """The node's half of one Open; ``counter`` is that of the last good frame, 0 while half-open."""
+    """The node's half of one Open; ``counter`` is that of the last good frame, 0 while half-open.
 
-    def __init__(self, key: bytes, uuid: bytes, station_nonce: bytes, *, nonce: bytes | None = None) -> None:
-        node_nonce = os.urandom(NONCE_OCTETS) if nonce is None else nonce
-        self._keys = SessionKeys.derive(key, uuid, station_nonce, node_nonce)
-        self.reply = node_nonce + self._keys.node_tag
+    ``station`` is Es, a checked point; ``one_time`` the node's key for this Open alone.
+    """
+
+    def __init__(self, key: bytes, uuid: bytes, station: bytes, one_time: PrivateKey) -> None:
+        node = one_time.point
+        self._keys = SessionKeys.derive(key, uuid, one_time.ecdh(station), station, node)
+        self.reply = node + self._keys.node_tag
         self.counter = 0
         self.good_at = 0.0
         self.staging: dict[tuple[int, int], bytes] = {}
+
+    @property
+    def message_key(self) -> bytes:
+        """k_m, 32 octets (operation.md section 3)."""
+        return self._keys.messages
 
     def unseal(self, payload: bytes) -> bytes | None:
         """Return the inner frame where tag and padding are right, else None. Changes nothing."""

@@ -22,7 +22,14 @@ from teds_provision.protocol.agreement import (
 )
 from teds_provision.protocol.commit import Refused
 from teds_provision.protocol.flash import Flash, FlashFailure, FlashMemory
-from teds_provision.protocol.keys import PrivateKey, prove_message, reset_message, station_key_message, verify
+from teds_provision.protocol.keys import (
+    PrivateKey,
+    SoftwareKey,
+    prove_message,
+    reset_message,
+    station_key_message,
+    verify,
+)
 from teds_provision.protocol.messages.frames import (
     COMMAND_HEADER,
     COMMON,
@@ -35,7 +42,17 @@ from teds_provision.protocol.messages.frames import (
     refusal,
 )
 from teds_provision.protocol.messages.identity import Identity, NodeState
-from teds_provision.protocol.session import BLOCK_OCTETS, LAST_COUNTER, OPEN_OCTETS, SEALED_HEAD_OCTETS, NodeSession
+from teds_provision.protocol.session import (
+    BLOCK_OCTETS,
+    COUNTER_OCTETS,
+    KEY_ID_OCTETS,
+    LAST_COUNTER,
+    OPEN_OCTETS,
+    SEALED_HEAD_OCTETS,
+    NodeSession,
+    OneTime,
+    open_mac,
+)
 from teds_provision.protocol.tim_teds import TedsAccess
 
 HALF_OPEN_SECONDS = 60.0
@@ -77,7 +94,8 @@ class _Origin:
 class Tim:
     """One transducer interface module.
 
-    ``max_message`` octets (1024 to 4094); ``clock`` gives monotonic seconds; ``random`` gives that many octets.
+    ``max_message`` octets (1024 to 4094); ``clock`` gives monotonic seconds; ``random`` gives that many octets, good
+    from the first moment after a start; ``one_time`` makes the key pair of one Open (a board may keep one ready in RAM).
     """
 
     key: PrivateKey
@@ -86,8 +104,11 @@ class Tim:
     max_message: int = 2048
     max_teds: int = 16384
     random: Callable[[int], bytes] = os.urandom
+    one_time: OneTime = SoftwareKey.generate
 
     def __post_init__(self) -> None:
+        # c of Open: random at the start, so that no mac from before a restart is good again
+        self._opens = int.from_bytes(self.random(COUNTER_OCTETS), "big")
         self._flash = self.memory.load()
         self._lines: dict[str, _Line] = {}
         self._pending: _Pending | None = None
@@ -256,12 +277,21 @@ class Tim:
     # -- sessions --------------------------------------------------------------------------------------------------
 
     def _open(self, payload: bytes, origin: _Origin) -> Reply:
+        counter = self._opens.to_bytes(COUNTER_OCTETS, "big")
+        if not payload:
+            return Reply(True, counter)
         _length(payload, OPEN_OCTETS)
-        key = self._flash.key
-        if key is None or not hmac.compare_digest(payload[:8], key_id(key)):
+        key, station = self._flash.key, payload[KEY_ID_OCTETS:-TAG_OCTETS]
+        if key is None or not hmac.compare_digest(payload[:KEY_ID_OCTETS], key_id(key)):
             raise Refused(Reason.UNKNOWN_KEY)
+        # The mac before the point: a stranger costs no point arithmetic, and each Open is good once.
+        if not hmac.compare_digest(payload[-TAG_OCTETS:], open_mac(key, self._flash.uuid, counter, station)):
+            raise Refused(Reason.BAD_TAG)
+        self._opens = (self._opens + 1) % (1 << 8 * COUNTER_OCTETS)
+        if not good_point(station, self._flash.node_key):
+            raise Refused(Reason.BAD_POINT)
         line = self._lines.setdefault(origin.link, _Line())
-        line.half_open = NodeSession(key, self._flash.uuid, payload[8:], nonce=self.random(16))
+        line.half_open = NodeSession(key, self._flash.uuid, station, self.one_time())
         line.half_open_at = self.clock()
         return Reply(True, line.half_open.reply)
 

@@ -16,6 +16,7 @@ _log = logging.getLogger(__name__)
 _BUSY_PAUSE = 0.25
 _BUSY_SECONDS = 10.0
 _REOPENINGS = 2
+_OPENING = "to open a session"
 
 _MEANING = {
     Reason.UNKNOWN_COMMAND: "it does not know the command",
@@ -104,9 +105,18 @@ class Conversation:
 
     def open(self, key: bytes) -> None:
         """Open a session under a link key; raises NodeRefused (16: unknown key) or NotAuthentic (wrong node tag)."""
-        session = StationSession(key, self.uuid)
-        session.accept(self.plain(session.open(), "to open a session"))
+        session, reply = self._open(key)
+        if reply.reason == Reason.BAD_TAG:  # another station's Open was faster: its counter is used up
+            session, reply = self._open(key)
+        if not reply.ok:
+            raise refused(reply.reason, _OPENING)
+        session.accept(reply.payload)
         self._session, self._key = session, key
+
+    def _open(self, key: bytes) -> tuple[StationSession, Reply]:
+        """Ask for c and send one Open; each has a one-time key of its own."""
+        session = StationSession(key, self.uuid)
+        return session, self._exchange(session.open(self.plain(session.ask(), _OPENING)))
 
     def reopen(self) -> None:
         """Open a new session under the same key, after the old one was lost."""

@@ -10,7 +10,14 @@ import pytest
 
 from teds_provision.errors import BadData, NotFound, StoreFailure, StoreLocked
 from teds_provision.node.flash_file import FlashFile
-from teds_provision.node.virtual import VirtualNode
+from teds_provision.node.virtual import Delays, VirtualNode
+from teds_provision.protocol.messages.frames import decode_reply
+from teds_provision.protocol.messages.identity import NodeState
+from teds_provision.protocol.session import StationSession
+from teds_provision.teds.codec import security
+from teds_provision.teds.image import SECURITY
+
+from ..protocol.desk import UUID, Desk
 
 
 def test_a_running_node_is_refused_to_another_process(tmp_path: Path) -> None:
@@ -58,3 +65,36 @@ def test_a_folder_that_cannot_be_used_is_named(tmp_path: Path) -> None:
         FlashFile.create(tmp_path / "file" / "node")
     with pytest.raises(NotFound):
         FlashFile(tmp_path / "nothing", exclusive=True)
+
+
+def test_a_flash_of_the_first_round_is_migrated(tmp_path: Path) -> None:
+    """Its node spoke SessionSuite 1: everything stays but the signed Security TEDS, which names that suite."""
+    desk = Desk().provision()
+    path = FlashFile.create(tmp_path / "node", uuid=UUID).path
+    made = FlashFile(tmp_path / "node")
+    made.commit(replace(desk.flash, node_key=made.key.point))
+    document = json.loads(path.read_text())
+    path.write_text(json.dumps({**document, "format": "teds-virtual-node/1"}))
+
+    migrated = FlashFile(tmp_path / "node")
+    state = migrated.load()
+    assert (state.state, state.key, state.epoch, state.sequence) == (NodeState.KEYED, desk.key, 1, 1)
+    assert (state.ca, state.station) == (desk.flash.ca, desk.flash.station)
+    assert state.blocks == {block: teds for block, teds in desk.flash.blocks.items() if block != SECURITY}
+    assert security.decode(state.security_teds()).values == security.OUR_VALUES
+    migrated.commit(replace(state, sequence=2))
+    assert json.loads(path.read_text())["format"] == "teds-virtual-node/2"
+    assert FlashFile(tmp_path / "node").load() == replace(state, sequence=2)
+
+
+def test_an_open_costs_a_slow_node_a_key_pair_and_an_ecdh(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    slept: list[float] = []
+    monkeypatch.setattr("teds_provision.node.virtual.time.sleep", slept.append)
+    made = FlashFile.create(tmp_path / "node", uuid=UUID)
+    made.commit(replace(made.load(), key=bytes(16), epoch=1))
+    slept.clear()
+    node, session = VirtualNode(tmp_path / "node", delays=Delays(crypto=0.25)), StationSession(bytes(16), UUID)
+    counter = decode_reply(node.request("nfc", session.ask().encode(), tapped=True)).payload
+    assert slept == [], "asking for c costs nothing"
+    session.accept(decode_reply(node.request("nfc", session.open(counter).encode(), tapped=True)).payload)
+    assert slept == [0.25, 0.25]

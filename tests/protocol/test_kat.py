@@ -10,6 +10,7 @@ from teds_provision.protocol import keys
 from teds_provision.protocol.agreement import Credentials, StationAgreement
 from teds_provision.protocol.datasheet import NodeKeys, sign_datasheet, unsigned_datasheet
 from teds_provision.protocol.flash import Flash
+from teds_provision.protocol.keys import SoftwareKey
 from teds_provision.protocol.messages.frames import Command, decode_reply
 from teds_provision.protocol.session import StationSession, pad
 from teds_provision.protocol.tim import Tim
@@ -57,9 +58,17 @@ def test_the_default_can_address_follows_from_the_uuid() -> None:
 
 def new_node(**state: object) -> Tim:
     """The vectors' node in factory state, with the vectors' nonces in their order of use."""
-    nonces = iter([octets("agreement", "nonceN"), octets("session", "nonceN")])
+    drawn = iter([octets("session", "c"), octets("agreement", "nonceN")])
+    one_time = SoftwareKey(int(KAT["session"]["En"]["d"], 16))
     flash = Flash(UUID, key("node").point, octets("sig102", "signature"), can_address=KAT["default_can_address"])
-    return Tim(key("node"), RamFlash(flash), clock=lambda: 0.0, max_message=2048, random=lambda n: next(nonces))
+    return Tim(
+        key("node"),
+        RamFlash(flash),
+        clock=lambda: 0.0,
+        max_message=2048,
+        random=lambda n: next(drawn),
+        one_time=lambda: one_time,
+    )
 
 
 def test_agreement_and_session_from_both_roles_give_the_vectors_frames() -> None:
@@ -74,11 +83,16 @@ def test_agreement_and_session_from_both_roles_give_the_vectors_frames() -> None
     assert agreed.confirm.encode() == octets("agreement", "confirm_frame")
     assert node.handle(agreed.confirm.encode(), link="nfc", tapped=True) == octets("agreement", "confirm_reply")
 
-    session = StationSession(agreed.key, UUID, nonce=octets("session", "nonceS"))
-    assert session.open().encode() == octets("session", "open_frame")
-    reply = node.handle(session.open().encode(), link="nfc", tapped=True)
+    session = StationSession(agreed.key, UUID, one_time=SoftwareKey(int(KAT["session"]["Es"]["d"], 16)))
+    assert session.ask().encode() == octets("session", "c_frame")
+    counter = node.handle(session.ask().encode(), link="nfc", tapped=True)
+    assert counter == octets("session", "c_reply")
+    frame = session.open(decode_reply(counter).payload).encode()
+    assert frame == octets("session", "open_frame")
+    reply = node.handle(frame, link="nfc", tapped=True)
     assert reply == octets("session", "open_reply")
     session.accept(decode_reply(reply).payload)
+    assert session.message_key == octets("session", "k_m")
     for sealed in KAT["sealed"]:
         inner = bytes.fromhex(sealed["inner"])
         assert pad(inner).hex() == sealed["padded"]

@@ -91,8 +91,8 @@ def test_the_station_sends_and_takes_what_is_published(document: Entry, entry: E
         inner = step.get("inner")
         if "open" in step:
             opened = step["open"]
-            session = StationSession(bytes.fromhex(opened["K"]), uuid, nonce=bytes.fromhex(opened["nonceS"]))
-            assert session.open().encode().hex() == step["command"]
+            session = StationSession(bytes.fromhex(opened["K"]), uuid, one_time=SoftwareKey(int(opened["Es"], 16)))
+            assert session.open(bytes.fromhex(opened["c"])).encode().hex() == step["command"]
             if "reason" not in step:
                 session.accept(decode_reply(bytes.fromhex(step["reply"])).payload)
                 sessions[opened["session"]] = session
@@ -140,13 +140,15 @@ def test_plain_primitives_give_the_same_keys_tags_and_frames(document: Entry, en
 
 def check_open(uuid: bytes, step: Entry) -> tuple[bytes, bytes]:
     opened, command, reply = step["open"], bytes.fromhex(step["command"]), bytes.fromhex(step["reply"])
-    link_key, nonces = bytes.fromhex(opened["K"]), bytes.fromhex(opened["nonceS"]) + reply[3:19]
-    assert command[:6].hex() == "000080030018"
+    link_key, station, node = bytes.fromhex(opened["K"]), command[14:79], reply[3:68]
+    assert command[:6].hex() == "000080030059"
     assert command[6:14] == hashlib.sha256(b"TEDS1 key id\0" + link_key).digest()[:8]
-    assert reply[3:19].hex() == step["nonceN"]
-    okm = vn.hkdf(link_key, nonces, b"TEDS1 session\0" + uuid, 64)
-    assert (okm[:16].hex(), okm[16:32].hex()) == (opened["k_sn"], opened["k_ns"])
-    assert reply[19:] == vn.mac(okm[32:], b"node open" + command[6:14] + nonces)
+    assert command[79:] == vn.mac(link_key, b"station open" + uuid + bytes.fromhex(opened["c"]) + station)
+    shared = vn.ecdh(opened["Es"], node)
+    assert shared == vn.ecdh(step["En"], station)
+    okm = vn.hkdf(shared, link_key, b"TEDS1 session\0" + uuid + station + node, 96)
+    assert (okm[:16].hex(), okm[16:32].hex(), okm[64:].hex()) == (opened["k_sn"], opened["k_ns"], opened["k_m"])
+    assert reply[68:] == vn.mac(okm[32:64], b"node open" + command[6:14] + station + node)
     return okm[:16], okm[16:32]
 
 
@@ -432,7 +434,7 @@ def test_bundles_open_or_are_refused_as_published(document: Entry, entry: Entry)
     told = entry["payload"]
     assert (opened.bundle.id, opened.bundle.mode) == (told["id"], told["mode"])
     assert [each.uuid.hex() for each in opened.bundle.nodes] == [each["uuid"] for each in told["nodes"]]
-    assert opened.bundle.nodes[0].key.hex() == "b42d833f8c86218d72b6baf189f57654"
+    assert opened.bundle.nodes[0].key.hex() == "86938b02ad8bfc4853fddfe9c5e45551"
     assert opened.station_signature is not None
     receipt = open_receipt(entry["receipt_jws"].encode(), trust_store(document, [entry["recipient"]]).get)
     assert (receipt.id, receipt.bundle_sha256) == (told["id"], opened.sha256)

@@ -185,7 +185,7 @@ def test_every_refusal_of_the_commit(desk: Desk) -> None:
         (desk.flash.security_teds(), Reason.BAD_FORM),
         (frame(b"\x03\x04\0\x80\1\1"), Reason.BAD_FORM),
         (resigned(desk, values={**security.OUR_VALUES, 4: 0}), Reason.BAD_FORM),
-        (resigned(desk, values={**security.OUR_VALUES, 109: 2}), Reason.BAD_FORM),
+        (resigned(desk, values={**security.OUR_VALUES, 109: 1}), Reason.BAD_FORM),
         (resigned(desk, node_key=other.point), Reason.BAD_SIGNATURE),
         (resigned(desk, node_key_signature=bytes(64)), Reason.BAD_SIGNATURE),
         (resigned(desk, station_key_signature=certified_by_other), Reason.BAD_SIGNATURE),

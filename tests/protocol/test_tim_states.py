@@ -30,7 +30,8 @@ REQUEST = StationAgreement(CREDENTIALS, UUID).request()
 COMMANDS = {
     "request": REQUEST,
     "confirm": security_command(Function.CONFIRM, bytes(16)),
-    "open": security_command(Function.OPEN, bytes(24)),
+    "open": security_command(Function.OPEN, bytes(89)),
+    "counter of open": security_command(Function.OPEN),
     "sealed": security_command(Function.SEALED, bytes(36)),
     "close": security_command(Function.CLOSE),
     "identify": security_command(Function.IDENTIFY),
@@ -53,6 +54,7 @@ TABLE: dict[str, tuple[int | None, int | None, int | None, int | None, int | Non
     "request": (OK, 3, OK, 3, OK),
     "confirm": (2, 3, 2, 3, 2),  # none pending
     "open": (2, 2, 16, 16, 3),
+    "counter of open": (2, 2, OK, OK, 3),
     "sealed": (2, 2, 2, 2, 3),
     "close": (3, 3, 3, 3, OK),
     "identify": (OK, OK, OK, OK, OK),
@@ -282,7 +284,8 @@ def test_an_open_with_an_old_key_gets_16() -> None:
     old = desk.key
     desk.agree()
     assert key_id(old) != key_id(desk.key)
-    assert desk.plain(StationSession(old, UUID).open()) == refusal(Reason.UNKNOWN_KEY)
+    session = StationSession(old, UUID)
+    assert desk.plain(session.open(desk.plain(session.ask()).payload)) == refusal(Reason.UNKNOWN_KEY)
 
 
 def test_the_security_teds_of_a_keyed_node_is_initial_with_the_present_epoch() -> None:

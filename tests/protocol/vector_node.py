@@ -71,7 +71,7 @@ class Replay:
     def __init__(self, document: Entry, entry: Entry) -> None:
         start = entry["start"]
         self.now = 0.0
-        self.nonce = b""
+        self.drawn: Entry = start
         self.memory = RamFlash(flash_of(document, start))
         self._key = SoftwareKey(int(document["keys"]["node"]["d"], 16))
         self._limits = {"max_message": start["max_message"], "max_teds": start["max_teds"]}
@@ -79,14 +79,21 @@ class Replay:
 
     def restart(self) -> None:
         """Power off and on."""
-        self.tim = Tim(self._key, self.memory, lambda: self.now, random=lambda size: self.nonce, **self._limits)
+        self.tim = Tim(
+            self._key, self.memory, lambda: self.now, random=self._random, one_time=self._one_time, **self._limits
+        )
+
+    def _random(self, size: int) -> bytes:
+        return bytes.fromhex(self.drawn["c" if size == 8 else "nonceN"])
+
+    def _one_time(self) -> SoftwareKey:
+        return SoftwareKey(int(self.drawn["En"], 16))
 
     def run(self, step: Entry) -> bytes | None:
         """Do one step; the reply frame where it is a command."""
-        self.now = step["at"]
+        self.now, self.drawn = step["at"], step
         match step.get("event"):
             case None:
-                self.nonce = bytes.fromhex(step.get("nonceN", ""))
                 return self.tim.handle(bytes.fromhex(step["command"]), link=step["link"], tapped=step["tapped"])
             case "link_lost":
                 self.tim.link_lost(step["link"])

@@ -123,7 +123,8 @@ def test_a_segment_that_only_begins_like_tagged_arguments_is_plain():
     [
         (1, "Request", 65 + 64 + 65 + 65),
         (2, "Confirm", 16),
-        (3, "Open", 24),
+        (3, "Open", 0),
+        (3, "Open", 89),
         (4, "Sealed", 30),
         (5, "Close", 0),
         (7, "Identify", 0),

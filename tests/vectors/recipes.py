@@ -8,7 +8,7 @@ from dataclasses import replace
 
 from cryptography.hazmat.primitives.ciphers.aead import AESCCM
 
-from teds_provision.protocol.agreement import RequestPayload
+from teds_provision.protocol.agreement import RequestPayload, key_id
 from teds_provision.protocol.messages.frames import (
     Command,
     Function,
@@ -181,6 +181,17 @@ def sessions() -> Iterator[Scene]:
     scene.say(scene.sessions["a"][0].seal(IDENTIFY), "Counter 3, after the end: outer 2.")
     yield scene
 
+    yield _open_checks()
+
+    scene = Scene("open-after-a-restart", "c is random at every start, so no Open from before is good again.", "keyed")
+    scene.open("a", "Open.")
+    before = bytes.fromhex(scene.steps[-1]["command"])
+    scene.event("restart", "Power off and on.")
+    scene.say(before, "The same Open: 12.", crafted=True)
+    scene.open("b", "With the new c.")
+    scene.sealed("b", IDENTIFY, "Good.")
+    yield scene
+
     scene = Scene("half-open-is-replaced", "A new Open replaces the half-open one.", "keyed")
     scene.open("a", "First Open; nothing sealed under it yet.")
     scene.open("b", "Second Open.")
@@ -253,7 +264,8 @@ def sessions() -> Iterator[Scene]:
     )
     scene.open("a", "Open.")
     inner: list[tuple[Command, str]] = [
-        (security_command(Function.OPEN, bytes(24)), "Open inside: 3."),
+        (security_command(Function.OPEN, bytes(89)), "Open inside: 3."),
+        (security_command(Function.OPEN), "Open without payload inside: 3."),
         (security_command(Function.SEALED, bytes(36)), "Sealed inside: 3."),
         (Command(0, 1, 5, b"\0"), "Class 1, function 5, which this node does not have: 1."),
         (Command(1, 3, 1, bytes(4)), "Class 3 on channel 1: 1."),
@@ -269,6 +281,37 @@ def sessions() -> Iterator[Scene]:
     for command, note in inner:
         scene.sealed("a", command, note)
     yield scene
+
+
+def _open_checks() -> Scene:
+    scene = Scene(
+        "open-checks",
+        "Open on a keyed node: length 4, keyId 16, mac 12, Es 15, in this order; c grows with each good mac.",
+        "keyed",
+    )
+    off_curve = bytes([4]) + bytes(31) + b"\x01" + bytes(31) + b"\x01"
+    empty, good = security_command(Function.OPEN), key("one_time_2").point
+    scene.say(empty, "Without payload: c.")
+    scene.say(empty, "Asking changes nothing: the same c.")
+    for size in (1, 8, 24, 88, 90):
+        scene.say(security_command(Function.OPEN, bytes(size)), f"{size} octets: 4.")
+    scene.say(security_command(Function.OPEN, bytes(89)), "A keyId that is not the key's: 16.")
+    scene.say(security_command(Function.OPEN, key_id(K) + good + bytes(16)), "A wrong mac: 12, and c stands.")
+    scene.say(
+        security_command(Function.OPEN, key_id(K) + off_curve + bytes(16)),
+        "A wrong mac over no point: 12 goes before 15.",
+    )
+    scene.crafted_open("The mac of the c that comes next: 12.", ahead=1)
+    scene.crafted_open("Es is not on the curve, under a good mac: 15. c is used up.", point=off_curve)
+    scene.crafted_open("Es is 65 zero octets: 15.", point=bytes(65))
+    scene.crafted_open("Es begins with 06 (hybrid form): 15.", point=b"\x06" + good[1:])
+    scene.crafted_open("Es is the node's own point: 15.", point=key("node").point)
+    scene.crafted_open("The mac of the c before: 12.", ahead=-1)
+    scene.open("a", "A good Open.")
+    again = bytes.fromhex(scene.steps[-1]["command"])
+    scene.say(again, "The same Open again: 12; the half-open one stands.", crafted=True)
+    scene.sealed("a", IDENTIFY, "Counter 1.")
+    return scene
 
 
 def _bad_frames() -> Scene:

@@ -12,7 +12,7 @@ from teds_provision.protocol.repetition import Repetition
 from teds_provision.protocol.session import StationSession
 
 from .recipes import CHALLENGE, IDENTIFY, changed_request
-from .scene import UUID, K, Scene, credentials, key, octets
+from .scene import UUID, K, Scene, credentials, key, named_key
 
 
 class Line(Scene):
@@ -30,11 +30,9 @@ class Line(Scene):
             ran.append(octets)
             return self._tim.handle(octets, link="nfc", tapped=True)
 
-        self._drawn = []
+        self._drawn = {}
         reply = run(frame) if functional else self.kept.answer(transaction, frame, run, now=self.now)
-        step = {"note": note, "at": self.now, "transaction": transaction, "functional": functional}
-        if self._drawn:
-            step["nonceN"] = self._drawn[0].hex()
+        step = {"note": note, "at": self.now, "transaction": transaction, "functional": functional, **self._drawn}
         step |= {"command": frame.hex(), "reply": reply.hex(), "run": bool(ran)}
         answer = decode_reply(reply)
         if answer.reason is not None:
@@ -51,8 +49,9 @@ class Line(Scene):
 def _session(name: str, note: str) -> tuple[Line, Command]:
     """A line with a session open, and its first Sealed."""
     line = Line(name, note)
-    session = StationSession(K, UUID, nonce=octets(name, "nonceS"))
-    reply = line.send(1, session.open(), "Open.")
+    session = StationSession(K, UUID, one_time=named_key(name, "Es"))
+    counter = decode_reply(line.send(0, session.ask(), "Open without payload asks for c.")).payload
+    reply = line.send(1, session.open(counter), "Open.")
     session.accept(decode_reply(reply).payload)
     return line, session.seal(security_command(Function.LIST))
 
@@ -70,6 +69,14 @@ def repetition() -> Iterator[Scene]:
     line.send(3, sealed, "That reply is the stored one now.")
     yield line
 
+    line = Line("open", "An Open whose reply was lost: the stored octets. Anew it would get 12.")
+    session = StationSession(K, UUID, one_time=named_key("open", "Es"))
+    opening = session.open(decode_reply(line.send(1, session.ask(), "Open without payload asks for c.")).payload)
+    line.send(2, opening, "Open.")
+    line.send(2, opening, "Equal octet for octet: the stored reply, the same En.")
+    line.send(3, opening, "Another transaction: run: 12.")
+    yield line
+
     line, sealed = _session("after-20-s", "The stored reply is kept for 20 s.")
     line.send(2, sealed, "Counter 1.")
     line.later(20.0).send(2, sealed, "20 s later: run: 13.")
@@ -77,7 +84,7 @@ def repetition() -> Iterator[Scene]:
 
     line, sealed = _session(
         "identify-between",
-        "A plain Identify between a Sealed and its repetition. Our node lets it replace the stored reply.",
+        "A plain Identify between a Sealed and its repetition. It replaces the stored reply, as every plain request but a functional one does.",
     )
     line.send(2, sealed, "Counter 1.")
     line.send(3, IDENTIFY, "Identify.")

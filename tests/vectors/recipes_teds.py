@@ -96,7 +96,7 @@ def canonical() -> Iterator[dict[str, Any]]:
         ("tedsid-class", "TEDSID of class 129: the TEDS' own check fails.", frame(bytes.fromhex("030400810101") + unframe(whole)[6:]), 4),
         ("no-tedsid", "The TEDSID is missing.", frame(unframe(whole)[6:]), 4),
         ("descending", "Field 2 stands before field 1.", changed(2, b"\x02", before=1), 4),
-        ("twice", "Field 109 stands twice.", added(109, b"\x01", 109), 4),
+        ("twice", "Field 109 stands twice.", added(109, b"\x02", 109), 4),
         ("used-enc-alg-missing", "Field 3 (UsedEncAlg) is missing; the TEDSID is not it.", changed(3, None), 4),
         ("unknown-field-7", "A type that is neither in the table nor 111 to 255.", added(7, b"\x00", 6), 4),
         ("unknown-field-99", "The same, 99.", added(99, b"", 6), 4),
@@ -127,7 +127,8 @@ def canonical() -> Iterator[dict[str, Any]]:
         ("profile-version-2", "Field 105 is 2.", changed(105, b"\x02"), 4),
         ("weak-hash", "Field 4 is 0 (MD5).", changed(4, b"\x00"), 4),
         ("weak-encryption", "Field 3 is 3 (DES).", changed(3, b"\x03"), 4),
-        ("other-suite", "Field 109 is 2.", changed(109, b"\x02"), 4),
+        ("older-suite", "Field 109 is 1, the suite without one-time keys.", changed(109, b"\x01"), 4),
+        ("other-suite", "Field 109 is 3.", changed(109, b"\x03"), 4),
     )  # fmt: skip
 
 

@@ -18,7 +18,7 @@ from teds_provision.protocol.datasheet import NodeKeys, digests, sign_datasheet,
 from teds_provision.protocol.flash import Flash
 from teds_provision.protocol.keys import GROUP_ORDER, SoftwareKey, fingerprint, node_key_message, station_key_message
 from teds_provision.protocol.messages.frames import Command, Function, Reply, decode_reply, security_command
-from teds_provision.protocol.session import SessionKeys, StationSession, _seal
+from teds_provision.protocol.session import SessionKeys, StationSession, _seal, open_mac
 from teds_provision.protocol.tim import Tim
 from teds_provision.teds.image import SECURITY, BlockId
 from tests.protocol.memory import RamFlash
@@ -40,8 +40,7 @@ def key(name: str) -> SoftwareKey:
     """A key of the vectors by name: those of kat.json, and more that follow from their names."""
     if name in NAMES:
         return SoftwareKey(int(KAT[name]["d"], 16))
-    digest = hashlib.sha256(b"TEDS1 vector key\0" + name.encode()).digest()
-    return SoftwareKey(int.from_bytes(digest, "big") % (GROUP_ORDER - 1) + 1)
+    return named_key(name)
 
 
 def keys() -> dict[str, Any]:
@@ -50,6 +49,12 @@ def keys() -> dict[str, Any]:
         name: {"d": key(name).secret().hex(), "P": key(name).point.hex(), "fingerprint": fingerprint(key(name).point)}
         for name in NAMES + MORE_NAMES
     }
+
+
+def named_key(*label: object) -> SoftwareKey:
+    """A one-time key in place of a random one: its scalar follows from a label."""
+    digest = hashlib.sha256(b"TEDS1 vector key\0" + "/".join(map(str, label)).encode()).digest()
+    return SoftwareKey(int.from_bytes(digest, "big") % (GROUP_ORDER - 1) + 1)
 
 
 def octets(*label: object) -> bytes:
@@ -110,15 +115,29 @@ class Scene:
         self.now = 0.0
         self.steps: list[dict[str, Any]] = []
         self.sessions: dict[str, tuple[StationSession, SessionKeys, str]] = {}
-        self._drawn: list[bytes] = []
+        self._drawn: dict[str, str] = {}
         self._tim = self._new()
+        self.first_c = self._drawn["c"]
 
     def _new(self) -> Tim:
-        return Tim(key("node"), self.memory, lambda: self.now, max_message=self.max_message, random=self._draw)
+        return Tim(
+            key("node"),
+            self.memory,
+            lambda: self.now,
+            max_message=self.max_message,
+            random=self._draw,
+            one_time=self._draw_key,
+        )
 
     def _draw(self, size: int) -> bytes:
-        made = octets(self.name, len(self.steps), "nonceN")[:size]
-        self._drawn.append(made)
+        what = "c" if size == 8 else "nonceN"
+        made = octets(self.name, len(self.steps), what)[:size]
+        self._drawn[what] = made.hex()
+        return made
+
+    def _draw_key(self) -> SoftwareKey:
+        made = named_key(self.name, len(self.steps), "En")
+        self._drawn["En"] = made.secret().hex()
         return made
 
     # -- what happens ----------------------------------------------------------------------------------------------
@@ -136,6 +155,7 @@ class Scene:
                 self._tim.link_lost(more["link"])
             case "restart":
                 self._tim = self._new()
+                self.steps[-1]["c"] = self._drawn["c"]
             case "reset_by_hand":
                 self._tim.reset_by_hand()
             case _:
@@ -147,11 +167,9 @@ class Scene:
         """Run one command frame and write it down."""
         command = frame if isinstance(frame, bytes) else frame.encode()
         counts = link == "nfc" if tapped is None else tapped
-        self._drawn = []
+        self._drawn = {}
         reply = self._tim.handle(command, link=link, tapped=counts)
-        step = {"note": note, "at": self.now, "link": link, "tapped": counts, "command": command.hex()}
-        if self._drawn:
-            step["nonceN"] = self._drawn[0].hex()
+        step = {"note": note, "at": self.now, "link": link, "tapped": counts, "command": command.hex(), **self._drawn}
         answer = decode_reply(reply)
         step |= {"reply": reply.hex()} | more
         if answer.reason is not None:
@@ -187,18 +205,30 @@ class Scene:
 
     def open(self, label: str, note: str, *, held: bytes = K, **more: Any) -> Reply:
         """Open under a link key; ``label`` names the session for later steps."""
-        nonce = octets(self.name, len(self.steps), "nonceS")
-        session = StationSession(held, UUID, nonce=nonce)
-        reply = self.say(session.open(), note, open={"session": label, "K": held.hex(), "nonceS": nonce.hex()}, **more)
+        one_time = named_key(self.name, len(self.steps), "Es")
+        session = StationSession(held, UUID, one_time=one_time)
+        counter = self.say(session.ask(), "Open without payload asks for c.", **more).payload
+        told = {"session": label, "K": held.hex(), "Es": one_time.secret().hex(), "c": counter.hex()}
+        reply = self.say(session.open(counter), note, open=told, **more)
         if reply.ok:
             session.accept(reply.payload)
-            derived = SessionKeys.derive(held, UUID, nonce, reply.payload[:16])
+            node = reply.payload[:65]
+            derived = SessionKeys.derive(held, UUID, one_time.ecdh(node), one_time.point, node)
             link = self.steps[-1]["link"]
             self.sessions[label] = (session, derived, link)
             self.steps[-1]["open"] |= {
-                "keyId": key_id(held).hex(), "k_sn": derived.to_node.hex(), "k_ns": derived.to_station.hex()
+                "keyId": key_id(held).hex(), "k_sn": derived.to_node.hex(), "k_ns": derived.to_station.hex(),
+                "k_m": derived.messages.hex(),
             }  # fmt: skip
         return reply
+
+    def crafted_open(self, note: str, *, ahead: int = 0, point: bytes | None = None, held: bytes = K) -> Reply:
+        """An Open whose mac is right for the node's c plus ``ahead``, with any point as Es."""
+        counter = self.say(StationSession(held, UUID).ask(), "Open without payload asks for c.").payload
+        used = ((int.from_bytes(counter, "big") + ahead) % (1 << 64)).to_bytes(8, "big")
+        station = named_key(self.name, len(self.steps), "Es").point if point is None else point
+        payload = key_id(held) + station + open_mac(held, UUID, used, station)
+        return self.say(security_command(Function.OPEN, payload), note, crafted=True)
 
     def sealed(self, label: str, command: Command, note: str, **more: Any) -> Reply:
         """One inner command under the session's next counter."""
@@ -226,7 +256,12 @@ class Scene:
         return {
             "name": self.name,
             "note": self.note,
-            "start": {**described(self.start), "max_message": self.max_message, "max_teds": self._tim.max_teds},
+            "start": {
+                **described(self.start),
+                "max_message": self.max_message,
+                "max_teds": self._tim.max_teds,
+                "c": self.first_c,
+            },
             "steps": self.steps,
             "end": {**described(self.memory.state), "identify": self._tim.identity().encode().hex()},
         }

@@ -87,6 +87,15 @@ def test_weak_algorithms_are_never_authentic(station: Station, image: Image) -> 
     assert failed(station, image.with_block(SECURITY, signed)) == ["algorithms"]
 
 
+def test_a_datasheet_of_the_older_session_suite_is_named_and_never_authentic(station: Station, image: Image) -> None:
+    shown = security.decode(image.blocks[SECURITY])
+    older = replace(shown, values={**shown.values, 109: 1})
+    signed = older.with_signature(station.credentials().key.sign(security.tbs(image.uuid, older.encode()))).encode()
+    old = image.with_block(SECURITY, signed)
+    assert (verdict(station, old), failed(station, old)) == ("not authentic", ["algorithms"])
+    assert any("older session suite 1" in check.why for check in verify_image(station, old))
+
+
 def test_a_foreign_security_teds_is_shown_and_never_trusted(station: Station, image: Image) -> None:
     foreign = frame(security.TEDSID_TUPLE + b"\x01\x01\x04\x02\x01\x02")
     assert verdict(station, image.with_block(SECURITY, foreign)) == "not authentic"

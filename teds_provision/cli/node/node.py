@@ -85,7 +85,7 @@ def create(app: App, folder: Path, uuid: bytes | None, name: str, max_message: i
     "--can", metavar="INTERFACE:CHANNEL", help="Hang on this bus; without --nfc it counts as tapped in factory state."
 )
 @click.option(
-    "--crypto-delay", type=click.FloatRange(min=0), default=0, metavar="MS", help="Milliseconds per signature or ECDH."
+    "--crypto-delay", type=click.FloatRange(min=0), default=0, metavar="MS", help="Milliseconds per point operation."
 )
 @click.option(
     "--flash-delay", type=click.FloatRange(min=0), default=0, metavar="MS", help="Milliseconds per flash commit."

@@ -18,10 +18,12 @@ from teds_provision.teds.image import BlockId
 TEDSID_TUPLE: Final = bytes.fromhex("030400800101")
 
 SIGNATURE, NODE_KEY, NODE_KEY_SIGNATURE, STATION_KEY, STATION_KEY_SIGNATURE = 100, 101, 102, 103, 104
-SIGNED_BLOCK, PROFILE_VERSION = 108, 105
+SIGNED_BLOCK, PROFILE_VERSION, SESSION_SUITE = 108, 105, 109
+OLDER_SUITE = 1
+"""SessionSuite without one-time keys, of this project's first round: shown, never authentic."""
 
 # Our values of Tables 2 to 5, ProfileVersion, SessionSuite and KeyAgreement: the only ones built, accepted or trusted.
-OUR_VALUES: Final = {1: 4, 2: 2, 3: 0, 4: 1, 105: 1, 109: 1, 110: 1}
+OUR_VALUES: Final = {1: 4, 2: 2, 3: 0, 4: 1, 105: 1, 109: 2, 110: 1}
 _U8 = (1, 2, 3, 4, 105, 109, 110)
 _BASE64 = {100: 64, 101: 65, 102: 64, 103: 65, 104: 64}
 _KNOWN = {1, 2, 3, 4, 5, 6, *range(100, 111)}

@@ -98,7 +98,8 @@ def compose_command(
         raise BadData(f"There is no command {group}.{function}.")
     if not 0 <= channel <= 0xFFFF:
         raise BadData(f"A channel is a number from 0 to 65535, not {channel}.")
-    payload = write_plain(spec.arguments, arguments or {}, of=spec.name)
+    asked = spec.answer is not None and not arguments
+    payload = b"" if asked else write_plain(spec.arguments, arguments or {}, of=spec.name)
     head = channel.to_bytes(2, "big") + bytes([group, function])
     return head + _u16(len(payload), spec.name) + payload
 
@@ -180,9 +181,10 @@ def _command(octets: bytes) -> Message:
         text = f"Function {group}.{function} is {'a maker’s own' if own else 'reserved'}."
         findings.append(Finding("note" if own else "error", "unknown-function", text, 3))
     payload = octets[COMMAND_HEADER:]
-    tagged = read_tagged(payload, spec.arguments, COMMAND_HEADER)
+    layout = "" if spec.answer is not None and not payload else spec.arguments
+    tagged = read_tagged(payload, layout, COMMAND_HEADER)
     if tagged is None:
-        arguments, more = read_plain(payload, spec.arguments, COMMAND_HEADER)
+        arguments, more = read_plain(payload, layout, COMMAND_HEADER)
     else:
         text = "The arguments are tagged with type and length; the standard's tables put them one after the other."
         arguments, more = tagged, [Finding("note", "tagged-arguments", text, COMMAND_HEADER)]
@@ -239,7 +241,8 @@ def _reply_layout(ok: bool, payload: bytes, request: Message | None) -> tuple[st
         return "reason:u8", "Refusal", request is None
     if request is not None and request.group is not None and request.function is not None:
         spec = COMMANDS.get((request.group, request.function), Spec(request.name, reply="octets:octets"))
-        layout = (spec.reply or "") if ok or len(payload) in {4, 12} else "octets:octets"
+        form = spec.reply if spec.answer is None or request.arguments else spec.answer
+        layout = (form or "") if ok or len(payload) in {4, 12} else "octets:octets"
         return layout, f"Reply to {spec.name}" if ok else f"Failure of {spec.name}", False
     if not payload:
         return "", "Success" if ok else "Failure", True

@@ -17,11 +17,15 @@ from teds_provision.protocol.messages.frames import SECURITY, Function, Reason
 
 
 class Spec(NamedTuple):
-    """A command or a service: its name, the layout of its arguments, and of its reply (None: it has none)."""
+    """A command or a service: its name, the layout of its arguments, and of its reply (None: it has none).
+
+    ``answer`` is the layout of the reply to the command without arguments, where that is another form of it (Open).
+    """
 
     name: str
     arguments: str = ""
     reply: str | None = None
+    answer: str | None = None
 
 
 CLASSES: Final = {
@@ -112,7 +116,7 @@ _PROFILE: Final[dict[int, Spec]] = {
         "nonce:o16 key_epoch:u32 tag:o16 security_teds:teds",
     ),
     Function.CONFIRM: Spec("Confirm", "tag:o16", ""),
-    Function.OPEN: Spec("Open", "key_id:o8 nonce:o16", "nonce:o16 tag:o16"),
+    Function.OPEN: Spec("Open", "key_id:o8 one_time_key:o65 mac:o16", "one_time_key:o65 tag:o16", "opens:o8"),
     Function.SEALED: Spec("Sealed", "counter:u32 sealed:octets", "counter:u32 sealed:octets"),
     Function.CLOSE: Spec("Close", "", ""),
     Function.IDENTIFY: Spec(

@@ -108,7 +108,9 @@ SECURITY: Final = (
     _security(106, "Sequence", "u32", "grows with every new signature", "M"),
     _security(107, "KeyEpoch", "u32", "the node's key epoch at signing", "M"),
     _security(108, "SignedBlock", "block id", "channel, access code and SHA-256 of a signed TEDS", "M", repeats=True),
-    _security(109, "SessionSuite", "u8", "session suite", "M", enumeration={1: "AES-128-CCM"}),
+    _security(
+        109, "SessionSuite", "u8", "session suite", "M", enumeration={1: "AES-128-CCM", 2: "one-time ECDH, AES-128-CCM"}
+    ),
     _security(110, "KeyAgreement", "u8", "key agreement", "M", enumeration={1: "C(1e, 2s, ECC CDH)"}),
 )
 

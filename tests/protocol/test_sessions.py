@@ -1,0 +1,133 @@
+"""Open with one-time keys: what each side refuses, and what a stolen key does not open (profile section 4)."""
+
+from __future__ import annotations
+
+import pytest
+
+from teds_provision.errors import Garbled, NotAuthentic
+from teds_provision.protocol.agreement import key_id
+from teds_provision.protocol.keys import SoftwareKey
+from teds_provision.protocol.messages.frames import Command, Function, Reason, refusal, security_command
+from teds_provision.protocol.session import SessionKeys, StationSession, _unseal, open_mac
+
+from .desk import UUID, Desk
+
+IDENTIFY = security_command(Function.IDENTIFY)
+OFF_CURVE = b"\x04" + bytes(63) + b"\x01"
+
+
+def opening(desk: Desk, *, one_time: SoftwareKey | None = None) -> tuple[StationSession, Command]:
+    """A session half made: c was asked for, the Open is not sent yet."""
+    session = StationSession(desk.key, UUID, one_time=one_time)
+    return session, session.open(desk.plain(session.ask()).payload)
+
+
+@pytest.mark.parametrize("size", [0, 7, 9])
+def test_the_station_takes_eight_octets_for_c(size: int) -> None:
+    with pytest.raises(Garbled, match="counter for Open"):
+        StationSession(bytes(16), UUID).open(bytes(size))
+
+
+@pytest.mark.parametrize("point", [OFF_CURVE, bytes(65), b"\x02" + SoftwareKey(19).point[1:33] + bytes(32), "its own"])
+def test_the_station_checks_the_nodes_one_time_point(point: bytes | str) -> None:
+    own = SoftwareKey(23)
+    session = StationSession(bytes(16), UUID, one_time=own)
+    session.open(bytes(8))
+    shown = own.point if isinstance(point, str) else point
+    with pytest.raises(NotAuthentic, match="not a valid point, or is our own"):
+        session.accept(shown + bytes(16))
+
+
+@pytest.mark.parametrize("size", [0, 32, 80, 82])
+def test_the_station_refuses_a_reply_of_another_length(size: int) -> None:
+    session = StationSession(bytes(16), UUID)
+    session.open(bytes(8))
+    with pytest.raises(Garbled):
+        session.accept(bytes(size))
+
+
+def test_a_node_without_the_key_is_caught_by_its_tag() -> None:
+    desk, thief = Desk().agree(), Desk().agree()
+    session, _ = opening(desk)
+    reply = thief.plain(session_command(thief, SoftwareKey(29)))
+    assert reply.ok
+    with pytest.raises(NotAuthentic, match="does not hold the key"):
+        session.accept(reply.payload)
+
+
+def session_command(desk: Desk, one_time: SoftwareKey) -> Command:
+    return opening(desk, one_time=one_time)[1]
+
+
+def test_an_open_is_good_once_and_counts() -> None:
+    desk = Desk().agree()
+    before = desk.plain(security_command(Function.OPEN)).payload
+    _, frame = opening(desk)
+    assert desk.plain(frame).ok
+    assert desk.plain(frame) == refusal(Reason.BAD_TAG)
+    after = desk.plain(security_command(Function.OPEN)).payload
+    assert int.from_bytes(after, "big") == int.from_bytes(before, "big") + 1
+
+
+def test_c_is_one_for_all_links_and_new_at_each_start() -> None:
+    desk = Desk().agree()
+    _, frame = opening(desk)
+    assert desk.plain(frame, link="can:f1", tapped=False).ok
+    assert desk.plain(frame) == refusal(Reason.BAD_TAG), "used up by the other link"
+    _, frame = opening(desk)
+    desk.restart()
+    assert desk.plain(frame) == refusal(Reason.BAD_TAG)
+
+
+def test_the_counter_runs_over_without_harm() -> None:
+    desk = Desk().agree()
+    desk.tim._opens = (1 << 64) - 1
+    _, frame = opening(desk)
+    assert desk.plain(frame).ok
+    assert desk.plain(security_command(Function.OPEN)).payload == bytes(8)
+
+
+def test_a_stranger_costs_no_point_arithmetic() -> None:
+    """Without K nobody makes the node draw a one-time key or decode a point."""
+    desk = Desk().agree()
+    made: list[SoftwareKey] = []
+
+    def one_time() -> SoftwareKey:
+        made.append(SoftwareKey.generate())
+        return made[-1]
+
+    desk.tim.one_time = one_time
+    point = SoftwareKey(31).point
+    for payload in (bytes(89), key_id(desk.key) + point + bytes(16), key_id(desk.key) + OFF_CURVE + bytes(16)):
+        assert not desk.plain(security_command(Function.OPEN, payload)).ok
+    assert not made
+    desk.open()
+    desk.open()
+    assert len({key.point for key in made}) == 2, "each for one Open"
+
+
+def test_the_link_key_alone_opens_no_recorded_session() -> None:
+    """What a thief of K has: K, UUID and every frame. Z is missing, and nothing else he has stands for it."""
+    desk = Desk().agree()
+    session, opened = opening(desk)
+    reply = desk.plain(opened).payload
+    session.accept(reply)
+    recorded = session.seal(IDENTIFY).payload
+    station, node = opened.payload[8:73], reply[:65]
+    guesses = (b"", bytes(32), desk.key, station[1:33], node[1:33], open_mac(desk.key, UUID, bytes(8), station))
+    for shared in guesses:
+        derived = SessionKeys.derive(desk.key, UUID, shared, station, node)
+        assert _unseal(derived.to_node, recorded) is None
+    assert desk.plain(security_command(Function.SEALED, recorded)).ok, "the frame was a good one"
+
+
+def test_both_sides_have_one_key_for_data_messages_and_it_is_new_with_each_open() -> None:
+    desk = Desk().agree().open()
+    assert desk.session is not None
+    first = desk.session.message_key
+    assert len(first) == 32
+    line = desk.tim._lines["nfc"]
+    assert line.half_open is not None
+    assert line.half_open.message_key == first
+    desk.open()
+    assert desk.session.message_key != first

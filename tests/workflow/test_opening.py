@@ -1,0 +1,72 @@
+"""Opening a session from the station's side: another station's Open may come between (profile section 4)."""
+
+from __future__ import annotations
+
+import pytest
+
+from teds_provision.errors import NodeRefused
+from teds_provision.protocol.agreement import Credentials, StationAgreement
+from teds_provision.protocol.keys import SoftwareKey, station_key_message
+from teds_provision.protocol.messages.frames import Function, Reason, decode_reply, security_command
+from teds_provision.protocol.session import StationSession
+
+from .bench import Board, MemoryLink, talk
+
+STATION, CA = SoftwareKey(5), SoftwareKey(3)
+
+
+def keyed(board: Board) -> bytes:
+    """Agree a key with the board; returns K."""
+    agreement = StationAgreement(
+        Credentials(STATION, CA.sign(station_key_message(STATION.point)), CA.point), board.uuid
+    )
+    reply = board.tim.handle(agreement.request().encode(), link="nfc", tapped=True)
+    agreed = agreement.accept(decode_reply(reply).payload, pinned=None, epoch=0)
+    board.tim.handle(agreed.confirm.encode(), link="nfc", tapped=True)
+    return agreed.key
+
+
+class FasterStation(MemoryLink):
+    """A link on which another station opens a session whenever this one has just asked for c; so many times."""
+
+    def __init__(self, board: Board, key: bytes, times: int) -> None:
+        super().__init__(board, via="can", tapped=False)
+        self._key, self._times = key, times
+
+    def exchange(self, frame: bytes) -> bytes:
+        reply = super().exchange(frame)
+        if frame == security_command(Function.OPEN).encode() and self._times:
+            self._times -= 1
+            session = StationSession(self._key, self.board.uuid)
+            opened = session.open(decode_reply(reply).payload).encode()
+            assert decode_reply(self.board.tim.handle(opened, link="can:f2", tapped=False)).ok
+        return reply
+
+
+def test_an_open_that_came_second_is_tried_once_more(board: Board) -> None:
+    key = keyed(board)
+    with talk(board, FasterStation(board, key, times=1)) as node:
+        node.open(key)
+        assert node.sealed
+        node.send(security_command(Function.IDENTIFY), "to identify")
+
+
+def test_after_the_second_refusal_the_operator_is_told(board: Board) -> None:
+    key = keyed(board)
+    link = FasterStation(board, key, times=2)
+    with talk(board, link) as node:
+        with pytest.raises(NodeRefused) as caught:
+            node.open(key)
+        assert caught.value.reason == Reason.BAD_TAG
+        assert not node.sealed
+    assert link.count == 4
+
+
+def test_an_unknown_key_is_not_tried_twice(board: Board) -> None:
+    keyed(board)
+    link = MemoryLink(board)
+    with talk(board, link) as node:
+        with pytest.raises(NodeRefused) as caught:
+            node.open(bytes(16))
+        assert caught.value.reason == Reason.UNKNOWN_KEY
+    assert link.count == 2
