@@ -95,7 +95,7 @@ class Tim:
     """One transducer interface module.
 
     ``max_message`` octets (1024 to 4094); ``clock`` gives monotonic seconds; ``random`` gives that many octets, good
-    from the first moment after a start; ``one_time`` makes the key pair of one Open (a board may keep one ready in RAM).
+    from the first moment after a start; ``one_time`` makes the key pair of one Open (a board may have one ready).
     """
 
     key: PrivateKey

@@ -84,7 +84,7 @@ def repetition() -> Iterator[Scene]:
 
     line, sealed = _session(
         "identify-between",
-        "A plain Identify between a Sealed and its repetition. It replaces the stored reply, as every plain request but a functional one does.",
+        "A plain Identify between a Sealed and its repetition replaces the stored reply.",
     )
     line.send(2, sealed, "Counter 1.")
     line.send(3, IDENTIFY, "Identify.")
