@@ -42,17 +42,17 @@ def make(home: Path, name: str) -> Station:
 
 def fill(station: Station, count: int) -> None:
     """Nodes with a proven key each, as after provisioning."""
-    with station.store.transaction():
+    with station.transaction():
         for number in range(count):
             uuid, key = number.to_bytes(10, "big"), number.to_bytes(16, "big")
             point = SoftwareKey(1 + number % 97).point
             identifier = key_id(key)
-            station.add_pending(uuid, key=key, key_id=identifier, epoch=3)
-            station.store.promote_key(uuid, identifier.hex())
-            station.store.put_whitelist(WhitelistEntry(uuid, fingerprint(point)))
+            station.keys.add_pending(uuid, key=key, key_id=identifier, epoch=3)
+            station.keys.promote(uuid, identifier.hex())
+            station.pins.put(WhitelistEntry(uuid, fingerprint(point)))
             name, profile = f"finger {number}", "tactile-finger-sensor"
             record = NodeRecord(uuid, point, name, profile, 2, 3, 7, groups=("left hand",), teds_sha256="ab" * 32)
-            station.store.put_node(record)
+            station.nodes.put(record)
 
 
 def timed(work: Callable[[], object]) -> tuple[float, object]:
@@ -116,7 +116,7 @@ def main(count: int = 10_000) -> None:
         for number in range(ROUNDS):
             south = make(place / f"south{number}", f"south {number}")
             for station, other in ((north, south), (south, north)):
-                station.store.put_trust(TrustRecord(other.name, "station", other.point, other.fingerprint))
+                station.policy.trust(TrustRecord(other.name, "station", other.point, other.fingerprint))
             bundle = place / f"{number}.jwe"
             order = ExportOrder((south.name,), None, "copy")
             exports.append(timed(lambda o=order, b=bundle: export_keys(north, plan_export(north, o), b))[0])
@@ -151,7 +151,7 @@ def memory(place: Path, north: Station, count: int) -> None:
     """Peak of what Python allocates in one export and one import."""
     south = make(place / "memory", "memory")
     for station, other in ((north, south), (south, north)):
-        station.store.put_trust(TrustRecord(other.name, "station", other.point, other.fingerprint))
+        station.policy.trust(TrustRecord(other.name, "station", other.point, other.fingerprint))
     bundle = place / "memory.jwe"
     for name, work in (
         ("export", lambda: export_keys(north, plan_export(north, ExportOrder(("memory",), None, "copy")), bundle)),

@@ -40,13 +40,13 @@ def backup(
     Raises StoreFailure, VaultFailure and its leaves.
     """
     vault = station.vault
-    database = take(station.store)
+    database = take(station._store)
     content = Content(
-        store=station.store.id,
+        store=station.id,
         point=station.point,
         name=station.name,
         created=utc_now(),
-        keystore=station.keystore,
+        keystore=station.identity.keystore,
         material=vault.secret_material(),
         database=database,
     )
@@ -80,7 +80,7 @@ def _count(station: Station, copy: Store) -> tuple[int, int, int]:
 
 def _warnings(station: Station, recovery: bytes | None, useless: int) -> list[str]:
     warnings = []
-    if station.keystore.startswith("pkcs11:"):
+    if station.identity.keystore.startswith("pkcs11:"):
         warnings.append(
             "The station key (and a CA key in the token) cannot leave the token and is not in this backup: "
             "it opens with the same token only."

@@ -30,7 +30,7 @@ def hand_over(demo: Demo, first: Station, second: Station) -> None:
     verify_from(demo, second, "verify")
     with demo.steps.step("refuse") as step:
         try:
-            first.require_whitelisted(demo.uuid)
+            first.policy.require_whitelisted(demo.uuid)
         except PolicyRefused as refused:
             step.detail = refused.message
         else:

@@ -94,11 +94,11 @@ def sign_request(station: Station, request: Request) -> Certificate:
     """Certify a station under this owner's CA, and remember that; raises NotFound where the CA key is not here."""
     if request.station == station.ca:
         raise PolicyRefused("The request names the CA's own key as a station.")
-    known = station.certificate(station.ca, request.station)
-    signature = known or station.certify(request.station)
+    known = station.identity.certificate(station.ca, request.station)
+    signature = known or station.identity.certify(request.station)
     if known is None:
-        with station.store.transaction():
-            station.keep_certificate(station.ca, request.station, signature)
+        with station.transaction():
+            station.identity.keep_certificate(station.ca, request.station, signature)
             station.audit("certify", None, "done", name=request.name, key=fingerprint(request.station))
     return Certificate(request.name, request.station, station.ca, signature)
 
@@ -110,9 +110,9 @@ def ask_for_certificate(home: Path, *, name: str | None, keystore: str | None, a
     """
     with Store.open(home, create=True) as store, StoreLock(home, command="init"):
         station = Station(store, ask)
-        if store.setting("station_point") is not None:
+        if station.identity.is_complete():
             return make_request(station.name, station.vault.identity())
-        if store.setting("requested_point") is None:
+        if station.identity.requested is None:
             vault, why = _vault_without_ca(home, store.id, keystore, ask)
             facts = {
                 "station_name": name or DEFAULT_NAME,
@@ -120,13 +120,12 @@ def ask_for_certificate(home: Path, *, name: str | None, keystore: str | None, a
                 "keystore": keystore if keystore and keystore.startswith("pkcs11:") else vault.kind,
                 "keystore_why": why,
             }
-            with store.transaction():
-                for fact, value in facts.items():
-                    store.set_setting(fact, value)
-                store.audit.append("init", None, "requested", {"fingerprint": fingerprint(vault.identity().point)})
+            with station.transaction():
+                station.identity.keep(facts)
+                station.audit("init", None, "requested", fingerprint=fingerprint(vault.identity().point))
         else:
             vault = station.vault
-        return make_request(store.setting("station_name") or DEFAULT_NAME, vault.identity())
+        return make_request(station.name, vault.identity())
 
 
 def _vault_without_ca(home: Path, store_id: str, keystore: str | None, ask: Ask) -> tuple[Vault, str]:
@@ -149,42 +148,39 @@ def adopt_certificate(home: Path, certificate: Certificate, *, ask: Ask) -> Stat
     if not (home / "store.sqlite3").exists():
         raise NotFound("No station has asked for a certificate here.", hint="First: init --request FILE")
     station = Station(Store.open(home), ask)
-    store = station.store
     try:
         with StoreLock(home, command="init"):
             _adopt(station, certificate)
     except BaseException:
-        store.close()
+        station.close()
         raise
     return station
 
 
 def _adopt(station: Station, certificate: Certificate) -> None:
-    store = station.store
-    own = store.setting("station_point") or store.setting("requested_point")
+    identity = station.identity
+    own = identity.point if identity.is_complete() else identity.requested
     if own is None:
         raise NotFound("No station has asked for a certificate here.", hint="First: init --request FILE")
-    if certificate.station.hex() != own:
+    if certificate.station != own:
         raise PolicyRefused(
             f"The certificate is for station {fingerprint(certificate.station)[:16]},"
-            f" this one is {fingerprint(bytes.fromhex(own))[:16]}."
+            f" this one is {fingerprint(own)[:16]}."
         )
     facts: dict[str, str] = {}
-    if store.setting("station_point") is None:
+    if not identity.is_complete():
         facts = {
-            "station_point": own,
+            "station_point": own.hex(),
             "ca_point": certificate.ca.hex(),
             "station_signature": certificate.signature.hex(),
         }
-    elif station.certificate(certificate.ca, station.point) is not None:
+    elif identity.certificate(certificate.ca, station.point) is not None:
         return
-    with store.transaction():
-        for fact, value in facts.items():
-            store.set_setting(fact, value)
+    with station.transaction():
+        identity.keep(facts)
         if not facts:  # a station with a CA of its own: certified by another one too, for the nodes of that one
-            station.keep_certificate(certificate.ca, station.point, certificate.signature)
-        detail = {"ca": fingerprint(certificate.ca), "own": bool(facts)}
-        store.audit.append("init", None, "certified", detail)
+            identity.keep_certificate(certificate.ca, station.point, certificate.signature)
+        station.audit("init", None, "certified", ca=fingerprint(certificate.ca), own=bool(facts))
 
 
 def _name(value: object) -> str:

@@ -20,7 +20,7 @@ from teds_provision.handover.trust import find_trusted
 from teds_provision.protocol.handover.bundle import Bundle, BundledNode, Mode, seal_bundle
 from teds_provision.protocol.handover.payload import time_text
 from teds_provision.protocol.keys import fingerprint
-from teds_provision.station.station import ROTATION, Station
+from teds_provision.station.station import Station
 from teds_provision.store import Batch, Handover, Holder, KeyRecord, NodeRecord, Tombstone, TrustRecord, utc_now
 
 DEFAULT_DAYS = 7
@@ -84,10 +84,10 @@ def plan_export(station: Station, order: ExportOrder, now: datetime | None = Non
     nodes, skipped = _Selection(station, order, {record.fingerprint for record in receivers}).choose()
     ca = _one_ca(station, order, nodes)
     if order.ca is not None:
-        nodes = [(node, key) for node, key in nodes if station.ca_of(node.uuid) == ca]
+        nodes = [(node, key) for node, key in nodes if station.keys.ca_of(node.uuid) == ca]
     listed = ((node.uuid, key.key_id, key.epoch) for node, key in nodes)
     content = content_digest(station.fingerprint, [r.fingerprint for r in receivers], order.mode, ca, listed)
-    earlier = next((row for row in station.store.handovers() if _is_same(row, content, now)), None)
+    earlier = next((row for row in station.handovers.all() if _is_same(row, content, now)), None)
     signatures = {record.fingerprint: _signature(station, ca, record) for record in receivers}
     expires = datetime.fromisoformat(Notes.from_json(earlier.nodes).expires) if earlier else None
     if expires is None or expires <= now:
@@ -121,7 +121,7 @@ def export_keys(station: Station, plan: ExportPlan, output: Path, now: datetime 
     now = now or datetime.now(UTC)
     sealed = _seal(station, plan, now)
     digest = hashlib.sha256(sealed).hexdigest()
-    with station.store.transaction():
+    with station.transaction():
         _record(station, plan, digest)
     write_new(output, sealed)
     return Exported(plan, digest, len(sealed), fresh=True)
@@ -137,16 +137,15 @@ class _Selection:
     """Which nodes go, by the tables as they are now (read once: there may be ten thousand)."""
 
     def __init__(self, station: Station, order: ExportOrder, receivers: set[str]) -> None:
-        store = station.store
         self.station, self.order, self.receivers = station, order, receivers
-        self.nodes = {node.uuid: node for node in store.nodes()}
-        held = list(store.all_keys())
+        self.nodes = {node.uuid: node for node in station.nodes.all()}
+        held = list(station.keys.all())
         self.keys = {key.uuid: key for key in held if key.state == "active"}
         self.pending = {key.uuid for key in held if key.state == "pending"}
-        self.due = {bytes.fromhex(uuid) for uuid, why in store.settings(ROTATION).items() if why}
-        self.tombstones = {tombstone.uuid: tombstone for tombstone in store.tombstones()}
-        self.revoked = {revocation.uuid for revocation in store.revocations()}
-        self.open = {row.id: row for row in store.handovers() if row.direction == "out" and row.state == OPEN}
+        self.due = station.keys.rotations_due().keys()
+        self.tombstones = {tombstone.uuid: tombstone for tombstone in station.policy.tombstones()}
+        self.revoked = {revocation.uuid for revocation in station.policy.revocations()}
+        self.open = {row.id: row for row in station.handovers.all() if row.direction == "out" and row.state == OPEN}
 
     def choose(self) -> tuple[list[tuple[NodeRecord, KeyRecord]], list[tuple[bytes, str]]]:
         """The nodes with their keys, and those that ``--all`` leaves out."""
@@ -203,7 +202,7 @@ _CURE = "See teds-provision nodes UUID; rotate with: teds-provision agree UUID -
 
 def _one_ca(station: Station, order: ExportOrder, nodes: list[tuple[NodeRecord, KeyRecord]]) -> bytes:
     """The CA that the nodes keep: one bundle has one."""
-    of, own = station.cas_of_nodes(), station.ca
+    of, own = station.keys.cas_of_nodes(), station.ca
     found = {fingerprint(ca): ca for ca in {of.get(node.uuid, own) for node, _ in nodes}}
     if order.ca is not None:
         found = {digits: ca for digits, ca in found.items() if digits.startswith(order.ca.lower())}
@@ -219,10 +218,10 @@ def _one_ca(station: Station, order: ExportOrder, nodes: list[tuple[NodeRecord, 
 
 def _signature(station: Station, ca: bytes, receiver: TrustRecord) -> bytes:
     """SIG104 over the receiver: known, or made now where the CA key is here."""
-    known = station.certificate(ca, receiver.point)
+    known = station.identity.certificate(ca, receiver.point)
     if known is None and ca == station.ca:
         try:
-            known = station.certify(receiver.point)
+            known = station.identity.certify(receiver.point)
         except NotFound:
             known = None
     if known is None:
@@ -239,7 +238,7 @@ def _other_holders(
 ) -> tuple[str, ...]:
     """Stations besides the receivers that hold any of these keys since an earlier copy."""
     chosen = {node.uuid for node, _ in nodes}
-    found = {holder.fingerprint for holder in station.store.holders() if holder.uuid in chosen}
+    found = {holder.fingerprint for holder in station.keys.holders() if holder.uuid in chosen}
     return tuple(sorted(found - {record.fingerprint for record in receivers}))
 
 
@@ -260,7 +259,7 @@ def _already(plan: ExportPlan, output: Path) -> str | None:
 
 
 def _seal(station: Station, plan: ExportPlan, now: datetime) -> bytes:
-    own = station.certificate(plan.ca, station.point)
+    own = station.identity.certificate(plan.ca, station.point)
     bundle = Bundle(
         id=plan.id,
         sender=station.fingerprint,
@@ -272,7 +271,7 @@ def _seal(station: Station, plan: ExportPlan, now: datetime) -> bytes:
         nodes=tuple(_bundled(station, node, key) for node, key in plan.nodes),
         # The sender's own goes along, so that the receiver can hand the nodes back one day.
         station_signatures={**plan.signatures, **({station.fingerprint: own} if own else {})},
-        revoked=tuple(revocation.statement for revocation in station.store.revocations()),
+        revoked=tuple(revocation.statement for revocation in station.policy.revocations()),
     )
     return seal_bundle(bundle, station.vault.identity(), [record.point for record in plan.receivers])
 
@@ -282,7 +281,7 @@ def _bundled(station: Station, node: NodeRecord, key: KeyRecord) -> BundledNode:
     return BundledNode(
         uuid=node.uuid,
         node_key=node.point,
-        key=station.unwrap(key),
+        key=station.keys.unwrap(key),
         epoch=key.epoch,
         sequence=node.sequence,
         profile=node.profile,
@@ -294,20 +293,21 @@ def _bundled(station: Station, node: NodeRecord, key: KeyRecord) -> BundledNode:
 
 def _record(station: Station, plan: ExportPlan, digest: str) -> None:
     """What must be durable before the file: who holds what, the bundle's row, and for a move the tombstones."""
-    store = station.store
     files = (*(Notes.from_json(plan.earlier.nodes).files if plan.earlier else ()), digest)
     uuids_hex = tuple(node.uuid.hex() for node, _ in plan.nodes)
     notes = Notes(uuids_hex, plan.content, plan.ca.hex(), time_text(plan.expires), files)
     peers = tuple(record.fingerprint for record in plan.receivers)
     row = plan.earlier or Handover(plan.id, "out", plan.mode, peers, OPEN, "")
-    store.put_handover(replace(row, nodes=notes.to_json(), bundle_sha256=digest))
+    station.handovers.put(replace(row, nodes=notes.to_json(), bundle_sha256=digest))
     for record in plan.receivers:
-        station.keep_certificate(plan.ca, record.point, plan.signatures[record.fingerprint])
+        station.identity.keep_certificate(plan.ca, record.point, plan.signatures[record.fingerprint])
     if plan.mode == "copy":
         now = utc_now()
-        store.put_batch(Batch(holders=[Holder(node.uuid, peer, now) for node, _ in plan.nodes for peer in peers]))
+        holders = [Holder(node.uuid, peer, now) for node, _ in plan.nodes for peer in peers]
+        station.handovers.take_in(Batch(holders=holders))
     elif plan.earlier is None:
         now = utc_now()
-        store.put_batch(Batch(tombstones=[Tombstone(node.uuid, peers[0], plan.id, now) for node, _ in plan.nodes]))
+        tombstones = [Tombstone(node.uuid, peers[0], plan.id, now) for node, _ in plan.nodes]
+        station.handovers.take_in(Batch(tombstones=tombstones))
     detail = {"handover": plan.id, "mode": plan.mode, "to": list(peers), "nodes": list(uuids_hex), "file": digest}
     station.audit("export", None, "again" if plan.earlier else "done", **detail)

@@ -21,7 +21,7 @@ from teds_provision.protocol.handover.receipt import Receipt, RefusedNode, seal_
 from teds_provision.protocol.handover.revocation import Revocation as Statement
 from teds_provision.protocol.keys import fingerprint, station_key_message, verify
 from teds_provision.protocol.messages.identity import NodeState
-from teds_provision.station.station import CA_OF, NEXT_CA, ROTATION, Station
+from teds_provision.station.station import Station
 from teds_provision.store import Batch, Handover, Holder, KeyRecord, NodeRecord, Revocation, WhitelistEntry, utc_now
 
 Decision = Literal["new", "newer", "same", "refused"]
@@ -80,11 +80,11 @@ def plan_import(station: Station, octets: bytes, now: datetime | None = None) ->
     this station, or every node refused.
     """
     digest = hashlib.sha256(octets).hexdigest()
-    came = [row for row in station.store.handovers() if row.direction == "in"]
+    came = [row for row in station.handovers.all() if row.direction == "in"]
     for row in came:
         if row.bundle_sha256 == digest:
             return _before(row)
-    stations = {record.fingerprint: record.point for record in station.store.trusted() if record.role == "station"}
+    stations = {record.fingerprint: record.point for record in station.policy.trusted() if record.role == "station"}
     opened = open_bundle(octets, station.vault.identity(), stations.get, now or datetime.now(UTC))
     bundle, content = opened.bundle, digest_of(opened.bundle)
     for row in came:
@@ -96,7 +96,7 @@ def plan_import(station: Station, octets: bytes, now: datetime | None = None) ->
                 )
             return _before(row)
     _check_certified(station, opened)
-    denied = tuple(one for one in opened.revocations if station.store.revocation(one.uuid) is None)
+    denied = tuple(one for one in opened.revocations if station.policy.revocation(one.uuid) is None)
     nodes = tuple(_Judge(station, denied, bundle.sender).each(bundle.nodes))
     if nodes and all(node.decision == "refused" for node in nodes):
         first = nodes[0]
@@ -104,7 +104,8 @@ def plan_import(station: Station, octets: bytes, now: datetime | None = None) ->
             f"No node of the bundle can be taken in; {first.node.uuid.hex()}: {first.why}.",
             hint="Nothing was imported. Tell the sender.",
         )
-    known = bundle.ca in station.trusted_cas() or station.certificate(bundle.ca, station.point) is not None
+    certified = station.identity.certificate(bundle.ca, station.point) is not None
+    known = certified or bundle.ca in station.policy.trusted_cas()
     return ImportPlan(opened, content, nodes, denied, known)
 
 
@@ -139,12 +140,12 @@ def import_keys(station: Station, plan: ImportPlan, now: datetime | None = None)
         plan.opened.sha256,
         text.decode("ascii"),
     )
-    with station.store.transaction():
+    with station.transaction():
         _keep_ca(station, plan)
         for statement in plan.denied:
             deny(station, statement)
         _Arrivals(station, plan).take_in()
-        station.store.put_handover(row)
+        station.handovers.put(row)
         taken = [node.node.uuid.hex() for node in plan.taken]
         detail = {"handover": bundle.id, "mode": bundle.mode, "from": bundle.sender, "nodes": taken}
         station.audit("import", None, "done", refused=len(receipt.refused), **detail)
@@ -153,10 +154,10 @@ def import_keys(station: Station, plan: ImportPlan, now: datetime | None = None)
 
 def deny(station: Station, statement: Statement) -> None:
     """Put a signed statement on the deny list; one that is there already stays."""
-    if station.store.revocation(statement.uuid) is None:
+    if station.policy.revocation(statement.uuid) is None:
         created = time_text(statement.created)
         entry = Revocation(statement.uuid, statement.fingerprint, statement.why, statement.statement, created)
-        station.store.put_revocation(entry)
+        station.policy.deny(entry)
         station.audit("revoke", statement.uuid, "on the deny list", why=statement.why, by=statement.sender)
 
 
@@ -168,7 +169,7 @@ def _before(row: Handover) -> Imported:
 def _check_certified(station: Station, opened: OpenedBundle) -> None:
     """The receiver must be able to write and rotate: it needs the CA's signature over its key."""
     ca = opened.bundle.ca
-    if opened.station_signature is None and station.certificate(ca, station.point) is None:
+    if opened.station_signature is None and station.identity.certificate(ca, station.point) is None:
         raise PolicyRefused(
             f"The bundle brings no signature of the CA {fingerprint(ca)[:16]} over this station's key.",
             hint="Ask the sender to export it again, where that CA key is kept.",
@@ -179,14 +180,14 @@ class _Judge:
     """Holds a bundle's nodes against the store, whose tables are read once."""
 
     def __init__(self, station: Station, denied: Iterable[Statement], sender: str) -> None:
-        store = station.store
+        policy = station.policy
         self.sender = sender
-        self.nodes = {node.uuid: node for node in store.nodes()}
-        self.pins = {entry.uuid: entry.fingerprint for entry in store.whitelist()}
-        self.denied = {entry.uuid: entry.why for entry in store.revocations()} | {one.uuid: one.why for one in denied}
-        self.tombstones = {tombstone.uuid: tombstone for tombstone in store.tombstones()}
+        self.nodes = {node.uuid: node for node in station.nodes.all()}
+        self.pins = station.pins.all()
+        self.denied = {entry.uuid: entry.why for entry in policy.revocations()} | {one.uuid: one.why for one in denied}
+        self.tombstones = {tombstone.uuid: tombstone for tombstone in policy.tombstones()}
         self.held: dict[bytes, dict[str, tuple[str, int]]] = {}
-        for key in store.all_keys():
+        for key in station.keys.all():
             self.held.setdefault(key.uuid, {})[key.key_id] = (key.state, key.epoch)
 
     def each(self, nodes: Iterable[BundledNode]) -> Iterable[PlannedNode]:
@@ -199,9 +200,7 @@ class _Judge:
         known, pin = self.nodes.get(node.uuid), self.pins.get(node.uuid)
         if node.uuid in self.denied:
             return f"it is revoked: {self.denied[node.uuid]}"
-        if (known is not None and known.point not in (None, node.node_key)) or (
-            pin is not None and pin != fingerprint(node.node_key)
-        ):
+        if pin is not None and pin != fingerprint(node.node_key):
             return "this UUID is known here with another node key"
         held = self.held.get(node.uuid, {})
         if key_id(node.key).hex() in held:
@@ -225,51 +224,54 @@ def _keep_ca(station: Station, plan: ImportPlan) -> None:
     """Keep the CA's signatures that the bundle brings: over this station, and over those it names that are known."""
     bundle, signature = plan.opened.bundle, plan.opened.station_signature
     if signature is not None:
-        station.keep_certificate(bundle.ca, station.point, signature)
-    points = {record.fingerprint: record.point for record in station.store.trusted() if record.role == "station"}
+        station.identity.keep_certificate(bundle.ca, station.point, signature)
+    points = {record.fingerprint: record.point for record in station.policy.trusted() if record.role == "station"}
     for digits, signature in bundle.station_signatures.items():
         point = points.get(digits)
         if point is None or digits == station.fingerprint:
             continue
         if not verify(bundle.ca, station_key_message(point), signature):
             raise NotAuthentic(f"The bundle's CA signature over station {digits[:16]} does not verify.")
-        station.keep_certificate(bundle.ca, point, signature)
+        station.identity.keep_certificate(bundle.ca, point, signature)
 
 
 class _Arrivals:
     """The rows of every node that is taken in, made from the tables as they are (read once), written at once."""
 
     def __init__(self, station: Station, plan: ImportPlan) -> None:
-        store, bundle = station.store, plan.opened.bundle
+        bundle = plan.opened.bundle
         self.station, self.plan, self.bundle = station, plan, bundle
-        self.known = {node.uuid: node for node in store.nodes()}
-        self.pins = {entry.uuid: entry for entry in store.whitelist()}
-        self.slots = store.slots()
-        self.cas = station.cas_of_nodes()
-        self.resting = {tombstone.uuid for tombstone in store.tombstones()}
+        self.known = {node.uuid: node for node in station.nodes.all()}
+        self.pins = {entry.uuid: entry for entry in station.pins.whitelist()}
+        self.slots = station.keys.slots()
+        self.cas = station.keys.cas_of_nodes()
+        self.resting = {tombstone.uuid for tombstone in station.policy.tombstones()}
         self.others = sorted({bundle.sender, *bundle.to} - {station.fingerprint})
         self.now = utc_now()
 
     def take_in(self) -> None:
         """Write all of them."""
-        taken, store, now = self.plan.taken, self.station.store, self.now
+        taken, now = self.plan.taken, self.now
         back = [one.node.uuid for one in taken if one.node.uuid in self.resting]
-        store.remove_tombstones(back)
+        self.station.policy.take_back(back)
         for uuid in back:
             self.station.audit("handover", uuid, "came back", handover=self.bundle.id)
         mode = self.bundle.mode
-        store.put_batch(
+        rotations, cas, next_cas = self._marks()
+        self.station.handovers.take_in(
             Batch(
                 nodes=[self._node(one.node) for one in taken],
                 whitelist=[entry for entry in (self._entry(one.node) for one in taken) if entry is not None],
                 keys=[self._key(one.node) for one in taken if one.decision != "same"],
                 holders=[Holder(one.node.uuid, other, now, mode) for one in taken for other in self.others],
-                settings=self._settings(),
+                rotations=rotations,
+                cas=cas,
+                next_cas=next_cas,
             )
         )
 
     def _key(self, node: BundledNode) -> KeyRecord:
-        return self.station.wrapped(
+        return self.station.keys.wrapped(
             node.uuid,
             key=node.key,
             key_id=key_id(node.key),
@@ -313,18 +315,19 @@ class _Arrivals:
             teds_sha256=node.teds_sha256 if node.sequence >= known.sequence else known.teds_sha256,
         )
 
-    def _settings(self) -> dict[str, str]:
-        """Which CA each node keeps, and after a move that its key has to be rotated."""
+    def _marks(self) -> tuple[dict[bytes, str], dict[bytes, bytes], dict[bytes, tuple[str, bytes]]]:
+        """Rotations that are due after a move; the CA that each node keeps, or keeps once its new key is proven."""
         ca, own, taken = self.bundle.ca, self.station.ca, self.plan.taken
         why = f"moved here by {self.bundle.id}: the sender has had this key"
-        due = {ROTATION + one.node.uuid.hex(): why for one in taken} if self.bundle.mode == "move" else {}
-        said = "" if ca == own else ca.hex()
+        rotations = {one.node.uuid: why for one in taken} if self.bundle.mode == "move" else {}
+        cas: dict[bytes, bytes] = {}
+        next_cas: dict[bytes, tuple[str, bytes]] = {}
         for one in taken:
             uuid = one.node.uuid
             if one.decision == "same" or self.cas.get(uuid, own) == ca:
                 continue
             if one.decision == "newer":  # the key held now stays good, under its CA, until the new one is proven
-                due[NEXT_CA + uuid.hex()] = f"{key_id(one.node.key).hex()}:{ca.hex()}"
+                next_cas[uuid] = (key_id(one.node.key).hex(), ca)
             else:
-                due[CA_OF + uuid.hex()] = said
-        return due
+                cas[uuid] = ca
+        return rotations, cas, next_cas

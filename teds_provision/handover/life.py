@@ -10,7 +10,6 @@ from teds_provision.errors import BadData, NotFound, UsageFailure
 from teds_provision.handover.import_keys import deny
 from teds_provision.protocol.handover.payload import is_label
 from teds_provision.protocol.handover.revocation import seal_revocation
-from teds_provision.protocol.keys import fingerprint
 from teds_provision.station.station import Station
 from teds_provision.steps.build import BuildOrder, build
 from teds_provision.steps.sign import known_image
@@ -38,32 +37,24 @@ def revoke(station: Station, uuid: bytes, why: str) -> Revoked:
     """Ban a node's key: off the whitelist, its keys deleted, and a signed statement that travels in every bundle."""
     if not why.strip() or not is_label(why):
         raise UsageFailure("Say why, in printable text of at most 1,024 characters.")
-    store, present = station.store, station.store.revocation(uuid)
-    if present is not None and not station.has_keys(uuid) and store.whitelisted(uuid) is None:
+    present = station.policy.revocation(uuid)
+    if present is not None and not station.keys.held(uuid) and station.pins.entry(uuid) is None:
         return Revoked(present, fresh=False)
     statement = None
     if present is None:
         now = datetime.now(UTC)
         key = station.vault.identity()
-        statement = seal_revocation(key, uuid=uuid, node=_pinned(station, uuid), why=why, created=now)
-    with store.transaction():
+        statement = seal_revocation(key, uuid=uuid, node=station.pins.pinned(uuid), why=why, created=now)
+    with station.transaction():
         if statement is not None:
             deny(station, statement)
-        store.remove_whitelist(uuid)
-        keys = store.remove_keys(uuid)
-        store.drop_draft(uuid)
+        station.pins.remove(uuid)
+        keys = station.keys.remove(uuid)
+        station.nodes.drop_draft(uuid)
         station.audit("revoke", uuid, "done", why=why, keys=keys)
-    entry = store.revocation(uuid)
+    entry = station.policy.revocation(uuid)
     assert entry is not None
     return Revoked(entry, fresh=True)
-
-
-def _pinned(station: Station, uuid: bytes) -> str | None:
-    """Fingerprint of the node's key as far as it is known."""
-    entry, node = station.store.whitelisted(uuid), station.store.node(uuid)
-    if entry is not None and entry.fingerprint is not None:
-        return entry.fingerprint
-    return fingerprint(node.point) if node is not None and node.point is not None else None
 
 
 def is_retired(record: NodeRecord | None) -> bool:
@@ -73,18 +64,18 @@ def is_retired(record: NodeRecord | None) -> bool:
 
 def is_finished(station: Station, uuid: bytes) -> bool:
     """Whether a node was taken out of service and signed that it is in factory state."""
-    record = station.store.node(uuid)
+    record = station.nodes.get(uuid)
     return record is not None and is_retired(record) and not (record.verdict or "").endswith(UNCONFIRMED)
 
 
 def retire(station: Station, uuid: bytes, receipt: ResetReceipt | None, *, as_: str = DECOMMISSIONED) -> None:
     """Take a node out of service. Without its receipt that is unconfirmed, and its keys stay for another try."""
-    store, record = station.store, station.store.node(uuid)
+    record = station.nodes.get(uuid)
     verdict = as_ if receipt is not None else as_ + UNCONFIRMED
-    with store.transaction():
-        store.remove_whitelist(uuid)
-        store.drop_draft(uuid)
-        station.remember(uuid, name=None, groups=(), verdict=verdict)
+    with station.transaction():
+        station.pins.remove(uuid)
+        station.nodes.drop_draft(uuid)
+        station.nodes.remember(uuid, name=None, groups=(), verdict=verdict)
         detail = {"proof": receipt.proof.hex()} if receipt is not None else {}
         station.audit("decommission", uuid, verdict, name=record.name if record else None, **detail)
 
@@ -107,12 +98,12 @@ def plan_takeover(station: Station, old: bytes, new: bytes, *, copy_calibration:
     """Look at both nodes; raises NotFound (OLD unknown, no calibration known), UsageFailure, NotWhitelisted (NEW)."""
     if old == new:
         raise UsageFailure("A node cannot replace itself.")
-    before = station.store.node(old)
+    before = station.nodes.get(old)
     if before is None:
         raise NotFound(f"Nothing is known of node {old.hex()}.", hint="See: teds-provision nodes")
-    station.require_not_given_away(old)
-    station.require_whitelisted(new)
-    after = station.store.node(new) or NodeRecord(new)
+    station.policy.require_not_given_away(old)
+    station.policy.require_whitelisted(new)
+    after = station.nodes.get(new) or NodeRecord(new)
     blocks: dict[tuple[int, int], bytes] = {}
     if copy_calibration:
         image = known_image(station, old) or Image(old, {})
@@ -131,15 +122,15 @@ def take_over(station: Station, plan: TakeOver, receipt: ResetReceipt | None) ->
 
     Returns warnings: with a calibration the spare's datasheet is built, to be signed and written.
     """
-    store, old, new = station.store, plan.old, plan.new.uuid
+    old, new = plan.old, plan.new.uuid
     warnings: tuple[str, ...] = ()
-    with store.transaction():
+    with station.transaction():
         if not plan.done:
-            entry, former = store.whitelisted(new), store.whitelisted(old.uuid)
+            entry, former = station.pins.entry(new), station.pins.entry(old.uuid)
             if entry is not None and former is not None and former.name is not None:
-                store.put_whitelist(replace(entry, name=former.name))
-            store.drop_draft(new)
-            station.remember(new, name=old.name, groups=old.groups, profile=old.profile)
+                station.pins.put(replace(entry, name=former.name))
+            station.nodes.drop_draft(new)
+            station.nodes.remember(new, name=old.name, groups=old.groups, profile=old.profile)
             if plan.calibration:
                 order = BuildOrder(old.profile, name=old.name)
                 warnings = build(station, new, order, has=Image(new, plan.calibration)).warnings

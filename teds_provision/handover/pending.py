@@ -76,7 +76,7 @@ def digest_of(bundle: Bundle) -> str:
 
 def peer_name(station: Station, fingerprint: str) -> str:
     """Name under which a station is trusted, else the first digits of its fingerprint."""
-    for record in station.store.trusted():
+    for record in station.policy.trusted():
         if record.fingerprint == fingerprint and record.role == "station":
             return record.name
     return fingerprint[:16]
@@ -84,7 +84,7 @@ def peer_name(station: Station, fingerprint: str) -> str:
 
 def find_handover(station: Station, text: str) -> Handover:
     """Return the bundle that left under this id, or its first digits; raises NotFound."""
-    fits = [row for row in station.store.handovers() if row.direction == "out" and row.id.startswith(text.lower())]
+    fits = [row for row in station.handovers.all() if row.direction == "out" and row.id.startswith(text.lower())]
     if len(fits) != 1 or len(text) < 4:
         raise NotFound(f"No handover that left here is known as {text!r}.", hint="See: teds-provision handover list")
     return fits[0]
@@ -118,10 +118,10 @@ def undo(station: Station, row: Handover) -> Undone:
         )
     if row.state == UNDONE:
         return Undone(row, uuids, fresh=False)
-    with station.store.transaction():
+    with station.transaction():
         for uuid in uuids:
             _lift(station, uuid, row)
-        station.store.put_handover(replace(row, state=UNDONE))
+        station.handovers.put(replace(row, state=UNDONE))
         station.audit("handover", None, "undone", handover=row.id, nodes=[uuid.hex() for uuid in uuids])
     return Undone(row, uuids, fresh=True)
 
@@ -143,9 +143,9 @@ def close(station: Station, octets: bytes) -> Closed:
     What the receiver refused comes back to this station, to be rotated at the next contact. Raises NotAuthentic
     (signature, sender, another file), PolicyRefused (not ours, undone), NotFound (unknown id), BadData.
     """
-    stations = {record.fingerprint: record.point for record in station.store.trusted() if record.role == "station"}
+    stations = {record.fingerprint: record.point for record in station.policy.trusted() if record.role == "station"}
     receipt = open_receipt(octets, stations.get)
-    row = station.store.handover(receipt.id, "out")
+    row = station.handovers.get(receipt.id, "out")
     if row is None:
         raise NotFound(f"No bundle {receipt.id} left this station.", hint="Give the receipt to the bundle's sender.")
     _check_receipt(station, row, receipt)
@@ -160,19 +160,19 @@ def close(station: Station, octets: bytes) -> Closed:
             f" {len(receipt.imported)} keys in all the same.",
             hint="Rotate them at once: teds-provision agree UUID --rotate. Or export the move anew.",
         )
-    with station.store.transaction():
+    with station.transaction():
         for uuid in receipt.imported if row.mode == "move" else ():
-            station.store.remove_keys(uuid)
-            station.store.drop_draft(uuid)
+            station.keys.remove(uuid)
+            station.nodes.drop_draft(uuid)
         for refused in receipt.refused:
             if row.mode == "move":
                 _lift(station, refused.uuid, row)
             else:
-                station.store.remove_holder(refused.uuid, receipt.sender)
+                station.keys.remove_holder(refused.uuid, receipt.sender)
         texts.append(text)
         state = CLOSED if len(texts) >= len(row.peers) else row.state
         row = replace(row, state=state, receipt="\n".join(texts))
-        station.store.put_handover(row)
+        station.handovers.put(row)
         detail = {"handover": row.id, "imported": len(receipt.imported), "refused": len(receipt.refused)}
         station.audit("handover", None, "receipt", state=state, **{"from": receipt.sender}, **detail)
     return Closed(row, receipt, fresh=True)
@@ -194,11 +194,11 @@ def _check_receipt(station: Station, row: Handover, receipt: Receipt) -> None:
 
 def _lift(station: Station, uuid: bytes, row: Handover) -> None:
     """Let a resting key be used again; as another station may have it, a new one is due first."""
-    tombstone = station.store.tombstone(uuid)
+    tombstone = station.policy.tombstone(uuid)
     if tombstone is not None and tombstone.handover_id == row.id:
-        station.store.remove_tombstone(uuid)
-        station.demand_rotation(uuid, f"the move {row.id} did not happen")
-        station.store.put_holder(Holder(uuid, row.peers[0], mode="move"))
+        station.policy.take_back([uuid])
+        station.keys.demand_rotation(uuid, f"the move {row.id} did not happen")
+        station.keys.put_holder(Holder(uuid, row.peers[0], mode="move"))
 
 
 @dataclass(frozen=True)
@@ -214,9 +214,9 @@ class Listed:
 
 def list_handovers(station: Station, now: datetime) -> list[Listed]:
     """Every bundle that left or came, oldest first; ``expired`` says that an open one can be imported no more."""
-    names = {record.fingerprint: record.name for record in station.store.trusted() if record.role == "station"}
+    names = {record.fingerprint: record.name for record in station.policy.trusted() if record.role == "station"}
     listed = []
-    for row in station.store.handovers():
+    for row in station.handovers.all():
         notes = Notes.from_json(row.nodes)
         expired = row.state == OPEN and datetime.fromisoformat(notes.expires) <= now
         peers = tuple(names.get(peer, peer[:16]) for peer in row.peers)

@@ -37,7 +37,7 @@ def prove_node(station: Station, node: Conversation) -> Proven:
 
     Raises TedsProvisionError: link, other key, unknown key.
     """
-    due = station.rotation_due(node.uuid) is not None
+    due = station.keys.rotation_due(node.uuid) is not None
     identify(station, node)
     held = require_session(station, node)
     station.audit("handover", node.uuid, "taken over", epoch=held.record.epoch, rotated=due)
@@ -46,8 +46,8 @@ def prove_node(station: Station, node: Conversation) -> Proven:
 
 def is_proven(station: Station, uuid: bytes) -> bool:
     """Whether a session was opened under the key that is held, and no rotation is due any more."""
-    active = any(key.state == "active" for key in station.store.keys(uuid))
-    return active and station.rotation_due(uuid) is None
+    active = any(key.state == "active" for key in station.keys.of(uuid))
+    return active and station.keys.rotation_due(uuid) is None
 
 
 def prove_nodes(

@@ -48,7 +48,7 @@ def candidate(station: Station, name: str, path: Path, role: TrustRole) -> Candi
         raise PolicyRefused(f"{path} holds this station's own key ({digits[:16]}); it needs no trust.")
     _check_name(name)
     record = TrustRecord(name, role, point, digits)
-    present = [known for known in station.store.trusted() if known.name == name or known.fingerprint == digits]
+    present = [known for known in station.policy.trusted() if known.name == name or known.fingerprint == digits]
     known = any((old.name, old.role, old.point) == (name, role, point) for old in present)
     for old in present:
         if old.name == name and (old.role, old.point) != (role, point):
@@ -110,13 +110,15 @@ def private_keys(folder: Path) -> Iterator[tuple[Path, str]]:
 def add(station: Station, chosen: list[Candidate]) -> int:
     """Trust these keys, in one transaction; returns how many were new."""
     new = 0
-    with station.store.transaction():
+    with station.transaction():
         for one in chosen:
             if one.certificate is not None:
-                station.keep_certificate(one.certificate.ca, one.certificate.station, one.certificate.signature)
+                station.identity.keep_certificate(
+                    one.certificate.ca, one.certificate.station, one.certificate.signature
+                )
             if one.known:
                 continue
-            station.store.put_trust(one.record)
+            station.policy.trust(one.record)
             station.audit(
                 "trust", None, "added", name=one.record.name, role=one.record.role, key=one.record.fingerprint
             )
@@ -129,7 +131,7 @@ def find_trusted(station: Station, text: str, role: TrustRole | None = None) -> 
 
     Raises NotFound, UsageFailure (several fit), BadData (file), PolicyRefused (the file's key is not trusted).
     """
-    known = [record for record in station.store.trusted() if role in (None, record.role)]
+    known = [record for record in station.policy.trusted() if role in (None, record.role)]
     digits = text.replace(" ", "").lower()
     by_digits = len(digits) >= _MIN_PREFIX and not set(digits) - set("0123456789abcdef")
     fits = [record for record in known if record.name == text] or [
@@ -156,8 +158,8 @@ def find_trusted(station: Station, text: str, role: TrustRole | None = None) -> 
 
 def remove(station: Station, record: TrustRecord) -> None:
     """Trust a key no more. What it signed before is not trusted any more either."""
-    with station.store.transaction():
-        station.store.remove_trust(record.name)
+    with station.transaction():
+        station.policy.distrust(record.name)
         station.audit("trust", None, "removed", name=record.name, role=record.role, key=record.fingerprint)
 
 

@@ -13,7 +13,7 @@ from teds_provision.store import KeyRecord, NodeRecord
 
 def inventory(station: Station, uuid: bytes | None = None) -> list[dict[str, Any]]:
     """Describe every node, or the one of ``uuid``; raises NotFound where nothing at all is known of it."""
-    store = station.store
+    store = station._store
     if uuid is not None:
         known = store.node(uuid)
         named = known or store.whitelisted(uuid) or store.keys(uuid) or store.tombstone(uuid) or store.revocation(uuid)

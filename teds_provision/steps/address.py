@@ -7,11 +7,9 @@ from teds_provision.protocol.messages.frames import Function, security_command
 from teds_provision.station.station import Station
 from teds_provision.steps.agree import open_session
 from teds_provision.steps.identify import identify
-from teds_provision.steps.journal import recorded
 from teds_provision.talk.conversation import Conversation, SessionLost
 
 
-@recorded("address")
 def set_address(station: Station, node: Conversation, address: int) -> bool:
     """Give the node another CAN address, 1 to 239, durably; False where it has it already.
 
@@ -30,7 +28,7 @@ def set_address(station: Station, node: Conversation, address: int) -> bool:
         node.forget()  # a link is one pair of addresses: this session ended with the old one
     elif node.sealed and _address_of(node) != address:
         raise Garbled("The node took the new CAN address and still shows the old one.")
-    station.remember(node.uuid, can_address=address)
+    station.nodes.remember(node.uuid, can_address=address)
     station.audit("address", node.uuid, "done", address=address)
     return True
 

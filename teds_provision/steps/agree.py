@@ -8,10 +8,8 @@ from teds_provision.errors import NodeRefused, NotAuthentic, PolicyRefused
 from teds_provision.protocol.agreement import StationAgreement
 from teds_provision.protocol.messages.frames import Reason
 from teds_provision.protocol.messages.identity import NodeState
-from teds_provision.station.boards import epoch_to_exceed, settled
 from teds_provision.station.station import NodeKey, Station
 from teds_provision.steps.identify import Identified
-from teds_provision.steps.journal import recorded
 from teds_provision.steps.read import read_identity
 from teds_provision.store import WhitelistEntry
 from teds_provision.talk.conversation import Conversation, SessionLost
@@ -32,8 +30,8 @@ def open_session(station: Station, node: Conversation) -> NodeKey | None:
     The key that worked becomes the active one and all others go: that is the only thing that ever deletes a key.
     Raises PolicyRefused for a node that was moved away, LinkFailure.
     """
-    station.require_not_given_away(node.uuid)
-    for held in station.node_keys(node.uuid):
+    station.policy.require_not_given_away(node.uuid)
+    for held in station.keys.unwrapped(node.uuid):
         try:
             node.open(held.key)
         except NodeRefused as refusal:
@@ -42,13 +40,14 @@ def open_session(station: Station, node: Conversation) -> NodeKey | None:
             raise
         except NotAuthentic:
             continue
-        with station.store.transaction():
-            settled(station, node.uuid)
-            station.remember(node.uuid, epoch=held.record.epoch)  # what is signed without the node is for this epoch
-            if held.record.state == "pending" or len(station.store.keys(node.uuid)) > 1:
-                station.promote(node.uuid, held.record.key_id)
+        with station.transaction():
+            station.pins.settled(node.uuid)
+            # what is signed without the node is for this epoch
+            station.nodes.remember(node.uuid, epoch=held.record.epoch)
+            if held.record.state == "pending" or len(station.keys.of(node.uuid)) > 1:
+                station.keys.promote(node.uuid, held.record.key_id)
                 if held.record.state == "pending" and held.record.source == "agreement":
-                    station.rotated(node.uuid)
+                    station.keys.rotated(node.uuid)
                 station.audit("key", node.uuid, "active", key_id=held.record.key_id, epoch=held.record.epoch)
         return held
     return None
@@ -59,27 +58,27 @@ def session_if_keyed(station: Station, node: Conversation) -> NodeKey | None:
 
     None for a node whose keys this station does not hold, or gave away.
     """
-    if station.store.tombstone(node.uuid) is not None:
+    if station.policy.tombstone(node.uuid) is not None:
         return None
     held = open_session(station, node)
-    entry = station.store.whitelisted(node.uuid)
-    due = station.rotation_due(node.uuid) is not None and entry is not None and entry.fingerprint is not None
+    entry = station.pins.entry(node.uuid)
+    due = station.keys.rotation_due(node.uuid) is not None and entry is not None and entry.fingerprint is not None
     if held is None or not due or entry is None:
         return held
     try:
-        _agree_anew(station, node, entry, station.ca_of(node.uuid))
+        _agree_anew(station, node, entry, station.keys.ca_of(node.uuid))
     except SessionLost as lost:
         raise lost.cause from lost
-    return next(iter(station.node_keys(node.uuid)))
+    return next(iter(station.keys.unwrapped(node.uuid)))
 
 
 def require_session(station: Station, node: Conversation) -> NodeKey:
     """Open a session or say why there is none: given away, no key held (PolicyRefused), or the node has another."""
-    station.require_not_given_away(node.uuid)
+    station.policy.require_not_given_away(node.uuid)
     held = session_if_keyed(station, node)
     if held is not None:
         return held
-    if not station.has_keys(node.uuid):
+    if not station.keys.held(node.uuid):
         raise PolicyRefused(
             f"This station holds no key of node {node.uuid.hex()}.",
             hint=f"Tap it and agree on one: teds-provision agree {node.uuid.hex()}",
@@ -95,7 +94,6 @@ def unknown_key(uuid: bytes) -> PolicyRefused:
     )
 
 
-@recorded("agree")
 def agree(station: Station, node: Conversation, who: Identified, *, rotate: bool = False) -> Agreed:
     """End with a session open under an agreed key: the present one, or a new one.
 
@@ -103,15 +101,15 @@ def agree(station: Station, node: Conversation, who: Identified, *, rotate: bool
     PolicyRefused, NodeRefused, NotAuthentic, LinkFailure; whatever is cut, the same call carries on.
     """
     returning = who.state == NodeState.FACTORY and _may_return(station, node.uuid)
-    entry = station.require_whitelisted(node.uuid, returning=returning)
+    entry = station.policy.require_whitelisted(node.uuid, returning=returning)
     held = open_session(station, node) if who.state != NodeState.FACTORY else None
-    rotate = rotate or (held is not None and station.rotation_due(node.uuid) is not None)
+    rotate = rotate or (held is not None and station.keys.rotation_due(node.uuid) is not None)
     if held is not None and not rotate:
         return Agreed(held.record.epoch, held.record.key_id, fresh=False)
-    if held is None and who.state != NodeState.FACTORY and station.has_keys(node.uuid) and not rotate:
+    if held is None and who.state != NodeState.FACTORY and station.keys.held(node.uuid) and not rotate:
         raise unknown_key(node.uuid)
     pinned = _pin_for(entry, node, who)
-    ca = station.ca if who.state == NodeState.FACTORY else station.ca_of(node.uuid)
+    ca = station.ca if who.state == NodeState.FACTORY else station.keys.ca_of(node.uuid)
     try:
         return _agree_anew(station, node, pinned, ca, returning=returning)
     except NodeRefused as refusal:
@@ -127,9 +125,9 @@ def agree(station: Station, node: Conversation, who: Identified, *, rotate: bool
 
 def _may_return(station: Station, uuid: bytes) -> bool:
     """Whether a node whose move was closed by its receipt may be keyed here again, should it prove to be reset."""
-    tombstone = station.store.tombstone(uuid)
-    row = station.store.handover(tombstone.handover_id, "out") if tombstone is not None else None
-    return row is not None and row.state == "closed" and not station.has_keys(uuid)
+    tombstone = station.policy.tombstone(uuid)
+    row = station.handovers.get(tombstone.handover_id, "out") if tombstone is not None else None
+    return row is not None and row.state == "closed" and not station.keys.held(uuid)
 
 
 def _pin_for(entry: WhitelistEntry, node: Conversation, who: Identified) -> WhitelistEntry:
@@ -155,32 +153,33 @@ def _agree_anew(
     """
     uuid = node.uuid
     agreement = StationAgreement(
-        replace(station.credentials(), ca=ca, station_signature=station.signature_under(ca)), uuid
+        replace(station.credentials(), ca=ca, station_signature=station.identity.signature_under(ca)), uuid
     )
     reply = node.send(agreement.request(), "the key agreement")
-    agreed = agreement.accept(reply, pinned=entry.fingerprint, epoch=epoch_to_exceed(station, uuid, entry.fingerprint))
+    epoch = station.pins.epoch_to_exceed(uuid, entry.fingerprint)
+    agreed = agreement.accept(reply, pinned=entry.fingerprint, epoch=epoch)
     key_id = agreed.key_id.hex()
     if returning and not agreed.unsigned:
-        station.require_not_given_away(uuid)
-    with station.store.transaction():
+        station.policy.require_not_given_away(uuid)
+    with station.transaction():
         if returning:
-            station.store.remove_tombstone(uuid)
+            station.policy.take_back([uuid])
             station.audit("handover", uuid, "came back after a reset")
-        station.add_pending(uuid, key=agreed.key, key_id=agreed.key_id, epoch=agreed.epoch)
-        station.set_ca_of(uuid, ca)
-        if entry != station.store.whitelisted(uuid):
-            station.store.put_whitelist(entry)
+        station.keys.add_pending(uuid, key=agreed.key, key_id=agreed.key_id, epoch=agreed.epoch)
+        station.keys.set_ca_of(uuid, ca)
+        if entry != station.pins.entry(uuid):
+            station.pins.put(entry)
         station.audit("agree", uuid, "pending", key_id=key_id, epoch=agreed.epoch, via=node.contact.link.via)
     node.send(agreed.confirm, "the key confirmation")
     node.forget()
     node.open(agreed.key)
-    with station.store.transaction():
-        station.promote(uuid, key_id)
-        station.remember(uuid, epoch=agreed.epoch, point=agreed.node)
-        station.rotated(uuid)
-        settled(station, uuid)
+    with station.transaction():
+        station.keys.promote(uuid, key_id)
+        station.nodes.remember(uuid, epoch=agreed.epoch, point=agreed.node)
+        station.keys.rotated(uuid)
+        station.pins.settled(uuid)
     identity = read_identity(node)
-    station.remember(
+    station.nodes.remember(
         uuid,
         sequence=identity.sequence,
         state=int(identity.state),

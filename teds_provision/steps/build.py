@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING
 
 from teds_provision.errors import BadData, NotFound, UsageFailure
 from teds_provision.station.station import Station
-from teds_provision.steps.journal import recorded
 from teds_provision.steps.sign import known_image, known_node_keys, unsigned_security
 from teds_provision.store import Draft
 from teds_provision.teds.image import SECURITY, BlockId, Image
@@ -43,7 +42,6 @@ class Built:
     calibrations: Mapping[int, Calibration] = field(default_factory=dict)
 
 
-@recorded("build")
 def build(
     station: Station,
     uuid: bytes,
@@ -82,9 +80,9 @@ def build(
         warnings += ("The node's key is not known yet: the Security TEDS is added when it was identified.",)
     if not keep_draft:
         return Built(image, profile.name, warnings, calibrations)
-    with station.store.transaction():
-        station.remember(uuid, profile=plan.wanted, name=plan.name)
-        station.store.put_draft(Draft(uuid, image.to_json(), "built", plan.wanted))
+    with station.transaction():
+        station.nodes.remember(uuid, profile=plan.wanted, name=plan.name)
+        station.nodes.keep_draft(Draft(uuid, image.to_json(), "built", plan.wanted))
         station.audit("build", uuid, "done", profile=profile.name, teds=image.digest())
     return Built(image, profile.name, warnings, calibrations)
 
@@ -104,11 +102,11 @@ class _Composed:
 def _composed(station: Station, uuid: bytes, order: BuildOrder, has: Image | None, edition: int) -> _Composed:
     from teds_provision.teds.profile import default_folders, load_profile
 
-    record = station.store.node(uuid)
+    record = station.nodes.get(uuid)
     wanted = order.profile or (record.profile if record else None)
     if wanted is None:
         raise UsageFailure(f"No profile is known for node {uuid.hex()}.", hint="Add --profile; see: profile list")
-    profile = load_profile(wanted, default_folders(station.store.home))
+    profile = load_profile(wanted, default_folders(station.home))
     calibrations, warnings = _calibrations(order, profile, has)
     name = order.name or (record.name if record else None)
     try:
@@ -129,7 +127,7 @@ def check_order(station: Station, uuid: bytes | None, order: BuildOrder) -> None
 
 def _pending(station: Station, uuid: bytes, has: Image | None) -> Image | None:
     """What an earlier run built or signed and never wrote: it says which calibration is meant, not the node."""
-    draft = station.store.draft(uuid)
+    draft = station.nodes.draft(uuid)
     if draft is None:
         return None
     image = Image.from_json(draft.image)

@@ -11,7 +11,6 @@ from teds_provision.protocol.keys import fingerprint, is_point, node_key_message
 from teds_provision.protocol.messages.frames import Function, security_command
 from teds_provision.protocol.messages.identity import NodeState
 from teds_provision.station.station import Station
-from teds_provision.steps.journal import recorded
 from teds_provision.steps.read import read_block
 from teds_provision.store import WhitelistEntry, utc_now
 from teds_provision.talk.conversation import Conversation
@@ -52,7 +51,6 @@ def prove(node: Conversation, point: bytes) -> None:
         )
 
 
-@recorded("identify")
 def identify(station: Station, node: Conversation) -> Identified:
     """Read UUID and key, demand the proof, and hold both against what this station knows.
 
@@ -62,7 +60,7 @@ def identify(station: Station, node: Conversation) -> Identified:
     """
     who = examine(station, node)
     pinned = who.whitelisted is not None and who.whitelisted.fingerprint is not None
-    station.remember(
+    station.nodes.remember(
         node.uuid,
         last_seen=utc_now(),
         **({"point": who.point} if node.tapped or pinned else {}),
@@ -71,15 +69,15 @@ def identify(station: Station, node: Conversation) -> Identified:
         who = replace(who, whitelisted=_pin(station, who.whitelisted, who.fingerprint))
     known = known_key(station, node.uuid)
     if known != who.point:
-        station.store.put_node_image(node.uuid, Image(node.uuid, {SECURITY: who.security_teds}).to_json())
+        station.nodes.keep_datasheet(Image(node.uuid, {SECURITY: who.security_teds}))
     return who
 
 
 def _pin(station: Station, entry: WhitelistEntry, key: str) -> WhitelistEntry:
     """Give an entry that was made without a fingerprint the key that was just tapped and proven (section 2)."""
     pinned = replace(entry, fingerprint=key, assurance="tap")
-    with station.store.transaction():
-        station.store.put_whitelist(pinned)
+    with station.transaction():
+        station.pins.put(pinned)
         station.audit("whitelist", entry.uuid, "pinned", fingerprint=key, assurance="tap")
     return pinned
 
@@ -92,7 +90,7 @@ def examine(station: Station, node: Conversation) -> Identified:
     if not is_point(point) or not verify(point, node_key_message(node.uuid, point), shown.node_key_signature):
         raise NotAuthentic(f"The key that the node shows is not signed for UUID {node.uuid.hex()} (field 102).")
     prove(node, point)
-    station.check_pin(node.uuid, point)
+    station.pins.check(node.uuid, point)
     identity = node.identity
     return Identified(
         uuid=node.uuid,
@@ -102,14 +100,14 @@ def examine(station: Station, node: Conversation) -> Identified:
         tag_uid=node.contact.tag_uid,
         address=node.contact.address,
         security_teds=octets,
-        whitelisted=station.store.whitelisted(node.uuid),
+        whitelisted=station.pins.entry(node.uuid),
     )
 
 
 def known_key(station: Station, uuid: bytes) -> bytes | None:
     """P(node) of the Security TEDS that was last read from this UUID, None where there is none of this profile."""
-    text = station.store.node_image(uuid)
-    octets = Image.from_json(text).security if text is not None else None
+    image = station.nodes.datasheet(uuid)
+    octets = image.security if image is not None else None
     try:
         return security.decode(octets).node_key if octets is not None else None
     except BadData:

@@ -16,7 +16,6 @@ from teds_provision.station.station import Station
 from teds_provision.steps.agree import Agreed, agree
 from teds_provision.steps.build import BuildOrder, Built, build, check_order
 from teds_provision.steps.identify import Identified, identify
-from teds_provision.steps.journal import recorded
 from teds_provision.steps.read import Survey, survey
 from teds_provision.steps.sign import Signed, sign
 from teds_provision.steps.verify import Verified
@@ -43,7 +42,6 @@ class Provisioned:
     warnings: tuple[str, ...]
 
 
-@recorded("provision")
 def provision(
     station: Station, node: Conversation, order: BuildOrder, *, accept: Accept, reporter: Reporter
 ) -> Provisioned:
@@ -65,7 +63,7 @@ class _Run:
         self._whitelist(who)
         self._agree(who)
         present = survey(self.node)
-        earlier = _signed_draft(self.station.store.draft(who.uuid))
+        earlier = _signed_draft(self.station.nodes.draft(who.uuid))
         built = self._build(present)
         signed = self._sign(who, built, present, earlier)
         written = self._write(signed, present)
@@ -119,7 +117,7 @@ class _Run:
                 on_node=present.image.security if intact and present.identity.state == NodeState.PROVISIONED else None,
                 earlier=() if earlier is None else (earlier,),
             )
-            self.station.store.put_draft(Draft(who.uuid, signed.image.to_json(), "signed", built.profile))
+            self.station.nodes.keep_draft(Draft(who.uuid, signed.image.to_json(), "signed", built.profile))
             step.result = NOTHING if signed.reused else DONE
             step.detail = f"sequence {signed.sequence}"
         return signed
@@ -148,17 +146,17 @@ def add_to_whitelist(station: Station, node: Conversation, who: Identified) -> W
     assurance: Assurance = "tap" if node.tapped else "bus" if new else "uuid"
     pinned = who.fingerprint if node.tapped or new else None
     entry = WhitelistEntry(who.uuid, pinned, assurance=assurance)
-    with station.store.transaction():
-        revoked = station.store.revocation(who.uuid)
+    with station.transaction():
+        revoked = station.policy.revocation(who.uuid)
         if revoked is not None:
             raise PolicyRefused(f"Node {who.uuid.hex()} was revoked: {revoked.why}.", hint="It was not whitelisted.")
-        station.check_pin(who.uuid, who.point)
-        present = station.store.whitelisted(who.uuid)
+        station.pins.check(who.uuid, who.point)
+        present = station.pins.entry(who.uuid)
         if present is not None:
             return present
-        station.store.put_whitelist(entry)
+        station.pins.put(entry)
         if pinned is not None:
-            station.remember(who.uuid, point=who.point)
+            station.nodes.remember(who.uuid, point=who.point)
         station.audit("whitelist", who.uuid, "added", fingerprint=pinned, assurance=assurance)
     return entry
 

@@ -12,7 +12,6 @@ from teds_provision.protocol.messages.identity import NodeState
 from teds_provision.station.station import Station
 from teds_provision.steps.agree import require_session
 from teds_provision.steps.identify import CHALLENGE_OCTETS, Identified
-from teds_provision.steps.journal import recorded
 from teds_provision.steps.read import read_identity
 from teds_provision.talk.conversation import Conversation, SessionLost
 
@@ -26,7 +25,6 @@ class ResetReceipt:
     proof: bytes
 
 
-@recorded("reset")
 def reset_node(station: Station, node: Conversation, who: Identified) -> ResetReceipt:
     """Reset in a session; a node that is in factory state already gives the same proof plainly.
 
@@ -36,9 +34,9 @@ def reset_node(station: Station, node: Conversation, who: Identified) -> ResetRe
     if who.state != NodeState.FACTORY:
         require_session(station, node)
     receipt = proof_of_reset(node, who.point)
-    with station.store.transaction():
-        station.store.remove_keys(who.uuid)
-        station.remember(who.uuid, state=int(NodeState.FACTORY), verdict=None)
+    with station.transaction():
+        station.keys.remove(who.uuid)
+        station.nodes.remember(who.uuid, state=int(NodeState.FACTORY), verdict=None)
         told = {"challenge": receipt.challenge.hex(), "proof": receipt.proof.hex()}
         station.audit("reset", who.uuid, "done", epoch=receipt.epoch, **told)
     return receipt

@@ -53,7 +53,7 @@ def known_node_keys(station: Station, uuid: bytes, image: Image | None = None) -
     for source in (image, known_image(station, uuid)):
         if source is not None and source.security is not None:
             keys = node_keys_of(uuid, source.security)
-            station.check_pin(uuid, keys.key)
+            station.pins.check(uuid, keys.key)
             return keys
     raise NotFound(
         f"The key of node {uuid.hex()} is not known yet.",
@@ -63,19 +63,18 @@ def known_node_keys(station: Station, uuid: bytes, image: Image | None = None) -
 
 def known_image(station: Station, uuid: bytes) -> Image | None:
     """What the node had when it was last read, None if it never was."""
-    text = station.store.node_image(uuid)
-    return None if text is None else Image.from_json(text)
+    return station.nodes.datasheet(uuid)
 
 
 def unsigned_security(station: Station, keys: NodeKeys, image: Image) -> bytes:
     """The Security TEDS of a built image: everything but the signature, sequence and epoch as they are now."""
-    node = station.store.node(keys.uuid)
+    node = station.nodes.get(keys.uuid)
     return unsigned_datasheet(
         keys,
         station.point,
-        station.signature_under(station.ca_of(keys.uuid)),
+        station.identity.signature_under(station.keys.ca_of(keys.uuid)),
         digests(image.blocks),
-        ca=security.ca_hint(station.name, fingerprint(station.ca_of(keys.uuid))),
+        ca=security.ca_hint(station.name, fingerprint(station.keys.ca_of(keys.uuid))),
         sequence=node.sequence if node else 0,
         key_epoch=node.epoch if node else 0,
     ).encode()
@@ -108,21 +107,21 @@ def sign(
                 number = security.decode(octets).sequence
                 if octets == on_node or number > node_sequence:
                     return Signed(image.with_block(SECURITY, octets), number, reused=True)
-    known = station.store.node(keys.uuid)
+    known = station.nodes.get(keys.uuid)
     number = max(node_sequence, known.sequence if known else 0) + 1 if sequence is None else sequence
     if number > LAST_SEQUENCE:
         raise PolicyRefused("The sequence of this node is used up.")
     unsigned = unsigned_datasheet(
         keys,
         station.point,
-        station.signature_under(station.ca_of(keys.uuid)),
+        station.identity.signature_under(station.keys.ca_of(keys.uuid)),
         digests(image.blocks),
-        ca=security.ca_hint(station.name, fingerprint(station.ca_of(keys.uuid))),
+        ca=security.ca_hint(station.name, fingerprint(station.keys.ca_of(keys.uuid))),
         last_modified=_now(),
         sequence=number,
         key_epoch=epoch,
     )
-    station.remember(keys.uuid, sequence=number)
+    station.nodes.remember(keys.uuid, sequence=number)
     octets = sign_datasheet(unsigned, keys.uuid, station.credentials(keys.uuid))
     station.audit("sign", keys.uuid, "done", sequence=number, epoch=epoch, teds=image.digest())
     return Signed(image.with_block(SECURITY, octets), number, reused=False)
@@ -134,11 +133,11 @@ def _says_the_same(station: Station, keys: NodeKeys, image: Image, octets: bytes
         found = security.decode(octets)
     except BadData:
         return False
-    ca = station.ca_of(keys.uuid)
+    ca = station.keys.ca_of(keys.uuid)
     return (
         found.signed
         and (found.node_key, found.node_key_signature) == (keys.key, keys.signature)
-        and (found.station_key, found.station_key_signature) == (station.point, station.signature_under(ca))
+        and (found.station_key, found.station_key_signature) == (station.point, station.identity.signature_under(ca))
         and found.ca == security.ca_hint(station.name, fingerprint(ca))
         and found.key_epoch == epoch
         and found.signed_blocks == digests(image.blocks)

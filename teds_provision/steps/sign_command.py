@@ -41,13 +41,13 @@ def sign_image(station: Station, order: SignOrder, node: Conversation | None) ->
     from teds_provision.teds.diff.datasheets import diff_blocks
 
     uuid = order.uuid
-    station.require_whitelisted(uuid)
-    draft = station.store.draft(uuid)
+    station.policy.require_whitelisted(uuid)
+    draft = station.nodes.draft(uuid)
     image = order.image or (Image.from_json(draft.image) if draft is not None else None)
     if image is None:
         raise NotFound(f"Nothing is built for node {uuid.hex()}.", hint=f"Build it: teds-provision build {uuid.hex()}")
-    record = station.store.node(uuid)
-    epoch = station.active_epoch(uuid) or (record.epoch if record else 0)
+    record = station.nodes.get(uuid)
+    epoch = station.keys.active_epoch(uuid) or (record.epoch if record else 0)
     sequence = record.sequence if record else 0
     has = known_image(station, uuid)
     if node is not None:
@@ -77,7 +77,7 @@ def sign_image(station: Station, order: SignOrder, node: Conversation | None) ->
     if draft is not None and (
         order.image is None or Image.from_json(draft.image).unsigned_blocks() == image.unsigned_blocks()
     ):
-        station.store.put_draft(Draft(uuid, signed.image.to_json(), "signed", draft.profile))
+        station.nodes.keep_draft(Draft(uuid, signed.image.to_json(), "signed", draft.profile))
     return SignDone(signed, told)
 
 

@@ -178,10 +178,10 @@ def _node_key(station: Station, uuid: bytes, shown: SecurityTeds) -> Check:
     if not signed:
         return Check(name, "failed", "field 102 does not sign this key for this UUID")
     try:
-        station.check_pin(uuid, shown.node_key)
+        station.pins.check(uuid, shown.node_key)
     except TedsProvisionError as error:
         return Check(name, "failed", error.message)
-    entry = station.store.whitelisted(uuid)
+    entry = station.pins.entry(uuid)
     pinned = "pinned" if entry is not None and entry.fingerprint else "not pinned here"
     return Check(name, "passed", f"{fingerprint(shown.node_key)[:16]}, {pinned}")
 
@@ -213,16 +213,16 @@ def _sequence(shown: SecurityTeds, known: Known | None) -> Check:
 
 
 def _not_revoked(station: Station, uuid: bytes) -> Check:
-    revoked = station.store.revocation(uuid)
+    revoked = station.policy.revocation(uuid)
     return _check("not revoked", revoked is None, f"revoked: {revoked.why}" if revoked else "")
 
 
 def _station(station: Station, uuid: bytes, shown: SecurityTeds) -> Check:
     key = shown.station_key or b""
-    certified = any(datasheet.station_signature_good(shown, ca) for ca in station.trusted_cas(uuid))
+    certified = any(datasheet.station_signature_good(shown, ca) for ca in station.policy.trusted_cas(uuid))
     return _check(
         "signing station",
-        key in station.trusted_stations() or certified,
+        key in station.policy.trusted_stations() or certified,
         f"station {fingerprint(key)[:16]} is not trusted here, nor certified by a trusted CA",
         fingerprint(key)[:16],
     )
@@ -230,10 +230,10 @@ def _station(station: Station, uuid: bytes, shown: SecurityTeds) -> Check:
 
 def _certificate(station: Station, uuid: bytes, shown: SecurityTeds) -> Check:
     name = "station certificate"
-    for ca in station.trusted_cas(uuid):
+    for ca in station.policy.trusted_cas(uuid):
         if datasheet.station_signature_good(shown, ca):
             return Check(name, "passed", f"CA {fingerprint(ca)[:16]}")
-    if shown.station_key == station.point or shown.station_key not in station.trusted_stations():
+    if shown.station_key == station.point or shown.station_key not in station.policy.trusted_stations():
         return Check(name, "failed", "field 104 does not verify under any trusted CA")
     return Check(name, "skipped", "the station is trusted itself; its CA is not known here")
 

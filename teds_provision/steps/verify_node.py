@@ -10,7 +10,6 @@ from teds_provision.protocol.messages.identity import NodeState
 from teds_provision.station.station import Station
 from teds_provision.steps.agree import session_if_keyed
 from teds_provision.steps.identify import Identified, prove
-from teds_provision.steps.journal import recorded
 from teds_provision.steps.read import read_identity, read_image
 from teds_provision.steps.reset import proof_of_reset
 from teds_provision.steps.verify import Check, Verified, known_of, possession, session, verify_image
@@ -36,13 +35,12 @@ def look_at_node(station: Station, node: Conversation, who: Identified) -> Looke
         if node.sealed:
             raise
         held, why = None, refusal.message.rstrip(".")
-    if held is None and not why and station.has_keys(node.uuid) and station.store.tombstone(node.uuid) is None:
+    if held is None and not why and station.keys.held(node.uuid) and station.policy.tombstone(node.uuid) is None:
         why = "the node opens no session under any key that is held here"
     image = read_image(node)
     return Looked(image, verify_node(station, node, image, who.point, why=why))
 
 
-@recorded("verify")
 def verify_node(station: Station, node: Conversation, image: Image, point: bytes, *, why: str = "") -> Verified:
     """Check what was read off a node, have it prove its key, and record the verdict. Raises only for the link.
 
@@ -70,8 +68,8 @@ def verify_node(station: Station, node: Conversation, image: Image, point: bytes
             "sequence": identity.sequence,
             "can_address": identity.can_address,
         }
-        station.store.put_node_image(node.uuid, image.to_json())
-    station.remember(node.uuid, **facts)
+        station.nodes.keep_datasheet(image)
+    station.nodes.remember(node.uuid, **facts)
     station.audit("verify", node.uuid, verified.verdict)
     return verified
 

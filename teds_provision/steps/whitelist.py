@@ -16,8 +16,6 @@ from typing import Any
 from xml.sax.saxutils import quoteattr
 
 from teds_provision.errors import OtherKey, PolicyRefused, UsageFailure
-from teds_provision.protocol.keys import fingerprint
-from teds_provision.station.boards import let_go
 from teds_provision.station.station import Station
 from teds_provision.steps.whitelist_files import FIELDS, FORMATS, Listed
 from teds_provision.store import WhitelistEntry
@@ -39,15 +37,15 @@ def plan_addition(station: Station, listed: Sequence[Listed]) -> Plan:
 
     Raises OtherKey where a UUID is pinned to another key, PolicyRefused for a revoked node: then none may be added.
     """
-    pinned = {record.uuid: fingerprint(record.point) for record in station.store.nodes() if record.point is not None}
-    present = {entry.uuid: entry for entry in station.store.whitelist()}
-    revoked = {revocation.uuid: revocation.why for revocation in station.store.revocations()}
+    pinned = station.pins.all()
+    present = {entry.uuid: entry for entry in station.pins.whitelist()}
+    revoked = {revocation.uuid: revocation.why for revocation in station.policy.revocations()}
     _refuse_revoked([entry.uuid for entry in listed if entry.uuid in revoked], revoked)
     write: list[WhitelistEntry] = []
     conflicts: list[tuple[Listed, str]] = []
     for entry in listed:
         known = present.get(entry.uuid)
-        pin = (known.fingerprint if known else None) or pinned.get(entry.uuid)
+        pin = pinned.get(entry.uuid)
         if entry.fingerprint is not None and pin not in (None, entry.fingerprint):
             conflicts.append((entry, str(pin)))
             continue
@@ -99,9 +97,8 @@ def add(station: Station, plan: Plan, *, source: str | None = None) -> None:
     """Carry out a plan in one transaction, with one entry of the audit log; ``source`` is the file it came from."""
     if not plan.write:
         return
-    with station.store.transaction():
-        for entry in plan.write:
-            station.store.put_whitelist(entry)
+    with station.transaction():
+        station.pins.put(*plan.write)
         if source is None:
             (entry,) = plan.write
             station.audit("whitelist", entry.uuid, "added", fingerprint=entry.fingerprint, assurance=entry.assurance)
@@ -115,20 +112,18 @@ def remove(station: Station, uuid: bytes) -> bool:
     Epoch, sequence and link keys stay: they still count when the node comes back. A replaced board under the same UUID
     can be pinned anew from here on.
     """
-    with station.store.transaction():
-        let_go(station, uuid)
-        removed = station.store.remove_whitelist(uuid)
+    with station.transaction():
         pinned = is_pinned(station, uuid)
-        station.store.unpin_node(uuid)
+        station.pins.let_go(uuid)
+        removed = station.pins.remove(uuid)
         if removed or pinned:
             station.audit("whitelist", uuid, "removed" if removed else "unpinned")
     return removed or pinned
 
 
 def is_pinned(station: Station, uuid: bytes) -> bool:
-    """Whether the key of this UUID is known from a contact, be it whitelisted or not."""
-    node = station.store.node(uuid)
-    return node is not None and node.point is not None
+    """Whether a key of this UUID is known, be it whitelisted or not."""
+    return station.pins.pinned(uuid) is not None
 
 
 def as_dict(entry: WhitelistEntry) -> dict[str, Any]:

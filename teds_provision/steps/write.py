@@ -10,7 +10,6 @@ from teds_provision.errors import BadData, NodeRefused, NotAuthentic, PolicyRefu
 from teds_provision.protocol.datasheet import SEQUENCE_WINDOW
 from teds_provision.protocol.messages.frames import Reason, update_teds, write_teds
 from teds_provision.station.station import Station
-from teds_provision.steps.journal import recorded
 from teds_provision.steps.read import read_block, read_identity, read_image
 from teds_provision.steps.sign import known_image, node_keys_of, sign
 from teds_provision.talk.conversation import Conversation, SessionLost
@@ -33,7 +32,6 @@ class Written:
     on_node: Image
 
 
-@recorded("write")
 def write(
     station: Station, node: Conversation, image: Image, *, has: Image | None = None, progress: Progress | None = None
 ) -> Written:
@@ -70,7 +68,7 @@ def write(
         has = between
     octets += _commit(station, node, image, has, progress)
     back = read_image(node)
-    station.store.put_node_image(image.uuid, back.to_json())
+    station.nodes.keep_datasheet(back)
     differing = [block for block in image if back.blocks.get(block) != image.blocks[block]]
     if differing:
         channel, access_code = differing[0]

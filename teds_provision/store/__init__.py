@@ -1,4 +1,4 @@
-"""What a station remembers: whitelist, nodes, wrapped keys, journal, trust and the audit log, in one SQLite file."""
+"""What a station remembers: whitelist, nodes, wrapped keys, trust and the audit log, in one SQLite file."""
 
 from teds_provision.store.audit import AuditEntry, AuditLog, AuditVerdict
 from teds_provision.store.bulk_tables import Batch
@@ -10,7 +10,6 @@ from teds_provision.store.records import (
     KeyRecord,
     NodeRecord,
     Revocation,
-    Step,
     Tombstone,
     TrustRecord,
     WhitelistEntry,
@@ -29,7 +28,6 @@ __all__ = [
     "KeyRecord",
     "NodeRecord",
     "Revocation",
-    "Step",
     "Store",
     "StoreLock",
     "Tombstone",

@@ -22,14 +22,19 @@ _SLOTS = "INSERT INTO key_slots VALUES(?, ?) ON CONFLICT(uuid) DO UPDATE SET las
 
 @dataclass(frozen=True)
 class Batch:
-    """Rows to add or replace. The caller has held them against what is there: epochs, pins and identity keys."""
+    """Rows to add or replace, and marks of nodes; the caller has held epochs and keys against what is there."""
 
     nodes: Sequence[NodeRecord] = ()
     whitelist: Sequence[WhitelistEntry] = ()
     keys: Sequence[KeyRecord] = ()
     holders: Sequence[Holder] = ()
     tombstones: Sequence[Tombstone] = ()
-    settings: Mapping[str, str] = field(default_factory=dict)
+    rotations: Mapping[bytes, str] = field(default_factory=dict)
+    """Why a rotation is due, by UUID."""
+    cas: Mapping[bytes, bytes] = field(default_factory=dict)
+    """P(CA) that a node keeps, by UUID."""
+    next_cas: Mapping[bytes, tuple[str, bytes]] = field(default_factory=dict)
+    """Key id and P(CA) that a node keeps once this key is proven, by UUID."""
 
 
 class BulkTables:
@@ -59,8 +64,6 @@ class BulkTables:
             many(_KEYS, (_row(key)[:-1] for key in batch.keys))
             many("INSERT OR REPLACE INTO holders VALUES(?, ?, ?, ?)", (_row(holder) for holder in batch.holders))
             many("INSERT OR REPLACE INTO tombstones VALUES(?, ?, ?, ?)", (_row(one) for one in batch.tombstones))
-            named = ((_SETTING + name, value) for name, value in batch.settings.items())
-            many("INSERT OR REPLACE INTO meta VALUES(?, ?)", named)
 
     def remove_tombstones(self, uuids: Iterable[bytes]) -> None:
         """Take the tombstones of these nodes away."""

@@ -1,4 +1,4 @@
-"""Whitelist, nodes, names, drafts and the journal of steps."""
+"""Whitelist, nodes, names, drafts and the image that each node had last."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import Any
 
 from teds_provision.errors import NotFound, OtherKey, UsageFailure
 from teds_provision.store.database import Database
-from teds_provision.store.records import UUID_OCTETS, Draft, NodeRecord, Step, WhitelistEntry, utc_now
+from teds_provision.store.records import UUID_OCTETS, Draft, NodeRecord, WhitelistEntry, utc_now
 
 _UUID_DIGITS = 2 * UUID_OCTETS
 _MIN_PREFIX = 4
@@ -126,39 +126,6 @@ class NodeTables:
     def put_node_image(self, uuid: bytes, image: str) -> None:
         """Remember what a node has: every TEDS as it was read."""
         self._database.execute("INSERT OR REPLACE INTO node_images VALUES(?, ?, ?)", (uuid, image, utc_now()))
-
-    def begin_step(self, uuid: bytes | None, step: str) -> int:
-        """Note that a step begins and return its row; an open one of this name is closed as ``interrupted``."""
-        with self._database.transaction():
-            self._database.execute(
-                "DELETE FROM steps WHERE uuid IS ? AND step = ? AND result IS NOT NULL", (uuid, step)
-            )
-            self._database.execute(
-                "UPDATE steps SET ended = ?, result = 'interrupted' WHERE uuid IS ? AND step = ?",
-                (utc_now(), uuid, step),
-            )
-            rows = self._database.execute(
-                "INSERT INTO steps(uuid, step, started) VALUES(?, ?, ?) RETURNING row", (uuid, step, utc_now())
-            )
-        return int(rows[0][0])
-
-    def end_step(self, row: int, result: str) -> None:
-        """Note how a step ended."""
-        self._database.execute("UPDATE steps SET ended = ?, result = ? WHERE row = ?", (utc_now(), result, row))
-
-    def open_steps(self, uuid: bytes | None) -> list[Step]:
-        """Return the steps that began and did not end, oldest first."""
-        return [step for step in self.steps(uuid) if step.result is None]
-
-    def close_steps(self, uuid: bytes | None, result: str) -> int:
-        """End every open step of a node at once; returns how many there were."""
-        return self._database.change(
-            "UPDATE steps SET ended = ?, result = ? WHERE uuid IS ? AND result IS NULL", (utc_now(), result, uuid)
-        )
-
-    def steps(self, uuid: bytes | None) -> list[Step]:
-        """Return the latest rows of each step of a node, oldest first."""
-        return self._database.read(Step, "SELECT * FROM steps WHERE uuid IS ? ORDER BY row", (uuid,))
 
 
 def _node(*row: Any) -> NodeRecord:

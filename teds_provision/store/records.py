@@ -89,18 +89,6 @@ class Draft:
 
 
 @dataclass(frozen=True)
-class Step:
-    """One step of a workflow; ``result`` and ``ended`` are None as long as it is open."""
-
-    row: int
-    uuid: bytes | None
-    step: str
-    started: str
-    ended: str | None
-    result: str | None
-
-
-@dataclass(frozen=True)
 class TrustRecord:
     """The public key of another station or of a CA, trusted because someone added it."""
 

@@ -19,7 +19,7 @@ _ID_OCTETS = 16
 
 
 class Store(NodeTables, KeyTables, HandoverTables, BulkTables):
-    """Whitelist, nodes, wrapped keys, drafts, journal, trust, handovers and the audit log of one station.
+    """Whitelist, nodes, wrapped keys, drafts, trust, handovers and the audit log of one station.
 
     Every method is durable when it returns, and all of them raise StoreFailure (or StoreLocked) where the file cannot
     give or take what they ask. Several processes may have it open; a command that changes it holds a StoreLock.

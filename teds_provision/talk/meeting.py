@@ -34,7 +34,7 @@ def meet(
     def wanted(identity: Identity) -> bool:
         return uuid is None or identity.uuid == uuid
 
-    known = station.store.node(uuid) if uuid is not None else None
+    known = station.nodes.get(uuid) if uuid is not None else None
     address = known.can_address if known is not None and known.can_address else None
     port = open_port(links)
     try:
@@ -89,5 +89,5 @@ def the_one(station: Station, contacts: list[Contact]) -> Contact:
 
 
 def _finished(station: Station, identity: Identity) -> bool:
-    known = station.store.node(identity.uuid)
+    known = station.nodes.get(identity.uuid)
     return identity.state == NodeState.PROVISIONED and known is not None and known.verdict == "authentic"

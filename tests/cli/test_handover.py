@@ -146,7 +146,7 @@ def test_people_are_shown_both_fingerprints_in_fours_and_what_it_means(homes: Ho
     from teds_provision.handover.trust import spoken
 
     station = open_station(homes.north)
-    both = [spoken(station.fingerprint), *(spoken(record.fingerprint) for record in station.store.trusted())]
+    both = [spoken(station.fingerprint), *(spoken(record.fingerprint) for record in station.policy.trusted())]
     station.close()
     told = {}
     for mode in ("copy", "move"):
@@ -167,7 +167,7 @@ def test_a_move_tells_who_else_holds_a_copy(homes: Homes) -> None:
 
     north = open_station(homes.north)
     west = SoftwareKey(61)
-    north.store.put_trust(TrustRecord("west", "station", west.point, fingerprint(west.point)))
+    north.policy.trust(TrustRecord("west", "station", west.point, fingerprint(west.point)))
     north.close()
     words = ["export-keys", "--all", "--yes", "--output"]
     assert homes.run(homes.north, *words, homes.folder / "copy.jwe", "--to", "west").code == 0

@@ -47,22 +47,21 @@ def test_a_dry_run_of_provision_leaves_no_trace(tmp_path: Path, capsys: pytest.C
     station, board = make_station(tmp_path / "home"), Board()
     _plan(App(as_json=True), station, talk(board))
     assert json.loads(capsys.readouterr().out)["plan"][:3] == ["identify", "whitelist", "agree"]
-    assert station.store.nodes() == []
-    assert station.store.node_image(board.uuid) is None
-    assert station.store.steps(board.uuid) == []
+    assert station.nodes.all() == []
+    assert station.nodes.datasheet(board.uuid) is None
 
 
 def test_a_dry_run_of_sign_against_the_node_settles_no_key(tmp_path: Path) -> None:
     station, board = make_station(tmp_path / "home"), Board()
-    station.store.put_whitelist(WhitelistEntry(board.uuid))
+    station.pins.put(WhitelistEntry(board.uuid))
     with talk(board) as node:
         agree(station, node, identify(station, node))
     build(station, board.uuid, ANGLE)
-    station.demand_rotation(board.uuid, "a copy was handed over")
-    before = station.store.keys(board.uuid)
+    station.keys.demand_rotation(board.uuid, "a copy was handed over")
+    before = station.keys.of(board.uuid)
     with talk(board) as node:
         sign_image(station, SignOrder(board.uuid, dry_run=True), node)
-    assert station.store.keys(board.uuid) == before
+    assert station.keys.of(board.uuid) == before
     assert board.state.epoch == 1
 
 
@@ -144,7 +143,7 @@ def test_json_is_json_whatever_stdout_can_write(tmp_path: Path) -> None:
 
 def test_what_is_wrong_with_a_link_is_told_before_anyone_is_asked_for_a_passphrase(tmp_path: Path) -> None:
     station = make_station(tmp_path)
-    station.store.put_whitelist(WhitelistEntry(Board.uuid))
+    station.pins.put(WhitelistEntry(Board.uuid))
     station.close()
     for words in (["agree", Board.uuid.hex()], ["provision", "--profile", "load-cell", "--yes"]):
         assert call(tmp_path, "--json", *words, "--via", "can").json["error"]["code"] == "usage"
@@ -152,7 +151,7 @@ def test_what_is_wrong_with_a_link_is_told_before_anyone_is_asked_for_a_passphra
 
 def test_files_are_written_in_utf_8_whatever_the_locale(tmp_path: Path) -> None:
     station = make_station(tmp_path)
-    station.store.put_whitelist(WhitelistEntry(Board.uuid, name="fräse \N{GEAR}"))
+    station.pins.put(WhitelistEntry(Board.uuid, name="fräse \N{GEAR}"))
     station.close()
     environment = clean_environment(LC_ALL="C", PYTHONUTF8="0", PYTHONCOERCECLOCALE="0")
     exported = spawn("--home", tmp_path, "whitelist", "export", tmp_path / "list.xml", environment=environment)

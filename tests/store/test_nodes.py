@@ -147,29 +147,6 @@ def test_a_draft_goes_through_its_stages(store: Store) -> None:
     assert store.draft(FINGER) is None
 
 
-def test_an_interrupted_step_stays_open_until_it_is_done_again(store: Store) -> None:
-    first = store.begin_step(FINGER, "agree")
-    assert [(step.row, step.step) for step in store.open_steps(FINGER)] == [(first, "agree")]
-    second = store.begin_step(FINGER, "agree")
-    assert [step.row for step in store.open_steps(FINGER)] == [second]
-    assert [step.result for step in store.steps(FINGER)] == ["interrupted", None]
-    store.end_step(second, "done")
-    assert store.open_steps(FINGER) == []
-    assert store.open_steps(JOINT) == []
-
-
-def test_the_journal_of_a_step_does_not_grow(store: Store) -> None:
-    for _ in range(20):
-        store.end_step(store.begin_step(FINGER, "write"), "done")
-    assert len(store.steps(FINGER)) == 1
-
-
-def test_a_step_may_begin_before_the_node_is_known(store: Store) -> None:
-    store.begin_step(None, "identify")
-    assert store.close_steps(None, "abandoned") == 1
-    assert store.open_steps(None) == []
-
-
 def test_ten_thousand_nodes_are_quick_to_find(store: Store) -> None:
     with store.transaction():
         for number in range(10_000):

@@ -24,16 +24,16 @@ from .bench import Board, MemoryLink, make_station, talk
 
 def trust(station: Station, other: Station, name: str | None = None) -> None:
     """``station`` trusts ``other``."""
-    station.store.put_trust(TrustRecord(name or other.name, "station", other.point, other.fingerprint))
+    station.policy.trust(TrustRecord(name or other.name, "station", other.point, other.fingerprint))
 
 
 def key_up(station: Station, board: Board, *, name: str | None = None) -> None:
     """Whitelist a board and agree on its first key."""
-    station.store.put_whitelist(WhitelistEntry(board.uuid))
+    station.pins.put(WhitelistEntry(board.uuid))
     with talk(board) as node:
         agree(station, node, identify(station, node))
     if name:
-        station.remember(board.uuid, name=name, groups=("left hand",), profile="tactile-finger-sensor")
+        station.nodes.remember(board.uuid, name=name, groups=("left hand",), profile="tactile-finger-sensor")
 
 
 def provisioned(station: Station, board: Board, profile: str = "temperature-sensor") -> Provisioned:
@@ -94,7 +94,7 @@ class Pair:
 
 
 def held(station: Station, board: Board) -> list[tuple[str, int, str]]:
-    return [(key.state, key.epoch, key.source) for key in station.store.keys(board.uuid)]
+    return [(key.state, key.epoch, key.source) for key in station.keys.of(board.uuid)]
 
 
 def node_key_id(board: Board) -> str:
@@ -104,7 +104,7 @@ def node_key_id(board: Board) -> str:
 
 def everything(station: Station) -> tuple[object, ...]:
     """What the store holds but for the audit log and times: to see that nothing changed."""
-    store = station.store
+    store = station._store
     return (
         [replace(entry, added="") for entry in store.whitelist()],
         store.nodes(),
@@ -117,7 +117,7 @@ def everything(station: Station) -> tuple[object, ...]:
 
 
 def row(station: Station, handover_id: str, direction: str) -> Handover:
-    found = station.store.handover(handover_id, direction)  # type: ignore[arg-type]
+    found = station.handovers.get(handover_id, direction)  # type: ignore[arg-type]
     assert found is not None
     return found
 

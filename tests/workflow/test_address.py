@@ -17,7 +17,7 @@ def test_a_tapped_node_takes_another_address_and_keeps_it(station: Station, boar
         assert set_address(station, node, 0x21)
     board.power_on()
     assert board.state.can_address == 0x21
-    record = station.store.node(board.uuid)
+    record = station.nodes.get(board.uuid)
     assert record is not None
     assert record.can_address == 0x21
     with talk(board) as node:

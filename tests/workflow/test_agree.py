@@ -22,11 +22,11 @@ def run(station: Station, board: Board, link: MemoryLink | None = None, *, rotat
 
 
 def whitelist(station: Station, board: Board) -> None:
-    station.store.put_whitelist(WhitelistEntry(board.uuid))
+    station.pins.put(WhitelistEntry(board.uuid))
 
 
 def held(station: Station, board: Board) -> list[tuple[str, int]]:
-    return [(record.state, record.epoch) for record in station.store.keys(board.uuid)]
+    return [(record.state, record.epoch) for record in station.keys.of(board.uuid)]
 
 
 def test_a_whitelisted_node_gets_a_key_and_its_entry_is_pinned(station: Station, board: Board) -> None:
@@ -37,7 +37,7 @@ def test_a_whitelisted_node_gets_a_key_and_its_entry_is_pinned(station: Station,
     assert board.state.key is not None
     assert key_id(board.state.key).hex() == agreed.key_id
     assert board.state.ca == station.ca
-    entry = station.store.whitelisted(board.uuid)
+    entry = station.pins.entry(board.uuid)
     assert entry is not None
     assert (entry.assurance, entry.fingerprint) == ("tap", identify(station, talk(board)).fingerprint)
     assert held(station, board) == [("active", 1)]
@@ -184,5 +184,5 @@ def test_a_rotation_by_another_station_is_told_never_healed_by_itself(station: S
 def test_a_lost_store_is_healed_by_a_tap_where_identity_and_ca_were_kept(station: Station, board: Board) -> None:
     whitelist(station, board)
     run(station, board)
-    station.store.remove_keys(board.uuid)
+    station.keys.remove(board.uuid)
     assert run(station, board).epoch == 2

@@ -32,6 +32,7 @@ from teds_provision.protocol.keys import SoftwareKey
 from teds_provision.station.station import Station, initialise
 from teds_provision.store import Draft, Holder, NodeRecord, Revocation, Store, Tombstone, TrustRecord, WhitelistEntry
 from teds_provision.store.snapshot import Relation, load, place, take
+from teds_provision.teds.image import Image
 from teds_provision.vault import forget_vaults
 from teds_provision.vault.passphrase import THROWAWAY
 from teds_provision.vault.software import SoftwareVault
@@ -51,14 +52,14 @@ def ask(prompt: str, confirm: bool) -> str:
 def add_key(station: Station, uuid: bytes, epoch: int, *, active: bool = True) -> bytes:
     key = bytes([epoch]) * 16
     key_id = epoch.to_bytes(8, "big")
-    station.add_pending(uuid, key=key, key_id=key_id, epoch=epoch)
+    station.keys.add_pending(uuid, key=key, key_id=key_id, epoch=epoch)
     if active:
-        station.store.promote_key(uuid, key_id.hex())
+        station.keys.promote(uuid, key_id.hex())
     return key
 
 
 def keys_of(station: Station, uuid: bytes) -> list[tuple[int, str, bytes]]:
-    return [(held.record.epoch, held.record.state, held.key) for held in station.node_keys(uuid)]
+    return [(held.record.epoch, held.record.state, held.key) for held in station.keys.unwrapped(uuid)]
 
 
 @pytest.fixture
@@ -67,13 +68,13 @@ def station(tmp_path: Path) -> Iterator[Station]:
     forget_vaults()
     made = make_station(tmp_path / "home")
     for uuid in (ONE, TWO):
-        made.store.put_whitelist(WhitelistEntry(uuid, assurance="tap"))
-        made.store.put_node(NodeRecord(uuid, POINT, state=2, epoch=1, sequence=5, verdict="authentic"))
+        made.pins.put(WhitelistEntry(uuid, assurance="tap"))
+        made.nodes.put(NodeRecord(uuid, POINT, state=2, epoch=1, sequence=5, verdict="authentic"))
         add_key(made, uuid, 1)
-        made.store.put_node_image(uuid, "{}")
+        made.nodes.keep_datasheet(Image(uuid))
     add_key(made, TWO, 2, active=False)
-    made.store.put_trust(TrustRecord("owner", "ca", POINT, "ab" * 32))
-    made.store.put_draft(Draft(ONE, "{}"))
+    made.policy.trust(TrustRecord("owner", "ca", POINT, "ab" * 32))
+    made.nodes.keep_draft(Draft(ONE, "{}"))
     made.audit("test", ONE, "ready")
     yield made
     made.close()
@@ -166,7 +167,7 @@ def test_a_backup_that_another_key_has_signed_is_not_the_stations(station: Stati
         open_with_key(backup_file.seal_to_key(real, forger, recovery.point), recovery)
     forged = open_with_key(backup_file.seal_to_key(replace(real, point=forger.point), forger, recovery.point), recovery)
     with pytest.raises(PolicyRefused, match=r"the store in .* is of station"):
-        open_present(station.store.home, forged)
+        open_present(station.home, forged)
     with pytest.raises(NotAuthentic):
         restored_into(tmp_path / "new", forged)
     assert not (tmp_path / "new" / "store.sqlite3").exists()
@@ -186,11 +187,11 @@ def test_the_jose_tool_opens_a_backup_with_the_recovery_key(station: Station, tm
     words = ["jose", "jwe", "dec", "-i", str(tmp_path / "b"), "-k", str(tmp_path / "k.jwk")]
     inner = subprocess.run(words, capture_output=True, check=True, timeout=30).stdout
     assert inner.count(b".") == 2
-    assert backup_file._verified(inner.strip()).store == station.store.id
+    assert backup_file._verified(inner.strip()).store == station.id
 
 
 def test_a_backup_taken_while_the_store_is_written_is_one_moment(station: Station, tmp_path: Path) -> None:
-    stop, home = threading.Event(), station.store.home
+    stop, home = threading.Event(), station.home
 
     def write() -> None:
         with Store.open(home) as store:
@@ -205,7 +206,7 @@ def test_a_backup_taken_while_the_store_is_written_is_one_moment(station: Statio
     writer.start()
     try:
         for _ in range(20):
-            with load(take(station.store)) as copy:
+            with load(take(station._store)) as copy:
                 sequences = {record.sequence for record in copy.nodes()}
                 assert len(sequences) == 1
                 assert copy.audit.check().intact
@@ -228,10 +229,10 @@ def test_an_empty_home_becomes_the_station_again(station: Station, tmp_path: Pat
     assert home.stat().st_mode & 0o777 == 0o700
     forget_vaults()
     again = Station.open(home, ask=ask)
-    assert (again.fingerprint, again.ca, again.store.id) == (station.fingerprint, station.ca, station.store.id)
+    assert (again.fingerprint, again.ca, again.id) == (station.fingerprint, station.ca, station.id)
     assert {uuid: keys_of(again, uuid) for uuid in (ONE, TWO)} == before
-    assert again.certify(POINT) == station.certify(POINT)
-    assert again.store.audit.check().intact
+    assert again.identity.certify(POINT) == station.identity.certify(POINT)
+    assert again.audit_log.check().intact
     again.close()
 
 
@@ -253,7 +254,7 @@ def test_killed_between_vault_and_store_the_same_command_carries_on(
 
 
 def test_a_damaged_store_is_kept_under_another_name(station: Station, tmp_path: Path) -> None:
-    path, home = tmp_path / "station.backup", station.store.home
+    path, home = tmp_path / "station.backup", station.home
     back_up(station, path)
     station.close()
     (home / "store.sqlite3").write_bytes(b"\0" * 8192)
@@ -270,8 +271,8 @@ def test_a_damaged_store_is_kept_under_another_name(station: Station, tmp_path: 
 
 
 def test_a_store_is_never_put_over_another(station: Station, tmp_path: Path) -> None:
-    with load(take(station.store)) as copy, pytest.raises(StoreFailure, match="already"):
-        place(copy, station.store.home)
+    with load(take(station._store)) as copy, pytest.raises(StoreFailure, match="already"):
+        place(copy, station.home)
 
 
 def test_a_log_left_by_a_lost_store_is_not_replayed_into_the_restored_one(station: Station, tmp_path: Path) -> None:
@@ -289,15 +290,15 @@ def test_a_log_left_by_a_lost_store_is_not_replayed_into_the_restored_one(statio
 
 def test_restoring_the_present_state_is_nothing_to_do(station: Station, tmp_path: Path) -> None:
     back_up(station, tmp_path / "b")
-    count = station.store.audit.check().count
-    done = merge(station.store, opened(tmp_path / "b"), dry_run=False)
+    count = station.audit_log.check().count
+    done = merge(station._store, opened(tmp_path / "b"), dry_run=False)
     assert (done.action, done.relation, done.back) == ("nothing", Relation.OLDER, {})
-    assert station.store.audit.check().count == count
+    assert station.audit_log.check().count == count
 
 
 def test_an_older_state_brings_back_what_is_missing_and_nothing_goes_back(station: Station, tmp_path: Path) -> None:
     back_up(station, tmp_path / "b")
-    store = station.store
+    store = station._store
     store.remove_whitelist(ONE)
     store.remove_trust("owner")
     add_key(station, ONE, 2)  # rotated since: the key of epoch 1 is gone
@@ -327,86 +328,86 @@ def test_an_older_state_brings_back_what_is_missing_and_nothing_goes_back(statio
 
 def test_a_revoked_node_stays_revoked_and_off_the_whitelist(station: Station, tmp_path: Path) -> None:
     back_up(station, tmp_path / "b")
-    station.store.put_revocation(Revocation(ONE, None, "stolen", "{}"))
-    station.store.remove_whitelist(ONE)
-    station.store.remove_keys(ONE)
+    station.policy.deny(Revocation(ONE, None, "stolen", "{}"))
+    station.pins.remove(ONE)
+    station.keys.remove(ONE)
     station.audit("revoke", ONE, "done")
-    done = merge(station.store, opened(tmp_path / "b"), dry_run=False)
+    done = merge(station._store, opened(tmp_path / "b"), dry_run=False)
     assert done.action == "nothing"
-    assert station.store.whitelisted(ONE) is None
-    assert station.store.keys(ONE) == []
+    assert station.pins.entry(ONE) is None
+    assert station.keys.of(ONE) == []
     assert "revocations made since: 1" in done.kept
 
 
 def test_keys_given_up_since_are_not_brought_back(station: Station, tmp_path: Path) -> None:
     back_up(station, tmp_path / "b")
-    station.store.remove_keys(ONE)
+    station.keys.remove(ONE)
     station.audit("decommission", ONE, "done")
-    merge(station.store, opened(tmp_path / "b"), dry_run=False)
-    assert station.store.keys(ONE) == []
+    merge(station._store, opened(tmp_path / "b"), dry_run=False)
+    assert station.keys.of(ONE) == []
 
 
 def test_a_node_that_was_pinned_anew_keeps_its_new_key(station: Station, tmp_path: Path) -> None:
-    station.store.put_whitelist(WhitelistEntry(ONE, "ab" * 32, assurance="tap"))
+    station.pins.put(WhitelistEntry(ONE, "ab" * 32, assurance="tap"))
     back_up(station, tmp_path / "b")
-    station.store.remove_whitelist(ONE)
-    station.store.unpin_node(ONE)
+    station.pins.remove(ONE)
+    station.pins.let_go(ONE)
     other = SoftwareKey.generate().point
-    station.remember(ONE, point=other)
+    station.nodes.remember(ONE, point=other)
     station.audit("identify", ONE, "proven")
-    done = merge(station.store, opened(tmp_path / "b"), dry_run=False)
-    known = station.store.node(ONE)
+    done = merge(station._store, opened(tmp_path / "b"), dry_run=False)
+    known = station.nodes.get(ONE)
     assert known is not None
     assert known.point == other
-    assert station.store.whitelisted(ONE) is None
+    assert station.pins.entry(ONE) is None
     assert "whitelist entries pinned to another key now: 1" in done.kept
 
 
 def test_a_newer_state_brings_a_rolled_back_store_forward(station: Station, tmp_path: Path) -> None:
-    home, stale = station.store.home, tmp_path / "stale"
-    with load(take(station.store)) as copy:
+    home, stale = station.home, tmp_path / "stale"
+    with load(take(station._store)) as copy:
         stale.mkdir(mode=0o700)
         place(copy, stale)
     shutil.copy(home / "vault.json", stale / "vault.json")
     new_key = add_key(station, ONE, 2)
-    station.store.put_node(NodeRecord(ONE, POINT, epoch=2, sequence=9, verdict="authentic"))
-    station.store.put_tombstone(Tombstone(TWO, "cd" * 32, "id"))
-    station.store.put_holder(Holder(ONE, "cd" * 32))
+    station.nodes.put(NodeRecord(ONE, POINT, epoch=2, sequence=9, verdict="authentic"))
+    station.policy.give_away(Tombstone(TWO, "cd" * 32, "id"))
+    station.keys.put_holder(Holder(ONE, "cd" * 32))
     station.audit("sign", ONE, "done")
     back_up(station, tmp_path / "b")
     old = Station.open(stale, ask=ask)
-    done = merge(old.store, opened(tmp_path / "b"), dry_run=False)
+    done = merge(old._store, opened(tmp_path / "b"), dry_run=False)
     assert done.relation is Relation.NEWER
-    known = old.store.node(ONE)
+    known = old.nodes.get(ONE)
     assert known is not None
     assert (known.epoch, known.sequence) == (2, 9)
     assert next(key for _, _, key in keys_of(old, ONE)) == new_key
     assert [state for _, state, _ in keys_of(old, ONE)] == ["pending", "active"]  # an Open decides
-    assert old.store.tombstone(TWO) is not None
-    assert old.store.holders(ONE)[0].fingerprint == "cd" * 32
-    assert old.store.audit.check().intact
-    assert [entry.act for entry in old.store.audit.entries()][-2:] == ["sign", "restore"]
-    assert merge(old.store, opened(tmp_path / "b"), dry_run=False).action == "nothing"
+    assert old.policy.tombstone(TWO) is not None
+    assert old.keys.holders(ONE)[0].fingerprint == "cd" * 32
+    assert old.audit_log.check().intact
+    assert [entry.act for entry in old.audit_log.entries()][-2:] == ["sign", "restore"]
+    assert merge(old._store, opened(tmp_path / "b"), dry_run=False).action == "nothing"
     old.close()
 
 
 def test_states_that_went_different_ways_keep_both_sides_newest(station: Station, tmp_path: Path) -> None:
     stale = tmp_path / "stale"
-    with load(take(station.store)) as copy:
+    with load(take(station._store)) as copy:
         stale.mkdir(mode=0o700)
         place(copy, stale)
-    shutil.copy(station.store.home / "vault.json", stale / "vault.json")
+    shutil.copy(station.home / "vault.json", stale / "vault.json")
     add_key(station, ONE, 4)
     station.audit("agree", ONE, "done")
     back_up(station, tmp_path / "b")
     other = Station.open(stale, ask=ask)
     add_key(other, TWO, 7)
     other.audit("agree", TWO, "done")
-    done = merge(other.store, opened(tmp_path / "b"), dry_run=False)
+    done = merge(other._store, opened(tmp_path / "b"), dry_run=False)
     assert done.relation is Relation.DIVERGED
     assert {epoch for epoch, _, _ in keys_of(other, ONE)} == {1, 4}
     assert {epoch for epoch, _, _ in keys_of(other, TWO)} == {7}
-    assert other.store.audit.check().intact
+    assert other.audit_log.check().intact
     other.close()
 
 
@@ -431,7 +432,7 @@ def test_master_keys_of_the_backup_join_those_of_the_vault(station: Station, tmp
     software(station).retire_masters()
     software(station).drop_ca()
     forget_vaults()
-    vault = complete_vault(station.store, opened(tmp_path / "b"), ask)
+    vault = complete_vault(station._store, opened(tmp_path / "b"), ask)
     assert isinstance(vault, SoftwareVault)
     assert len(vault._material.masters.keys) == 2
     assert vault.ca() is None  # it was taken out since, and stays out
@@ -440,31 +441,31 @@ def test_master_keys_of_the_backup_join_those_of_the_vault(station: Station, tmp
 def test_a_vault_that_lacks_nothing_is_left_as_it_is(station: Station, tmp_path: Path) -> None:
     back_up(station, tmp_path / "b")
     software(station).drop_ca()
-    before = (station.store.home / "vault.json").read_bytes()
+    before = (station.home / "vault.json").read_bytes()
     forget_vaults()
-    assert complete_vault(station.store, opened(tmp_path / "b"), ask).ca() is None
-    assert (station.store.home / "vault.json").read_bytes() == before
+    assert complete_vault(station._store, opened(tmp_path / "b"), ask).ca() is None
+    assert (station.home / "vault.json").read_bytes() == before
 
 
 def test_a_lost_vault_comes_back_beside_its_store(station: Station, tmp_path: Path) -> None:
     back_up(station, tmp_path / "b")
-    (station.store.home / "vault.json").unlink()
+    (station.home / "vault.json").unlink()
     forget_vaults()
-    assert complete_vault(station.store, opened(tmp_path / "b"), ask).identity().point == station.point
-    again = Station.open(station.store.home, ask=ask)
+    assert complete_vault(station._store, opened(tmp_path / "b"), ask).identity().point == station.point
+    again = Station.open(station.home, ask=ask)
     assert keys_of(again, ONE)[0][0] == 1
     again.close()
 
 
 def test_marks_on_nodes_do_not_go_back_and_come_forward(station: Station, tmp_path: Path) -> None:
     """For example that a rotation is due: an older backup that does not know it must not lift it."""
-    station.store.set_setting("mark", "before")
+    station._store.set_setting("mark", "before")
     back_up(station, tmp_path / "old")
-    station.store.set_setting("mark", "due")
-    station.store.set_setting("other", "due")
+    station._store.set_setting("mark", "due")
+    station._store.set_setting("other", "due")
     station.audit("test", ONE, "marked")
-    merge(station.store, opened(tmp_path / "old"), dry_run=False)
-    assert station.store.setting("mark") == "due"
+    merge(station._store, opened(tmp_path / "old"), dry_run=False)
+    assert station._store.setting("mark") == "due"
     back_up(station, tmp_path / "new")
     stale = tmp_path / "stale"
     with load(opened(tmp_path / "old").database) as copy:
@@ -477,7 +478,7 @@ def test_marks_on_nodes_do_not_go_back_and_come_forward(station: Station, tmp_pa
 
 
 def test_a_key_that_the_vault_does_not_open_is_told_when_backing_up(station: Station, tmp_path: Path) -> None:
-    with closing(sqlite3.connect(station.store.home / "store.sqlite3")) as connection, connection:
+    with closing(sqlite3.connect(station.home / "store.sqlite3")) as connection, connection:
         connection.execute("UPDATE keys SET wrapped = zeroblob(60) WHERE uuid = ? AND epoch = 1", (ONE,))
     assert "1 keys in the store do not open" in back_up(station, tmp_path / "b").warnings[0]
 

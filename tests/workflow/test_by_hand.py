@@ -30,7 +30,7 @@ ANGLE = BuildOrder(profile="magnetic-angular-position-sensor")
 def test_a_datasheet_signed_by_hand_after_a_cut_agreement_is_taken(
     station: Station, board: Board, lost: int, rotate: bool
 ) -> None:
-    station.store.put_whitelist(WhitelistEntry(board.uuid))
+    station.pins.put(WhitelistEntry(board.uuid))
     if rotate:
         with talk(board) as node:
             agree(station, node, identify(station, node))
@@ -49,7 +49,7 @@ def test_a_datasheet_signed_by_hand_after_a_cut_agreement_is_taken(
 
 
 def test_a_node_that_refuses_at_the_last_of_all_attempts_is_told_as_such(station: Station, board: Board) -> None:
-    station.store.put_whitelist(WhitelistEntry(board.uuid))
+    station.pins.put(WhitelistEntry(board.uuid))
     with talk(board) as node:
         agree(station, node, identify(station, node))
     build(station, board.uuid, ANGLE)
@@ -125,6 +125,6 @@ def test_a_node_whose_last_verdict_was_not_good_is_not_finished(station: Station
     boards = [Board(uuid=bytes([number]) * 10) for number in range(2)]
     for board in boards:
         provision(station, board)
-    station.remember(boards[1].uuid, verdict="not authentic")
+    station.nodes.remember(boards[1].uuid, verdict="not authentic")
     contacts = [_at(board, 0x10 + number) for number, board in enumerate(boards)]
     assert the_one(station, contacts).identity.uuid == boards[1].uuid

@@ -74,7 +74,7 @@ def test_a_certified_station_has_the_owners_ca_and_no_ca_key(pair: tuple[Station
         assert station.ca == owner.ca
         assert station.vault.ca() is None
         with pytest.raises(NotFound):
-            station.certify(owner.point)
+            station.identity.certify(owner.point)
 
 
 def test_until_it_is_certified_a_station_does_nothing(tmp_path: Path) -> None:
@@ -101,7 +101,7 @@ def test_they_rekey_each_others_nodes_by_tap(pair: tuple[Station, Station], dire
     one, other = pair[::direction]
     board = Board()
     provisioned(one, board)
-    other.store.put_whitelist(WhitelistEntry(board.uuid))
+    other.pins.put(WhitelistEntry(board.uuid))
     with talk(board) as node:
         assert agree(other, node, identify(other, node)).epoch == 2
     assert board.state.ca == one.ca
@@ -194,7 +194,7 @@ def test_a_station_with_a_ca_of_its_own_joins_for_the_nodes_of_another(tmp_path:
     certificate = sign_request(owner, read_request(request(home, "east")))
     station = adopt_certificate(home, certificate, ask=ask)
     assert station.ca != owner.ca
-    assert station.signature_under(owner.ca) == certificate.signature
+    assert station.identity.signature_under(owner.ca) == certificate.signature
     station.close()
 
 

@@ -50,18 +50,18 @@ def test_after_a_copy_both_stations_reach_the_node(pair: Pair) -> None:
     assert session(pair.south, pair.board) == 1
     assert held(pair.south, pair.board) == [("active", 1, "import")]
     assert session(pair.north, pair.board) == 1
-    record = pair.south.store.node(pair.board.uuid)
+    record = pair.south.nodes.get(pair.board.uuid)
     assert record is not None
     assert (record.name, record.groups, record.profile) == ("finger 1", ("left hand",), "tactile-finger-sensor")
-    entry = pair.south.store.whitelisted(pair.board.uuid)
+    entry = pair.south.pins.entry(pair.board.uuid)
     assert entry is not None
     assert (entry.assurance, entry.fingerprint is not None) == ("import", True)
 
 
 def test_each_station_knows_who_else_holds_a_copy(pair: Pair) -> None:
     pair.take(pair.export("copy")[0])
-    assert [(h.fingerprint, h.mode) for h in pair.north.store.holders()] == [(pair.south.fingerprint, "copy")]
-    assert [(h.fingerprint, h.mode) for h in pair.south.store.holders()] == [(pair.north.fingerprint, "copy")]
+    assert [(h.fingerprint, h.mode) for h in pair.north.keys.holders()] == [(pair.south.fingerprint, "copy")]
+    assert [(h.fingerprint, h.mode) for h in pair.south.keys.holders()] == [(pair.north.fingerprint, "copy")]
 
 
 def test_stations_alternate_sessions_under_one_copied_key(pair: Pair) -> None:
@@ -86,7 +86,7 @@ def test_a_rotation_by_one_locks_the_other_out_and_is_told(pair: Pair) -> None:
     pair.take(pair.export("copy")[0])
     with talk(pair.board) as node:
         agree(pair.south, node, identify(pair.south, node), rotate=True)
-    assert pair.south.store.holders() == []
+    assert pair.south.keys.holders() == []
     with talk(pair.board) as node, pytest.raises(PolicyRefused, match="knows none of the keys"):
         agree(pair.north, node, identify(pair.north, node))
     assert session(pair.south, pair.board) == 2
@@ -101,8 +101,8 @@ def test_one_bundle_for_several_stations(pair: Pair, tmp_path: Path) -> None:
     for station in (pair.south, west):
         pair.take(path, station)
         assert session(station, pair.board) == 1
-    assert {h.fingerprint for h in pair.south.store.holders()} == {pair.north.fingerprint, west.fingerprint}
-    assert pair.south.certificate(pair.north.ca, west.point) is not None
+    assert {h.fingerprint for h in pair.south.keys.holders()} == {pair.north.fingerprint, west.fingerprint}
+    assert pair.south.identity.certificate(pair.north.ca, west.point) is not None
     west.close()
 
 
@@ -151,8 +151,8 @@ def test_the_receiver_of_a_move_rotates_at_its_first_contact(pair: Pair) -> None
     assert node_key_id(pair.board) != before
     assert held(pair.south, pair.board) == [("active", 2, "agreement")]
     assert is_proven(pair.south, pair.board.uuid)
-    assert pair.south.store.holders() == []
-    assert pair.south.rotation_due(pair.board.uuid) is None
+    assert pair.south.keys.holders() == []
+    assert pair.south.keys.rotation_due(pair.board.uuid) is None
 
 
 @pytest.mark.parametrize("lost", range(1, 9))
@@ -169,8 +169,8 @@ def test_a_first_contact_cut_anywhere_is_carried_on(pair: Pair, what: str, lost:
         pass
     epoch = session(pair.south, pair.board)
     assert epoch >= 2
-    assert pair.south.rotation_due(pair.board.uuid) is None
-    assert [key.key_id for key in pair.south.store.keys(pair.board.uuid)] == [node_key_id(pair.board)]
+    assert pair.south.keys.rotation_due(pair.board.uuid) is None
+    assert [key.key_id for key in pair.south.keys.of(pair.board.uuid)] == [node_key_id(pair.board)]
 
 
 def test_any_first_contact_after_a_move_rotates_even_to_write(pair: Pair) -> None:
@@ -193,9 +193,9 @@ def test_the_receiver_writes_and_rotates_under_the_senders_ca(pair: Pair) -> Non
 
 def test_the_senders_ca_counts_for_these_nodes_and_no_others(pair: Pair) -> None:
     pair.take(pair.export("copy")[0])
-    assert pair.north.ca in pair.south.trusted_cas(pair.board.uuid)
-    assert pair.north.ca not in pair.south.trusted_cas()
-    assert pair.north.ca not in pair.south.trusted_cas(bytes(10))
+    assert pair.north.ca in pair.south.policy.trusted_cas(pair.board.uuid)
+    assert pair.north.ca not in pair.south.policy.trusted_cas()
+    assert pair.north.ca not in pair.south.policy.trusted_cas(bytes(10))
 
 
 def test_a_reset_node_gets_its_new_stations_own_ca(pair: Pair) -> None:
@@ -222,7 +222,7 @@ def test_a_node_goes_there_and_back(pair: Pair) -> None:
     export_keys(pair.south, plan_export(pair.south, ExportOrder(("north",), None, "move")), back)
     pair.take(back, pair.north)
     assert session(pair.north, pair.board) == 3
-    assert pair.north.store.tombstone(pair.board.uuid) is None
+    assert pair.north.policy.tombstone(pair.board.uuid) is None
     with pytest.raises(PolicyRefused, match="was moved to station"):
         session(pair.south, pair.board)
 
@@ -236,7 +236,7 @@ def test_the_receipt_closes_a_move_and_deletes_its_keys(pair: Pair) -> None:
     assert close(pair.north, taken.receipt).fresh
     assert held(pair.north, pair.board) == []
     assert row(pair.north, exported.plan.id, "out").state == "closed"
-    tombstone = pair.north.store.tombstone(pair.board.uuid)
+    tombstone = pair.north.policy.tombstone(pair.board.uuid)
     assert tombstone is not None
     assert tombstone.to_fingerprint == pair.south.fingerprint
     assert not close(pair.north, taken.receipt + b"\n").fresh
@@ -283,9 +283,9 @@ def test_undo_gives_the_key_back_and_rotates_it_before_anything_else(pair: Pair)
     _, exported = pair.export("move")
     assert undo(pair.north, find_handover(pair.north, exported.plan.id[:8])).fresh
     assert not undo(pair.north, find_handover(pair.north, exported.plan.id)).fresh
-    assert [holder.fingerprint for holder in pair.north.store.holders()] == [pair.south.fingerprint]
+    assert [holder.fingerprint for holder in pair.north.keys.holders()] == [pair.south.fingerprint]
     assert session(pair.north, pair.board) == 2
-    assert pair.north.store.holders() == []
+    assert pair.north.keys.holders() == []
     assert session(pair.north, pair.board) == 2
 
 
@@ -315,7 +315,7 @@ def test_what_cannot_be_undone(pair: Pair) -> None:
 def test_a_node_refused_by_the_receiver_of_a_move_is_the_senders_again(tmp_path: Path) -> None:
     pair = Pair.make(tmp_path, 2)
     first, second = pair.boards
-    pair.south.store.put_whitelist(WhitelistEntry(second.uuid, "ab" * 32))
+    pair.south.pins.put(WhitelistEntry(second.uuid, "ab" * 32))
     path, _ = pair.export("move")
     taken = pair.take(path)
     assert [uuid for uuid, _ in taken.notes.refused] == [second.uuid.hex()]
@@ -370,7 +370,7 @@ def test_a_bundle_file_is_private_and_never_overwritten(pair: Pair) -> None:
     with pytest.raises(UsageFailure, match="exists already"):
         pair.export("move", output=occupied)
     assert occupied.read_text() == "a letter"
-    assert pair.north.store.tombstones() == []
+    assert pair.north.policy.tombstones() == []
 
 
 def test_no_key_in_the_clear_anywhere(pair: Pair) -> None:
@@ -419,11 +419,11 @@ def test_a_moved_node_is_not_handed_to_someone_else(pair: Pair, tmp_path: Path) 
 
 
 def test_without_the_ca_key_the_receiver_must_be_certified_already(pair: Pair) -> None:
-    signature = pair.north.certify(pair.south.point)
+    signature = pair.north.identity.certify(pair.south.point)
     pair.north.vault.drop_ca()  # type: ignore[attr-defined]
     with pytest.raises(PolicyRefused, match="not certified by the CA"):
         pair.export("copy")
-    pair.north.keep_certificate(pair.north.ca, pair.south.point, signature)
+    pair.north.identity.keep_certificate(pair.north.ca, pair.south.point, signature)
     pair.take(pair.export("copy")[0])
     assert provisioned(pair.south, pair.board).verified.verdict == "authentic"
 
@@ -457,7 +457,7 @@ def test_the_bundle_says_what_the_profile_lists(pair: Pair) -> None:
     keys = {pair.north.fingerprint: pair.north.point}
     opened = open_bundle(path.read_bytes(), pair.south.vault.identity(), keys.get, datetime.now(UTC))
     (node,) = opened.bundle.nodes
-    record = pair.north.store.node(pair.board.uuid)
+    record = pair.north.nodes.get(pair.board.uuid)
     assert record is not None
     assert (node.uuid, node.node_key, node.key) == (pair.board.uuid, pair.board.key.point, pair.board.state.key)
     assert (node.epoch, node.sequence, node.teds_sha256) == (1, 1, record.teds_sha256)
@@ -485,7 +485,7 @@ def test_a_bundle_for_another_station_or_from_a_stranger(pair: Pair, tmp_path: P
     path, _ = pair.export("copy")
     with pytest.raises(PolicyRefused, match="not sealed for this station"):
         plan_import(west, path.read_bytes())
-    pair.south.store.remove_trust("north")
+    pair.south.policy.distrust("north")
     with pytest.raises(NotAuthentic, match="Nobody trusted here"):
         plan_import(pair.south, path.read_bytes())
     west.close()
@@ -540,9 +540,9 @@ def test_a_newer_key_under_another_ca_counts_once_it_is_proven(pair: Pair) -> No
     bundle = pair.folder / "back.jwe"
     export_keys(pair.south, plan_export(pair.south, ExportOrder(("north",), None)), bundle)
     pair.take(bundle, pair.north)
-    assert pair.north.ca_of(pair.board.uuid) == pair.north.ca
+    assert pair.north.keys.ca_of(pair.board.uuid) == pair.north.ca
     assert session(pair.north, pair.board) == 2
-    assert pair.north.ca_of(pair.board.uuid) == pair.south.ca
+    assert pair.north.keys.ca_of(pair.board.uuid) == pair.south.ca
     assert provisioned(pair.north, pair.board).verified.verdict == "authentic"
 
 
@@ -551,9 +551,9 @@ def test_a_claimed_key_under_another_ca_does_not_spoil_the_one_in_use(pair: Pair
     path, _ = pair.export("copy")
     pair.take(path)
     key = bytes(range(16))
-    pair.south.add_pending(pair.board.uuid, key=key, key_id=key_id(key), epoch=9)
-    pair.south.store.promote_key(pair.board.uuid, key_id(key).hex())
-    pair.south.set_ca_of(pair.board.uuid, pair.south.ca)
+    pair.south.keys.add_pending(pair.board.uuid, key=key, key_id=key_id(key), epoch=9)
+    pair.south.keys.promote(pair.board.uuid, key_id(key).hex())
+    pair.south.keys.set_ca_of(pair.board.uuid, pair.south.ca)
     bundle = pair.folder / "lie.jwe"
     export_keys(pair.south, plan_export(pair.south, ExportOrder(("north",), None)), bundle)
     pair.take(bundle, pair.north)
@@ -597,7 +597,7 @@ def test_the_same_keys_again_in_a_new_bundle(pair: Pair) -> None:
 
 def test_a_station_that_lost_the_node_to_a_rotation_does_not_agree_anew(pair: Pair) -> None:
     pair.take(pair.export("move")[0])
-    pair.north.store.remove_tombstone(pair.board.uuid)
+    pair.north.policy.take_back([pair.board.uuid])
     with talk(pair.board) as node:
         agree(pair.north, node, identify(pair.north, node), rotate=True)
     with talk(pair.board) as node, pytest.raises((PolicyRefused, NodeRefused), match="knows none"):

@@ -37,9 +37,9 @@ class Prepared:
         export(pair.north, folder / "whole.jwe")
         pair.close()
         # north as it was before that export
-        for tombstone in (north := open_station(folder / "north")).store.tombstones():
-            north.store.remove_tombstone(tombstone.uuid)
-            north.store.remove_handover(tombstone.handover_id, "out")
+        for tombstone in (north := open_station(folder / "north")).policy.tombstones():
+            north.policy.take_back([tombstone.uuid])
+            north.handovers.remove(tombstone.handover_id, "out")
         north.close()
         self.states = [board.state for board in self.boards]
         self.round = 0
@@ -80,7 +80,7 @@ def killed_before(step: int, act: object, station: Station, bundle: Path) -> boo
 
 def check_export(station: Station, bundle: Path, boards: list[Board]) -> None:
     """Before the move, or in it: never a file while a key is still in use."""
-    resting = [tombstone.uuid for tombstone in station.store.tombstones()]
+    resting = [tombstone.uuid for tombstone in station.policy.tombstones()]
     assert resting in ([], [board.uuid for board in boards])
     if not resting:
         assert not bundle.exists()
@@ -99,7 +99,7 @@ def carry_on(north: Path, south: Path, bundle: Path, boards: list[Board]) -> Non
     assert [session(receiver, board) for board in boards] == [2, 2]
     assert len(close(sender, receipt).receipt.imported) == 2
     assert [held(sender, board) for board in boards] == [[], []]
-    assert len(sender.store.handovers()) == 1
+    assert len(sender.handovers.all()) == 1
     sender.close()
     receiver.close()
 
@@ -156,7 +156,7 @@ def test_an_import_killed_by_the_system(prepared: Prepared, step: int) -> None:
     assert kill(south, "import", step, bundle) == -signal.SIGKILL
     station = open_station(south)
     assert held(station, prepared.boards[0]) == []
-    assert station.store.handovers() == []
+    assert station.handovers.all() == []
     take(station, bundle)
     assert [session(station, board) for board in prepared.boards] == [2, 2]
     station.close()

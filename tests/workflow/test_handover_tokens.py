@@ -55,7 +55,7 @@ def test_copy_move_receipt_and_revocation_with_keys_in_tokens(uris: dict[str, st
         assert close(north, taken.receipt).fresh
     assert session(north, one) == 1
     assert held(north, other) == []
-    assert [entry.why for entry in south.store.revocations()] == ["lost"]
+    assert [entry.why for entry in south.policy.revocations()] == ["lost"]
     assert provisioned(south, one).verified.verdict == "authentic"
     for station in stations.values():
         station.close()

@@ -43,7 +43,7 @@ def test_a_revoked_node_gets_nothing_any_more(pair: Pair) -> None:
     done = provisioned(pair.north, pair.board)
     assert revoke(pair.north, pair.board.uuid, "stolen").fresh
     assert held(pair.north, pair.board) == []
-    assert pair.north.store.whitelisted(pair.board.uuid) is None
+    assert pair.north.pins.entry(pair.board.uuid) is None
     with talk(pair.board) as node, pytest.raises(PolicyRefused, match="was revoked: stolen"):
         agree(pair.north, node, identify(pair.north, node))
     failed = list(verify_image(pair.north, Image(pair.board.uuid, done.image.blocks)))
@@ -53,7 +53,7 @@ def test_a_revoked_node_gets_nothing_any_more(pair: Pair) -> None:
 
 def test_whitelisting_a_revoked_node_anew_does_not_help(pair: Pair) -> None:
     revoke(pair.north, pair.board.uuid, "stolen")
-    pair.north.store.put_whitelist(WhitelistEntry(pair.board.uuid))
+    pair.north.pins.put(WhitelistEntry(pair.board.uuid))
     with talk(pair.board) as node, pytest.raises(PolicyRefused, match="was revoked"):
         agree(pair.north, node, identify(pair.north, node))
 
@@ -92,11 +92,11 @@ def test_a_node_on_the_receivers_deny_list_is_not_imported(pair: Pair) -> None:
 def test_a_deny_list_of_strangers_counts_for_nothing_and_is_passed_over(pair: Pair, tmp_path: Path) -> None:
     third = Pair.make(tmp_path / "third", 1)
     revoke(third.north, pair.boards[1].uuid, "says a stranger")
-    (entry,) = third.north.store.revocations()
-    pair.north.store.put_revocation(entry)
+    (entry,) = third.north.policy.revocations()
+    pair.north.policy.deny(entry)
     taken = pair.take(pair.export("copy")[0])
     assert taken.uuids == (pair.boards[0].uuid,)
-    assert pair.south.store.revocations() == []
+    assert pair.south.policy.revocations() == []
     third.close()
 
 
@@ -118,7 +118,7 @@ def test_a_node_out_of_service_signed_that_it_is_reset(pair: Pair) -> None:
     assert held(pair.north, pair.board) == []
     assert is_finished(pair.north, pair.board.uuid)
     with pytest.raises(NotFound):
-        pair.north.store.resolve("finger 1")
+        pair.north.nodes.resolve("finger 1")
     with talk(pair.board) as node, pytest.raises(NotWhitelisted):
         agree(pair.north, node, identify(pair.north, node))
 
@@ -126,7 +126,7 @@ def test_a_node_out_of_service_signed_that_it_is_reset(pair: Pair) -> None:
 def test_a_node_that_does_not_answer_is_unconfirmed_and_can_be_tried_again(pair: Pair) -> None:
     retire(pair.north, pair.board.uuid, None)
     assert not is_finished(pair.north, pair.board.uuid)
-    record = pair.north.store.node(pair.board.uuid)
+    record = pair.north.nodes.get(pair.board.uuid)
     assert record is not None
     assert record.verdict == "decommissioned, unconfirmed"
     with pytest.raises(PolicyRefused, match="out of service"):
@@ -144,11 +144,11 @@ def test_a_spare_takes_over_name_groups_and_profile(pair: Pair) -> None:
     key_up(pair.north, spare)
     plan = plan_takeover(pair.north, pair.board.uuid, spare.uuid, copy_calibration=False)
     take_over(pair.north, plan, None)
-    record = pair.north.store.node(spare.uuid)
+    record = pair.north.nodes.get(spare.uuid)
     assert record is not None
     assert (record.name, record.groups, record.profile) == ("finger 1", ("left hand",), "tactile-finger-sensor")
-    assert pair.north.store.resolve("finger 1") == spare.uuid
-    old = pair.north.store.node(pair.board.uuid)
+    assert pair.north.nodes.resolve("finger 1") == spare.uuid
+    old = pair.north.nodes.get(pair.board.uuid)
     assert old is not None
     assert (old.name, old.verdict) == (None, f"replaced by {spare.uuid.hex()}, unconfirmed")
     assert plan_takeover(pair.north, pair.board.uuid, spare.uuid, copy_calibration=False).done
@@ -178,7 +178,7 @@ def test_a_calibration_is_copied_only_when_told(pair: Pair, tmp_path: Path, copi
     provisioned(pair.north, spare, "temperature-sensor")
     same = spare.state.blocks.get((1, 5)) == old.state.blocks[1, 5]
     assert same is copied
-    record = pair.north.store.node(spare.uuid)
+    record = pair.north.nodes.get(spare.uuid)
     assert record is not None
     assert record.name == "thermo"
 

@@ -28,7 +28,7 @@ def test_a_keyed_node_on_a_bus_is_listed_by_uuid_and_pinned_by_its_first_tap(
     assert (entry.assurance, entry.fingerprint) == ("uuid", None)
     with talk(board) as node:
         shown = identify(station, node)
-    pinned = station.store.whitelisted(board.uuid)
+    pinned = station.pins.entry(board.uuid)
     assert pinned is not None
     assert pinned.fingerprint == shown.fingerprint
 
@@ -36,10 +36,10 @@ def test_a_keyed_node_on_a_bus_is_listed_by_uuid_and_pinned_by_its_first_tap(
 def test_one_damaged_key_does_not_hide_the_good_one(station: Station, board: Board) -> None:
     whitelist(station, board)
     agree(station, board)
-    station.add_pending(board.uuid, key=bytes(16), key_id=bytes(8), epoch=9)
-    station.store._database.execute("UPDATE keys SET wrapped = x'00' WHERE state = 'pending'")
+    station.keys.add_pending(board.uuid, key=bytes(16), key_id=bytes(8), epoch=9)
+    station._store._database.execute("UPDATE keys SET wrapped = x'00' WHERE state = 'pending'")
     assert agree(station, board).epoch == 1
-    station.store._database.execute("UPDATE keys SET wrapped = x'00'")
+    station._store._database.execute("UPDATE keys SET wrapped = x'00'")
     with pytest.raises(VaultFailure):
         agree(station, board)
 
@@ -64,12 +64,12 @@ def test_a_node_given_away_and_provisioned_elsewhere_does_not_come_back_on_a_hin
     from .test_provision import run as provision
 
     provision(station, board)
-    station.store.remove_keys(board.uuid)
-    station.store.put_handover(Handover("one", "out", "move", ("ab" * 32,), "closed", "{}"))
-    station.store.put_tombstone(Tombstone(board.uuid, "ab" * 32, "one"))
+    station.keys.remove(board.uuid)
+    station.handovers.put(Handover("one", "out", "move", ("ab" * 32,), "closed", "{}"))
+    station.policy.give_away(Tombstone(board.uuid, "ab" * 32, "one"))
     with talk(board) as node, pytest.raises(PolicyRefused, match="was moved"):
         step(station, node, replace(identify(station, node), state=NodeState.FACTORY))
-    assert station.store.tombstone(board.uuid) is not None
+    assert station.policy.tombstone(board.uuid) is not None
     board.tim.reset_by_hand()
     assert agree(station, board).epoch == 2
-    assert station.store.tombstone(board.uuid) is None
+    assert station.policy.tombstone(board.uuid) is None

@@ -58,7 +58,7 @@ def test_a_new_node_ends_authentic(station: Station, board: Board) -> None:
     assert list(results(done)) == ["identify", "whitelist", "agree", "build", "sign", "write", "verify"]
     assert set(results(done).values()) == {"done"}
     assert board.state.state == NodeState.PROVISIONED
-    record = station.store.node(board.uuid)
+    record = station.nodes.get(board.uuid)
     assert record is not None
     assert (record.verdict, record.sequence, record.epoch) == ("authentic", 1, 1)
 
@@ -86,12 +86,12 @@ def test_without_a_yes_an_unknown_node_is_left_alone(station: Station, board: Bo
     with pytest.raises(NotWhitelisted):
         run(station, board, accept=no)
     assert board.state.state == NodeState.FACTORY
-    assert station.store.whitelist() == []
+    assert station.pins.whitelist() == []
 
 
 def test_over_the_bus_of_a_node_without_nfc(station: Station, board: Board) -> None:
     assert run(station, board, MemoryLink(board, via="can", tapped=True)).verified.verdict == "authentic"
-    entry = station.store.whitelisted(board.uuid)
+    entry = station.pins.entry(board.uuid)
     assert entry is not None
     assert entry.assurance == "bus"
 
@@ -117,7 +117,7 @@ def test_cut_at_every_message_the_same_command_carries_on(tmp_path: Path, half: 
         with pytest.raises(NodeSilent):
             run(station, board, MemoryLink(board, **{half: lost}))  # type: ignore[arg-type]
         assert run(station, board).verified.verdict == "authentic", f"{half} {lost}"
-        assert [record.state for record in station.store.keys(board.uuid)] == ["active"]
+        assert [record.state for record in station.keys.of(board.uuid)] == ["active"]
         station.close()
 
 
@@ -173,7 +173,7 @@ def test_read_only_teds_are_signed_as_they_are(station: Station, board: Board) -
 
 def test_a_sequence_far_behind_is_caught_up_in_steps(station: Station, board: Board) -> None:
     run(station, board)
-    station.remember(board.uuid, sequence=200_000)
+    station.nodes.remember(board.uuid, sequence=200_000)
     assert run(station, board, order=replace(ANGLE, name="far ahead")).verified.verdict == "authentic"
     assert board.state.sequence == 200_001
 
@@ -190,7 +190,7 @@ def test_a_revoked_node_is_refused(station: Station, board: Board) -> None:
     from teds_provision.store import Revocation
 
     run(station, board)
-    station.store.put_revocation(Revocation(board.uuid, None, "stolen", ""))
+    station.policy.deny(Revocation(board.uuid, None, "stolen", ""))
     with pytest.raises(PolicyRefused, match="stolen"):
         run(station, board)
 
@@ -242,4 +242,4 @@ def test_a_wrong_order_changes_nothing(station: Station, board: Board, tmp_path:
         run(station, board, order=order)
     assert wrong.value.exit_code in (2, 3, 8)
     assert board.state.state == NodeState.FACTORY
-    assert station.store.whitelisted(board.uuid) is None
+    assert station.pins.entry(board.uuid) is None

@@ -47,14 +47,14 @@ def private(key: object, encoding: Encoding = Encoding.PEM) -> bytes:
 
 def test_a_key_counts_once_it_was_added_and_until_it_is_removed(north: Station, keys: Path) -> None:
     (keys / "lab.pem").write_text(to_pem(OTHER.point))
-    assert north.trusted_stations() == [north.point]
+    assert north.policy.trusted_stations() == [north.point]
     assert add(north, [candidate(north, "lab", keys / "lab.pem", "station")]) == 1
-    assert north.trusted_stations() == [north.point, OTHER.point]
+    assert north.policy.trusted_stations() == [north.point, OTHER.point]
     again = candidate(north, "lab", keys / "lab.pem", "station")
     assert again.known
     assert add(north, [again]) == 0
     remove(north, find_trusted(north, "lab"))
-    assert north.trusted_stations() == [north.point]
+    assert north.policy.trusted_stations() == [north.point]
 
 
 def test_a_key_is_found_by_name_fingerprint_or_file(north: Station, keys: Path) -> None:
@@ -116,7 +116,7 @@ def test_a_folder_of_keys_with_roles_by_name(north: Station, keys: Path) -> None
     found = candidates_of(north, keys, "station")
     assert [(one.record.name, one.record.role) for one in found] == [("lab", "station"), ("owner", "ca")]
     add(north, found)
-    assert SoftwareKey(22).point in north.trusted_cas()
+    assert SoftwareKey(22).point in north.policy.trusted_cas()
 
 
 def bad_files() -> dict[str, bytes]:
@@ -138,7 +138,7 @@ def test_a_folder_that_holds_a_private_key_is_refused_whole(north: Station, keys
     (keys / name).write_bytes(bad_files()[name])
     with pytest.raises(PolicyRefused, match="is for public keys"):
         candidates_of(north, keys, "station")
-    assert north.store.trusted() == []
+    assert north.policy.trusted() == []
 
 
 def test_the_keys_folder_of_this_workspace_holds_no_private_key() -> None:

@@ -83,7 +83,7 @@ def test_the_very_datasheet_of_the_node_without_a_session_is_unproven(
     station: Station, board: Board, state: NodeState, reason: Reason
 ) -> None:
     recorded = run(station, board).image
-    before = station.store.node(board.uuid)
+    before = station.nodes.get(board.uuid)
     attacker = Attacker(board, recorded, state, reason)
     verified = looked_at(station, attacker)
     assert verified.verdict == "unproven"
@@ -91,7 +91,7 @@ def test_the_very_datasheet_of_the_node_without_a_session_is_unproven(
         require_authentic(verified)
     assert told.value.exit_code == 5
     assert (Function.RESET in attacker.asked) == (state == NodeState.FACTORY)
-    after = station.store.node(board.uuid)
+    after = station.nodes.get(board.uuid)
     assert before is not None
     assert after is not None
     assert replace(after, last_seen=before.last_seen) == before, "nothing of this is believed, its address least of all"
@@ -109,7 +109,7 @@ def test_an_old_datasheet_without_a_session_is_not_authentic(station: Station, b
 def test_where_no_key_is_held_the_stores_own_values_still_count(station: Station, board: Board) -> None:
     old = run(station, board).image
     new = run(station, board, order=replace(ANGLE, name="renamed")).image
-    station.store.remove_keys(board.uuid)
+    station.keys.remove(board.uuid)
     assert looked_at(station, Attacker(board, new)).verdict == "authentic"
     assert looked_at(station, Attacker(board, old)).verdict == "not authentic"
     assert looked_at(station, Attacker(board, new)).verdict == "authentic", "the old one was not remembered"

@@ -107,10 +107,10 @@ def test_a_foreign_security_teds_is_shown_and_never_trusted(station: Station, im
 def test_a_stranger_trusts_nothing_until_told(station: Station, image: Image, tmp_path: Path) -> None:
     stranger = make_station(tmp_path / "stranger")
     assert "signing station" in failed(stranger, image)
-    stranger.store.put_trust(TrustRecord("peer", "station", station.point, fingerprint(station.point)))
+    stranger.policy.trust(TrustRecord("peer", "station", station.point, fingerprint(station.point)))
     assert verdict(stranger, image) == "authentic"
-    stranger.store.remove_trust("peer")
-    stranger.store.put_trust(TrustRecord("owner", "ca", station.ca, fingerprint(station.ca)))
+    stranger.policy.distrust("peer")
+    stranger.policy.trust(TrustRecord("owner", "ca", station.ca, fingerprint(station.ca)))
     assert verdict(stranger, image) == "authentic"
 
 
@@ -193,7 +193,7 @@ def test_a_datasheet_of_a_later_epoch_is_caught(station: Station, board: Board, 
 def test_what_is_not_whitelisted_cannot_be_signed(station: Station, board: Board, image: Image) -> None:
     from teds_provision.steps.sign_command import SignOrder, sign_image
 
-    station.store.remove_whitelist(board.uuid)
+    station.pins.remove(board.uuid)
     with pytest.raises(NotWhitelisted):
         sign_image(station, SignOrder(board.uuid, image), None)
 

@@ -186,7 +186,7 @@ def test_a_hundred_thousand_entries_are_quick(tmp_path: Path, station: Station) 
     assert len(listed[0]) == len(listed[1]) == len(listed[2]) == 100_000
     add(station, plan_addition(station, listed[0]), source="big.xml")
     assert time.monotonic() - started < 60  # some 5 s on a quiet machine
-    assert len(station.store.whitelist()) == 100_000
+    assert len(station.pins.whitelist()) == 100_000
     assert plan_addition(station, listed[1]).write == ()
 
 
@@ -207,23 +207,23 @@ def test_a_pinned_key_is_never_replaced_and_one_conflict_refuses_all(station: St
     with pytest.raises(OtherKey, match="pinned to the key abababababababab") as caught:
         plan_addition(station, [Listed(1, TWO), Listed(2, ONE, OTHER)])
     assert caught.value.exit_code == 6
-    assert station.store.whitelisted(TWO) is None
+    assert station.pins.entry(TWO) is None
 
 
 def test_an_unpinned_entry_gains_a_key_and_keeps_the_rest(station: Station) -> None:
     put(station, Listed(1, ONE, name="finger"))
-    before = station.store.whitelisted(ONE)
+    before = station.pins.entry(ONE)
     assert before is not None
     assert before.assurance == "uuid"
     put(station, Listed(1, ONE, KEY, "thumb"))
-    after = station.store.whitelisted(ONE)
+    after = station.pins.entry(ONE)
     assert after is not None
     assert (after.fingerprint, after.name, after.assurance, after.added) == (KEY, "finger", "import", before.added)
     assert plan_addition(station, [Listed(1, ONE), Listed(2, ONE, KEY)]).write == ()
 
 
 def test_the_key_that_a_node_has_proved_counts_as_pinned(station: Station) -> None:
-    station.remember(ONE, point=station.point)
+    station.nodes.remember(ONE, point=station.point)
     with pytest.raises(OtherKey):
         plan_addition(station, [Listed(1, ONE, KEY)])
     put(station, Listed(1, ONE, station.fingerprint))
@@ -233,15 +233,15 @@ def test_the_key_that_a_node_has_proved_counts_as_pinned(station: Station) -> No
 
 
 def test_removing_keeps_epoch_and_sequence(station: Station) -> None:
-    station.remember(ONE, point=station.point, epoch=3, sequence=9)
+    station.nodes.remember(ONE, point=station.point, epoch=3, sequence=9)
     put(station, Listed(1, ONE))
     remove(station, ONE)
-    known = station.store.node(ONE)
+    known = station.nodes.get(ONE)
     assert known is not None
     assert (known.point, known.epoch, known.sequence) == (None, 3, 9)
 
 
 def test_a_revoked_node_is_not_whitelisted_again(station: Station) -> None:
-    station.store.put_revocation(Revocation(ONE, None, "stolen", "{}"))
+    station.policy.deny(Revocation(ONE, None, "stolen", "{}"))
     with pytest.raises(PolicyRefused, match="stolen"):
         plan_addition(station, [Listed(1, ONE)])

@@ -17,19 +17,19 @@ from .bench import Board, MemoryLink, talk
 def test_the_first_tap_pins_the_key_and_raises_the_assurance(station: Station, board: Board) -> None:
     add(station, plan_addition(station, [Listed(0, board.uuid, name="finger")]))
     who = identify(station, talk(board))
-    entry = station.store.whitelisted(board.uuid)
+    entry = station.pins.entry(board.uuid)
     assert entry is not None
     assert (entry.fingerprint, entry.assurance, entry.name) == (fingerprint(board.key.point), "tap", "finger")
     assert who.whitelisted == entry
-    assert [e.outcome for e in station.store.audit.entries() if e.act == "whitelist"] == ["added", "pinned"]
+    assert [e.outcome for e in station.audit_log.entries() if e.act == "whitelist"] == ["added", "pinned"]
     identify(station, talk(board))
-    assert len([e for e in station.store.audit.entries() if e.act == "whitelist"]) == 2
+    assert len([e for e in station.audit_log.entries() if e.act == "whitelist"]) == 2
 
 
 def test_a_bus_pins_nothing(station: Station, board: Board) -> None:
     add(station, plan_addition(station, [Listed(0, board.uuid)]))
     identify(station, talk(board, MemoryLink(board, via="can", tapped=False)))
-    entry = station.store.whitelisted(board.uuid)
+    entry = station.pins.entry(board.uuid)
     assert entry is not None
     assert (entry.fingerprint, entry.assurance) == (None, "uuid")
 
@@ -45,6 +45,6 @@ def test_another_board_under_the_same_uuid_is_refused_until_the_entry_is_removed
     remove(station, board.uuid)
     add(station, plan_addition(station, [Listed(0, board.uuid)]))
     identify(station, talk(replaced))
-    entry = station.store.whitelisted(board.uuid)
+    entry = station.pins.entry(board.uuid)
     assert entry is not None
     assert entry.fingerprint == fingerprint(replaced.key.point)

@@ -76,7 +76,7 @@ def export_keys(
     if everything == bool(uuids):
         raise click.UsageError("Name the nodes, or say --all.")
     station = app.station()
-    nodes = None if everything else tuple(station.store.resolve(uuid) for uuid in uuids)
+    nodes = None if everything else tuple(station.nodes.resolve(uuid) for uuid in uuids)
     order = ExportOrder(receivers, nodes, mode, expires, ca)
     if not dry_run:
         station.unlock()

@@ -31,15 +31,15 @@ def revoke(app: App, uuid: str, why: str, yes: bool, dry_run: bool) -> None:
     from teds_provision.handover.life import revoke as run
 
     station = app.station()
-    octets = station.store.resolve(uuid)
+    octets = station.nodes.resolve(uuid)
     if dry_run:
-        keys = len(station.store.keys(octets))
+        keys = len(station.keys.of(octets))
         app.emit(
             {"uuid": octets.hex(), "plan": "revoke", "keys": keys}, f"Plan: revoke {octets.hex()}, delete {keys} keys."
         )
         return
     station.unlock()
-    if station.store.revocation(octets) is None:
+    if station.policy.revocation(octets) is None:
         app.confirm(f"Revoke node {octets.hex()} for good?", yes=yes)
     with station.lock("revoke", app.note):
         done = run(station, octets, why)
@@ -68,8 +68,8 @@ def decommission(app: App, uuid: str, force: bool, yes: bool, dry_run: bool, lin
     from teds_provision.handover.life import is_finished, retire
 
     station = app.station()
-    octets = station.store.resolve(uuid)
-    station.require_not_given_away(octets)
+    octets = station.nodes.resolve(uuid)
+    station.policy.require_not_given_away(octets)
     if dry_run:
         app.emit({"uuid": octets.hex(), "plan": "decommission"}, f"Plan: reset {octets.hex()}, take it out of service.")
         return
@@ -139,7 +139,7 @@ def replace(
     app = ctx.find_object(App)
     assert app is not None
     station = app.station()
-    octets, spare = station.store.resolve(old), station.store.resolve(new)
+    octets, spare = station.nodes.resolve(old), station.nodes.resolve(new)
     station.unlock(octets)
     with station.lock("replace", app.note):
         plan = plan_takeover(station, octets, spare, copy_calibration=copy_calibration)

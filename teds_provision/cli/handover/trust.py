@@ -135,8 +135,9 @@ def list_(app: App) -> None:
     from teds_provision.protocol.keys import fingerprint
 
     station = app.station()
-    records = station.store.trusted()
-    certified = {record.fingerprint: station.certificate(station.ca, record.point) is not None for record in records}
+    records = station.policy.trusted()
+    ca, certificate = station.ca, station.identity.certificate
+    certified = {record.fingerprint: certificate(ca, record.point) is not None for record in records}
     told = [
         {**_record(record), "added": record.added, "certified": certified[record.fingerprint]}
         if record.role == "station"

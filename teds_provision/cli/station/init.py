@@ -56,11 +56,11 @@ def init(
             "public_key": to_pem(station.point),
             "fingerprint": station.fingerprint,
             "ca": {"public_key": to_pem(station.ca), "fingerprint": ca},
-            "keystore": station.keystore,
+            "keystore": station.identity.keystore,
             "why": why,
         },
         f"Station  {station.name}\n  key      {station.fingerprint[:16]}\n  CA key   {ca[:16]}\n"
-        f"  keystore {station.keystore} ({why})\n  home     {app.home}\n\n{to_pem(station.point)}",
+        f"  keystore {station.identity.keystore} ({why})\n  home     {app.home}\n\n{to_pem(station.point)}",
     )
 
 

@@ -34,12 +34,12 @@ def log(app: App, uuid: str | None, follow: bool, last: int | None) -> None:
     The whole chain is checked, whatever is shown. Exits 7 where an entry was changed, removed or added by hand.
     """
     station = app.station()
-    wanted = station.store.resolve(uuid) if uuid else None
-    verdict = station.store.audit.check()
+    wanted = station.nodes.resolve(uuid) if uuid else None
+    verdict = station.audit_log.check()
     if follow:
         _follow(app, station, wanted, verdict, last)
         return
-    entries = [entry for entry in station.store.audit.entries() if wanted in (None, entry.uuid)]
+    entries = [entry for entry in station.audit_log.entries() if wanted in (None, entry.uuid)]
     shown = entries if last is None else entries[max(0, len(entries) - last) :]
     app.emit(
         {
@@ -70,7 +70,7 @@ def _follow(app: App, station: Station, wanted: bytes | None, verdict: AuditVerd
     _require_intact(verdict)
     after = 0 if last is None else max(0, verdict.count - last)
     while True:
-        for entry in station.store.audit.entries(after):
+        for entry in station.audit_log.entries(after):
             after = entry.seq
             if wanted in (None, entry.uuid):
                 print(json.dumps(_as_dict(entry)) if app.json else _line(entry), flush=True)

@@ -26,7 +26,7 @@ def nodes(app: App, uuid: str | None) -> None:
     from teds_provision.station.inventory import inventory
 
     station = app.station()
-    found = inventory(station, station.store.resolve(uuid) if uuid else None)
+    found = inventory(station, station.nodes.resolve(uuid) if uuid else None)
     app.emit({"nodes": found}, lambda console: _one(console, found[0]) if uuid else _table(console, found))
 
 

@@ -35,7 +35,7 @@ def address(app: App, uuid: str, address: int, yes: bool, dry_run: bool, links: 
 
     del yes  # the old address can be given back the same way
     station = app.station()
-    octets = station.store.resolve(uuid)
+    octets = station.nodes.resolve(uuid)
     if dry_run:
         plan = f"Plan: node {octets.hex()} gets CAN address 0x{address:02x}."
         app.emit({"uuid": octets.hex(), "plan": "address", "can_address": address}, plan)

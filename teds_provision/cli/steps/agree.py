@@ -31,10 +31,10 @@ def agree(app: App, uuid: str, links: LinkSettings, rotate: bool, yes: bool, dry
 
     station = app.station()
     del yes  # nothing here is lost by a new key: the old one stays until the node has proven the new one
-    octets = station.store.resolve(uuid)
-    station.require_whitelisted(octets)
+    octets = station.nodes.resolve(uuid)
+    station.policy.require_whitelisted(octets)
     if dry_run:
-        held = [f"{record.state} key of epoch {record.epoch}" for record in station.store.keys(octets)]
+        held = [f"{record.state} key of epoch {record.epoch}" for record in station.keys.of(octets)]
         plan = ("rotate" if rotate else "keep") if held else "agree on a first key"
         app.emit(
             {"uuid": octets.hex(), "plan": plan, "held": held}, f"Plan: {plan} ({', '.join(held) or 'no key held'})."

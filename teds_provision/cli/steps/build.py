@@ -69,7 +69,7 @@ def build(app: App, uuid: str, order: Any, output: Path | None, edition: str, ye
 
     del yes  # a build can always be made again
     station = app.station()
-    octets = station.store.resolve(uuid)
+    octets = station.nodes.resolve(uuid)
     with station.lock("build", app.note):
         built = run(station, octets, order, edition=int(edition), keep_draft=not dry_run)
     if output is not None and not dry_run:

@@ -57,9 +57,9 @@ def _one(station: Any, node: Any, add: bool) -> dict[str, Any]:
         entry = who.whitelisted
         if entry is None and add:
             entry = add_to_whitelist(station, node, who)
-        known = station.store.node(who.uuid)
+        known = station.nodes.get(who.uuid)
         name = (known.name if known else None) or described.name
-        station.remember(who.uuid, name=name, channels=described.channels)
+        station.nodes.remember(who.uuid, name=name, channels=described.channels)
         station.audit("identify", who.uuid, "proven", fingerprint=who.fingerprint)
     return {
         "uuid": who.uuid.hex(),

@@ -49,7 +49,7 @@ def provision(
     from teds_provision.talk.meeting import meet
 
     station, reporter = app.station(), reporter_for(app)
-    wanted = station.store.resolve(uuid) if uuid is not None else None
+    wanted = station.nodes.resolve(uuid) if uuid is not None else None
     check_order(station, wanted, order)
     run = _runner(app, station, order, yes, reporter)
     if dry_run:
@@ -85,7 +85,7 @@ def _runner(
         accepted.add((who.uuid, who.fingerprint))
 
     def one(node: Conversation) -> Provisioned:
-        if app.interactive and not yes and station.store.whitelisted(node.uuid) is None:
+        if app.interactive and not yes and station.pins.entry(node.uuid) is None:
             accept(examine(station, node))  # before the store is locked: people take their time
         with station.lock("provision", app.note):
             done = run(station, node, order, accept=accept, reporter=reporter)
@@ -117,7 +117,7 @@ def _plan(app: App, station: Station, node: Conversation) -> None:
     who = examine(station, node)
     steps = ["identify"]
     steps += [] if who.whitelisted else ["whitelist"]
-    steps += ["agree"] if who.state == NodeState.FACTORY or not station.has_keys(who.uuid) else []
+    steps += ["agree"] if who.state == NodeState.FACTORY or not station.keys.held(who.uuid) else []
     steps += ["build", "sign", "write", "verify"]
     text = f"Plan for {who.uuid.hex()} ({who.state.name.lower()}): {', '.join(steps)}."
     app.emit({"uuid": who.uuid.hex(), "state": who.state.name.lower(), "plan": steps}, text)

@@ -29,14 +29,14 @@ def read(app: App, uuid: str, output: Path | None, links: LinkSettings) -> None:
     from teds_provision.talk.meeting import meet
 
     station = app.station()
-    octets = station.store.resolve(uuid)
+    octets = station.nodes.resolve(uuid)
     with meet(station, links, octets, reporter_for(app), before=lambda: station.unlock(octets)) as node:
         identify(station, node)
         with station.lock("read", app.note):
             session_if_keyed(station, node)
         image = read_image(node)
         if node.sealed:
-            station.store.put_node_image(octets, image.to_json())
+            station.nodes.keep_datasheet(image)
     text = image.to_json()
     if output is not None:
         write_file(output, text)

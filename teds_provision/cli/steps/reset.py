@@ -26,7 +26,7 @@ def reset(app: App, uuid: str, yes: bool, dry_run: bool, links: LinkSettings) ->
     from teds_provision.talk.meeting import meet
 
     station = app.station()
-    octets = station.store.resolve(uuid)
+    octets = station.nodes.resolve(uuid)
     if dry_run:
         app.emit({"uuid": octets.hex(), "plan": "reset"}, f"Plan: reset {octets.hex()} to factory state.")
         return

@@ -50,10 +50,10 @@ def sign(
         if output is None and not dry_run:
             raise UsageFailure("Signing an image file needs a place for the result.", hint="Add --output IMAGE.")
         image = Image.from_json(read_file(path))
-    uuid = image.uuid if image is not None else station.store.resolve(what)
+    uuid = image.uuid if image is not None else station.nodes.resolve(what)
     order = SignOrder(uuid, image, accept_calibration, dry_run)
     if not dry_run:
-        station.require_whitelisted(uuid)
+        station.policy.require_whitelisted(uuid)
         station.unlock()
     if read_node:
         with meet(station, links, uuid, reporter_for(app)) as node, station.lock("sign", app.note):

@@ -75,7 +75,7 @@ def _node(app: App, what: str, links: LinkSettings) -> tuple[Image, Verified]:
     from teds_provision.talk.meeting import meet
 
     station = app.station()
-    uuid = station.store.resolve(what)
+    uuid = station.nodes.resolve(what)
     with meet(station, links, uuid, reporter_for(app), before=lambda: station.unlock(uuid)) as node:
         who = identify(station, node)
         with station.lock("verify", app.note):

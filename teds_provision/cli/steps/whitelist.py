@@ -61,7 +61,7 @@ def add(app: App, uuid: str, fingerprint: str | None, name: str | None, dry_run:
     from teds_provision.steps.whitelist_files import Listed, require_name
 
     station = app.station()
-    octets = station.store.resolve(uuid)
+    octets = station.nodes.resolve(uuid)
     require_name(name)
     wanted = Listed(0, octets, fingerprint, name)
     if dry_run:
@@ -88,8 +88,8 @@ def remove(app: App, uuid: str, yes: bool, dry_run: bool) -> None:
     from teds_provision.steps.whitelist import remove as run
 
     station = app.station()
-    octets = station.store.resolve(uuid)
-    entry = station.store.whitelisted(octets)
+    octets = station.nodes.resolve(uuid)
+    entry = station.pins.entry(octets)
     told = f"{octets.hex()}{f' ({entry.name})' if entry and entry.name else ''}"
     pinned = entry.fingerprint if entry is not None else None
     if entry is None and not is_pinned(station, octets):
@@ -112,7 +112,7 @@ def list_entries(app: App) -> None:
     UUID, the pinned key, how well it was proven, when the entry was added, and the node's name.
     """
     station = app.station()
-    entries = station.store.whitelist()
+    entries = station.pins.whitelist()
 
     def human(console: Console) -> None:
         from rich.table import Table
@@ -181,7 +181,7 @@ def export_file(app: App, file: Path, form: str | None, dry_run: bool) -> None:
 
     station = app.station()
     form = form_of(file, form)
-    entries = station.store.whitelist()
+    entries = station.pins.whitelist()
     if not dry_run:
         write_file(file, render(entries, form))
     verb = "Would write" if dry_run else "Wrote"
@@ -202,5 +202,5 @@ def _emit(app: App, station: Station, text: str, **more: Any) -> None:
     """Tell a change in one line; with --json the whole whitelist as it stands now."""
     from teds_provision.steps.whitelist import as_dict
 
-    listed = [as_dict(entry) for entry in station.store.whitelist()] if app.json else []
+    listed = [as_dict(entry) for entry in station.pins.whitelist()] if app.json else []
     app.emit({"whitelist": listed, **more}, lambda console: console.print(text, markup=False))

@@ -36,9 +36,9 @@ def write(app: App, uuid: str, image: Path | None, yes: bool, dry_run: bool, lin
 
     del yes  # what is written was signed for this node before, and the commit is all or nothing
     station, reporter = app.station(), reporter_for(app)
-    octets = station.store.resolve(uuid)
-    station.require_whitelisted(octets)
-    draft = station.store.draft(octets)
+    octets = station.nodes.resolve(uuid)
+    station.policy.require_whitelisted(octets)
+    draft = station.nodes.draft(octets)
     if image is not None:
         wanted = Image.from_json(read_file(image))
     elif draft is not None:

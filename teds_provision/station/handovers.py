@@ -1,0 +1,42 @@
+"""Bundles that left and came, and the many rows that one of them brings at once."""
+
+from __future__ import annotations
+
+from teds_provision.station.node_keys import NodeKeys
+from teds_provision.store import Batch, Handover, Store
+from teds_provision.store.records import Direction
+
+
+class Handovers:
+    """The handovers of one station."""
+
+    def __init__(self, store: Store, keys: NodeKeys) -> None:
+        self._store = store
+        self._keys = keys
+
+    def all(self) -> list[Handover]:
+        """Every bundle that left or came, oldest first."""
+        return self._store.handovers()
+
+    def get(self, handover_id: str, direction: Direction) -> Handover | None:
+        """One bundle, None if it is not known."""
+        return self._store.handover(handover_id, direction)
+
+    def put(self, handover: Handover) -> None:
+        """Add or replace a bundle."""
+        self._store.put_handover(handover)
+
+    def remove(self, handover_id: str, direction: Direction) -> bool:
+        """Forget a bundle; False if there is none."""
+        return self._store.remove_handover(handover_id, direction)
+
+    def take_in(self, batch: Batch) -> None:
+        """Add or replace many rows, all or none; the caller has held them against what is there."""
+        with self._store.transaction():
+            self._store.put_batch(batch)
+            for uuid, why in batch.rotations.items():
+                self._keys.demand_rotation(uuid, why)
+            for uuid, ca in batch.cas.items():
+                self._keys.set_ca_of(uuid, ca)
+            for uuid, (key_id, ca) in batch.next_cas.items():
+                self._keys.set_ca_with(uuid, key_id, ca)

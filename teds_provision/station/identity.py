@@ -1,0 +1,124 @@
+"""Who this base station is: its name, its key, its owner's CA, and the signatures of CAs over station keys."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from typing import TYPE_CHECKING
+
+from teds_provision.errors import NotAuthentic, NotFound, PolicyRefused
+from teds_provision.protocol.agreement import Credentials
+from teds_provision.protocol.keys import fingerprint, station_key_message, verify
+from teds_provision.store import Store
+
+if TYPE_CHECKING:
+    from teds_provision.vault import Vault
+
+DEFAULT_NAME = "station"
+
+
+class Identity:
+    """The facts of one station, and the certificates (SIG104) that it knows; secrets come from the vault."""
+
+    def __init__(self, store: Store, vault: Callable[[], Vault]) -> None:
+        self._store = store
+        self._vault = vault
+
+    # -- facts -----------------------------------------------------------------------------------------------------
+
+    def is_complete(self) -> bool:
+        """Whether init was finished: a key, a CA and its signature are there."""
+        return self._store.setting("station_point") is not None
+
+    @property
+    def requested(self) -> bytes | None:
+        """P(base station) for which a certificate was asked for, None where none was."""
+        point = self._store.setting("requested_point")
+        return bytes.fromhex(point) if point is not None else None
+
+    def keep(self, facts: Mapping[str, str]) -> None:
+        """Keep facts of init by name; the caller holds them in one transaction with what belongs to them."""
+        for fact, value in facts.items():
+            self._store.set_setting(fact, value)
+
+    def _fact(self, name: str) -> str:
+        value = self._store.setting(name)
+        if value is None:
+            raise NotFound(f"There is no base station in {self._store.home} yet.", hint="Make one: teds-provision init")
+        return value
+
+    @property
+    def name(self) -> str:
+        """The station's name; the default one before init was finished."""
+        return self._store.setting("station_name") or DEFAULT_NAME
+
+    @property
+    def point(self) -> bytes:
+        """P(base station), 65 octets."""
+        return bytes.fromhex(self._fact("station_point"))
+
+    @property
+    def fingerprint(self) -> str:
+        """Fingerprint of the station's key."""
+        return fingerprint(self.point)
+
+    @property
+    def ca(self) -> bytes:
+        """P(CA) of the owner, 65 octets."""
+        return bytes.fromhex(self._fact("ca_point"))
+
+    @property
+    def signature(self) -> bytes:
+        """SIG104: the CA's signature over the station's key, 64 octets."""
+        return bytes.fromhex(self._fact("station_signature"))
+
+    @property
+    def keystore(self) -> str:
+        """Where the secrets lie: ``keyring``, ``file`` or a ``pkcs11:`` URI."""
+        return self._fact("keystore")
+
+    @property
+    def keystore_why(self) -> str:
+        """Why init chose this keystore, in words."""
+        return self._store.setting("keystore_why") or ""
+
+    # -- certificates ----------------------------------------------------------------------------------------------
+
+    def certify(self, point: bytes) -> bytes:
+        """SIG104 of this owner's CA over another station's key; raises NotFound where the CA key is not here."""
+        ca = self._vault().ca()
+        if ca is None or ca.point != self.ca:
+            raise NotFound("The CA key is not in this vault.", hint="Do this where the CA key is kept.")
+        return ca.sign(station_key_message(point))
+
+    def certificate(self, ca: bytes, point: bytes) -> bytes | None:
+        """SIG104 of ``ca`` over a station's key as far as it is known here."""
+        if (ca, point) == (self.ca, self.point):
+            return self.signature
+        known = self._store.setting(_certificate_setting(ca, point))
+        return bytes.fromhex(known) if known else None
+
+    def keep_certificate(self, ca: bytes, point: bytes, signature: bytes) -> None:
+        """Keep a SIG104; raises NotAuthentic where it does not verify."""
+        if not verify(ca, station_key_message(point), signature):
+            raise NotAuthentic(f"The CA {fingerprint(ca)[:16]} did not sign the station {fingerprint(point)[:16]}.")
+        if self.certificate(ca, point) is None:
+            self._store.set_setting(_certificate_setting(ca, point), signature.hex())
+
+    def signature_under(self, ca: bytes) -> bytes:
+        """SIG104 of ``ca`` over this station's key; raises PolicyRefused where there is none."""
+        signature = self.certificate(ca, self.point)
+        if signature is None:
+            raise PolicyRefused(
+                f"This station is not certified by the CA {fingerprint(ca)[:16]}.",
+                hint="Have it signed where that CA key is kept: teds-provision trust ca sign REQUEST",
+            )
+        return signature
+
+    def credentials(self, ca: bytes | None = None) -> Credentials:
+        """What the station shows and signs with under ``ca``, the owner's where none is named."""
+        under = self.ca if ca is None else ca
+        return Credentials(self._vault().identity(), self.signature_under(under), under)
+
+
+def _certificate_setting(ca: bytes, point: bytes) -> str:
+    return f"certificate:{fingerprint(ca)}:{fingerprint(point)}"

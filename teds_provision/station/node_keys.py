@@ -1,0 +1,167 @@
+"""The link keys that this station holds, whose CA each node keeps, who else holds a key, and which rotation is due."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+from teds_provision.errors import NoKeyring, VaultFailure, WrongPassphrase
+from teds_provision.station.identity import Identity
+from teds_provision.store import Holder, KeyRecord, Store, utc_now
+from teds_provision.store.records import KeySource
+from teds_provision.vault.base import node_key_context
+
+if TYPE_CHECKING:
+    from teds_provision.vault import Vault
+
+CA_OF, NEXT_CA, ROTATION = "ca-of:", "next-ca:", "rotate:"
+"""Names of settings by node (UUID in hex follows): the CA key that it keeps, the one that it keeps if a pending key
+(``keyId:P(CA)``, both hex) turns out to be good, and why a rotation is due."""
+
+
+@dataclass(frozen=True)
+class NodeKey:
+    """One unwrapped link key that this station holds for a node."""
+
+    record: KeyRecord
+    key: bytes
+
+    def __repr__(self) -> str:
+        return f"NodeKey({self.record.key_id}, {self.record.state})"
+
+
+class NodeKeys:
+    """The link keys of one station: wrapped in the store, opened by the vault."""
+
+    def __init__(self, store: Store, vault: Callable[[], Vault], identity: Identity) -> None:
+        self._store = store
+        self._vault = vault
+        self._identity = identity
+
+    def of(self, uuid: bytes) -> list[KeyRecord]:
+        """The keys of a node, wrapped, in the order to try them: newest pending first, the active one last."""
+        return self._store.keys(uuid)
+
+    def all(self) -> Iterator[KeyRecord]:
+        """Every key of every node, wrapped, in the order they came, a page at a time."""
+        return self._store.all_keys()
+
+    def held(self, uuid: bytes) -> bool:
+        """Whether any key is held for a node."""
+        return bool(self._store.keys(uuid))
+
+    def unwrapped(self, uuid: bytes) -> Iterator[NodeKey]:
+        """Every key held for a node, in the order of trying: newest pending first, the active one last.
+
+        One that cannot be unwrapped does not hide the others; VaultFailure comes after the last.
+        """
+        damaged: VaultFailure | None = None
+        for record in self._store.keys(uuid):
+            try:
+                key = self.unwrap(record)
+            except (WrongPassphrase, NoKeyring):
+                raise
+            except VaultFailure as failure:
+                damaged = failure
+                continue
+            yield NodeKey(record, key)
+        if damaged is not None:
+            raise damaged
+
+    def active_epoch(self, uuid: bytes) -> int:
+        """Epoch of the current (active) key of a node, 0 for none."""
+        return next((record.epoch for record in self._store.keys(uuid) if record.state == "active"), 0)
+
+    def slots(self) -> dict[bytes, int]:
+        """The last slot given to each node's keys."""
+        return self._store.slots()
+
+    def add_pending(self, uuid: bytes, *, key: bytes, key_id: bytes, epoch: int, imported: bool = False) -> None:
+        """Store a new key durably as pending; nothing else is touched."""
+        with self._store.transaction():
+            slot = self._store.next_slot(uuid)
+            source: KeySource = "import" if imported else "agreement"
+            self._store.add_key(
+                self.wrapped(uuid, key=key, key_id=key_id, epoch=epoch, slot=slot, source=source, created=utc_now())
+            )
+
+    def wrapped(
+        self, uuid: bytes, *, key: bytes, key_id: bytes, epoch: int, slot: int, source: KeySource, created: str
+    ) -> KeyRecord:
+        """Return the record of a new pending key in a slot that the node never had."""
+        context = node_key_context(self._store.id, uuid, epoch, slot)
+        sealed = self._vault().wrap(key, context=context)
+        return KeyRecord(uuid, epoch, key_id.hex(), "pending", slot, sealed, source, created)
+
+    def unwrap(self, record: KeyRecord) -> bytes:
+        """Return a link key in the clear; raises VaultFailure where it is damaged or of another vault."""
+        context = node_key_context(self._store.id, record.uuid, record.epoch, record.slot)
+        return self._vault().unwrap(record.wrapped, context=context)
+
+    def promote(self, uuid: bytes, key_id: str) -> None:
+        """Make a key the active one after a good Open under it; its CA is then the one that the node keeps."""
+        with self._store.transaction():
+            self._store.promote_key(uuid, key_id)
+            named, _, ca = (self._store.setting(NEXT_CA + uuid.hex()) or "").partition(":")
+            if named:
+                self._store.set_setting(NEXT_CA + uuid.hex(), "")
+            if named == key_id:
+                self.set_ca_of(uuid, bytes.fromhex(ca))
+
+    def remove(self, uuid: bytes) -> int:
+        """Delete every key of a node; returns how many there were."""
+        return self._store.remove_keys(uuid)
+
+    # -- the CA that a node keeps ----------------------------------------------------------------------------------
+
+    def ca_of(self, uuid: bytes) -> bytes:
+        """P(CA) that a node keeps: the owner's, or that of the bundle in which the node's key came."""
+        other = self._store.setting(CA_OF + uuid.hex())
+        return bytes.fromhex(other) if other else self._identity.ca
+
+    def cas_of_nodes(self) -> dict[bytes, bytes]:
+        """P(CA) of every node that keeps another CA than the owner's."""
+        return {bytes.fromhex(uuid): bytes.fromhex(ca) for uuid, ca in self._store.settings(CA_OF).items() if ca}
+
+    def set_ca_of(self, uuid: bytes, ca: bytes) -> None:
+        """Note which CA a node keeps."""
+        if ca != self.ca_of(uuid):
+            self._store.set_setting(CA_OF + uuid.hex(), "" if ca == self._identity.ca else ca.hex())
+
+    def set_ca_with(self, uuid: bytes, key_id: str, ca: bytes) -> None:
+        """Note which CA a node keeps if the pending key ``key_id`` turns out to be good."""
+        self._store.set_setting(NEXT_CA + uuid.hex(), f"{key_id}:{ca.hex()}")
+
+    # -- rotations and other holders -------------------------------------------------------------------------------
+
+    def rotation_due(self, uuid: bytes) -> str | None:
+        """Why the next session with a node has to rotate its key first; None where it has not."""
+        return self._store.setting(ROTATION + uuid.hex()) or None
+
+    def rotations_due(self) -> dict[bytes, str]:
+        """Why a rotation is due, for every node that has one."""
+        return {bytes.fromhex(uuid): why for uuid, why in self._store.settings(ROTATION).items() if why}
+
+    def demand_rotation(self, uuid: bytes, why: str) -> None:
+        """Have the next session with a node rotate its key before anything else."""
+        self._store.set_setting(ROTATION + uuid.hex(), why)
+
+    def rotated(self, uuid: bytes) -> None:
+        """Note that a node has a key that no other station holds."""
+        if self.rotation_due(uuid):
+            self._store.set_setting(ROTATION + uuid.hex(), "")
+        for holder in self._store.holders(uuid):
+            self._store.remove_holder(uuid, holder.fingerprint)
+
+    def holders(self, uuid: bytes | None = None) -> list[Holder]:
+        """Who else holds keys: of this node, or of all."""
+        return self._store.holders(uuid)
+
+    def put_holder(self, holder: Holder) -> None:
+        """Note that another station holds a key of this node."""
+        self._store.put_holder(holder)
+
+    def remove_holder(self, uuid: bytes, fingerprint: str) -> bool:
+        """Note that a station holds it no more; False if it was not noted."""
+        return self._store.remove_holder(uuid, fingerprint)

@@ -1,0 +1,63 @@
+"""What is known of nodes: names and states, the datasheet that each had last, and the one that it is being given."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+from teds_provision.store import Draft, NodeRecord, Store
+from teds_provision.teds.image import Image
+
+
+class Nodes:
+    """The nodes of one station, by UUID."""
+
+    def __init__(self, store: Store) -> None:
+        self._store = store
+
+    def all(self) -> list[NodeRecord]:
+        """All nodes, by UUID."""
+        return self._store.nodes()
+
+    def get(self, uuid: bytes) -> NodeRecord | None:
+        """What is known of a node, None if nothing is."""
+        return self._store.node(uuid)
+
+    def put(self, record: NodeRecord) -> None:
+        """Add or replace a node. Epoch and sequence never go back; raises OtherKey for another identity key."""
+        self._store.put_node(record)
+
+    def remember(self, uuid: bytes, **facts: object) -> NodeRecord:
+        """Bring what is known of a node up to date and return it."""
+        with self._store.transaction():  # no other process changes what was read before it is written
+            present = self._store.node(uuid)
+            changed = replace(present or NodeRecord(uuid), **facts)  # type: ignore[arg-type]
+            if changed != present:
+                self._store.put_node(changed)
+        return changed
+
+    def resolve(self, text: str) -> bytes:
+        """The UUID that ``text`` (a UUID, a prefix of it, or a name) means; raises NotFound, UsageFailure."""
+        return self._store.resolve(text)
+
+    # -- datasheets ------------------------------------------------------------------------------------------------
+
+    def datasheet(self, uuid: bytes) -> Image | None:
+        """The image that a node had when it was last read or written, None if it never was."""
+        text = self._store.node_image(uuid)
+        return Image.from_json(text) if text is not None else None
+
+    def keep_datasheet(self, image: Image) -> None:
+        """Remember what a node has: every TEDS as it was read or written."""
+        self._store.put_node_image(image.uuid, image.to_json())
+
+    def draft(self, uuid: bytes) -> Draft | None:
+        """The image that a node is being given, and how far it came."""
+        return self._store.draft(uuid)
+
+    def keep_draft(self, draft: Draft) -> None:
+        """Keep an image for a node, in place of the one before."""
+        self._store.put_draft(draft)
+
+    def drop_draft(self, uuid: bytes) -> None:
+        """Forget the image of a node, if there is one."""
+        self._store.drop_draft(uuid)

@@ -1,0 +1,109 @@
+"""Who and what counts here: trusted stations and CAs, the deny list, nodes given away, and the rules upon them."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+from teds_provision.errors import NotWhitelisted, PolicyRefused
+from teds_provision.station.identity import Identity
+from teds_provision.station.node_keys import NodeKeys
+from teds_provision.store import Revocation, Store, Tombstone, TrustRecord, WhitelistEntry
+from teds_provision.store.records import TrustRole
+
+
+class Policy:
+    """What this station trusts and refuses."""
+
+    def __init__(self, store: Store, identity: Identity, keys: NodeKeys) -> None:
+        self._store = store
+        self._identity = identity
+        self._keys = keys
+
+    # -- trust -----------------------------------------------------------------------------------------------------
+
+    def trusted(self, role: TrustRole | None = None) -> list[TrustRecord]:
+        """Every trusted station and CA, or those of one role, by name."""
+        return [record for record in self._store.trusted() if role in (None, record.role)]
+
+    def trust(self, record: TrustRecord) -> None:
+        """Trust a key under a name; raises PolicyRefused if the name stands for another key or role."""
+        self._store.put_trust(record)
+
+    def distrust(self, name_or_fingerprint: str) -> bool:
+        """Trust a key no more; False if none fits, raises UsageFailure if several do."""
+        return self._store.remove_trust(name_or_fingerprint)
+
+    def trusted_cas(self, uuid: bytes | None = None) -> list[bytes]:
+        """CA keys that count here: the owner's, those added, and for one node that of the bundle it came in."""
+        cas = [self._identity.ca, *(record.point for record in self.trusted("ca"))]
+        if uuid is None or (kept := self._keys.ca_of(uuid)) in cas:
+            return cas
+        return [*cas, kept]
+
+    def trusted_stations(self) -> list[bytes]:
+        """Station keys that count here: its own, and those added."""
+        return [self._identity.point, *(record.point for record in self.trusted("station"))]
+
+    # -- nodes that are refused ------------------------------------------------------------------------------------
+
+    def revocations(self) -> list[Revocation]:
+        """The deny list, by UUID."""
+        return self._store.revocations()
+
+    def revocation(self, uuid: bytes) -> Revocation | None:
+        """Why a node is denied, None if it is not."""
+        return self._store.revocation(uuid)
+
+    def deny(self, revocation: Revocation) -> None:
+        """Put a node on the deny list."""
+        self._store.put_revocation(revocation)
+
+    def lift(self, uuid: bytes) -> bool:
+        """Take a node off the deny list; False if it was not on it."""
+        return self._store.remove_revocation(uuid)
+
+    def tombstones(self) -> list[Tombstone]:
+        """Every node that was given away, by UUID."""
+        return self._store.tombstones()
+
+    def tombstone(self, uuid: bytes) -> Tombstone | None:
+        """Where a node was given, None if it was not."""
+        return self._store.tombstone(uuid)
+
+    def give_away(self, tombstone: Tombstone) -> None:
+        """Note that a node was given away: its key rests here."""
+        self._store.put_tombstone(tombstone)
+
+    def take_back(self, uuids: Iterable[bytes]) -> None:
+        """Take the tombstones of these nodes away."""
+        self._store.remove_tombstones(uuids)
+
+    def require_whitelisted(self, uuid: bytes, *, returning: bool = False) -> WhitelistEntry:
+        """Return the whitelist entry; raises NotWhitelisted, or PolicyRefused for a revoked node or one given away.
+
+        ``returning``: a node given away may come back here, if a key agreement shows that it was reset.
+        """
+        revoked = self.revocation(uuid)
+        if revoked is not None:
+            raise PolicyRefused(f"Node {uuid.hex()} was revoked: {revoked.why}.")
+        if not returning:
+            self.require_not_given_away(uuid)
+        entry = self._store.whitelisted(uuid)
+        if entry is None:
+            raise NotWhitelisted(
+                f"Node {uuid.hex()} is not on the whitelist.", hint=f"Add it: teds-provision whitelist add {uuid.hex()}"
+            )
+        return entry
+
+    def require_not_given_away(self, uuid: bytes) -> None:
+        """Raise PolicyRefused for a node that was moved to another station: its key is used no more."""
+        tombstone = self.tombstone(uuid)
+        if tombstone is None:
+            return
+        row = self._store.handover(tombstone.handover_id, "out")
+        undo = f"Use it there, or: teds-provision handover undo {tombstone.handover_id}"
+        back = "Use it there, or have it handed back (export-keys there, import-keys here)."
+        raise PolicyRefused(
+            f"Node {uuid.hex()} was moved to station {tombstone.to_fingerprint[:16]}; its key rests here.",
+            hint=undo if row is not None and row.state == "open" else back,
+        )
