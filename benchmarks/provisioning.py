@@ -21,7 +21,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from teds_provision.links import Contact, LinkSettings, Notice, open_port
+from teds_provision.links import Capabilities, Contact, LinkSettings, Notice, open_port
 from teds_provision.links.can.pacing import classic_bits
 from teds_provision.node.nfc_air import answer_seconds, command_seconds
 from teds_provision.station.station import Station, initialise
@@ -49,6 +49,11 @@ class Timed:
     def via(self) -> str:
         """As the link says."""
         return str(self.inner.via)  # type: ignore[attr-defined]
+
+    @property
+    def capabilities(self) -> Capabilities:
+        """As the link says."""
+        return self.inner.capabilities  # type: ignore[attr-defined, no-any-return]
 
     def exchange(self, frame: bytes) -> bytes:
         """Exchange, with a watch on it."""

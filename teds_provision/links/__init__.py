@@ -8,7 +8,18 @@ Importing this package loads neither nfcpy nor python-can.
 
 from __future__ import annotations
 
-from teds_provision.links.opening import open_port
-from teds_provision.links.ports import Contact, Link, LinkSettings, Notice, Port
+from teds_provision.links.opening import LINKS, open_place, open_port, open_ports
+from teds_provision.links.ports import Capabilities, Contact, Link, LinkSettings, Notice, Port
 
-__all__ = ["Contact", "Link", "LinkSettings", "Notice", "Port", "open_port"]
+__all__ = [
+    "LINKS",
+    "Capabilities",
+    "Contact",
+    "Link",
+    "LinkSettings",
+    "Notice",
+    "Port",
+    "open_place",
+    "open_port",
+    "open_ports",
+]

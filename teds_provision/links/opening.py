@@ -1,23 +1,82 @@
-"""The one function that turns the user's link options into an open port; loads the libraries of that link alone."""
+"""The registry of links, and the one way to open a port: a place ``LINK:WHERE``, e.g. ``can:socketcan:can0``.
+
+A new link touches its own folder, a line of :data:`LINKS`, and a check of the doctor. Its library is loaded when its
+first port is opened.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from dataclasses import dataclass
+from importlib import import_module
+from typing import Final
+
 from teds_provision.errors import UsageFailure
-from teds_provision.links.ports import LinkSettings, Port
+from teds_provision.links.ports import CAN, NFC, Capabilities, LinkSettings, Port
+
+
+@dataclass(frozen=True)
+class LinkKind:
+    """One kind of link: ``module`` has a function ``open_port(where)``; ``example`` is a place of that kind.
+
+    ``needs`` is what to say where the place is left out and there is no default.
+    """
+
+    name: str
+    module: str
+    capabilities: Capabilities
+    example: str
+    needs: str = ""
+
+
+LINKS: Final = {
+    kind.name: kind
+    for kind in (
+        LinkKind("nfc", "teds_provision.links.nfc.reader", NFC, "nfc:usb"),
+        LinkKind(
+            "can",
+            "teds_provision.links.can.port",
+            CAN,
+            "can:socketcan:can0",
+            needs="--via can needs to know the bus. Add --can, e.g. --can socketcan:can0?bitrate=500000.",
+        ),
+    )
+}
+
+
+def open_place(place: str) -> Port:
+    """Open the reader or bus at ``LINK:WHERE``; raises NoReader with the cure, or UsageFailure."""
+    name, _, where = place.partition(":")
+    kind = LINKS.get(name)
+    if kind is None:
+        known = " or ".join(f"--via {known}" for known in LINKS)
+        raise UsageFailure(f"The link {name!r} is not part of this version.", hint=f"Use {known}.")
+    if kind.needs and not where:
+        problem, _, cure = kind.needs.partition(". ")
+        raise UsageFailure(f"{problem}.", hint=cure)
+    opened: Callable[[str], Port] = import_module(kind.module).open_port
+    return opened(where)
 
 
 def open_port(settings: LinkSettings) -> Port:
-    """Open the reader or bus that ``settings`` name; raises NoReader with the cure, or UsageFailure."""
-    if settings.via == "nfc":
-        from teds_provision.links.nfc.reader import NfcPort
+    """Open the one reader or bus that ``settings`` name; raises NoReader with the cure, or UsageFailure."""
+    places = settings.places
+    if len(places) > 1:
+        raise UsageFailure(
+            f"{len(places)} readers are named, and this command works with one.",
+            hint="Several readers are for --watch; name one with --nfc.",
+        )
+    return open_place(places[0])
 
-        return NfcPort(settings.nfc or "usb")
-    if settings.via == "can":
-        from teds_provision.links.can.port import CanPort
 
-        if not settings.can:
-            raise UsageFailure(
-                "--via can needs to know the bus.", hint="Add --can, e.g. --can socketcan:can0?bitrate=500000."
-            )
-        return CanPort(settings.can)
-    raise UsageFailure(f"The link {settings.via!r} is not part of this version.", hint="Use --via nfc or --via can.")
+def open_ports(settings: LinkSettings) -> list[Port]:
+    """Open every reader or bus that ``settings`` name; where one does not open, none stays open."""
+    ports: list[Port] = []
+    try:
+        for place in settings.places:
+            ports.append(open_place(place))
+    except BaseException:
+        for port in ports:
+            port.close()
+        raise
+    return ports

@@ -9,7 +9,9 @@ from typing import Literal, Protocol
 
 from teds_provision.protocol.messages.identity import Identity
 
-NoticeKind = Literal["waiting", "foreign-tag", "reader-ready", "reader-lost", "node-left", "conflict", "retry"]
+NoticeKind = Literal[
+    "waiting", "foreign-tag", "reader-ready", "reader-lost", "node-left", "conflict", "unfinished", "retry"
+]
 
 
 @dataclass(frozen=True)
@@ -27,12 +29,34 @@ class Notice:
 NoticeSink = Callable[[Notice], None]
 
 
+@dataclass(frozen=True)
+class Capabilities:
+    """What a link can do, so that nobody asks for its name.
+
+    ``tapped``: somebody holds the node to this reader, so that a key that comes this way may be pinned and agreed.
+    ``streams``: data messages of measuring nodes can be heard (``CanPort.listen``). ``many``: several nodes are there
+    at once, and may be talked to from one thread each.
+    """
+
+    tapped: bool = False
+    streams: bool = False
+    many: bool = False
+
+
+NFC = Capabilities(tapped=True)
+CAN = Capabilities(streams=True, many=True)
+
+
 class Link(Protocol):
-    """One node's line: one request, its one reply, in order."""
+    """One node's line: one request, its one reply, in order. Used by one thread at a time."""
 
     @property
     def via(self) -> str:
-        """``nfc`` or ``can``."""
+        """Name of the link in the registry: ``nfc``, ``can``. For people; decide by :attr:`capabilities`."""
+
+    @property
+    def capabilities(self) -> Capabilities:
+        """What this link can do."""
 
     def exchange(self, frame: bytes) -> bytes:
         """Send one whole command frame and return the whole reply frame that belongs to it.
@@ -56,11 +80,23 @@ class Contact:
 
 
 class Port(Protocol):
-    """A reader or a bus on which nodes are found. Used from one thread."""
+    """A reader or a bus on which nodes are found.
+
+    Thread-safe: a bus carries exchanges with several nodes at once, each in the thread of its caller; a reader serves
+    one tap at a time.
+    """
 
     @property
     def via(self) -> str:
-        """``nfc`` or ``can``."""
+        """Name of the link in the registry: ``nfc``, ``can``. For people; decide by :attr:`capabilities`."""
+
+    @property
+    def place(self) -> str:
+        """Where this port is, as it was opened: ``nfc:usb:072f:2200``, ``can:socketcan:can0``."""
+
+    @property
+    def capabilities(self) -> Capabilities:
+        """What this link can do."""
 
     def find(
         self, wanted: Callable[[Identity], bool], *, seconds: float, notice: NoticeSink, address: int | None = None
@@ -86,10 +122,20 @@ class Port(Protocol):
 
 @dataclass(frozen=True)
 class LinkSettings:
-    """The user's link options, unparsed: ``--via``, ``--nfc``, ``--can``, ``--ble``, ``--timeout`` (seconds)."""
+    """The user's link options, unparsed: ``--via``, ``--nfc`` (one, or several), ``--can``, ``--ble``, ``--timeout``.
+
+    ``timeout`` in seconds. ``nfc`` None or ``auto``: the one reader that is there.
+    """
 
     via: str = "nfc"
-    nfc: str | None = None
+    nfc: str | tuple[str, ...] | None = None
     can: str | None = None
     ble: str | None = None
     timeout: float = 60.0
+
+    @property
+    def places(self) -> tuple[str, ...]:
+        """Every place that ``via`` names, as ``LINK:WHERE``; WHERE is empty where the option was left out."""
+        named = getattr(self, self.via, None)
+        wheres = (named,) if isinstance(named, str) else named or ("",)
+        return tuple(f"{self.via}:{where}" for where in wheres)

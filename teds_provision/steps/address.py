@@ -24,7 +24,7 @@ def set_address(station: Station, node: Conversation, address: int) -> bool:
         node.send(security_command(Function.SET_CAN_ADDRESS, bytes([address])), "the new CAN address")
     except SessionLost as lost:
         raise lost.cause from lost
-    if node.contact.link.via == "can":
+    if node.contact.address is not None:
         node.forget()  # a link is one pair of addresses: this session ended with the old one
     elif node.sealed and _address_of(node) != address:
         raise Garbled("The node took the new CAN address and still shows the old one.")

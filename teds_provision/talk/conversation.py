@@ -94,7 +94,7 @@ class Conversation:
     @property
     def tapped(self) -> bool:
         """Whether commands of this conversation arrive over NFC."""
-        return self.contact.link.via == "nfc"
+        return self.contact.link.capabilities.tapped
 
     @property
     def sealed(self) -> bool:

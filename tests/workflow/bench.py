@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from teds_provision.errors import NodeSilent
-from teds_provision.links import Contact
+from teds_provision.links import LINKS, Capabilities, Contact
 from teds_provision.node.flash_file import default_can_address
 from teds_provision.protocol.flash import Flash
 from teds_provision.protocol.keys import SoftwareKey, node_key_message
@@ -91,6 +91,10 @@ class MemoryLink:
             raise NodeSilent("The reply was lost.")
         return self.tamper(self.count, reply) if self.tamper is not None else reply
 
+    @property
+    def capabilities(self) -> Capabilities:
+        return LINKS[self.via].capabilities
+
     def close(self) -> None:
         self.board.tim.link_lost(self.via)
 
@@ -99,7 +103,8 @@ def contact(board: Board, link: MemoryLink | None = None) -> Contact:
     """The node as a port would find it."""
     link = link or MemoryLink(board)
     reply = board.tim.identity().encode()
-    return Contact(Identity.decode(reply), link, tag_uid=b"\x04\x11\x22\x33\x44\x55\x66", address=None)
+    address = board.tim.flash.can_address if link.via == "can" else None
+    return Contact(Identity.decode(reply), link, tag_uid=b"\x04\x11\x22\x33\x44\x55\x66", address=address)
 
 
 def talk(board: Board, link: MemoryLink | None = None) -> Conversation:

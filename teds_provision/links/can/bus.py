@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import contextlib
 import logging
+import select
 import socket
 import sys
-from dataclasses import dataclass
+import time
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Final, NoReturn
 
 from teds_provision.errors import LinkFailure, NoReader, UsageFailure
@@ -17,17 +20,27 @@ if TYPE_CHECKING:
 
 _SEND_SECONDS: Final = 1.0
 _SOCKETCAND_PORT: Final = 29536
+_RECEIVE_BUFFER: Final = 4 << 20
+_LATEST_SECONDS: Final = 1.0
+"""A time stamp that is older is taken for one of another clock."""
+_OURS: Final = ((0x18DA0000, 0x1FFE0000), (0x1CFF0000, 0x1FFF0000), (0x18FF0000, 0x1FFFFF00), (0x18EF0000, 0x1FFF0000))
+"""Identifiers and masks of the profile: commands, functional requests; data and Announce; trigger; Drive."""
 _BUS_OFF: Final = 0x40
 """Error class of a SocketCAN error frame (linux/can/error.h, CAN_ERR_BUSOFF)."""
 
 
 @dataclass(frozen=True)
 class Frame:
-    """One CAN data frame with a 29-bit identifier; ``data`` 0 to 8 octets, in FD up to 64."""
+    """One CAN data frame with a 29-bit identifier; ``data`` 0 to 8 octets, in FD up to 64.
+
+    ``at`` is when it came in, in seconds of ``time.monotonic()``, taken back by what it lay in the kernel's queue;
+    0 for a frame that is sent.
+    """
 
     identifier: int
     data: bytes
     fd: bool = False
+    at: float = field(default=0.0, compare=False)
 
 
 class Bus:
@@ -36,6 +49,7 @@ class Bus:
     def __init__(self, spec: CanSpec) -> None:
         self.spec = spec
         self._bus = _open(spec)
+        self._descriptor = _descriptor(self._bus)
         self._pacer = Pacer(spec.bitrate, spec.data_bitrate) if spec.pace else None
 
     @property
@@ -82,7 +96,23 @@ class Bus:
             return None
         if message.is_remote_frame or not message.is_extended_id:
             return None
-        return Frame(message.arbitration_id, bytes(message.data), message.is_fd)
+        return Frame(message.arbitration_id, bytes(message.data), message.is_fd, _arrival(message.timestamp))
+
+    def wait(self, seconds: float, wake: socket.socket) -> None:
+        """Sleep until there may be a frame to receive, ``wake`` can be read, or ``seconds`` are over.
+
+        Not every interface can be waited for so: there this returns at once, and :meth:`receive` waits.
+        """
+        descriptor = self._descriptor
+        if descriptor < 0:
+            return
+        with contextlib.suppress(OSError, ValueError):  # closed meanwhile: receive() tells
+            select.select([descriptor, wake.fileno()], [], [], seconds)
+
+    @property
+    def can_be_waited_for(self) -> bool:
+        """Whether :meth:`wait` sleeps."""
+        return self._descriptor >= 0
 
     def drain(self, most: int = 10_000) -> None:
         """Throw away what has come in unread."""
@@ -149,9 +179,23 @@ def _open(spec: CanSpec) -> can.BusABC:
         raise NoReader(f"The CAN bus {spec.text} does not open: {_reason(error)}.", hint=_cure(spec)) from error
     if spec.interface == "udp_multicast":
         _this_group_alone(bus)
+        _room_for_a_flood(bus)
     if spec.interface == "socketcan":
-        bus.set_filters([{"can_id": 0x18DA0000, "can_mask": 0x1FFE0000, "extended": True}])
+        bus.set_filters([{"can_id": value, "can_mask": mask, "extended": True} for value, mask in _OURS])
     return bus
+
+
+def _descriptor(bus: can.BusABC) -> int:
+    try:
+        return int(bus.fileno())
+    except Exception:  # noqa: BLE001  (NotImplementedError, and whatever a back end without one raises)
+        return -1
+
+
+def _arrival(timestamp: float) -> float:
+    """Time of arrival on the monotonic clock, from the kernel's or adapter's time stamp where that is a Unix time."""
+    late = time.time() - timestamp
+    return time.monotonic() - (late if 0.0 < late < _LATEST_SECONDS else 0.0)
 
 
 def _this_group_alone(bus: can.BusABC) -> None:
@@ -162,6 +206,14 @@ def _this_group_alone(bus: can.BusABC) -> None:
         return
     level, option = (socket.IPPROTO_IPV6, 29) if found.family == socket.AF_INET6 else (socket.IPPROTO_IP, 49)
     found.setsockopt(level, option, 0)  # IPV6_MULTICAST_ALL, IP_MULTICAST_ALL (linux/in6.h, linux/in.h)
+
+
+def _room_for_a_flood(bus: can.BusABC) -> None:
+    """Have the kernel hold more than the 256 frames of its default: 60 nodes answer one Identify with 300."""
+    found = getattr(getattr(bus, "_multicast", None), "_socket", None)
+    if isinstance(found, socket.socket):
+        with contextlib.suppress(OSError):
+            found.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, _RECEIVE_BUFFER)
 
 
 def _probe(spec: CanSpec, options: dict[str, Any]) -> None:

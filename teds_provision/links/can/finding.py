@@ -3,39 +3,101 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
 from typing import Final
 
-from teds_provision.errors import Garbled
-from teds_provision.links.can.bus import Bus, Frame
+from teds_provision.errors import AddressConflict, BadData, Garbled, NodeSilent, TedsProvisionError
+from teds_provision.links.can.bus import Frame
 from teds_provision.links.can.gathering import Gathering
 from teds_provision.links.can.isotp import FUNCTIONAL, single
+from teds_provision.links.can.link import conflict
+from teds_provision.links.can.shared import Asked, SharedBus
 from teds_provision.protocol.messages.frames import Function, decode_reply, security_command
 from teds_provision.protocol.messages.identity import Identity
 
 IDENTIFY: Final = security_command(Function.IDENTIFY).encode()
-_SLICE: Final = 0.02
+SILENCE_SECONDS: Final = 0.3
+LONGEST_SECONDS: Final = 3.0
+"""A station listens until 300 ms of silence, 3 s at most (profile: wire, "CAN")."""
+
+AskOne = Callable[[int], Identity | None]
+"""Ask one address who is there: None where nobody answers in a way that can be read; raises AddressConflict."""
 
 
-def ask_all(bus: Bus, gathering: Gathering, seconds: float, *, enough: Callable[[], bool], settle: float) -> None:
-    """Send a functional Identify and collect answers for ``seconds``, or until ``enough`` once ``settle`` is over.
+@dataclass
+class Found:
+    """What one functional Identify came to: who answers where, and what remained unclear."""
 
-    The request is a classic single frame also on an FD bus, unless the option says FD. Raises LinkFailure.
+    identities: dict[int, Identity] = field(default_factory=dict)
+    conflicts: set[int] = field(default_factory=set)
+    unfinished: set[int] = field(default_factory=set)
+
+    @property
+    def twice(self) -> dict[bytes, list[int]]:
+        """UUIDs that answer under more than one address, with these: one of them is not who it says."""
+        places: dict[bytes, list[int]] = {}
+        for address, identity in sorted(self.identities.items()):
+            places.setdefault(identity.uuid, []).append(address)
+        return {uuid: addresses for uuid, addresses in places.items() if len(addresses) > 1}
+
+
+def ask_all(
+    bus: SharedBus, transaction: int, *, silence: float, longest: float
+) -> Iterator[tuple[int, Identity] | Found]:
+    """Send a functional Identify; yields each node as it answers, and at last all that was found.
+
+    Ends after ``silence`` seconds without a frame of an answer, ``longest`` at most. What came torn stands under
+    ``conflicts`` or ``unfinished``: it may be two nodes, or a lost frame. Raises LinkFailure.
     """
-    bus.drain()
     fd = bus.spec.fd
-    body = bytes([gathering.transaction]) + IDENTIFY
-    bus.send(Frame(FUNCTIONAL | gathering.own, single(body, fd=fd), fd))
+    with bus.gather(transaction) as asked:
+        body = bytes([transaction]) + IDENTIFY
+        bus.send(Frame(FUNCTIONAL | bus.own, single(body, fd=fd), fd))
+        told: set[int] = set()
+        for node in _news(bus, asked, silence, longest):
+            identity = _read(asked.gathering, node)
+            if identity is not None and node not in told:
+                told.add(node)
+                yield node, identity
+        gathering = asked.gathering
+    yield Found(_identities(gathering), set(gathering.conflicts), gathering.unfinished | _unreadable(gathering))
+
+
+def _news(bus: SharedBus, asked: Asked, silence: float, longest: float) -> Iterator[int]:
     began = time.monotonic()
-    while (passed := time.monotonic() - began) < seconds:
-        if passed >= settle and not gathering.busy and enough():
+    while True:
+        now = time.monotonic()
+        left = min(asked.heard_at + silence, began + longest) - now
+        node = asked.next(left)
+        bus.check()
+        if node is not None and node >= 0:
+            yield node
+        elif left <= 0 and time.monotonic() >= min(asked.heard_at + silence, began + longest):
             return
-        frame = bus.receive(min(_SLICE, seconds - passed))
-        if frame is None:
+
+
+def settle(found: Found, ask: AskOne, *, until: float) -> Found:
+    """Ask each address that remained unclear by itself: a lost frame does not come twice, two nodes do.
+
+    ``until`` is a monotonic time. Keeps as ``conflicts`` where two really answer, as ``unfinished`` where nobody does.
+    """
+    identities, conflicts, unfinished = dict(found.identities), set[int](), set[int]()
+    for address in sorted(found.conflicts | found.unfinished):
+        if time.monotonic() >= until:
+            (conflicts if address in found.conflicts else unfinished).add(address)
             continue
-        flow = gathering.take(frame)
-        if flow is not None:
-            bus.send(flow)
+        try:
+            identity = ask(address)
+        except AddressConflict:
+            identities.pop(address, None)
+            conflicts.add(address)
+            continue
+        if identity is not None:
+            identities[address] = identity
+        else:
+            (conflicts if address in found.conflicts else unfinished).add(address)
+    return Found(identities, conflicts, unfinished)
 
 
 def read_identity(reply: bytes) -> Identity:
@@ -46,6 +108,50 @@ def read_identity(reply: bytes) -> Identity:
     return Identity.decode(answer.payload)
 
 
+def ask_one(ask: Callable[[bytes], bytes]) -> Identity | None:
+    """Who is there, by ``ask`` (a command frame to its reply); None for nobody, or nobody that can be understood."""
+    torn = 0
+    while torn < 2:
+        try:
+            return read_identity(ask(IDENTIFY))
+        except (NodeSilent, BadData):
+            return None
+        except Garbled:
+            torn += 1
+    return None
+
+
 def conflict_text(node: int) -> str:
     """One sentence that names the address."""
-    return f"Two nodes answer under the CAN address 0x{node:02X}."
+    return conflict(node).message
+
+
+def twice_text(uuid: bytes, addresses: list[int]) -> str:
+    """One sentence that names the UUID and where it answers."""
+    where = " and ".join(f"0x{address:02X}" for address in addresses)
+    return f"Node {uuid.hex().upper()} answers under {where}: one of them is not who it says."
+
+
+def unfinished_text(nodes: set[int]) -> str:
+    """One sentence that names the addresses whose answers came in part."""
+    where = ", ".join(f"0x{node:02X}" for node in sorted(nodes))
+    return f"The answer of {where} began and did not end; ask again."
+
+
+def _read(gathering: Gathering, node: int) -> Identity | None:
+    if node in gathering.conflicts or node not in gathering.answers:
+        return None
+    try:
+        return read_identity(gathering.answers[node])
+    except TedsProvisionError:
+        return None
+
+
+def _identities(gathering: Gathering) -> dict[int, Identity]:
+    """Who answered in a way that can be read, addresses with two nodes left out."""
+    read = {node: _read(gathering, node) for node in sorted(gathering.answers)}
+    return {node: identity for node, identity in read.items() if identity is not None}
+
+
+def _unreadable(gathering: Gathering) -> set[int]:
+    return {node for node in gathering.answers if node not in gathering.conflicts and _read(gathering, node) is None}

@@ -13,6 +13,7 @@ from teds_provision.links.nfc.library import nfc
 from teds_provision.links.nfc.tag import FieldLost, ReaderLost, ReaderTag, activate, translated
 from teds_provision.links.nfc.udp import ReaderDevice, address_of, frontend
 
+AUTO = "auto"
 _PATH = re.compile(r"usb(:[0-9a-fA-F]{4}(:[0-9a-fA-F]{4})?|:\d{1,3}(:\d{1,3})?)?|(tty|com):[^:]+(:\w+)?")
 _HOPELESS = 10  # polls in a row that the reader answers with an error
 _NO_LIBUSB = "usb: paths need the C library libusb, which is not installed."
@@ -53,15 +54,18 @@ class Reader:
 def open_reader(path: str) -> Reader:
     """Open the reader that ``path`` names: ``udp[:host][:port]`` or any path of nfcpy (``usb``, ``tty:USB0:pn532``).
 
-    Raises NoReader with the cause and its cure, UsageFailure for a path that is none.
+    ``auto`` is the one USB reader that is there. Raises NoReader with the cause and its cure, UsageFailure for a path
+    that is none, and where ``auto`` finds several.
     """
+    if path == AUTO:
+        path = _the_only_one()
     if path.startswith("udp"):
         device = ReaderDevice(*address_of(path))
         return Reader(frontend(device, path), again=path, simulated=True)
     if not _PATH.fullmatch(path):
         raise UsageFailure(
             f"{path!r} is not the path of a reader.",
-            hint="Write usb, usb:072f:2200, tty:USB0:pn532 or udp:localhost:54321.",
+            hint="Write auto, usb, usb:072f:2200, tty:USB0:pn532 or udp:localhost:54321.",
         )
     if path.startswith("usb"):
         return _open_usb(path)
@@ -73,16 +77,8 @@ def open_reader(path: str) -> Reader:
 
 def _open_usb(path: str) -> Reader:
     """Open the first reader that can be opened, by its full path: a partial one hides why it fails."""
-    try:
-        seen = nfc.clf.transport.USB.find(path) or []
-    except FileNotFoundError as error:
-        raise NoReader(_NO_LIBUSB, hint="On Debian: sudo apt install libusb-1.0-0.") from error
-    except Exception as error:  # libusb1 raises its own tree
-        raise _explained(path, error) from error
     failure: NoReader | None = None
-    for vendor, product, bus, number in seen:
-        if (vendor, product) not in nfc.clf.device.usb_device_map:
-            continue
+    for vendor, product, bus, number in _usb_readers(path):
         try:
             clf = nfc.ContactlessFrontend(f"usb:{int(bus):03}:{int(number):03}")
         except Exception as error:  # noqa: BLE001  (nfcpy's drivers raise anything)
@@ -90,6 +86,27 @@ def _open_usb(path: str) -> Reader:
             continue
         return Reader(clf, again=f"usb:{vendor:04x}:{product:04x}", simulated=False)
     raise failure or NoReader(f"No NFC reader was found on {path}.", hint=_candidates())
+
+
+def _usb_readers(path: str) -> list[tuple[int, int, int, int]]:
+    """Vendor, product, bus and device number of every reader on ``path`` that nfcpy has a driver for."""
+    try:
+        seen = nfc.clf.transport.USB.find(path) or []
+    except FileNotFoundError as error:
+        raise NoReader(_NO_LIBUSB, hint="On Debian: sudo apt install libusb-1.0-0.") from error
+    except Exception as error:  # libusb1 raises its own tree
+        raise _explained(path, error) from error
+    return [found for found in seen if found[:2] in nfc.clf.device.usb_device_map]
+
+
+def _the_only_one() -> str:
+    """The path of the only reader that is there; ``usb`` where there is none, so that it says what is missing."""
+    found = [f"usb:{int(bus):03}:{int(number):03}" for _, _, bus, number in _usb_readers("usb")]
+    if len(found) > 1:
+        raise UsageFailure(
+            f"{len(found)} readers are plugged in: {', '.join(found)}.", hint=f"Name one, e.g. --nfc {found[0]}."
+        )
+    return found[0] if found else "usb"
 
 
 def _explained(path: str, error: Exception, vendor: int = 0, product: int = 0) -> NoReader:

@@ -11,11 +11,11 @@ import time
 from collections.abc import Callable, Iterator
 
 from teds_provision.errors import Garbled, LinkFailure, NodeSilent, NoNode, NoReader
-from teds_provision.links.nfc.frontend import Reader, open_reader
+from teds_provision.links.nfc.frontend import AUTO, Reader, open_reader
 from teds_provision.links.nfc.poller import Poller
 from teds_provision.links.nfc.tag import FieldLost, ReaderLost
 from teds_provision.links.nfc.visit import Foreign, Visit, look
-from teds_provision.links.ports import Contact, Notice, NoticeSink
+from teds_provision.links.ports import NFC, Capabilities, Contact, Notice, NoticeSink
 from teds_provision.protocol.messages.identity import Identity
 
 REPEATS = 2  # of one transaction
@@ -28,17 +28,34 @@ _MISSES = 2  # presence checks in a row without an answer
 _LOOK_AGAIN = 1.0  # seconds until a tag that was not wanted is read anew
 
 
-class NfcPort:
-    """A reader, on which nodes are found by tapping them. Used from one thread.
+def open_port(where: str) -> NfcPort:
+    """Open the reader that ``where`` names, as ``--nfc`` does; empty or ``auto``: the one that is there.
 
-    ``path`` is ``udp:localhost:PORT`` or a path of nfcpy. Raises NoReader when the reader cannot be opened.
+    Raises NoReader, UsageFailure.
+    """
+    return NfcPort(where or AUTO)
+
+
+class NfcPort:
+    """A reader, on which nodes are found by tapping them. One tap at a time: calls from several threads take turns.
+
+    ``path`` is ``udp:localhost:PORT``, a path of nfcpy, or ``auto``. Raises NoReader when the reader cannot be opened,
+    UsageFailure where ``auto`` finds several.
     """
 
     def __init__(self, path: str) -> None:
         self._reader: Reader | None = open_reader(path)
         self._again = self._reader.again
+        self._named = f" ({self._reader.name} at {self._again})" if path == AUTO else ""
+        self.place = f"nfc:{self._again}"
         self._transaction = secrets.randbelow(0x10000)
         self._lost = False
+        self.turn = threading.RLock()
+
+    @property
+    def capabilities(self) -> Capabilities:
+        """What a reader can do."""
+        return NFC
 
     @property
     def via(self) -> str:
@@ -65,7 +82,7 @@ class NfcPort:
                 continue
             if not waiting:
                 waiting = True
-                notice(Notice("waiting", "Hold the node to the reader.", left))
+                notice(Notice("waiting", f"Hold the node to the reader{self._named}.", left))
             time.sleep(_PAUSE)
         if self._reader is None:
             raise NoReader("The reader was unplugged and did not come back.", hint="Plug it in again.")
@@ -86,7 +103,7 @@ class NfcPort:
         """
         here: bytes | None = None  # the node of the visit that is not over yet
         gone_at, told = 0.0, ""
-        waiting = Notice("waiting", "Hold a node to the reader.")
+        waiting = Notice("waiting", f"Hold a node to the reader{self._named}.")
         notice(waiting)
         while not stop.is_set():
             seen = self._look(notice, stop)
@@ -152,12 +169,13 @@ class NfcPort:
     def _look(self, notice: NoticeSink, stop: threading.Event) -> Visit | Foreign | None:
         """Poll once; None when nothing lies there or the reader is away (which is told once)."""
         try:
-            if self._reader is None:
-                self._reader = open_reader(self._again)
-            if self._lost:
-                self._lost = False
-                notice(Notice("reader-ready", f"The reader is back: {self._reader.name}."))
-            return self._sense_and_look()
+            with self.turn:
+                if self._reader is None:
+                    self._reader = open_reader(self._again)
+                if self._lost:
+                    self._lost = False
+                    notice(Notice("reader-ready", f"The reader is back: {self._reader.name}."))
+                return self._sense_and_look()
         except FieldLost:
             return None
         except NoReader as error:
@@ -169,10 +187,11 @@ class NfcPort:
             return None
 
     def _sense_and_look(self) -> Visit | Foreign | None:
-        if self._reader is None:
-            raise ReaderLost("it was closed")
-        tag = self._reader.sense()
-        return None if tag is None else look(tag)
+        with self.turn:
+            if self._reader is None:
+                raise ReaderLost("it was closed")
+            tag = self._reader.sense()
+            return None if tag is None else look(tag)
 
     def _stay(self, seen: Visit | Foreign, stop: threading.Event, seconds: float | None) -> None:
         """Wait until the tag is taken away, at most ``seconds``."""
@@ -180,7 +199,8 @@ class NfcPort:
         misses = 0
         while misses < _MISSES and not stop.is_set() and (until is None or time.monotonic() < until):
             try:
-                misses = 0 if self._reader is not None and seen.tag.is_present else misses + 1
+                with self.turn:
+                    misses = 0 if self._reader is not None and seen.tag.is_present else misses + 1
             except ReaderLost:
                 return  # the next look finds out and says so
             stop.wait(_PAUSE)
@@ -200,6 +220,11 @@ class NfcLink:
         """``nfc``."""
         return "nfc"
 
+    @property
+    def capabilities(self) -> Capabilities:
+        """What a tap can do."""
+        return NFC
+
     def exchange(self, frame: bytes) -> bytes:
         """Send one whole command frame and return its whole reply frame.
 
@@ -207,6 +232,10 @@ class NfcLink:
         moment is activated anew (its session is gone then, which the layer above notices by the reply). Raises
         NodeSilent, Garbled or NoReader.
         """
+        with self._port.turn:
+            return self._exchange(frame)
+
+    def _exchange(self, frame: bytes) -> bytes:
         transaction, started = self._port.next_transaction(), time.monotonic()
         for attempt in range(REPEATS + 1):
             try:
@@ -227,8 +256,9 @@ class NfcLink:
     def close(self) -> None:
         """Deselect the service, unless nothing was sent; never raises."""
         try:
-            if self._poller is not None:
-                self._poller.deselect()
+            with self._port.turn:
+                if self._poller is not None:
+                    self._poller.deselect()
         except LinkFailure:
             self._poller = None
 

@@ -12,7 +12,7 @@ from collections.abc import Callable, Iterator
 import pytest
 
 from teds_provision.errors import AddressConflict, LinkFailure, NodeSilent, NoNode, NoReader
-from teds_provision.links.can import port as port_module
+from teds_provision.links.can import link as link_module
 from teds_provision.links.can.port import CanPort
 from teds_provision.links.ports import Contact, Notice
 from teds_provision.node.can_server import CanServer
@@ -172,11 +172,18 @@ def test_two_nodes_under_one_address_are_a_conflict(hub: Hub) -> None:
     first.pinned = second.pinned = True  # or they would sort themselves out
     with serving(hub.spec, first), serving(hub.spec, second), opened(hub.spec) as port:
         with pytest.raises(AddressConflict, match="0x21"):
-            find(port, seconds=3)
+            port.everyone(seconds=3, notice=quiet)
+        with pytest.raises(AddressConflict, match="0x21"):  # noqa: PT012  (either may notice, by the first answer)
+            link = find(port, seconds=3).link
+            time.sleep(0.1)
+            link.exchange(COUNT)
         kinds: list[str] = []
         stop = threading.Event()
         threading.Timer(1.5, stop.set).start()
-        assert list(port.watch(stop=stop, notice=lambda told: kinds.append(told.kind))) == []
+        for contact in port.watch(stop=stop, notice=lambda told: kinds.append(told.kind)):  # the first that answers
+            time.sleep(0.1)
+            with pytest.raises(AddressConflict, match="0x21"):
+                contact.link.exchange(COUNT)
         assert "conflict" in kinds
 
 
@@ -197,7 +204,7 @@ def test_another_node_than_the_wanted_is_told_and_waited_past(hub: Hub) -> None:
 
 
 def test_a_node_that_falls_silent(hub: Hub, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(port_module, "REPLY_SECONDS", 0.3)
+    monkeypatch.setattr(link_module, "REPLY_SECONDS", 0.3)
     with opened(hub.spec) as port:
         with serving(hub.spec, EchoNode(0x21)):
             link = find(port).link
@@ -211,7 +218,7 @@ def test_a_node_that_falls_silent(hub: Hub, monkeypatch: pytest.MonkeyPatch) -> 
 
 
 def test_a_lost_reply_is_repeated_and_the_command_runs_once(hub: Hub, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(port_module, "REPLY_SECONDS", 0.3)
+    monkeypatch.setattr(link_module, "REPLY_SECONDS", 0.3)
     node = EchoNode(0x21)
     with serving(hub.spec, node), opened(hub.spec) as port:
         link = find(port).link

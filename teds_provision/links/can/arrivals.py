@@ -1,0 +1,131 @@
+"""Who came to a bus and who left it, for as long as it is watched."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Final
+
+from teds_provision.errors import AddressConflict
+from teds_provision.links.can.finding import Found, ask_all, conflict_text, settle
+from teds_provision.links.ports import Notice, NoticeSink
+from teds_provision.protocol.messages.identity import Identity, NodeState
+
+if TYPE_CHECKING:
+    from teds_provision.links.can.port import CanPort
+    from teds_provision.links.can.shared import Ear, SharedBus
+
+_ANNOUNCE: Final = 0x1CFF0000
+_ANNOUNCE_MASK: Final = 0x1FFFFF00
+_GONE_SECONDS: Final = 3.0
+"""A node that has been silent for so long has left."""
+_SILENCE_SECONDS: Final = 0.1
+_LONGEST_SECONDS: Final = 3.0
+_LEAST_PAUSE: Final = 0.02
+_MOST_PAUSE: Final = 1.0
+_PAUSE_PER_NODE: Final = 0.03
+"""Seconds until everyone is asked again, for each node that answered: its six frames take 1.6 ms, 5 % of a bus."""
+
+
+@dataclass
+class _Seen:
+    """What was last known of one node: the last ``round`` that it answered in, and since when it is ``silent``."""
+
+    address: int
+    state: NodeState
+    round: int
+    silent: float | None = None
+
+
+class Arrivals:
+    """The nodes of one bus; :meth:`round` asks everyone once and yields what is new."""
+
+    def __init__(self, port: CanPort, notice: NoticeSink) -> None:
+        self._port, self._notice = port, notice
+        self._seen: dict[bytes, _Seen] = {}
+        self._conflicts: set[int] = set()
+        self._round = 0
+        self._ear: Ear | None = None
+        self._bus: SharedBus | None = None
+
+    def lost(self) -> None:
+        """The bus failed: its listener is of no use any more."""
+        self._ear = self._bus = None
+
+    def round(self, stop: threading.Event) -> Iterator[tuple[int, Identity]]:
+        """Ask everyone (or ``node=`` alone) and yield address and identity of each node that is news."""
+        self._round += 1
+        self._listen()
+        clashing: set[int] = set()
+        if self._port.spec.node is not None:
+            yield from self._one(self._port.spec.node, clashing)
+        else:
+            yield from self._all(stop, clashing)
+        for node in sorted(clashing - self._conflicts):
+            self._notice(Notice("conflict", conflict_text(node)))
+        self._conflicts = clashing
+        if not stop.is_set():
+            self._say_who_left(clashing)
+            self._port.tell_of_rivals(self._notice)
+
+    def pause(self, stop: threading.Event) -> None:
+        """Wait until everyone may be asked again, or a node announces itself."""
+        until = time.monotonic() + min(_MOST_PAUSE, max(_LEAST_PAUSE, _PAUSE_PER_NODE * len(self._seen)))
+        while (left := until - time.monotonic()) > 0 and not stop.is_set():
+            if self._ear is None:
+                stop.wait(left)
+            elif self._ear.get(min(left, 0.1)) is not None:
+                return
+
+    def _listen(self) -> None:
+        bus = self._port.bus()
+        if bus is not self._bus:
+            self._bus = bus
+            self._ear = bus.listen(lambda frame: frame.identifier & _ANNOUNCE_MASK == _ANNOUNCE, most=256)
+
+    def _one(self, address: int, clashing: set[int]) -> Iterator[tuple[int, Identity]]:
+        try:
+            identity = self._port.identify(address)
+        except AddressConflict:
+            clashing.add(address)
+            return
+        if identity is not None and self._is_news(address, identity):
+            yield address, identity
+
+    def _all(self, stop: threading.Event, clashing: set[int]) -> Iterator[tuple[int, Identity]]:
+        found = Found()
+        bus, transaction = self._port.bus(), self._port.next_transaction()
+        for news in ask_all(bus, transaction, silence=_SILENCE_SECONDS, longest=_LONGEST_SECONDS):
+            if stop.is_set():
+                return
+            if isinstance(news, Found):
+                found = news
+            elif self._is_news(*news):
+                yield news
+        settled = settle(found, self._port.identify, until=time.monotonic() + _LONGEST_SECONDS)
+        clashing |= settled.conflicts
+        for address in found.conflicts | found.unfinished:
+            identity = settled.identities.get(address)
+            if identity is not None and self._is_news(address, identity):
+                yield address, identity
+
+    def _is_news(self, address: int, identity: Identity) -> bool:
+        """New, back after silence, or reset to factory state. A new address alone is no news."""
+        before = self._seen.get(identity.uuid)
+        self._seen[identity.uuid] = _Seen(address, identity.state, self._round)
+        factory = NodeState.FACTORY
+        return before is None or (identity.state is factory and before.state is not factory)
+
+    def _say_who_left(self, clashing: set[int]) -> None:
+        """Tell of nodes that have been silent for so long that they count as gone, and forget them."""
+        now = time.monotonic()
+        for uuid, last in list(self._seen.items()):
+            if last.round == self._round or last.address in clashing:
+                continue
+            last.silent = last.silent or now
+            if now - last.silent >= _GONE_SECONDS:
+                del self._seen[uuid]
+                name = uuid.hex().upper()
+                self._notice(Notice("node-left", f"Node {name} at 0x{last.address:02X} does not answer any more."))

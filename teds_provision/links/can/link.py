@@ -1,0 +1,211 @@
+"""One node's line on CAN: a request, its reply, and what is done about frames that were lost (profile: wire, "CAN")."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from queue import Empty
+from typing import Final
+
+from teds_provision.errors import AddressConflict, Garbled, LinkFailure, NodeSilent
+from teds_provision.links.can.bus import Frame
+from teds_provision.links.can.isotp import physical_id, single
+from teds_provision.links.can.shared import Line, SharedBus
+from teds_provision.links.can.transfer import OVERFLOW, WAIT, consecutive_frames, first_frame, gap_seconds
+from teds_provision.links.ports import CAN, Capabilities
+
+REPLY_SECONDS: Final = 5.0
+REPEAT_SECONDS: Final = 15.0
+TRIES: Final = 3
+"""A reply is awaited 5 s; a request is repeated at most twice, within 15 s (profile: wire)."""
+_SHARES: Final = (0.3, 0.7, 1.0)
+"""Parts of the 5 s after which a request goes out again: a lost one costs 1.5 s, a slow node still has its 5 s."""
+_FLOW_SECONDS: Final = (0.25, 0.5, 1.0)
+"""The wait for a flow control, try after try, at most N_Bs of ISO 15765-2: a lost one ends it early."""
+_GAP_SECONDS: Final = 0.5
+"""The wait for the next consecutive frame (N_Cr, at most 1 s)."""
+_LONGEST_TRY: Final = 120.0
+"""Seconds: 4095 octets at the longest gap (127 ms) that a node may ask for take 75 s."""
+
+
+def conflict(node: int) -> AddressConflict:
+    """The error for two nodes under one address."""
+    return AddressConflict(
+        f"Two nodes answer under the CAN address 0x{node:02X}.",
+        hint="Tap one of them, or connect it alone, and: teds-provision address UUID NEW.",
+    )
+
+
+class _NoFlow(Exception):
+    """The node did not take up our first frame, or a block; ``begun`` says whether it took up anything."""
+
+    def __init__(self, *, begun: bool) -> None:
+        super().__init__()
+        self.begun = begun
+
+
+class CanLink:
+    """One node's line: the pair of its address and ours. ``bus`` gives the open bus, ``number`` a transaction."""
+
+    via: Final = "can"
+
+    def __init__(
+        self,
+        bus: Callable[[], SharedBus],
+        number: Callable[[], int],
+        address: int,
+        *,
+        reply_seconds: float | None = None,
+    ) -> None:
+        self._bus, self._number = bus, number
+        self.address = address
+        self._reply_seconds = REPLY_SECONDS if reply_seconds is None else reply_seconds
+
+    @property
+    def capabilities(self) -> Capabilities:
+        """What a node on a bus can do."""
+        return CAN
+
+    def exchange(self, frame: bytes) -> bytes:
+        """Send one command frame and return its reply; see ``Link.exchange``."""
+        return self.ask(frame, tries=TRIES, seconds=self._reply_seconds)
+
+    def close(self) -> None:
+        """Nothing to leave behind on CAN."""
+
+    def ask(self, frame: bytes, *, tries: int, seconds: float) -> bytes:
+        """As ``exchange``, at most ``tries`` times, each with ``seconds`` of silence allowed."""
+        bus, transaction = self._bus(), self._number()
+        try:
+            with bus.line(self.address).exchange(transaction) as line:
+                reply = _Exchange(bus, line, bytes([transaction]) + frame, tries, seconds).run()
+        except LinkFailure as failure:
+            if bus.rivals.seen() and not bus.failed:
+                raise type(failure)(f"{failure.message} {bus.rivals.text}", hint=bus.rivals.hint) from failure
+            raise
+        if bus.clash(self.address):
+            raise conflict(self.address)
+        return reply[1:]
+
+
+class _Exchange:
+    """One request and its reply, repeated as needed. Runs in the thread that asks."""
+
+    def __init__(self, bus: SharedBus, line: Line, body: bytes, tries: int, seconds: float) -> None:
+        self._bus, self._line, self._body = bus, line, body
+        self._tries, self._seconds = tries, seconds
+        self._fd = bus.spec.fd
+        self._torn = False
+        self._clash = False
+
+    def run(self) -> bytes:
+        """Return the whole reply, transaction first; raises NodeSilent, Garbled, AddressConflict, LinkFailure."""
+        began = time.monotonic()
+        whole = refused = 0
+        while whole < self._tries:
+            try:
+                self._send(_FLOW_SECONDS[min(refused, len(_FLOW_SECONDS) - 1)])
+            except _NoFlow as lost:
+                refused += 1
+                if not self._worth_another(began, refused, begun=lost.begun):
+                    break
+                continue
+            share = _SHARES[max(0, len(_SHARES) - self._tries + whole)] if self._tries > 1 else 1.0
+            whole += 1
+            reply = self._reply(self._seconds * share)
+            if reply is not None:
+                return reply
+            if time.monotonic() - began >= REPEAT_SECONDS:
+                break
+        raise self._failed()
+
+    def _worth_another(self, began: float, refused: int, *, begun: bool) -> bool:
+        """Whether a request that never went out whole is begun anew: at once, while the node may only be busy."""
+        passed = time.monotonic() - began
+        if begun:
+            return passed < REPEAT_SECONDS
+        return self._tries > 1 and (refused < self._tries or passed < self._seconds)
+
+    def _send(self, patience: float) -> None:
+        """Send the request; raises _NoFlow where the node does not take it up, Garbled where it is too long for it."""
+        if len(self._body) <= (62 if self._fd else 7):
+            self._put(single(self._body, fd=self._fd))
+            return
+        while not self._line.flows.empty():
+            self._line.flows.get_nowait()
+        head, rest = first_frame(self._body, fd=self._fd)
+        self._put(head)
+        left, begun = 0, False
+        block, gap = 0, 0.0
+        for data in consecutive_frames(rest, fd=self._fd):
+            if not left:
+                block, gap = self._flow(patience, begun=begun)
+                left, begun = block or len(self._body), True
+            elif gap:
+                time.sleep(gap)
+            self._put(data)
+            left -= 1
+
+    def _flow(self, patience: float, *, begun: bool) -> tuple[int, float]:
+        """Wait for a flow control; returns its block size (0: no limit) and gap in seconds."""
+        until = time.monotonic() + patience
+        end = time.monotonic() + _LONGEST_TRY
+        while (left := min(until, end) - time.monotonic()) > 0:
+            try:
+                data = self._line.flows.get(timeout=left)
+            except Empty:
+                break
+            if len(data) < 3:
+                self._bus.check()
+                continue
+            if data[0] == OVERFLOW:
+                raise Garbled(
+                    f"The node at 0x{self._line.node:02X} refuses {len(self._body)} octets (flow control: overflow).",
+                    hint="Its Identify announces a longer maxMessage than it keeps; write in smaller pieces.",
+                )
+            if data[0] == WAIT:
+                until = time.monotonic() + 1.0
+            elif data[0] & 0xF == 0:
+                return data[1], gap_seconds(data[2])
+        raise _NoFlow(begun=begun)
+
+    def _put(self, data: bytes) -> None:
+        self._bus.send(Frame(physical_id(self._line.node, self._bus.own), data, self._fd))
+
+    def _reply(self, seconds: float) -> bytes | None:
+        """Wait for the reply; None after ``seconds`` without a beginning, or where it is torn."""
+        until = time.monotonic() + seconds
+        end = time.monotonic() + _LONGEST_TRY
+        while (left := min(until, end) - time.monotonic()) > 0:
+            try:
+                event = self._line.events.get(timeout=left)
+            except Empty:
+                self._bus.check()
+                if self._line.partial is None:
+                    continue
+                until = self._line.heard_at + _GAP_SECONDS  # it came on meanwhile, or is torn
+                self._torn = self._torn or until <= time.monotonic()
+                continue
+            match event.kind:
+                case "whole":
+                    return event.body
+                case "begun":
+                    until = time.monotonic() + _GAP_SECONDS
+                case "clash":
+                    self._clash = True
+                case "torn":
+                    self._torn = True
+                    return None
+                case _:
+                    self._bus.check()
+        return None
+
+    def _failed(self) -> LinkFailure:
+        where = f"The node at 0x{self._line.node:02X} on {self._bus.spec.text}"
+        if self._clash or self._bus.clash(self._line.node):
+            return conflict(self._line.node)
+        if self._torn:
+            return Garbled(
+                f"{where} answers, but its replies come with frames missing.", hint="Check wiring, bit rate, bus load."
+            )
+        return NodeSilent(f"{where} does not answer any more.", hint="Check its power, its wiring and its address.")

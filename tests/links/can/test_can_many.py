@@ -1,0 +1,172 @@
+"""One bus, many threads: exchanges with several nodes at once, listeners, two stations of one address."""
+
+from __future__ import annotations
+
+import os
+import threading
+import time
+from collections.abc import Callable
+
+import pytest
+
+from teds_provision.errors import LinkFailure, UsageFailure
+from teds_provision.links import LINKS, LinkSettings, Notice, open_place, open_port
+from teds_provision.links.can.bus import Bus, Frame
+from teds_provision.links.can.port import CanPort
+from teds_provision.links.can.spec import parse_spec
+from tests.links.can.hub import Hub
+
+pytestmark = pytest.mark.link
+Start = Callable[..., None]
+ANNOUNCE = 0x1CFF0021
+
+
+def write(octets: bytes) -> bytes:
+    return b"\x00\x00\x01\x03" + len(octets).to_bytes(2, "big") + octets
+
+
+def quiet(_: Notice) -> None:
+    pass
+
+
+def in_threads(work: Callable[[int], object], count: int) -> list[object]:
+    results: list[object] = [None] * count
+
+    def run(number: int) -> None:
+        try:
+            results[number] = work(number)
+        except Exception as error:  # noqa: BLE001  (the test shows it)
+            results[number] = error
+
+    threads = [threading.Thread(target=run, args=(number,)) for number in range(count)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join(60)
+    return results
+
+
+def test_eight_nodes_are_talked_to_at_once_and_none_waits_for_a_slow_one(hub: Hub, nodes: Start) -> None:
+    addresses = list(range(0x21, 0x29))
+    nodes(hub.spec, *addresses, delay=0.3)
+    port = CanPort(hub.spec)
+    bodies = [os.urandom(300 + 10 * number) for number in range(8)]
+    began = time.monotonic()
+    replies = in_threads(lambda number: port.link(addresses[number]).exchange(write(bodies[number])), 8)
+    assert replies == [body[::-1] for body in bodies]
+    assert time.monotonic() - began < 8 * 0.3
+    port.close()
+
+
+def test_everyone_is_asked_while_exchanges_run(hub: Hub, nodes: Start) -> None:
+    addresses = list(range(0x21, 0x29))
+    nodes(hub.spec, *addresses)
+    port = CanPort(hub.spec)
+    stop = threading.Event()
+
+    def talk(number: int) -> int:
+        count = 0
+        while not stop.is_set():
+            octets = os.urandom(100)
+            assert port.link(addresses[number]).exchange(write(octets)) == octets[::-1]
+            count += 1
+        return count
+
+    def ask(number: int) -> object:
+        del number
+        try:
+            return [
+                sorted(contact.address or 0 for contact in port.everyone(seconds=3, notice=quiet)) for _ in range(3)
+            ]
+        finally:
+            stop.set()
+
+    results = in_threads(lambda number: ask(number) if number == 4 else talk(number), 5)
+    assert results[4] == [addresses] * 3
+    assert all(isinstance(count, int) and count for count in results[:4]), results
+    port.close()
+
+
+def test_a_listener_hears_what_it_wants_beside_an_exchange(hub: Hub, nodes: Start) -> None:
+    nodes(hub.spec, 0x21)
+    port = CanPort(hub.spec)
+    with port.listen(lambda frame: frame.identifier == ANNOUNCE) as ear:
+        before = time.monotonic()
+        hub.send(ANNOUNCE, b"\x01\x02abcd\x00\x00")
+        assert port.link(0x21).exchange(write(b"abc")) == b"cba"
+        frame = ear.get(1)
+        assert frame == Frame(ANNOUNCE, b"\x01\x02abcd\x00\x00")
+        assert before - 0.1 < frame.at <= time.monotonic()
+        assert ear.get(0.05) is None
+    port.close()
+
+
+def test_a_listener_that_does_not_read_loses_what_does_not_fit_and_knows_it(hub: Hub) -> None:
+    port = CanPort(hub.spec)
+    ear = port.bus().listen(lambda frame: True, most=10)
+    fence = port.listen(lambda frame: frame.data == b"end")
+    for number in range(25):
+        hub.send(ANNOUNCE, bytes([number]))
+    hub.send(ANNOUNCE, b"end")
+    assert fence.get(2)
+    assert [ear.get(0) for _ in range(10)] == [Frame(ANNOUNCE, bytes([number])) for number in range(10)]
+    assert ear.lost == 16
+    port.close()
+
+
+def test_a_bus_that_goes_away_wakes_whoever_waits() -> None:
+    hub = Hub()
+    port = CanPort(hub.spec)
+    ear = port.listen(lambda frame: True)
+    threading.Timer(0.2, hub.close).start()
+    results = in_threads(lambda number: ear.get(20) if number else port.link(0x21).exchange(write(b"x")), 2)
+    assert [isinstance(result, LinkFailure) for result in results] == [True, True], results
+    port.close()
+
+
+def test_two_stations_of_one_address_are_noticed_and_named(hub: Hub, nodes: Start) -> None:
+    nodes(hub.spec, 0x21, 0x22)
+    ours, theirs, other = CanPort(hub.spec), CanPort(hub.spec), CanPort(hub.spec + "&source=0xF2")
+    other.link(0x22).exchange(write(b"abc"))
+    ours.link(0x21).exchange(write(b"abc"))
+    assert not ours.bus().rivals.seen()  # a station of another address is nobody's rival
+    theirs.link(0x22).exchange(write(b"abcdefgh"))
+    told: list[Notice] = []
+    ours.everyone(seconds=2, notice=told.append)
+    assert any(notice.kind == "conflict" and "0xF1" in notice.text and "source=0xF2" in notice.text for notice in told)
+    with pytest.raises(LinkFailure, match="Another base station") as failure:
+        ours.link(0x55).ask(write(b"nobody"), tries=1, seconds=0.2)
+    assert "source=0xF2" in failure.value.hint
+    for port in (ours, theirs, other):
+        port.close()
+
+
+def test_an_interface_that_gives_back_our_own_frames_makes_no_rival(group: str, nodes: Start) -> None:
+    nodes(group, 0x21)
+    port = CanPort(group)
+    for _ in range(5):
+        port.link(0x21).exchange(write(bytes(200)))
+    assert not port.bus().rivals.seen()
+    bus = Bus(parse_spec(group))
+    for _ in range(3):
+        bus.send(Frame(0x18DA21F1, b"\x02\x01\x02"))
+    bus.close()
+    until = time.monotonic() + 2
+    while not port.bus().rivals.seen() and time.monotonic() < until:
+        time.sleep(0.01)
+    assert port.bus().rivals.seen()
+    port.close()
+
+
+def test_the_registry_opens_a_place_and_names_what_it_does_not_know(hub: Hub) -> None:
+    port = open_place(f"can:{hub.spec}")
+    assert port.place == f"can:{hub.spec}"
+    assert port.capabilities == LINKS["can"].capabilities
+    port.close()
+    with pytest.raises(UsageFailure, match="radio"):
+        open_place("radio:0")
+    with pytest.raises(UsageFailure, match="know the bus"):
+        open_port(LinkSettings("can"))
+    with pytest.raises(UsageFailure, match="2 readers"):
+        open_port(LinkSettings(nfc=("udp:localhost:7", "udp:localhost:8")))
+    assert LinkSettings(nfc=("usb", "udp:localhost:8")).places == ("nfc:usb", "nfc:udp:localhost:8")
