@@ -1,0 +1,41 @@
+"""Where a virtual transducer has its values from: one file each, one line each in the table below."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Final
+
+from teds_provision.errors import UsageFailure
+from teds_provision.node.sources import command, lines, noise, ramp, recorded, sine
+from teds_provision.node.sources.base import Place, Source, Tell
+
+Maker = Callable[[str, Sequence[Place], Tell], Source]
+
+SOURCES: Final[dict[str, Maker]] = {
+    "noise": noise.make,
+    "sine": sine.make,
+    "ramp": ramp.make,
+    "file": recorded.make,
+    "-": lines.make_stream,
+    "unix": lines.make_socket,
+    "exec": command.make,
+}
+ONE_NODE_ONLY: Final = frozenset({"-", "unix"})
+"""Sources of which there is one, so that several nodes of a process cannot share them."""
+
+
+def kind_of(text: str) -> str:
+    """The word before the colon of ``--source``; raises UsageFailure for one that is not known."""
+    kind = text.partition(":")[0]
+    if kind not in SOURCES:
+        raise UsageFailure(
+            f"--source {text!r} is not known.",
+            hint="Write noise, sine:PERIOD, ramp:PERIOD, file:CSV, -, unix:PATH or exec:COMMAND.",
+        )
+    return kind
+
+
+def make_source(text: str, places: Sequence[Place], tell: Tell) -> Source:
+    """The source that ``--source`` names, for these sensors; raises UsageFailure, NotFound or BadData."""
+    kind = kind_of(text)
+    return SOURCES[kind](text.partition(":")[2], places, tell)

@@ -1,0 +1,77 @@
+"""``exec:COMMAND``: a program that prints lines as a simulation does, and is given what actuators are told."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import shlex
+import subprocess
+import threading
+from collections.abc import Mapping, Sequence
+
+from teds_provision.errors import NotFound, UsageFailure
+from teds_provision.node.sources.base import Drive, Place, Tell
+from teds_provision.node.sources.lines import Lines, feed
+
+_SECONDS_TO_END = 2.0
+
+
+class Command(Lines):
+    """Runs a program (no shell); lines need no ``t``: without one the node's clock is the host's."""
+
+    def __init__(self, places: Sequence[Place], tell: Tell, words: Sequence[str]) -> None:
+        super().__init__(places, tell, needs_time=False)
+        self._words = list(words)
+        self._process: subprocess.Popen[bytes] | None = None
+        self._stopped = False
+
+    def start(self, drive: Drive) -> None:
+        """Start the program; raises NotFound where there is none. Its errors go to our standard error."""
+        try:
+            self._process = subprocess.Popen(self._words, stdin=subprocess.PIPE, stdout=subprocess.PIPE)
+        except OSError as error:
+            raise NotFound(f"The program {self._words[0]} cannot be started: {error.strerror}.") from error
+        assert self._process.stdin is not None
+        os.set_blocking(self._process.stdin.fileno(), False)
+        self.begin(drive)
+        threading.Thread(target=self._run, name="source", daemon=True).start()
+
+    def acted(self, values: Mapping[str, float]) -> None:
+        """Write what actuators were told; a program that does not read loses it."""
+        if self._process is not None and self._process.stdin is not None:
+            with contextlib.suppress(OSError, ValueError):
+                os.write(self._process.stdin.fileno(), json.dumps({"set": dict(values)}).encode() + b"\n")
+
+    def stop(self) -> None:
+        """End the program: SIGTERM, after 2 s SIGKILL."""
+        self._stopped = True
+        if self._process is None:
+            return
+        self._process.terminate()
+        try:
+            self._process.wait(_SECONDS_TO_END)
+        except subprocess.TimeoutExpired:
+            self._process.kill()
+            self._process.wait()
+
+    def _run(self) -> None:
+        assert self._process is not None
+        assert self._process.stdout is not None
+        descriptor = self._process.stdout.fileno()
+        feed(lambda: os.read(descriptor, 65536), self.take)
+        code = self._process.wait()
+        if not self._stopped:
+            self._tell(f"The program {self._words[0]} ended with {code}: from now on no value is valid.")
+            self.end()
+
+
+def make(argument: str, places: Sequence[Place], tell: Tell) -> Command:
+    """``exec:./hand --rate 100``: words as a shell would part them."""
+    try:
+        words = shlex.split(argument)
+    except ValueError as error:
+        raise UsageFailure(f"exec: {error}.", hint="Close the quotes.") from error
+    if not words:
+        raise UsageFailure("exec: names no program.", hint="Write --source 'exec:./hand --rate 100'.")
+    return Command(places, tell, words)

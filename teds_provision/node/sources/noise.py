@@ -1,0 +1,25 @@
+"""``noise``: every instant another value, evenly spread over the range."""
+
+from __future__ import annotations
+
+import random
+from collections.abc import Sequence
+
+from teds_provision.errors import UsageFailure
+from teds_provision.node.sources.base import Generated, Place, Reading, Tell
+
+
+class Noise(Generated):
+    """Evenly spread noise over each channel's range."""
+
+    def at(self, channel: int, seconds: float) -> Reading | None:
+        """A new random value at each call."""
+        place = self.places.get(channel)
+        return None if place is None else place.between(random.random())
+
+
+def make(argument: str, places: Sequence[Place], tell: Tell) -> Noise:
+    """``noise`` takes no argument."""
+    if argument:
+        raise UsageFailure(f"noise takes nothing behind it, not {argument!r}.", hint="Write --source noise.")
+    return Noise(places)

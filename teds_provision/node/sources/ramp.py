@@ -1,0 +1,25 @@
+"""``ramp:PERIOD``: from the lowest value to the highest in each period, then anew."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from teds_provision.node.sources.base import Generated, Place, Reading, Tell, seconds_of
+
+
+class Ramp(Generated):
+    """A ramp of ``period`` seconds over each channel's range."""
+
+    def __init__(self, places: Sequence[Place], period: float) -> None:
+        super().__init__(places)
+        self.period = period
+
+    def at(self, channel: int, seconds: float) -> Reading | None:
+        """The ramp at that time."""
+        place = self.places.get(channel)
+        return None if place is None else place.between((seconds / self.period) % 1.0)
+
+
+def make(argument: str, places: Sequence[Place], tell: Tell) -> Ramp:
+    """``ramp:2`` or ``ramp:20ms``; 10 s where nothing is said."""
+    return Ramp(places, seconds_of(argument or "10", "ramp"))

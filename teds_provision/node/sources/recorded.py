@@ -1,0 +1,112 @@
+"""``file:CSV``: what a file says, played back by the node's clock; behind its last row nothing is valid.
+
+The first line names the columns: ``t`` (or ``time``, seconds; the first row is the node's start), then a channel's name
+for values in its unit, or ``raw:NAME`` for raw numbers. An empty field keeps nothing valid. Lines that begin with ``#``
+are comments. A value holds until the next row.
+"""
+
+from __future__ import annotations
+
+import bisect
+import csv
+import math
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Final
+
+from teds_provision.errors import BadData, UsageFailure
+from teds_provision.files import read_limited
+from teds_provision.node.sources.base import Generated, Place, Reading, Tell
+
+MOST_OCTETS: Final = 256 << 20
+_TIME: Final = ("t", "time")
+_RAW: Final = "raw:"
+
+
+class Recorded(Generated):
+    """Rows of readings: ``times`` ascend from 0, ``rows`` have one entry for each of ``columns`` (channel numbers)."""
+
+    def __init__(
+        self, places: Sequence[Place], times: list[float], columns: dict[int, list[Reading | None]], tell: Tell
+    ) -> None:
+        super().__init__(places)
+        self._times, self._columns, self._tell = times, columns, tell
+        # the last row is worth as long as the one before it
+        self._end = times[-1] + (times[-1] - times[-2] if len(times) > 1 else 0.0)
+        self._told = False
+
+    def at(self, channel: int, seconds: float) -> Reading | None:
+        """The last row that is not newer; None behind the end."""
+        column = self._columns.get(channel)
+        if seconds > self._end:
+            if not self._told:
+                self._told = True
+                self._tell("The file of values is at its end: from now on no value is valid.")
+            return None
+        if column is None:
+            return None
+        return column[max(0, bisect.bisect_right(self._times, seconds) - 1)]
+
+
+def make(argument: str, places: Sequence[Place], tell: Tell) -> Recorded:
+    """``file:run.csv``; raises NotFound, and BadData with the line that is wrong."""
+    if not argument:
+        raise UsageFailure("file: names no file.", hint="Write --source file:run.csv.")
+    return read(Path(argument), places, tell)
+
+
+def read(path: Path, places: Sequence[Place], tell: Tell) -> Recorded:
+    """Read a file of at most 256 MiB whole."""
+    try:
+        text = read_limited(path, MOST_OCTETS, "file of values").decode("utf-8-sig")
+    except UnicodeDecodeError as error:
+        raise BadData(f"{path} is no text: octet {error.start} is not UTF-8.") from error
+    lines = [(number, line) for number, line in enumerate(text.splitlines(), 1) if line.strip() and line[0] != "#"]
+    if len(lines) < 2:
+        raise BadData(f"{path} holds no row of values.", hint="First line: t,NAME,NAME …; then a row for each instant.")
+    fields = list(csv.reader(line for _, line in lines))
+    header = [name.strip() for name in fields[0]]
+    columns = _columns(path, header, {place.name: place.number for place in places if place.name})
+    at = next(index for index, name in enumerate(header) if name.lower() in _TIME)
+    times: list[float] = []
+    readings: dict[int, list[Reading | None]] = {number: [] for number, _, _ in columns}
+    for (line, _), row in zip(lines[1:], fields[1:], strict=True):
+        if len(row) != len(header):
+            raise BadData(f"{path}, line {line}: {len(row)} fields, the first line names {len(header)}.")
+        time = _number(path, line, row[at])
+        if time is None or (times and time - times[0] < times[-1] - times[0]):
+            raise BadData(f"{path}, line {line}: times must be numbers that ascend.")
+        times.append(time)
+        for number, index, raw in columns:
+            value = _number(path, line, row[index])
+            reading = None if value is None else Reading(raw=value) if raw else Reading(value=value)
+            readings[number].append(reading)
+    return Recorded(places, [time - times[0] for time in times], readings, tell)
+
+
+def _columns(path: Path, header: list[str], numbers: dict[str, int]) -> list[tuple[int, int, bool]]:
+    """(channel, column, raw) of each column that names a channel."""
+    found: list[tuple[int, int, bool]] = []
+    if not any(name.lower() in _TIME for name in header):
+        raise BadData(f"{path}: no column is named t.", hint="First line: t,NAME,NAME …")
+    for index, name in enumerate(header):
+        raw = name.startswith(_RAW)
+        number = numbers.get(name.removeprefix(_RAW))
+        if number is not None:
+            if any(number == other for other, _, _ in found):
+                raise BadData(f"{path}: two columns are for the channel {name.removeprefix(_RAW)}.")
+            found.append((number, index, raw))
+        elif name.lower() not in _TIME:
+            raise BadData(f"{path}: the node has no sensor named {name!r}.", hint=f"It has: {', '.join(numbers)}.")
+    return found
+
+
+def _number(path: Path, line: int, text: str) -> float | None:
+    text = text.strip()
+    if not text:
+        return None
+    try:
+        number = float(text)
+    except ValueError:
+        raise BadData(f"{path}, line {line}: {text[:40]!r} is no number.") from None
+    return number if math.isfinite(number) else None

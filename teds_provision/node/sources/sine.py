@@ -1,0 +1,29 @@
+"""``sine:PERIOD``: a sine over the whole range; channel n runs a twelfth of the period behind channel n - 1."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+from teds_provision.node.sources.base import Generated, Place, Reading, Tell, seconds_of
+
+
+class Sine(Generated):
+    """A sine of ``period`` seconds; at time 0 channel 1 stands in the middle of its range and rises."""
+
+    def __init__(self, places: Sequence[Place], period: float) -> None:
+        super().__init__(places)
+        self.period = period
+
+    def at(self, channel: int, seconds: float) -> Reading | None:
+        """The sine at that time."""
+        place = self.places.get(channel)
+        if place is None:
+            return None
+        phase = seconds / self.period - (channel - 1) / 12
+        return place.between(0.5 + 0.5 * math.sin(2 * math.pi * phase))
+
+
+def make(argument: str, places: Sequence[Place], tell: Tell) -> Sine:
+    """``sine:2`` or ``sine:20ms``; 10 s where nothing is said."""
+    return Sine(places, seconds_of(argument or "10", "sine"))

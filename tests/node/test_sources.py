@@ -1,0 +1,286 @@
+"""Sources of a virtual transducer: what they give at which time of the node's clock, and what a bad line does."""
+
+from __future__ import annotations
+
+import json
+import os
+import socket
+import sys
+import threading
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from teds_provision.errors import BadData, NoReader, NotFound, TedsProvisionError, UsageFailure
+from teds_provision.node.sources import SOURCES, make_source
+from teds_provision.node.sources.base import Place, Reading
+from teds_provision.node.sources.lines import Lines, Stream
+
+ANGLE, FORCE = Place(1, "angle", -180.0, 180.0), Place(2, "force", 0.0, 5.0)
+PLACES = (ANGLE, FORCE, Place(3, "bare"))
+
+
+class Clock:
+    """The node's clock as a source drives it."""
+
+    def __init__(self) -> None:
+        self.seconds, self.own, self.steps = 0.0, False, []
+        self.ended = threading.Event()
+
+    def now(self) -> float:
+        return self.seconds
+
+    def own_clock(self) -> None:
+        self.own = True
+
+    def advance(self, seconds: float, change: Callable[[], None]) -> None:
+        assert seconds >= self.seconds
+        self.seconds = seconds
+        change()
+        self.steps.append(seconds)
+
+    def host_clock(self) -> None:
+        self.own = False
+        self.ended.set()
+
+
+def test_generated_values_keep_to_the_range_and_the_period() -> None:
+    sine = make_source("sine:4", PLACES, print)
+    assert sine.at(1, 0.0) == Reading(value=0.0)
+    assert sine.at(1, 1.0) == Reading(value=180.0)
+    assert sine.at(9, 1.0) is None
+    ramp = make_source("ramp:20ms", PLACES, print)
+    assert [ramp.at(2, seconds).value for seconds in (0.0, 0.005, 0.01, 0.02)] == pytest.approx([0, 1.25, 2.5, 0])
+    noise = make_source("noise", PLACES, print)
+    seen = {noise.at(3, 0.0).value for _ in range(50)}
+    assert len(seen) > 40
+    assert all(0 <= value <= 1 for value in seen)
+
+
+@pytest.mark.parametrize(
+    ("text", "error"),
+    [
+        ("sinus", UsageFailure),
+        ("sine:0", UsageFailure),
+        ("sine:-1", UsageFailure),
+        ("ramp:fast", UsageFailure),
+        ("ramp:nan", UsageFailure),
+        ("noise:3", UsageFailure),
+        ("unix:", UsageFailure),
+        ("exec:", UsageFailure),
+        ("exec:'a", UsageFailure),
+        ("file:", UsageFailure),
+        ("file:/nowhere.csv", NotFound),
+    ],
+)
+def test_a_source_that_cannot_be_names_the_cure(text: str, error: type[TedsProvisionError]) -> None:
+    with pytest.raises(error):
+        make_source(text, PLACES, print)
+
+
+def test_every_source_of_the_contract_is_there() -> None:
+    assert set(SOURCES) == {"noise", "sine", "ramp", "file", "-", "unix", "exec"}
+
+
+def test_a_file_is_played_back_and_nothing_is_valid_behind_it(tmp_path: Path) -> None:
+    path = tmp_path / "run.csv"
+    path.write_text("# made by hand\nt,angle,raw:force\n10,1.5,7\n10.5,,8\n11,3,\n")
+    told: list[str] = []
+    source = make_source(f"file:{path}", PLACES, told.append)
+    assert [source.at(1, seconds) for seconds in (0.0, 0.4, 0.6, 1.2)] == [
+        Reading(value=1.5),
+        Reading(value=1.5),
+        None,
+        Reading(value=3.0),
+    ]
+    assert source.at(2, 0.7) == Reading(raw=8.0)
+    assert source.at(3, 0.0) is None
+    assert [source.at(1, 1.6), source.at(1, 99.0)] == [None, None]
+    assert len(told) == 1
+
+
+@pytest.mark.parametrize(
+    ("text", "place"),
+    [
+        ("", "no row"),
+        ("t,angle\n", "no row"),
+        ("angle\n1\n", "named t"),
+        ("t,angel\n0,1\n", "'angel'"),
+        ("t,angle,raw:angle\n0,1,1\n", "two columns"),
+        ("t,angle\n0,1\n1\n", "line 3"),
+        ("t,angle\n1,1\n0,1\n", "line 3"),
+        ("t,angle\nx,1\n", "line 2"),
+        ("t,angle\n0,x\n", "line 2"),
+        ("t,angle\n\n#\n,1\n", "line 4"),
+    ],
+)
+def test_a_bad_file_is_told_with_its_line(tmp_path: Path, text: str, place: str) -> None:
+    path = tmp_path / "run.csv"
+    path.write_text(text)
+    with pytest.raises(BadData, match=place):
+        make_source(f"file:{path}", PLACES, print)
+
+
+def lines(told: list[str], *, needs_time: bool = True) -> tuple[Lines, Clock]:
+    source, clock = Lines(PLACES, told.append, needs_time=needs_time), Clock()
+    source.begin(clock)
+    return source, clock
+
+
+def test_lines_set_values_and_drive_the_clock() -> None:
+    source, clock = lines([])
+    assert clock.own
+    source.take(b'{"t": 0.5, "value": {"angle": 12.5}, "raw": {"force": 4000}}')
+    source.take(b'{"t": 0.75, "value": {"angle": null}}')
+    assert clock.steps == [0.5, 0.75]
+    assert source.at(1, 0.0) is None
+    assert source.at(2, 0.0) == Reading(raw=4000.0)
+
+
+@pytest.mark.parametrize(
+    "line",
+    [
+        b"junk",
+        b"[1]",
+        b"[" * 100_000,
+        b'{"value": {"angle": 1}}',
+        b'{"t": true}',
+        b'{"t": -1}',
+        b'{"t": NaN}',
+        b'{"t": 1e400}',
+        b'{"t": 0.5}',
+        b'{"t": 2, "value": 3}',
+        b'{"t": 2, "value": {"angel": 3}}',
+        b'{"t": 2, "value": {"angle": "3"}}',
+        b'{"t": 2, "raw": {"angle": NaN}}',
+        b'{"t": 2, "raw": {"angle": 1' + b"0" * 400 + b"}}",
+    ],
+)
+def test_a_line_that_is_none_changes_nothing_and_is_counted(line: bytes) -> None:
+    told: list[str] = []
+    source, clock = lines(told)
+    source.take(b'{"t": 1, "value": {"angle": 1}}')
+    source.take(line)
+    assert (source.dropped, len(told), clock.seconds) == (1, 1, 1.0)
+    assert source.at(1, 1.0) == Reading(value=1.0)
+    source.take(b'{"t": 1, "value": {"angle": 2}}')
+    assert source.at(1, 1.0) == Reading(value=2.0)
+
+
+@given(st.binary(max_size=60))
+def test_no_octets_stop_the_source(octets: bytes) -> None:
+    source, clock = lines([])
+    source.take(octets)
+    assert clock.seconds >= 0
+
+
+def test_the_next_simulation_goes_on_where_the_clock_stands() -> None:
+    source, clock = lines([])
+    source.take(b'{"t": 5, "value": {"angle": 1}}')
+    source.end()
+    assert not clock.own
+    assert source.at(1, 5.0) is None
+    clock.seconds = 8.0  # the host's clock went on
+    source.begin(clock)
+    source.take(b'{"t": 0, "value": {"angle": 2}}')
+    source.take(b'{"t": 0.25, "value": {"angle": 3}}')
+    assert clock.seconds == 8.25
+
+
+def test_a_program_needs_no_times() -> None:
+    source, clock = lines([], needs_time=False)
+    source.take(b'{"value": {"angle": 2}}')
+    assert source.at(1, 0.0) == Reading(value=2.0)
+    assert not clock.own
+    source.take(b'{"t": 3, "value": {"angle": 4}}')
+    assert clock.own
+    assert source.at(1, 0.0) == Reading(value=4.0)
+
+
+def wait_for(what: Callable[[], object]) -> bool:
+    until = time.monotonic() + 10
+    while not what():
+        if time.monotonic() > until:
+            return False
+        time.sleep(0.005)
+    return True
+
+
+def test_standard_input_ends_and_the_node_stays() -> None:
+    reading, writing = os.pipe()
+    told: list[str] = []
+    with os.fdopen(reading, "rb") as stream:
+        source, clock = Stream(PLACES, told.append, stream), Clock()
+        source.start(clock)
+        os.write(writing, b'{"t": 1, "value": {"angle": 1}}\n{"t": 2, "val')
+        assert wait_for(lambda: source.at(1, 1.0) == Reading(value=1.0))
+        os.write(writing, b'ue": {"angle": 2}}')
+        os.close(writing)
+        assert clock.ended.wait(10)
+        assert clock.steps == [1.0, 2.0]
+        assert source.at(1, 2.0) is None
+        assert "end" in told[0]
+        source.stop()
+
+
+def test_simulations_come_and_go_at_a_unix_socket(tmp_path: Path) -> None:
+    path, told, clock = tmp_path / "hand.sock", [], Clock()
+    source = make_source(f"unix:{path}", PLACES, told.append)
+    source.start(clock)
+    try:
+        assert path.stat().st_mode & 0o777 == 0o600
+        with pytest.raises(NoReader, match=r"hand\.sock"):
+            make_source(f"unix:{path}", PLACES, print).start(Clock())
+        for value in (1.0, 2.0):
+            clock.ended.clear()
+            with socket.socket(socket.AF_UNIX) as simulation:
+                simulation.connect(str(path))
+                simulation.sendall(json.dumps({"t": value, "value": {"angle": value}}).encode() + b"\n")
+                assert wait_for(lambda: source.at(1, 0.0) == Reading(value=value))  # noqa: B023 - waited for here
+                source.acted({"gripper": value})
+                assert json.loads(simulation.recv(100)) == {"set": {"gripper": value}}
+            assert clock.ended.wait(10)
+            assert source.at(1, 0.0) is None
+    finally:
+        source.stop()
+    assert not path.exists()
+
+
+def test_a_socket_that_a_killed_node_left_is_replaced(tmp_path: Path) -> None:
+    path = tmp_path / "hand.sock"
+    with socket.socket(socket.AF_UNIX) as left:
+        left.bind(str(path))
+    source = make_source(f"unix:{path}", PLACES, print)
+    source.start(Clock())
+    source.stop()
+
+
+PROGRAM = """
+import json, sys
+print(json.dumps({"value": {"angle": 1}}), flush=True)
+told = json.loads(sys.stdin.readline())
+print(json.dumps({"value": {"angle": told["set"]["gripper"]}}), flush=True)
+sys.stdin.readline()
+sys.exit(3)
+"""
+
+
+def test_a_program_gives_values_is_told_what_actuators_do_and_may_end(tmp_path: Path) -> None:
+    path, told, clock = tmp_path / "hand.py", [], Clock()
+    path.write_text(PROGRAM)
+    source = make_source(f"exec:{sys.executable} {path}", PLACES, told.append)
+    source.start(clock)
+    assert wait_for(lambda: source.at(1, 0.0) == Reading(value=1.0))
+    source.acted({"gripper": 7.5})
+    assert wait_for(lambda: source.at(1, 0.0) == Reading(value=7.5))
+    source.acted({"gripper": 0.0})
+    assert clock.ended.wait(10)
+    assert source.at(1, 0.0) is None
+    assert "ended with 3" in told[0]
+    source.stop()
+    with pytest.raises(NotFound):
+        make_source("exec:/no/such/program", PLACES, print).start(clock)
