@@ -149,7 +149,8 @@ def _sequence(image: Image | None) -> int:
 def _calibrations(
     order: BuildOrder, profile: Profile, has: Image | None
 ) -> tuple[dict[int, Calibration], tuple[str, ...]]:
-    from teds_provision.teds.calibration import calibrations_of, load_calibrations
+    from teds_provision.teds.calibration import load_calibrations
+    from teds_provision.teds.sheet import Sheet
 
     if order.calibration is not None:
         if not order.calibration.is_file():
@@ -157,7 +158,7 @@ def _calibrations(
         return load_calibrations(order.calibration, profile), ()
     if order.drop_calibration or has is None:
         return {}, ()
-    kept = calibrations_of(has.blocks)
+    kept = dict(Sheet.of(has).calibrations)
     numbers = ", ".join(map(str, kept))
     return kept, (f"The calibration that was given before is kept (channel {numbers}).",) if kept else ()
 

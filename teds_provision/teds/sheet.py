@@ -176,7 +176,8 @@ class Channel:
 class Sheet:
     """The datasheet of one node; ``channels`` ascend by number and are those that have a TransducerChannel TEDS.
 
-    ``calibrations`` holds every calibration that can be computed, also of a channel that nothing describes.
+    ``calibrations`` holds every calibration that is understood, also one that cannot be computed, or one of a channel
+    that nothing describes.
     """
 
     uuid: bytes
@@ -232,6 +233,7 @@ class _Reader:
     def __init__(self, uuid: bytes, blocks: Mapping[BlockId, bytes]) -> None:
         self.uuid, self.blocks = uuid, blocks
         self.seen: dict[BlockId, Decoded] = {}
+        self.understood: dict[int, Calibration] = {}
 
     def decoded(self, channel: int, access_code: int) -> Decoded | None:
         """One TEDS decoded, None where it is not there."""
@@ -251,8 +253,15 @@ class _Reader:
         teds = self.decoded(number, AccessCode.CALIBRATION)
         if teds is None:
             return own
-        calibration, problem = _calibration(teds, own)
-        return _calibrated(own, calibration, problem)
+        if teds.verdict in _DAMAGED:
+            return replace(own, calibration_problem="Its length, checksum or structure is wrong.")
+        try:
+            found = from_decoded(teds, channel=number, units=own.units, actuator=own.actuator)
+        except BadData as error:
+            return replace(own, calibration_problem=error.message)
+        self.understood[number] = found
+        problem = computable(found)
+        return replace(own, calibration=None if problem else found, calibration_problem=problem)
 
     def meta(self) -> Meta:
         teds = self.decoded(0, AccessCode.META)
@@ -271,9 +280,8 @@ class _Reader:
         numbers = sorted({channel for channel, code in self.blocks if code in _OF_CHANNELS})
         every = [self.channel(number) for number in numbers]
         described = tuple(channel for channel in every if channel.described)
-        calibrations = {channel.number: channel.calibration for channel in every if channel.calibration is not None}
         findings = (*self.of_blocks(), *_between(self.uuid, meta, every))
-        return Sheet(self.uuid or meta.uuid or b"", meta, described, calibrations, findings)
+        return Sheet(self.uuid or meta.uuid or b"", meta, described, self.understood, findings)
 
     def of_blocks(self) -> Iterator[SheetFinding]:
         """What the decoder found in each TEDS, and TEDS that stand in a place that is not theirs."""
@@ -344,18 +352,6 @@ def _channel(number: int, name: str, teds: Decoded | None) -> Channel:
     )
 
 
-def _calibration(teds: Decoded, own: Channel) -> tuple[Calibration | None, str]:
-    """Calibration of a channel, or why there is none that can be computed."""
-    if teds.verdict in _DAMAGED:
-        return None, "The Calibration TEDS is damaged: its length, checksum or structure is wrong."
-    try:
-        found = from_decoded(teds, channel=own.number, units=own.units, actuator=own.actuator)
-    except BadData as error:
-        return None, error.message
-    problem = computable(found)
-    return (None, problem) if problem else (found, "")
-
-
 def computable(calibration: Calibration) -> str:
     """Why nothing can be computed with a calibration; "" where it can."""
     unit = calibration.unit
@@ -366,10 +362,6 @@ def computable(calibration: Calibration) -> str:
     if not math.isfinite(unit.scale) or not math.isfinite(unit.offset) or unit.scale == 0:
         return "The calibrated unit has no way into SI units: its slope is 0 or not finite."
     return ""
-
-
-def _calibrated(own: Channel, calibration: Calibration | None, problem: str) -> Channel:
-    return replace(own, calibration=calibration, calibration_problem=problem)
 
 
 def _float(teds: Decoded, name: str) -> float:

@@ -20,15 +20,18 @@ from teds_provision.teds.calibration import (
     METHODS,
     Calibration,
     CalibrationInput,
-    calibrations_of,
+    Residuals,
     describe_calibration,
+    evaluate,
     fit,
     from_decoded,
     load_calibrations,
     read_calibrations,
+    residuals,
     sentence,
 )
 from teds_provision.teds.profile import Profile, load_profile
+from teds_provision.teds.sheet import Sheet
 from teds_provision.teds.units.units import parse_unit
 
 
@@ -56,38 +59,48 @@ TWO_INPUTS = Calibration(
 )
 
 
+def value(calibration: Calibration, *inputs: float) -> float:
+    return evaluate(calibration, *inputs).value
+
+
+def residuals_of(calibration: Calibration) -> Residuals:
+    left = residuals(calibration)
+    assert left is not None
+    return left
+
+
 def test_the_published_check_value_of_one_input() -> None:
-    assert SPLINE(700) == pytest.approx(306.91, abs=1e-4)
+    assert value(SPLINE, 700) == pytest.approx(306.91, abs=1e-4)
 
 
 def test_the_published_check_value_of_two_inputs() -> None:
-    assert TWO_INPUTS(100, 20) == pytest.approx(34.55, abs=1e-5)
+    assert value(TWO_INPUTS, 100, 20) == pytest.approx(34.55, abs=1e-5)
 
 
 def test_a_value_on_a_boundary_belongs_to_the_upper_segment() -> None:
     steps = Calibration(1, "steps", (CalibrationInput(1, 0, (0, 10, 20), (0, 10)),), (1.0, 2.0))
-    assert [steps(x) for x in (0, 9.999, 10, 19, 20)] == [1, 1, 2, 2, 2]
+    assert [value(steps, x) for x in (0, 9.999, 10, 19, 20)] == [1, 1, 2, 2, 2]
 
 
 def test_outside_the_outer_boundaries_the_end_segment_holds_and_is_flagged() -> None:
-    result = SPLINE.evaluate(np.array([-10.0, 0.0, 1024.0, 1034.0, math.nan]))
+    result = evaluate(SPLINE, np.array([-10.0, 0.0, 1024.0, 1034.0, math.nan]))
     assert result.value[:4] == pytest.approx([232.15, 233.15, 345.79, 346.99], abs=1e-3)
     assert result.outside.tolist() == [1, 0, 0, 1, 1]
-    assert SPLINE.evaluate(2000.0).outside == 1.0
+    assert evaluate(SPLINE, 2000.0).outside == 1.0
 
 
 def test_arrays_and_scalars_give_the_same() -> None:
     x = np.random.default_rng(7).uniform(-50, 250, 50)
-    grid = TWO_INPUTS.evaluate(x[:, None], np.linspace(-10, 50, 7)[None, :])
+    grid = evaluate(TWO_INPUTS, x[:, None], np.linspace(-10, 50, 7)[None, :])
     assert grid.value.shape == (50, 7)
-    assert grid.value[3, 2] == pytest.approx(TWO_INPUTS(float(x[3]), 10.0))
+    assert grid.value[3, 2] == pytest.approx(value(TWO_INPUTS, float(x[3]), 10.0))
 
 
 def test_cells_are_ordered_with_the_last_input_fastest() -> None:
     inputs = (CalibrationInput(1, 0, (0, 1, 2), (0, 0)), CalibrationInput(2, 0, (0, 1, 2, 3), (0, 0, 0)))
     grid = Calibration(1, "steps", inputs, (0, 1, 2, 10, 11, 12))
-    assert [grid(0.5, y) for y in (0.5, 1.5, 2.5)] == [0, 1, 2]
-    assert [grid(1.5, y) for y in (0.5, 1.5, 2.5)] == [10, 11, 12]
+    assert [value(grid, 0.5, y) for y in (0.5, 1.5, 2.5)] == [0, 1, 2]
+    assert [value(grid, 1.5, y) for y in (0.5, 1.5, 2.5)] == [10, 11, 12]
 
 
 @pytest.mark.parametrize(
@@ -113,13 +126,13 @@ def test_what_does_not_fit_together_is_refused(
 def test_a_line_through_exact_points_is_found() -> None:
     line = fit([(0, 1.0), (100, 51.0), (200, 101.0)], "linear", channel=1)
     assert line.coefficients == (1.0, 0.5)
-    residuals = line.residuals()
+    residuals = residuals_of(line)
     assert residuals is not None
     assert residuals.maximum < 1e-5
 
 
 def test_the_residuals_of_a_line_are_shown() -> None:
-    residuals = fit([(0, 0.0), (1, 1.0), (2, 0.0)], "linear", channel=1).residuals()
+    residuals = residuals_of(fit([(0, 0.0), (1, 1.0), (2, 0.0)], "linear", channel=1))
     assert residuals is not None
     assert residuals.maximum == pytest.approx(2 / 3)
     assert residuals.rms == pytest.approx(math.sqrt(2) / 3)
@@ -130,14 +143,14 @@ def test_a_polynomial_survives_rounding_to_float32_over_16_bit_raw() -> None:
     raw = np.linspace(0, 65535, 40)
     value = 10 * (raw / 65535) ** 3 - 4 * (raw / 65535) ** 2 + raw / 65535
     cubic = fit(list(zip(raw.tolist(), value.tolist(), strict=True)), "polynomial", channel=1, degree=3)
-    residuals = cubic.residuals()
+    residuals = residuals_of(cubic)
     assert residuals is not None
     assert residuals.maximum < 2e-5
 
 
 def test_a_table_goes_through_its_points_and_straight_in_between() -> None:
     table = fit([(100, 5.0), (0, 0.0), (50, 1.0), (50, 2.0)], "table", channel=1)
-    assert [table(x) for x in (0, 25, 50, 75, 100)] == pytest.approx([0, 0.75, 1.5, 3.25, 5])
+    assert [value(table, x) for x in (0, 25, 50, 75, 100)] == pytest.approx([0, 0.75, 1.5, 3.25, 5])
 
 
 def test_a_table_can_be_thinned_and_stays_as_close_as_asked() -> None:
@@ -147,7 +160,7 @@ def test_a_table_can_be_thinned_and_stays_as_close_as_asked() -> None:
         fit(points, "table", channel=1)
     thin = fit(points, "table", channel=1, tolerance=0.01)
     assert 20 < thin.inputs[0].segments < 200
-    residuals = thin.residuals()
+    residuals = residuals_of(thin)
     assert residuals is not None
     assert 0.001 < residuals.maximum < 0.0101
     assert fit(points, "table", channel=1, tolerance=5.0).inputs[0].segments == 1
@@ -155,13 +168,13 @@ def test_a_table_can_be_thinned_and_stays_as_close_as_asked() -> None:
 
 def test_steps_hold_up_to_the_next_point() -> None:
     steps = fit([(0, 1.0), (10, 2.0), (20, 3.0)], "steps", channel=1)
-    assert [steps(x) for x in (0, 9, 10, 25)] == [1, 1, 2, 3]
+    assert [value(steps, x) for x in (0, 9, 10, 25)] == [1, 1, 2, 3]
 
 
 def test_an_actuator_is_fitted_from_units_to_raw() -> None:
     line = fit([(0, 10.0), (4095, 110.0)], "linear", channel=1, actuator=True)
-    assert line(110.0) == pytest.approx(4095, abs=0.01)
-    assert line(10.0) == pytest.approx(0, abs=0.01)
+    assert value(line, 110.0) == pytest.approx(4095, abs=0.01)
+    assert value(line, 10.0) == pytest.approx(0, abs=0.01)
 
 
 @pytest.mark.parametrize("method", METHODS)
@@ -225,9 +238,9 @@ def test_a_calibration_survives_its_teds(calibration: Calibration, edition: teds
 def test_the_calibrated_unit_is_recognized_again(magnetic: Profile) -> None:
     table = replace(fit([(0, 0.0), (65535, 360.0)], "table", channel=1), unit=parse_unit("degree"))
     built = magnetic.build(bytes(10), calibration={1: table})
-    again = calibrations_of(built.blocks)[1]
+    again = dict(Sheet.of_blocks(built.blocks).calibrations)[1]
     assert again.unit.text == "°"
-    assert again.unit.to_si(again(65535)) == pytest.approx(2 * math.pi)
+    assert again.unit.to_si(value(again, 65535)) == pytest.approx(2 * math.pi)
 
 
 def test_a_foreign_calibration_is_bad_data_and_nothing_else() -> None:
@@ -295,7 +308,7 @@ def test_a_csv_of_points_becomes_the_table_that_the_profile_asks_for(magnetic: P
     assert list(found) == [1]
     table = found[1]
     assert (table.method, table.by, table.uncertainty) == ("table", "lab 2", 0.5)
-    assert table(32768) == 181
+    assert value(table, 32768) == 181
     assert table.date == datetime(2026, 10, 31, tzinfo=UTC)
     assert table.interval == pytest.approx(365.2425 * 86400)
     assert table.unit.to_si(180.0) == pytest.approx(math.pi)
@@ -343,7 +356,7 @@ def test_an_uncertainty_may_have_its_own_unit(tactile: Profile) -> None:
 
 def test_segments_with_coefficients_are_read_as_they_are(magnetic: Profile) -> None:
     text = "from,to,offset,c0,c1\n0,512,0,233.15,0.1\n512,1024,512,284.35,0.12\n"
-    assert read_calibrations(text, "x.csv", magnetic)[1](700) == pytest.approx(306.91, abs=1e-3)
+    assert value(read_calibrations(text, "x.csv", magnetic)[1], 700) == pytest.approx(306.91, abs=1e-3)
 
 
 READY = {
@@ -361,7 +374,7 @@ READY = {
 @pytest.mark.parametrize("kind", READY)
 def test_ready_coefficients_are_read_from_json(kind: str, magnetic: Profile) -> None:
     found = read_calibrations(json.dumps(READY[kind]), "cal.json", magnetic)
-    assert found[1](10) == pytest.approx(8)
+    assert value(found[1], 10) == pytest.approx(8)
 
 
 def test_ready_coefficients_of_several_inputs_are_read_from_toml(tactile: Profile) -> None:
@@ -380,7 +393,7 @@ degree = 1
 boundaries = [0, 40]
 offsets = [25]
 """
-    assert read_calibrations(text, "cal.toml", tactile)[1](100, 20) == pytest.approx(34.55, abs=1e-4)
+    assert value(read_calibrations(text, "cal.toml", tactile)[1], 100, 20) == pytest.approx(34.55, abs=1e-4)
 
 
 @pytest.mark.parametrize(
@@ -458,6 +471,8 @@ def test_any_text_is_a_calibration_or_bad_data(text: str, name: str) -> None:
 
 def test_a_calibration_kept_from_a_node_gives_the_same_octets(magnetic: Profile) -> None:
     built = magnetic.build(bytes(10), calibration=read_calibrations(CSV, "x.csv", magnetic))
-    kept = Calibration.from_decoded(teds.decode(built.blocks[1, 5]))
+    kept = from_decoded(teds.decode(built.blocks[1, 5]))
     assert magnetic.build(bytes(10), calibration={1: kept}).blocks == built.blocks
-    assert magnetic.build(bytes(10), calibration=calibrations_of(built.blocks)).blocks == built.blocks
+    assert (
+        magnetic.build(bytes(10), calibration=dict(Sheet.of_blocks(built.blocks).calibrations)).blocks == built.blocks
+    )

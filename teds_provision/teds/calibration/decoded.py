@@ -3,14 +3,11 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
 from datetime import UTC, datetime, timedelta
 
 from teds_provision.errors import BadData
 from teds_provision.teds.calibration.model import METHODS, MONOTONE, Calibration, CalibrationInput, Method, Monotone
-from teds_provision.teds.codec.codes import AccessCode
 from teds_provision.teds.codec.model import Decoded, Field, TimeInstance, Units
-from teds_provision.teds.image import BlockId
 from teds_provision.teds.units.units import WrittenUnit, recognize
 
 
@@ -58,28 +55,6 @@ def _raw_range(value: object) -> tuple[float, float] | None:
     if isinstance(value, tuple) and len(value) == 2 and value[0] < value[1]:
         return float(value[0]), float(value[1])
     return None
-
-
-def calibrations_of(blocks: Mapping[BlockId, bytes]) -> dict[int, Calibration]:
-    """Calibrations that framed TEDS of a node hold, with units and kind from the channels' own TEDS.
-
-    Channels whose calibration is not understood here are left out.
-    """
-    from teds_provision.teds.codec.decode import decode
-
-    out: dict[int, Calibration] = {}
-    for (channel, access_code), octets in sorted(blocks.items()):
-        if access_code != AccessCode.CALIBRATION:
-            continue
-        own = decode(blocks[channel, AccessCode.CHANNEL]) if (channel, AccessCode.CHANNEL) in blocks else None
-        units = own.get("PhyUnits") if own else None
-        actuator = own is not None and own.get("ChanType") == 1
-        try:
-            known = units if isinstance(units, Units) else None
-            out[channel] = from_decoded(decode(octets), channel=channel, units=known, actuator=actuator)
-        except BadData:
-            continue
-    return out
 
 
 def _guess(inputs: tuple[CalibrationInput, ...]) -> Method:

@@ -6,6 +6,7 @@ import math
 from datetime import datetime
 from typing import Any
 
+from teds_provision.teds.calibration.fitting import residuals
 from teds_provision.teds.calibration.model import Calibration
 
 
@@ -20,14 +21,14 @@ def kind_of(calibration: Calibration) -> str:
 
 def describe_calibration(calibration: Calibration, now: datetime | None = None) -> dict[str, Any]:
     """Plain data of a calibration; residuals where it has its points, ``overdue`` where ``now`` is given."""
-    residuals = calibration.residuals()
+    left = residuals(calibration)
     shown = None
-    if residuals is not None:
-        at, difference = residuals.worst
+    if left is not None:
+        at, difference = left.worst
         shown = {
-            "points": len(residuals.inputs),
-            "maximum": residuals.maximum,
-            "rms": residuals.rms,
+            "points": len(left.inputs),
+            "maximum": left.maximum,
+            "rms": left.rms,
             "worst": {"input": at, "difference": difference},
         }
     return {
@@ -54,12 +55,12 @@ def sentence(calibration: Calibration) -> str:
     """One line for people: ``channel 1: polynomial of degree 3, 20 points, largest residual 0.1 N at raw 300, …``."""
     unit = "raw" if calibration.actuator else calibration.unit.text
     text = f"channel {calibration.channel}: {kind_of(calibration)}"
-    residuals = calibration.residuals()
-    if residuals is not None:
-        at, _ = residuals.worst
+    left = residuals(calibration)
+    if left is not None:
+        at, _ = left.worst
         place = f"{at:.6g} {calibration.unit.text}" if calibration.actuator else f"raw {at:.8g}"
-        text += f", {len(residuals.inputs)} points, largest residual {residuals.maximum:.3g} {unit} at {place}"
-        text += f", rms {residuals.rms:.3g} {unit}"
+        text += f", {len(left.inputs)} points, largest residual {left.maximum:.3g} {unit} at {place}"
+        text += f", rms {left.rms:.3g} {unit}"
     if calibration.due is not None:
         text += f", due {calibration.due:%Y-%m-%d}"
     return text

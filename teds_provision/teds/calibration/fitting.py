@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from teds_provision.errors import BadData
+from teds_provision.teds.calibration.formula import evaluate
 from teds_provision.teds.calibration.model import Calibration, CalibrationInput, Method
 
 Points = Sequence[tuple[float, float]]
@@ -51,12 +52,17 @@ def oriented(points: Points, *, actuator: bool) -> list[tuple[float, float]]:
     return [(value, raw) for raw, value in points] if actuator else list(points)
 
 
-def residuals(calibration: Calibration) -> Residuals:
-    """Residuals of a calibration's own points, by the curve as written (Float32), the zero offset left out."""
+def residuals(calibration: Calibration) -> Residuals | None:
+    """Residuals of a calibration's own points, by the curve as written (Float32), the zero offset left out.
+
+    None without points.
+    """
+    if not calibration.points:
+        return None
     pairs = oriented(calibration.points, actuator=calibration.actuator)
     inputs = np.array([x for x, _ in pairs])
     references = np.array([y for _, y in pairs])
-    curve = calibration.evaluate(inputs).value - calibration.zero_offset
+    curve = evaluate(calibration, inputs).value - calibration.zero_offset
     return Residuals(*(tuple(part.tolist()) for part in (inputs, references, curve, references - curve)))
 
 

@@ -13,17 +13,11 @@ import math
 import struct
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime, timedelta
-from typing import TYPE_CHECKING, Final, Generic, Literal, TypeVar, overload
+from typing import Final, Literal
 
 from teds_provision.errors import BadData
-from teds_provision.teds.codec.model import Decoded, Edition, TimeInstance, Units
+from teds_provision.teds.codec.model import Edition, TimeInstance
 from teds_provision.teds.units.units import WrittenUnit, parse_unit
-
-if TYPE_CHECKING:
-    import numpy as np
-    from numpy.typing import NDArray
-
-    from teds_provision.teds.calibration.fitting import Residuals
 
 Method = Literal["linear", "polynomial", "table", "steps"]
 Monotone = Literal["increasing", "decreasing", "either"]
@@ -33,7 +27,6 @@ MONOTONE: Final[tuple[Monotone, ...]] = ("increasing", "decreasing", "either")
 """Names of the codes 1 to 3 of field 137 (house profile)."""
 
 PLAIN: Final = parse_unit("1")
-_Value = TypeVar("_Value")
 
 
 def float32(values: tuple[float, ...], name: str) -> tuple[float, ...]:
@@ -74,14 +67,6 @@ class CalibrationInput:
     def ascending(self) -> bool:
         """Whether the boundaries ascend strictly, as they must for the formula to mean anything."""
         return all(low < high for low, high in zip(self.boundaries, self.boundaries[1:], strict=False))
-
-
-@dataclass(frozen=True)
-class Evaluation(Generic[_Value]):
-    """Result of the formula in calibrated units, and where an input lay outside its outer boundaries."""
-
-    value: _Value
-    outside: _Value
 
 
 @dataclass(frozen=True)
@@ -129,39 +114,6 @@ class Calibration:
             value = getattr(self, name)
             if value is not None:
                 object.__setattr__(self, name, float32((value,), name)[0])
-
-    @classmethod
-    def from_decoded(
-        cls, decoded: Decoded, *, channel: int | None = None, units: Units | None = None, actuator: bool = False
-    ) -> Calibration:
-        """Return the calibration of a decoded Calibration TEDS, see :func:`from_decoded`."""
-        from teds_provision.teds.calibration.decoded import from_decoded
-
-        return from_decoded(decoded, channel=channel, units=units, actuator=actuator)
-
-    @overload
-    def evaluate(self, *inputs: float) -> Evaluation[float]: ...
-    @overload
-    def evaluate(self, *inputs: NDArray[np.float64]) -> Evaluation[NDArray[np.float64]]: ...
-    def evaluate(self, *inputs: object) -> object:
-        """Apply the formula and the zero offset to one value, or one array, per input.
-
-        Arrays are broadcast against each other; ``outside`` is then an array of the same shape (1 where an input lies
-        outside its boundaries or is NaN), else 0.0 or 1.0. Raises BadData for another number of inputs.
-        """
-        from teds_provision.teds.calibration.evaluate import evaluate
-
-        return evaluate(self, inputs)
-
-    def __call__(self, *inputs: float) -> float:
-        """Return the calibrated value of one reading per input."""
-        return self.evaluate(*inputs).value
-
-    def residuals(self) -> Residuals | None:
-        """Differences between the points and the curve as it will be written; None without points."""
-        from teds_provision.teds.calibration.fitting import residuals
-
-        return residuals(self) if self.points else None
 
     @property
     def due(self) -> datetime | None:

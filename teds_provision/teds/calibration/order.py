@@ -9,7 +9,7 @@ from difflib import get_close_matches
 from itertools import pairwise
 
 from teds_provision.errors import BadData
-from teds_provision.teds.calibration.fitting import fit
+from teds_provision.teds.calibration.fitting import fit, residuals
 from teds_provision.teds.calibration.model import METHODS, Calibration, CalibrationInput, Method
 from teds_provision.teds.profile.model import ChannelProfile
 from teds_provision.teds.profile.reader import FLOAT32_MAXIMUM
@@ -94,7 +94,7 @@ def calibration_of(order: Order, channel: ChannelProfile) -> Calibration:
 
 def _misfit(curve: Calibration) -> float | None:
     """Largest residual of a fit in the calibrated unit; None where it is Float32 rounding (or raw, of an actuator)."""
-    left = None if curve.actuator else curve.residuals()
+    left = None if curve.actuator else residuals(curve)
     if left is None:
         return None
     return left.maximum if left.maximum > 1e-5 * max(map(abs, left.references)) else None

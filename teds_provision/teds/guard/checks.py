@@ -9,6 +9,7 @@ from typing import Final, Literal
 
 import numpy as np
 
+from teds_provision.teds.calibration.fitting import residuals
 from teds_provision.teds.calibration.model import Calibration
 from teds_provision.teds.guard.curve import FLOAT32_STEP, Curve
 
@@ -180,7 +181,7 @@ def _residual(curve: Curve, given: Calibration | None) -> Iterator[Raised]:
     if channel.actuator or not channel.uncertainty > 0:
         return
     stated = _show(curve, channel.uncertainty, difference=True)
-    left = given.residuals() if given is not None and not given.actuator else None
+    left = residuals(given) if given is not None and not given.actuator else None
     limit = channel.uncertainty * (1 + 1e-6)
     if given is not None and left is not None:
         worst = given.unit.difference_to_si(left.maximum)

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
+from teds_provision.teds.calibration.formula import evaluate
 from teds_provision.teds.calibration.model import Calibration
 from teds_provision.teds.calibration.samples import raw_range
 from teds_provision.teds.codec.codes import AccessCode
@@ -127,7 +128,7 @@ class Curve:
     @cached_property
     def _plain(self) -> NDArray[np.float64]:
         grid = np.meshgrid(*self.axes, indexing="ij")
-        return self.calibration.evaluate(*grid).value - self.calibration.zero_offset
+        return evaluate(self.calibration, *grid).value - self.calibration.zero_offset
 
     def _converted(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
         if self.channel.actuator:

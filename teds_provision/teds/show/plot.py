@@ -14,12 +14,14 @@ from typing import TYPE_CHECKING, Any, Final
 
 from teds_provision.errors import BadData, UsageFailure
 from teds_provision.files import SHARED, write_whole
-from teds_provision.teds.calibration.decoded import calibrations_of, is_finite
+from teds_provision.teds import calibration as calibrating
+from teds_provision.teds.calibration.decoded import is_finite
 from teds_provision.teds.calibration.describe import kind_of
 from teds_provision.teds.calibration.model import Calibration
 from teds_provision.teds.codec.codes import AccessCode
 from teds_provision.teds.codec.decode import decode
 from teds_provision.teds.image import BlockId
+from teds_provision.teds.sheet import Sheet
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -77,7 +79,7 @@ def _panels(
     from teds_provision.teds.guard.curve import channel_of, curve_of
 
     panels = []
-    for number, calibration in calibrations_of(blocks).items():
+    for number, calibration in Sheet.of_blocks(blocks).calibrations.items():
         if channel is not None and number != channel:
             continue
         if not is_finite(calibration) or not all(part.ascending for part in calibration.inputs):
@@ -217,7 +219,7 @@ class _View:
 
     def residuals(self, axes: Any) -> None:
         """Draw the residuals of the points, and the stated uncertainty."""
-        own = replace(self.calibration, points=self.panel.points, actuator=self.channel.actuator).residuals()
+        own = calibrating.residuals(replace(self.calibration, points=self.panel.points, actuator=self.channel.actuator))
         if own is None:
             return
         axes.plot(own.inputs, own.differences, "o-", color=_ORANGE, markersize=3, linewidth=0.7)

@@ -1,0 +1,274 @@
+"""From the octets of a channel to values with a unit, and back, prepared once from its datasheet.
+
+This is the papers' interpreter: no line of code knows a sensor, everything comes from the :class:`Sheet`. It works in
+blocks; whoever measures hands it the octets of many samples at once.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+
+from teds_provision.errors import BadData
+from teds_provision.teds.calibration.formula import PreparedCurve, PreparedInverse
+from teds_provision.teds.calibration.reading import SampleReader
+from teds_provision.teds.calibration.samples import DataModel, Range, SampleForm
+from teds_provision.teds.codec.model import Units
+from teds_provision.teds.sheet import Channel, Sheet
+from teds_provision.teds.units.units import RATIO, WrittenUnit
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from teds_provision.teds.calibration.reading import Octets
+
+    Floats = NDArray[np.float64]
+
+_DIGITAL, _ARBITRARY = 4, 5
+_ROUNDING: Final = 4 * 2.0**-23
+"""Limits and coefficients are Float32: a value this much of the limit beyond it is not beyond it."""
+
+
+@dataclass(frozen=True)
+class Values:
+    """A block of samples: ``raw`` as the data model says, ``value`` in the channel's unit, NaN where not ``valid``.
+
+    Not valid: the raw value cannot be (more than SigBits, not a number), or the value lies beyond the limits by more
+    than the stated uncertainty, or is no number. ``extrapolated``: an input lay outside the calibrated range; such a
+    value is valid as long as the limits hold, which the guard looked at before the datasheet was signed.
+    """
+
+    raw: NDArray[np.generic]
+    value: Floats
+    valid: NDArray[np.bool_]
+    extrapolated: NDArray[np.bool_]
+
+
+class ChannelInterpreter:
+    """Reads and writes the samples of one channel of a datasheet.
+
+    ``unit`` is the unit of the values, ``uncertainty`` the worst case in it (None where not stated), ``limits`` are
+    LowLimit and HiLimit in it (infinite where not stated). ``problem`` says in a sentence why raw values are all that
+    there is ("" where values can be had), for example a channel without calibration.
+    """
+
+    def __init__(self, sheet: Sheet, number: int) -> None:
+        """Prepare channel ``number``; raises BadData where it is not there or its samples cannot be read."""
+        channel = sheet.channel(number)
+        if channel is None:
+            raise BadData(f"The datasheet describes no channel {number}.")
+        if channel.sample is None:
+            raise BadData(f"The datasheet does not say how a sample of channel {number} is coded.")
+        self.channel: Channel = channel
+        self.reader = SampleReader(channel.sample)
+        self.unit: WrittenUnit = channel.unit
+        self._readers = {part: SampleReader(form) for part, form in _forms(sheet, self.inputs).items()}
+        self.problem = self._problem(sheet)
+        self.limits = self._limits()
+        self.uncertainty = self._uncertainty()
+        slack = self.uncertainty or 0.0
+        low, high = self.limits
+        self._floor = low - slack - _ROUNDING * abs(low) if math.isfinite(low) else -math.inf
+        self._ceiling = high + slack + _ROUNDING * abs(high) if math.isfinite(high) else math.inf
+
+    @property
+    def octets(self) -> int:
+        """Octets of one sample (ModLenth)."""
+        return self.reader.octets
+
+    @property
+    def inputs(self) -> tuple[int, ...]:
+        """Channels whose raw values the calibration takes, in its order; this channel alone without one."""
+        own = self.channel.calibration
+        if own is None or self.channel.actuator:
+            return (self.channel.number,)
+        return tuple(part.channel for part in own.inputs)
+
+    @property
+    def others(self) -> tuple[int, ...]:
+        """Further channels whose raw values are needed for a value of this one."""
+        return tuple(number for number in dict.fromkeys(self.inputs) if number != self.channel.number)
+
+    def decode(self, octets: Octets, others: Mapping[int, Octets] | None = None) -> Values:
+        """Values of a block of samples; ``others`` holds the octets of as many samples of each further input."""
+        raw = self.reader.raw(octets)
+        rows = {number: self._readers[number].raw(more) for number, more in (others or {}).items()}
+        return self.values(raw, rows)
+
+    def values(self, raw: NDArray[np.generic], others: Mapping[int, NDArray[np.generic]] | None = None) -> Values:
+        """Values of raw values (of :meth:`SampleReader.raw`); raises BadData where an input is missing."""
+        numbers, valid = self.reader.numbers(raw)
+        if self.problem or (self.channel.actuator and self._curve is not None and self._way_back is None):
+            nothing = np.full(len(raw), math.nan)
+            return Values(raw, nothing, np.zeros(len(raw), dtype=bool), np.zeros(len(raw), dtype=bool))
+        if self.channel.actuator and self._way_back is not None:
+            shown = self._shown(self._way_back(numbers))
+            extrapolated = np.zeros(len(raw), dtype=bool)
+        elif self._curve is not None:
+            inputs, valid = self._inputs(numbers, valid, others or {})
+            shown = self._shown(self._curve(*inputs))
+            extrapolated = self._curve.outside(*inputs)
+        else:
+            shown, extrapolated = self._shown(numbers), np.zeros(len(raw), dtype=bool)
+        valid &= (shown >= self._floor) & (shown <= self._ceiling) & np.isfinite(shown)
+        return Values(raw, np.where(valid, shown, math.nan), valid, extrapolated)
+
+    def encode(self, values: Floats | float, others: Mapping[int, NDArray[np.generic]] | None = None) -> bytes:
+        """Octets of values in :attr:`unit`: kept within the limits, converted, rounded to what the sample can hold.
+
+        For an actuator the set point to send, for a virtual sensor the sample that it would give. Raises BadData where
+        there is no way back (no calibration, a curve that turns, a value that is not finite).
+        """
+        values = np.clip(np.atleast_1d(np.asarray(values, dtype=np.float64)), *self.limits)
+        if not np.isfinite(values).all():
+            raise BadData(f"A value of channel {self.channel.number} is not finite.")
+        return self.reader.write(self.raw_numbers(values, others))
+
+    def raw_numbers(self, values: Floats, others: Mapping[int, NDArray[np.generic]] | None = None) -> Floats:
+        """Raw values (not yet rounded) that stand for values in :attr:`unit`; raises BadData as :meth:`encode` does."""
+        if self.problem:
+            raise BadData(self.problem)
+        if self._curve is None:
+            return self._stated(values)
+        if self.channel.actuator:
+            return self._curve(self._stated(values))
+        missing = [number for number in self.others if number not in (others or {})]
+        if missing:
+            raise BadData(f"Channel {self.channel.number} is compensated by channel {missing[0]}, which is not given.")
+        more = [self._readers[n].numbers((others or {})[n])[0] for n in self.inputs if n != self.channel.number]
+        return self._inverse(self._stated(values), more)
+
+    def beyond(self, value: float) -> str:
+        """Why a value may not be set, as a sentence; "" where the limits of the datasheet allow it."""
+        low, high = self.limits
+        if math.isfinite(value) and low - _ROUNDING * abs(low) <= value <= high + _ROUNDING * abs(high):
+            return ""
+        text = f"{low:.6g} to {high:.6g} {self.unit.text}".strip()
+        return f"{value:g} {self.unit.text} is beyond the limits of channel {self.channel.number}, {text}."
+
+    @cached_property
+    def _curve(self) -> PreparedCurve | None:
+        own = self.channel.calibration
+        return PreparedCurve(own) if own is not None else None
+
+    @cached_property
+    def _inverse(self) -> PreparedInverse:
+        curve = self._curve
+        assert curve is not None, "a channel without calibration is not inverted"
+        parts = curve.calibration.inputs
+        main = next((n for n, part in enumerate(parts) if part.channel == self.channel.number), 0)
+        own = curve.calibration
+        if self.channel.actuator:
+            low, high = (self._own_value(limit) for limit in self.limits)
+            known = math.isfinite(low) and math.isfinite(high)
+            ends = (min(low, high), max(low, high)) if known else None
+        else:
+            ends = own.raw_range or self.reader.form.raw_range
+        low, high = ends or (parts[main].boundaries[0], parts[main].boundaries[-1])
+        step = 0.25 if self.reader.form.integer and not self.channel.actuator else 0.0
+        return PreparedInverse(curve, low, high, main=main, step=step)
+
+    @cached_property
+    def _way_back(self) -> PreparedInverse | None:
+        """For an actuator: from its raw set point to values; None where its curve turns, so that none can be told."""
+        try:
+            return self._inverse if self._curve is not None else None
+        except BadData:
+            return None
+
+    def _inputs(
+        self, numbers: Floats, valid: NDArray[np.bool_], others: Mapping[int, NDArray[np.generic]]
+    ) -> tuple[list[Floats], NDArray[np.bool_]]:
+        inputs = []
+        for number in self.inputs:
+            if number == self.channel.number:
+                inputs.append(numbers)
+                continue
+            raw = others.get(number)
+            if raw is None or len(raw) != len(numbers):
+                raise BadData(f"Channel {self.channel.number} is compensated by channel {number}, which is not given.")
+            more, possible = self._readers[number].numbers(raw)
+            inputs.append(more)
+            valid = valid & possible
+        return inputs, valid
+
+    @cached_property
+    def _same(self) -> bool:
+        """Whether the curve gives values in :attr:`unit` as they are."""
+        own = self.channel.calibration
+        scale, offset = (own.unit.scale, own.unit.offset) if own is not None else (1.0, 0.0)
+        return (scale, offset) == (self.unit.scale, self.unit.offset)
+
+    def _shown(self, values: Floats) -> Floats:
+        """Values of the curve (or, without one, in SI units) in :attr:`unit`."""
+        if self._same:
+            return values
+        own = self.channel.calibration
+        si = values * own.unit.scale + own.unit.offset if own is not None else values
+        return (si - self.unit.offset) / self.unit.scale
+
+    def _stated(self, values: Floats) -> Floats:
+        """Values in :attr:`unit` in the unit of the curve (or, without one, in SI units)."""
+        if self._same:
+            return values
+        si = values * self.unit.scale + self.unit.offset
+        own = self.channel.calibration
+        return (si - own.unit.offset) / own.unit.scale if own is not None else si
+
+    def _own_value(self, value: float) -> float:
+        return float(self._stated(np.asarray(value)))
+
+    def _limits(self) -> Range:
+        """The narrower of the channel's limits (SI) and those of its calibration, in :attr:`unit`."""
+        channel, own = self.channel, self.channel.calibration
+        lows, highs = [self.unit.from_si(channel.low)], [self.unit.from_si(channel.high)]
+        if own is not None:
+            given = [None if limit is None else own.unit.to_si(limit) for limit in (own.low_limit, own.high_limit)]
+            lows += [self.unit.from_si(limit) for limit in given[:1] if limit is not None]
+            highs += [self.unit.from_si(limit) for limit in given[1:] if limit is not None]
+        known_lows, known_highs = ([n for n in ends if math.isfinite(n)] for ends in (lows, highs))
+        return max(known_lows, default=-math.inf), min(known_highs, default=math.inf)
+
+    def _uncertainty(self) -> float | None:
+        stated = self.channel.stated_uncertainty
+        return self.unit.difference_from_si(stated) if math.isfinite(stated) and stated >= 0 else None
+
+    def _problem(self, sheet: Sheet) -> str:
+        channel = self.channel
+        if channel.calibration_problem:
+            return f"Channel {channel.number} has a calibration that cannot be used: {channel.calibration_problem}"
+        for number in self.others:
+            if number not in self._readers:
+                known = sheet.channel(number)
+                why = "is not described" if known is None else "has samples that cannot be read"
+                return f"Channel {channel.number} is compensated by channel {number}, which {why}."
+        if channel.actuator and channel.calibration is not None and len(channel.calibration.inputs) > 1:
+            return f"The calibration of actuator {channel.number} takes several inputs; one is what can be set here."
+        if channel.calibration is None and not _speaks_for_itself(channel):
+            unit = self.unit.text
+            return f"Channel {channel.number} has no calibration: its raw values cannot be turned into {unit}."
+        return ""
+
+
+def _forms(sheet: Sheet, numbers: tuple[int, ...]) -> dict[int, SampleForm]:
+    """Sample forms of channels that can be read."""
+    found = {number: sheet.channel(number) for number in numbers}
+    forms = {number: channel.sample for number, channel in found.items() if channel is not None}
+    return {number: form for number, form in forms.items() if form is not None and not form.problem}
+
+
+def _speaks_for_itself(channel: Channel) -> bool:
+    """Whether samples are values without a calibration: floats in SI units, counts, bits, fractions of a ratio."""
+    form, units = channel.sample, channel.units
+    if form is None:
+        return False
+    if form.model in (DataModel.FLOAT32, DataModel.FLOAT64, DataModel.TIME_OF_DAY):
+        return True
+    if units.interpretation in (_DIGITAL, _ARBITRARY) or units == Units(extension=units.extension):
+        return True
+    return units.interpretation == RATIO and form.model in (DataModel.FRACTION, DataModel.LONG_FRACTION)

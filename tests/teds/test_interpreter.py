@@ -1,0 +1,356 @@
+"""From octets to values and back: data models, calibrations, limits, and the way back for actuators and simulations."""
+
+from __future__ import annotations
+
+import math
+import struct
+from dataclasses import replace
+from fractions import Fraction
+from itertools import product
+
+import numpy as np
+import pytest
+from hypothesis import assume, given, settings
+from hypothesis import strategies as st
+
+from teds_provision import teds
+from teds_provision.errors import BadData
+from teds_provision.teds import AccessCode, Sheet
+from teds_provision.teds.calibration import (
+    Calibration,
+    CalibrationInput,
+    ChannelInterpreter,
+    PreparedCurve,
+    PreparedInverse,
+    SampleReader,
+    evaluate,
+    fit,
+)
+from teds_provision.teds.calibration.samples import DataModel, SampleForm
+from teds_provision.teds.image import BlockId, Image
+from teds_provision.teds.profile import load_profile
+from teds_provision.teds.units.units import WrittenUnit, parse_unit
+
+UUID = bytes(10)
+Blocks = dict[BlockId, bytes]
+
+
+def blocks_of(profile: str, calibrations: dict[int, Calibration] | None = None) -> Blocks:
+    return dict(load_profile(profile).build(UUID, calibration=calibrations or {}).blocks)
+
+
+def sheet_of(profile: str, calibrations: dict[int, Calibration] | None = None) -> Sheet:
+    return Sheet.of(Image(UUID, blocks_of(profile, calibrations)))
+
+
+def changed(sheet: Sheet, number: int = 1, **more: object) -> Sheet:
+    """The same sheet with another channel."""
+    channels = tuple(replace(c, **more) if c.number == number else c for c in sheet.channels)  # type: ignore[arg-type]
+    return replace(sheet, channels=channels)
+
+
+FORMS = st.one_of(
+    st.builds(SampleForm, st.just(0), st.integers(1, 8), st.integers(0, 70)),
+    st.builds(SampleForm, st.just(3), st.integers(1, 8), st.integers(0, 70)),
+    st.builds(SampleForm, st.just(4), st.integers(1, 12), st.just(0)),
+    st.builds(SampleForm, st.sampled_from([5, 6]), st.integers(9, 255), st.integers(0, 2100)),
+    st.sampled_from([SampleForm(1, 4), SampleForm(2, 8), SampleForm(7, 8)]),
+)
+
+
+def one_number(form: SampleForm, octets: bytes) -> float:
+    """What one sample means, written down as the contract has it."""
+    whole = int.from_bytes(octets, "big")
+    match form.model:
+        case 1:
+            return float(struct.unpack(">f", octets)[0])
+        case 2:
+            return float(struct.unpack(">d", octets)[0])
+        case 3 | 6:
+            return float(Fraction(whole, 1 << 8 * len(octets)))
+        case 7:
+            value = int.from_bytes(octets[:4], "big") + (int.from_bytes(octets[4:], "big") & 0x7FFFFFFF) * 1e-9
+            return -value if octets[4] & 0x80 else value
+        case _:
+            try:
+                return float(whole)
+            except OverflowError:
+                return math.inf
+
+
+@settings(max_examples=300, deadline=None)
+@given(form=FORMS, data=st.data())
+def test_every_octet_string_reads_as_the_contract_says(form: SampleForm, data: st.DataObject) -> None:
+    samples = data.draw(st.lists(st.binary(min_size=form.octets, max_size=form.octets), max_size=5))
+    reader = SampleReader(form)
+    numbers, possible = reader.numbers(reader.raw(b"".join(samples)))
+    expected = np.array([one_number(form, octets) for octets in samples])
+    np.testing.assert_array_equal(numbers, expected)
+    most = form.raw_range[1] if form.integer and form.raw_range else math.inf
+    assert possible.tolist() == [math.isfinite(x) and x <= most for x in expected.tolist()]
+
+
+def test_a_block_may_come_as_rows_of_a_larger_message() -> None:
+    reader = SampleReader(SampleForm(DataModel.UNSIGNED, 2))
+    body = np.frombuffer(bytes.fromhex("aa 0001 bb 0203 aa 0004 bb 0506"), dtype=np.uint8).reshape(-1, 6)
+    assert reader.raw(body[:, 1:3]).tolist() == [1, 4]
+    assert reader.raw(body[:, 4:6]).tolist() == [0x0203, 0x0506]
+    with pytest.raises(BadData, match="3 octets"):
+        reader.raw(b"abc")
+    with pytest.raises(BadData, match="3 octets"):
+        reader.raw(body[:, :3])
+
+
+@pytest.mark.parametrize(
+    ("form", "number", "octets"),
+    [
+        (SampleForm(0, 2), 4660.4, "1234"),
+        (SampleForm(0, 2), -5, "0000"),
+        (SampleForm(0, 2, 12), 70000, "0fff"),
+        (SampleForm(0, 3), 1.5, "000002"),
+        (SampleForm(0, 8), 1e30, "ff" * 8),
+        (SampleForm(5, 9), 2.0**65, "020000000000000000"),
+        (SampleForm(1, 4), 1e300, "7f7fffff"),
+        (SampleForm(2, 8), -1.5, "bff8000000000000"),
+        (SampleForm(3, 2), 0.5, "8000"),
+        (SampleForm(3, 2), 1.0, "ffff"),
+        (SampleForm(3, 2, 4), 0.26, "4000"),
+        (SampleForm(6, 9), 0.25, "400000000000000000"),
+    ],
+)
+def test_numbers_are_written_rounded_and_kept_within_what_the_form_can_hold(
+    form: SampleForm, number: float, octets: str
+) -> None:
+    assert SampleReader(form).write(np.array([number])).hex() == octets
+
+
+def test_what_is_no_quantity_is_not_written_and_what_cannot_be_read_is_refused() -> None:
+    for form in (SampleForm(4, 1), SampleForm(7, 8)):
+        with pytest.raises(BadData):
+            SampleReader(form).write(np.array([1.0]))
+    with pytest.raises(BadData, match="reserved"):
+        SampleReader(SampleForm(77, 1))
+    with pytest.raises(BadData, match="not finite"):
+        SampleReader(SampleForm(1, 4)).write(np.array([math.nan]))
+
+
+@st.composite
+def calibrations(draw: st.DrawFn, inputs: int) -> Calibration:
+    parts = []
+    for number in range(1, inputs + 1):
+        degree, segments = draw(st.integers(0, 3)), draw(st.integers(1, 4))
+        edges = sorted(draw(st.sets(st.integers(0, 65535), min_size=segments + 1, max_size=segments + 1)))
+        offsets = draw(st.lists(st.integers(0, 65535), min_size=segments, max_size=segments))
+        parts.append(CalibrationInput(number, degree, tuple(map(float, edges)), tuple(map(float, offsets))))
+    count = math.prod(part.segments * (part.degree + 1) for part in parts)
+    numbers = st.floats(-8, 8, width=32)
+    coefficients = draw(st.lists(numbers, min_size=count, max_size=count))
+    return Calibration(1, "polynomial", tuple(parts), tuple(coefficients), zero_offset=draw(numbers))
+
+
+def by_hand(calibration: Calibration, *inputs: float) -> Fraction:
+    """The formula of ieee-1451.0.md section 6 in exact arithmetic, written down once more."""
+    cell, distances = 0, []
+    for part, value in zip(calibration.inputs, inputs, strict=True):
+        segment = sum(1 for edge in part.boundaries[1:-1] if value >= edge)
+        cell = cell * part.segments + segment
+        distances.append(Fraction(value) - Fraction(part.offsets[segment]))
+    powers = list(product(*(range(part.degree + 1) for part in calibration.inputs)))
+    total = Fraction(calibration.zero_offset)
+    for place, exponents in enumerate(powers):
+        term = Fraction(calibration.coefficients[cell * len(powers) + place])
+        for distance, exponent in zip(distances, exponents, strict=True):
+            term *= distance**exponent
+        total += term
+    return total
+
+
+@settings(max_examples=200, deadline=None)
+@given(calibration=st.integers(1, 2).flatmap(calibrations), data=st.data())
+def test_blocks_give_what_one_value_gives_and_what_exact_arithmetic_gives(
+    calibration: Calibration, data: st.DataObject
+) -> None:
+    count = data.draw(st.integers(1, 6))
+    octets = [data.draw(st.binary(min_size=2 * count, max_size=2 * count)) for _ in calibration.inputs]
+    arrays = [np.frombuffer(part, dtype=">u2").astype(np.float64) for part in octets]
+    values = PreparedCurve(calibration)(*arrays)
+    for place in range(count):
+        inputs = [float(array[place]) for array in arrays]
+        assert values[place] == evaluate(calibration, *inputs).value
+        exact = by_hand(calibration, *inputs)
+        size = sum(abs(c) for c in calibration.coefficients) * 65535.0 ** sum(p.degree for p in calibration.inputs) + 8
+        assert abs(Fraction(float(values[place])) - exact) <= Fraction(size) * Fraction(2) ** -45
+
+
+@settings(max_examples=100, deadline=None)
+@given(octets=st.binary(min_size=2, max_size=40).filter(lambda b: len(b) % 2 == 0))
+def test_the_interpreter_gives_what_evaluate_gives_on_every_octet_string(octets: bytes) -> None:
+    interpreter = ChannelInterpreter(ANGLE, 1)
+    values = interpreter.decode(octets)
+    for raw, value, valid in zip(values.raw.tolist(), values.value.tolist(), values.valid.tolist(), strict=True):
+        expected = evaluate(TABLE, float(raw)).value
+        low, high = interpreter.limits
+        within = low - interpreter.uncertainty <= expected <= high + interpreter.uncertainty  # type: ignore[operator]
+        assert valid == within
+        assert value == expected if valid else math.isnan(value)
+
+
+TABLE = replace(
+    fit([(n * 1000, (n * 1000 * 370 / 65536) ** 1.0001) for n in range(66)], "table", channel=1),
+    unit=parse_unit("degree"),
+    uncertainty=0.5,
+)
+ANGLE = sheet_of("magnetic-angular-position-sensor", {1: TABLE})
+
+
+def test_limits_and_uncertainty_are_told_in_the_unit_of_the_values() -> None:
+    interpreter = ChannelInterpreter(ANGLE, 1)
+    assert interpreter.unit.text in ("°", "degree")
+    assert interpreter.uncertainty == pytest.approx(0.5)
+    assert interpreter.limits == pytest.approx((0.0, 360.0))
+    assert interpreter.octets == 2
+    assert interpreter.inputs == (1,)
+
+
+def test_a_value_beyond_the_limits_by_more_than_the_uncertainty_is_not_valid() -> None:
+    interpreter = ChannelInterpreter(ANGLE, 1)
+    raws = np.array([0, 63800, 65000], dtype=np.uint64)
+    values = interpreter.values(raws)
+    assert values.valid.tolist() == [True, True, False]
+    assert 360.0 < values.value[1] < 360.5
+    assert math.isnan(values.value[2])
+    assert values.raw is raws
+
+
+def test_a_raw_value_beyond_its_bits_is_not_valid_and_beyond_its_points_is_marked() -> None:
+    part = CalibrationInput(1, 1, (10.0, 3000.0), (0.0,))
+    line = Calibration(1, "linear", (part,), (0.0, 0.05), unit=parse_unit("degree"))
+    sheet = changed(sheet_of("magnetic-angular-position-sensor", {1: line}), sample=SampleForm(0, 2, 12))
+    values = ChannelInterpreter(sheet, 1).values(np.array([5, 100, 3500, 4096], dtype=np.uint64))
+    assert values.valid.tolist() == [True, True, True, False]
+    assert values.extrapolated.tolist() == [True, False, True, True]
+
+
+def test_a_channel_without_calibration_gives_raw_values_alone_and_says_why() -> None:
+    interpreter = ChannelInterpreter(sheet_of("magnetic-angular-position-sensor"), 1)
+    assert "no calibration" in interpreter.problem
+    values = interpreter.decode(bytes.fromhex("12340001"))
+    assert values.raw.tolist() == [0x1234, 1]
+    assert not values.valid.any()
+    assert np.isnan(values.value).all()
+    with pytest.raises(BadData, match="no calibration"):
+        interpreter.encode(1.0)
+
+
+def test_floats_counts_and_bits_speak_for_themselves() -> None:
+    angle = sheet_of("magnetic-angular-position-sensor")
+    floats = ChannelInterpreter(changed(angle, sample=SampleForm(DataModel.FLOAT32, 4)), 1)
+    assert floats.problem == ""
+    values = floats.decode(struct.pack(">3f", math.pi, 2 * math.pi, math.nan))
+    assert values.value[:2] == pytest.approx([180.0, 360.0])
+    assert values.valid.tolist() == [True, True, False]
+    assert floats.encode(180.0) == struct.pack(">f", math.pi)
+    counts = changed(angle, units=teds.Units(), sample=SampleForm(DataModel.UNSIGNED, 2), low=math.nan, high=math.nan)
+    assert ChannelInterpreter(counts, 1).decode(bytes.fromhex("0102")).value.tolist() == [258.0]
+
+
+def test_a_compensated_channel_asks_for_its_other_input() -> None:
+    inputs = (CalibrationInput(1, 1, (0, 65535), (0,)), CalibrationInput(2, 1, (0, 65535), (0,)))
+    both = Calibration(1, "polynomial", inputs, (0.0, 0.001, 0.0001, 0.0), unit=parse_unit("N"))
+    sheet = sheet_of("tactile-finger-sensor", {1: both})
+    interpreter = ChannelInterpreter(sheet, 1)
+    assert interpreter.others == (2,)
+    own, other = np.array([5000, 6000], dtype=">u2").tobytes(), np.array([10, 20], dtype=">u2").tobytes()
+    values = interpreter.decode(own, {2: other})
+    assert values.value.tolist() == [evaluate(both, 5000, 10).value, evaluate(both, 6000, 20).value]
+    with pytest.raises(BadData, match="compensated by channel 2"):
+        interpreter.decode(own)
+    back = interpreter.encode(values.value, {2: np.array([10, 20], dtype=np.uint64)})
+    assert back == own
+    assert "not described" in ChannelInterpreter(replace(sheet, channels=sheet.channels[:1]), 1).problem
+
+
+def actuator(calibration: Calibration | None = None) -> Sheet:
+    sheet = sheet_of("gripper")
+    number = next(channel.number for channel in sheet.channels if channel.actuator)
+    own = sheet.channel(number)
+    assert own is not None
+    if calibration is None:
+        low, high = own.unit.from_si(own.low), own.unit.from_si(own.high)
+        part = CalibrationInput(number, 1, (low, high), (low,))
+        calibration = Calibration(number, "linear", (part,), (0.0, 4000 / (high - low)), unit=own.unit, actuator=True)
+    return Sheet.of(Image(UUID, blocks_of("gripper", {number: calibration})))
+
+
+def test_an_actuator_is_set_within_its_limits_and_read_back() -> None:
+    sheet = actuator()
+    number = next(channel.number for channel in sheet.channels if channel.actuator)
+    interpreter = ChannelInterpreter(sheet, number)
+    low, high = interpreter.limits
+    middle = (low + high) / 2
+    assert int.from_bytes(interpreter.encode(middle), "big") == 2000
+    assert int.from_bytes(interpreter.encode(high * 3), "big") == 4000
+    assert interpreter.decode(interpreter.encode(middle)).value[0] == pytest.approx(middle)
+    assert interpreter.beyond(middle) == ""
+    assert "beyond the limits" in interpreter.beyond(high * 1.01)
+    assert interpreter.beyond(math.nan)
+    with pytest.raises(BadData, match="not finite"):
+        interpreter.encode(math.nan)
+
+
+def test_an_actuator_whose_curve_turns_can_be_set_but_not_read_back() -> None:
+    number = next(channel.number for channel in sheet_of("gripper").channels if channel.actuator)
+    own = sheet_of("gripper").channel(number)
+    assert own is not None
+    low, high = own.unit.from_si(own.low), own.unit.from_si(own.high)
+    part = CalibrationInput(number, 2, (low, high), ((low + high) / 2,))
+    bent = Calibration(number, "polynomial", (part,), (100.0, 0.0, 5.0), unit=own.unit, actuator=True)
+    interpreter = ChannelInterpreter(actuator(bent), number)
+    assert len(interpreter.encode(high)) == interpreter.octets
+    assert not interpreter.decode(interpreter.encode(high)).valid.any()
+
+
+@settings(max_examples=150, deadline=None)
+@given(
+    steps=st.lists(st.floats(0.01, 10), min_size=2, max_size=8),
+    falling=st.booleans(),
+    cubic=st.booleans(),
+    data=st.data(),
+)
+def test_the_way_back_gives_the_raw_value_that_it_came_from(
+    steps: list[float], falling: bool, cubic: bool, data: st.DataObject
+) -> None:
+    values = np.cumsum(steps)
+    points = list(zip(np.linspace(0, 65535, len(values)).round().tolist(), values.tolist(), strict=True))
+    if falling:
+        points = [(raw, -value) for raw, value in points]
+    curve = PreparedCurve(fit(points, "polynomial" if cubic else "table", channel=1))
+    try:
+        inverse = PreparedInverse(curve, 0.0, 65535.0, step=0.25)
+    except BadData:
+        assume(not cubic)  # a polynomial through such points may turn
+        raise
+    raws = np.array(data.draw(st.lists(st.integers(0, 65535), min_size=1, max_size=5)), dtype=np.float64)
+    found = inverse(curve(raws))
+    slack = 8 * 2.0**-23 * float(np.abs(curve(raws)).max())
+    assert np.all((np.abs(found - raws) <= 0.26) | (np.abs(curve(found) - curve(raws)) <= slack))
+    beyond = inverse(np.array([-1e9, 1e9]))
+    assert sorted(beyond.tolist()) == pytest.approx([0.0, 65535.0], abs=0.26)
+
+
+def test_a_calibration_in_a_unit_without_a_name_is_shown_in_the_usual_one() -> None:
+    odd = replace(TABLE, unit=WrittenUnit("(× 0.1 rad)", TABLE.unit.units, 0.1), coefficients=TABLE.coefficients)
+    blocks = blocks_of("magnetic-angular-position-sensor")
+    blocks[1, AccessCode.CALIBRATION] = teds.compose(AccessCode.CALIBRATION, replace(odd, uncertainty=0.1).fields())
+    interpreter = ChannelInterpreter(Sheet.of_blocks(blocks), 1)
+    assert interpreter.unit.text == "°"
+    shown = interpreter.decode(bytes.fromhex("0100")).value[0]
+    assert shown == pytest.approx(math.degrees(evaluate(odd, 256.0).value * 0.1))
+    assert interpreter.uncertainty == pytest.approx(math.degrees(0.01))
+
+
+def test_what_is_not_described_is_refused() -> None:
+    with pytest.raises(BadData, match="no channel 9"):
+        ChannelInterpreter(ANGLE, 9)
+    with pytest.raises(BadData, match="how a sample"):
+        ChannelInterpreter(changed(ANGLE, sample=None), 1)
