@@ -1,0 +1,244 @@
+"""Node ticks to host time: an estimate, a bound that holds, and a lying clock is found out (operation.md section 5).
+
+Two kinds of evidence. A Clock *exchange* says where the offset lies: within an interval that delay can only widen. An
+*arrival* says that a sample was taken before it came: an upper limit, whose lower hull over time follows the skew.
+The estimate is a line through the exchanges (of the hull before there are enough of them), kept inside what the
+evidence allows. A refit never steps: the difference is let out over SLEW seconds, so time never goes back.
+
+Host time is CLOCK_MONOTONIC in nanoseconds; :class:`Wall` converts once, at the start of a measurement, so that a step
+of the wall clock does not tear a recording.
+"""
+
+from __future__ import annotations
+
+import itertools
+import time
+from collections import deque
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+OWN_DRIFT = 50.0  # ppm that the host's clock may be off beside the node's
+NODE_DRIFT = 100.0  # ppm, until the node has said its own
+AT_FIRST = 5  # exchanges that a station does at once: one alone may have met a long delay
+EXCHANGES = 64  # kept: at one each 3.3 s three and a half minutes
+WINDOW = 30_000_000_000  # ns of arrivals under the hull
+BUCKET = 50_000_000  # ns: the best arrival of each stands for it
+SLEW = 1_000_000_000  # ns over which a refit's difference is let out
+SPAN_OF_A_HULL = 2_000_000_000  # ns of arrivals before they say something about skew
+SPAN_OF_EXCHANGES = 60_000_000_000  # ns of exchanges before they say more about it than the arrivals
+
+
+@dataclass(frozen=True)
+class Exchange:
+    """One Clock command: request left at ``asked`` (its first copy), reply whole at ``answered`` (host, monotonic ns).
+
+    ``received`` and ``sent`` are the node's ticks, ``step`` its clock's step in ns, ``drift`` its bound in ppm.
+    """
+
+    asked: int
+    answered: int
+    received: int
+    sent: int
+    step: int
+    drift: int
+
+    @property
+    def offset(self) -> float:
+        """Host minus node, ns."""
+        return ((self.asked - self.received) + (self.answered - self.sent)) / 2
+
+    @property
+    def error(self) -> float:
+        """Bound of the offset's error at the moment of the exchange, ns."""
+        return ((self.answered - self.asked) - (self.sent - self.received)) / 2 + self.step
+
+    @property
+    def tick(self) -> int:
+        """The moment of the exchange on the node's clock."""
+        return (self.received + self.sent) // 2
+
+
+class ClockMap:
+    """Ticks of one node in one session to host time. Not for several threads at once.
+
+    ``lie`` is empty, or says why this clock cannot be believed; then stamps go on, and the data are to be marked.
+    """
+
+    def __init__(self, own_drift: float = OWN_DRIFT) -> None:
+        self.lie = ""
+        self._own = own_drift
+        self._rate = (own_drift + NODE_DRIFT) / 1e6  # ns of doubt for each ns of age
+        self._exchanges: deque[Exchange] = deque(maxlen=EXCHANGES)
+        self._arrivals: deque[tuple[int, int]] = deque()  # (tick, host - tick), the best of each bucket
+        self._bucket = -1
+        self._origin = 0  # tick at which the line's offset stands
+        self._offset = 0.0
+        self._skew = 0.0
+        self._residue = 0.0  # what the last refit still lets out
+        self._refitted = 0  # tick of that refit
+        self._known = False
+        self._handed_out = False  # whether somebody has stamps by now: before that a refit may step
+
+    @property
+    def known(self) -> bool:
+        """Whether there is any evidence yet."""
+        return self._known
+
+    def exchange(self, one: Exchange) -> bool:
+        """Take an exchange; False where the clock lies (``lie`` says how). A lying exchange changes nothing else."""
+        if one.sent < one.received:
+            self.lie = "the node sent its reply before it received the request, by its own clock"
+        elif one.sent - one.received > (one.answered - one.asked) * (1 + one.drift / 1e6) + 2 * one.step:
+            self.lie = "the node says that it took longer over the reply than the whole exchange"
+        else:
+            self._rate = max(self._rate, (one.drift + self._own) / 1e6)
+            low, high = self._limits(one.tick)
+            if one.offset - one.error > high or one.offset + one.error < low:
+                self.lie = "two exchanges contradict each other: the node's clock was set, or runs at another speed"
+                return False
+            self._exchanges.append(one)
+            self._refit(one.tick)
+            return True
+        return False
+
+    def arrival(self, tick: int, host: int) -> None:
+        """Take a sample's tick and when the message that held it had come (host, monotonic ns)."""
+        upper = host - tick
+        if tick // BUCKET == self._bucket and self._arrivals:
+            if upper < self._arrivals[-1][1]:
+                self._arrivals[-1] = (tick, upper)
+            return
+        self._bucket = tick // BUCKET
+        while self._arrivals and self._arrivals[0][0] < tick - WINDOW:
+            self._arrivals.popleft()
+        self._arrivals.append((tick, upper))
+        if len(self._arrivals) % 10 == 1:
+            self._refit(tick)
+
+    def host(self, ticks: NDArray[np.uint64]) -> NDArray[np.float64]:
+        """Host time (monotonic, seconds) of ticks."""
+        self._handed_out = True
+        since = ticks.astype(np.int64) - self._origin
+        left = 1.0 - (ticks.astype(np.int64) - self._refitted) / SLEW
+        slope: NDArray[Any] = self._offset + self._skew * since + self._residue * np.clip(left, 0.0, 1.0)
+        # Whole nanoseconds first: a tick of months and an offset of years would lose microseconds as floats.
+        whole: NDArray[np.float64] = (ticks.astype(np.int64) + np.rint(slope).astype(np.int64)) / 1e9
+        return whole
+
+    def tick_at(self, host: int) -> int:
+        """Node's tick at a host time (monotonic ns), by the present line."""
+        guess = host - round(self._offset)
+        return host - round(self._line(guess))
+
+    def bound(self, tick: int) -> float:
+        """Bound of the error of ``host`` at a tick, seconds; infinite without an exchange."""
+        low, high = self._limits(tick)
+        now = self._line(tick)
+        return max(high - now, now - low, 0.0) / 1e9
+
+    def _line(self, tick: int) -> float:
+        left = min(max(1.0 - (tick - self._refitted) / SLEW, 0.0), 1.0)
+        return self._offset + self._skew * (tick - self._origin) + self._residue * left
+
+    def _limits(self, tick: int) -> tuple[float, float]:
+        """The offsets that all evidence allows at a tick: each piece widens with its age."""
+        low, high = -np.inf, np.inf
+        for one in self._exchanges:
+            doubt = one.error + self._rate * abs(tick - one.tick)
+            low = max(low, one.offset - doubt)
+            high = min(high, one.offset + doubt)
+        for at, upper in self._arrivals:
+            high = min(high, upper + self._rate * abs(tick - at))
+        return low, high
+
+    def _refit(self, tick: int) -> None:
+        before = self._line(tick) if self._handed_out else None
+        offset, skew = self._by_exchanges(tick) if self._exchanges else self._by_arrivals(tick)
+        low, high = self._limits(tick)
+        self._origin, self._offset, self._skew = tick, float(min(max(offset, low), high)), skew
+        self._residue, self._refitted = 0.0 if before is None else before - self._offset, tick
+        self._known = True
+
+    def _by_exchanges(self, tick: int) -> tuple[float, float]:
+        """Weighted line through the exchanges, the skew held within the drift; (offset at tick, skew)."""
+        at = np.array([one.tick - tick for one in self._exchanges], dtype=np.float64)
+        offsets = np.array([one.offset for one in self._exchanges])
+        errors = np.array([one.error for one in self._exchanges])
+        base = offsets[-1]
+        # A round trip's excess over the quickest one is delay that fell on one way or the other: it says little.
+        weights = 1.0 / (errors - 0.9 * errors.min() + 1_000.0) ** 2
+        by_hull = self._by_arrivals(tick)[1]
+        middle = np.average(at, weights=weights)
+        level = np.average(offsets - base, weights=weights)
+        spread = float(np.sum(weights * (at - middle) ** 2))
+        skew = by_hull
+        if spread and len(at) >= 4 and at.max() - at.min() >= SPAN_OF_EXCHANGES:
+            skew = float(np.sum(weights * (at - middle) * (offsets - base - level)) / spread)
+            skew = min(max(skew, -self._rate), self._rate)
+        return float(base + level - skew * middle), skew
+
+    def _by_arrivals(self, tick: int) -> tuple[float, float]:
+        """The edge of the lower hull over the middle of the window; (offset at tick, skew)."""
+        if not self._arrivals:
+            return 0.0, 0.0
+        hull = _lower_hull(list(self._arrivals))
+        if hull[-1][0] - hull[0][0] < SPAN_OF_A_HULL:
+            return float(min(upper for _, upper in self._arrivals)), 0.0
+        middle = (hull[0][0] + hull[-1][0]) / 2
+        for (left, low), (right, high) in itertools.pairwise(hull):
+            if right >= middle:
+                skew = min(max((high - low) / (right - left), -self._rate), self._rate)
+                return low + skew * (tick - left), skew
+        raise AssertionError("a hull spans its middle")
+
+
+def _lower_hull(points: list[tuple[int, int]]) -> list[tuple[int, int]]:
+    hull: list[tuple[int, int]] = []
+    for x, y in points:
+        while len(hull) > 1 and (hull[-1][1] - hull[-2][1]) * (x - hull[-2][0]) >= (y - hull[-2][1]) * (
+            hull[-1][0] - hull[-2][0]
+        ):
+            hull.pop()
+        hull.append((x, y))
+    return hull
+
+
+@dataclass(frozen=True)
+class Wall:
+    """Monotonic to unix seconds, read once."""
+
+    offset: float
+
+    @classmethod
+    def now(cls) -> Wall:
+        """The narrowest of a few readings, so that an interruption between the two clocks does not count."""
+        readings = []
+        for _ in range(9):
+            before = time.monotonic_ns()
+            wall = time.time_ns()
+            after = time.monotonic_ns()
+            readings.append((after - before, wall - (before + after) / 2))
+        return cls(min(readings)[1] / 1e9)
+
+    def unix(self, monotonic: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Unix seconds."""
+        return monotonic + self.offset
+
+
+class Monotone:
+    """Stamps of one stream never go back, whatever a refit says."""
+
+    def __init__(self) -> None:
+        self._last = -np.inf
+
+    def __call__(self, times: NDArray[np.float64]) -> NDArray[np.float64]:
+        """The times, each at least as late as the one before it."""
+        held: NDArray[np.float64] = np.maximum(np.maximum.accumulate(times), self._last)
+        if len(held):
+            self._last = float(held[-1])
+        return held

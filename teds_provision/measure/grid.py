@@ -1,0 +1,120 @@
+"""One line of times for all channels of a group: the "synchronized data" of the second paper.
+
+A row stands at every multiple of the grid's period. Each channel gives its last value that is not newer than the row
+(never one from the future), with its age; after two of its own periods without a value both are NaN. A row waits until
+every live stream has come past it, but no longer than ``patience``: nobody waits for the slowest.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from teds_provision.measure.blocks import Block, ChannelFacts, GroupRows
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+PERIODS_OF_A_VALUE = 2.0  # then it is too old to stand for the channel
+LONGEST_BURST = 10_000  # rows at once; a longer gap of all streams is left out
+
+
+@dataclass
+class _Stream:
+    columns: list[int]
+    keeps: float  # seconds that a value stands for its channels
+    times: list[NDArray[Any]] = field(default_factory=list)
+    values: list[NDArray[Any]] = field(default_factory=list)
+    newest: float = -math.inf
+    began: float = math.nan
+
+
+class Grid:
+    """Gathers blocks of a group's streams and gives out rows.
+
+    ``period`` is in seconds (the shortest of the channels' unless given), ``patience`` the longest wait for a row
+    after its time. Channels without a period (events) keep their last value.
+    """
+
+    def __init__(
+        self, group: str, facts: Sequence[ChannelFacts], *, period: float | None = None, patience: float = 0.1
+    ) -> None:
+        self.group = group
+        self.channels = tuple(one.key for one in facts)
+        self.patience = patience
+        periods = [one.period for one in facts if one.period]
+        self.period = period or (min(periods) if periods else 1.0)
+        self._columns = {key: place for place, key in enumerate(self.channels)}
+        self._keeps = {one.key: PERIODS_OF_A_VALUE * one.period if one.period else math.inf for one in facts}
+        self._streams: dict[tuple[str, int], _Stream] = {}
+        self._next: int | None = None  # number of the next row: its time is number × period
+        self._test = False
+
+    def take(self, block: Block) -> None:
+        """Samples of a stream; channels that are not of this group are left out."""
+        stream = self._stream(block)
+        if stream is None or not len(block.time):
+            return
+        order = [place for place, number in enumerate(block.channels) if (block.uuid, number) in self._columns]
+        stream.times.append(block.time)
+        stream.values.append(np.where(block.valid, block.value, np.nan)[:, order])
+        if math.isnan(stream.began):
+            stream.began = float(block.time[0])
+        stream.newest = max(stream.newest, float(block.time[-1]))
+        self._test = self._test or block.test_pattern
+        if self._next is None:
+            self._next = math.ceil(float(block.time[0]) / self.period - 1e-6)
+
+    def _stream(self, block: Block) -> _Stream | None:
+        key = block.uuid, block.stream
+        columns = [self._columns[block.uuid, one] for one in block.channels if (block.uuid, one) in self._columns]
+        if not columns:
+            return None
+        known = self._streams.get(key)
+        if known is None or known.columns != columns:
+            keeps = max(self._keeps[self.channels[one]] for one in columns)
+            known = self._streams[key] = _Stream(columns, keeps)
+        return known
+
+    def rows(self, now: float) -> GroupRows | None:
+        """The rows that are due at unix time ``now``; None where there is none."""
+        if self._next is None:
+            return None
+        live = [one.newest for one in self._streams.values() if one.newest > now - one.keeps - self.patience]
+        ready = min(live) if live else -math.inf
+        # The small number lets a stamp that was rounded stand for the row that it was taken for.
+        until = math.floor(max(ready, now - self.patience) / self.period + 1e-6)
+        if until < self._next:
+            return None
+        first = max(self._next, until - LONGEST_BURST + 1)
+        self._next = until + 1
+        times = np.arange(first, until + 1) * self.period
+        value = np.full((len(times), len(self.channels)), np.nan)
+        age = np.full_like(value, np.nan)
+        for stream in self._streams.values():
+            _fill(stream, times, value, age, self.period * 1e-6)
+        return GroupRows(self.group, self.channels, times, value, age, self._test)
+
+    def began_apart(self) -> float:
+        """Seconds between the first samples of the stream that began first and of the one that began last."""
+        began = [one.began for one in self._streams.values() if not math.isnan(one.began)]
+        return max(began) - min(began) if began else 0.0
+
+
+def _fill(stream: _Stream, rows: NDArray[Any], value: NDArray[Any], age: NDArray[Any], rounding: float) -> None:
+    if not stream.times:
+        return
+    times, values = np.concatenate(stream.times), np.concatenate(stream.values)
+    place = np.searchsorted(times, rows + rounding, side="right") - 1
+    old = rows - times[np.maximum(place, 0)]
+    good = (place >= 0) & (old <= stream.keeps)
+    for offset, column in enumerate(stream.columns):
+        value[good, column] = values[place[good], offset]
+        age[good, column] = np.maximum(old[good], 0.0)
+    # What a later row may still need: the last value before the next row, and all after it.
+    kept = max(int(place[-1]), 0)
+    stream.times, stream.values = [times[kept:]], [values[kept:]]
