@@ -8,19 +8,11 @@ from dataclasses import replace
 
 from teds_provision.protocol import datasheet
 from teds_provision.protocol.flash import Flash
-from teds_provision.protocol.messages.frames import Reason
+from teds_provision.protocol.messages.frames import Reason, Refused
 from teds_provision.teds.codec import security
 from teds_provision.teds.codec.codes import AccessCode
 from teds_provision.teds.codec.security import NotCanonical, SecurityTeds
 from teds_provision.teds.image import SECURITY, BlockId
-
-
-class Refused(Exception):
-    """A command is refused for ``reason``; nothing was changed."""
-
-    def __init__(self, reason: Reason) -> None:
-        super().__init__(reason.name)
-        self.reason = reason
 
 
 def _demand(holds: bool, reason: Reason) -> None:

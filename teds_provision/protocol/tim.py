@@ -20,7 +20,6 @@ from teds_provision.protocol.agreement import (
     good_point,
     key_id,
 )
-from teds_provision.protocol.commit import Refused
 from teds_provision.protocol.flash import Flash, FlashFailure, FlashMemory
 from teds_provision.protocol.keys import (
     PrivateKey,
@@ -37,6 +36,7 @@ from teds_provision.protocol.messages.frames import (
     Command,
     Function,
     Reason,
+    Refused,
     Reply,
     TedsFunction,
     refusal,
@@ -60,6 +60,7 @@ PENDING_SECONDS = 60.0
 IDLE_SECONDS = 600.0
 CHALLENGE_OCTETS = 32
 LAST_CAN_ADDRESS = 239
+_SESSION_ONLY = {Function.CLOSE, *range(Function.SAMPLE, Function.DRIVE + 1)}
 
 
 @dataclass
@@ -196,7 +197,7 @@ class Tim:
         if function in (Function.REQUEST, Function.CONFIRM, Function.SET_CAN_ADDRESS):
             if not origin.tapped:
                 raise Refused(Reason.NOT_PERMITTED)
-        elif function == Function.CLOSE or (function == Function.RESET and not factory):
+        elif function in _SESSION_ONLY or (function == Function.RESET and not factory):
             raise Refused(Reason.NOT_PERMITTED)
         elif (function == Function.OPEN and factory) or (
             function == Function.SEALED and not self._has_session(origin.link)
@@ -231,6 +232,8 @@ class Tim:
                 _length(payload, 0)
                 entries = [channel.to_bytes(2, "big") + bytes([code]) for channel, code in self._flash.present()]
                 return Reply(True, b"".join(entries))
+            case _:
+                raise Refused(Reason.UNKNOWN_COMMAND)
 
     # -- key agreement ---------------------------------------------------------------------------------------------
 

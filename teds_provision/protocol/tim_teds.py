@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from teds_provision.protocol.commit import Refused, verified_commit
+from teds_provision.protocol.commit import verified_commit
 from teds_provision.protocol.datasheet import can_be_stored, passes_own_check
 from teds_provision.protocol.flash import Flash
-from teds_provision.protocol.messages.frames import Attribute, Command, Reason, Reply, TedsStatus
+from teds_provision.protocol.messages.frames import Attribute, Command, Reason, Refused, Reply, TedsStatus
 from teds_provision.teds.image import SECURITY, BlockId
 
 READ_OVERHEAD = 46

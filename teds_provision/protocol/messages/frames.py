@@ -11,12 +11,12 @@ from teds_provision.errors import Garbled
 
 COMMAND_HEADER: Final = 6
 REPLY_HEADER: Final = 3
-COMMON, SECURITY = 1, 128
-"""Command classes: CommonCmd of the standard, and the profile's own."""
+COMMON, OPERATE, EITHER, SECURITY = 1, 3, 4, 128
+"""Command classes: CommonCmd, XdcrOperate and XdcrEither of the standard, and the profile's own."""
 
 
 class Function(IntEnum):
-    """Functions of class 128 (profile sections 3 and 4)."""
+    """Functions of class 128 (profile sections 3 and 4; 12 to 20: operation.md)."""
 
     REQUEST = 1
     CONFIRM = 2
@@ -28,6 +28,15 @@ class Function(IntEnum):
     RESET = 9
     SET_CAN_ADDRESS = 10
     LIST = 11
+    SAMPLE = 12
+    SET = 13
+    SUBSCRIBE = 14
+    STOP = 15
+    CLOCK = 16
+    ARM = 17
+    POWER = 18
+    OPERATION = 19
+    DRIVE = 20
 
 
 class TedsFunction(IntEnum):
@@ -60,6 +69,19 @@ class Reason(IntEnum):
     UNKNOWN_KEY = 16
     BUSY = 17
     NO_SUCH_TEDS = 18
+    OUT_OF_RANGE = 19
+    TOO_LATE = 20
+    DOES_NOT_FIT = 21
+    NO_ROOM = 22
+    FAULT = 23
+
+
+class Refused(Exception):
+    """A command is refused for ``reason``; nothing was changed. Raised and caught inside the node."""
+
+    def __init__(self, reason: Reason) -> None:
+        super().__init__(reason.name)
+        self.reason = reason
 
 
 @dataclass(frozen=True)

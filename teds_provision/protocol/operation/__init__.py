@@ -1,0 +1,43 @@
+"""Measurement operation: claims, data sets, actuators, streams, clock, trigger (operation.md). Pure, both roles.
+
+Nothing here does I/O, waits or reads a clock. Times are integers: node ticks and station times in ns, ``gap`` in µs,
+leases in s, dead-men in ms. Data sets are raw octets as ModLenth and DatModel say.
+
+Where things are
+----------------
+================  ====================================================================================================
+``commands``      every payload: ``Operate`` ``idle`` ``Operation`` ``read_data_set`` ``write_data_set`` ``sample``
+                  ``Sampled`` ``set_values`` ``run_self_test`` ``Power`` ``Subscribe`` ``Subscribed`` ``stop`` ``drive``
+                  ``Driven`` ``Clock`` ``Arm``; builders give a ``Command`` for ``Conversation.send``
+``datagram``      data and Drive messages: run keys, ``Sealer``, ``Layout``, the test pattern
+``can_frames``    identifiers and cutting on CAN and BLE: ``cut`` ``Assembly`` ``data_address`` ``trigger_station``
+``budget``        the node's budget in ppm, the load of a CAN bus
+``subscription``  station: ``Plan`` (Subscribe and the check of its reply), ``Receiver`` (opens messages, counts)
+``timing``        station: ``ClockSample`` (offset, bound, lies), ``Token`` (trigger)
+``driving``       station: ``Driver`` (Drive messages)
+``hardware``      node: what the firmware below gives (``Hardware``, ``Port``)
+``claims``        node: who claims what, leases, dead-men, safe states
+``streams``       node: streams, their budget, messages being filled and sent
+``role``          node: every command of operation.md inside a session; used by ``Tim``
+================  ====================================================================================================
+
+A station, in order
+-------------------
+>>> plan = Plan.of(0, ((1, 2),), n=25, period=1_000_000)          # stream 0: channel 1 of 2 octets, 1 kHz
+>>> subscribed = plan.accept(conversation.send(plan.command(), "to subscribe"), now)
+>>> receiver = Receiver(plan, subscribed, session.message_key)    # k_m: StationSession.message_key
+>>> assembly = Assembly(plan.length, fd=False)                     # one for each (node, stream)
+>>> octets = assembly.take(address.segment, frame.data)           # address = data_address(identifier)
+>>> message = receiver.take(octets, clock_sample.tick(time.monotonic_ns()))   # Message, or None: see receiver.counts
+
+A node
+------
+``Tim(..., hardware=...)``; the link tells it what only a link knows:
+
+* ``tim.handle(frame, link=…, tapped=…)`` as before; then, when the reply has left, ``tim.reply_left(link)``;
+* ``tim.poll()`` again and again: takes samples, runs leases and dead-men; gives the tick at which it wants to be called
+  again. ``tim.event(channel, tick, data_set, valid)`` whenever an event sensor has seen one;
+* ``tim.next_frame(bus)`` for a link that streams: the next data frame of a bus, and the tick before which it must not
+  begin;
+* ``tim.trigger(bus, station, token, tick)`` and ``tim.drive(bus, station, frame)`` for what comes without a reply.
+"""

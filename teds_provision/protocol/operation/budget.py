@@ -1,0 +1,66 @@
+"""What data messages take of a link: the node's budget, and the load of a CAN bus (operation.md sections 4 and 6)."""
+
+from __future__ import annotations
+
+from typing import Final
+
+from teds_provision.protocol.operation.can_frames import frames_of
+
+MILLION: Final = 10**6
+MOST_LOAD: Final = 0.6
+"""Share of a CAN bus that a station lets data frames take, at worst-case stuffing."""
+BLE_OVERHEAD: Final = 4
+_FULL_OCTETS: Final = 8
+
+
+def frames(length: int, *, link: str, fd: bool) -> int:
+    """Frames of a data message: of 8 octets, on FD of 64, on BLE one. ``link`` is ``can`` or ``ble``."""
+    return 1 if link == "ble" else frames_of(length, fd=fd)
+
+
+def share(count: int, gap: int, n: int, period: int) -> int:
+    """One stream's share of the node's budget in ppm: ⌈frames · g · 10^9 / (n · period)⌉ (g in µs, period in ns).
+
+    The node counts with g at least 1; the sum over its streams on one bus is at most 10^6.
+    """
+    return -(-count * gap * 10**9 // (n * period))
+
+
+def classic_bits(octets: int, *, worst: bool = True) -> int:
+    """Bits of a classic frame with a 29-bit identifier and ``octets`` of data, interframe space included.
+
+    ISO 11898-1. ``worst``: with the most stuff bits that can be; else without any.
+    """
+    stuffed = 54 + 8 * octets  # start, identifier, control, data, CRC: the part that is stuffed
+    return stuffed + (stuffed - 1) // 4 * worst + 13
+
+
+def fd_seconds(octets: int, bitrate: int, data_bitrate: int, *, worst: bool = True) -> float:
+    """Seconds that a CAN FD frame with a 29-bit identifier takes, bit rate switched; ``octets`` a length of FD.
+
+    ISO 11898-1:2015: CRC of 17 bits up to 16 octets, else of 21, with the stuff count and its fixed stuff bits.
+    """
+    slow = 36  # start to the bit-rate switch
+    fast = 5 + 8 * octets  # ESI, DLC, data
+    crc = 17 if octets <= 16 else 21
+    fixed = 4 + crc + 1 + (4 + crc) // 4  # stuff count, CRC, fixed stuff bits (one first, then every fourth)
+    stuff_slow, stuff_fast = ((slow - 1) // 4 * worst, fast // 4 * worst)
+    tail = 1 + 2 + 7 + 3  # CRC delimiter, ACK and its delimiter, end of frame, interframe space
+    return (slow + stuff_slow + tail) / bitrate + (fast + stuff_fast + fixed) / data_bitrate
+
+
+def bus_load(
+    length: int, n: int, period: int, *, bitrate: int, data_bitrate: int | None = None, worst: bool = True
+) -> float:
+    """Share of a CAN bus that one stream takes: messages of ``length`` octets, one every n · period ns."""
+    if data_bitrate is None:
+        whole, rest = divmod(length, _FULL_OCTETS)
+        bits = whole * classic_bits(_FULL_OCTETS, worst=worst) + (classic_bits(rest, worst=worst) if rest else 0)
+        seconds = bits / bitrate
+    else:
+        from teds_provision.protocol.operation.can_frames import FD_OCTETS, fd_length
+
+        whole, rest = divmod(length, FD_OCTETS)
+        seconds = whole * fd_seconds(FD_OCTETS, bitrate, data_bitrate, worst=worst)
+        seconds += fd_seconds(fd_length(rest), bitrate, data_bitrate, worst=worst) if rest else 0.0
+    return seconds * 1e9 / (n * period)

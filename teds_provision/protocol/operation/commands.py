@@ -1,0 +1,406 @@
+"""Payloads of the operation commands and their replies: builders and parsers for both roles (operation.md 1 to 5).
+
+``encode`` gives the octets of a payload, ``command`` the whole command. ``decode`` of a command (node side) raises
+Refused with reason 4 for a wrong form; ``decode`` of a reply (station side) raises Garbled.
+"""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from enum import IntEnum, IntFlag
+from typing import Final
+
+from teds_provision.errors import Garbled
+from teds_provision.protocol.messages.frames import (
+    COMMON,
+    EITHER,
+    OPERATE,
+    Command,
+    Function,
+    Reason,
+    Refused,
+    security_command,
+)
+
+DIGEST_OCTETS: Final = 16
+OPERATE_FUNCTION, IDLE_FUNCTION = 1, 2
+READ_FUNCTION, WRITE_FUNCTION = 1, 2
+SELF_TEST_FUNCTION: Final = 5
+FIRST_LEASE, LAST_LEASE = 1, 60
+FIRST_DEAD_MAN, LAST_DEAD_MAN = 20, 10_000
+LAST_STREAM: Final = 3
+MOST_STREAM_CHANNELS: Final = 16
+MOST_SAMPLE_CHANNELS: Final = 64
+WAITS: Final = 0xFFFFFFFFFFFFFFFF
+"""``start`` of a stream that waits for a trigger."""
+SOON: Final = 0
+"""``start`` of a stream that begins when the node likes, within 1 s."""
+NONE: Final = 0xFFFFFFFF
+"""``last`` of Clock: no Drive message had a good tag yet."""
+TEST_PATTERN: Final = 0x80
+"""Bit 7 of a stream's kind and of a message's flags."""
+NOT_VALID: Final = 0x01
+"""Bit 0 of flags: some value is not valid."""
+
+
+def _form(holds: bool) -> None:
+    if not holds:
+        raise Refused(Reason.BAD_FORM)
+
+
+def channel_list(octets: bytes, most: int) -> tuple[int, ...]:
+    """Read a list of 1 to ``most`` channels, each 1 to 255 and once; raises Refused (4)."""
+    _form(1 <= len(octets) <= most and 0 not in octets and len(set(octets)) == len(octets))
+    return tuple(octets)
+
+
+# -- claims (section 1) ------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Operate:
+    """Operate (4.1): claims ``channel`` (0: every sensor); ``lease`` in s, ``dead_man`` in ms for an actuator alone."""
+
+    channel: int
+    digest: bytes
+    lease: int
+    dead_man: int | None = None
+
+    def command(self) -> Command:
+        """The command."""
+        payload = self.digest + bytes([self.lease])
+        if self.dead_man is not None:
+            payload += struct.pack(">H", self.dead_man)
+        return Command(self.channel, EITHER, OPERATE_FUNCTION, payload)
+
+    @classmethod
+    def decode(cls, channel: int, payload: bytes, *, actuator: bool) -> Operate:
+        """Read the payload for a sensor (or 0) or an actuator."""
+        _form(len(payload) == DIGEST_OCTETS + (3 if actuator else 1))
+        dead_man = int.from_bytes(payload[17:], "big") if actuator else None
+        return cls(channel, payload[:DIGEST_OCTETS], payload[DIGEST_OCTETS], dead_man)
+
+
+def idle(channel: int = 0) -> Command:
+    """Idle (4.2): let go of one channel, 0 of all."""
+    return Command(channel, EITHER, IDLE_FUNCTION)
+
+
+class ChannelState(IntFlag):
+    """State bits of a channel in the reply to Operation."""
+
+    ACTUATOR = 1
+    CLAIMED_HERE = 2
+    CLAIMED_BY_OTHER = 4
+    EVENT_SENSOR = 8
+    SAFE = 16
+    STOPPED = 32
+    TESTING = 64
+    FAULT = 128
+
+
+@dataclass(frozen=True)
+class Operation:
+    """Reply to Operation (128.19): mode, and for each channel its state bits and claimant (source address, 0 none)."""
+
+    measuring: bool
+    channels: Mapping[int, tuple[ChannelState, int]]
+
+    def encode(self) -> bytes:
+        """Return mode ‖ (channel ‖ state ‖ claimant) …, ascending."""
+        rows = (bytes([channel, *self.channels[channel]]) for channel in sorted(self.channels))
+        return bytes([self.measuring]) + b"".join(rows)
+
+    @classmethod
+    def decode(cls, payload: bytes) -> Operation:
+        """Read the reply; raises Garbled."""
+        if len(payload) % 3 != 1 or payload[0] > 1:
+            raise Garbled("The node's reply to Operation has a wrong form.")
+        numbers = payload[1::3]
+        if list(numbers) != sorted(set(numbers)) or 0 in numbers:
+            raise Garbled("The node's reply to Operation does not ascend.")
+        states = zip(map(ChannelState, payload[2::3]), payload[3::3], strict=True)
+        return cls(payload[0] == 1, dict(zip(numbers, states, strict=True)))
+
+
+OPERATION: Final = security_command(Function.OPERATION)
+
+
+# -- one value at a time (section 2) -----------------------------------------------------------------------------------
+
+
+def read_data_set(channel: int) -> Command:
+    """Read data-set segment (3.1) of one channel, from offset 0."""
+    return Command(channel, OPERATE, READ_FUNCTION, bytes(4))
+
+
+def decode_data_set(payload: bytes, octets: int) -> bytes:
+    """The data set of a reply to 3.1; raises Garbled where it has not ``octets`` octets from offset 0 on."""
+    if len(payload) != 4 + octets or payload[:4] != bytes(4):
+        raise Garbled(f"A data set of {octets} octets came as {max(0, len(payload) - 4)}.")
+    return payload[4:]
+
+
+def write_data_set(channel: int, data_set: bytes) -> Command:
+    """Write data-set segment (3.2) of one actuator, from offset 0."""
+    return Command(channel, OPERATE, WRITE_FUNCTION, bytes(4) + data_set)
+
+
+def sample(channels: Sequence[int]) -> Command:
+    """Sample (128.12): these channels together, 1 to 64."""
+    return security_command(Function.SAMPLE, bytes(channels))
+
+
+@dataclass(frozen=True)
+class Sampled:
+    """Reply to Sample: ``tick`` (ns) of the first value, flags, the data sets in the order asked."""
+
+    tick: int
+    flags: int
+    data: bytes
+
+    def encode(self) -> bytes:
+        """Return tick ‖ flags ‖ data sets."""
+        return struct.pack(">QB", self.tick, self.flags) + self.data
+
+    @classmethod
+    def decode(cls, payload: bytes, octets: int) -> Sampled:
+        """Read the reply whose data sets have ``octets`` octets together; raises Garbled."""
+        if len(payload) != 9 + octets:
+            raise Garbled(f"A reply to Sample has {len(payload)} octets, not {9 + octets}.")
+        return cls(int.from_bytes(payload[:8], "big"), payload[8], payload[9:])
+
+    @property
+    def valid(self) -> bool:
+        """Whether every value is valid."""
+        return not self.flags & NOT_VALID
+
+
+def set_values(values: Iterable[tuple[int, bytes]]) -> Command:
+    """Set (128.13): (channel, data set) of actuators, all of them or none."""
+    return security_command(Function.SET, b"".join(bytes([channel]) + octets for channel, octets in values))
+
+
+def run_self_test(channel: int = 0) -> Command:
+    """Run self-test (1.5) of one channel or all (0); the result is in Operation."""
+    return Command(channel, COMMON, SELF_TEST_FUNCTION, b"\0")
+
+
+POWER: Final = security_command(Function.POWER)
+
+
+class PowerFlag(IntFlag):
+    """Flags of the reply to Power."""
+
+    BATTERY = 1
+    CHARGING = 2
+    FULL = 4
+    IN_FIELD = 8
+    TOO_LOW = 16
+
+
+@dataclass(frozen=True)
+class Power:
+    """Reply to Power (128.18); ``flags`` are those of PowerFlag.
+
+    Level in %, voltage in V, current in A (+ charges), temperature in °C; None where unknown.
+    """
+
+    flags: int = 0
+    level: int | None = None
+    voltage: float | None = None
+    current: float | None = None
+    temperature: int | None = None
+
+    def encode(self) -> bytes:
+        """Return the 7 octets: flags ‖ level ‖ mV u16 ‖ mA i16 ‖ °C i8."""
+        return struct.pack(
+            ">BBHhb",
+            self.flags,
+            0xFF if self.level is None else self.level,
+            0xFFFF if self.voltage is None else round(self.voltage * 1000),
+            0x7FFF if self.current is None else round(self.current * 1000),
+            0x7F if self.temperature is None else self.temperature,
+        )
+
+    @classmethod
+    def decode(cls, payload: bytes) -> Power:
+        """Read the 7 octets; raises Garbled."""
+        if len(payload) != 7:
+            raise Garbled(f"A reply to Power has 7 octets, this one {len(payload)}.")
+        flags, level, voltage, current, temperature = struct.unpack(">BBHhb", payload)
+        return cls(
+            flags,
+            None if level == 0xFF else level,
+            None if voltage == 0xFFFF else voltage / 1000,
+            None if current == 0x7FFF else current / 1000,
+            None if temperature == 0x7F else temperature,
+        )
+
+
+# -- streams (section 4) -----------------------------------------------------------------------------------------------
+
+
+class Kind(IntEnum):
+    """How a stream samples: at even times; one message an event; or even, by the sensor's own clock."""
+
+    PERIODIC = 0
+    EVENT = 1
+    FREE = 2
+
+
+@dataclass(frozen=True)
+class Subscribe:
+    """Subscribe (128.14): ``gap`` in µs, ``period`` and ``start`` in ns of the node's clock (start: SOON, WAITS)."""
+
+    stream: int
+    kind: Kind
+    n: int
+    gap: int
+    period: int
+    start: int
+    channels: tuple[int, ...]
+    test_pattern: bool = False
+
+    def encode(self) -> bytes:
+        """Return the payload."""
+        kind = self.kind | (TEST_PATTERN if self.test_pattern else 0)
+        head = struct.pack(">BBBHQQ", self.stream, kind, self.n, self.gap, self.period, self.start)
+        return head + bytes(self.channels)
+
+    def command(self) -> Command:
+        """The command."""
+        return security_command(Function.SUBSCRIBE, self.encode())
+
+    @classmethod
+    def decode(cls, payload: bytes) -> Subscribe:
+        """Read the payload; its form is checked as section 4 says (form, stream, kind, n: 4)."""
+        _form(len(payload) > 21)
+        stream, kind, n, gap, period, start = struct.unpack_from(">BBBHQQ", payload)
+        channels = channel_list(payload[21:], MOST_STREAM_CHANNELS)
+        _form(stream <= LAST_STREAM and kind & ~TEST_PATTERN in set(Kind) and n >= 1)
+        made = cls(stream, Kind(kind & ~TEST_PATTERN), n, gap, period, start, channels, bool(kind & TEST_PATTERN))
+        _form(made.kind != Kind.EVENT or (n == 1 and len(channels) == 1))
+        return made
+
+    def length(self, octets: int) -> int:
+        """Octets of each data message, where one instant of all channels has ``octets``."""
+        return message_length(self.kind, self.n, octets)
+
+
+def message_length(kind: Kind, n: int, octets: int) -> int:
+    """13 + n · Σ ModLenth, + 8 for kinds that carry their tick."""
+    return 13 + n * octets + (0 if kind == Kind.PERIODIC else 8)
+
+
+@dataclass(frozen=True)
+class Subscribed:
+    """Reply to Subscribe: run, length of each message in octets, first instant in ns (WAITS: not known yet)."""
+
+    run: int
+    length: int
+    start: int
+
+    def encode(self) -> bytes:
+        """Return the 12 octets."""
+        return struct.pack(">HHQ", self.run, self.length, self.start)
+
+    @classmethod
+    def decode(cls, payload: bytes) -> Subscribed:
+        """Read the 12 octets; raises Garbled."""
+        if len(payload) != 12:
+            raise Garbled(f"A reply to Subscribe has 12 octets, this one {len(payload)}.")
+        return cls(*struct.unpack(">HHQ", payload))
+
+
+def stop(stream: int) -> Command:
+    """Stop (128.15)."""
+    return security_command(Function.STOP, bytes([stream]))
+
+
+def decode_stopped(payload: bytes) -> int:
+    """The counter that the next message would have had; raises Garbled."""
+    if len(payload) != 4:
+        raise Garbled(f"A reply to Stop has 4 octets, this one {len(payload)}.")
+    return int.from_bytes(payload, "big")
+
+
+def drive(channels: Sequence[int]) -> Command:
+    """Drive (128.20): values for these actuators by message."""
+    return security_command(Function.DRIVE, bytes(channels))
+
+
+@dataclass(frozen=True)
+class Driven:
+    """Reply to Drive: run, and length of each message in octets."""
+
+    run: int
+    length: int
+
+    def encode(self) -> bytes:
+        """Return the 4 octets."""
+        return struct.pack(">HH", self.run, self.length)
+
+    @classmethod
+    def decode(cls, payload: bytes) -> Driven:
+        """Read the 4 octets; raises Garbled."""
+        if len(payload) != 4:
+            raise Garbled(f"A reply to Drive has 4 octets, this one {len(payload)}.")
+        return cls(*struct.unpack(">HH", payload))
+
+
+# -- clock and trigger (section 5) -------------------------------------------------------------------------------------
+
+CLOCK: Final = security_command(Function.CLOCK)
+
+
+@dataclass(frozen=True)
+class Clock:
+    """Reply to Clock (128.16): ticks in ns, ``step`` in ns, ``drift`` in ppm; ``mark`` 0: none, ``last`` NONE: none."""
+
+    received: int
+    sent: int
+    mark: int
+    step: int
+    drift: int
+    last: int
+
+    def encode(self) -> bytes:
+        """Return the 34 octets."""
+        return struct.pack(">QQQIHI", self.received, self.sent, self.mark, self.step, self.drift, self.last)
+
+    @classmethod
+    def decode(cls, payload: bytes) -> Clock:
+        """Read the 34 octets; raises Garbled."""
+        if len(payload) != 34:
+            raise Garbled(f"A reply to Clock has 34 octets, this one {len(payload)}.")
+        return cls(*struct.unpack(">QQQIHI", payload))
+
+
+class Action(IntEnum):
+    """What a trigger does: note the tick, start the streams that wait, bring every actuator to its safe state."""
+
+    MARK = 0
+    START = 1
+    STOP = 2
+
+
+@dataclass(frozen=True)
+class Arm:
+    """Arm (128.17): ``commitment`` C, ``life`` in s (0 disarms), ``action``; the range is the node's to check (19)."""
+
+    commitment: bytes
+    life: int
+    action: int
+
+    def command(self) -> Command:
+        """The command."""
+        return security_command(Function.ARM, self.commitment + bytes([self.life, self.action]))
+
+    @classmethod
+    def decode(cls, payload: bytes) -> Arm:
+        """Read the payload; raises Refused (4)."""
+        _form(len(payload) == 18)
+        return cls(payload[:16], payload[16], payload[17])

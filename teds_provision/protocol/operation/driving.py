@@ -1,0 +1,52 @@
+"""Drive messages on the station's side: sealed, with the time until which they hold (operation.md section 4)."""
+
+from __future__ import annotations
+
+from typing import Final
+
+from teds_provision.errors import Garbled, NotAuthentic
+from teds_provision.protocol.operation.commands import Driven
+from teds_provision.protocol.operation.datagram import (
+    LAST_COUNTER,
+    DriveValues,
+    Layout,
+    Sealer,
+    drive_key,
+    drive_length,
+)
+from teds_provision.protocol.operation.subscription import TickBounds
+
+MICRO: Final = 1000
+_WRAP: Final = 1 << 32
+
+
+class Driver:
+    """Seals the values of one run of Drive; ``layout`` says channels and widths, ``dead_man`` the smallest of them, ms.
+
+    Raises NotAuthentic where the reply's length is not the one computed.
+    """
+
+    def __init__(self, layout: Layout, reply: Driven, message_key: bytes, *, dead_man: int) -> None:
+        if reply.length != drive_length(layout.octets):
+            raise NotAuthentic(
+                f"The node takes Drive messages of {reply.length} octets; {drive_length(layout.octets)} were computed."
+            )
+        self.layout, self.run = layout, reply.run
+        self.next = 0
+        self._dead_man = dead_man * 10**6
+        self._sealer = Sealer(drive_key(message_key, reply.run))
+
+    def seal(self, values: tuple[bytes, ...], now: TickBounds, *, hold: int | None = None) -> bytes:
+        """One message with these data sets, in the layout's order.
+
+        It holds for ``hold`` ns from the earliest that the node's tick can be now (the dead-man by default, and never
+        longer), so that it is never too far ahead for the node. Raises Garbled where the counters are used up.
+        """
+        if tuple(map(len, values)) != self.layout.widths:
+            raise Garbled("The data sets of a Drive message do not have the widths of its channels.")
+        if self.next > LAST_COUNTER:
+            raise Garbled("This Drive has used up its counters; ask for a new one.")
+        until = (now.low + min(self._dead_man, hold or self._dead_man)) // MICRO % _WRAP
+        message = self._sealer.seal(self.next, DriveValues(until, b"".join(values)).encode())
+        self.next += 1
+        return message

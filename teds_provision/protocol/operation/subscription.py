@@ -1,0 +1,247 @@
+"""A stream as the station sees it: what it asks for, what it accepts, which messages it believes (section 3 and 4).
+
+:class:`Plan` builds Subscribe and checks its reply; :class:`Receiver` opens messages, drops what section 3 says and
+counts each cause apart. No clock of its own: the caller hands in the bounds of the node's present tick.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from dataclasses import dataclass, replace
+from typing import Final, NamedTuple
+
+from teds_provision.errors import NotAuthentic
+from teds_provision.protocol.messages.frames import Command
+from teds_provision.protocol.operation.commands import (
+    NOT_VALID,
+    SOON,
+    TEST_PATTERN,
+    WAITS,
+    Kind,
+    Subscribe,
+    Subscribed,
+    message_length,
+)
+from teds_provision.protocol.operation.datagram import MOST_OCTETS, Layout, Sealer, counter_of, pattern, stream_key
+
+START_WITHIN: Final = 10**9
+"""A stream that was asked to begin soon begins within so many ns after the reply's tick."""
+LATE_AFTER: Final = 200 * 10**6
+"""A message may be 2 · n · period + so many ns old."""
+MOST_HELD: Final = 64
+"""Messages of a stream that waits for its trigger which are held until the mark is read; the oldest goes first."""
+_TICK: Final = 8
+
+
+class TickBounds(NamedTuple):
+    """The node's present tick in ns lies between these, by the clock map and its bound."""
+
+    low: int
+    high: int
+
+
+@dataclass(frozen=True)
+class Plan:
+    """A stream that a station wants; ``subscribe`` says it, ``layout`` the channels' widths (from the signed TEDS)."""
+
+    subscribe: Subscribe
+    layout: Layout
+
+    @classmethod
+    def of(
+        cls,
+        stream: int,
+        channels: tuple[tuple[int, int], ...],
+        *,
+        n: int,
+        period: int,
+        kind: Kind = Kind.PERIODIC,
+        gap: int = 0,
+        start: int = SOON,
+        test_pattern: bool = False,
+    ) -> Plan:
+        """A plan over (channel, ModLenth) pairs; ``period`` and ``start`` in ns, ``gap`` in µs."""
+        numbers, widths = tuple(c for c, _ in channels), tuple(w for _, w in channels)
+        return cls(Subscribe(stream, kind, n, gap, period, start, numbers, test_pattern), Layout(numbers, widths))
+
+    @property
+    def length(self) -> int:
+        """Octets of each data message."""
+        return message_length(self.subscribe.kind, self.subscribe.n, self.layout.octets)
+
+    @property
+    def fits(self) -> bool:
+        """Whether a message has at most 240 octets (on BLE the MTU may ask for less)."""
+        return self.length <= MOST_OCTETS
+
+    @property
+    def span(self) -> int:
+        """N · period in ns: what one message covers."""
+        return self.subscribe.n * self.subscribe.period
+
+    def command(self) -> Command:
+        """Subscribe."""
+        return self.subscribe.command()
+
+    def accept(self, payload: bytes, now: TickBounds) -> Subscribed:
+        """Read the reply; ``now`` bounds the node's tick when it came.
+
+        Raises Garbled, or NotAuthentic where length or start are not those that were asked: end and report the stream.
+        """
+        reply, asked = Subscribed.decode(payload), self.subscribe.start
+        if reply.length != self.length:
+            raise NotAuthentic(f"The node streams {reply.length} octets a message; {self.length} were computed.")
+        good = now.low <= reply.start + START_WITHIN and reply.start <= now.high + START_WITHIN
+        if reply.start != asked and not (asked == SOON and good):
+            raise NotAuthentic("The node's stream begins at another time than was asked.")
+        if reply.run == 0:
+            raise NotAuthentic("The node names run 0; runs begin at 1.")
+        return reply
+
+
+def most_instants(kind: Kind, octets: int, most: int = MOST_OCTETS) -> int:
+    """The largest n whose message has at most ``most`` octets, one instant having ``octets``; 0 where none fits."""
+    room = most - message_length(kind, 0, 0)
+    return min(255, room // octets, 1 if kind == Kind.EVENT else 255) if octets else 0
+
+
+@dataclass(frozen=True, slots=True)
+class Message:
+    """One good data message: ``index`` of its first sample, ``tick`` of that (ns), n instants one after another.
+
+    Sample i of it was taken at ``tick`` + i · period (kinds periodic and free). For events ``index`` counts events.
+    """
+
+    counter: int
+    index: int
+    tick: int
+    flags: int
+    data: bytes
+
+    @property
+    def valid(self) -> bool:
+        """Whether every value in it is valid."""
+        return not self.flags & NOT_VALID
+
+    @property
+    def test_pattern(self) -> bool:
+        """Whether it is no measurement."""
+        return bool(self.flags & TEST_PATTERN)
+
+
+@dataclass
+class Counts:
+    """What became of messages; each counts once.
+
+    ``lost``: gaps of the counter, to the count that Stop gave. ``late``: counter not above the last good one (late,
+    doubled, replayed). ``bad``: wrong tag. ``junk``: wrong length, or frames that make no message. ``future``: its
+    first tick is later than now. ``stale``: too old. ``unasked``: a test pattern that was not asked for, or the other
+    way round. ``overflow``: held for a mark for too long.
+    """
+
+    good: int = 0
+    lost: int = 0
+    late: int = 0
+    bad: int = 0
+    junk: int = 0
+    future: int = 0
+    stale: int = 0
+    unasked: int = 0
+    overflow: int = 0
+
+
+class Receiver:
+    """Opens the messages of one run of a stream.
+
+    ``message_key`` is k_m of the session; ``previous`` the receiver of the same stream's run before, whose messages may
+    still be under way: they are dropped and not counted. ``oldest`` in ns replaces the age up to which one counts.
+    """
+
+    def __init__(
+        self,
+        plan: Plan,
+        reply: Subscribed,
+        message_key: bytes,
+        *,
+        previous: Receiver | None = None,
+        oldest: int | None = None,
+    ) -> None:
+        self.plan, self.run = plan, reply.run
+        self.start: int | None = None if reply.start == WAITS else reply.start
+        self.counts = Counts()
+        self.last = -1
+        self._sealer = Sealer(stream_key(message_key, reply.run))
+        self._before = previous._sealer if previous is not None else None
+        self._oldest = 2 * plan.span + LATE_AFTER if oldest is None else oldest
+        self._length = plan.length
+        self._timed = plan.subscribe.kind != Kind.PERIODIC
+        self._pattern = TEST_PATTERN if plan.subscribe.test_pattern else 0
+        self._held: deque[tuple[Message, TickBounds]] = deque()
+
+    def take(self, octets: bytes, now: TickBounds) -> Message | None:
+        """Open one message; None where it is dropped (see ``counts``) or held until :meth:`begin`."""
+        if len(octets) != self._length:
+            self.counts.junk += 1
+            return None
+        counter = counter_of(octets)
+        plain = self._sealer.open(octets)
+        if plain is None:
+            if self._before is None or self._before.open(octets) is None:
+                self.counts.bad += 1
+            return None
+        if counter <= self.last:
+            self.counts.late += 1
+            return None
+        self.counts.lost += counter - self.last - 1
+        self.last = counter
+        message = self._read(counter, plain)
+        if message.flags & TEST_PATTERN != self._pattern:
+            self.counts.unasked += 1
+            return None
+        if self.start is None and not self._timed:
+            if len(self._held) == MOST_HELD:
+                self._held.popleft()
+                self.counts.overflow += 1
+            self._held.append((message, now))
+            return None
+        return message if self._fresh(message, now) else None
+
+    def begin(self, start: int) -> list[Message]:
+        """The first instant of a stream that waited is known (mark + 10 ms): gives the messages held, where fresh."""
+        self.start = start
+        held, self._held = self._held, deque()
+        dated = [(replace(message, tick=start + message.tick), now) for message, now in held]
+        return [message for message, now in dated if self._fresh(message, now)]
+
+    def finish(self, counter: int) -> None:
+        """Stop gave the counter that the next message would have had: what is missing up to there was lost."""
+        self.counts.lost += max(0, counter - self.last - 1)
+        self.last = max(self.last, counter - 1)
+
+    def expected(self, message: Message) -> bytes:
+        """The test pattern that this message must hold."""
+        layout, n = self.plan.layout, self.plan.subscribe.n
+        rows = (
+            pattern(channel, width, message.index + i)
+            for i in range(n)
+            for channel, width in zip(layout.channels, layout.widths, strict=True)
+        )
+        return b"".join(rows)
+
+    def _read(self, counter: int, plain: bytes) -> Message:
+        index = counter * self.plan.subscribe.n
+        if self._timed:
+            return Message(counter, index, int.from_bytes(plain[1 : 1 + _TICK], "big"), plain[0], plain[1 + _TICK :])
+        since = index * self.plan.subscribe.period
+        return Message(counter, index, since + (self.start or 0), plain[0], plain[1:])
+
+    def _fresh(self, message: Message, now: TickBounds) -> bool:
+        if message.tick > now.high:
+            self.counts.future += 1
+            return False
+        last = message.tick + (self.plan.span - self.plan.subscribe.period)
+        if last < now.low - self._oldest:
+            self.counts.stale += 1
+            return False
+        self.counts.good += 1
+        return True

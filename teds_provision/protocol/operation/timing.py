@@ -1,0 +1,87 @@
+"""Clock and trigger on the station's side: offset, its bound, lies, tokens (operation.md section 5)."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+from dataclasses import dataclass
+from typing import Final, NamedTuple
+
+from teds_provision.errors import NotAuthentic
+from teds_provision.protocol.operation.can_frames import TOKEN_OCTETS
+from teds_provision.protocol.operation.commands import Action, Arm, Clock
+from teds_provision.protocol.operation.subscription import TickBounds
+
+START_AFTER_MARK: Final = 10 * 10**6
+"""Streams start so many ns after the mark, the same on all nodes."""
+MILLION: Final = 10**6
+
+
+@dataclass(frozen=True)
+class ClockSample:
+    """One exchange of Clock; station times in ns: ``asked`` when the first copy left, ``answered`` when all was there.
+
+    Raises NotAuthentic where the node's two ticks cannot be: its clock lies.
+    """
+
+    asked: int
+    answered: int
+    reply: Clock
+
+    def __post_init__(self) -> None:
+        inside = self.reply.sent - self.reply.received
+        if not 0 <= inside <= self.answered - self.asked:
+            raise NotAuthentic("The node's clock lies: its answer took longer than the exchange.")
+
+    @property
+    def offset(self) -> float:
+        """Node's tick minus station's time, in ns: ((received - asked) + (sent - answered)) / 2."""
+        return ((self.reply.received - self.asked) + (self.reply.sent - self.answered)) / 2
+
+    def error(self, at: int, *, own_drift: float = 0.0) -> float:
+        """Bound of the offset's error in ns at station time ``at``; ``own_drift`` of the station's clock in ppm."""
+        reply = self.reply
+        round_trip = (self.answered - self.asked) - (reply.sent - reply.received)
+        age = max(0, at - self.answered)
+        return round_trip / 2 + reply.step + (reply.drift + own_drift) * age / MILLION
+
+    def tick(self, at: int, *, own_drift: float = 0.0) -> TickBounds:
+        """Bounds of the node's tick at station time ``at``."""
+        middle, error = at + self.offset, self.error(at, own_drift=own_drift)
+        return TickBounds(int(middle - error), int(middle + error) + 1)
+
+    def meets(self, other: ClockSample, *, own_drift: float = 0.0) -> bool:
+        """Whether the bounds of two exchanges meet; where they do not, the clock lies."""
+        at = max(self.answered, other.answered)
+        apart = abs(self.offset - other.offset)
+        return apart <= self.error(at, own_drift=own_drift) + other.error(at, own_drift=own_drift)
+
+
+class Token(NamedTuple):
+    """T of one trigger, 8 octets that only the station knows; its commitment C goes to the nodes, T on the bus."""
+
+    octets: bytes
+
+    @classmethod
+    def draw(cls) -> Token:
+        """A new one; each is for one use."""
+        return cls(os.urandom(TOKEN_OCTETS))
+
+    @property
+    def commitment(self) -> bytes:
+        """C = SHA-256("TEDS1 trigger" ‖ 00 ‖ T)[0:16]."""
+        return commitment(self.octets)
+
+    def arm(self, action: Action, life: int) -> Arm:
+        """Arm (send ``.command()`` in each node's session); ``life`` 1 to 60 s."""
+        return Arm(self.commitment, life, action)
+
+
+def commitment(token: bytes) -> bytes:
+    """C of a token T."""
+    return hashlib.sha256(b"TEDS1 trigger\0" + token).digest()[:16]
+
+
+def mark_is_honest(mark: int, seen: TickBounds) -> bool:
+    """Whether a node's mark meets the time, in its ticks, at which the station's controller sent the trigger frame."""
+    return seen.low <= mark <= seen.high
