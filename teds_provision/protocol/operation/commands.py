@@ -1,4 +1,4 @@
-"""Payloads of the operation commands and their replies: builders and parsers for both roles (operation.md 1 to 5).
+"""Payloads of claims and single values and their replies: builders and parsers for both roles (operation.md 1, 2).
 
 ``encode`` gives the octets of a payload, ``command`` the whole command. ``decode`` of a command (node side) raises
 Refused with reason 4 for a wrong form; ``decode`` of a reply (station side) raises Garbled.
@@ -9,7 +9,7 @@ from __future__ import annotations
 import struct
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from enum import IntEnum, IntFlag
+from enum import IntFlag
 from typing import Final
 
 from teds_provision.errors import Garbled
@@ -30,29 +30,22 @@ READ_FUNCTION, WRITE_FUNCTION = 1, 2
 SELF_TEST_FUNCTION: Final = 5
 FIRST_LEASE, LAST_LEASE = 1, 60
 FIRST_DEAD_MAN, LAST_DEAD_MAN = 20, 10_000
-LAST_STREAM: Final = 3
-MOST_STREAM_CHANNELS: Final = 16
 MOST_SAMPLE_CHANNELS: Final = 64
-WAITS: Final = 0xFFFFFFFFFFFFFFFF
-"""``start`` of a stream that waits for a trigger."""
-SOON: Final = 0
-"""``start`` of a stream that begins when the node likes, within 1 s."""
-NONE: Final = 0xFFFFFFFF
-"""``last`` of Clock: no Drive message had a good tag yet."""
 TEST_PATTERN: Final = 0x80
 """Bit 7 of a stream's kind and of a message's flags."""
 NOT_VALID: Final = 0x01
 """Bit 0 of flags: some value is not valid."""
 
 
-def _form(holds: bool) -> None:
+def demand_form(holds: bool) -> None:
+    """Raise Refused with reason 4 unless ``holds``."""
     if not holds:
         raise Refused(Reason.BAD_FORM)
 
 
 def channel_list(octets: bytes, most: int) -> tuple[int, ...]:
     """Read a list of 1 to ``most`` channels, each 1 to 255 and once; raises Refused (4)."""
-    _form(1 <= len(octets) <= most and 0 not in octets and len(set(octets)) == len(octets))
+    demand_form(1 <= len(octets) <= most and 0 not in octets and len(set(octets)) == len(octets))
     return tuple(octets)
 
 
@@ -78,7 +71,7 @@ class Operate:
     @classmethod
     def decode(cls, channel: int, payload: bytes, *, actuator: bool) -> Operate:
         """Read the payload for a sensor (or 0) or an actuator."""
-        _form(len(payload) == DIGEST_OCTETS + (3 if actuator else 1))
+        demand_form(len(payload) == DIGEST_OCTETS + (3 if actuator else 1))
         dead_man = int.from_bytes(payload[17:], "big") if actuator else None
         return cls(channel, payload[:DIGEST_OCTETS], payload[DIGEST_OCTETS], dead_man)
 
@@ -238,169 +231,3 @@ class Power:
             None if current == 0x7FFF else current / 1000,
             None if temperature == 0x7F else temperature,
         )
-
-
-# -- streams (section 4) -----------------------------------------------------------------------------------------------
-
-
-class Kind(IntEnum):
-    """How a stream samples: at even times; one message an event; or even, by the sensor's own clock."""
-
-    PERIODIC = 0
-    EVENT = 1
-    FREE = 2
-
-
-@dataclass(frozen=True)
-class Subscribe:
-    """Subscribe (128.14): ``gap`` in µs, ``period`` and ``start`` in ns of the node's clock (start: SOON, WAITS)."""
-
-    stream: int
-    kind: Kind
-    n: int
-    gap: int
-    period: int
-    start: int
-    channels: tuple[int, ...]
-    test_pattern: bool = False
-
-    def encode(self) -> bytes:
-        """Return the payload."""
-        kind = self.kind | (TEST_PATTERN if self.test_pattern else 0)
-        head = struct.pack(">BBBHQQ", self.stream, kind, self.n, self.gap, self.period, self.start)
-        return head + bytes(self.channels)
-
-    def command(self) -> Command:
-        """The command."""
-        return security_command(Function.SUBSCRIBE, self.encode())
-
-    @classmethod
-    def decode(cls, payload: bytes) -> Subscribe:
-        """Read the payload; its form is checked as section 4 says (form, stream, kind, n: 4)."""
-        _form(len(payload) > 21)
-        stream, kind, n, gap, period, start = struct.unpack_from(">BBBHQQ", payload)
-        channels = channel_list(payload[21:], MOST_STREAM_CHANNELS)
-        _form(stream <= LAST_STREAM and kind & ~TEST_PATTERN in set(Kind) and n >= 1)
-        made = cls(stream, Kind(kind & ~TEST_PATTERN), n, gap, period, start, channels, bool(kind & TEST_PATTERN))
-        _form(made.kind != Kind.EVENT or (n == 1 and len(channels) == 1))
-        return made
-
-    def length(self, octets: int) -> int:
-        """Octets of each data message, where one instant of all channels has ``octets``."""
-        return message_length(self.kind, self.n, octets)
-
-
-def message_length(kind: Kind, n: int, octets: int) -> int:
-    """13 + n · Σ ModLenth, + 8 for kinds that carry their tick."""
-    return 13 + n * octets + (0 if kind == Kind.PERIODIC else 8)
-
-
-@dataclass(frozen=True)
-class Subscribed:
-    """Reply to Subscribe: run, length of each message in octets, first instant in ns (WAITS: not known yet)."""
-
-    run: int
-    length: int
-    start: int
-
-    def encode(self) -> bytes:
-        """Return the 12 octets."""
-        return struct.pack(">HHQ", self.run, self.length, self.start)
-
-    @classmethod
-    def decode(cls, payload: bytes) -> Subscribed:
-        """Read the 12 octets; raises Garbled."""
-        if len(payload) != 12:
-            raise Garbled(f"A reply to Subscribe has 12 octets, this one {len(payload)}.")
-        return cls(*struct.unpack(">HHQ", payload))
-
-
-def stop(stream: int) -> Command:
-    """Stop (128.15)."""
-    return security_command(Function.STOP, bytes([stream]))
-
-
-def decode_stopped(payload: bytes) -> int:
-    """The counter that the next message would have had; raises Garbled."""
-    if len(payload) != 4:
-        raise Garbled(f"A reply to Stop has 4 octets, this one {len(payload)}.")
-    return int.from_bytes(payload, "big")
-
-
-def drive(channels: Sequence[int]) -> Command:
-    """Drive (128.20): values for these actuators by message."""
-    return security_command(Function.DRIVE, bytes(channels))
-
-
-@dataclass(frozen=True)
-class Driven:
-    """Reply to Drive: run, and length of each message in octets."""
-
-    run: int
-    length: int
-
-    def encode(self) -> bytes:
-        """Return the 4 octets."""
-        return struct.pack(">HH", self.run, self.length)
-
-    @classmethod
-    def decode(cls, payload: bytes) -> Driven:
-        """Read the 4 octets; raises Garbled."""
-        if len(payload) != 4:
-            raise Garbled(f"A reply to Drive has 4 octets, this one {len(payload)}.")
-        return cls(*struct.unpack(">HH", payload))
-
-
-# -- clock and trigger (section 5) -------------------------------------------------------------------------------------
-
-CLOCK: Final = security_command(Function.CLOCK)
-
-
-@dataclass(frozen=True)
-class Clock:
-    """Reply to Clock (128.16): ticks in ns, ``step`` in ns, ``drift`` in ppm; ``mark`` 0: none, ``last`` NONE: none."""
-
-    received: int
-    sent: int
-    mark: int
-    step: int
-    drift: int
-    last: int
-
-    def encode(self) -> bytes:
-        """Return the 34 octets."""
-        return struct.pack(">QQQIHI", self.received, self.sent, self.mark, self.step, self.drift, self.last)
-
-    @classmethod
-    def decode(cls, payload: bytes) -> Clock:
-        """Read the 34 octets; raises Garbled."""
-        if len(payload) != 34:
-            raise Garbled(f"A reply to Clock has 34 octets, this one {len(payload)}.")
-        return cls(*struct.unpack(">QQQIHI", payload))
-
-
-class Action(IntEnum):
-    """What a trigger does: note the tick, start the streams that wait, bring every actuator to its safe state."""
-
-    MARK = 0
-    START = 1
-    STOP = 2
-
-
-@dataclass(frozen=True)
-class Arm:
-    """Arm (128.17): ``commitment`` C, ``life`` in s (0 disarms), ``action``; the range is the node's to check (19)."""
-
-    commitment: bytes
-    life: int
-    action: int
-
-    def command(self) -> Command:
-        """The command."""
-        return security_command(Function.ARM, self.commitment + bytes([self.life, self.action]))
-
-    @classmethod
-    def decode(cls, payload: bytes) -> Arm:
-        """Read the payload; raises Refused (4)."""
-        _form(len(payload) == 18)
-        return cls(payload[:16], payload[16], payload[17])

@@ -5,7 +5,6 @@ from __future__ import annotations
 from typing import Final
 
 from teds_provision.errors import Garbled, NotAuthentic
-from teds_provision.protocol.operation.commands import Driven
 from teds_provision.protocol.operation.datagram import (
     LAST_COUNTER,
     DriveValues,
@@ -14,6 +13,7 @@ from teds_provision.protocol.operation.datagram import (
     drive_key,
     drive_length,
 )
+from teds_provision.protocol.operation.stream_commands import Driven
 from teds_provision.protocol.operation.subscription import TickBounds
 
 MICRO: Final = 1000

@@ -12,17 +12,9 @@ from typing import Final, NamedTuple
 
 from teds_provision.errors import NotAuthentic
 from teds_provision.protocol.messages.frames import Command
-from teds_provision.protocol.operation.commands import (
-    NOT_VALID,
-    SOON,
-    TEST_PATTERN,
-    WAITS,
-    Kind,
-    Subscribe,
-    Subscribed,
-    message_length,
-)
+from teds_provision.protocol.operation.commands import NOT_VALID, TEST_PATTERN
 from teds_provision.protocol.operation.datagram import MOST_OCTETS, Layout, Sealer, counter_of, pattern, stream_key
+from teds_provision.protocol.operation.stream_commands import SOON, WAITS, Kind, Subscribe, Subscribed, message_length
 
 START_WITHIN: Final = 10**9
 """A stream that was asked to begin soon begins within so many ns after the reply's tick."""

@@ -9,7 +9,7 @@ from typing import Final, NamedTuple
 
 from teds_provision.errors import NotAuthentic
 from teds_provision.protocol.operation.can_frames import TOKEN_OCTETS
-from teds_provision.protocol.operation.commands import Action, Arm, Clock
+from teds_provision.protocol.operation.stream_commands import Action, Arm, Clock
 from teds_provision.protocol.operation.subscription import TickBounds
 
 START_AFTER_MARK: Final = 10 * 10**6

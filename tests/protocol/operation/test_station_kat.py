@@ -20,36 +20,38 @@ from teds_provision.protocol.operation.can_frames import (
     trigger_station,
 )
 from teds_provision.protocol.operation.commands import (
-    CLOCK,
-    NONE,
     OPERATION,
     POWER,
-    WAITS,
-    Action,
     ChannelState,
-    Clock,
-    Driven,
-    Kind,
     Operate,
     Operation,
     Power,
     PowerFlag,
     Sampled,
-    Subscribe,
-    Subscribed,
     decode_data_set,
-    decode_stopped,
-    drive,
     idle,
     read_data_set,
     run_self_test,
     sample,
     set_values,
-    stop,
     write_data_set,
 )
 from teds_provision.protocol.operation.datagram import Layout, drive_key, stream_key
 from teds_provision.protocol.operation.driving import Driver
+from teds_provision.protocol.operation.stream_commands import (
+    CLOCK,
+    NONE,
+    WAITS,
+    Action,
+    Clock,
+    Driven,
+    Kind,
+    Subscribe,
+    Subscribed,
+    decode_stopped,
+    drive,
+    stop,
+)
 from teds_provision.protocol.operation.subscription import Plan, Receiver, TickBounds
 from teds_provision.protocol.operation.timing import START_AFTER_MARK, ClockSample, Token
 
