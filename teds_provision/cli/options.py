@@ -25,21 +25,36 @@ def command(*lines: str, **attributes: Any) -> Callable[[Callable[..., Any]], cl
     return click.command(context_settings=COMMAND_SETTINGS, epilog=examples(*lines), **attributes)
 
 
+class _Several(click.Option):
+    """An option that may be given several times, and once, as a bare word, in config.toml."""
+
+    def type_cast_value(self, ctx: click.Context, value: Any) -> Any:
+        """Take a word for a list of one."""
+        return super().type_cast_value(ctx, (value,) if isinstance(value, str) else value)
+
+
 def link_options(function: Function) -> Function:
-    """Add --via, --nfc, --can, --ble, --timeout; the command gets them as one ``links: LinkSettings``."""
+    """Add --via, --nfc (several with --watch), --can, --ble, --timeout; the command gets ``links: LinkSettings``."""
     from functools import wraps
 
     @wraps(function)
     def with_links(
-        *args: Any, via: str, nfc: str | None, can: str | None, ble: str | None, timeout: float, **rest: Any
+        *args: Any, via: str, nfc: tuple[str, ...], can: str | None, ble: str | None, timeout: float, **rest: Any
     ) -> Any:
-        return function(*args, links=LinkSettings(via, nfc, can, ble, timeout), **rest)
+        return function(*args, links=LinkSettings(via, nfc or None, can, ble, timeout), **rest)
 
     options = [
         click.option(
             "--via", type=click.Choice(["nfc", "can", "ble"]), default="nfc", show_default=True, help="The link to use."
         ),
-        click.option("--nfc", metavar="PATH", help="Reader: usb, usb:072f:2200, tty:USB0:pn532, udp:localhost:54321."),
+        click.option(
+            "--nfc",
+            metavar="PATH",
+            multiple=True,
+            cls=_Several,
+            help="Reader: auto (the one that is there), usb, usb:072f:2200, tty:USB0:pn532, udp:localhost:54321; "
+            "several with --watch.",
+        ),
         click.option("--can", metavar="INTERFACE:CHANNEL", help="Bus: socketcan:can0, udp_multicast:239.74.163.2, …"),
         click.option("--ble", metavar="ADAPTER", help="Not in this version."),
         click.option(

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from teds_provision.errors import NoReader, UsageFailure
+from teds_provision.links.nfc.exchange import Frontend
 from teds_provision.links.nfc.library import nfc
 from teds_provision.links.nfc.tag import FieldLost, ReaderLost, ReaderTag, activate, translated
 from teds_provision.links.nfc.udp import ReaderDevice, address_of, frontend
@@ -70,7 +71,7 @@ def open_reader(path: str) -> Reader:
     if path.startswith("usb"):
         return _open_usb(path)
     try:
-        return Reader(nfc.ContactlessFrontend(path), again=path, simulated=False)
+        return Reader(Frontend(path), again=path, simulated=False)
     except Exception as error:  # nfcpy and pyserial raise anything
         raise _explained(path, error) from error
 
@@ -80,7 +81,7 @@ def _open_usb(path: str) -> Reader:
     failure: NoReader | None = None
     for vendor, product, bus, number in _usb_readers(path):
         try:
-            clf = nfc.ContactlessFrontend(f"usb:{int(bus):03}:{int(number):03}")
+            clf = Frontend(f"usb:{int(bus):03}:{int(number):03}")
         except Exception as error:  # noqa: BLE001  (nfcpy's drivers raise anything)
             failure = failure or _explained(f"usb:{vendor:04x}:{product:04x}", error, vendor, product)
             continue

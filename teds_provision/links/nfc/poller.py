@@ -15,6 +15,7 @@ from teds_provision.links.nfc.message import Record
 from teds_provision.links.nfc.pieces import Piece, Requester, room
 
 PATIENCE = 5.0  # seconds that a station goes on reading
+LONGEST_INTERVAL = 0.032  # seconds between two reads past N_wait, doubling up to this
 LONGEST = 120.0  # seconds that one transaction may take, however the node spins it out
 _REREADS = 3  # of a torn message
 _STATUS_OCTETS = len(message.encode([tnep.status(0)]))
@@ -90,11 +91,12 @@ class Poller:
         if len(octets) > self._service.max_ndef:
             raise Garbled(f"The node takes NDEF messages of at most {self._service.max_ndef} octets.")
         self._mailbox.write(octets)
-        t_wait = self._service.t_wait
+        interval = t_wait = self._service.t_wait
         patience = max(PATIENCE, min((self._service.n_wait + 1) * t_wait, 3 * PATIENCE))
-        until, torn = self._clock() + patience, 0
+        until, torn, reads = self._clock() + patience, 0, 0
         self._sleep(min(t_wait, patience))
         while True:
+            reads += 1
             try:
                 answer = self._mailbox.read()
                 if answer and answer != octets and take(_successful(message.decode(answer))):
@@ -108,7 +110,9 @@ class Poller:
                 raise NodeSilent(
                     f"The node did not answer within {patience:.0f} s.", hint="Leave it on the reader and try again."
                 )
-            self._sleep(min(t_wait, left))
+            if reads > self._service.n_wait:
+                interval = max(t_wait, min(2 * interval, LONGEST_INTERVAL))
+            self._sleep(min(interval, left))
 
 
 def _take(records: Sequence[Record], requester: Requester) -> bool:

@@ -21,10 +21,10 @@ from teds_provision.protocol.messages.identity import Identity
 REPEATS = 2  # of one transaction
 REPEAT_WITHIN = 15.0  # seconds
 RETURN_WITHIN = 3.0  # seconds that a node which slipped off has to come back in the middle of a transaction
-_PAUSE = 0.1  # seconds between two polls of the field
+_PAUSE, _SHORT_PAUSE = 0.1, 0.03  # seconds between two polls of the field; the short one while boards are changed
+_CHANGING = 2.0  # seconds after a node left in which the next one is expected
 _REOPEN = 1.0  # seconds between two tries to open a lost reader
 _DEBOUNCE = 0.7  # seconds: the same node back within them was never away
-_MISSES = 2  # presence checks in a row without an answer
 _LOOK_AGAIN = 1.0  # seconds until a tag that was not wanted is read anew
 
 
@@ -50,6 +50,7 @@ class NfcPort:
         self.place = f"nfc:{self._again}"
         self._transaction = secrets.randbelow(0x10000)
         self._lost = False
+        self._failures = 0  # of the reader, since it last polled the field
         self.turn = threading.RLock()
 
     @property
@@ -102,7 +103,7 @@ class NfcPort:
         0.7 s.
         """
         here: bytes | None = None  # the node of the visit that is not over yet
-        gone_at, told = 0.0, ""
+        gone_at, told = -_CHANGING, ""
         waiting = Notice("waiting", f"Hold a node to the reader{self._named}.")
         notice(waiting)
         while not stop.is_set():
@@ -113,7 +114,7 @@ class NfcPort:
                 notice(waiting)
                 here = None
             if seen is None:
-                stop.wait(_PAUSE)
+                stop.wait(_SHORT_PAUSE if time.monotonic() - gone_at < _CHANGING else _PAUSE)
                 continue
             if isinstance(seen, Foreign):
                 told = _tell(seen, told, notice)
@@ -159,6 +160,12 @@ class NfcPort:
                 raise FieldLost
             time.sleep(_PAUSE)
 
+    def reopen(self) -> None:
+        """Open the reader again after it failed; raises NoReader when it is gone."""
+        with self.turn:
+            if self._reader is None:
+                self._reader = open_reader(self._again)
+
     def lose_reader(self) -> None:
         """Close a reader that failed, so that the next look opens it again."""
         self.close()
@@ -180,6 +187,9 @@ class NfcPort:
             return None
         except NoReader as error:
             self.lose_reader()
+            self._failures += 1
+            if self._failures == 1 and not self._lost:
+                return None  # one error alone: the next look opens it again, and nobody need know
             if not self._lost:
                 self._lost = True
                 notice(Notice("reader-lost", f"{error.message} Waiting for it."))
@@ -191,19 +201,20 @@ class NfcPort:
             if self._reader is None:
                 raise ReaderLost("it was closed")
             tag = self._reader.sense()
+            self._failures = 0
             return None if tag is None else look(tag)
 
     def _stay(self, seen: Visit | Foreign, stop: threading.Event, seconds: float | None) -> None:
-        """Wait until the tag is taken away, at most ``seconds``."""
+        """Wait until the tag does not answer (one miss: the next look finds who is there), at most ``seconds``."""
         until = None if seconds is None else time.monotonic() + seconds
-        misses = 0
-        while misses < _MISSES and not stop.is_set() and (until is None or time.monotonic() < until):
+        while not stop.is_set() and (until is None or time.monotonic() < until):
             try:
                 with self.turn:
-                    misses = 0 if self._reader is not None and seen.tag.is_present else misses + 1
+                    if self._reader is None or not seen.tag.is_present:
+                        return
             except ReaderLost:
                 return  # the next look finds out and says so
-            stop.wait(_PAUSE)
+            stop.wait(_SHORT_PAUSE)
 
 
 class NfcLink:
@@ -229,15 +240,17 @@ class NfcLink:
         """Send one whole command frame and return its whole reply frame.
 
         A transaction that failed is repeated as it is, at most twice within 15 s; a node that left the field for a
-        moment is activated anew (its session is gone then, which the layer above notices by the reply). Raises
-        NodeSilent, Garbled or NoReader.
+        moment is activated anew (its session is gone then, which the layer above notices by the reply), and a reader
+        that failed is opened again once. Raises NodeSilent, Garbled or NoReader.
         """
         with self._port.turn:
             return self._exchange(frame)
 
     def _exchange(self, frame: bytes) -> bytes:
         transaction, started = self._port.next_transaction(), time.monotonic()
-        for attempt in range(REPEATS + 1):
+        reopened = False
+        attempt = 0
+        while True:
             try:
                 poller = self._ready()
                 try:
@@ -247,11 +260,18 @@ class NfcLink:
                     if attempt == REPEATS or time.monotonic() - started > REPEAT_WITHIN:
                         raise
                     self._notice(Notice("retry", f"{error.message} Trying again."))
+            except ReaderLost:
+                self._poller = None
+                self._port.lose_reader()
+                if reopened or attempt == REPEATS or time.monotonic() - started > REPEAT_WITHIN:
+                    raise
+                reopened = True  # one error alone is not worth a word
+                self._port.reopen()
             except NoReader:
                 self._poller = None
                 self._port.lose_reader()
                 raise
-        raise AssertionError("unreachable")
+            attempt += 1
 
     def close(self) -> None:
         """Deselect the service, unless nothing was sent; never raises."""

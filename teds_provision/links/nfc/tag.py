@@ -11,10 +11,17 @@ from contextlib import contextmanager
 from typing import Any
 
 from teds_provision.errors import Garbled, NodeSilent, NoReader
-from teds_provision.links.nfc.library import Type2Tag, Type4ATag, Type4Ndef, nfc
+from teds_provision.links.nfc.library import (
+    Type2Ndef,
+    Type2Tag,
+    Type2TagCommandError,
+    Type4ATag,
+    Type4Ndef,
+    nfc,
+)
 
 _TRIES = 3  # of a read, before the message counts as unreadable
-_PRESENCE_WAIT = 0.2  # seconds that a Type 4 tag gets to say that it is still there
+_PRESENCE_WAIT = 0.06  # seconds that a Type 4 tag gets to say that it is still there
 _FSC = (16, 24, 32, 40, 48, 64, 96, 128, 256)  # octets by FSCI (ISO/IEC 14443-4, table 1)
 
 
@@ -93,8 +100,64 @@ class _Type4Tag(Type4ATag):  # type: ignore[misc]
         return True
 
 
+class _Type2Ndef(Type2Ndef):  # type: ignore[misc]
+    """NDEF on Type 2: once nfcpy has found where the message lies, one READ says whether there is one.
+
+    nfcpy reads the capability container and every TLV anew each time, and before each write. Where lock or reserved
+    octets lie within the message, or beyond the first sector, its own way is kept.
+    """
+
+    _simple = False
+    _ndef_tlv_offset: int
+    _capacity: int
+
+    def _read_ndef_data(self) -> bytearray | None:
+        if not self._simple:
+            octets: bytearray | None = super()._read_ndef_data()
+            begin = self._ndef_tlv_offset
+            end = begin + 4 + self._capacity
+            whole = octets is not None and not any(begin <= octet < end for octet in self._skip_bytes)
+            self._simple = whole and begin % 4 <= 2 and end <= 1024
+            return octets
+        try:
+            return self._read_from(self._ndef_tlv_offset)
+        except Type2TagCommandError:
+            return None
+
+    def _read_from(self, offset: int) -> bytearray | None:
+        page = offset // 4
+        octets = bytearray(self._tag.read(page))[offset % 4 :]
+        if octets[0] != 0x03:
+            self._simple = False
+            return self._read_ndef_data()
+        if octets[1] == 0:
+            return bytearray()
+        size, begin = (int.from_bytes(octets[2:4], "big"), 4) if octets[1] == 255 else (octets[1], 2)
+        while len(octets) < begin + size:
+            page += 4
+            octets += self._tag.read(page)
+        return octets[begin : begin + size]
+
+    def _write_ndef_data(self, data: bytearray) -> None:
+        if not self._simple:
+            super()._write_ndef_data(data)
+            return
+        offset = self._ndef_tlv_offset
+        page, before = offset // 4, offset % 4
+        head = bytes((3, len(data))) if len(data) < 255 else b"\x03\xff" + len(data).to_bytes(2, "big")
+        kept = bytes(self._tag.read(page)[:before]) if before else b""
+        octets = kept + head + bytes(data) + (b"\xfe" if len(data) < self._capacity else b"")
+        pages = [octets[at : at + 4].ljust(4, b"\0") for at in range(0, len(octets), 4)]
+        self._tag.write(page, pages[0][: before + 1] + b"\0" + pages[0][before + 2 :])
+        for number, four in enumerate(pages[1:], 1):
+            self._tag.write(page + number, four)
+        self._tag.write(page, pages[0])
+
+
 class _Type2Tag(Type2Tag):  # type: ignore[misc]
     """Type 2, asked once whether it is still there (nfcpy asks three times)."""
+
+    NDEF = _Type2Ndef
 
     def _is_present(self) -> bool:
         try:
@@ -126,9 +189,9 @@ class ReaderTag:
 
     @property
     def is_present(self) -> bool:
-        """Whether the tag still answers; raises ReaderLost."""
+        """Whether the tag still answers, in this activation; raises ReaderLost."""
         try:
-            with translated():
+            with self._asked():
                 return bool(self._tag.is_present)
         except FieldLost:
             return False
@@ -148,18 +211,26 @@ class ReaderTag:
     def write(self, octets: bytes) -> None:
         """Replace the NDEF message; raises FieldLost, ReaderLost, Garbled (read-only, or too small).
 
-        A Type 2 tag is read afresh first: nfcpy sends only the pages that differ from what it saw last, and the node
-        has put another message since.
+        A Type 2 tag whose pages nfcpy writes is read afresh first: it sends only those that differ from what it saw
+        last, and the node has put another message since.
         """
-        if self._ndef is None or self.kind != "Type 4":
+        if self._ndef is None or not getattr(self._ndef, "_simple", self.kind == "Type 4"):
             self.read()
         if not self._ndef.is_writeable or len(octets) > self._ndef.capacity:
             raise Garbled(f"The tag does not take an NDEF message of {len(octets)} octets.")
-        with translated():
+        with self._asked():
             self._ndef.octets = octets
 
-    def _read_once(self) -> bytes | None:
+    @contextmanager
+    def _asked(self) -> Iterator[None]:
+        """Talk to the tag: FieldLost where the reader has looked for another since."""
         with translated():
+            if self._tag.target is None or self._tag.clf.target is not self._tag.target:
+                raise FieldLost
+            yield
+
+    def _read_once(self) -> bytes | None:
+        with self._asked():
             if self._ndef is None:
                 self._ndef = self._tag.NDEF(self._tag)
             self._ndef.has_changed  # noqa: B018  (nfcpy: this property reads the tag)

@@ -12,8 +12,8 @@ Node side (:class:`NodeDevice`)
 
 Reader side (:class:`ReaderDevice`)
     * answers that came after their time-out are dropped before the next command;
-    * time-outs are at least 0.1 s (the other side is a process on a busy machine);
-    * an empty field costs 0.15 s instead of 1 s.
+    * time-outs below 0.05 s are 0.1 s (the other side is a process on a busy machine);
+    * an empty field costs 0.08 s instead of 1 s.
 """
 
 from __future__ import annotations
@@ -28,12 +28,14 @@ from collections.abc import Callable
 from typing import Any, Final
 
 from teds_provision.errors import UsageFailure
+from teds_provision.links.nfc.exchange import Frontend
 from teds_provision.links.nfc.library import UdpDevice, nfc
 
 DEFAULT_PORT: Final = 54321
 _LOOPBACK: Final = {"", "localhost", "127.0.0.1"}
 _SENS_REQ: Final = (b"\x26", b"\x52")
-_FLOOR, _SENSE_WAIT = 0.1, 0.15  # seconds
+_FLOOR, _SENSE_WAIT = 0.1, 0.08  # seconds
+_PASSIVE, _SHORT = 0.002, 0.05  # seconds: the passive acknowledge of SECTOR SELECT is 1 ms, READ gets 5 ms
 _Frame = tuple[str, bytearray, Any]
 
 
@@ -54,7 +56,7 @@ def address_of(path: str) -> tuple[str, int]:
 def frontend(device: Any, path: str) -> Any:
     """Return an nfcpy frontend on an opened udp device."""
     device._vendor_name, device._device_name, device._chipset_name, device._path = "", "simulated reader", "", path
-    clf = nfc.ContactlessFrontend()
+    clf = Frontend()
     clf.device = device
     return clf
 
@@ -197,12 +199,12 @@ class ReaderDevice(UdpDevice):  # type: ignore[misc]
         """Send a command and return its answer; what came too late for an earlier one is dropped first."""
         while select.select([self.socket], [], [], 0)[0]:
             self.socket.recvfrom(2048)
-        if timeout is not None and timeout > 0.002:  # 1 ms is the passive acknowledge of SECTOR SELECT
-            timeout = max(timeout, _FLOOR)
+        if timeout is not None and _PASSIVE < timeout < _SHORT:
+            timeout = _FLOOR
         return super().send_cmd_recv_rsp(target, data, timeout)  # type: ignore[no-any-return]
 
     def sense_tta(self, target: Any) -> Any:
-        """Look for a Type A target for 0.15 s."""
+        """Look for a Type A target for 0.08 s."""
         self._sensing = True
         try:
             return super().sense_tta(target)

@@ -1,0 +1,81 @@
+"""nfcpy's front end and its PN53x driver, mended where they hang or waste time; nothing above them changes.
+
+* An exchange without a target raises: nfcpy answers None there, which its tags take for "still present", so that a node
+  that was lifted off in the middle of an exchange was never missed.
+* The PN53x driver sets its registers and its time-out before each exchange, three host commands for one that counts.
+  Here they are set only when they change.
+"""
+
+from __future__ import annotations
+
+import errno
+from typing import Any
+
+from teds_provision.links.nfc.library import nfc
+
+_MOST_INDEX = 16  # of InCommunicateThru's time-out, 0.1 ms · 2^(n - 1)
+_LATE = 0.1  # seconds beyond the chip's own time-out that nfcpy gives the host command
+_TIMED_OUT = 0x01  # status of the chip: the target has not answered
+
+
+class Frontend(nfc.ContactlessFrontend):  # type: ignore[misc]
+    """A front end that never answers for a target that is gone."""
+
+    def exchange(self, send_data: bytes, timeout: float) -> Any:
+        """Exchange one frame; raises nfc.clf.TimeoutError where no target is activated."""
+        if self.target is None and self.device is not None:
+            raise nfc.clf.TimeoutError("no target is activated")
+        return super().exchange(send_data, timeout)
+
+    def open(self, path: str) -> bool:
+        """Open the device at ``path``, a PN53x with its exchanges slimmed."""
+        opened = bool(super().open(path))
+        pn53x = getattr(nfc.clf, "pn53x", None)  # imported by nfcpy when its first driver is
+        if opened and pn53x is not None and isinstance(self.device, pn53x.Device):
+            self.device.send_cmd_recv_rsp = _Slim(self.device, pn53x).exchange
+        return opened
+
+
+class _Slim:
+    """The exchange of a PN53x, registers and time-out set when target, bit rate or time-out are others."""
+
+    def __init__(self, device: Any, pn53x: Any) -> None:
+        self._device, self._pn53x = device, pn53x
+        self._whole = device.send_cmd_recv_rsp
+        self._target: Any = None  # for which registers and time-out are set; held, so that none takes its identity
+        self._rates = ("", "")
+        self._index = 0
+
+    def exchange(self, target: Any, data: bytes, timeout: float) -> Any:
+        """As ``nfc.clf.pn53x.Device.send_cmd_recv_rsp``."""
+        microseconds = int(timeout * 1e6)
+        index = next((n + 1 for n in range(_MOST_INDEX) if microseconds >> n <= 100), _MOST_INDEX)
+        rates = (target.brty_send, target.brty_recv)
+        if self._target is not target or self._rates != rates:
+            self._target = None
+            answer = self._whole(target, data, timeout)
+            self._target, self._rates, self._index = target, rates, index
+            return answer
+        if self._index != index:
+            self._device.chipset.rf_configuration(0x02, bytearray((10, 11, index)))
+            self._index = index
+        try:
+            return self._send(target, bytearray(data), (100 << (index - 1)) / 1e6 + _LATE)
+        except self._pn53x.Chipset.Error as error:
+            self._target = None
+            if error.errno == _TIMED_OUT:
+                raise nfc.clf.TimeoutError from error
+            raise nfc.clf.TransmissionError(str(error)) from error
+        except OSError as error:
+            self._target = None
+            if error.errno == errno.ETIMEDOUT:
+                raise nfc.clf.TimeoutError("send_cmd_recv_rsp") from error
+            raise
+
+    def _send(self, target: Any, data: bytearray, timeout: float) -> Any:
+        if target.sens_res and not target.atr_res:
+            if target.rid_res:
+                return self._device._tt1_send_cmd_recv_rsp(data, timeout)
+            if target.sel_res[0] & 0x60 == 0x00:
+                return self._device._tt2_send_cmd_recv_rsp(data, timeout)
+        return self._device.chipset.in_communicate_thru(data, timeout)
