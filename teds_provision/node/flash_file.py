@@ -8,6 +8,7 @@ import os
 import secrets
 import time
 import zlib
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -44,11 +45,22 @@ class FlashFile:
         self._document = self._read()
 
     @classmethod
-    def create(cls, folder: Path, *, uuid: bytes | None = None, name: str = "", max_message: int = 2048) -> FlashFile:
-        """Make a node in factory state with its own key; an existing one of that UUID is opened instead."""
+    def create(
+        cls,
+        folder: Path,
+        *,
+        uuid: bytes | None = None,
+        name: str = "",
+        max_message: int = 2048,
+        blocks: Mapping[BlockId, bytes] | None = None,
+    ) -> FlashFile:
+        """Make a node in factory state with its own key; an existing one of that UUID is opened instead.
+
+        ``blocks`` are TEDS that it is made with: stored unsigned, and kept aside as what its hardware is.
+        """
         if (folder / FILE).exists():
             existing = cls(folder)
-            if uuid not in (None, existing.load().uuid):
+            if uuid not in (None, existing.load().uuid) or blocks not in (None, existing.hardware):
                 raise UsageFailure(f"{folder} already holds another node.", hint="Choose another folder.")
             return existing
         try:
@@ -61,9 +73,12 @@ class FlashFile:
             uuid,
             key.point,
             key.sign(node_key_message(uuid, key.point)),
+            blocks=dict(blocks or {}),
             can_address=default_can_address(uuid),
         )
         head = {"format": FORMAT, "name": name, "max_message": max_message, "key": key.secret().hex()}
+        if blocks:
+            head["hardware"] = _blocks_to_json(blocks)
         try:
             _replace(folder / FILE, head | {"flash": _flash_to_json(flash)})
         except OSError as error:
@@ -84,6 +99,11 @@ class FlashFile:
     def max_message(self) -> int:
         """Octets of the longest frame that this node handles."""
         return int(self._document["max_message"])
+
+    @property
+    def hardware(self) -> dict[BlockId, bytes]:
+        """The TEDS that it was made with: what its channels are, whatever datasheet is written later."""
+        return _blocks_from_json(self._document.get("hardware", []))
 
     def load(self) -> Flash:
         """Return the committed state."""
@@ -134,6 +154,7 @@ class FlashFile:
             whole = document["format"] == FORMAT and "name" in document and int(document["max_message"]) > 0
             SoftwareKey.from_secret(bytes.fromhex(document["key"]))
             _flash_from_json(document["flash"])
+            _blocks_from_json(document.get("hardware", []))
         except (KeyError, TypeError, ValueError, AttributeError, BadData):
             whole = False
         if not whole:
@@ -158,6 +179,14 @@ def _unusable(folder: Path, error: OSError) -> StoreFailure:
     return StoreFailure(f"The folder {folder} cannot be used: {error.strerror}.", hint="Choose another folder.")
 
 
+def _blocks_to_json(blocks: Mapping[BlockId, bytes]) -> list[list[int | str]]:
+    return [[channel, code, blocks[channel, code].hex()] for channel, code in sorted(blocks)]
+
+
+def _blocks_from_json(blocks: Any) -> dict[BlockId, bytes]:
+    return {(channel, code): bytes.fromhex(teds) for channel, code, teds in blocks}
+
+
 def _flash_to_json(flash: Flash) -> dict[str, Any]:
     def text(octets: bytes | None) -> str | None:
         return None if octets is None else octets.hex()
@@ -166,7 +195,7 @@ def _flash_to_json(flash: Flash) -> dict[str, Any]:
         "uuid": flash.uuid.hex(),
         "node_key": flash.node_key.hex(),
         "node_key_signature": flash.node_key_signature.hex(),
-        "blocks": [[channel, code, flash.blocks[channel, code].hex()] for channel, code in sorted(flash.blocks)],
+        "blocks": _blocks_to_json(flash.blocks),
         "read_only": sorted(map(list, flash.read_only)),
         "epoch": flash.epoch,
         "sequence": flash.sequence,
@@ -182,12 +211,11 @@ def _flash_from_json(data: dict[str, Any]) -> Flash:
     def octets(text: str | None) -> bytes | None:
         return None if text is None else bytes.fromhex(text)
 
-    blocks: dict[BlockId, bytes] = {(channel, code): bytes.fromhex(teds) for channel, code, teds in data["blocks"]}
     return Flash(
         uuid=bytes.fromhex(data["uuid"]),
         node_key=bytes.fromhex(data["node_key"]),
         node_key_signature=bytes.fromhex(data["node_key_signature"]),
-        blocks=blocks,
+        blocks=_blocks_from_json(data["blocks"]),
         read_only=frozenset((channel, code) for channel, code in data["read_only"]),
         epoch=data["epoch"],
         sequence=data["sequence"],

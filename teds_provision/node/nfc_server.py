@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import threading
+import time
 from collections.abc import Callable
 from typing import Any, Literal
 
@@ -17,6 +18,7 @@ from teds_provision.node.nfc_tnep import TnepTag
 
 _LISTEN = 0.25  # seconds after which the server looks around: stop, renewal of the initial message
 _QUEUE = 0.2  # seconds between two tries to lie down on a reader on which another node lies
+_LEAVING = 1.0  # seconds that a node before is given to leave
 _SENS_RES = {4: b"\x04\x00", 7: b"\x44\x00", 10: b"\x84\x00"}
 TYPE4_MAX_NDEF = 4160  # a frame of 4094 octets in one message
 
@@ -28,7 +30,8 @@ class NfcServer:
 
     ``uid`` has 4, 7 or 10 octets (Type 2: 7), random when None. ``wt_int`` (0 to 63) and ``n_wait`` (0 to 15) are
     announced; ``max_ndef`` octets is the longest NDEF message, by default 4160 (Type 4) or 499 (Type 2, its most).
-    ``pace`` makes every frame last as long as on air at 106 kbit/s. Raises UsageFailure for what does not fit.
+    ``pace`` makes every frame last as long as on air at 106 kbit/s; with ``queue`` it waits while another node lies
+    there. Raises UsageFailure for what does not fit.
     """
 
     def __init__(
@@ -38,10 +41,11 @@ class NfcServer:
         *,
         tag: Literal["4", "2"] = "4",
         uid: bytes | None = None,
-        wt_int: int = 20,
+        wt_int: int = 4,
         n_wait: int = 15,
         max_ndef: int | None = None,
         pace: bool = False,
+        queue: bool = False,
     ) -> None:
         self._path = path
         self._device: Any = None
@@ -55,17 +59,18 @@ class NfcServer:
         else:
             self._type2 = nfc_type2.Type2Memory(self._uid, max_ndef or nfc_type2.MAX_NDEF)
         self._tnep = TnepTag(self._type4 or self._memory2(), handler, wt_int=wt_int, n_wait=n_wait)
-        self._pace = pace
+        self._pace, self._queue = pace, queue
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self._serve, name="nfc-tag", daemon=True)
 
     def start(self) -> None:
-        """Lie down on the reader; while another node lies there, wait for it to leave. Raises NoReader."""
+        """Lie down on the reader. Raises NoReader, also where another node lies there and does not leave."""
         self._device = NodeDevice(*self._address)
         if self._pace:
             self._device.air = Air()
         try:
-            self._device.bind()
+            if not self._bound() and not self._queue:
+                raise NoReader(f"Another node (or program) lies on {self._path}.", hint="End it, or name another port.")
         except OSError as error:
             raise NoReader(
                 f"The node cannot lie on {self._path}: {error.strerror}.", hint="Try another port."
@@ -80,6 +85,14 @@ class NfcServer:
             self._device.wake()
             self._thread.join()
             self._tnep.stop()
+
+    def _bound(self) -> bool:
+        """Take the port; a node that is just leaving it is given a second."""
+        until = time.monotonic() + _LEAVING
+        while not self._device.bind():
+            if self._queue or time.monotonic() > until or self._stop.wait(_QUEUE):
+                return False
+        return True
 
     def _memory2(self) -> nfc_type2.Type2Memory:
         assert self._type2 is not None

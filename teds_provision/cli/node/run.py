@@ -1,0 +1,125 @@
+"""``node run``: virtual transducers on their links, until SIGTERM or Ctrl-C."""
+
+from __future__ import annotations
+
+import signal
+import threading
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from teds_provision.cli.context import App, pass_app
+from teds_provision.cli.options import command
+from teds_provision.errors import UsageFailure
+
+if TYPE_CHECKING:
+    from teds_provision.node.virtual import LinkServer, VirtualNode
+
+
+@command(
+    "teds-provision node run bench/finger --nfc udp:localhost:54321",
+    "teds-provision node run bench/finger --nfc udp:localhost:54321 --can udp_multicast:239.74.163.2",
+    "teds-provision node run bench/angle --can udp_multicast:239.74.163.2 --source sine:2",
+    "teds-provision node run bench/a bench/b bench/c --can udp_multicast:239.74.163.2",
+    short_help="Run the nodes in DIR … until SIGTERM or Ctrl-C.",
+)
+@click.argument("folders", metavar="DIR…", nargs=-1, required=True, type=click.Path(path_type=Path, file_okay=False))
+@click.option("--nfc", metavar="PATH", help="Lie on this simulated reader: udp:localhost:54321 (one node).")
+@click.option("--tag", type=click.Choice(["4", "2"]), default="4", show_default=True, help="NFC Forum tag type.")
+@click.option(
+    "--can", metavar="INTERFACE:CHANNEL", help="Hang on this bus; without --nfc it counts as tapped in factory state."
+)
+@click.option(
+    "--source",
+    default="noise",
+    show_default=True,
+    metavar="SOURCE",
+    help="Where values come from: noise, sine:PERIOD, ramp:PERIOD, file:CSV, -, unix:PATH, exec:COMMAND.",
+)
+@click.option(
+    "--crypto-delay", type=click.FloatRange(min=0), default=0, metavar="MS", help="Milliseconds per point operation."
+)
+@click.option(
+    "--flash-delay", type=click.FloatRange(min=0), default=0, metavar="MS", help="Milliseconds per flash commit."
+)
+@click.option(
+    "--wait-time",
+    type=click.IntRange(4, 60),
+    default=4,
+    show_default=True,
+    metavar="WT_INT",
+    help="TNEP minimum waiting time, a multiple of 4 (4 is 1 ms, 20 is 16 ms).",
+)
+@click.option("--pace", is_flag=True, help="Let every NFC frame last as long as at 106 kbit/s.")
+@pass_app
+def run(
+    app: App, /, folders: Sequence[Path], crypto_delay: float, flash_delay: float, source: str, **links: Any
+) -> None:
+    """Run the nodes in DIR … until SIGTERM or Ctrl-C; SIGUSR1 is their reset by hand.
+
+    Prints one line when the links are up, then a line for what an actuator does.
+    """
+    from teds_provision.node.sources import ONE_NODE_ONLY, kind_of
+    from teds_provision.node.virtual import Delays, VirtualNode
+
+    if not links["nfc"] and not links["can"]:
+        raise UsageFailure(
+            "A node needs a link.", hint="Add --nfc udp:localhost:54321, --can udp_multicast:239.74.163.2, or both."
+        )
+    if len(folders) > 1 and (links["nfc"] or kind_of(source) in ONE_NODE_ONLY):
+        what = "--nfc" if links["nfc"] else f"--source {source}"
+        raise UsageFailure(f"{what} is for one node.", hint="Run the others in processes of their own.")
+    delays = Delays(crypto_delay / 1000, flash_delay / 1000)
+    nodes = [VirtualNode(folder, delays=delays, exclusive=True) for folder in folders]
+    stop = threading.Event()
+    for number in (signal.SIGTERM, signal.SIGINT):
+        signal.signal(number, lambda *_: stop.set())
+    signal.signal(signal.SIGUSR1, lambda *_: threading.Thread(target=_reset_all, args=(nodes,)).start())
+    running: list[Any] = []
+    try:
+        for part in _servers(app, nodes, **links):
+            part.start()
+            running.append(part)
+        _say_ready(app, nodes, [links[kind] for kind in ("nfc", "can") if links[kind]], source)
+        while not stop.wait(0.5):
+            pass
+    finally:
+        for part in reversed(running):
+            part.stop()
+
+
+def _reset_all(nodes: Sequence[VirtualNode]) -> None:
+    for node in nodes:
+        node.reset_by_hand()
+
+
+def _say_ready(app: App, nodes: Sequence[VirtualNode], up: list[str], source: str) -> None:
+    from teds_provision.protocol.keys import fingerprint
+
+    flashes = [node.tim.flash for node in nodes]
+    named = [{"uuid": flash.uuid.hex(), "fingerprint": fingerprint(flash.node_key)} for flash in flashes]
+    several = {"nodes": named} if len(named) > 1 else {}
+    who = f"Node {named[0]['uuid']}" if len(named) == 1 else f"{len(named)} nodes"
+    app.emit(
+        {**named[0], **several, "links": up, "source": source, "ready": True}, f"{who} ready on {' and '.join(up)}."
+    )
+
+
+def _servers(
+    app: App, nodes: Sequence[VirtualNode], *, nfc: str | None, tag: Any, can: str | None, pace: bool, wait_time: int
+) -> list[LinkServer]:
+    servers: list[LinkServer] = []
+    if nfc:
+        from teds_provision.node.nfc_server import NfcServer
+
+        servers.append(NfcServer(nfc, nodes[0], tag=tag, pace=pace, wt_int=wait_time // 4 * 4))
+    if can:
+        from teds_provision.node.can_server import CanServer
+
+        bus = CanServer(can, tell=app.warn)
+        for node in nodes:
+            bus.add(node, counts_as_tapped=node.in_factory_state if nfc is None else lambda: False)
+        servers.append(bus)
+    return servers

@@ -1,0 +1,109 @@
+"""A virtual transducer from a datasheet: the TEDS that it is made with, which are its hardware from then on."""
+
+from __future__ import annotations
+
+import secrets
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Final
+
+from teds_provision.errors import BadData
+from teds_provision.files import read_limited
+from teds_provision.node.flash_file import FILE, FlashFile
+from teds_provision.protocol.datasheet import can_be_stored, passes_own_check
+from teds_provision.teds.codec.codes import AccessCode
+from teds_provision.teds.codec.frame import frame, raw_tuple, tuples, unframe
+from teds_provision.teds.formats import detect, read_blocks
+from teds_provision.teds.formats.block import MAX_FILE
+from teds_provision.teds.image import SECURITY, BlockId
+from teds_provision.teds.profile import load_profile
+from teds_provision.teds.sheet import Sheet
+
+UUID_OCTETS: Final = 10
+_META: Final[BlockId] = (0, AccessCode.META)
+_UUID_FIELD: Final = 4
+
+
+@dataclass(frozen=True)
+class Described:
+    """TEDS of one node, without Security TEDS; ``uuid`` is what they say, None where they say none (or all zeros)."""
+
+    blocks: Mapping[BlockId, bytes]
+    uuid: bytes | None = None
+
+    def of(self, uuid: bytes) -> Described:
+        """The same node under another UUID: field 4 of a Meta-TEDS of the 2007 form says that one."""
+        meta = self.blocks.get(_META)
+        if meta is None or self.uuid == uuid:
+            return replace(self, uuid=uuid)
+        parts = [
+            raw_tuple(part.type, uuid if part.type == _UUID_FIELD and len(part.value) == UUID_OCTETS else part.value)
+            for part in tuples(unframe(meta))
+        ]
+        return Described({**self.blocks, _META: frame(b"".join(parts))}, uuid)
+
+
+def from_file(path: Path) -> Described:
+    """Read an image, XML, JSON, hex or binary file; a channel's TEDS without a channel are those of channel 1.
+
+    Raises NotFound, and BadData that names the TEDS which no node holds.
+    """
+    octets = read_limited(path, MAX_FILE, "file of TEDS")
+    try:
+        blocks = read_blocks(octets, detect(octets), path=path)
+    except BadData as error:
+        raise BadData(f"{path}: {error.message}", hint=error.hint) from error
+    placed: dict[BlockId, bytes] = {}
+    for channel, code, teds in blocks:
+        if code is None:
+            raise BadData(f"{path} holds octets that are no TEDS.", hint=f"See what it holds: show {path}")
+        key = (_usual_channel(code) if channel is None else channel, int(code))
+        if key in placed:
+            raise BadData(f"{path} holds two TEDS of access code {code} for channel {key[0]}.")
+        placed[key] = teds
+    placed = {key: teds for key, teds in placed.items() if key[1] != AccessCode.SECURITY}
+    for (channel, code), teds in placed.items():
+        if not can_be_stored((channel, code)) or not passes_own_check((channel, code), teds):
+            raise BadData(
+                f"{path}: no node can hold the TEDS of access code {code} of channel {channel}, or it is damaged.",
+                hint=f"See what is wrong: show {path}",
+            )
+    if not placed:
+        raise BadData(f"{path} holds no TEDS.")
+    stated = Sheet.of_blocks(placed).meta.uuid
+    return Described(placed, stated if stated and len(stated) == UUID_OCTETS and any(stated) else None)
+
+
+def from_profile(profile: str, folders: tuple[Path, ...] | None, uuid: bytes, name: str = "") -> Described:
+    """The TEDS of a type, without calibration; raises NotFound and BadData."""
+    made = load_profile(profile, folders).build(uuid, name=name or None)
+    return Described({key: teds for key, teds in made.blocks.items() if key != SECURITY}, uuid)
+
+
+def create(
+    folder: Path,
+    *,
+    uuid: bytes | None = None,
+    name: str = "",
+    max_message: int = 2048,
+    teds: Path | None = None,
+    profile: str | None = None,
+    folders: tuple[Path, ...] | None = None,
+) -> FlashFile:
+    """Make a node, or open the one that was made so before. Its UUID: the one given, else the file's, else random.
+
+    Raises UsageFailure (another node lies there), NotFound, BadData, StoreFailure.
+    """
+    described = from_file(teds) if teds is not None else None
+    wanted = uuid or (described.uuid if described is not None else None)
+    if wanted is None:
+        wanted = FlashFile(folder).load().uuid if (folder / FILE).exists() else secrets.token_bytes(UUID_OCTETS)
+    if profile is not None:
+        described = from_profile(profile, folders, wanted, name)
+    blocks = described.of(wanted).blocks if described is not None else None
+    return FlashFile.create(folder, uuid=wanted, name=name, max_message=max_message, blocks=blocks)
+
+
+def _usual_channel(code: int) -> int:
+    return 1 if code in {AccessCode.CHANNEL, AccessCode.CALIBRATION} else 0
