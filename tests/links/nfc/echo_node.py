@@ -68,6 +68,7 @@ def main() -> None:
         n_wait=options.get("n_wait", 15),
         max_ndef=options.get("max_ndef"),
         pace=options.get("pace", False),
+        queue=True,
     )
     spoil(server, options)
     done = threading.Event()
