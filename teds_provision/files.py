@@ -39,6 +39,13 @@ def whole_file(path: Path, *, replace: bool, mode: int = PRIVATE) -> Iterator[Bi
     Durable when it returns: file, then name. ``replace`` False never takes the place of another file. Raises OSError,
     FileExistsError for a name that is taken.
     """
+    with whole_draft(path, replace=replace, mode=mode) as (_, file):
+        yield file
+
+
+@contextmanager
+def whole_draft(path: Path, *, replace: bool, mode: int = PRIVATE) -> Iterator[tuple[Path, BinaryIO]]:
+    """Like :func:`whole_file`, with the file's present name, for those who write it by its name."""
     draft = path.with_name(f".{path.name}.{secrets.token_hex(8)}{_SUFFIX}")
     _sweep(path)
     descriptor = os.open(draft, os.O_CREAT | os.O_EXCL | os.O_RDWR | os.O_NOFOLLOW | os.O_CLOEXEC, mode)
@@ -46,7 +53,7 @@ def whole_file(path: Path, *, replace: bool, mode: int = PRIVATE) -> Iterator[Bi
         with open(descriptor, "w+b") as file:
             with suppress(OSError):  # some network folders have no locks: then only its age tells a left-over file
                 fcntl.flock(file.fileno(), fcntl.LOCK_EX | fcntl.LOCK_NB)
-            yield file
+            yield draft, file
             file.flush()
             os.fsync(file.fileno())
             _publish(draft, path, replace=replace)

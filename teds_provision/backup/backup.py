@@ -3,18 +3,18 @@
 from __future__ import annotations
 
 import hashlib
-from contextlib import suppress
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
-from teds_provision.backup.sealed_file import Content, seal_to_key, seal_to_passphrase
-from teds_provision.errors import StoreFailure, VaultFailure
-from teds_provision.files import write_whole
+from teds_provision.backup.content import Content, Head
+from teds_provision.backup.sealed_file import MAX_OCTETS, SealedFile, Sealer, write
+from teds_provision.errors import StoreFailure, StoreLocked, TedsProvisionError, VaultFailure
+from teds_provision.files import whole_draft
 from teds_provision.protocol.keys import fingerprint
 from teds_provision.station.station import Station
 from teds_provision.store import utc_now
-from teds_provision.store.snapshot import load, take
-from teds_provision.store.store import Store
+from teds_provision.store.snapshot import totals
 from teds_provision.vault import Ask, node_key_context
 from teds_provision.vault.passphrase import PRODUCT, Costs
 
@@ -32,50 +32,90 @@ class BackedUp:
 
 
 def backup(
-    station: Station, path: Path, ask: Ask, *, recovery: bytes | None = None, costs: Costs = PRODUCT
+    station: Station,
+    path: Path,
+    ask: Ask,
+    *,
+    recovery: bytes | None = None,
+    costs: Costs = PRODUCT,
+    notice: Callable[[str], object] | None = None,
 ) -> BackedUp:
     """Write a sealed copy of the station to ``path`` (mode 0600, whole or not at all; an old file is replaced).
 
-    ``recovery`` is the point of a recovery key, else ``ask`` gives a new passphrase. The store may be in use meanwhile.
+    ``recovery`` is the point of a recovery key, else ``ask`` gives a new passphrase. The store may be in use meanwhile;
+    ``notice`` is told whom the entry in the audit log waits for. The file gets its name only after it was read back as
+    ``restore`` would, and after that entry: where another process keeps it from being made, the command fails
+    (StoreLocked). On a disk that takes no entry at all the backup is made, with a warning.
     Raises StoreFailure, VaultFailure and its leaves.
     """
     vault = station.vault
-    database = take(station._store)
-    content = Content(
-        store=station.id,
-        point=station.point,
-        name=station.name,
-        created=utc_now(),
-        keystore=station.identity.keystore,
-        material=vault.secret_material(),
-        database=database,
+    sealer = Sealer(
+        passphrase=ask("New passphrase for the backup", True) if recovery is None else None,
+        recovery=recovery,
+        costs=costs,
     )
-    with load(database) as copy:
-        nodes, keys, useless = _count(station, copy)
-    if recovery is not None:
-        sealed, to = seal_to_key(content, vault.identity(), recovery), fingerprint(recovery)
-    else:
-        sealed = seal_to_passphrase(content, vault.identity(), ask("New passphrase for the backup", True), costs)
-        to = "passphrase"
-    write_whole(path, sealed, failure=VaultFailure)
-    digest = hashlib.sha256(sealed).hexdigest()
-    warnings = _warnings(station, recovery, useless)
-    with suppress(StoreFailure):  # a full disk is a reason for a backup, and must not make it fail
-        station.audit("backup", None, "done", sha256=digest, to=to, nodes=nodes, keys=keys)
-    return BackedUp(len(sealed), digest, nodes, keys, to, tuple(warnings))
+    head = Head(
+        station.id, station.point, station.name, utc_now(), _kind(station.identity.keystore), vault.secret_material()
+    )
+    to = fingerprint(recovery) if recovery is not None else "passphrase"
+    try:
+        with whole_draft(path, replace=True) as (draft, file):
+            key = write(file, head, station.rows(), vault.identity(), sealer)
+            file.flush()
+            nodes, keys, useless = _read_back(station, draft, key)
+            octets = file.tell()
+            file.seek(0)
+            digest = hashlib.file_digest(file, "sha256").hexdigest()  # type: ignore[arg-type]
+            warnings = _warnings(station, recovery, useless)
+            warnings += _note(station, notice, sha256=digest, to=to, nodes=nodes, keys=keys)
+    except OSError as error:
+        raise VaultFailure(
+            f"{path} cannot be written: {error.strerror}.", hint="Mend that and run the same command again."
+        ) from error
+    return BackedUp(octets, digest, nodes, keys, to, tuple(warnings))
 
 
-def _count(station: Station, copy: Store) -> tuple[int, int, int]:
-    """Count nodes, keys, and the keys that the vault does not open: those are lost already."""
-    keys = useless = 0
-    for record in copy.all_keys():
-        keys += 1
+def _kind(keystore: str) -> str:
+    """What the head says of the keystore: never a path, as nothing may be loaded because a backup names it."""
+    return "pkcs11" if keystore.startswith("pkcs11:") else keystore
+
+
+def _read_back(station: Station, draft: Path, key: bytes) -> tuple[int, int, int]:
+    """Open what was written as restore would; count nodes, keys, and the keys that the vault does not open."""
+    try:
+        sealed = SealedFile(draft)
+        with sealed.open_with_content_key(key) as content:
+            found = totals(content.copy)
+            return found["nodes"], found["keys"], _useless(station, content)
+    except TedsProvisionError as error:
+        raise StoreFailure(
+            f"The backup was written and does not open again: {error.message}",
+            hint=f"Nothing was kept. Check the disk (at most {MAX_OCTETS >> 30} GiB are read), then run it again.",
+        ) from error
+
+
+def _useless(station: Station, content: Content) -> int:
+    """Count the keys that the vault does not open: those are lost already."""
+    useless = 0
+    for record in content.copy.all_keys():
         try:
-            context = node_key_context(copy.id, record.uuid, record.epoch, record.slot)
+            context = node_key_context(content.copy.id, record.uuid, record.epoch, record.slot)
             station.vault.unwrap(record.wrapped, context=context)
         except VaultFailure:
             useless += 1
-    return len(copy.nodes()), keys, useless
+    return useless
+
+
+def _note(station: Station, notice: Callable[[str], object] | None, **detail: object) -> list[str]:
+    """Make the entry in the audit log."""
+    try:
+        with station.lock("backup", notice):
+            station.audit("backup", None, "done", **detail)
+    except StoreLocked:
+        raise
+    except StoreFailure as failure:  # a full or read-only disk is a reason for a backup, and must not make it fail
+        return [f"The audit log has no entry of this backup: {failure.message}"]
+    return []
 
 
 def _warnings(station: Station, recovery: bytes | None, useless: int) -> list[str]:

@@ -12,30 +12,41 @@ from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from teds_provision.backup.sealed_file import Content
-from teds_provision.errors import NotAuthentic, PolicyRefused, StoreFailure, VaultFailure, WrongPassphrase
+from teds_provision.backup.content import Content
+from teds_provision.errors import (
+    NotAuthentic,
+    PolicyRefused,
+    StoreFailure,
+    UsageFailure,
+    VaultFailure,
+    WrongPassphrase,
+)
 from teds_provision.protocol.keys import fingerprint
+from teds_provision.station.node_keys import RESTORED
+from teds_provision.station.station import Station
 from teds_provision.store import NodeRecord, Revocation, Store, StoreLock, Tombstone
 from teds_provision.store.snapshot import (
     Relation,
     extend_audit,
     is_damage,
-    load,
     place,
     relation,
     set_aside,
     settings,
+    totals,
 )
 from teds_provision.vault import Ask, Vault, create_vault, node_key_context, open_vault
 from teds_provision.vault.passphrase import PRODUCT, Costs
-from teds_provision.vault.software import SoftwareVault
 
 _OF_THIS_MACHINE = frozenset({"keystore", "keystore_why"})
 
 
 @dataclass(frozen=True)
 class Restored:
-    """What was done (or would be): ``rebuilt``, ``merged`` or ``nothing``; how much came back, and what stayed."""
+    """What was done (or would be): ``rebuilt``, ``merged`` or ``nothing``; how much came back, and what stayed.
+
+    ``rotations_due`` counts the nodes whose key has to be rotated by tap, or by a person's word, before anything else.
+    """
 
     action: str
     relation: Relation | None
@@ -43,6 +54,7 @@ class Restored:
     kept: tuple[str, ...]
     keystore: str
     set_aside: Path | None = None
+    rotations_due: int = 0
 
 
 class _OnlyAPlan(Exception):
@@ -68,9 +80,9 @@ def open_present(home: Path, content: Content) -> Store | None:
     point = store.setting("station_point")
     if store.id != content.store or (point is not None and bytes.fromhex(point) != content.point):
         store.close()
-        here = "of an unfinished init" if point is None else f"of station {fingerprint(bytes.fromhex(point))[:16]}"
+        here = "of an unfinished init" if point is None else f"of station {fingerprint(bytes.fromhex(point))[:32]}"
         raise PolicyRefused(
-            f"The backup is of station {content.station[:16]}; the store in {home} is {here}.",
+            f"The backup is of station {content.station[:32]}; the store in {home} is {here}.",
             hint="Restore into another --home: backups never mix stations.",
         )
     return store
@@ -81,78 +93,104 @@ def rebuild(home: Path, content: Content, ask: Ask, *, keystore: str | None = No
 
     ``keystore`` as for init; None takes the kind that the station had, or a passphrase file where the keyring does not
     work. The vault comes first, the store last and in one piece: killed in between, the same command carries on.
-    Raises NotAuthentic, VaultFailure and its leaves, StoreFailure.
+    Every node that a key is held for is due for rotation afterwards, by tap or a person's word: nobody here knows what
+    became of it since the backup. Raises NotAuthentic, VaultFailure and its leaves, StoreFailure.
     """
-    with load(content.database) as copy:
-        _check_inside(copy, content)
-        try:
-            home.mkdir(mode=0o700, parents=True, exist_ok=True)
-        except OSError as error:
-            raise StoreFailure(f"{home} cannot be made: {error.strerror}.", hint="Choose another --home.") from error
-        with StoreLock(home, command="restore"):
-            vault, why = bring_vault(home, content, ask, keystore, costs)
-            chosen = keystore or content.keystore
-            kind = chosen if chosen.startswith("pkcs11:") else vault.kind
-            with copy.transaction():
-                copy.set_setting("keystore", kind)
-                copy.set_setting("keystore_why", why)
-                copy.audit.append("restore", None, "rebuilt", {"created": content.created, "keystore": vault.kind})
-            aside = set_aside(home) if (home / "store.sqlite3").exists() else None
-            place(copy, home)
-        back = _whole(copy)
-    return Restored("rebuilt", None, back, (), kind, aside)
+    copy = content.copy
+    _check_inside(copy, content)
+    wanted = keystore_for(content, keystore)
+    try:
+        home.mkdir(mode=0o700, parents=True, exist_ok=True)
+    except OSError as error:
+        raise StoreFailure(f"{home} cannot be made: {error.strerror}.", hint="Choose another --home.") from error
+    with StoreLock(home, command="restore"):
+        vault, why = bring_vault(home, content, ask, wanted, costs)
+        kind = wanted if wanted is not None and wanted.startswith("pkcs11:") else vault.kind
+        with copy.transaction():
+            copy.set_setting("keystore", kind)
+            copy.set_setting("keystore_why", why)
+            due = _demand_rotations(copy, content, ask)
+            detail = {"created": content.created, "keystore": vault.kind, "rotations_due": due}
+            copy.audit.append("restore", None, "rebuilt", detail)
+        aside = set_aside(home) if (home / "store.sqlite3").exists() else None
+        place(copy, home)
+    return Restored("rebuilt", None, totals(copy), (), kind, aside, due)
+
+
+def _demand_rotations(copy: Store, content: Content, ask: Ask) -> int:
+    """Have every node for which a key is held rotate it first, and only when a person has the node in hand."""
+    why = f"{RESTORED} of {content.created}: it may have been given away or replaced since"
+    keys = Station(copy, ask).keys
+    nodes = {record.uuid for record in keys.all()}
+    for uuid in nodes:
+        keys.demand_rotation(uuid, why)
+    return len(nodes)
+
+
+def keystore_for(content: Content, asked: str | None) -> str | None:
+    """Which keystore a restored station gets: None means the keyring, or a passphrase file where it does not work.
+
+    No path of a module ever comes from a backup: for keys in a token the URI has to be given (UsageFailure). Raises
+    PolicyRefused where the keys cannot be put there.
+    """
+    wanted = asked or (None if content.keystore in ("keyring", "pkcs11") or content.in_token else content.keystore)
+    if wanted not in (None, "keyring", "file") and not wanted.startswith("pkcs11:"):
+        raise UsageFailure("There is no such keystore.", hint="Give --keystore keyring, file or pkcs11:URI.")
+    if content.in_token and asked is None:
+        raise UsageFailure(
+            "The station's key is in a token, and a backup does not say by which module it is reached.",
+            hint="Add --keystore 'pkcs11:token=LABEL?module-path=/path/of/the/module.so'.",
+        )
+    if content.in_token != (wanted or "").startswith("pkcs11:"):
+        raise PolicyRefused(
+            "The station's key is in a token and cannot be put elsewhere."
+            if content.in_token
+            else "The keys of this backup cannot be put into a token.",
+            hint="Restore with --keystore pkcs11:URI of that token."
+            if content.in_token
+            else "Restore with --keystore keyring or file.",
+        )
+    return wanted
 
 
 def bring_vault(
     home: Path, content: Content, ask: Ask, keystore: str | None, costs: Costs = PRODUCT
 ) -> tuple[Vault, str]:
     """Make or complete the vault with what the backup holds, and have it show the station's key."""
-    wanted = keystore or (None if content.keystore == "keyring" else content.keystore)
-    token = content.keystore.startswith("pkcs11:")
-    if token != (wanted or "").startswith("pkcs11:"):
-        raise PolicyRefused(
-            "The station's key is in a token and cannot be put elsewhere."
-            if token
-            else "The keys of this backup cannot be put into a token.",
-            hint="Restore with --keystore pkcs11:URI of that token."
-            if token
-            else "Restore with --keystore keyring or file.",
-        )
-    vault, why = create_vault(home, content.store, wanted, ask, costs=costs, restored=content.material)
+    vault, why = create_vault(home, content.store, keystore, ask, costs=costs, restored=content.material)
     if vault.identity().point != content.point:
         raise NotAuthentic("The keys in the backup are not those of the station that signed it.")
     return vault, why
 
 
-def complete_vault(store: Store, content: Content, ask: Ask) -> Vault:
+def complete_vault(store: Store, content: Content, ask: Ask, *, keystore: str | None = None) -> Vault:
     """Open the vault of a living station; make it again where it is lost, and join master keys that it lacks.
 
     A CA key that was taken out of the vault since the backup stays out. Raises VaultFailure and its leaves.
     """
-    keystore = store.setting("keystore") or content.keystore
+    wanted = store.setting("keystore") or keystore_for(content, keystore)
     try:
-        vault = open_vault(store.home, store.id, keystore, ask)
+        vault = open_vault(store.home, store.id, wanted or "keyring", ask)
     except WrongPassphrase:
         raise
     except VaultFailure:  # lost, or locked: then making it fails as well and says so
-        return bring_vault(store.home, content, ask, keystore)[0]
+        return bring_vault(store.home, content, ask, wanted)[0]
     if _opens_all(vault, content):
         return vault
     had_ca = vault.ca() is not None
-    vault, _ = bring_vault(store.home, content, ask, keystore)
-    if not had_ca and isinstance(vault, SoftwareVault):
+    vault, _ = bring_vault(store.home, content, ask, wanted)
+    if not had_ca:
         vault.drop_ca()
     return vault
 
 
 def _opens_all(vault: Vault, content: Content) -> bool:
-    with load(content.database) as copy:
-        try:
-            for record in copy.all_keys():
-                context = node_key_context(copy.id, record.uuid, record.epoch, record.slot)
-                vault.unwrap(record.wrapped, context=context)
-        except VaultFailure:
-            return False
+    try:
+        for record in content.copy.all_keys():
+            context = node_key_context(content.copy.id, record.uuid, record.epoch, record.slot)
+            vault.unwrap(record.wrapped, context=context)
+    except VaultFailure:
+        return False
     return True
 
 
@@ -161,21 +199,21 @@ def merge(store: Store, content: Content, *, dry_run: bool) -> Restored:
 
     Raises NotAuthentic, BadData, StoreFailure.
     """
-    with load(content.database) as copy:
-        _check_inside(copy, content)
-        how = relation(copy, store)
-        work = _Merge(store, copy, how)
-        try:
-            with store.transaction():
-                work.run()
-                back = {name: count for name, count in work.back.items() if count}
-                if back:
-                    detail = {"created": content.created, "relation": how.name.lower(), "back": back}
-                    store.audit.append("restore", None, "merged", detail)
-                if dry_run:
-                    raise _OnlyAPlan
-        except _OnlyAPlan:
-            pass
+    copy = content.copy
+    _check_inside(copy, content)
+    how = relation(copy, store)
+    work = _Merge(store, copy, how)
+    try:
+        with store.transaction():
+            work.run()
+            back = {name: count for name, count in work.back.items() if count}
+            if back:
+                detail = {"created": content.created, "relation": how.name.lower(), "back": back}
+                store.audit.append("restore", None, "merged", detail)
+            if dry_run:
+                raise _OnlyAPlan
+    except _OnlyAPlan:
+        pass
     action = "merged" if back else "nothing"
     return Restored(action, how, back, tuple(work.told()), store.setting("keystore") or "")
 
@@ -183,15 +221,6 @@ def merge(store: Store, content: Content, *, dry_run: bool) -> Restored:
 def _check_inside(copy: Store, content: Content) -> None:
     if copy.id != content.store or copy.setting("station_point") != content.point.hex():
         raise NotAuthentic("The store in the backup is not that of the station that signed it.")
-
-
-def _whole(copy: Store) -> dict[str, int]:
-    return {
-        "whitelist": len(copy.whitelist()),
-        "nodes": len(copy.nodes()),
-        "keys": sum(1 for _ in copy.all_keys()),
-        "trust": len(copy.trusted()),
-    }
 
 
 class _Merge:

@@ -1,167 +1,200 @@
-"""The sealed file of ``backup``: what stands in it, and what opening it checks.
+"""The sealed file of ``backup`` (version 2): what stands in it, and what opening it checks.
 
-Inside, whatever seals it: a compact JWS (ES256) by the station itself, ``typ`` ``teds-backup+jws``, over one line of
-JSON (station, store, date, the vault's secret material) and the octets of the database after it. Outside, either
+One line of JSON in the clear: ``format`` ``teds-backup/2``, ``store``, ``station``, ``created``, ``key`` and ``sha256``
+over all of it, so that a damaged head is told from a wrong passphrase. ``key`` is the file's own random key, sealed
+under a passphrase (Argon2id, AES-256-GCM) or as a JWE to a recovery key, which any JOSE implementation opens.
+Then chunks (:mod:`.chunks`), each bound to the SHA-256 of that line. Inside: a line of JSON (:class:`.content.Head`),
+the store as rows (:mod:`teds_provision.store.dump`), and the station's signature, 64 octets: SIG(station,
+"TEDS1 backup" ‖ 00 ‖ SHA-256 of the first line ‖ SHA-256 of all that stands before the signature).
 
-* a passphrase: JSON with ``format`` ``teds-backup/1``, ``store``, ``station``, ``created`` in the clear, bound to the
-  sealed part (Argon2id, AES-256-GCM), and ``sha256`` over all of it, so that damage is told from a wrong passphrase; or
-* a recovery key: a JWE (General JSON, ``cty`` ``teds-backup+jws``) that any JOSE implementation opens with that key.
+Files of version 1 (:mod:`.version_1`) still open.
 """
 
 from __future__ import annotations
 
 import hashlib
-from dataclasses import dataclass, field
+import os
+from collections.abc import Iterable
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, BinaryIO, Final
 
 from teds_provision import __version__
+from teds_provision.backup import version_1
+from teds_provision.backup.chunks import KEY_OCTETS, ChunkReader, ChunkWriter
+from teds_provision.backup.content import Content, Head
 from teds_provision.errors import BadData, NotAuthentic, NotFound, PolicyRefused
 from teds_provision.protocol.handover import jose
-from teds_provision.protocol.handover.strict_json import decode_base64url, dump, load_object
-from teds_provision.protocol.keys import PrivateKey, fingerprint, is_point
+from teds_provision.protocol.handover.strict_json import dump, load_object
+from teds_provision.protocol.keys import SIGNATURE_OCTETS, PrivateKey, fingerprint, is_point, verify
+from teds_provision.store import Store
+from teds_provision.store.dump import load as load_rows
+from teds_provision.store.snapshot import load as load_database
 from teds_provision.vault import passphrase as sealing
 
-FORMAT: Final = "teds-backup/1"
-MAX_OCTETS: Final = 512 * 1024 * 1024
-TYP: Final = "teds-backup+jws"
+FORMAT: Final = "teds-backup/2"
+KEY_TYPE: Final = "teds-backup-key"
+MAX_OCTETS: Final = 16 << 30
+"""More is neither written nor read: about ten times what 100,000 nodes need."""
+_LABEL: Final = b"TEDS1 backup\0"
 _MAX_HEAD_OCTETS: Final = 64 * 1024
+_MAX_LINE_OCTETS: Final = 256 * 1024
 _TEXTS: Final = ("store", "station", "point", "name", "created", "keystore", "material")
+_CLEAR: Final = ("format", "store", "station", "created")
 
 
-@dataclass(frozen=True)
-class Content:
-    """What a backup holds. ``material`` is all that the vault keeps secret; for a token, only what it has sealed."""
+class Sealer:
+    """What a backup is sealed with: a passphrase, or the 65-octet point of a recovery key."""
 
-    store: str
-    point: bytes
-    name: str
-    created: str
-    keystore: str
-    material: str = field(repr=False)
-    database: bytes = field(repr=False)
+    def __init__(
+        self, *, passphrase: str | None = None, recovery: bytes | None = None, costs: sealing.Costs = sealing.PRODUCT
+    ) -> None:
+        self._passphrase, self._recovery, self._costs = passphrase, recovery, costs
+        if passphrase is not None:
+            sealing.check_new(passphrase)
 
-    @property
-    def station(self) -> str:
-        """Fingerprint of the station."""
-        return fingerprint(self.point)
-
-
-def seal_to_passphrase(content: Content, key: PrivateKey, passphrase: str, costs: sealing.Costs) -> bytes:
-    """Return the file; raises VaultFailure where the passphrase is too weak to be one."""
-    clear = {"format": FORMAT, "store": content.store, "station": content.station, "created": content.created}
-    sealed = sealing.seal(passphrase, _signed(content, key), context=_context(clear), costs=costs)
-    document = {**clear, "sealed": sealed}
-    return dump({**document, "sha256": _digest(document)}) + b"\n"
+    def wrap(self, key: bytes, clear: dict[str, Any]) -> dict[str, Any]:
+        """Seal the file's own key, as a JSON object."""
+        if self._recovery is not None:
+            return load_object(jose.encrypt(key, [self._recovery], cty=KEY_TYPE), "The sealed key")
+        assert self._passphrase is not None
+        return sealing.seal(self._passphrase, key, context=_context(clear), costs=self._costs)
 
 
-def seal_to_key(content: Content, key: PrivateKey, recovery: bytes) -> bytes:
-    """Return the file for the 65-octet point of a recovery key."""
-    return jose.encrypt(_signed(content, key), [recovery], cty=TYP) + b"\n"
+def write(out: BinaryIO, head: Head, rows: Iterable[bytes], signer: PrivateKey, sealer: Sealer) -> bytes:
+    """Write a whole backup; returns the file's own key, to read it back with. Raises what ``rows`` raises, OSError."""
+    key = os.urandom(KEY_OCTETS)
+    clear = {"format": FORMAT, "store": head.store, "station": head.station, "created": head.created}
+    document = {**clear, "key": sealer.wrap(key, clear)}
+    line = dump({**document, "sha256": _digest(document)}) + b"\n"
+    out.write(line)
+    bound = hashlib.sha256(line).digest()
+    chunks = ChunkWriter(out, key, bound)
+    chunks.write(dump(_members(head)) + b"\n")
+    for octets in rows:
+        chunks.write(octets)
+    chunks.write(signer.sign(_LABEL + bound + chunks.digest.digest()))
+    chunks.end()
+    return key
 
 
-def read(path: Path) -> bytes:
-    """Read a file that should be a backup, and not endlessly; raises NotFound, BadData."""
-    try:
-        with path.open("rb") as file:
-            head = file.read(64)
-            _check_start(head)
-            octets = head + file.read(MAX_OCTETS)
-    except OSError as error:
-        raise NotFound(f"{path} cannot be read: {error.strerror}.") from error
-    return octets
+class SealedFile:
+    """A backup that lies in a file, still sealed. Opening it reads its first line; raises NotFound, BadData."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        try:
+            self.octets = path.stat().st_size
+            with path.open("rb") as file:
+                line = file.readline(_MAX_LINE_OCTETS)
+        except OSError as error:
+            raise NotFound(f"{path} cannot be read: {error.strerror}.") from error
+        if line.lstrip()[:1] != b"{":
+            raise BadData("This is not a backup.", hint="Give the file that teds-provision backup wrote.")
+        if self.octets > MAX_OCTETS:
+            raise BadData(f"The file is larger than {MAX_OCTETS} octets; no backup is.")
+        self._line = line
+        self._head: dict[str, Any] | None = None
+        if line.startswith(b'{"format":"teds-backup/2"'):
+            self._head = load_object(line, "The head of the backup") if line.endswith(b"\n") else None
+            if self._head is None or not isinstance(self._head.get("key"), dict):
+                raise BadData("The backup was cut off in its head, or it is damaged.", hint="Take another copy.")
+            self.is_for_key = "protected" in self._head["key"]
+        else:
+            self.is_for_key = version_1.is_for_key(version_1.read(path))
+
+    def open_with_passphrase(self, passphrase: str) -> Content:
+        """Open it; raises BadData, NotAuthentic (damaged or changed), WrongPassphrase, VaultFailure."""
+        if self._head is None:
+            return _of_version_1(version_1.open_with_passphrase(version_1.read(self.path), passphrase))
+        clear = self._checked_head()
+        key, _ = sealing.unseal(passphrase, self._head["key"], context=_context(clear))
+        return self.open_with_content_key(key)
+
+    def open_with_key(self, key: PrivateKey) -> Content:
+        """Open it with the recovery key; raises PolicyRefused (another key), NotAuthentic, BadData."""
+        if self._head is None:
+            return _of_version_1(version_1.open_with_key(version_1.read(self.path), key))
+        self._checked_head()
+        sealed = dump(self._head["key"])
+        recipients = jose.read_header(sealed, max_octets=_MAX_LINE_OCTETS).recipients
+        if fingerprint(key.point) not in recipients:
+            shown = ", ".join(kid[:32] for kid in recipients)
+            raise PolicyRefused(f"The backup is sealed to the recovery key {shown}, not to this one.")
+        return self.open_with_content_key(jose.decrypt(sealed, key, cty=KEY_TYPE, max_octets=_MAX_LINE_OCTETS))
+
+    def open_with_content_key(self, key: bytes) -> Content:
+        """Open it with the file's own key; raises BadData, NotAuthentic, StoreFailure."""
+        clear = self._checked_head()
+        bound = hashlib.sha256(self._line).digest()
+        if len(key) != KEY_OCTETS:
+            raise BadData("The backup's own key has another length than 32 octets.")
+        try:
+            with self.path.open("rb") as file:
+                file.seek(len(self._line))
+                return _content(ChunkReader(file, key, bound), bound, clear)
+        except OSError as error:
+            raise NotFound(f"{self.path} cannot be read: {error.strerror}.") from error
+
+    def _checked_head(self) -> dict[str, Any]:
+        """The members in the clear, held against their digest."""
+        assert self._head is not None
+        document = {name: value for name, value in self._head.items() if name != "sha256"}
+        if self._head.get("sha256") != _digest(document):
+            raise NotAuthentic("The backup was damaged or changed: its digest does not fit.", hint="Take another copy.")
+        return {name: self._head.get(name) for name in _CLEAR}
 
 
-def is_for_key(octets: bytes) -> bool:
-    """Say whether a recovery key opens this file (else a passphrase); raises BadData where it is no backup."""
-    document = _document(octets)
-    if "protected" in document:
-        return True
-    if document.get("format") != FORMAT:
-        raise BadData("This is not a backup of this version of teds-provision.")
-    return False
-
-
-def open_with_passphrase(octets: bytes, passphrase: str) -> Content:
-    """Open a file; raises BadData, NotAuthentic (damaged or changed), WrongPassphrase, VaultFailure."""
-    document = _document(octets)
-    digest = document.pop("sha256", None)
-    if digest != _digest(document):
-        raise NotAuthentic("The backup was damaged or changed: its digest does not fit.", hint="Take another copy.")
-    clear = {name: document.get(name) for name in ("format", "store", "station", "created")}
-    sealed = document.get("sealed")
-    if not isinstance(sealed, dict):
-        raise BadData("The backup has no sealed part.")
-    inner, _ = sealing.unseal(passphrase, sealed, context=_context(clear))
-    content = _verified(inner)
-    if (content.store, content.station) != (clear["store"], clear["station"]):
+def _content(chunks: ChunkReader, bound: bytes, clear: dict[str, Any]) -> Content:
+    head = _head_of(chunks.read_line(_MAX_HEAD_OCTETS))
+    if (head.store, head.station, head.created) != (clear["store"], clear["station"], clear["created"]):
         raise NotAuthentic("The backup says outside that it is of another station than it is inside.")
-    return content
+    copy = load_rows(chunks)
+    try:
+        signed = _LABEL + bound + chunks.digest.digest()
+        if not verify(head.point, signed, chunks.read(SIGNATURE_OCTETS)):
+            raise NotAuthentic("The backup is not signed by the station that it names.")
+        chunks.require_end()
+        return _with(head, copy)
+    except BaseException:
+        copy.close()
+        raise
 
 
-def open_with_key(octets: bytes, key: PrivateKey) -> Content:
-    """Open a file with the recovery key; raises PolicyRefused (another key), NotAuthentic, BadData."""
-    recipients = jose.read_header(octets, max_octets=MAX_OCTETS).recipients
-    if fingerprint(key.point) not in recipients:
-        shown = ", ".join(kid[:16] for kid in recipients)
-        raise PolicyRefused(f"The backup is sealed to the recovery key {shown}, not to this one.")
-    return _verified(jose.decrypt(octets, key, cty=TYP, max_octets=MAX_OCTETS))
+def _with(head: Head, copy: Store) -> Content:
+    return Content(**vars(head), copy=copy)
 
 
-def _signed(content: Content, key: PrivateKey) -> bytes:
-    head = {
+def _of_version_1(old: version_1.Content) -> Content:
+    head = Head(old.store, old.point, old.name, old.created, old.keystore, old.material)
+    return _with(head, load_database(old.database))
+
+
+def _members(head: Head) -> dict[str, str]:
+    return {
         "format": FORMAT,
-        "store": content.store,
-        "station": content.station,
-        "point": content.point.hex(),
-        "name": content.name,
-        "created": content.created,
-        "keystore": content.keystore,
-        "material": content.material,
+        "store": head.store,
+        "station": head.station,
+        "point": head.point.hex(),
+        "name": head.name,
+        "created": head.created,
+        "keystore": head.keystore,
+        "material": head.material,
         "version": __version__,
     }
-    return jose.sign_compact(dump(head) + b"\n" + content.database, key, typ=TYP)
 
 
-def _verified(inner: bytes) -> Content:
-    """Check the signature under the key that the content names; whose key that is, the caller has to know."""
-    parts = inner.split(b".", 2)
-    unchecked = _parsed(decode_base64url(parts[1] if len(parts) == 3 else b"", "The content of the backup"))
-
-    def named(kid: str) -> bytes | None:
-        return unchecked.point if kid == unchecked.station else None
-
-    return _parsed(jose.verify_compact(inner, named, typ=TYP, max_octets=MAX_OCTETS).payload)
-
-
-def _parsed(payload: bytes) -> Content:
-    end = payload.find(b"\n", 0, _MAX_HEAD_OCTETS)
-    if end < 0:
-        raise BadData("The content of the backup has no head.")
-    head = load_object(payload[:end], "The head of the backup")
-    if head.get("format") != FORMAT or not all(isinstance(head.get(name), str) for name in _TEXTS):
+def _head_of(line: bytes) -> Head:
+    members = load_object(line, "The head of the backup")
+    if members.get("format") != FORMAT or not all(isinstance(members.get(name), str) for name in _TEXTS):
         raise BadData("The head of the backup is not of this version.")
     try:
-        point = bytes.fromhex(head["point"])
+        point = bytes.fromhex(members["point"])
     except ValueError:
         point = b""
     if not is_point(point):
         raise BadData("The backup names no valid station key.")
-    return Content(
-        head["store"], point, head["name"], head["created"], head["keystore"], head["material"], payload[end + 1 :]
-    )
-
-
-def _document(octets: bytes) -> dict[str, Any]:
-    if len(octets) > MAX_OCTETS:
-        raise BadData(f"The file is larger than {MAX_OCTETS} octets; no backup is.")
-    _check_start(octets[:64])
-    return load_object(octets, "The backup")
-
-
-def _check_start(octets: bytes) -> None:
-    if octets.lstrip()[:1] != b"{":
-        raise BadData("This is not a backup.", hint="Give the file that teds-provision backup wrote.")
+    values = (members[name] for name in ("name", "created", "keystore", "material"))
+    return Head(members["store"], point, *values)
 
 
 def _digest(document: dict[str, Any]) -> str:

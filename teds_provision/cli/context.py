@@ -153,6 +153,17 @@ class App:
         answer: str = click.prompt(prompt, hide_input=True, confirmation_prompt=confirm, err=True)
         return answer
 
+    def ask_new(self, prompt: str) -> str:
+        """Get a new passphrase where --passphrase-fd gives the old one: from the terminal, typed twice."""
+        if self.no_input or not sys.stdin.isatty():
+            raise WrongPassphrase(
+                f"{prompt.rstrip(': ')} is needed and nobody can be asked.",
+                hint="Give it through a file descriptor: --new-passphrase-fd 4 4<FILE.",
+            )
+        self.live_line()
+        answer: str = click.prompt(prompt, hide_input=True, confirmation_prompt=True, err=True)
+        return answer
+
     # -- the station -----------------------------------------------------------------------------------------------
 
     def station(self) -> Station:

@@ -53,6 +53,7 @@ SECTIONS: Final[dict[str, dict[str, Entry]]] = {
         "decommission": Entry("handover.life", "decommission", "Reset a node and take it out of service."),
         "replace": Entry("handover.life", "replace", "Put a spare in the place of a broken node."),
         "backup": Entry("station.backup", "backup", "Write the whole store to a sealed file."),
+        "vault": Entry("station.vault", "vault", "A new passphrase or PIN; a new master key over every node key."),
         "restore": Entry("station.backup", "restore", "Bring a sealed store back; no epoch or sequence goes back."),
     },
     "Try it": {
@@ -62,5 +63,5 @@ SECTIONS: Final[dict[str, dict[str, Entry]]] = {
 }
 
 COMMANDS: Final = {name: entry for section in SECTIONS.values() for name, entry in section.items()}
-GROUPS: Final = frozenset({"trust", "profile", "whitelist", "handover", "node"})
+GROUPS: Final = frozenset({"vault", "trust", "profile", "whitelist", "handover", "node"})
 """The commands that have commands of their own."""

@@ -9,14 +9,15 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
-from teds_provision.errors import BadData, NotAuthentic, NotFound, PolicyRefused, VaultFailure
+from teds_provision.errors import BadData, NotAuthentic, NotFound, PolicyRefused
 from teds_provision.protocol.handover.jwk import point_of, public_jwk
 from teds_provision.protocol.handover.strict_json import decode_base64url, dump, encode_base64url, load_object
 from teds_provision.protocol.keys import PrivateKey, fingerprint, station_key_message, verify
 from teds_provision.station.station import DEFAULT_NAME, Station
 from teds_provision.store import Store, StoreLock
+from teds_provision.vault import create_vault
 
 if TYPE_CHECKING:
     from teds_provision.vault import Ask, Vault
@@ -113,7 +114,7 @@ def ask_for_certificate(home: Path, *, name: str | None, keystore: str | None, a
         if station.identity.is_complete():
             return make_request(station.name, station.vault.identity())
         if station.identity.requested is None:
-            vault, why = _vault_without_ca(home, store.id, keystore, ask)
+            vault, why = create_vault(home, store.id, keystore, ask, with_ca=False)
             facts = {
                 "station_name": name or DEFAULT_NAME,
                 "requested_point": vault.identity().point.hex(),
@@ -126,18 +127,6 @@ def ask_for_certificate(home: Path, *, name: str | None, keystore: str | None, a
         else:
             vault = station.vault
         return make_request(station.name, vault.identity())
-
-
-def _vault_without_ca(home: Path, store_id: str, keystore: str | None, ask: Ask) -> tuple[Vault, str]:
-    from teds_provision.vault import create_vault
-
-    if keystore is not None and keystore.startswith("pkcs11:"):
-        from teds_provision.vault.pkcs11 import Pkcs11Vault
-
-        return Pkcs11Vault.create(home, store_id, keystore, ask, with_ca=False), "the token was asked for"
-    vault, why = create_vault(home, store_id, keystore, ask)
-    vault.drop_ca()  # type: ignore[attr-defined]  # made a moment ago and never used
-    return vault, why
 
 
 def adopt_certificate(home: Path, certificate: Certificate, *, ask: Ask) -> Station:
@@ -206,13 +195,13 @@ def require_ca(station: Station) -> PrivateKey:
 def export_ca(station: Station, vault: Vault, path: Path, passphrase: str) -> None:
     """Write the CA key to a new file under a passphrase; raises PolicyRefused, VaultFailure (token, file)."""
     require_ca(station)
-    _software(vault).export_ca(path, passphrase)
+    vault.export_ca(path, passphrase)
     station.audit("ca", None, "exported", ca=fingerprint(station.ca))
 
 
 def drop_ca(station: Station) -> bool:
     """Delete the CA key from the vault; False if it is not there."""
-    dropped: bool = _software(station.vault).drop_ca()
+    dropped = station.vault.drop_ca()
     if dropped:
         station.audit("ca", None, "dropped", ca=fingerprint(station.ca))
     return dropped
@@ -225,27 +214,5 @@ def import_ca(station: Station, vault: Vault, path: Path, passphrase: str) -> No
 
     if SoftwareKey.from_secret(read_ca(path, passphrase)).point != station.ca:
         raise PolicyRefused(f"{path} holds another CA key than that of this station ({fingerprint(station.ca)[:16]}).")
-    _software(vault).import_ca(path, passphrase)
+    vault.import_ca(path, passphrase)
     station.audit("ca", None, "imported", ca=fingerprint(station.ca))
-
-
-def _software(vault: Vault) -> Any:
-    """The vault's own methods for its CA key, which not every kind has."""
-    if not all(hasattr(vault, name) for name in ("export_ca", "drop_ca")):
-        raise VaultFailure(f"The {vault.kind} vault cannot do that with its CA key.")
-    if vault.kind == "pkcs11" and not hasattr(vault, "import_ca"):
-        return _Token(vault)
-    return vault
-
-
-class _Token:
-    """A token's CA key: it can be destroyed, but neither leave nor come."""
-
-    def __init__(self, vault: Any) -> None:
-        self.export_ca, self.drop_ca = vault.export_ca, vault.drop_ca
-
-    def import_ca(self, path: Path, passphrase: str) -> None:
-        """Refuse."""
-        raise VaultFailure(
-            "A CA key from a file cannot be put into a token.", hint="Use --keystore file in another home."
-        )

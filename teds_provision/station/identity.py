@@ -81,6 +81,27 @@ class Identity:
         """Why init chose this keystore, in words."""
         return self._store.setting("keystore_why") or ""
 
+    @property
+    def rewrapping(self) -> int | None:
+        """Number of the master key that the link keys are being wrapped under anew, None where no such run is open."""
+        number = self._store.setting("rewrapping")
+        return int(number) if number else None
+
+    @property
+    def master(self) -> int:
+        """Number of the master key that wraps link keys now, 1 where it was never changed."""
+        return int(self._store.setting("master") or 1)
+
+    def begin_rewrapping(self, number: int) -> None:
+        """Have every process wrap under this master key from now on."""
+        with self._store.transaction():
+            self._store.set_setting("master", str(number))
+            self._store.set_setting("rewrapping", str(number))
+
+    def end_rewrapping(self) -> None:
+        """Note that no key is wrapped under an older master key any more."""
+        self._store.set_setting("rewrapping", "")
+
     # -- certificates ----------------------------------------------------------------------------------------------
 
     def certify(self, point: bytes) -> bytes:

@@ -19,6 +19,9 @@ CA_OF, NEXT_CA, ROTATION = "ca-of:", "next-ca:", "rotate:"
 """Names of settings by node (UUID in hex follows): the CA key that it keeps, the one that it keeps if a pending key
 (``keyId:P(CA)``, both hex) turns out to be good, and why a rotation is due."""
 
+RESTORED = "restored from a backup"
+"""Begins the reason of a rotation that needs a tap or a person's word: nobody knows who else has that key by now."""
+
 
 @dataclass(frozen=True)
 class NodeKey:
@@ -34,10 +37,13 @@ class NodeKey:
 class NodeKeys:
     """The link keys of one station: wrapped in the store, opened by the vault."""
 
-    def __init__(self, store: Store, vault: Callable[[], Vault], identity: Identity) -> None:
+    def __init__(
+        self, store: Store, vault: Callable[[], Vault], identity: Identity, reopened: Callable[[], Vault] | None = None
+    ) -> None:
         self._store = store
         self._vault = vault
         self._identity = identity
+        self._reopened = reopened or vault
 
     def of(self, uuid: bytes) -> list[KeyRecord]:
         """The keys of a node, wrapped, in the order to try them: newest pending first, the active one last."""
@@ -89,15 +95,24 @@ class NodeKeys:
     def wrapped(
         self, uuid: bytes, *, key: bytes, key_id: bytes, epoch: int, slot: int, source: KeySource, created: str
     ) -> KeyRecord:
-        """Return the record of a new pending key in a slot that the node never had."""
+        """Return the record of a new pending key in a slot that the node never had; call it inside the transaction."""
         context = node_key_context(self._store.id, uuid, epoch, slot)
-        sealed = self._vault().wrap(key, context=context)
+        vault = self._vault()
+        if self._identity.master not in vault.masters():  # another process has changed it (vault rewrap)
+            vault = self._reopened()
+        sealed = vault.wrap(key, context=context)
         return KeyRecord(uuid, epoch, key_id.hex(), "pending", slot, sealed, source, created)
 
     def unwrap(self, record: KeyRecord) -> bytes:
         """Return a link key in the clear; raises VaultFailure where it is damaged or of another vault."""
         context = node_key_context(self._store.id, record.uuid, record.epoch, record.slot)
-        return self._vault().unwrap(record.wrapped, context=context)
+        vault = self._vault()
+        try:
+            return vault.unwrap(record.wrapped, context=context)
+        except VaultFailure:
+            if self._identity.master in vault.masters():
+                raise
+        return self._reopened().unwrap(record.wrapped, context=context)
 
     def promote(self, uuid: bytes, key_id: str) -> None:
         """Make a key the active one after a good Open under it; its CA is then the one that the node keeps."""
@@ -112,6 +127,10 @@ class NodeKeys:
     def remove(self, uuid: bytes) -> int:
         """Delete every key of a node; returns how many there were."""
         return self._store.remove_keys(uuid)
+
+    def wrap_anew(self, rewrap: Callable[[KeyRecord], bytes]) -> int:
+        """Replace the wrapped form of every key by what ``rewrap`` gives, all or none; returns how many."""
+        return self._store.replace_keys(rewrap)
 
     # -- the CA that a node keeps ----------------------------------------------------------------------------------
 
@@ -142,6 +161,10 @@ class NodeKeys:
     def rotations_due(self) -> dict[bytes, str]:
         """Why a rotation is due, for every node that has one."""
         return {bytes.fromhex(uuid): why for uuid, why in self._store.settings(ROTATION).items() if why}
+
+    def restored(self, uuid: bytes) -> bool:
+        """Whether the keys of a node came back from a backup and none was agreed since."""
+        return (self.rotation_due(uuid) or "").startswith(RESTORED)
 
     def demand_rotation(self, uuid: bytes, why: str) -> None:
         """Have the next session with a node rotate its key before anything else."""

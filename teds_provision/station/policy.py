@@ -95,6 +95,14 @@ class Policy:
             )
         return entry
 
+    def require_not_restored(self, uuid: bytes) -> None:
+        """Raise PolicyRefused for a node whose key came back from a backup: it may have been given away since."""
+        if self._keys.restored(uuid):
+            raise PolicyRefused(
+                f"The key of node {uuid.hex()} was {self._keys.rotation_due(uuid)}.",
+                hint=f"Tap it (any command), or rotate it by your word: agree {uuid.hex()} --rotate --yes",
+            )
+
     def require_not_given_away(self, uuid: bytes) -> None:
         """Raise PolicyRefused for a node that was moved to another station: its key is used no more."""
         tombstone = self.tombstone(uuid)

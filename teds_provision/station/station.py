@@ -16,7 +16,7 @@ Opening a station reads the store only; the vault opens at the first secret.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -31,6 +31,7 @@ from teds_provision.station.nodes import Nodes
 from teds_provision.station.pins import Pins
 from teds_provision.station.policy import Policy
 from teds_provision.store import AuditLog, Store, StoreLock
+from teds_provision.store.dump import dump
 
 if TYPE_CHECKING:
     from teds_provision.vault import Ask, Vault
@@ -46,7 +47,7 @@ class Station:
         self._ask = ask
         self._vault: Vault | None = None
         self.identity = Identity(store, self._opened)
-        self.keys = NodeKeys(store, self._opened, self.identity)
+        self.keys = NodeKeys(store, self._opened, self.identity, self._reopened)
         self.pins = Pins(store, self.keys, store.audit)
         self.policy = Policy(store, self.identity, self.keys)
         self.nodes = Nodes(store)
@@ -114,6 +115,11 @@ class Station:
             self._vault = open_vault(self.home, self.id, self.identity.keystore, self._ask)
         return self._vault
 
+    def _reopened(self) -> Vault:
+        """Open the vault again: another process has replaced what this one read."""
+        self._vault = None
+        return self._opened()
+
     def unlock(self, uuid: bytes | None = None) -> None:
         """Open the vault now: nobody is asked for a passphrase while the store is locked or a node lies there.
 
@@ -125,6 +131,10 @@ class Station:
     def credentials(self, uuid: bytes | None = None) -> Credentials:
         """What the station shows and signs with: to node ``uuid`` under the CA that this node keeps, else its own."""
         return self.identity.credentials(None if uuid is None else self.keys.ca_of(uuid))
+
+    def rows(self) -> Iterator[bytes]:
+        """The whole store as it is at one moment, as a stream (see :mod:`teds_provision.store.dump`)."""
+        return dump(self._store)
 
     # -- one command at a time, all or nothing, and who did it -----------------------------------------------------
 

@@ -24,13 +24,16 @@ class Agreed:
     fresh: bool
 
 
-def open_session(station: Station, node: Conversation) -> NodeKey | None:
+def open_session(station: Station, node: Conversation, *, word: bool = False) -> NodeKey | None:
     """Open a session under the first key that the node knows, newest pending first; None where it knows none.
 
     The key that worked becomes the active one and all others go: that is the only thing that ever deletes a key.
-    Raises PolicyRefused for a node that was moved away, LinkFailure.
+    ``word``: a person said that this node may be used although its key came back from a backup. Raises PolicyRefused
+    for a node that was moved away, or that is neither tapped nor vouched for then; LinkFailure.
     """
     station.policy.require_not_given_away(node.uuid)
+    if not (node.tapped or word):
+        station.policy.require_not_restored(node.uuid)
     for held in station.keys.unwrapped(node.uuid):
         try:
             node.open(held.key)
@@ -97,12 +100,13 @@ def unknown_key(uuid: bytes) -> PolicyRefused:
 def agree(station: Station, node: Conversation, who: Identified, *, rotate: bool = False) -> Agreed:
     """End with a session open under an agreed key: the present one, or a new one.
 
-    ``rotate`` demands a new one: inside a session where a key is known, else by tap. Raises NotWhitelisted, OtherKey,
-    PolicyRefused, NodeRefused, NotAuthentic, LinkFailure; whatever is cut, the same call carries on.
+    ``rotate`` demands a new one, by a person's word: inside a session where a key is known, else by tap.
+    Raises NotWhitelisted, OtherKey, PolicyRefused, NodeRefused, NotAuthentic, LinkFailure; whatever is cut, the same
+    call carries on.
     """
     returning = who.state == NodeState.FACTORY and _may_return(station, node.uuid)
     entry = station.policy.require_whitelisted(node.uuid, returning=returning)
-    held = open_session(station, node) if who.state != NodeState.FACTORY else None
+    held = open_session(station, node, word=rotate) if who.state != NodeState.FACTORY else None
     rotate = rotate or (held is not None and station.keys.rotation_due(node.uuid) is not None)
     if held is not None and not rotate:
         return Agreed(held.record.epoch, held.record.key_id, fresh=False)

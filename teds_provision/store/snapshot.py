@@ -1,4 +1,4 @@
-"""Copies of a whole store: taken while it is in use, opened in memory, put in the place of a lost one."""
+"""Copies of a whole store: held against a living one, put in the place of a lost one."""
 
 from __future__ import annotations
 
@@ -10,13 +10,14 @@ from pathlib import Path
 from typing import Final
 
 from teds_provision.errors import BadData, StoreFailure
-from teds_provision.files import whole_file
+from teds_provision.files import whole_draft
 from teds_provision.store.audit import AuditLog
 from teds_provision.store.database import FILE_NAME, Database, as_store_failure
 from teds_provision.store.store import Store
 
 _MAGIC: Final = b"SQLite format 3\0"
 _FORMAT_VERSIONS: Final = slice(18, 20)  # of the file header: 1 for a rollback journal, 2 for a write-ahead log
+_COUNTED: Final = ("whitelist", "nodes", "keys", "trust")
 _DAMAGE: Final = (sqlite3.SQLITE_CORRUPT, sqlite3.SQLITE_NOTADB)
 
 
@@ -29,22 +30,11 @@ class Relation(Enum):
     DIVERGED = "a state that went another way"
 
 
-def take(store: Store) -> bytes:
-    """Return the store as the octets of a database file, as it is at one moment, whoever else is at work on it.
-
-    Raises StoreFailure.
-    """
-    database = store._database
-    with closing(sqlite3.connect(":memory:")) as copy:
-        with database._lock, database._translated():
-            database._connection.backup(copy)
-        octets = bytearray(copy.serialize())
-    octets[_FORMAT_VERSIONS] = b"\1\1"
-    return bytes(octets)
-
-
 def load(octets: bytes) -> Store:
-    """Open what :func:`take` gave, in memory; an older schema is brought forward. Raises BadData, StoreFailure."""
+    """Open a whole database file (backups of version 1 hold one) in memory; an older schema is brought forward.
+
+    Raises BadData, StoreFailure.
+    """
     if not octets.startswith(_MAGIC) or octets[_FORMAT_VERSIONS] != b"\1\1":
         raise BadData("The backup holds no store.")
     connection = sqlite3.connect(":memory:", isolation_level=None, check_same_thread=False)
@@ -75,12 +65,20 @@ def place(copy: Store, home: Path) -> None:
     if path.exists():
         raise StoreFailure(f"There is a store in {home} already.", hint="Restore into another --home.")
     try:
-        with whole_file(path, replace=False) as file:
-            file.write(take(copy))
+        with whole_draft(path, replace=False) as (draft, _):
+            with closing(sqlite3.connect(draft)) as target, copy._database._lock, copy._database._translated():
+                target.execute("PRAGMA journal_mode=OFF")  # a draft that fails goes whole
+                copy._database._connection.backup(target)
             for left in ("-wal", "-shm"):  # of a store that is gone: they would be replayed into this one
                 path.with_name(FILE_NAME + left).unlink(missing_ok=True)
-    except OSError as error:
+    except (OSError, sqlite3.Error) as error:
         raise as_store_failure(error, path) from error
+
+
+def totals(store: Store) -> dict[str, int]:
+    """Count whitelist, nodes, keys and trusted keys of a store."""
+    count = store._database.one
+    return {table: int((count(f"SELECT count(*) FROM {table}") or (0,))[0]) for table in _COUNTED}
 
 
 def set_aside(home: Path) -> Path:

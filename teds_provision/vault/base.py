@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from pathlib import Path
 from typing import TYPE_CHECKING, Protocol
 
 if TYPE_CHECKING:
@@ -36,6 +37,39 @@ class Vault(Protocol):
 
     def unwrap(self, wrapped: bytes, *, context: bytes) -> bytes:
         """Open what :meth:`wrap` gave, under the same context."""
+
+    def masters(self) -> tuple[int, ...]:
+        """Return the numbers of the master keys, ascending; the last one wraps, all of them unwrap."""
+
+    def add_master(self) -> None:
+        """Add a master key durably; it wraps from now on. First step of a change."""
+
+    def retire_masters(self) -> None:
+        """Forget all master keys but the newest, durably. Last step of a change, once every key is wrapped anew."""
+
+    def change_passphrase(self, ask: Ask) -> None:
+        """Replace the passphrase (or PIN) durably; the keys stay. Raises VaultFailure where another program does that.
+
+        ``ask`` is called for the new one, and before it for the old one where the vault has to give it on.
+        """
+
+    def export_ca(self, path: Path, passphrase: str) -> None:
+        """Write the CA key to a new file as an encrypted PKCS #8 PEM; the vault keeps it until :meth:`drop_ca`.
+
+        Raises UsageFailure (the file exists), VaultFailure: no CA key here, one that cannot leave, a weak passphrase.
+        """
+
+    def drop_ca(self) -> bool:
+        """Take the CA key out of the vault for good; False if there is none."""
+
+    def import_ca(self, path: Path, passphrase: str) -> PrivateKey:
+        """Take in the CA key that :meth:`export_ca` wrote, and return it.
+
+        Raises WrongPassphrase, NotFound, VaultFailure: not such a file, another CA key is here, none can come in.
+        """
+
+    def replaced(self) -> bool:
+        """Say whether another process has replaced what this one opened, so that it has to be opened again."""
 
     def secret_material(self) -> str:
         """Return what a sealed backup has to hold so that this vault can be made again. Whoever calls it seals it."""

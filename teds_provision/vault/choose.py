@@ -19,14 +19,17 @@ def create_vault(
     *,
     costs: Costs = PRODUCT,
     restored: str | None = None,
+    with_ca: bool = True,
 ) -> tuple[Vault, str]:
     """Make the vault of a station, or open the one that an earlier run made; return it and why it was chosen.
 
     ``keystore`` is ``keyring``, ``file``, ``pkcs11:…`` (RFC 7512) or None: then the keyring if one works (proven by a
     set, a read back and a delete), else a passphrase file. ``costs`` are those of a new passphrase file, ``restored``
-    the secret material of a backup. Raises VaultFailure and its leaves, UsageFailure.
+    the secret material of a backup; ``with_ca`` False makes no CA key. Raises VaultFailure (leaves too), UsageFailure.
     """
-    vault, why = _create(home, store_id, keystore, ask, costs, restored)
+    vault, why = _create(home, store_id, keystore, ask, costs, restored, with_ca=with_ca)
+    if not with_ca and restored is None:
+        vault.drop_ca()  # one that was made a moment ago and never used
     _opened[home.resolve(), store_id, keystore if keystore and vault.kind == "pkcs11" else vault.kind] = vault
     return vault, why
 
@@ -38,7 +41,7 @@ def open_vault(home: Path, store_id: str, keystore: str, ask: Ask) -> Vault:
     """
     place = (home.resolve(), store_id, keystore)
     vault = _opened.get(place)
-    if vault is None or _replaced(vault, home):
+    if vault is None or vault.replaced():
         _opened[place] = vault = _open(home, store_id, keystore, ask)
     return vault
 
@@ -48,15 +51,15 @@ def forget_vaults() -> None:
     _opened.clear()
 
 
-def _replaced(vault: Vault, home: Path) -> bool:
-    """Say whether another process has written the passphrase file since this one opened it."""
-    from teds_provision.vault.file_vault import FILE_NAME, FileVault, stamp
-
-    return isinstance(vault, FileVault) and vault.stamp != stamp(home / FILE_NAME)
-
-
 def _create(
-    home: Path, store_id: str, keystore: str | None, ask: Ask, costs: Costs, restored: str | None
+    home: Path,
+    store_id: str,
+    keystore: str | None,
+    ask: Ask,
+    costs: Costs,
+    restored: str | None,
+    *,
+    with_ca: bool,
 ) -> tuple[Vault, str]:
     from teds_provision.vault.file_vault import FILE_NAME, FileVault
     from teds_provision.vault.keyring_vault import KeyringVault
@@ -64,7 +67,9 @@ def _create(
     if keystore is not None and keystore.startswith("pkcs11:"):
         from teds_provision.vault.pkcs11 import Pkcs11Vault
 
-        return Pkcs11Vault.create(home, store_id, keystore, ask, restored=restored), "the token was asked for"
+        return Pkcs11Vault.create(
+            home, store_id, keystore, ask, restored=restored, with_ca=with_ca
+        ), "the token was asked for"
     if keystore == "keyring":
         return KeyringVault.create(store_id, restored=restored), "the keyring was asked for"
     if keystore == "file":

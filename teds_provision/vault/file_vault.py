@@ -69,13 +69,17 @@ class FileVault(SoftwareVault):
         return cls(path, store_id, Material.decode(plaintext.decode("ascii", "replace")), key)
 
     def change_passphrase(self, ask: Ask, *, costs: Costs = PRODUCT) -> None:
-        """Seal the same keys under a new passphrase."""
+        """Seal the same keys under a new passphrase. Copies and backups made before still open with the old one."""
         passphrase = ask("New passphrase for this station's keys", True)
         check_new(passphrase)
         key = SealingKey.derive(passphrase, costs=costs)
         write_whole(self._path, _sealed(self._store_id, self._material, key), failure=VaultFailure)
         self._key = key
         self.stamp = stamp(self._path)
+
+    def replaced(self) -> bool:
+        """Say whether another process has written the file since this one opened it."""
+        return self.stamp != stamp(self._path)
 
     def _save(self, material: Material) -> None:
         write_whole(self._path, _sealed(self._store_id, material, self._key), failure=VaultFailure)

@@ -15,7 +15,7 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Final, NoReturn, TypeVar
 
 from teds_provision.errors import NoKeyring, VaultFailure
-from teds_provision.vault.base import SERVICE
+from teds_provision.vault.base import SERVICE, Ask
 from teds_provision.vault.master import Material
 from teds_provision.vault.software import SoftwareVault, settle
 
@@ -82,6 +82,18 @@ class KeyringVault(SoftwareVault):
             "The keyring has no entry for this station.",
             hint="Open the keyring of the user who ran init, or restore a backup (teds-provision restore).",
         )
+
+    def change_passphrase(self, ask: Ask) -> None:
+        """Refuse: the keyring asks for its own passphrase. Raises VaultFailure always."""
+        raise VaultFailure(
+            f"The keyring has a passphrase of its own ({self.description}).",
+            hint="Change it with the keyring's own program (Seahorse, KWallet manager, Keychain Access, passwd).",
+        )
+
+    def replaced(self) -> bool:
+        """Say whether another process has replaced the entry since this one read it."""
+        line = _get(self._name(), self._backend, self._entry)
+        return line is not None and line != self._material.encode()
 
     def _save(self, material: Material) -> None:
         _set(self._name(), self._backend, self._entry, material.encode())

@@ -19,6 +19,7 @@ from teds_provision.errors import BadData, NotFound, VaultFailure
 from teds_provision.files import read_limited, write_new, write_whole
 from teds_provision.protocol.keys import PrivateKey, SoftwareKey, fingerprint, verify
 from teds_provision.vault.base import Ask
+from teds_provision.vault.file_vault import stamp
 from teds_provision.vault.master import MasterKeys
 from teds_provision.vault.pkcs11_lock import exclusive
 from teds_provision.vault.pkcs11_token import TokenKey, TokenSession, ask_pin, find_token, log_in
@@ -41,6 +42,7 @@ class Pkcs11Vault:
         self.description = f"PKCS #11 token {session.label!r} by {uri.module_path}"
         self._home, self._store_id, self._module_path = home, store_id, uri.module_path
         self._session, self._content = session, content
+        self._stamp = stamp(home / FILE_NAME)
 
     @classmethod
     def create(
@@ -107,6 +109,12 @@ class Pkcs11Vault:
             hint="Keep the token itself away, or make the CA in another home with --keystore file.",
         )
 
+    def import_ca(self, path: Path, passphrase: str) -> PrivateKey:
+        """Refuse: a key from a file was in the clear somewhere. Raises VaultFailure always."""
+        raise VaultFailure(
+            "A CA key from a file cannot be put into a token.", hint="Use --keystore file in another home."
+        )
+
     def drop_ca(self) -> bool:
         """Destroy the CA key in the token for good; False if there is none. It cannot be exported before."""
         key = self._content.ca
@@ -115,6 +123,20 @@ class Pkcs11Vault:
         self._replace(_Content(self._content.station, None, self._content.masters))
         self._session.destroy(key)
         return True
+
+    def masters(self) -> tuple[int, ...]:
+        """Return the numbers of the master keys, ascending; the last one wraps."""
+        return tuple(sorted(self._content.masters.keys))
+
+    def change_passphrase(self, ask: Ask) -> None:
+        """Have the token set a new PIN; it asks for the old one. Raises WrongPassphrase, VaultFailure."""
+        old, new = ask("PIN of the token, as it is now", False), ask("New PIN of the token", True)
+        with exclusive(self._module_path):
+            self._session.set_pin(old, new)
+
+    def replaced(self) -> bool:
+        """Say whether another process has replaced the file since this one opened it."""
+        return self._stamp != stamp(self._home / FILE_NAME)
 
     def add_master(self) -> None:
         """Add a master key, which wraps from now on; the old ones still unwrap. First step of a change."""
@@ -127,7 +149,8 @@ class Pkcs11Vault:
 
     def secret_material(self) -> str:
         """Return what a backup needs: the file, sealed as it is. It is of no use without the token."""
-        return (self._home / FILE_NAME).read_text()
+        octets = read_limited(self._home / FILE_NAME, _MAX_OCTETS, "vault", failure=VaultFailure, follow=False)
+        return octets.decode("utf-8", "replace")
 
     def close(self) -> None:
         """End the session with the token."""
@@ -145,7 +168,7 @@ class Pkcs11Vault:
     def _replace(self, content: _Content) -> None:
         with exclusive(self._module_path):
             _save(self._home, self._store_id, content, replace=True)
-        self._content = content
+        self._content, self._stamp = content, stamp(self._home / FILE_NAME)
 
     def __repr__(self) -> str:
         return f"Pkcs11Vault({self.description}, station {fingerprint(self._content.station.point)[:16]})"

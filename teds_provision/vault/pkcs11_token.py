@@ -114,6 +114,27 @@ class TokenSession:
 
         guarded(run)
 
+    def set_pin(self, old: str, new: str) -> None:
+        """Have the token take a new user PIN; one try. Raises WrongPassphrase, VaultFailure."""
+        from pkcs11 import exceptions
+
+        def run() -> None:
+            with self._token.open(rw=True) as session:
+                session.set_pin(old, new)
+
+        try:
+            run()
+        except (exceptions.PinIncorrect, exceptions.ArgumentsBad):
+            raise WrongPassphrase(
+                f"The PIN of the token {self.label!r} is wrong.", hint="Run it again with the right PIN."
+            ) from None
+        except (exceptions.PinInvalid, exceptions.PinLenRange):
+            raise VaultFailure(
+                f"The token {self.label!r} does not take this as a new PIN.", hint="Mind its length and its characters."
+            ) from None
+        except exceptions.PKCS11Error as error:
+            raise _failure(error) from error
+
     def close(self) -> None:
         """End the session; the last one to end logs out."""
         guarded(self._session.close, retry=False)

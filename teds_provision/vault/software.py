@@ -45,7 +45,7 @@ class SoftwareVault(ABC):
     def export_ca(self, path: Path, passphrase: str) -> None:
         """Write the CA key to ``path`` as an encrypted PKCS #8 PEM; the vault keeps it until :meth:`drop_ca`.
 
-        Raises VaultFailure: no CA key here, passphrase too weak, the file exists or cannot be written.
+        Raises UsageFailure (the file exists), VaultFailure: no CA key here, weak passphrase, it cannot be written.
         """
         from teds_provision.vault.ca_file import write_ca
 
@@ -73,6 +73,14 @@ class SoftwareVault(ABC):
         if self._material.ca is None:
             self._replace(self._material.with_ca(secret))
         return SoftwareKey.from_secret(secret)
+
+    def masters(self) -> tuple[int, ...]:
+        """Return the numbers of the master keys, ascending; the last one wraps."""
+        return tuple(sorted(self._material.masters.keys))
+
+    def replaced(self) -> bool:
+        """Say whether another process has replaced what this one opened."""
+        return False
 
     def add_master(self) -> None:
         """Add a master key, which wraps from now on; the old ones still unwrap. First step of a change."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import click
 
@@ -12,8 +12,9 @@ from teds_provision.cli.context import App, pass_app, read_line
 from teds_provision.cli.options import command, dry_run_option, yes_option
 
 if TYPE_CHECKING:
+    from teds_provision.backup.content import Content
     from teds_provision.backup.restore import Restored
-    from teds_provision.backup.sealed_file import Content
+    from teds_provision.store import Store
 
 _KEY_HINT = (
     "A recovery key is an encrypted PEM: openssl genpkey -algorithm EC -pkeyopt ec_paramgen_curve:P-256 "
@@ -55,7 +56,7 @@ def backup(
 
     station = app.station()
     point = from_pem(read_file(recovery)) if recovery is not None else None
-    to = f"recovery key {fingerprint(point)[:16]}" if point is not None else "a passphrase"
+    to = f"recovery key {fingerprint(point)[:32]}" if point is not None else "a passphrase"
     if dry_run:
         plan = {"backup": str(file), "to": to, "replaces": file.exists(), "dry_run": True}
         app.emit(plan, f"Plan: seal the store of {station.name} to {to}, into {file}.")
@@ -63,7 +64,7 @@ def backup(
     _require_place(app.home, file)
     if file.exists():
         app.confirm(f"{file} exists. Replace it?", yes=yes)
-    done = run(station, file, _asker(app, backup_passphrase_fd), recovery=point)
+    done = run(station, file, _asker(app, backup_passphrase_fd), recovery=point, notice=app.note)
     for warning in done.warnings:
         app.warn(warning)
     result = {
@@ -110,27 +111,48 @@ def restore(
     the audit log only grows. A backup of another station is refused (exit 6). A wrong passphrase is exit 7, a file
     that was changed 4, one that is cut off or something else 8.
     """
-    from teds_provision.backup.restore import open_present, rebuild
+    from teds_provision.backup.restore import keystore_for, open_present, rebuild
 
     content = _open(app, file, recovery_key, _asker(app, backup_passphrase_fd))
+    app.closing(content.close)
     present = open_present(app.home, content)
-    told = f"{content.name} (key {content.station[:16]}) of {content.created}"
     if present is not None:
         app.closing(present.close)
-        _merge(app, present, content, told, yes=yes, dry_run=dry_run)
+        _merge(app, present, content, keystore, yes=yes, dry_run=dry_run)
         return
+    wanted = keystore_for(content, keystore)
+    app.note(_told(content, wanted))
     if dry_run:
-        app.emit(
-            {"action": "rebuild", "station": content.station, "created": content.created, "dry_run": True},
-            f"Plan: make the station {told} in {app.home}.",
-        )
+        plan = {"action": "rebuild", "station": content.station, "created": content.created, "dry_run": True}
+        app.emit(plan | {"age_days": content.age_days()}, f"Plan: make this station in {app.home}.")
         return
     if recovery_key is not None:  # whoever has the public key can seal: only the fingerprint tells whose this is
-        app.confirm(f"This backup says that it is {told}. Is that your station?", yes=yes)
+        app.confirm(f"Is that your station, and shall its keys lie in {_named(wanted)}?", yes=yes)
     done = rebuild(app.home, content, app.ask_secret, keystore=keystore)
     if done.set_aside is not None:
         app.warn(f"The damaged store is kept as {done.set_aside}.")
-    _emit(app, content, done, f"The station {told} is back in {app.home}, its keys in the keystore {done.keystore}.")
+    if done.rotations_due:
+        app.warn(
+            f"{done.rotations_due} nodes need a new key before anything else: the keys in a backup may have been given"
+            " away since. Tap each, or: teds-provision agree UUID --rotate"
+        )
+    _emit(app, content, done, f"The station is back in {app.home}, its keys in the keystore {done.keystore}.")
+
+
+def _told(content: Content, keystore: str | None) -> str:
+    """Whose backup it is, how old, and where the keys shall lie: what a person has to compare."""
+    from teds_provision.handover.trust import spoken
+
+    days = content.age_days()
+    age = f"{days} day{'' if days == 1 else 's'} ago" if days >= 0 else "in the future: compare the clocks"
+    return (
+        f"Backup of station {content.name}, made {content.created} ({age})\n  key      {spoken(content.station)}\n"
+        f"  keystore {_named(keystore)}"
+    )
+
+
+def _named(keystore: str | None) -> str:
+    return keystore or "the keyring, or a passphrase file where none works"
 
 
 def _require_place(home: Path, file: Path) -> None:
@@ -145,13 +167,13 @@ def _require_place(home: Path, file: Path) -> None:
         raise UsageFailure(f"{file} is a file of the station itself.", hint="Give the backup another name or place.")
 
 
-def _merge(app: App, store: Any, content: Content, told: str, *, yes: bool, dry_run: bool) -> None:
+def _merge(app: App, store: Store, content: Content, keystore: str | None, *, yes: bool, dry_run: bool) -> None:
     from teds_provision.backup.restore import complete_vault, merge
     from teds_provision.store import StoreLock
 
     plan = merge(store, content, dry_run=True)
     how = plan.relation.value if plan.relation is not None else ""
-    head = f"The backup {told} is {how} of this station."
+    head = f"{_told(content, store.setting('keystore') or keystore)}\nIt is {how} of this station."
     app.note("\n".join([head, *_lines(plan)]))
     if dry_run:
         _emit(app, content, plan, f"Plan: {'bring back what is listed' if plan.back else 'nothing to do'}.", dry=True)
@@ -159,7 +181,7 @@ def _merge(app: App, store: Any, content: Content, told: str, *, yes: bool, dry_
     if plan.back:
         app.confirm("Bring this back?", yes=yes)
     with StoreLock(app.home, command="restore", notice=app.note):
-        complete_vault(store, content, app.ask_secret)
+        complete_vault(store, content, app.ask_secret, keystore=keystore)
         done = merge(store, content, dry_run=False)
     _emit(app, content, done, "Brought back." if done.back else "The store lacks nothing of it (nothing to do).")
 
@@ -175,24 +197,26 @@ def _emit(app: App, content: Content, done: Restored, text: str, *, dry: bool = 
         "station": content.station,
         "name": content.name,
         "created": content.created,
+        "age_days": content.age_days(),
         "relation": done.relation.name.lower() if done.relation is not None else None,
         "back": done.back,
         "kept": list(done.kept),
         "keystore": done.keystore,
+        "rotations_due": done.rotations_due,
         "dry_run": dry,
     }
     app.emit(result, lambda console: console.print(text, markup=False))
 
 
 def _open(app: App, file: Path, recovery_key: Path | None, ask: Callable[[str, bool], str]) -> Content:
-    from teds_provision.backup.sealed_file import is_for_key, open_with_key, open_with_passphrase, read
+    from teds_provision.backup.sealed_file import SealedFile
     from teds_provision.errors import UsageFailure, VaultFailure, WrongPassphrase
     from teds_provision.protocol.keys import SoftwareKey
     from teds_provision.vault.ca_file import read_ca
 
-    octets = read(file)
-    if not is_for_key(octets):
-        return open_with_passphrase(octets, ask("Passphrase of the backup", False))
+    sealed = SealedFile(file)
+    if not sealed.is_for_key:
+        return sealed.open_with_passphrase(ask("Passphrase of the backup", False))
     if recovery_key is None:
         raise UsageFailure("This backup is sealed to a recovery key.", hint="Give it with --recovery-key PEM.")
     passphrase = ask(f"Passphrase of {recovery_key}", False)
@@ -202,7 +226,7 @@ def _open(app: App, file: Path, recovery_key: Path | None, ask: Callable[[str, b
         raise
     except VaultFailure as failure:
         raise VaultFailure(failure.message, hint=_KEY_HINT) from failure
-    return open_with_key(octets, key)
+    return sealed.open_with_key(key)
 
 
 def _asker(app: App, descriptor: int | None) -> Callable[[str, bool], str]:

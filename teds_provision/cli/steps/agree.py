@@ -30,7 +30,6 @@ def agree(app: App, uuid: str, links: LinkSettings, rotate: bool, yes: bool, dry
     from teds_provision.talk.meeting import meet
 
     station = app.station()
-    del yes  # nothing here is lost by a new key: the old one stays until the node has proven the new one
     octets = station.nodes.resolve(uuid)
     station.policy.require_whitelisted(octets)
     if dry_run:
@@ -40,6 +39,8 @@ def agree(app: App, uuid: str, links: LinkSettings, rotate: bool, yes: bool, dry
             {"uuid": octets.hex(), "plan": plan, "held": held}, f"Plan: {plan} ({', '.join(held) or 'no key held'})."
         )
         return
+    if station.keys.restored(octets) and links.via != "nfc" and rotate:
+        app.confirm(f"Node {octets.hex()} is {station.keys.rotation_due(octets)}. Is it still this station's?", yes=yes)
     meeting = meet(station, links, octets, reporter_for(app), before=station.unlock)
     with meeting as node, station.lock("agree", app.note):
         agreed = run(station, node, identify(station, node), rotate=rotate)

@@ -1,0 +1,89 @@
+"""``vault``: where this station's secrets lie: a new passphrase or PIN, a new master key."""
+
+from __future__ import annotations
+
+import click
+
+from teds_provision.cli.context import App, pass_app, read_line
+from teds_provision.cli.options import COMMAND_SETTINGS, dry_run_option, examples, yes_option
+
+
+@click.group(
+    context_settings=COMMAND_SETTINGS,
+    epilog=examples("teds-provision vault passphrase", "teds-provision vault rewrap"),
+)
+def vault() -> None:
+    """Where this station's secrets lie: give it a new passphrase, or wrap every node key under a new master key."""
+
+
+@vault.command(
+    context_settings=COMMAND_SETTINGS,
+    short_help="Give the passphrase file (or the token) a new passphrase (or PIN).",
+    epilog=examples(
+        "teds-provision vault passphrase",
+        "teds-provision --passphrase-fd 3 vault passphrase --new-passphrase-fd 4 3<old 4<new",
+    ),
+)
+@click.option("--new-passphrase-fd", type=int, metavar="N", help="Read the new passphrase from this file descriptor.")
+@dry_run_option
+@pass_app
+def passphrase(app: App, new_passphrase_fd: int | None, dry_run: bool) -> None:
+    """Give the passphrase file a new passphrase, or the token a new PIN; the keys stay the same.
+
+    Copies of the old file, and backups, still open with the old passphrase. Where that has leaked, see the page "when
+    something went wrong".
+    """
+    station = app.station()
+    kind = station.identity.keystore.partition(":")[0]
+    if dry_run:
+        app.emit({"keystore": kind, "rewrapped": 0, "plan": True}, f"Plan: a new passphrase for the {kind} keystore.")
+        return
+    opened = station.vault
+
+    def ask(prompt: str, confirm: bool) -> str:
+        new = confirm and new_passphrase_fd is not None
+        return read_line(new_passphrase_fd or 0) if new else app.ask_new(prompt) if confirm else app.ask_secret(prompt)
+
+    with station.lock("vault passphrase", app.note):
+        opened.change_passphrase(ask)
+        station.audit("vault", None, "new passphrase")
+    app.emit(
+        {"keystore": kind, "rewrapped": 0},
+        f"{opened.description} opens with the new passphrase. Copies and backups made before open with the old one.",
+    )
+
+
+@vault.command(
+    context_settings=COMMAND_SETTINGS,
+    short_help="Make a new master key and wrap every node key anew.",
+    epilog=examples("teds-provision vault rewrap"),
+)
+@yes_option
+@dry_run_option
+@pass_app
+def rewrap(app: App, yes: bool, dry_run: bool) -> None:
+    """Make a new master key, wrap every node key under it, and forget the old one.
+
+    Who has an old copy of the store and the old master key still has the node keys of that day: agree anew with the
+    nodes (agree UUID --rotate) where that matters. A run that was cut is carried on by the same command.
+    """
+    from teds_provision.station.rewrap import rewrap as run
+
+    del yes  # nothing here is lost: the old master key goes when nothing needs it any more
+    station = app.station()
+    kind = station.identity.keystore.partition(":")[0]
+    if dry_run:
+        count = sum(1 for _ in station.keys.all())
+        app.emit(
+            {"keystore": kind, "rewrapped": count, "plan": True}, f"Plan: wrap {count} keys under a new master key."
+        )
+        return
+    station.unlock()
+    with station.lock("vault rewrap", app.note):
+        done = run(station)
+    if done.damaged:
+        app.warn(f"{done.damaged} keys in the store open under no master key; run teds-provision doctor.")
+    app.emit(
+        {"keystore": kind, "rewrapped": done.keys, "damaged": done.damaged},
+        f"{done.keys} keys are wrapped under a new master key in the {kind} keystore.",
+    )
