@@ -56,7 +56,7 @@ class Vault(Protocol):
     def export_ca(self, path: Path, passphrase: str) -> None:
         """Write the CA key to a new file as an encrypted PKCS #8 PEM; the vault keeps it until :meth:`drop_ca`.
 
-        Raises UsageFailure (the file exists), VaultFailure: no CA key here, one that cannot leave, a weak passphrase.
+        Raises VaultFailure: no CA key here, one that cannot leave, a weak passphrase, the file exists.
         """
 
     def drop_ca(self) -> bool:

@@ -12,7 +12,7 @@ from pathlib import Path
 from textwrap import wrap
 from typing import Final
 
-from teds_provision.errors import VaultFailure, WrongPassphrase
+from teds_provision.errors import UsageFailure, VaultFailure, WrongPassphrase
 from teds_provision.files import read_limited, write_new
 from teds_provision.vault.passphrase import check_new
 
@@ -30,11 +30,14 @@ _SEQUENCE, _INTEGER, _OCTETS = 0x30, 0x02, 0x04
 def write_ca(path: Path, secret: bytes, passphrase: str) -> None:
     """Write the key of a 32-octet scalar, encrypted, into a new file of mode 0600.
 
-    Raises UsageFailure (the file exists), VaultFailure (weak passphrase; it cannot be written: then none is left).
+    Raises VaultFailure: the file exists, the passphrase is weak, or it cannot be written (then none is left).
     """
     check_new(passphrase)
     pem = _encrypted_pem(_plain_der(secret), passphrase)
-    write_new(path, pem, failure=VaultFailure)
+    try:
+        write_new(path, pem, failure=VaultFailure)
+    except UsageFailure as taken:  # this command's exit code is that of the vault since version 0.1
+        raise VaultFailure(taken.message, hint=taken.hint) from None
 
 
 def read_ca(path: Path, passphrase: str) -> bytes:

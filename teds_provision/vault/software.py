@@ -45,7 +45,7 @@ class SoftwareVault(ABC):
     def export_ca(self, path: Path, passphrase: str) -> None:
         """Write the CA key to ``path`` as an encrypted PKCS #8 PEM; the vault keeps it until :meth:`drop_ca`.
 
-        Raises UsageFailure (the file exists), VaultFailure: no CA key here, weak passphrase, it cannot be written.
+        Raises VaultFailure: no CA key here, weak passphrase, the file exists or cannot be written.
         """
         from teds_provision.vault.ca_file import write_ca
 

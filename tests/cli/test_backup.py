@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pytest
 
-from teds_provision.store import KeyRecord, NodeRecord, Store
+from teds_provision.store import Draft, KeyRecord, NodeRecord, Store
 from tests.workflow.bench import PASSPHRASE, make_station
 
 from .shell import call, clean_environment, spawn
@@ -205,6 +205,8 @@ def test_killed_in_the_middle_of_a_merge_the_store_is_old_or_new(home: Path, sea
 
 
 def test_a_full_disk_leaves_the_old_backup_and_no_rest(home: Path, sealed: Path, tmp_path: Path) -> None:
+    with Store.open(home) as store:
+        store.put_draft(Draft(ONE, "x" * 300_000))
     before, words = sealed.read_bytes(), tmp_path / "words"
     words.write_text(PASSPHRASE + "\n")
     run = f"{sys.executable} -m teds_provision --home {home} --passphrase-fd 3 backup {sealed} --yes 3<{words}"

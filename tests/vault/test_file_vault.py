@@ -205,7 +205,7 @@ def test_openssl_opens_the_exported_ca_key(tmp_path: Path, vault: FileVault) -> 
 def test_an_export_never_overwrites_and_never_takes_a_weak_passphrase(tmp_path: Path, vault: FileVault) -> None:
     taken = tmp_path / "ca.pem"
     taken.write_text("precious")
-    with pytest.raises(UsageFailure, match="exists already"):
+    with pytest.raises(VaultFailure, match="exists already"):
         vault.export_ca(taken, "a passphrase for the safe")
     assert taken.read_text() == "precious"
     with pytest.raises(VaultFailure, match="too short"):

@@ -18,10 +18,10 @@ def vault() -> None:
 
 @vault.command(
     context_settings=COMMAND_SETTINGS,
-    short_help="Give the passphrase file (or the token) a new passphrase (or PIN).",
+    short_help="Set a new passphrase, or PIN of the token.",
     epilog=examples(
         "teds-provision vault passphrase",
-        "teds-provision --passphrase-fd 3 vault passphrase --new-passphrase-fd 4 3<old 4<new",
+        "teds-provision vault passphrase --new-passphrase-fd 4",
     ),
 )
 @click.option("--new-passphrase-fd", type=int, metavar="N", help="Read the new passphrase from this file descriptor.")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import json
 import os
 import shutil
@@ -11,35 +12,55 @@ import threading
 from collections.abc import Iterator
 from contextlib import closing
 from dataclasses import replace
+from datetime import UTC, datetime
 from pathlib import Path
 
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from teds_provision.backup import sealed_file as backup_file
 from teds_provision.backup.backup import BackedUp, backup
+from teds_provision.backup.chunks import CHUNK_OCTETS, ChunkReader, ChunkWriter
+from teds_provision.backup.content import Content, Head
 from teds_provision.backup.restore import Restored, complete_vault, merge, open_present, rebuild
-from teds_provision.backup.sealed_file import Content, is_for_key, open_with_key, open_with_passphrase
+from teds_provision.backup.sealed_file import SealedFile, Sealer
 from teds_provision.errors import (
     BadData,
     NotAuthentic,
     NotFound,
     PolicyRefused,
     StoreFailure,
+    StoreLocked,
+    UsageFailure,
     VaultFailure,
     WrongPassphrase,
 )
 from teds_provision.protocol.keys import SoftwareKey
 from teds_provision.station.station import Station, initialise
-from teds_provision.store import Draft, Holder, NodeRecord, Revocation, Store, Tombstone, TrustRecord, WhitelistEntry
-from teds_provision.store.snapshot import Relation, load, place, take
+from teds_provision.store import (
+    Draft,
+    Holder,
+    NodeRecord,
+    Revocation,
+    Store,
+    StoreLock,
+    Tombstone,
+    TrustRecord,
+    WhitelistEntry,
+)
+from teds_provision.store import dump as rows
+from teds_provision.store.schema import SCHEMA_VERSION
+from teds_provision.store.snapshot import Relation, place
 from teds_provision.teds.image import Image
 from teds_provision.vault import forget_vaults
 from teds_provision.vault.passphrase import THROWAWAY
 from teds_provision.vault.software import SoftwareVault
 
 from ..vault.softhsm import PIN, loaded, unload
-from .bench import PASSPHRASE, make_station
+from ..workflow.bench import PASSPHRASE, make_station
 
+FIXTURES = Path(__file__).parent / "fixtures"
 SEALED = "sealed under other words"
 ONE, TWO, NEW = (bytes.fromhex(f"8d4d9da65281f700000{n}") for n in (1, 2, 3))
 POINT = SoftwareKey.generate().point
@@ -86,7 +107,18 @@ def back_up(station: Station, path: Path, recovery: bytes | None = None) -> Back
 
 
 def opened(path: Path) -> Content:
-    return open_with_passphrase(path.read_bytes(), SEALED)
+    return SealedFile(path).open_with_passphrase(SEALED)
+
+
+def opened_octets(folder: Path, octets: bytes, passphrase: str = SEALED) -> Content:
+    (folder / "octets").write_bytes(octets)
+    return SealedFile(folder / "octets").open_with_passphrase(passphrase)
+
+
+def copy_of(station: Station, folder: Path) -> Content:
+    """The station as it is now, as a backup that was opened."""
+    back_up(station, folder / "copy.backup")
+    return opened(folder / "copy.backup")
 
 
 def restored_into(home: Path, content: Content) -> Restored:
@@ -103,7 +135,8 @@ def test_the_file_is_private_whole_and_tells_nothing_secret(station: Station, tm
     octets = path.read_bytes()
     assert (done.nodes, done.keys, done.sealed_to, done.warnings) == (2, 3, "passphrase", ())
     assert path.stat().st_mode & 0o777 == 0o600
-    assert set(json.loads(octets)) == {"format", "store", "station", "created", "sealed", "sha256"}
+    head = json.loads(octets.split(b"\n", 1)[0])
+    assert set(head) == {"format", "store", "station", "created", "key", "sha256"}
     assert station.vault.secret_material().encode() not in octets
     assert ONE not in octets
     assert ONE.hex().encode() not in octets
@@ -116,56 +149,65 @@ def test_a_wrong_passphrase_and_every_kind_of_damage_are_told_apart(station: Sta
     back_up(station, path)
     octets = path.read_bytes()
     with pytest.raises(WrongPassphrase):
-        open_with_passphrase(octets, "other words here")
-    step = max(1, len(octets) // 400)
+        opened_octets(tmp_path, octets, "other words here")
+    step = max(1, len(octets) // 150)
     for place_ in range(0, len(octets) - 1, step):
         changed = bytearray(octets)
         changed[place_] ^= 1
         with pytest.raises((NotAuthentic, BadData)):
-            open_with_passphrase(bytes(changed), SEALED)
+            opened_octets(tmp_path, bytes(changed))
+    with pytest.raises((BadData, NotAuthentic)):
+        opened_octets(tmp_path, octets + b"more")
     for length in (0, 1, 70, len(octets) // 2, len(octets) - 2):
         with pytest.raises(BadData):
-            open_with_passphrase(octets[:length], SEALED)
+            opened_octets(tmp_path, octets[:length])
 
 
 def test_who_recomputes_the_digest_still_needs_the_passphrase(station: Station, tmp_path: Path) -> None:
     path = tmp_path / "station.backup"
     back_up(station, path)
-    document = json.loads(path.read_bytes())
+    line, chunks = path.read_bytes().split(b"\n", 1)
+    document = json.loads(line)
     document.pop("sha256")
     document["created"] = "2030-01-01T00:00:00Z"
-    forged = {**document, "sha256": backup_file._digest(document)}
+    forged = backup_file.dump({**document, "sha256": backup_file._digest(document)})
     with pytest.raises(WrongPassphrase):
-        open_with_passphrase(json.dumps(forged).encode(), SEALED)
+        opened_octets(tmp_path, forged + b"\n" + chunks)
 
 
 @pytest.mark.parametrize("octets", [b"", b"{}", b"[]", b"\0" * 1000, b'{"format": "teds-image/1"}', b"{" * 100_000])
-def test_what_is_no_backup_is_bad_data(octets: bytes) -> None:
+def test_what_is_no_backup_is_bad_data(tmp_path: Path, octets: bytes) -> None:
+    (tmp_path / "b").write_bytes(octets)
     with pytest.raises(BadData):
-        is_for_key(octets)
+        SealedFile(tmp_path / "b")
 
 
 def test_a_recovery_key_opens_it_and_no_other(station: Station, tmp_path: Path) -> None:
     recovery, path = SoftwareKey.generate(), tmp_path / "station.backup"
     back_up(station, path, recovery.point)
-    octets = path.read_bytes()
-    assert is_for_key(octets)
-    assert open_with_key(octets, recovery).point == station.point
+    sealed = SealedFile(path)
+    assert sealed.is_for_key
+    with sealed.open_with_key(recovery) as content:
+        assert content.point == station.point
     with pytest.raises(PolicyRefused, match="sealed to the recovery key"):
-        open_with_key(octets, SoftwareKey.generate())
-    changed = octets.replace(b'"tag":"', b'"tag":"A', 1)[:-2]
+        sealed.open_with_key(SoftwareKey.generate())
+    path.write_bytes(path.read_bytes().replace(b'"tag":"', b'"tag":"A', 1))
     with pytest.raises((NotAuthentic, BadData)):
-        open_with_key(changed, recovery)
+        SealedFile(path).open_with_key(recovery)
 
 
 def test_a_backup_that_another_key_has_signed_is_not_the_stations(station: Station, tmp_path: Path) -> None:
     """Whoever has the public recovery key can seal something; it must not pass for this station."""
     recovery, path, forger = SoftwareKey.generate(), tmp_path / "station.backup", SoftwareKey.generate()
     back_up(station, path, recovery.point)
-    real = open_with_key(path.read_bytes(), recovery)
-    with pytest.raises(NotAuthentic):
-        open_with_key(backup_file.seal_to_key(real, forger, recovery.point), recovery)
-    forged = open_with_key(backup_file.seal_to_key(replace(real, point=forger.point), forger, recovery.point), recovery)
+    sealer = Sealer(recovery=recovery.point)
+    with SealedFile(path).open_with_key(recovery) as real, path.open("wb") as file:
+        backup_file.write(file, real, rows.dump(real.copy), forger, sealer)
+    with pytest.raises(NotAuthentic, match="not signed"):
+        SealedFile(path).open_with_key(recovery)
+    with copy_of(station, tmp_path) as real, path.open("wb") as file:
+        backup_file.write(file, replace(real, point=forger.point), rows.dump(real.copy), forger, sealer)
+    forged = SealedFile(path).open_with_key(recovery)
     with pytest.raises(PolicyRefused, match=r"the store in .* is of station"):
         open_present(station.home, forged)
     with pytest.raises(NotAuthentic):
@@ -184,10 +226,12 @@ def test_the_jose_tool_opens_a_backup_with_the_recovery_key(station: Station, tm
     back_up(station, tmp_path / "b", recovery.point)
     jwk = {**public_jwk(recovery.point), "d": encode_base64url(recovery.secret())}
     (tmp_path / "k.jwk").write_text(json.dumps(jwk))
-    words = ["jose", "jwe", "dec", "-i", str(tmp_path / "b"), "-k", str(tmp_path / "k.jwk")]
-    inner = subprocess.run(words, capture_output=True, check=True, timeout=30).stdout
-    assert inner.count(b".") == 2
-    assert backup_file._verified(inner.strip()).store == station.id
+    line = (tmp_path / "b").read_bytes().split(b"\n", 1)[0]
+    (tmp_path / "key.jwe").write_text(json.dumps(json.loads(line)["key"]))
+    words = ["jose", "jwe", "dec", "-i", str(tmp_path / "key.jwe"), "-k", str(tmp_path / "k.jwk")]
+    own = subprocess.run(words, capture_output=True, check=True, timeout=30).stdout
+    with SealedFile(tmp_path / "b").open_with_content_key(own) as content:
+        assert content.store == station.id
 
 
 def test_a_backup_taken_while_the_store_is_written_is_one_moment(station: Station, tmp_path: Path) -> None:
@@ -201,15 +245,16 @@ def test_a_backup_taken_while_the_store_is_written_is_one_moment(station: Statio
                 with store.transaction():
                     for uuid in (ONE, TWO):
                         store.put_node(NodeRecord(uuid, POINT, sequence=number))
+                stop.wait(0.002)  # SQLite's writers wait their turn without a queue
 
     writer = threading.Thread(target=write)
     writer.start()
     try:
         for _ in range(20):
-            with load(take(station._store)) as copy:
-                sequences = {record.sequence for record in copy.nodes()}
+            with copy_of(station, tmp_path) as content:
+                sequences = {record.sequence for record in content.copy.nodes()}
                 assert len(sequences) == 1
-                assert copy.audit.check().intact
+                assert content.copy.audit.check().intact
     finally:
         stop.set()
         writer.join()
@@ -271,8 +316,8 @@ def test_a_damaged_store_is_kept_under_another_name(station: Station, tmp_path: 
 
 
 def test_a_store_is_never_put_over_another(station: Station, tmp_path: Path) -> None:
-    with load(take(station._store)) as copy, pytest.raises(StoreFailure, match="already"):
-        place(copy, station.home)
+    with copy_of(station, tmp_path) as content, pytest.raises(StoreFailure, match="already"):
+        place(content.copy, station.home)
 
 
 def test_a_log_left_by_a_lost_store_is_not_replayed_into_the_restored_one(station: Station, tmp_path: Path) -> None:
@@ -365,9 +410,9 @@ def test_a_node_that_was_pinned_anew_keeps_its_new_key(station: Station, tmp_pat
 
 def test_a_newer_state_brings_a_rolled_back_store_forward(station: Station, tmp_path: Path) -> None:
     home, stale = station.home, tmp_path / "stale"
-    with load(take(station._store)) as copy:
+    with copy_of(station, tmp_path) as content:
         stale.mkdir(mode=0o700)
-        place(copy, stale)
+        place(content.copy, stale)
     shutil.copy(home / "vault.json", stale / "vault.json")
     new_key = add_key(station, ONE, 2)
     station.nodes.put(NodeRecord(ONE, POINT, epoch=2, sequence=9, verdict="authentic"))
@@ -393,9 +438,9 @@ def test_a_newer_state_brings_a_rolled_back_store_forward(station: Station, tmp_
 
 def test_states_that_went_different_ways_keep_both_sides_newest(station: Station, tmp_path: Path) -> None:
     stale = tmp_path / "stale"
-    with load(take(station._store)) as copy:
+    with copy_of(station, tmp_path) as content:
         stale.mkdir(mode=0o700)
-        place(copy, stale)
+        place(content.copy, stale)
     shutil.copy(station.home / "vault.json", stale / "vault.json")
     add_key(station, ONE, 4)
     station.audit("agree", ONE, "done")
@@ -468,9 +513,9 @@ def test_marks_on_nodes_do_not_go_back_and_come_forward(station: Station, tmp_pa
     assert station._store.setting("mark") == "due"
     back_up(station, tmp_path / "new")
     stale = tmp_path / "stale"
-    with load(opened(tmp_path / "old").database) as copy:
+    with opened(tmp_path / "old") as content:
         stale.mkdir(mode=0o700)
-        place(copy, stale)
+        place(content.copy, stale)
     with Store.open(stale) as store:
         done = merge(store, opened(tmp_path / "new"), dry_run=False)
         assert done.relation is Relation.NEWER
@@ -500,7 +545,9 @@ def test_a_token_keeps_its_keys_and_opens_the_restored_station(tmp_path: Path, m
         with pytest.raises(PolicyRefused, match="in a token"):
             rebuild(tmp_path / "file", content, pin, keystore="file", costs=THROWAWAY)
         forget_vaults()
-        assert rebuild(tmp_path / "new", content, pin).keystore == uri
+        with pytest.raises(UsageFailure, match="which module"):
+            rebuild(tmp_path / "new", content, pin)
+        assert rebuild(tmp_path / "new", content, pin, keystore=uri).keystore == uri
         again = Station.open(tmp_path / "new", ask=pin)
         assert keys_of(again, ONE) == [(1, "active", key)]
         again.close()
@@ -514,3 +561,197 @@ def test_a_passphrase_that_is_none_is_refused_before_anything_is_written(station
     with pytest.raises(VaultFailure, match="too short"):
         backup(station, tmp_path / "b", lambda prompt, confirm: "short", costs=THROWAWAY)
     assert not (tmp_path / "b").exists()
+
+
+# -- many chunks, other versions, hostile rows -------------------------------------------------------------------------
+
+
+def test_a_store_of_several_chunks_goes_out_and_comes_back(station: Station, tmp_path: Path) -> None:
+    text = json.dumps({"filler": "x" * 100_000})
+    with station.transaction():
+        for number in range(40):
+            station._store.put_draft(Draft(number.to_bytes(10, "big"), text))
+    done = back_up(station, tmp_path / "b")
+    assert done.octets > 3 * CHUNK_OCTETS
+    octets = (tmp_path / "b").read_bytes()
+    with opened(tmp_path / "b") as content:
+        assert list(rows.dump(content.copy))[1:] != []
+        draft = content.copy.draft((39).to_bytes(10, "big"))
+        assert draft is not None
+        assert draft.image == text
+    head = octets.index(b"\n") + 1
+    full = CHUNK_OCTETS + 16
+    first, second = octets[head : head + full], octets[head + full : head + 2 * full]
+    assert len(first) == len(second) == full
+    swapped = octets[:head] + second + first + octets[head + 2 * full :]
+    dropped = octets[:head] + first + octets[head + 2 * full :]
+    doubled = octets[:head] + first + first + octets[head + full :]
+    cut_at_a_chunk = octets[: head + 2 * full]
+    ended_early = cut_at_a_chunk + b"teds-backup end\n"
+    for changed in (swapped, dropped, doubled, cut_at_a_chunk, ended_early):
+        with pytest.raises((NotAuthentic, BadData)):
+            opened_octets(tmp_path, changed)
+
+
+def test_a_chunk_of_another_backup_of_the_same_station_does_not_fit(station: Station, tmp_path: Path) -> None:
+    back_up(station, tmp_path / "a")
+    back_up(station, tmp_path / "b")
+    (head, _), (_, chunks) = ((tmp_path / name).read_bytes().split(b"\n", 1) for name in "ab")
+    with pytest.raises(NotAuthentic):
+        opened_octets(tmp_path, head + b"\n" + chunks)
+
+
+@pytest.mark.parametrize("length", [0, 1, CHUNK_OCTETS - 1, CHUNK_OCTETS, CHUNK_OCTETS + 1, 2 * CHUNK_OCTETS])
+def test_any_length_goes_through_the_chunks(length: int) -> None:
+    key, context, out = os.urandom(32), b"context", io.BytesIO()
+    writer = ChunkWriter(out, key, context)
+    writer.write(b"x" * length)
+    writer.end()
+    reader = ChunkReader(io.BytesIO(out.getvalue()), key, context)
+    assert reader.read(length) == b"x" * length
+    reader.require_end()
+    assert reader.digest.digest() == writer.digest.digest()
+    with pytest.raises(BadData):
+        reader.read(1)
+    with pytest.raises(NotAuthentic):
+        ChunkReader(io.BytesIO(out.getvalue()), key, b"other").require_end()
+
+
+def test_backups_of_version_1_still_open(tmp_path: Path) -> None:
+    """Made by version 1's own code: a station named "version one" with two nodes and their keys."""
+    with SealedFile(FIXTURES / "version-1.backup").open_with_passphrase(SEALED) as content:
+        assert (content.name, len(content.copy.nodes())) == ("version one", 2)
+        done = rebuild(tmp_path / "home", content, ask, costs=THROWAWAY)
+    assert (done.back["nodes"], done.rotations_due) == (2, 2)
+    again = Station.open(tmp_path / "home", ask=ask)
+    assert keys_of(again, TWO) == [(1, "active", bytes([2]) * 16)]
+    again.close()
+    recovery = SoftwareKey.from_secret(bytes(31) + b"\x07")
+    with SealedFile(FIXTURES / "version-1-recovery.backup").open_with_key(recovery) as content:
+        assert len(content.copy.nodes()) == 2
+    with pytest.raises(WrongPassphrase):
+        SealedFile(FIXTURES / "version-1.backup").open_with_passphrase("other words here")
+
+
+class Octets:
+    """Octets as a dump is read from."""
+
+    def __init__(self, octets: bytes) -> None:
+        self._octets = io.BytesIO(octets)
+
+    def read(self, size: int) -> bytes:
+        octets = self._octets.read(size)
+        if len(octets) < size:
+            raise BadData("too early")
+        return octets
+
+    def read_line(self, limit: int) -> bytes:
+        return self._octets.readline(limit).rstrip(b"\n")
+
+
+def test_a_dump_comes_back_row_for_row(station: Station) -> None:
+    first = b"".join(station.rows())
+    with rows.load(Octets(first)) as copy:
+        assert b"".join(rows.dump(copy)) == first
+
+
+def head(tables: dict[str, list[str]], schema: object = SCHEMA_VERSION) -> bytes:
+    return json.dumps({"schema": schema, "tables": tables}).encode() + b"\n"
+
+
+@pytest.mark.parametrize(
+    "octets",
+    [
+        b"",
+        b"[]\n",
+        b'{"schema": 1}\n',
+        b'{"schema": true, "tables": {}}\n',
+        head({"sqlite_schema": ["name"]}) + b"\xff\0\0\0\0",
+        head({"x; DROP TABLE keys": ["a"]}) + b"\xff\0\0\0\0",
+        head({"meta": ["name", "value", "more"]}) + b"\xff\0\0\0\0",
+        head({"meta": ["name", "value"]}),
+        head({"meta": ["name", "value"]}) + b"\0\xff\xff\xff\xff",
+        head({"meta": ["name", "value"]}) + b"\7\0\0\0\0",
+        head({"meta": ["name", "value"]}) + b"\0\0\0\0\2\0\0\xff\0\0\0\0",  # NULL where none may be
+        head({"meta": ["name", "value"]}) + b"\0\0\0\0\1\0\xff\0\0\0\0",  # a value too few
+        head({"meta": ["name", "value"]}) + b"\0\0\0\0\5\2\0\0\1\0\xff\0\0\0\0",  # a text longer than its row
+        head({"meta": ["name", "value"]}) + b"\xff\0\0\0\0",  # no identifier
+    ],
+)
+def test_rows_that_are_none_are_bad_data(octets: bytes) -> None:
+    with pytest.raises((BadData, StoreFailure)):
+        rows.load(Octets(octets))
+
+
+@given(st.binary(max_size=200))
+def test_no_octets_make_a_dump_raise_anything_foreign(octets: bytes) -> None:
+    with pytest.raises((BadData, StoreFailure)):
+        rows.load(Octets(head({"meta": ["name", "value"], "nodes": []}) + octets))
+    with pytest.raises((BadData, StoreFailure)):
+        rows.load(Octets(head({"meta": ["name", "value"]}) + octets))
+
+
+def test_a_newer_schema_is_not_guessed_at() -> None:
+    with pytest.raises(StoreFailure, match="knows up to"):
+        rows.load(Octets(head({}, SCHEMA_VERSION + 1) + b"\xff\0\0\0\0"))
+
+
+# -- what is told, and what a restored station may not do --------------------------------------------------------------
+
+
+def test_after_a_restore_every_key_has_to_be_rotated_by_a_person(station: Station, tmp_path: Path) -> None:
+    back_up(station, tmp_path / "b")
+    done = restored_into(tmp_path / "new", opened(tmp_path / "b"))
+    assert done.rotations_due == 2
+    again = Station.open(tmp_path / "new", ask=ask)
+    for uuid in (ONE, TWO):
+        assert "restored from a backup" in (again.keys.rotation_due(uuid) or "")
+        with pytest.raises(PolicyRefused, match="restored from a backup"):
+            again.policy.require_not_restored(uuid)
+    again.keys.rotated(ONE)
+    again.policy.require_not_restored(ONE)
+    again.close()
+
+
+def test_no_module_path_goes_into_a_backup_or_comes_out_of_one(station: Station, tmp_path: Path) -> None:
+    with copy_of(station, tmp_path) as content:
+        evil = replace(content, keystore="pkcs11:token=x?module-path=/tmp/evil.so")
+        for asked in (None, "file"):
+            with pytest.raises((UsageFailure, PolicyRefused)):
+                rebuild(tmp_path / "new", evil, ask, keystore=asked)
+        with pytest.raises(UsageFailure, match="no such keystore"):
+            rebuild(tmp_path / "new", replace(content, keystore="other"), ask)
+    assert not (tmp_path / "new").exists()
+
+
+def test_a_backup_beside_a_stuck_writer_says_so_and_leaves_no_file(
+    station: Station, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    told: list[str] = []
+    held = station.lock("provision")
+    monkeypatch.setattr(
+        Station, "lock", lambda self, command, notice: StoreLock(self.home, command=command, wait=0.1, notice=notice)
+    )
+    before = station.audit_log.check().count
+    with held, pytest.raises(StoreLocked):
+        backup(station, tmp_path / "b", ask, costs=THROWAWAY, notice=told.append)
+    assert len(told) == 1
+    assert "provision" in told[0]
+    assert not (tmp_path / "b").exists()
+    assert station.audit_log.check().count == before
+
+
+def test_a_backup_that_does_not_open_again_is_not_kept(
+    station: Station, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("teds_provision.backup.sealed_file.MAX_OCTETS", 1000)
+    with pytest.raises(StoreFailure, match="does not open again"):
+        back_up(station, tmp_path / "b")
+    assert list(tmp_path.glob("*b")) == []
+    assert station.audit_log.check().count == 1 + 1  # init and ready
+
+
+def test_the_age_of_a_backup() -> None:
+    made = Head("id", POINT, "n", "2026-01-01T00:00:00Z", "file", "")
+    assert made.age_days(datetime(2026, 1, 13, 12, tzinfo=UTC)) == 12
+    assert replace(made, created="yesterday").age_days() == 0
