@@ -1,0 +1,112 @@
+"""From what a source says to the octets of a sample, one value at a time and quickly; and back for an actuator."""
+
+from __future__ import annotations
+
+import bisect
+import math
+import struct
+from typing import Final
+
+import numpy as np
+
+from teds_provision.errors import BadData
+from teds_provision.node.sources.base import Place, Reading
+from teds_provision.teds.calibration.interpreter import ChannelInterpreter
+from teds_provision.teds.calibration.reading import SampleReader
+from teds_provision.teds.calibration.samples import DataModel
+from teds_provision.teds.sheet import Channel, Sheet
+
+_KNOTS: Final = 257
+_INTEGER_TOLERANCE: Final = 0.01  # of a step: what lies so near a rounding edge may go either way
+_FLOAT_TOLERANCE: Final = 1e-9
+_PACKING: Final = {DataModel.FLOAT32: struct.Struct(">f"), DataModel.FLOAT64: struct.Struct(">d")}
+
+
+class Converter:
+    """Converts for one channel of the datasheet that the node was made with.
+
+    Where that has no calibration, an integer channel is an ideal converter: its range is spread evenly over the raw
+    numbers. Raises BadData where samples of that form cannot be made.
+    """
+
+    def __init__(self, sheet: Sheet, channel: Channel) -> None:
+        if channel.sample is None:
+            raise BadData(f"The datasheet does not say how a sample of channel {channel.number} is coded.")
+        self.form = channel.sample
+        self._writer = SampleReader(channel.sample)
+        self._channel = channel
+        self._interpreter = ChannelInterpreter(sheet, channel.number)
+        self.low, self.high = self._interpreter.limits
+        self._table = self._tabulated()
+
+    @property
+    def place(self) -> Place:
+        """The channel as sources see it."""
+        return Place(self._channel.number, self._channel.name, self.low, self.high)
+
+    def octets(self, reading: Reading) -> bytes:
+        """The sample that the channel gives; values are kept within the limits, and rounded to what a sample holds.
+
+        Raises BadData where there is no way from the value to a sample.
+        """
+        return self.write(reading.raw if reading.raw is not None else self.raw(reading.value or 0.0))
+
+    def raw(self, value: float) -> float:
+        """The raw number, not rounded, of a value in the unit in which people see it."""
+        value = min(max(value, self.low), self.high)
+        if self._table is None:
+            return float(self._interpreter.raw_numbers(np.array([value]))[0])
+        values, raws = self._table
+        at = min(max(bisect.bisect_right(values, value), 1), len(values) - 1)
+        share = (value - values[at - 1]) / (values[at] - values[at - 1])
+        return raws[at - 1] + share * (raws[at] - raws[at - 1])
+
+    def write(self, raw: float) -> bytes:
+        """Octets of a raw number, rounded and kept within what a sample can hold."""
+        form = self.form
+        if form.integer and form.raw_range is not None:
+            return int(min(max(round(raw), 0), int(form.raw_range[1]))).to_bytes(form.octets, "big")
+        packing = _PACKING.get(DataModel(form.model))
+        if packing is not None and abs(raw) < 3e38:
+            return packing.pack(raw)
+        return self._writer.write(np.array([raw]))
+
+    def value(self, octets: bytes) -> float | None:
+        """The value that a set point stands for, None where nothing says so."""
+        if self._interpreter.problem:
+            return self._ideal_value(octets)
+        values = self._interpreter.decode(octets).value
+        return float(values[0]) if math.isfinite(values[0]) else None
+
+    def raw_of(self, octets: bytes) -> float:
+        """The raw number that octets hold; NaN where they hold none."""
+        numbers, possible = self._writer.numbers(self._writer.raw(octets))
+        return float(numbers[0]) if possible[0] else math.nan
+
+    def _ideal_value(self, octets: bytes) -> float | None:
+        ends, raw = self.form.raw_range, self.raw_of(octets)
+        if ends is None or not math.isfinite(raw) or not self._ranged:
+            return None
+        return self.low + raw / ends[1] * (self.high - self.low)
+
+    @property
+    def _ranged(self) -> bool:
+        return math.isfinite(self.low) and math.isfinite(self.high) and self.low < self.high
+
+    def _tabulated(self) -> tuple[list[float], list[float]] | None:
+        """Knots of the way from values to raw numbers where straight lines between them are as good as the curve."""
+        if not self._ranged:
+            return None
+        ends = self.form.raw_range
+        if self._interpreter.problem:
+            return ([self.low, self.high], [0.0, ends[1]]) if ends is not None else None
+        knots = np.linspace(self.low, self.high, 2 * _KNOTS - 1)
+        try:
+            raws = self._interpreter.raw_numbers(knots)
+        except BadData:
+            return None
+        between = (raws[0:-1:2] + raws[2::2]) / 2
+        tolerance = _INTEGER_TOLERANCE if self.form.integer else _FLOAT_TOLERANCE * float(np.abs(raws).max())
+        if not np.isfinite(raws).all() or float(np.abs(between - raws[1::2]).max()) > tolerance:
+            return None
+        return [float(x) for x in knots[::2]], [float(x) for x in raws[::2]]
