@@ -49,8 +49,6 @@ class ChannelFacts:
     sample_form: str = ""  # of the raw value: uint16, float32 …
     period: float | None = None  # seconds between samples as measured; None for events
     quantity: str = ""  # what the profile or the name calls it, e.g. "relative humidity"; empty where nobody said
-    vector: str = ""  # name of the vector group of the datasheet; empty where the channel is in none
-    kind_of_group: str = ""  # meaning of that vector group: "magnetic field", "wrench", "imu"; empty if not said
 
     @property
     def key(self) -> tuple[str, int]:

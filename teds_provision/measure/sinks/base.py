@@ -216,7 +216,8 @@ class ThreadedSink(ABC):
     def _work(self) -> None:
         try:
             self._begin()
-            self._say("running")
+            if self.stats.state == "starting":  # a sink that waits for somebody has said so by now
+                self._say("running")
             self._run()
         except TedsProvisionError as error:
             self._fail(error)

@@ -21,7 +21,7 @@ TOKEN = re.compile(r"[A-Za-z](?:[A-Za-z0-9]|_(?=[A-Za-z0-9]))*\Z")
 
 def slug(text: str) -> str:
     """A name from a person or a datasheet as one part of a topic; empty where nothing is left of it."""
-    letters = unicodedata.normalize("NFKD", text).encode("ascii", "ignore").decode().lower()
+    letters = unicodedata.normalize("NFKD", text.casefold()).encode("ascii", "ignore").decode().lower()
     joined = re.sub(r"[^a-z0-9]+", "_", letters).strip("_")[:LONGEST].strip("_")
     return f"n_{joined}" if joined and not joined[0].isalpha() else joined
 

@@ -1,0 +1,232 @@
+"""What ROS 1 and ROS 2 have in common: which topics there are, and when which message goes out.
+
+The cost of a topic is its messages, not its values (notes of measurements in docs/ros.md). So a group's rows go out as
+one array at full rate, each channel on a topic of its own at ``StationFacts.scalar_rate``, and the sink counts its
+messages per second and says when that is more than what one process bears.
+
+| topic | type | when |
+|---|---|---|
+| ``/<station>/<group>`` | sensor_msgs/JointState (name, position = value) | each row of the grid |
+| ``/<station>/<group>/age`` | sensor_msgs/JointState (name, position = age in seconds) | each row |
+| ``/<station>/<node>/<channel>`` | by :mod:`meaning` | at the scalar rate |
+| ``/<station>/<node>/teds`` | std_msgs/String, JSON, latched | when the facts are known |
+| ``/<station>/<node>/<channel>/cmd`` | std_msgs/Float64, subscribed | actuators only |
+| ``/diagnostics`` | diagnostic_msgs/DiagnosticArray | once a second |
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import time
+from abc import abstractmethod
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from teds_provision.measure.blocks import Block, ChannelFacts, Command, GroupRows, NodeReport, StationFacts
+from teds_provision.measure.sinks.base import CommandTaker, Item, ThreadedSink
+from teds_provision.measure.sinks.lines import facts_as_json
+from teds_provision.measure.sinks.meaning import VARIANCE_NOTE, Meaning, meaning_of, variance_of
+from teds_provision.measure.sinks.names import Topics
+
+BUDGET = 5000  # messages a second that one process bears (docs/ros.md)
+ROWS = 1000  # rows a second of an array, at most; a recorder takes all of them
+OK, WARN, ERROR, STALE = range(4)  # of diagnostic_msgs/DiagnosticStatus
+JOINT_STATE, STRING, DIAGNOSTICS = "sensor_msgs/JointState", "std_msgs/String", "diagnostic_msgs/DiagnosticArray"
+
+
+@dataclass(frozen=True)
+class Status:
+    """One entry of /diagnostics."""
+
+    level: int
+    name: str
+    message: str
+    hardware: str
+    values: tuple[tuple[str, str], ...] = ()
+
+
+@dataclass
+class _Scalars:
+    """Scalar topics of one stream, and when they are due."""
+
+    channels: list[tuple[int, str, Meaning, float]]  # column, topic, meaning, variance
+    frame: str
+    due: float = 0.0
+
+
+class TopicSink(ThreadedSink):
+    """Decides what goes out; subclasses carry it: six steps, all on the sink's thread."""
+
+    def __init__(self, name: str, commands: CommandTaker | None) -> None:
+        super().__init__(name)
+        self._commands = commands
+        self._station = StationFacts("")
+        self._facts: dict[tuple[str, int], ChannelFacts] = {}
+        self._topics = Topics(self._station)
+        self._scalars: dict[tuple[str, int, tuple[int, ...]], _Scalars] = {}
+        self._reports: dict[str, NodeReport] = {}
+        self._arrays: dict[tuple[tuple[str, int], ...], float] = {}  # time of the last row that went out
+        self._sent = 0
+        self._second = 0.0
+        self.refused_commands = 0
+
+    @abstractmethod
+    def _array(self, topic: str, stamp: float, names: Sequence[str], values: Sequence[float]) -> None:
+        """One JointState; NaN where there is no value."""
+
+    @abstractmethod
+    def _scalar(self, topic: str, meaning: Meaning, stamp: float, frame: str, value: float, variance: float) -> None:
+        """One value by its meaning."""
+
+    @abstractmethod
+    def _latched(self, topic: str, words: str) -> None:
+        """A String that late comers get too."""
+
+    @abstractmethod
+    def _parameter(self, name: str, value: object) -> None:
+        """Facts for a parameter server, where there is one."""
+
+    @abstractmethod
+    def _listen(self, topic: str, uuid: str, channel: int) -> None:
+        """Subscribe to set points of an actuator; each goes to :meth:`_command`."""
+
+    @abstractmethod
+    def _diagnose(self, stamp: float, statuses: Sequence[Status]) -> None:
+        """One DiagnosticArray."""
+
+    def _prepare(self, facts: tuple[ChannelFacts, ...], station: StationFacts) -> None:
+        self._station = station
+        self._topics = Topics(station)
+        self._facts = {one.key: one for one in facts}
+        self._topics.learn(facts)
+
+    def _begin(self) -> None:
+        self._announce(tuple(self._facts.values()))
+
+    def _take(self, item: Item) -> None:
+        if isinstance(item, Block):
+            self._block(item)
+        elif isinstance(item, GroupRows):
+            self._rows(item)
+        elif changed := self._learn(item):
+            self._announce(changed)
+
+    def _learn(self, item: NodeReport | tuple[ChannelFacts, ...]) -> list[ChannelFacts]:
+        """Keep a report or facts; gives the facts that are new."""
+        if isinstance(item, NodeReport):
+            self._reports[item.uuid] = item
+            return []
+        changed = [one for one in item if self._facts.get(one.key) != one]
+        self._facts.update((one.key, one) for one in changed)
+        self._topics.learn(changed)
+        self._scalars.clear()
+        return changed
+
+    def _announce(self, facts: Sequence[ChannelFacts]) -> None:
+        """Metadata, parameters and command topics of channels; again when a way to the consumers opened anew."""
+        for uuid in dict.fromkeys(one.uuid for one in facts):
+            channels = [one for one in self._facts.values() if one.uuid == uuid]
+            words = {
+                "uuid": uuid,
+                "station": self._station.name,
+                "clock": self._station.clock,
+                "test_pattern": self._station.test_pattern,
+                "variance": VARIANCE_NOTE,
+                "channels": [{**facts_as_json(one), "topic": self._topics.channel(*one.key)} for one in channels],
+            }
+            self._latched(self._topics.of_node(uuid, "teds"), json.dumps(words))
+            for one in channels:
+                self._parameter(self._topics.channel(*one.key), facts_as_json(one))
+                if one.kind == "actuator" and self._commands is not None:
+                    self._listen(f"{self._topics.channel(*one.key)}/cmd", one.uuid, one.number)
+
+    def _block(self, block: Block) -> None:
+        rate = self._station.scalar_rate
+        # A test pattern is no measurement: it goes to recorders, which mark it, and to no topic, which cannot.
+        if rate <= 0 or block.test_pattern or not len(block.time):
+            return
+        key = block.uuid, block.stream, block.channels
+        if key not in self._scalars:
+            self._scalars[key] = self._scalars_of(block)
+        scalars = self._scalars[key]
+        now = time.monotonic()
+        if now < scalars.due:
+            return
+        # The next beat, not "now + period": else each delay would slow the topic down for good.
+        scalars.due = scalars.due + 1 / rate if now < scalars.due + 1 / rate else now + 1 / rate
+        stamp = float(block.time[-1])
+        for column, topic, meaning, variance in scalars.channels:
+            value = float(block.value[-1, column])
+            if math.isfinite(value):
+                self._scalar(topic, meaning, stamp, scalars.frame, meaning.field_value(value), variance)
+                self._went(1)
+
+    def _scalars_of(self, block: Block) -> _Scalars:
+        channels = []
+        for column, number in enumerate(block.channels):
+            facts = self._facts.get((block.uuid, number), ChannelFacts(block.uuid, "", number, ""))
+            topic = self._topics.channel(block.uuid, number)
+            channels.append((column, topic, meaning_of(facts), variance_of(facts)))
+        return _Scalars(channels, self._station.frame_ids.get(block.uuid, ""))
+
+    def _rows(self, rows: GroupRows) -> None:
+        if rows.test_pattern:
+            return
+        topic = self._topics.of_group(rows.group)
+        names = [self._topics.channel(*key).removeprefix(f"/{self._topics.station}/") for key in rows.channels]
+        last = self._arrays.get(rows.channels, -math.inf)
+        for k, stamp in enumerate(rows.time.tolist()):
+            if stamp - last < 1 / ROWS - 1e-6:
+                continue
+            last = stamp
+            self._array(topic, stamp, names, rows.value[k].tolist())
+            self._array(f"{topic}/age", stamp, names, rows.age[k].tolist())
+            self._went(int(np.isfinite(rows.value[k]).sum()), messages=2)
+        self._arrays[rows.channels] = last
+
+    def _went(self, values: int, messages: int = 1) -> None:
+        self._sent += messages
+        self._count(written=values, messages=messages)
+
+    def _idle(self, now: float) -> None:
+        if now - self._second < 1.0:
+            return
+        rate = self._sent / (now - self._second) if self._second else 0.0
+        self._sent, self._second = 0, now
+        if self.stats.state == "running":
+            over = f", above the {BUDGET} that one process bears: lower --scalar-rate" if rate > BUDGET else ""
+            self._say("running", f"{rate:.0f} messages/s{over}")
+        self._diagnose(time.time(), self._statuses(rate))
+
+    def _statuses(self, rate: float) -> list[Status]:
+        found = [self._status(report) for report in self._reports.values()]
+        for one in self._facts.values():
+            if one.overdue:
+                name = f"{self._topics.node(one.uuid)}: calibration of {one.label}"
+                found.append(Status(WARN, name, f"due since {one.due}", one.uuid))
+        stats = self.stats
+        values = (("messages per second", f"{rate:.0f}"), ("dropped values", str(stats.dropped)))
+        level = WARN if rate > BUDGET or stats.dropped else OK
+        found.append(Status(level, f"{self._topics.station}: {self.name}", stats.detail, self._topics.station, values))
+        return found
+
+    def _status(self, report: NodeReport) -> Status:
+        counters = {"lost": report.lost, "late": report.late, "bad": report.bad, "invalid": report.invalid}
+        level = {"running": OK, "waiting": WARN, "ended": OK}.get(report.state, ERROR)
+        if level == OK and any(counters.values()):
+            level = WARN
+        values = [("samples", str(report.samples)), *((name, str(count)) for name, count in counters.items())]
+        if report.clock_error is not None:
+            values.append(("clock error [s]", f"{report.clock_error:.2g}"))
+        message = report.why or report.state
+        return Status(level, f"{self._topics.node(report.uuid)}: measurement", message, report.uuid, tuple(values))
+
+    def _command(self, uuid: str, channel: int, value: float) -> None:
+        """A set point came; what is no finite number is refused here, limits are kept where units are known."""
+        if self._commands is None or not math.isfinite(value):
+            self.refused_commands += 1
+            return
+        self._commands(Command(uuid, channel, value, time.monotonic()))

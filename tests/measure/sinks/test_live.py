@@ -1,0 +1,234 @@
+"""Names of topics, which message fits a channel, and when what goes out; the carriers have tests of their own."""
+
+from __future__ import annotations
+
+import json
+import re
+import time
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from teds_provision.errors import UsageFailure
+from teds_provision.measure.blocks import Block, ChannelFacts, Command, GroupRows, NodeReport, StationFacts
+from teds_provision.measure.sinks.live import ERROR, OK, WARN, Status, TopicSink
+from teds_provision.measure.sinks.meaning import Meaning, meaning_of, variance_of
+from teds_provision.measure.sinks.names import Topics, slug
+from teds_provision.teds.units.units import parse_units
+from tests.measure.sinks.parts import ANGLE, ARM, FORCE, HAND, STATION, block
+
+ROS_TOPIC = re.compile(r"/[A-Za-z][A-Za-z0-9_]*(/[A-Za-z][A-Za-z0-9_]*)*")
+
+
+@given(st.text(), st.text(), st.text())
+def test_any_names_make_a_topic_that_ros_takes(station: str, node: str, channel: str) -> None:
+    topics = Topics(StationFacts(station))
+    topics.learn([ChannelFacts(ARM, node, 3, channel)])
+    topic = topics.channel(ARM, 3)
+    assert ROS_TOPIC.fullmatch(topic)
+    assert "__" not in topic
+    assert all(not part.endswith("_") for part in topic.split("/"))
+    assert len(topic.split("/")) == 4
+
+
+def test_namesakes_get_topics_of_their_own() -> None:
+    topics = Topics(STATION)
+    topics.learn([ANGLE, replace(ANGLE, number=2), replace(FORCE, node="Arm"), replace(ANGLE, number=3, name="")])
+    names = {topics.channel(*key) for key in ((ARM, 1), (ARM, 2), (ARM, 3), (HAND, 2))}
+    assert len(names) == 4, names
+
+
+def test_a_chosen_name_goes_before_a_made_one_and_must_be_one() -> None:
+    topics = Topics(replace(STATION, names={(ARM, 1): "crane/boom", (HAND, 0): "gripper"}))
+    topics.learn([ANGLE, FORCE])
+    assert topics.channel(ARM, 1) == "/crane/boom"
+    assert topics.channel(HAND, 2) == "/bench/gripper/force"
+    for wrong in ("two words", "a__b", "9lives", "end_", ""):
+        with pytest.raises(UsageFailure):
+            Topics(replace(STATION, names={(ARM, 1): wrong}))
+
+
+def test_words_become_plain_letters() -> None:
+    assert slug("Drehwinkel (Größe)") == "drehwinkel_grosse"
+    assert slug("3. axis") == "n_3_axis"
+    assert slug("角度") == ""
+
+
+@pytest.mark.parametrize(
+    ("unit", "name", "quantity", "type_"),
+    [
+        ("degC", "oil", "", "sensor_msgs/Temperature"),
+        ("kPa", "supply", "", "sensor_msgs/FluidPressure"),
+        ("MPa", "shear stress", "", "std_msgs/Float64"),
+        ("lx", "light", "", "sensor_msgs/Illuminance"),
+        ("%", "relative_humidity", "", "sensor_msgs/RelativeHumidity"),
+        ("%", "throttle", "", "std_msgs/Float64"),
+        ("m", "height", "range", "sensor_msgs/Range"),
+        ("m", "range of motion", "", "std_msgs/Float64"),
+        ("degree", "angle", "", "std_msgs/Float64"),
+        ("N", "force", "", "std_msgs/Float64"),
+        ("count", "steps", "", "std_msgs/Float64"),
+    ],
+)
+def test_a_typed_message_only_where_unit_and_meaning_fit(unit: str, name: str, quantity: str, type_: str) -> None:
+    facts = ChannelFacts(ARM, "arm", 1, name, units=parse_units(unit), quantity=quantity)
+    assert meaning_of(facts).type == type_
+    assert meaning_of(replace(facts, kind="actuator")).type == "std_msgs/Float64"
+
+
+def test_a_temperature_goes_out_in_degrees_celsius_with_its_variance() -> None:
+    facts = ChannelFacts(ARM, "arm", 1, "oil", unit="K", units=parse_units("K"), uncertainty=0.3)
+    assert meaning_of(facts).field_value(293.15) == pytest.approx(20.0)
+    assert variance_of(facts) == pytest.approx(0.03)
+    assert variance_of(replace(facts, uncertainty=None)) == 0.0, "0 means unknown"
+
+
+class Carrier(TopicSink):
+    """Keeps what went out."""
+
+    def __init__(self, commands: list[Command] | None = None) -> None:
+        super().__init__("carrier", None if commands is None else commands.append)
+        self.arrays: list[tuple[str, float, list[str], list[float]]] = []
+        self.scalars: list[tuple[str, str, float, float]] = []
+        self.words: dict[str, str] = {}
+        self.parameters: dict[str, object] = {}
+        self.listens: list[tuple[str, str, int]] = []
+        self.statuses: list[Status] = []
+
+    def _array(self, topic: str, stamp: float, names: Sequence[str], values: Sequence[float]) -> None:
+        self.arrays.append((topic, stamp, list(names), list(values)))
+
+    def _scalar(self, topic: str, meaning: Meaning, stamp: float, frame: str, value: float, variance: float) -> None:
+        self.scalars.append((topic, meaning.type, value, variance))
+
+    def _latched(self, topic: str, words: str) -> None:
+        self.words[topic] = words
+
+    def _parameter(self, name: str, value: object) -> None:
+        self.parameters[name] = value
+
+    def _listen(self, topic: str, uuid: str, channel: int) -> None:
+        self.listens.append((topic, uuid, channel))
+
+    def _diagnose(self, stamp: float, statuses: Sequence[Status]) -> None:
+        self.statuses = list(statuses)
+
+    def _finish(self) -> None:
+        self._second = 0.0
+        self._idle(time.monotonic())
+
+
+def carried(
+    items: Sequence[Block | GroupRows | NodeReport | list[ChannelFacts]],
+    facts: Sequence[ChannelFacts] = (ANGLE, FORCE),
+    station: StationFacts = STATION,
+    commands: list[Command] | None = None,
+) -> Carrier:
+    sink = Carrier(commands)
+    sink.open(facts, station)
+    for item in items:
+        if isinstance(item, Block):
+            sink.write(item)
+        elif isinstance(item, GroupRows):
+            sink.write_group(item)
+        elif isinstance(item, NodeReport):
+            sink.report(item)
+        else:
+            sink.describe(item)
+    sink.close()
+    assert sink.stats.error == ""
+    return sink
+
+
+def test_scalars_go_out_at_their_rate_with_the_newest_value() -> None:
+    sink = carried([block([[k], [k + 1]]) for k in range(50)], station=replace(STATION, scalar_rate=0.5))
+    assert sink.scalars == [("/bench/arm/angle", "std_msgs/Float64", pytest.approx(0.1), pytest.approx(0.0087**2 / 3))]
+    assert carried([block()], station=replace(STATION, scalar_rate=0)).scalars == []
+
+
+def test_an_invalid_value_has_no_scalar_message_and_is_nan_in_the_array() -> None:
+    rows = GroupRows(
+        "crane", ((ARM, 1), (HAND, 2)), np.array([1.0]), np.array([[1.0, np.nan]]), np.array([[0.0, np.nan]])
+    )
+    sink = carried([block([[1]], valid=[[False]]), rows])
+    assert sink.scalars == []
+    [(topic, stamp, names, values), (ages, *_)] = sink.arrays
+    assert (topic, ages) == ("/bench/crane", "/bench/crane/age")
+    assert (stamp, names) == (1.0, ["arm/angle", "hand/force"])
+    assert values[0] == 1.0
+    assert np.isnan(values[1])
+
+
+def test_rows_faster_than_a_thousand_a_second_are_thinned_out() -> None:
+    times = np.arange(100) / 10_000
+    rows = GroupRows("crane", ((ARM, 1),), times, np.ones((100, 1)), np.zeros((100, 1)))
+    assert len({stamp for _, stamp, _, _ in carried([rows]).arrays}) == 10
+
+
+def test_a_test_pattern_reaches_no_topic() -> None:
+    rows = GroupRows("crane", ((ARM, 1),), np.array([1.0]), np.array([[1.0]]), np.array([[0.0]]), test_pattern=True)
+    sink = carried([block(valid=[[False]] * 3, test_pattern=True), rows])
+    assert sink.scalars == sink.arrays == []
+
+
+def test_metadata_and_parameters_say_what_the_datasheet_says() -> None:
+    sink = carried([])
+    words = json.loads(sink.words["/bench/arm/teds"])
+    assert words["channels"][0]["topic"] == "/bench/arm/angle"
+    assert words["channels"][0]["fingerprint"] == "ab" * 32
+    assert sink.parameters["/bench/arm/angle"] == {k: v for k, v in words["channels"][0].items() if k != "topic"}
+
+
+def test_only_actuators_listen_and_only_where_somebody_takes_commands() -> None:
+    grip = replace(FORCE, kind="actuator")
+    assert carried([], [ANGLE, grip], commands=[]).listens == [("/bench/hand/force/cmd", HAND, 2)]
+    assert carried([], [ANGLE, grip]).listens == []
+
+
+def test_a_command_that_is_no_number_moves_nothing() -> None:
+    commands: list[Command] = []
+    sink = Carrier(commands)
+    for value in (float("nan"), float("inf"), 1.5):
+        sink._command(HAND, 2, value)
+    assert [one.value for one in commands] == [1.5]
+    assert sink.refused_commands == 2
+
+
+@pytest.mark.parametrize(
+    ("report", "level"),
+    [
+        (NodeReport(ARM, "running"), OK),
+        (NodeReport(ARM, "running", lost=1), WARN),
+        (NodeReport(ARM, "waiting"), WARN),
+        (NodeReport(ARM, "lost", "no frame for 1 s"), ERROR),
+        (NodeReport(ARM, "refused", "another key"), ERROR),
+    ],
+)
+def test_diagnostics_tell_what_is_wrong(report: NodeReport, level: int) -> None:
+    sink = carried([report], [replace(ANGLE, overdue=True, due="2026-01-01")])
+    status, overdue, own = sink.statuses
+    assert status.level == level
+    assert status.message == (report.why or report.state)
+    assert overdue.level == WARN
+    assert "2026-01-01" in overdue.message
+    assert own.hardware == "bench"
+
+
+def test_a_slow_carrier_loses_the_oldest_and_says_how_much() -> None:
+    class Slow(Carrier):
+        def _scalar(self, *_: object) -> None:
+            time.sleep(0.3)
+
+    sink = Slow()
+    sink.open([ANGLE], replace(STATION, scalar_rate=1e6))
+    for k in range(600):
+        sink.write(block([[k]], index=k))
+    dropped = sink.stats.dropped
+    sink._closing = True
+    sink._items.clear()
+    sink.close()
+    assert dropped >= 300

@@ -1,0 +1,204 @@
+"""ROS 1 by Debian's own master, rostopic and rosparam; masters and children that die."""
+
+from __future__ import annotations
+
+import os
+import queue
+import signal
+import socket
+import subprocess
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from teds_provision.measure.blocks import Command, GroupRows, NodeReport
+from teds_provision.measure.sinks import open_sink
+from teds_provision.measure.sinks.ros1 import Ros1Sink
+from teds_provision.teds.units.units import parse_units
+from tests.measure.sinks.parts import ANGLE, ARM, FORCE, HAND, STATION, block
+
+pytestmark = [
+    pytest.mark.system,
+    pytest.mark.skipif(not Path("/usr/bin/rosmaster").exists(), reason="python3-rosmaster is not installed"),
+    pytest.mark.skipif(not Path("/usr/bin/rostopic").exists(), reason="python3-rostopic is not installed"),
+]
+OIL = replace(FORCE, number=3, name="oil", unit="K", units=parse_units("K"), uncertainty=0.3)
+GRIP = replace(FORCE, kind="actuator")
+
+
+class Master:
+    """Debian's rosmaster on a free port, with files of its own."""
+
+    def __init__(self, folder: Path) -> None:
+        with socket.socket() as free:
+            free.bind(("127.0.0.1", 0))
+            self.port = free.getsockname()[1]
+        self.uri = f"http://127.0.0.1:{self.port}"
+        self.environment = {
+            "PATH": "/usr/bin:/bin",
+            "ROS_MASTER_URI": self.uri,
+            "ROS_IP": "127.0.0.1",
+            "ROS_HOME": str(folder),
+            "ROS_LOG_DIR": str(folder),
+            "HOME": str(folder),
+        }
+        self.process: subprocess.Popen[bytes] | None = None
+
+    def start(self) -> None:
+        command = ["/usr/bin/python3", "/usr/bin/rosmaster", "--core", "-p", str(self.port)]
+        self.process = subprocess.Popen(
+            command, env=self.environment, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
+        )
+
+    def stop(self) -> None:
+        if self.process is not None:
+            self.process.kill()
+            self.process.wait()
+            self.process = None
+
+    def tool(self, *words: str) -> str:
+        command = ["/usr/bin/python3", f"/usr/bin/{words[0]}", *words[1:]]
+        done = subprocess.run(command, env=self.environment, capture_output=True, text=True, timeout=60, check=False)
+        return done.stdout
+
+
+@pytest.fixture
+def master(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Master]:
+    one = Master(tmp_path)
+    for name in ("ROS_IP", "ROS_HOME", "ROS_LOG_DIR"):
+        monkeypatch.setenv(name, one.environment[name])
+    yield one
+    one.stop()
+
+
+def until(what: Callable[[], object], seconds: float = 60.0) -> None:
+    end = time.monotonic() + seconds
+    while not what():
+        assert time.monotonic() < end, "it did not come to that"
+        time.sleep(0.05)
+
+
+def ros1(master: Master, commands: Callable[[Command], None] | None = None) -> Ros1Sink:
+    sink = open_sink(f"ros1:{master.uri}", commands)
+    assert isinstance(sink, Ros1Sink)
+    return sink
+
+
+def feed(sink: Ros1Sink, k: int) -> None:
+    sink.write(block([[10 + k]], index=k, start=time.time()))
+    sink.write(block([[2931.5, 5]], [[293.15, 0.5]], uuid=HAND, channels=(3, 2), index=k, start=time.time()))
+    values = np.array([[1.0, np.nan]])
+    sink.write_group(GroupRows("crane", ((ARM, 1), (HAND, 3)), np.array([time.time()]), values, values * 0))
+
+
+def test_debians_tools_see_topics_values_metadata_and_parameters(master: Master) -> None:
+    master.start()
+    sink = ros1(master)
+    sink.open([ANGLE, OIL, GRIP], STATION)
+    sink.report(NodeReport(ARM, "running", lost=2))
+    until(lambda: sink.stats.state == "running")
+    feed(sink, 0)
+    reader = subprocess.Popen(
+        ["/usr/bin/python3", "/usr/bin/rostopic", "echo", "-n", "1", "/bench/hand/oil"],
+        env=master.environment,
+        stdout=subprocess.PIPE,
+        text=True,
+    )
+    array = subprocess.Popen(
+        ["/usr/bin/python3", "/usr/bin/rostopic", "echo", "-n", "1", "/bench/crane"],
+        env=master.environment,
+        stdout=subprocess.PIPE,
+        text=True,
+    )
+    k = 0
+    while reader.poll() is None or array.poll() is None:
+        k += 1
+        assert k < 1200
+        feed(sink, k)
+        time.sleep(0.05)
+    assert reader.stdout is not None
+    assert array.stdout is not None
+    temperature, row = reader.stdout.read(), array.stdout.read()
+    reader.stdout.close()
+    array.stdout.close()
+    assert "temperature: 20.0" in temperature
+    assert "variance: 0.03" in temperature
+    assert "- arm/angle" in row
+    assert "[1.0, nan]" in row
+    topics = set(master.tool("rostopic", "list").split())
+    assert {"/bench/arm/angle", "/bench/hand/oil", "/bench/crane", "/bench/arm/teds", "/diagnostics"} <= topics
+    assert "/bench/hand/force/cmd" not in topics, "nobody takes commands here"
+    assert master.tool("rostopic", "type", "/bench/arm/angle").strip() == "std_msgs/Float64"
+    latched = master.tool("rostopic", "echo", "-n", "1", "/bench/arm/teds")
+    assert ANGLE.fingerprint in latched, "a late comer gets the metadata"
+    assert f"uuid: {ARM}" in master.tool("rosparam", "get", "/bench/arm/angle")
+    diagnostics = master.tool("rostopic", "echo", "-n", "1", "/diagnostics")
+    assert 'key: "lost"' in diagnostics
+    sink.close()
+    assert sink.stats.error == ""
+
+
+def test_a_command_topic_moves_an_actuator(master: Master) -> None:
+    master.start()
+    came: queue.Queue[Command] = queue.Queue()
+    sink = ros1(master, came.put)
+    sink.open([GRIP], STATION)
+    until(lambda: sink.stats.state == "running")
+    topic = "/bench/hand/force/cmd"
+    words = ["/usr/bin/rostopic", "pub", "-r", "5", topic, "std_msgs/Float64", "1.25"]
+    command = ["/usr/bin/python3", *words]
+    publisher = subprocess.Popen(command, env=master.environment, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+    try:
+        one = came.get(timeout=60)
+    finally:
+        publisher.kill()
+        publisher.wait()
+        sink.close()
+    assert (one.uuid, one.channel, one.value) == (HAND, 2, 1.25)
+
+
+def test_without_a_master_it_waits_and_says_for_what_then_carries_on(master: Master) -> None:
+    sink = ros1(master)
+    sink.open([ANGLE], STATION)
+    until(lambda: str(master.port) in sink.stats.detail)
+    assert sink.stats.state == "waiting"
+    sink.write(block())
+    until(lambda: sink.stats.dropped == 3)
+    master.start()
+    until(lambda: sink.stats.state == "running")
+    until(lambda: "/bench/arm/teds" in master.tool("rostopic", "list"))
+    sink.close()
+
+
+def test_a_master_and_a_child_that_die_are_survived(master: Master) -> None:
+    master.start()
+    sink = ros1(master)
+    sink.open([ANGLE], STATION)
+    until(lambda: sink.stats.state == "running")
+    child = sink._child
+    assert child is not None
+    os.kill(child.pid, signal.SIGKILL)
+    until(lambda: sink.stats.state == "waiting")
+    until(lambda: sink.stats.state == "running")
+    master.stop()
+    until(lambda: sink.stats.state == "waiting")
+    master.start()
+    until(lambda: sink.stats.state == "running")
+    until(lambda: (sink.write(block(start=time.time())), "/bench/arm/angle" in master.tool("rostopic", "list"))[1])
+    sink.close()
+    assert sink.stats.error == ""
+
+
+def test_nothing_of_the_child_outlives_the_sink(master: Master) -> None:
+    master.start()
+    sink = ros1(master)
+    sink.open([ANGLE], STATION)
+    until(lambda: sink.stats.state == "running")
+    child = sink._child
+    assert child is not None
+    sink.close()
+    assert child.poll() is not None
