@@ -5,7 +5,7 @@ PYTHON ?= python3
 VENV ?= .venv
 BIN := $(VENV)/bin
 
-.PHONY: demo test lint types unit bench bench-teds bench-handover fuzz clean
+.PHONY: demo test lint types unit bench bench-teds bench-handover fuzz model clean
 
 demo: $(VENV)/.run
 	@$(BIN)/teds-provision demo
@@ -37,6 +37,10 @@ bench-handover: $(VENV)/.dev
 fuzz: .venv-fuzz/.ready
 	@mkdir -p build/fuzz
 	.venv-fuzz/bin/python tests/fuzz/fuzz_teds.py -max_total_time=$(or $(SECONDS),600) -artifact_prefix=build/ build/fuzz tests/fuzz/corpus
+
+# The model of a key's life, by SPIN: the rules hold, each broken one is found.
+model: $(VENV)/.made
+	$(BIN)/python model/check.py
 
 # Stamps, not the files that are made: what was cut short is made anew.
 $(VENV)/.made:

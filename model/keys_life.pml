@@ -13,6 +13,7 @@
  *   BREAK_M6      a store brought back from a backup is used as if nothing had happened since
  *   BREAK_PENDING the new key is stored after Confirm left, not before
  *   BREAK_HELD_BACK  an Open under the old key deletes the new one, whose Confirm was held back on the way
+ *   BREAK_OLD_PENDING  any pending key that opens ends a due rotation, also one made before the rotation was due
  *   BREAK_REFUSAL a refused Open deletes the key that was tried
  *   BREAK_LATE    a late receipt deletes the key though the node has come back since
  */
@@ -191,6 +192,13 @@ inline keep_newer(s) {
 	b = 0
 }
 
+/* A pending key that came back from a backup is not a rotation: it may have been used and shared since. */
+#ifdef BREAK_OLD_PENDING
+#define MADE_SINCE(s) true
+#else
+#define MADE_SINCE(s) (node_key >= st[s].due_since)
+#endif
+
 proctype station(byte s)
 {
 	byte b;
@@ -222,7 +230,7 @@ end:
 		st[s].present_key = node_key;
 		keep_newer(s);			/* now, and only now, others are deleted */
 		if
-		:: maker[node_key] == s && node_key >= st[s].due_since ->
+		:: maker[node_key] == s && MADE_SINCE(s) ->
 			st[s].due = false; st[s].shared = false; given_to[s] = NOBODY
 		:: else
 		fi;

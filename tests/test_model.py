@@ -1,0 +1,22 @@
+"""The model of a key's life: its rules hold, and each rule that is broken is noticed (model/README.md)."""
+
+from __future__ import annotations
+
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+CHECK = Path(__file__).parent.parent / "model" / "check.py"
+
+
+@pytest.mark.system
+@pytest.mark.timeout(600)
+@pytest.mark.skipif(shutil.which("spin") is None or shutil.which("cc") is None, reason="spin or a C compiler missing")
+def test_the_rules_hold_and_each_broken_rule_is_found() -> None:
+    done = subprocess.run([sys.executable, str(CHECK), "--quick"], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert "without rule M3" in done.stdout
+    assert "WRONG" not in done.stdout
