@@ -31,7 +31,8 @@ def rewrap(station: Station) -> Rewrapped:
     """
     vault, identity = station.vault, station.identity
     if identity.rewrapping != vault.masters()[-1]:
-        vault.add_master()
+        if vault.masters()[-1] <= identity.master:  # else a run was cut before it noted the one that it had made
+            vault.add_master()
         identity.begin_rewrapping(vault.masters()[-1])
     damaged = 0
 

@@ -1,0 +1,247 @@
+"""``vault passphrase`` and ``vault rewrap``: as commands, and cut at every durable write."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import pytest
+
+from teds_provision.errors import WrongPassphrase
+from teds_provision.station.rewrap import rewrap
+from teds_provision.station.station import Station
+from teds_provision.store import StoreLock
+from teds_provision.store.database import Database
+from teds_provision.vault import forget_vaults
+from teds_provision.vault.file_vault import FileVault
+from teds_provision.vault.passphrase import THROWAWAY
+from tests.cli.shell import clean_environment, spawn
+from tests.vault.softhsm import PIN, loaded, unload
+from tests.workflow.bench import PASSPHRASE, make_station
+
+NODES = [number.to_bytes(10, "big") for number in range(1, 5)]
+NEW = "four other random words"
+
+
+class Killed(BaseException):
+    """The process died here."""
+
+
+@contextmanager
+def dying_at(step: int) -> Iterator[list[int]]:
+    """Die before the given durable step: a statement of the store, an fsync, a rename, a link. Gives the count."""
+    count = [0]
+
+    def counted(real: Callable[..., object]) -> Callable[..., object]:
+        def run(*args: object, **more: object) -> object:
+            count[0] += 1
+            if count[0] == step:
+                raise Killed
+            return real(*args, **more)
+
+        return run
+
+    with pytest.MonkeyPatch.context() as patch:
+        for owner, names in ((os, ("fsync", "replace", "link")), (Database, ("execute", "change", "execute_many"))):
+            for name in names:
+                patch.setattr(owner, name, counted(getattr(owner, name)))
+        yield count
+
+
+def asking(*answers: str) -> Callable[[str, bool], str]:
+    said = list(answers)
+    return lambda prompt, confirm: said.pop(0)
+
+
+@pytest.fixture
+def home(tmp_path: Path) -> Iterator[Path]:
+    """A station with a key of each of four nodes, one of them with a pending key beside it."""
+    forget_vaults()
+    station = make_station(tmp_path / "home")
+    for uuid in NODES:
+        station.keys.add_pending(uuid, key=uuid + b"first!", key_id=uuid[-8:], epoch=1)
+        station.keys.promote(uuid, uuid[-8:].hex())
+    station.keys.add_pending(NODES[0], key=NODES[0] + b"second", key_id=b"pending!", epoch=2)
+    station.close()
+    yield tmp_path / "home"
+    forget_vaults()
+
+
+def keys(station: Station) -> list[tuple[int, bytes]]:
+    return [(held.record.epoch, held.key) for uuid in NODES for held in station.keys.unwrapped(uuid)]
+
+
+def opened(home: Path, passphrase: str = PASSPHRASE) -> Station:
+    forget_vaults()
+    return Station.open(home, ask=asking(*[passphrase] * 9))
+
+
+def test_rewrap_cut_at_every_durable_write_loses_no_key(home: Path) -> None:
+    station = opened(home)
+    before, wrapped = keys(station), {record.wrapped for record in station.keys.all()}
+    station.close()
+    step, came = 0, True
+    while came:
+        step += 1
+        station = opened(home)
+        station.unlock()
+        came = False
+        with dying_at(step):
+            try:
+                rewrap(station)
+            except Killed:
+                came = True
+        station.close()
+        again = opened(home)
+        assert keys(again) == before, f"cut before durable step {step}"
+        masters = len(again.vault.masters())
+        assert masters <= 2
+        if not came:
+            assert masters == 1
+            assert not wrapped & {record.wrapped for record in again.keys.all()}
+        again.close()
+    assert step > 15
+
+
+def test_a_run_that_was_cut_is_carried_on_and_not_begun_anew(home: Path) -> None:
+    station = opened(home)
+    station.vault.add_master()
+    station.identity.begin_rewrapping(2)
+    assert rewrap(station).keys == 5
+    assert station.vault.masters() == (2,)
+    assert rewrap(station).keys == 5
+    assert station.vault.masters() == (3,)
+    station.close()
+
+
+def test_a_key_that_was_lost_before_does_not_keep_the_old_master_key(home: Path) -> None:
+    station = opened(home)
+    station._store._database.execute("UPDATE keys SET wrapped = zeroblob(60) WHERE uuid = ?", (NODES[3],))
+    done = rewrap(station)
+    assert (done.keys, done.damaged) == (4, 1)
+    assert station.vault.masters() == (2,)
+    station.close()
+
+
+def test_a_process_that_opened_the_vault_before_goes_on_with_the_new_master_key(home: Path) -> None:
+    """A ``--watch`` that runs for hours must neither lose the keys it makes nor fail to read those of others."""
+    long_running = opened(home)
+    before = keys(long_running)
+    other = opened(home)
+    rewrap(other)
+    assert keys(long_running) == before
+    third = opened(home)
+    rewrap(third)
+    long_running.keys.add_pending(NODES[1], key=b"made later......", key_id=b"later...", epoch=7)
+    assert (7, b"made later......") in keys(opened(home))
+    for station in (long_running, other, third):
+        station.close()
+
+
+def test_a_new_passphrase_cut_at_every_durable_write_opens_with_the_old_or_the_new(home: Path) -> None:
+    before = FileVault.open(home, Station.open(home, ask=asking()).id, asking(PASSPHRASE)).identity().point
+    store_id = opened(home).id
+    step, came = 0, True
+    while came:
+        step += 1
+        vault = FileVault.open(home, store_id, asking(PASSPHRASE))
+        came = False
+        with dying_at(step):
+            try:
+                vault.change_passphrase(asking(NEW), costs=THROWAWAY)
+            except Killed:
+                came = True
+        fits = []
+        for passphrase in (PASSPHRASE, NEW):
+            try:
+                assert FileVault.open(home, store_id, asking(passphrase)).identity().point == before
+            except WrongPassphrase:
+                continue
+            fits.append(passphrase)
+        assert len(fits) == 1, f"cut before durable step {step}"
+        if fits == [NEW]:
+            FileVault.open(home, store_id, asking(NEW)).change_passphrase(asking(PASSPHRASE), costs=THROWAWAY)
+        assert [path.name for path in home.iterdir() if path.name.startswith(".")] == []
+    assert step == 4  # the file, its name, the folder, and the run that was not cut
+
+
+# -- as commands -------------------------------------------------------------------------------------------------------
+
+
+def passphrase_command(home: Path, old: str, new: str) -> subprocess.CompletedProcess[str]:
+    pipes = []
+    for secret in (old, new):
+        read, write = os.pipe()
+        os.write(write, secret.encode() + b"\n")
+        os.close(write)
+        pipes.append(read)
+    words = ["--home", home, "--json", "--passphrase-fd", pipes[0], "vault", "passphrase"]
+    words += ["--new-passphrase-fd", pipes[1]]
+    done = subprocess.run(
+        [sys.executable, "-m", "teds_provision", *map(str, words)],
+        pass_fds=pipes,
+        capture_output=True,
+        text=True,
+        check=False,
+        timeout=60,
+        stdin=subprocess.DEVNULL,
+        env=clean_environment(),
+    )
+    for read in pipes:
+        os.close(read)
+    return done
+
+
+def test_a_new_passphrase_by_command(home: Path) -> None:
+    assert passphrase_command(home, "some other words", NEW).returncode == 7
+    assert passphrase_command(home, PASSPHRASE, "short").returncode == 7
+    done = passphrase_command(home, PASSPHRASE, NEW)
+    assert done.returncode == 0, done.stdout
+    assert '"keystore": "file"' in done.stdout
+    assert PASSPHRASE not in done.stdout + done.stderr
+    assert NEW not in done.stdout + done.stderr
+    assert spawn("--home", home, "vault", "rewrap", passphrase=PASSPHRASE).code == 7
+    assert spawn("--home", home, "vault", "rewrap", passphrase=NEW).code == 0
+    station = opened(home, NEW)
+    assert len(keys(station)) == 5
+    assert [entry.outcome for entry in station.audit_log.entries()][-2:] == ["new passphrase", "rewrapped"]
+    station.close()
+
+
+def test_rewrap_by_command_and_its_plan(home: Path) -> None:
+    planned = spawn("--home", home, "--json", "vault", "rewrap", "--dry-run")
+    assert (planned.code, planned.json["rewrapped"]) == (0, 5)
+    done = spawn("--home", home, "--json", "vault", "rewrap", passphrase=PASSPHRASE)
+    assert (done.code, done.json) == (0, {"keystore": "file", "rewrapped": 5, "damaged": 0})
+
+
+def test_nobody_changes_the_vault_while_another_command_holds_the_store(home: Path) -> None:
+    with StoreLock(home, command="provision"):
+        process = spawn("--home", home, "--json", "vault", "rewrap", passphrase=PASSPHRASE)
+    assert process.code == 7
+    assert process.json["error"]["code"] == "store-locked"
+
+
+@pytest.mark.system
+def test_a_tokens_pin_and_master_key(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    from teds_provision.station.station import initialise
+
+    forget_vaults()
+    uri = loaded(tmp_path, monkeypatch, ("bench",))["bench"]
+    try:
+        station, _ = initialise(tmp_path / "home", name="bench", keystore=uri, ask=lambda prompt, confirm: PIN)
+        station.keys.add_pending(NODES[0], key=bytes(16), key_id=b"pending!", epoch=1)
+        rewrap(station)
+        assert [held.key for held in station.keys.unwrapped(NODES[0])] == [bytes(16)]
+        with pytest.raises(WrongPassphrase):
+            station.vault.change_passphrase(asking("0000", "654321"))
+        station.vault.change_passphrase(asking(PIN, "654321"))
+        station.vault.change_passphrase(asking("654321", PIN))
+        station.close()
+    finally:
+        forget_vaults()
+        unload()
