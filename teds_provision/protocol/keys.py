@@ -9,7 +9,7 @@ from __future__ import annotations
 import hashlib
 from typing import Protocol
 
-from cryptography.exceptions import InvalidSignature
+from cryptography.exceptions import InvalidSignature, UnsupportedAlgorithm
 from cryptography.hazmat.primitives import hashes
 from cryptography.hazmat.primitives.asymmetric import ec
 from cryptography.hazmat.primitives.asymmetric.utils import decode_dss_signature, encode_dss_signature
@@ -136,6 +136,8 @@ def from_pem(text: bytes) -> bytes:
         raise BadData("This file holds a private key where a public one belongs.")
     try:
         key = load_pem_public_key(text)
+    except UnsupportedAlgorithm as error:
+        raise BadData("This is no P-256 key: its kind is not known here; stations and CAs have P-256 keys.") from error
     except ValueError as error:
         raise BadData("This file holds no public key in PEM form.") from error
     if not isinstance(key, ec.EllipticCurvePublicKey) or not isinstance(key.curve, ec.SECP256R1):

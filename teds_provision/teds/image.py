@@ -9,6 +9,7 @@ from dataclasses import dataclass, field
 from typing import Final
 
 from teds_provision.errors import BadData
+from teds_provision.limits import LIMITS, check_count, load_json
 from teds_provision.teds.codec.codes import AccessCode
 
 FORMAT = "teds-image/1"
@@ -58,10 +59,7 @@ class Image:
     @classmethod
     def from_json(cls, text: str | bytes) -> Image:
         """Read an image file strictly; raises BadData naming what is wrong."""
-        try:
-            data = json.loads(text)
-        except (ValueError, RecursionError) as error:
-            raise BadData("This is not a TEDS image: it is not JSON.") from error
+        data = load_json(text, "the TEDS image")
         if not isinstance(data, dict) or data.get("format") != FORMAT:
             raise BadData(f'This is not a TEDS image: "format" is not "{FORMAT}".')
         uuid = _hex(data.get("uuid"), "uuid")
@@ -70,6 +68,7 @@ class Image:
         entries = data.get("blocks")
         if not isinstance(entries, list):
             raise BadData('"blocks" of the image is not a list.')
+        check_count(len(entries), LIMITS.teds_of_a_file, "TEDS in the image")
         blocks: dict[BlockId, bytes] = {}
         for number, entry in enumerate(entries):
             key, teds = _block(entry, number)

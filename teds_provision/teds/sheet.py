@@ -18,12 +18,13 @@ from typing import Final
 from teds_provision.errors import BadData
 from teds_provision.teds.calibration.decoded import from_decoded, is_finite
 from teds_provision.teds.calibration.model import Calibration
-from teds_provision.teds.calibration.samples import SampleForm
+from teds_provision.teds.calibration.samples import DataModel, SampleForm
 from teds_provision.teds.codec.codes import AccessCode
 from teds_provision.teds.codec.decode import decode
 from teds_provision.teds.codec.model import Decoded, Finding, Severity, Units, Verdict
 from teds_provision.teds.codec.tables import name_of
 from teds_provision.teds.image import BlockId, Image
+from teds_provision.teds.units.names import ARBITRARY, DIGITAL, RATIO
 from teds_provision.teds.units.units import WrittenUnit, display_unit, format_units, format_value
 
 NOT_STATED: Final = math.nan
@@ -166,6 +167,30 @@ class Channel:
     def overdue(self, now: datetime) -> bool:
         """Whether the next calibration was due before ``now``."""
         return self.calibration is not None and self.calibration.overdue(now)
+
+    @property
+    def value_problem(self) -> str:
+        """Why its samples give no values in a unit, as a sentence; "" where they do.
+
+        Without a calibration only floats (in SI units), counts, bits, times and fractions of a ratio are values.
+        """
+        if self.calibration_problem:
+            return f"Channel {self.number} has a calibration that cannot be used: {self.calibration_problem}"
+        if self.sample is None:
+            return f"The datasheet does not say how a sample of channel {self.number} is coded."
+        if self.sample.problem:
+            return f"The samples of channel {self.number} cannot be read: {self.sample.problem}."
+        if self.calibration is None and not self._speaks_for_itself(self.sample.model):
+            unit = self.unit.text
+            return f"Channel {self.number} has no calibration: its raw values cannot be turned into {unit}."
+        return ""
+
+    def _speaks_for_itself(self, model: int) -> bool:
+        if model in (DataModel.FLOAT32, DataModel.FLOAT64, DataModel.TIME_OF_DAY):
+            return True
+        if self.units.interpretation in (DIGITAL, ARBITRARY) or self.units == Units(extension=self.units.extension):
+            return True
+        return self.units.interpretation == RATIO and model in (DataModel.FRACTION, DataModel.LONG_FRACTION)
 
     def show(self, value: float, *, difference: bool = False, digits: int = 6) -> str:
         """Value in SI units as people see it: ``360 °``, ``0.35 N``; a difference leaves the unit's offset out."""

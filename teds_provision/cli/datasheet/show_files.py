@@ -10,10 +10,10 @@ from typing import TYPE_CHECKING, Any
 
 from teds_provision.errors import BadData
 from teds_provision.files import read_limited
+from teds_provision.limits import LIMITS
 from teds_provision.teds.codec.codes import AccessCode
 from teds_provision.teds.codec.model import Decoded, Edition, Finding, Verdict
 from teds_provision.teds.formats import Block, Kind, class_of, detect, read_blocks
-from teds_provision.teds.formats.block import MAX_FILE
 from teds_provision.teds.messages import Message, decode_message, looks_like_message
 from teds_provision.teds.show import Shown, describe
 
@@ -54,10 +54,10 @@ class ShownFile:
 def read_file(name: str) -> bytes:
     """Octets of a file or, for ``-``, of standard input; raises NotFound and, for more than 32 MiB, BadData."""
     if name != STDIN:
-        return read_limited(Path(name), MAX_FILE, "file of TEDS")
-    octets = sys.stdin.buffer.read(MAX_FILE + 1)
-    if len(octets) > MAX_FILE:
-        raise BadData(f"Standard input gives more than {MAX_FILE >> 20} MiB; no file of TEDS has.")
+        return read_limited(Path(name), LIMITS.teds_file, "file of TEDS")
+    octets = sys.stdin.buffer.read(LIMITS.teds_file + 1)
+    if len(octets) > LIMITS.teds_file:
+        raise BadData(f"Standard input gives more than {LIMITS.teds_file >> 20} MiB; no file of TEDS has.")
     return octets
 
 
@@ -73,7 +73,8 @@ def load(name: str, edition: Edition | None = None) -> ShownFile:
         path = Path(name) if name != STDIN else None
         blocks = read_blocks(octets, kind, path=path)
     except BadData as error:
-        raise BadData(f"{name}: {error.message}", hint=error.hint) from error
+        named = error.message.startswith(f"{name}:") or error.message.startswith(f"{name} ")
+        raise BadData(error.message if named else f"{name}: {error.message}", hint=error.hint) from error
     if not blocks:
         raise BadData(f"{name} holds no TEDS.")
     if len(blocks) == 1 and is_message(blocks[0].octets):

@@ -11,8 +11,11 @@ from difflib import get_close_matches
 from typing import Final
 
 from teds_provision.errors import BadData
+from teds_provision.limits import LIMITS, check_size
 
 MAXIMUM_ROWS: Final = 200_000
+_CHANNEL_DIGITS: Final = 5
+_LINE: Final = 20_000
 RAW: Final = {"raw", "count", "counts", "adc", "code", "digital", "x", "input"}
 CHANNEL: Final = {"channel", "ch"}
 SEGMENT: Final = ("from", "to", "offset")
@@ -59,6 +62,7 @@ class _Columns:
 def read_csv(text: str, file: str, keys: Sequence[str]) -> CsvTable:
     """Read a calibration CSV; raises BadData naming file, line and field."""
     table = CsvTable(file)
+    check_size(len(text), LIMITS.text_file, file)
     data: list[tuple[int, str]] = []
     for number, line in enumerate(text.splitlines(), 1):
         stripped = line.strip()
@@ -70,6 +74,9 @@ def read_csv(text: str, file: str, keys: Sequence[str]) -> CsvTable:
         raise BadData(
             f"{file}:1: the file holds no points.", hint="It takes lines of raw value and value, like: 512, 10.5"
         )
+    long = next((number for number, line in data if len(line) > _LINE), None)
+    if long is not None:
+        raise BadData(f"{file}:{long}: the line has more than {_LINE} characters.")
     if len(data) > MAXIMUM_ROWS:
         raise BadData(f"{file}:{data[MAXIMUM_ROWS][0]}: more than {MAXIMUM_ROWS} lines.")
     delimiter = _delimiter(data[0][1])
@@ -101,7 +108,7 @@ def _metadata(table: CsvTable, line: str, number: int, keys: Sequence[str]) -> N
             raise BadData(f"{table.file}:{number}: {key}: given twice.")
         table.metadata[key] = (match[2], number)
         return
-    near = get_close_matches(key, keys, n=1, cutoff=0.8)
+    near = get_close_matches(key[:64], keys, n=1, cutoff=0.8)
     if near:
         raise BadData(f'{table.file}:{number}: {key}: there is no such key. Did you mean "{near[0]}"?')
 
@@ -180,11 +187,11 @@ def _row(table: CsvTable, number: int, cells: list[str], columns: _Columns, deci
         try:
             values.append(_number(cells[place], decimal_comma=decimal_comma))
         except (ValueError, OverflowError) as error:
-            raise BadData(f'{table.file}:{number}: {name}: "{cells[place]}" is not a number.') from error
+            raise BadData(f'{table.file}:{number}: {name}: "{cells[place][:40]}" is not a number.') from error
     channel = None
     if columns.channel is not None:
         text = cells[columns.channel]
-        if not text.isdecimal():
-            raise BadData(f'{table.file}:{number}: channel: "{text}" is not the number of a channel.')
+        if not (text.isascii() and text.isdecimal() and len(text) <= _CHANNEL_DIGITS):
+            raise BadData(f'{table.file}:{number}: channel: "{text[:40]}" is not the number of a channel.')
         channel = int(text)
     return Row(number, channel, tuple(values))

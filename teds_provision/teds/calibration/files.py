@@ -5,7 +5,6 @@ Metadata of a CSV stand in lines ``# key: value``; every error names file, line 
 
 from __future__ import annotations
 
-import json
 import re
 from collections.abc import Mapping
 from difflib import get_close_matches
@@ -13,6 +12,7 @@ from pathlib import Path
 from typing import Final
 
 from teds_provision.errors import BadData
+from teds_provision.limits import LIMITS, load_json
 from teds_provision.teds.calibration.csv_text import CsvTable, read_csv
 from teds_provision.teds.calibration.model import Calibration
 from teds_provision.teds.calibration.order import Order, calibration_of
@@ -42,7 +42,7 @@ KEYS: Final = (
     "calibration",
 )
 CSV_KEYS: Final = KEYS[:12]
-_CHANNELS: Final = re.compile(r"(\d+)(?:\s*-\s*(\d+))?\Z")
+_CHANNELS: Final = re.compile(r"([0-9]{1,5})(?:\s*-\s*([0-9]{1,5}))?\Z")
 
 
 def load_calibrations(path: Path, profile: Profile) -> dict[int, Calibration]:
@@ -88,12 +88,7 @@ def _from_csv(table: CsvTable) -> list[Order]:
 
 
 def _json(text: str, file: str) -> Table:
-    try:
-        data = json.loads(text)
-    except json.JSONDecodeError as error:
-        raise BadData(f"{file}:{error.lineno}: this is not JSON: {error.msg}.") from error
-    except RecursionError as error:
-        raise BadData(f"{file}:1: this is not JSON: it is nested too deeply.") from error
+    data = load_json(text, "the calibration", octets=LIMITS.text_file, file=file)
     if not isinstance(data, dict):
         raise BadData(f"{file}:1: an object is expected, with points or coefficients.")
 
@@ -126,7 +121,7 @@ def _order(table: Table, file: str) -> Order:
     order = Order(file, table.where.line)
     for key, entry in table.entries.items():
         if key not in KEYS or key == "calibration" or isinstance(entry, Table):
-            near = get_close_matches(key, KEYS, n=1)
+            near = get_close_matches(key[:64], KEYS, n=1)
             guess = f' Did you mean "{near[0]}"?' if near else f" Known are: {', '.join(KEYS)}."
             raise BadData(f"{entry.where}: {key}: there is no such key.{guess}")
         order.values[key] = (entry.value, entry.where.line)

@@ -17,10 +17,9 @@ import numpy as np
 from teds_provision.errors import BadData
 from teds_provision.teds.calibration.formula import PreparedCurve, PreparedInverse
 from teds_provision.teds.calibration.reading import SampleReader
-from teds_provision.teds.calibration.samples import DataModel, Range, SampleForm
-from teds_provision.teds.codec.model import Units
+from teds_provision.teds.calibration.samples import Range, SampleForm
 from teds_provision.teds.sheet import Channel, Sheet
-from teds_provision.teds.units.units import RATIO, WrittenUnit
+from teds_provision.teds.units.units import WrittenUnit
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -29,7 +28,6 @@ if TYPE_CHECKING:
 
     Floats = NDArray[np.float64]
 
-_DIGITAL, _ARBITRARY = 4, 5
 _ROUNDING: Final = 4 * 2.0**-23
 """Limits and coefficients are Float32: a value this much of the limit beyond it is not beyond it."""
 
@@ -240,8 +238,6 @@ class ChannelInterpreter:
 
     def _problem(self, sheet: Sheet) -> str:
         channel = self.channel
-        if channel.calibration_problem:
-            return f"Channel {channel.number} has a calibration that cannot be used: {channel.calibration_problem}"
         for number in self.others:
             if number not in self._readers:
                 known = sheet.channel(number)
@@ -249,10 +245,7 @@ class ChannelInterpreter:
                 return f"Channel {channel.number} is compensated by channel {number}, which {why}."
         if channel.actuator and channel.calibration is not None and len(channel.calibration.inputs) > 1:
             return f"The calibration of actuator {channel.number} takes several inputs; one is what can be set here."
-        if channel.calibration is None and not _speaks_for_itself(channel):
-            unit = self.unit.text
-            return f"Channel {channel.number} has no calibration: its raw values cannot be turned into {unit}."
-        return ""
+        return channel.value_problem
 
 
 def _forms(sheet: Sheet, numbers: tuple[int, ...]) -> dict[int, SampleForm]:
@@ -260,15 +253,3 @@ def _forms(sheet: Sheet, numbers: tuple[int, ...]) -> dict[int, SampleForm]:
     found = {number: sheet.channel(number) for number in numbers}
     forms = {number: channel.sample for number, channel in found.items() if channel is not None}
     return {number: form for number, form in forms.items() if form is not None and not form.problem}
-
-
-def _speaks_for_itself(channel: Channel) -> bool:
-    """Whether samples are values without a calibration: floats in SI units, counts, bits, fractions of a ratio."""
-    form, units = channel.sample, channel.units
-    if form is None:
-        return False
-    if form.model in (DataModel.FLOAT32, DataModel.FLOAT64, DataModel.TIME_OF_DAY):
-        return True
-    if units.interpretation in (_DIGITAL, _ARBITRARY) or units == Units(extension=units.extension):
-        return True
-    return units.interpretation == RATIO and form.model in (DataModel.FRACTION, DataModel.LONG_FRACTION)

@@ -26,6 +26,9 @@ METHODS: Final[tuple[Method, ...]] = ("linear", "polynomial", "table", "steps")
 MONOTONE: Final[tuple[Monotone, ...]] = ("increasing", "decreasing", "either")
 """Names of the codes 1 to 3 of field 137 (house profile)."""
 
+MAXIMUM_INPUTS: Final = 8
+"""Inputs of one calibration that are read: what is looked at grows with the power of their number."""
+
 PLAIN: Final = parse_unit("1")
 
 
@@ -98,8 +101,8 @@ class Calibration:
     raw_range: tuple[float, float] | None = None
 
     def __post_init__(self) -> None:
-        if not self.inputs:
-            raise BadData("A calibration has at least one input.")
+        if not 1 <= len(self.inputs) <= MAXIMUM_INPUTS:
+            raise BadData(f"A calibration has 1 to {MAXIMUM_INPUTS} inputs, not {len(self.inputs)}.")
         cells = math.prod(part.segments for part in self.inputs)
         each = math.prod(part.degree + 1 for part in self.inputs)
         if len(self.coefficients) != cells * each:

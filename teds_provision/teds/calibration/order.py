@@ -260,7 +260,7 @@ def _method(order: Order) -> Method | None:
     for method in METHODS:
         if value == method:
             return method
-    near = get_close_matches(str(value), METHODS, n=1)
+    near = get_close_matches(str(value)[:64], METHODS, n=1)
     guess = f'Did you mean "{near[0]}"?' if near else f"One of {', '.join(METHODS)} is expected."
     raise order.wrong("method", f"{value!r} is no method. {guess}")
 

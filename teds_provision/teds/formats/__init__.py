@@ -23,7 +23,8 @@ from pathlib import Path
 from typing import Final, Literal, get_args
 
 from teds_provision.errors import BadData
-from teds_provision.teds.formats.block import MAX_FILE, Block, class_of, is_run, split_run, with_class
+from teds_provision.limits import LIMITS, check_count, check_size, load_json
+from teds_provision.teds.formats.block import Block, class_of, is_run, split_run, with_class
 
 __all__ = [
     "FORMATS",
@@ -41,6 +42,8 @@ __all__ = [
 Format = Literal["binary", "hex", "ihex", "json", "xml", "image", "toml"]
 Kind = Literal["binary", "hex", "ihex", "json", "xml", "image", "toml", "bundle"]
 FORMATS: Final[tuple[str, ...]] = get_args(Format)
+# A list, where TOML would have the name of a table.
+_JSON_LIST: Final = re.compile(r"\[\s*(?:\{|\]|\[\s*[\[\]{])")
 _CONTROL: Final = re.compile(r"[\x00-\x08\x0b\x0e-\x1f]")
 
 
@@ -54,7 +57,7 @@ def detect(octets: bytes) -> Kind:
     stripped = text.lstrip()
     if stripped.startswith("<"):
         return "xml"
-    if stripped.startswith("{"):
+    if stripped.startswith("{") or _JSON_LIST.match(stripped):
         return _json_kind(text)
     if stripped.startswith(":"):
         return "ihex"
@@ -68,18 +71,16 @@ def detect(octets: bytes) -> Kind:
 def _text(octets: bytes) -> str | None:
     """Text of a file, None where it holds control characters or is no UTF-8."""
     try:
-        text = octets[:MAX_FILE].decode("utf-8-sig")
+        text = octets[: LIMITS.teds_file].decode("utf-8-sig")
     except UnicodeDecodeError:
         return None
     return None if _CONTROL.search(text) else text
 
 
 def _json_kind(text: str) -> Kind:
-    import json
-
     try:
-        data = json.loads(text)
-    except (ValueError, RecursionError):
+        data = load_json(text, "the file")
+    except BadData:
         return "json"
     if isinstance(data, dict) and data.get("format") == "teds-image/1":
         return "image"
@@ -93,9 +94,13 @@ def read_blocks(octets: bytes, kind: Kind | None = None, *, path: Path | None = 
     not hold what its kind says, with the place of the fault. Octets that make no TEDS are no fault here: decoding them
     gives the findings.
     """
-    if len(octets) > MAX_FILE:
-        raise BadData(f"The file has {len(octets)} octets; at most {MAX_FILE} are read.")
-    kind = kind or detect(octets)
+    check_size(len(octets), LIMITS.teds_file, "the file")
+    blocks = _read(octets, kind or detect(octets), path)
+    check_count(len(blocks), LIMITS.teds_of_a_file, "TEDS")
+    return blocks
+
+
+def _read(octets: bytes, kind: Kind, path: Path | None) -> list[Block]:
     if kind == "binary":
         return [with_class(piece) for piece in split_run(octets)]
     if kind == "xml":

@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Final, NamedTuple
+from typing import NamedTuple
 
+from teds_provision.limits import LIMITS, check_count
 from teds_provision.teds.codec.frame import MINIMUM_OCTETS, checksum, teds_class
-
-MAX_FILE: Final = 32 << 20
-"""Octets of the largest file that is read."""
 
 
 class Block(NamedTuple):
@@ -39,6 +37,7 @@ def split_run(octets: bytes) -> list[bytes]:
             if stated != checksum(piece[:-2]):
                 return [octets]
         pieces.append(piece)
+        check_count(len(pieces), LIMITS.teds_of_a_file, "TEDS")
         at = end
     return pieces
 

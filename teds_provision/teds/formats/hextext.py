@@ -11,6 +11,7 @@ from collections.abc import Sequence
 from typing import Final
 
 from teds_provision.errors import BadData
+from teds_provision.limits import LIMITS, check_count
 from teds_provision.teds.formats.block import Block, class_of, split_run, with_class
 
 _PLACE: Final = re.compile(r"#\s*channel (\d{1,5}|-) access code (\d{1,3}|-)(?=\s|$)")
@@ -21,8 +22,13 @@ _LINE_DIGITS: Final = 64
 
 def looks_like_hex(text: str) -> bool:
     """Whether a text holds hex digits and nothing else, comments aside."""
-    digits = "".join(_digits(line) for line in text.splitlines())
-    return bool(digits) and _OTHER.search(digits) is None
+    some = False
+    for line in text.splitlines():
+        digits = _digits(line)
+        if _OTHER.search(digits) is not None:
+            return False
+        some = some or bool(digits)
+    return some
 
 
 def read_hex(text: str) -> list[Block]:
@@ -34,6 +40,7 @@ def read_hex(text: str) -> list[Block]:
         found = _PLACE.match(line.strip())
         if found:
             blocks += _finish(place, digits)
+            check_count(len(blocks), LIMITS.teds_of_a_file, "TEDS")
             channel, code = (None if part == "-" else int(part) for part in found.groups())
             if (channel or 0) > 0xFFFF or (code or 0) > 0xFF:
                 raise BadData(f"Line {number} names channel {channel} and access code {code}; they are u16 and u8.")

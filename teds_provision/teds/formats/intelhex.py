@@ -10,6 +10,7 @@ from collections.abc import Iterator, Sequence
 from typing import Final
 
 from teds_provision.errors import BadData
+from teds_provision.limits import LIMITS, check_count
 from teds_provision.teds.formats.block import Block, split_run, with_class
 
 DATA, END, SEGMENT_BASE, SEGMENT_START, LINEAR_BASE, LINEAR_START = range(6)
@@ -26,6 +27,7 @@ def read_intel_hex(text: str) -> list[Block]:
 def stretches(text: str) -> list[tuple[int, bytes]]:
     """Runs of octets without a gap as (address, octets), ascending; raises BadData where records overlap."""
     pieces: list[tuple[int, bytes]] = []
+    check_count(text.count(":"), LIMITS.hex_records, "records in the Intel HEX text")
     base = 0
     ended = False
     for number, line in enumerate(text.splitlines(), 1):
@@ -41,7 +43,9 @@ def stretches(text: str) -> list[tuple[int, bytes]]:
         ended = kind == END
     if not ended:
         raise BadData("The Intel HEX text has no end record (:00000001FF): it was cut off.")
-    return _joined(sorted(pieces))
+    runs = _joined(sorted(pieces))
+    check_count(len(runs), LIMITS.hex_stretches, "stretches of octets in the Intel HEX text")
+    return runs
 
 
 def _place(base: int, address: int, data: bytes) -> Iterator[tuple[int, bytes]]:

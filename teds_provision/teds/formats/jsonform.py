@@ -8,6 +8,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any, Final
 
 from teds_provision.errors import BadData
+from teds_provision.limits import LIMITS, check_count, load_json
 from teds_provision.teds.codec.model import TimeInstance, Units
 from teds_provision.teds.formats.block import Block
 from teds_provision.teds.formats.tree import (
@@ -41,12 +42,10 @@ def write_json(blocks: Sequence[Block]) -> str:
 
 def read_json(text: str | bytes) -> list[Block]:
     """Read a JSON document of this format; raises BadData naming what is wrong."""
-    try:
-        data = json.loads(text)
-    except (ValueError, RecursionError) as error:
-        raise BadData(f"This is not JSON: {error}.") from error
+    data = load_json(text, "the JSON document")
     if not isinstance(data, dict) or data.get("format") != FORMAT or not isinstance(data.get("teds"), list):
         raise BadData(f'This JSON is no list of TEDS: "format" is not "{FORMAT}" or "teds" is not a list.')
+    check_count(len(data["teds"]), LIMITS.teds_of_a_file, "TEDS")
     return [_block(entry, number) for number, entry in enumerate(data["teds"], 1)]
 
 

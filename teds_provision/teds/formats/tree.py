@@ -23,6 +23,7 @@ from teds_provision.teds.formats.block import Block
 Kind = Literal["integer", "number", "text", "octets", "units", "time", "integers", "numbers", "fields"]
 EntryValue = int | float | str | bytes | Units | TimeInstance | tuple[int, ...] | tuple[float, ...] | None
 
+_EXPONENT_CHARACTERS: Final = 8
 MAX_DEPTH: Final = 8
 _F32: Final = struct.Struct(">f")
 _FLOAT32_MAXIMUM: Final = 3.4028234663852886e38
@@ -189,16 +190,24 @@ def units_to_parts(units: Units) -> dict[str, str]:
     return parts | ({"extension": str(units.extension)} if units.extension else {})
 
 
+def _short(value: object) -> str:
+    """Text of an exponent; without powers of ten, which could ask for a number of any size."""
+    text = str(value)
+    if len(text) > _EXPONENT_CHARACTERS or "e" in text.lower():
+        raise ValueError(text[:_EXPONENT_CHARACTERS])
+    return text
+
+
 def units_from_parts(parts: Mapping[str, object]) -> Units:
     """Units from those parts, texts or numbers; raises BadData."""
     unknown = set(parts) - {"interpretation", "extension", *UNIT_PARTS}
     if unknown:
         raise BadData(f"Units have no part {min(unknown)!r}.")
     try:
-        exponents = {name: Fraction(str(parts.get(name, 0))) for name in UNIT_PARTS}
-        interpretation, extension = (int(str(parts.get(name, 0))) for name in ("interpretation", "extension"))
+        exponents = {name: Fraction(_short(parts.get(name, 0))) for name in UNIT_PARTS}
+        interpretation, extension = (int(_short(parts.get(name, 0))) for name in ("interpretation", "extension"))
     except (ValueError, ZeroDivisionError) as error:
-        raise BadData(f"The units {dict(parts)!r} hold something that is no number.") from error
+        raise BadData("The units hold an exponent that is no number.") from error
     if not all(abs(exponent) <= 64 and (2 * exponent).denominator == 1 for exponent in exponents.values()):
         raise BadData("Exponents of units are multiples of 1/2 from -64 to 63.5.")
     return Units(interpretation, **exponents, extension=extension)

@@ -13,8 +13,9 @@ from pathlib import Path
 from typing import Final
 
 from teds_provision.errors import BadData
+from teds_provision.limits import LIMITS, check_count, check_size, check_xml, whole_number
 from teds_provision.teds.codec.model import Edition, TimeInstance, Units
-from teds_provision.teds.formats.block import MAX_FILE, Block
+from teds_provision.teds.formats.block import Block
 from teds_provision.teds.formats.tree import (
     MAX_DEPTH,
     Entry,
@@ -95,16 +96,17 @@ def read_xml(octets: bytes) -> list[Block]:
         raise BadData(f"This XML is no set of TEDS: its root is {root.tag!r}, not teds-set of {NAMESPACE}.")
     if root.attrib:
         raise BadData(f"teds-set has no attribute {min(root.attrib)!r}.")
+    check_count(len(root), LIMITS.teds_of_a_file, "TEDS")
     return [from_tree(_tree(element, number)) for number, element in enumerate(root, 1)]
 
 
 def parse(octets: bytes) -> ET.Element:
-    """Parse XML that a stranger wrote: no DTD, no entities, at most ``MAX_FILE`` octets; raises BadData."""
+    """Parse XML that a stranger wrote: no DTD, no entities, at most what ``limits`` says. Raises BadData."""
     from defusedxml import DefusedXmlException
     from defusedxml.ElementTree import fromstring
 
-    if len(octets) > MAX_FILE:
-        raise BadData(f"The XML has {len(octets)} octets; at most {MAX_FILE} are read.")
+    check_size(len(octets), LIMITS.teds_file, "the XML")
+    check_xml(octets, "the XML")
     try:
         root: ET.Element = fromstring(octets, forbid_dtd=True)
     except DefusedXmlException as error:
@@ -212,15 +214,24 @@ def _value(element: ET.Element, where: str) -> tuple[Kind, EntryValue]:
         raise BadData(f"The {kind} of {where} does not read as one: {(element.text or '')[:40]!r}.") from error
 
 
+def _whole(text: str) -> int:
+    return whole_number(text, "the value")
+
+
+def _list(text: str) -> list[str]:
+    check_size(len(text), LIMITS.text_file, "a list of numbers")
+    return text.split()
+
+
 def _float(text: str) -> float:
     return float(text.replace("INF", "inf").strip())
 
 
 _READERS: Final[dict[str, tuple[Kind, Callable[[str], EntryValue]]]] = {
-    "integer": ("integer", int),
+    "integer": ("integer", _whole),
     "number": ("number", _float),
     "text": ("text", str),
     "octets": ("octets", bytes.fromhex),
-    "integers": ("integers", lambda text: tuple(int(part) for part in text.split())),
-    "numbers": ("numbers", lambda text: tuple(_float(part) for part in text.split())),
+    "integers": ("integers", lambda text: tuple(_whole(part) for part in _list(text))),
+    "numbers": ("numbers", lambda text: tuple(_float(part) for part in _list(text))),
 }

@@ -26,6 +26,8 @@ if TYPE_CHECKING:
 
 SAMPLES: Final = 65_537
 GRID: Final = 250_000
+TERMS: Final = 50_000_000
+"""Terms of the formula that are computed for one curve of several inputs, at most."""
 FLOAT32_STEP: Final = 2.0**-23
 
 Range = tuple[float, float]
@@ -194,7 +196,8 @@ def curve_of(
     """
     main = next((n for n, part in enumerate(calibration.inputs) if part.channel == channel.number), 0)
     count = len(calibration.inputs)
-    each = SAMPLES if count == 1 else max(9, int(GRID ** (1 / count)))
+    terms = math.prod(part.degree + 1 for part in calibration.inputs)
+    each = SAMPLES if count == 1 else max(3, int(min(GRID, TERMS / terms) ** (1 / count)))
     if count == 1 and not dense and _straight(calibration) and (also is None or _straight(also)):
         each = 2
     axes = []

@@ -90,7 +90,7 @@ def _by_name(name: str, folders: Sequence[Path], besides: Sequence[Path] = ()) -
             if path.is_file() and path.resolve() not in besides:
                 return path
     known = sorted({path.stem for path in _files(folders)})
-    near = get_close_matches(name, known, n=1, cutoff=0.5)
+    near = get_close_matches(name[:64], known, n=1, cutoff=0.5)
     guess = f'Did you mean "{near[0]}"? ' if near else ""
     raise NotFound(
         f'There is no profile "{name}".',

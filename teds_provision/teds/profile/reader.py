@@ -182,7 +182,7 @@ class Section:
         known = self._known | set(also)
         for key in self.table.entries:
             if key not in known:
-                near = get_close_matches(key, known, n=1, cutoff=0.6)
+                near = get_close_matches(key[:64], known, n=1, cutoff=0.6)
                 guess = f' Did you mean "{near[0]}"?' if near else f" Known here: {', '.join(sorted(known))}."
                 self.error(key, f"there is no such key.{guess}")
 
@@ -278,7 +278,7 @@ def _choice(key: Key, value: object) -> int:
         return key.choices[value]
     if isinstance(value, int) and not isinstance(value, bool):
         return _integer(value, 0xFF)
-    near = get_close_matches(str(value), key.choices, n=1, cutoff=0.6)
+    near = get_close_matches(str(value)[:64], key.choices, n=1, cutoff=0.6)
     guess = f'Did you mean "{near[0]}"?' if near else f"One of {', '.join(key.choices)} is expected."
     raise _Wrong(f"{value!r} is not known here. {guess}")
 

@@ -15,8 +15,7 @@ from typing import Final
 
 from teds_provision.errors import BadData, StoreFailure
 from teds_provision.files import read_limited
-
-MAXIMUM_OCTETS: Final = 1 << 20
+from teds_provision.limits import LIMITS, check_depth, check_toml
 
 KeyPath = tuple[str | int, ...]
 
@@ -121,13 +120,15 @@ def key_lines(text: str) -> dict[KeyPath, int]:
 
 def parse(text: str, file: str) -> Table:
     """Read TOML text; ``file`` is the name shown in errors. Raises BadData with file and line."""
+    check_toml(text, file)
     try:
         data = tomllib.loads(text)
-    except (tomllib.TOMLDecodeError, RecursionError) as error:
+    except (ValueError, RecursionError) as error:
         message = str(error)
         at = _AT.search(message)
         line = int(at[1]) if at else max(1, text.count("\n"))
         raise BadData(f"{file}:{line}: this is not TOML: {_AT.sub('', message).strip()}.") from error
+    check_depth(data, LIMITS.toml_depth, file)
     lines = key_lines(text)
 
     def place(path: KeyPath) -> Where:
@@ -157,7 +158,7 @@ def _shown(path: KeyPath) -> str:
 
 def read_text(path: Path) -> str:
     """Text of a small UTF-8 file; raises NotFound, BadData or StoreFailure naming it."""
-    octets = read_limited(path, MAXIMUM_OCTETS, "profile or calibration", failure=StoreFailure)
+    octets = read_limited(path, LIMITS.text_file, "profile or calibration", failure=StoreFailure)
     try:
         return octets.decode("utf-8-sig")
     except UnicodeDecodeError as error:

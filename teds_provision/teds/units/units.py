@@ -13,10 +13,11 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from difflib import get_close_matches
 from fractions import Fraction
-from functools import cache
+from functools import cache, lru_cache
 from typing import TYPE_CHECKING, Any, Final
 
 from teds_provision.errors import BadData
+from teds_provision.limits import LIMITS
 from teds_provision.teds.codec.model import UNIT_PARTS, Units
 from teds_provision.teds.units.names import (
     LOG_RATIO,
@@ -91,7 +92,7 @@ class WrittenUnit:
         return value / abs(self.scale)
 
 
-@cache
+@lru_cache(maxsize=1024)
 def parse_unit(text: str) -> WrittenUnit:
     """Read a unit as people write it: ``degree``, ``N``, ``mm``, ``degC``, ``1/s``, ``mV/V``, ``%``, ``count``.
 
@@ -100,6 +101,8 @@ def parse_unit(text: str) -> WrittenUnit:
     ``g_n`` the standard acceleration of free fall. Raises BadData naming the text and how to write it.
     """
     text = text.strip()
+    if len(text) > LIMITS.unit:
+        raise BadData(f"A unit has at most {LIMITS.unit} characters, this one {len(text)}.")
     if text in SPECIAL:
         return WrittenUnit(text, *SPECIAL[text])
     if text in NAMED:
@@ -132,6 +135,15 @@ def _ratio(text: str) -> WrittenUnit | None:
     return WrittenUnit(text, Units(RATIO, **exponents), above.scale / below.scale)
 
 
+# Names, products, quotients, one power each: nothing whose value is computed, as 9**9**9 would be.
+_PLAIN_POWER: Final = r"(?:\s*(?:\^|\*\*)\s*\(?[-+]?[0-9]{1,3}(?:\.[05]|/2)?\)?|[⁰¹²³⁴⁵⁶⁷⁸⁹⁻]{1,4})?+"
+_PLAIN_NAME: Final = r"[^\W\d_]\w*+|[°%Ω]\w*+"
+_PLAIN_UNIT: Final = re.compile(
+    rf"\(?\s*(?:1|(?:{_PLAIN_NAME}){_PLAIN_POWER})"
+    rf"(?:\s*(?:(?:\*(?!\*)|/|·|\bper\b)\s*|\s)\(?\s*(?:1|(?:{_PLAIN_NAME}){_PLAIN_POWER})\)?)*\s*\)?"
+)
+
+
 @cache
 def _registry() -> pint.UnitRegistry[Any]:
     import pint
@@ -140,6 +152,8 @@ def _registry() -> pint.UnitRegistry[Any]:
 
 
 def _by_pint(text: str) -> WrittenUnit:
+    if _PLAIN_UNIT.fullmatch(text) is None:
+        raise _unknown(text)
     registry = _registry()
     try:
         parsed = registry.parse_units(text)
@@ -182,7 +196,7 @@ def _representable(text: str, exponents: dict[str, Fraction]) -> None:
 
 
 def _unknown(text: str) -> BadData:
-    near = get_close_matches(text, [*NAMED, *TABLE, *SPECIAL], n=1, cutoff=0.6)
+    near = get_close_matches(text[:64], [*NAMED, *TABLE, *SPECIAL], n=1, cutoff=0.6)
     guess = f'Did you mean "{near[0]}"? ' if near else ""
     return BadData(
         f'"{text}" is not a unit.', hint=f'{guess}Write it like "degree", "N", "mm", "degC", "m/s²", "mV/V" or "count".'

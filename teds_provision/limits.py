@@ -1,0 +1,160 @@
+"""How much of a file is read: the limits of every reader in one place, stated in docs/formats.md.
+
+What comes from outside is looked at cheaply (octets, tags, brackets, depth) before anything is built from it, so that
+no file costs more than 10 s and 300 MB. Every check raises BadData that says what is too much and where the limit is.
+This module stands below every room and imports nothing of ours but the errors.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Iterable
+from dataclasses import dataclass
+from typing import Any, Final
+
+from teds_provision.errors import BadData
+
+
+@dataclass(frozen=True)
+class Limits:
+    """Largest sizes in octets (or characters), and counts, that are read."""
+
+    teds_file: int = 32 << 20
+    """A file of TEDS: binary, hex, Intel HEX, JSON, XML, image."""
+    teds_of_a_file: int = 2000
+    """255 channels with six TEDS each, and those of the node, are 1,540."""
+    json_values: int = 2_000_000
+    json_depth: int = 32
+    xml_elements: int = 200_000
+    xml_attributes: int = 400_000
+    xml_depth: int = 32
+    text_file: int = 1 << 20
+    """A profile, a calibration, a sheet of requirements (TOML, CSV, JSON)."""
+    toml_parts: int = 32
+    toml_depth: int = 16
+    toml_keys: int = 20_000
+    integer_digits: int = 1000
+    hex_records: int = 2_500_000
+    hex_stretches: int = 2000
+    unit: int = 64
+    expression: int = 1000
+    terms: int = 16
+
+
+LIMITS: Final = Limits()
+
+# Possessive quantifiers and a border in front keep these linear in the text, whatever it holds.
+_PART: Final = r"(?:[A-Za-z0-9_-]++|'')"
+_LONG_KEY: Final = re.compile(rf"(?<![A-Za-z0-9_-]){_PART}(?:[ \t]*+\.[ \t]*+{_PART}){{{LIMITS.toml_parts}}}")
+_LONG_INTEGER: Final = re.compile(rf"(?<![A-Za-z0-9_-])[+-]?(?:0[xob])?[0-9a-fA-F_]{{{LIMITS.integer_digits + 1}}}")
+_STRINGS: Final = re.compile(r"""\"(?:[^"\\]|\\.)*+\"|'[^'\n]*+'|\#[^\n]*+""")
+
+
+def check_size(octets: int, limit: int, what: str) -> None:
+    """Raise BadData where something has more octets (or characters) than are read."""
+    if octets > limit:
+        raise BadData(f"{_upper(what)} has {octets} octets; at most {limit} are read.")
+
+
+def check_count(count: int, limit: int, what: str) -> None:
+    """Raise BadData where there are more of something than are read."""
+    if count > limit:
+        raise BadData(f"There are {count} {what} here; at most {limit} are read.")
+
+
+def load_json(text: str | bytes, what: str, *, octets: int = LIMITS.teds_file, file: str = "") -> Any:
+    """JSON that a stranger wrote: bounded in size, values, depth and digits, each name once in its object.
+
+    ``what`` names it in errors, with its article: "the image"; with ``file`` they name file and line. Raises BadData.
+    """
+    check_size(len(text), octets, what)
+    if isinstance(text, str):
+        values = text.count("[") + text.count("{") + text.count(",")
+    else:
+        values = text.count(b"[") + text.count(b"{") + text.count(b",")
+    check_count(values, LIMITS.json_values, f"values in {what}")
+    try:
+        value = json.loads(text, object_pairs_hook=_unique, parse_int=_integer)
+    except RecursionError as error:
+        raise BadData(f"{file}:1: " * bool(file) + f"{_upper(what)} is nested too deeply.") from error
+    except json.JSONDecodeError as error:
+        if file:
+            raise BadData(f"{file}:{error.lineno}: this is not JSON: {error.msg}.") from error
+        raise BadData(f"{_upper(what)} is not JSON: line {error.lineno}: {error.msg}.") from error
+    except ValueError as error:
+        raise BadData(f"{file}:1: " * bool(file) + f"{_upper(what)} cannot be read: {error}.") from error
+    check_depth(value, LIMITS.json_depth, what)
+    return value
+
+
+def check_depth(value: object, limit: int, what: str) -> None:
+    """Raise BadData where lists and tables nest deeper than ``limit``; walks level by level, never deeper."""
+    level: list[object] = [value]
+    for _ in range(limit + 1):
+        inside: list[object] = []
+        for container in level:
+            parts: Iterable[object] = container.values() if isinstance(container, dict) else container  # type: ignore[assignment]
+            if isinstance(container, dict | list):
+                inside += [part for part in parts if isinstance(part, dict | list)]
+        if not inside:
+            return
+        level = inside
+    raise BadData(f"{_upper(what)} nests deeper than {limit} levels.")
+
+
+def check_toml(text: str, file: str) -> None:
+    """Raise BadData, with the line, for TOML whose keys or integers would take long to read."""
+    check_size(len(text.encode("utf-8", "surrogatepass")), LIMITS.text_file, file)
+    keys = text.count("=")
+    plain = _STRINGS.sub(lambda found: "''" + "\n" * found[0].count("\n"), text)
+    for pattern, why in (
+        (_LONG_KEY, f"a key of more than {LIMITS.toml_parts} parts"),
+        (_LONG_INTEGER, f"an integer of more than {LIMITS.integer_digits} digits"),
+    ):
+        found = pattern.search(plain)
+        if found is not None:
+            raise BadData(f"{file}:{plain.count(chr(10), 0, found.start()) + 1}: {why}.")
+    if keys > LIMITS.toml_keys:
+        raise BadData(f"{file}: there are {keys} keys; at most {LIMITS.toml_keys} are read.")
+
+
+def check_xml(text: bytes, what: str, *, elements: int = 0, attributes: int = 0) -> None:
+    """Raise BadData for XML with more elements or attributes than are read; 0 stands for the usual limit.
+
+    Counted in the octets: expat takes no encoding in which ``<`` and ``=`` are other octets than in ASCII.
+    """
+    check_count(text.count(b"<"), elements or LIMITS.xml_elements, f"tags in {what}")
+    check_count(text.count(b"="), attributes or LIMITS.xml_attributes, f"attributes in {what}")
+
+
+def whole_number(text: str, what: str) -> int:
+    """Integer of a text of decimal digits; raises BadData for another text and for more digits than are read."""
+    digits = text.strip()
+    if len(digits) > LIMITS.integer_digits or not re.fullmatch(r"[+-]?[0-9]+", digits):
+        shown = digits if len(digits) <= LIMITS.integer_digits else f"{digits[:12]}… ({len(digits)} characters)"
+        raise BadData(f"{_upper(what)} is no whole number: {shown!r}.")
+    return int(digits)
+
+
+class _TwiceNamed(ValueError):
+    """Two members of one object have the same name."""
+
+
+def _unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    members = dict(pairs)
+    if len(members) != len(pairs):
+        seen: set[str] = set()
+        again = next(name for name, _ in pairs if name in seen or seen.add(name))  # type: ignore[func-returns-value]
+        raise _TwiceNamed(f'an object names "{again[:40]}" twice')
+    return members
+
+
+def _integer(digits: str) -> int:
+    if len(digits) > LIMITS.integer_digits:
+        raise ValueError(f"it holds an integer of {len(digits)} digits; at most {LIMITS.integer_digits} are read")
+    return int(digits)
+
+
+def _upper(what: str) -> str:
+    return what[:1].upper() + what[1:]

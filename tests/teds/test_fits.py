@@ -1,0 +1,158 @@
+"""Whether a datasheet suffices for a task."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from datetime import UTC, datetime
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from teds_provision.errors import BadData
+from teds_provision.teds import Sheet
+from teds_provision.teds.calibration import fit
+from teds_provision.teds.fits import Fit, judge, met, parse_fits, parse_require
+from teds_provision.teds.image import Image
+from teds_provision.teds.profile import load_profile
+from teds_provision.teds.units.units import parse_unit
+
+NOW = datetime(2026, 11, 21, tzinfo=UTC)
+
+
+def angle(**more: object) -> Sheet:
+    line = replace(
+        fit([(0, 0.0), (65535, 360.0)], "linear", channel=1),
+        unit=parse_unit("degree"),
+        date=datetime(2026, 1, 1, tzinfo=UTC),
+        interval=365.0 * 86_400,
+        uncertainty=1.0,
+    )
+    built = load_profile("magnetic-angular-position-sensor").build(bytes(10), calibration={1: line})
+    sheet = Sheet.of(Image(bytes(10), built.blocks))
+    return replace(sheet, channels=(replace(sheet.channels[0], **more),))  # type: ignore[arg-type]
+
+
+def only(text: str, sheet: Sheet, now: datetime | None = None) -> Fit:
+    (found,) = judge(parse_fits(text), sheet, now)
+    return found
+
+
+def test_the_papers_sensor_fits_the_papers_task() -> None:
+    found = only("angle >= 360 deg, uncertainty <= 1 deg, rate >= 1 kHz", angle())
+    assert found.result == "passed", found.why
+    assert "360" in found.why
+    assert "10000 Hz" in found.why
+
+
+@pytest.mark.parametrize(
+    ("text", "result", "words"),
+    [
+        ("angle >= 360 deg", "passed", ""),
+        ("angle >= 6.28 rad", "passed", ""),
+        ("angle >= 400 deg", "passed", ""),  # a full turn reaches every angle
+        ("range >= 400 deg", "failed", "range is 360 °, asked is >= 400 deg"),
+        ("uncertainty <= 0.5 deg", "failed", "uncertainty is 1 °"),
+        ("uncertainty <= 0.3 %", "passed", "0.278 %"),
+        ("uncertainty <= 0.2 %", "failed", "0.278 %"),
+        ("rate >= 1 MHz", "failed", "asked is >= 1 MHz"),
+        ("high >= 360 deg, low <= 0 deg", "passed", ""),
+        ("low <= -10 deg", "failed", "low is 0 °"),
+        ("force >= 1 N", "failed", "no channel gives force"),
+    ],
+)
+def test_each_bound_is_judged_in_its_unit(text: str, result: str, words: str) -> None:
+    found = only(text, angle())
+    assert (found.result, words in found.why) == (result, True), found.why
+
+
+def test_a_part_of_a_turn_reaches_no_further_than_its_limits() -> None:
+    half = angle(low=-math.pi / 2, high=math.pi / 2)
+    assert only("angle >= 90 deg", half).result == "passed"
+    assert only("angle >= 91 deg", half).result == "failed"
+    assert only("angle <= -90 deg", half).result == "passed"
+    assert only("angle <= -91 deg", half).result == "failed"
+
+
+def test_what_the_datasheet_does_not_state_is_skipped_and_says_what() -> None:
+    found = only("angle >= 360 deg, rate >= 1 Hz", angle(timing=replace(angle().channels[0].timing, period=math.nan)))
+    assert found.result == "skipped"
+    assert found.why == "rate is not stated."
+
+
+def test_an_overdue_calibration_promises_no_uncertainty_and_without_one_there_are_no_values() -> None:
+    late = datetime(2027, 6, 1, tzinfo=UTC)
+    assert only("uncertainty <= 1 deg", angle(), NOW).result == "passed"
+    assert "due on 2027-01-01" in only("uncertainty <= 1 deg", angle(), late).why
+    assert "no calibration" in only("angle >= 1 deg", angle(calibration=None)).why
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("", "1 to 16 terms"),
+        ("rate >= 1 Hz," * 17, "1 to 16 terms"),
+        ("angel >= 360 deg", '"angel" is no quantity'),
+        ("angle = 360 deg", "is no bound"),
+        ("angle >= many deg", "is no bound"),
+        ("angle >= 1e999 deg", "too large"),
+        ("angle >= 360 N", "does not measure this"),
+        ("rate >= 5 deg", "does not measure this"),
+        ("angle >= 1 deg, force >= 1 N", "one quantity"),
+        ("angle >= 9**9**9 m", "is not a unit"),
+        ("x" * 2000, "1000"),
+    ],
+)
+def test_an_expression_that_means_nothing_is_refused_by_name(text: str, words: str) -> None:
+    with pytest.raises(BadData) as caught:
+        parse_fits(text)
+    assert words in caught.value.message
+
+
+@given(st.text(max_size=80) | st.text("anglerate><= 0123456789.,dNHzk%-", max_size=60))
+def test_no_expression_raises_anything_else(text: str) -> None:
+    try:
+        requirement = parse_fits(text)
+    except BadData:
+        return
+    assert judge(requirement, angle())
+
+
+REQUIRE = """
+[angle]
+range = ">= 360 deg"
+uncertainty = "1 deg"
+rate = "1 kHz"
+
+["Joint 3"]
+low = "0 deg"
+"""
+
+
+def test_a_sheet_of_requirements_names_quantities_and_channels() -> None:
+    by_quantity, by_name = parse_require(REQUIRE, "task.toml")
+    assert (by_quantity.quantity, by_name.channel) == ("angle", "Joint 3")
+    assert [term.text for term in by_quantity.terms] == ["range >= 360 deg", "uncertainty <= 1 deg", "rate >= 1 kHz"]
+    assert met(by_quantity, judge(by_quantity, angle()))
+    assert not met(by_name, judge(by_name, angle()))
+    assert met(by_name, judge(by_name, angle(name="Joint 3")))
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("", "asks for nothing"),
+        ("angle = 3", "no table of bounds"),
+        ("[angle]\nwidth = '3 deg'", 'no bound "width"'),
+        ("[angle]\nrange = 3", "is a text"),
+        ("[angle]\nrange = '3 N'", "does not measure this"),
+        ("[angle", "no TOML"),
+        ("a." * 40 + "a = 1", "more than 32 parts"),
+    ],
+)
+def test_a_sheet_of_requirements_that_means_nothing_names_the_place(text: str, words: str) -> None:
+    with pytest.raises(BadData) as caught:
+        parse_require(text, "task.toml")
+    assert words in caught.value.message
+    assert caught.value.message.startswith("task.toml")
