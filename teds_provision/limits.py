@@ -132,7 +132,7 @@ def whole_number(text: str, what: str) -> int:
     """Integer of a text of decimal digits; raises BadData for another text and for more digits than are read."""
     digits = text.strip()
     if len(digits) > LIMITS.integer_digits or not re.fullmatch(r"[+-]?[0-9]+", digits):
-        shown = digits if len(digits) <= LIMITS.integer_digits else f"{digits[:12]}… ({len(digits)} characters)"
+        shown = digits if len(digits) <= 40 else f"{digits[:12]}… ({len(digits)} characters)"
         raise BadData(f"{_upper(what)} is no whole number: {shown!r}.")
     return int(digits)
 

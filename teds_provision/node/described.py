@@ -10,12 +10,12 @@ from typing import Final
 
 from teds_provision.errors import BadData
 from teds_provision.files import read_limited
+from teds_provision.limits import LIMITS
 from teds_provision.node.flash_file import FILE, FlashFile
 from teds_provision.protocol.datasheet import can_be_stored, passes_own_check
 from teds_provision.teds.codec.codes import AccessCode
 from teds_provision.teds.codec.frame import frame, raw_tuple, tuples, unframe
 from teds_provision.teds.formats import detect, read_blocks
-from teds_provision.teds.formats.block import MAX_FILE
 from teds_provision.teds.image import SECURITY, BlockId
 from teds_provision.teds.profile import load_profile
 from teds_provision.teds.sheet import Sheet
@@ -49,7 +49,7 @@ def from_file(path: Path) -> Described:
 
     Raises NotFound, and BadData that names the TEDS which no node holds.
     """
-    octets = read_limited(path, MAX_FILE, "file of TEDS")
+    octets = read_limited(path, LIMITS.teds_file, "file of TEDS")
     try:
         blocks = read_blocks(octets, detect(octets), path=path)
     except BadData as error:
