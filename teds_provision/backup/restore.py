@@ -32,13 +32,10 @@ from teds_provision.store.snapshot import (
     place,
     relation,
     set_aside,
-    settings,
     totals,
 )
 from teds_provision.vault import Ask, Vault, create_vault, node_key_context, open_vault
 from teds_provision.vault.passphrase import PRODUCT, Costs
-
-_OF_THIS_MACHINE = frozenset({"keystore", "keystore_why"})
 
 
 @dataclass(frozen=True)
@@ -77,10 +74,11 @@ def open_present(home: Path, content: Content) -> Store | None:
     if store.damage() is not None:
         store.close()
         return None
-    point = store.setting("station_point")
-    if store.id != content.store or (point is not None and bytes.fromhex(point) != content.point):
+    facts = store.facts()
+    point = facts.point if facts is not None else None
+    if store.id != content.store or (point is not None and point != content.point):
         store.close()
-        here = "of an unfinished init" if point is None else f"of station {fingerprint(bytes.fromhex(point))[:32]}"
+        here = "of an unfinished init" if point is None else f"of station {fingerprint(point)[:32]}"
         raise PolicyRefused(
             f"The backup is of station {content.station[:32]}; the store in {home} is {here}.",
             hint="Restore into another --home: backups never mix stations.",
@@ -107,8 +105,7 @@ def rebuild(home: Path, content: Content, ask: Ask, *, keystore: str | None = No
         vault, why = bring_vault(home, content, ask, wanted, costs)
         kind = wanted if wanted is not None and wanted.startswith("pkcs11:") else vault.kind
         with copy.transaction():
-            copy.set_setting("keystore", kind)
-            copy.set_setting("keystore_why", why)
+            _move_to(copy, kind, why)
             due = _demand_rotations(copy, content, ask)
             detail = {"created": content.created, "keystore": vault.kind, "rotations_due": due}
             copy.audit.append("restore", None, "rebuilt", detail)
@@ -122,8 +119,7 @@ def _demand_rotations(copy: Store, content: Content, ask: Ask) -> int:
     why = f"{RESTORED} of {content.created}: it may have been given away or replaced since"
     keys = Station(copy, ask).keys
     nodes = {record.uuid for record in keys.all()}
-    for uuid in nodes:
-        keys.demand_rotation(uuid, why)
+    keys.mark({uuid: {"rotation": why} for uuid in nodes})
     return len(nodes)
 
 
@@ -168,7 +164,8 @@ def complete_vault(store: Store, content: Content, ask: Ask, *, keystore: str | 
 
     A CA key that was taken out of the vault since the backup stays out. Raises VaultFailure and its leaves.
     """
-    wanted = store.setting("keystore") or keystore_for(content, keystore)
+    facts = store.facts()
+    wanted = facts.keystore if facts is not None else keystore_for(content, keystore)
     try:
         vault = open_vault(store.home, store.id, wanted or "keyring", ask)
     except WrongPassphrase:
@@ -215,11 +212,13 @@ def merge(store: Store, content: Content, *, dry_run: bool) -> Restored:
     except _OnlyAPlan:
         pass
     action = "merged" if back else "nothing"
-    return Restored(action, how, back, tuple(work.told()), store.setting("keystore") or "")
+    facts = store.facts()
+    return Restored(action, how, back, tuple(work.told()), facts.keystore if facts is not None else "")
 
 
 def _check_inside(copy: Store, content: Content) -> None:
-    if copy.id != content.store or copy.setting("station_point") != content.point.hex():
+    facts = copy.facts()
+    if copy.id != content.store or facts is None or facts.point != content.point:
         raise NotAuthentic("The store in the backup is not that of the station that signed it.")
 
 
@@ -247,7 +246,8 @@ class _Merge:
         self._keys()
         self._images()
         self._trust()
-        self._settings()
+        self._facts()
+        self._marks()
 
     def told(self) -> list[str]:
         """What stayed, in sentences."""
@@ -334,15 +334,15 @@ class _Merge:
 
     def _images(self) -> None:
         for record in self.copy.nodes():
-            draft, image = self.copy.draft(record.uuid), self.copy.node_image(record.uuid)
+            draft, history = self.copy.draft(record.uuid), self.copy.history(record.uuid)
             known = self.live.draft(record.uuid)
             if draft is not None and draft != known and (self.newer or (known is None and not self.older)):
                 self.live.put_draft(draft)
                 self.back["drafts"] += 1
-            present = self.live.node_image(record.uuid)
-            if image is not None and image != present and (present is None or self.newer):
-                self.live.put_node_image(record.uuid, image)
-                self.back["images"] += 1
+            present = self.live.history(record.uuid)
+            if history and history != present and (not present or self.newer):
+                self.live.put_history(history[::-1])
+                self.back["datasheets"] += 1
 
     def _trust(self) -> None:
         names = {record.name for record in self.live.trusted()}
@@ -356,15 +356,40 @@ class _Merge:
             self.live.put_trust(record)
             self.back[f"trust in {record.role} {record.name}"] += 1
 
-    def _settings(self) -> None:
-        """Facts of the station and marks on nodes (whose CA a node keeps, a rotation that is due)."""
-        present = settings(self.live)
-        for name, value in settings(self.copy).items():
-            if name in _OF_THIS_MACHINE or present.get(name) == value:
-                continue
-            if name not in present or self.newer:
-                self.live.set_setting(name, value)
-                self.back["settings"] += 1
+    def _facts(self) -> None:
+        """Facts of the station that init had not reached here, and certificates; the keystore is this machine's."""
+        here, there = self.live.facts(), self.copy.facts()
+        if there is not None and (here is None or here.point is None):
+            kept = there if here is None else replace(there, keystore=here.keystore, keystore_why=here.keystore_why)
+            self.live.put_facts(kept)
+            self.back["station"] += 1
+        present = self.live.certificates()
+        for (ca, station), signature in self.copy.certificates().items():
+            if (ca, station) not in present:
+                self.live.put_certificate(ca, station, signature)
+                self.back["certificates"] += 1
+
+    def _marks(self) -> None:
+        """Whose CA a node keeps, a rotation that is due: from a newer copy, or with a key that is missing here.
+
+        What an older copy has and this store lacks may have been settled since.
+        """
+        present = self.live.all_marks()
+        wanted = {
+            uuid: marks
+            for uuid, marks in self.copy.all_marks().items()
+            if present.get(uuid) != marks
+            and (self.newer or (uuid not in present and not (self.older and uuid in self.held)))
+        }
+        self.live.put_marks(wanted)
+        self.back["marks"] += len(wanted)
+
+
+def _move_to(copy: Store, keystore: str, why: str) -> None:
+    """Note in a restored store where the secrets lie on this machine."""
+    facts = copy.facts()
+    if facts is not None:
+        copy.put_facts(replace(facts, keystore=keystore, keystore_why=why))
 
 
 def _epochs(store: Store) -> dict[bytes, int]:

@@ -74,7 +74,8 @@ def store(place: Place) -> Iterator[Finding]:
         if damage is not None:
             yield Finding("store", "failed", f"The store is damaged: {damage}.", "teds-provision restore FILE")
             return
-        if opened.setting("station_point") is None:
+        facts = opened.facts()
+        if facts is None or facts.point is None:
             yield Finding("store", "warning", "An init was begun here and not finished.", _INIT)
             return
         count = len(opened.nodes())
@@ -203,7 +204,8 @@ def _keystore(place: Place) -> str | None:
         return None
     try:
         with Store.open(place.home) as opened:
-            return opened.setting("keystore")
+            facts = opened.facts()
+            return facts.keystore if facts is not None else None
     except StoreFailure:  # the check of the store says so
         return None
 

@@ -15,7 +15,7 @@ from teds_provision.errors import BadData, NotAuthentic, NotFound, PolicyRefused
 from teds_provision.protocol.handover.jwk import point_of, public_jwk
 from teds_provision.protocol.handover.strict_json import decode_base64url, dump, encode_base64url, load_object
 from teds_provision.protocol.keys import PrivateKey, fingerprint, station_key_message, verify
-from teds_provision.station.station import DEFAULT_NAME, Station
+from teds_provision.station.station import Station
 from teds_provision.store import Store, StoreLock
 from teds_provision.vault import create_vault
 
@@ -115,14 +115,9 @@ def ask_for_certificate(home: Path, *, name: str | None, keystore: str | None, a
             return make_request(station.name, station.vault.identity())
         if station.identity.requested is None:
             vault, why = create_vault(home, store.id, keystore, ask, with_ca=False)
-            facts = {
-                "station_name": name or DEFAULT_NAME,
-                "requested_point": vault.identity().point.hex(),
-                "keystore": keystore if keystore and keystore.startswith("pkcs11:") else vault.kind,
-                "keystore_why": why,
-            }
+            where = keystore if keystore and keystore.startswith("pkcs11:") else vault.kind
             with station.transaction():
-                station.identity.keep(facts)
+                station.identity.found(name, where, why, requested=vault.identity().point)
                 station.audit("init", None, "requested", fingerprint=fingerprint(vault.identity().point))
         else:
             vault = station.vault
@@ -156,20 +151,15 @@ def _adopt(station: Station, certificate: Certificate) -> None:
             f"The certificate is for station {fingerprint(certificate.station)[:16]},"
             f" this one is {fingerprint(own)[:16]}."
         )
-    facts: dict[str, str] = {}
-    if not identity.is_complete():
-        facts = {
-            "station_point": own.hex(),
-            "ca_point": certificate.ca.hex(),
-            "station_signature": certificate.signature.hex(),
-        }
-    elif identity.certificate(certificate.ca, station.point) is not None:
+    fresh = not identity.is_complete()
+    if not fresh and identity.certificate(certificate.ca, station.point) is not None:
         return
     with station.transaction():
-        identity.keep(facts)
-        if not facts:  # a station with a CA of its own: certified by another one too, for the nodes of that one
+        if fresh:
+            identity.complete(own, certificate.ca, certificate.signature)
+        else:  # a station with a CA of its own: certified by another one too, for the nodes of that one
             identity.keep_certificate(certificate.ca, station.point, certificate.signature)
-        station.audit("init", None, "certified", ca=fingerprint(certificate.ca), own=bool(facts))
+        station.audit("init", None, "certified", ca=fingerprint(certificate.ca), own=fresh)
 
 
 def _name(value: object) -> str:

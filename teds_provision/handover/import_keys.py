@@ -10,7 +10,7 @@ import hashlib
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
-from typing import Literal
+from typing import Any, Literal
 
 from teds_provision.errors import NotAuthentic, PolicyRefused
 from teds_provision.handover.pending import IMPORTED, Notes, digest_of
@@ -257,16 +257,13 @@ class _Arrivals:
         for uuid in back:
             self.station.audit("handover", uuid, "came back", handover=self.bundle.id)
         mode = self.bundle.mode
-        rotations, cas, next_cas = self._marks()
         self.station.handovers.take_in(
             Batch(
                 nodes=[self._node(one.node) for one in taken],
                 whitelist=[entry for entry in (self._entry(one.node) for one in taken) if entry is not None],
                 keys=[self._key(one.node) for one in taken if one.decision != "same"],
                 holders=[Holder(one.node.uuid, other, now, mode) for one in taken for other in self.others],
-                rotations=rotations,
-                cas=cas,
-                next_cas=next_cas,
+                marks=self._marks(),
             )
         )
 
@@ -315,19 +312,19 @@ class _Arrivals:
             teds_sha256=node.teds_sha256 if node.sequence >= known.sequence else known.teds_sha256,
         )
 
-    def _marks(self) -> tuple[dict[bytes, str], dict[bytes, bytes], dict[bytes, tuple[str, bytes]]]:
+    def _marks(self) -> dict[bytes, dict[str, Any]]:
         """Rotations that are due after a move; the CA that each node keeps, or keeps once its new key is proven."""
-        ca, own, taken = self.bundle.ca, self.station.ca, self.plan.taken
-        why = f"moved here by {self.bundle.id}: the sender has had this key"
-        rotations = {one.node.uuid: why for one in taken} if self.bundle.mode == "move" else {}
-        cas: dict[bytes, bytes] = {}
-        next_cas: dict[bytes, tuple[str, bytes]] = {}
-        for one in taken:
+        ca, own = self.bundle.ca, self.station.ca
+        marks: dict[bytes, dict[str, Any]] = {}
+        for one in self.plan.taken:
             uuid = one.node.uuid
+            if self.bundle.mode == "move":
+                marks[uuid] = {"rotation": f"moved here by {self.bundle.id}: the sender has had this key"}
             if one.decision == "same" or self.cas.get(uuid, own) == ca:
                 continue
             if one.decision == "newer":  # the key held now stays good, under its CA, until the new one is proven
-                next_cas[uuid] = (key_id(one.node.key).hex(), ca)
+                kept: dict[str, Any] = {"next_key_id": key_id(one.node.key).hex(), "next_ca": ca}
             else:
-                cas[uuid] = ca
-        return rotations, cas, next_cas
+                kept = {"ca": ca}
+            marks[uuid] = {**marks.get(uuid, {}), **kept}
+        return marks

@@ -34,9 +34,4 @@ class Handovers:
         """Add or replace many rows, all or none; the caller has held them against what is there."""
         with self._store.transaction():
             self._store.put_batch(batch)
-            for uuid, why in batch.rotations.items():
-                self._keys.demand_rotation(uuid, why)
-            for uuid, ca in batch.cas.items():
-                self._keys.set_ca_of(uuid, ca)
-            for uuid, (key_id, ca) in batch.next_cas.items():
-                self._keys.set_ca_with(uuid, key_id, ca)
+            self._keys.mark(batch.marks)

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 from teds_provision.errors import NotAuthentic, NotFound, PolicyRefused
 from teds_provision.protocol.agreement import Credentials
 from teds_provision.protocol.keys import fingerprint, station_key_message, verify
-from teds_provision.store import Store
+from teds_provision.store import Facts, Store
 
 if TYPE_CHECKING:
     from teds_provision.vault import Vault
@@ -27,34 +28,44 @@ class Identity:
 
     def is_complete(self) -> bool:
         """Whether init was finished: a key, a CA and its signature are there."""
-        return self._store.setting("station_point") is not None
+        facts = self._store.facts()
+        return facts is not None and facts.point is not None
 
     @property
     def requested(self) -> bytes | None:
         """P(base station) for which a certificate was asked for, None where none was."""
-        point = self._store.setting("requested_point")
-        return bytes.fromhex(point) if point is not None else None
+        facts = self._store.facts()
+        return facts.requested if facts is not None else None
 
-    def keep(self, facts: Mapping[str, str]) -> None:
-        """Keep facts of init by name; the caller holds them in one transaction with what belongs to them."""
-        for fact, value in facts.items():
-            self._store.set_setting(fact, value)
+    def found(self, name: str | None, keystore: str, keystore_why: str, *, requested: bytes | None = None) -> None:
+        """Keep where the secrets of a new station lie, and the key for which it asks a certificate, if it does."""
+        self._store.put_facts(Facts(name or DEFAULT_NAME, keystore, keystore_why, requested))
 
-    def _fact(self, name: str) -> str:
-        value = self._store.setting(name)
-        if value is None:
+    def complete(self, point: bytes, ca: bytes, signature: bytes) -> None:
+        """Keep the station's key, its owner's CA and SIG104: init is finished."""
+        self._store.put_facts(replace(self._facts, point=point, ca=ca, signature=signature))
+
+    @property
+    def _facts(self) -> Facts:
+        facts = self._store.facts()
+        if facts is None:
             raise NotFound(f"There is no base station in {self._store.home} yet.", hint="Make one: teds-provision init")
+        return facts
+
+    def _made(self, value: bytes | None) -> bytes:
+        if value is None:
+            raise NotFound(f"init was not finished in {self._store.home}.", hint="Finish it: teds-provision init")
         return value
 
     @property
     def name(self) -> str:
-        """The station's name; the default one before init was finished."""
-        return self._store.setting("station_name") or DEFAULT_NAME
+        """The station's name."""
+        return self._facts.name
 
     @property
     def point(self) -> bytes:
         """P(base station), 65 octets."""
-        return bytes.fromhex(self._fact("station_point"))
+        return self._made(self._facts.point)
 
     @property
     def fingerprint(self) -> str:
@@ -64,43 +75,42 @@ class Identity:
     @property
     def ca(self) -> bytes:
         """P(CA) of the owner, 65 octets."""
-        return bytes.fromhex(self._fact("ca_point"))
+        return self._made(self._facts.ca)
 
     @property
     def signature(self) -> bytes:
         """SIG104: the CA's signature over the station's key, 64 octets."""
-        return bytes.fromhex(self._fact("station_signature"))
+        return self._made(self._facts.signature)
 
     @property
     def keystore(self) -> str:
         """Where the secrets lie: ``keyring``, ``file`` or a ``pkcs11:`` URI."""
-        return self._fact("keystore")
+        return self._facts.keystore
 
     @property
     def keystore_why(self) -> str:
         """Why init chose this keystore, in words."""
-        return self._store.setting("keystore_why") or ""
+        return self._facts.keystore_why
 
     @property
     def rewrapping(self) -> int | None:
         """Number of the master key that the link keys are being wrapped under anew, None where no such run is open."""
-        number = self._store.setting("rewrapping")
-        return int(number) if number else None
+        return self._facts.rewrapping
 
     @property
     def master(self) -> int:
         """Number of the master key that wraps link keys now, 1 where it was never changed."""
-        return int(self._store.setting("master") or 1)
+        return self._facts.master
 
     def begin_rewrapping(self, number: int) -> None:
         """Have every process wrap under this master key from now on."""
         with self._store.transaction():
-            self._store.set_setting("master", str(number))
-            self._store.set_setting("rewrapping", str(number))
+            self._store.put_facts(replace(self._facts, master=number, rewrapping=number))
 
     def end_rewrapping(self) -> None:
         """Note that no key is wrapped under an older master key any more."""
-        self._store.set_setting("rewrapping", "")
+        with self._store.transaction():
+            self._store.put_facts(replace(self._facts, rewrapping=None))
 
     # -- certificates ----------------------------------------------------------------------------------------------
 
@@ -115,15 +125,14 @@ class Identity:
         """SIG104 of ``ca`` over a station's key as far as it is known here."""
         if (ca, point) == (self.ca, self.point):
             return self.signature
-        known = self._store.setting(_certificate_setting(ca, point))
-        return bytes.fromhex(known) if known else None
+        return self._store.certificate(fingerprint(ca), fingerprint(point))
 
     def keep_certificate(self, ca: bytes, point: bytes, signature: bytes) -> None:
         """Keep a SIG104; raises NotAuthentic where it does not verify."""
         if not verify(ca, station_key_message(point), signature):
             raise NotAuthentic(f"The CA {fingerprint(ca)[:16]} did not sign the station {fingerprint(point)[:16]}.")
         if self.certificate(ca, point) is None:
-            self._store.set_setting(_certificate_setting(ca, point), signature.hex())
+            self._store.put_certificate(fingerprint(ca), fingerprint(point), signature)
 
     def signature_under(self, ca: bytes) -> bytes:
         """SIG104 of ``ca`` over this station's key; raises PolicyRefused where there is none."""
@@ -139,7 +148,3 @@ class Identity:
         """What the station shows and signs with under ``ca``, the owner's where none is named."""
         under = self.ca if ca is None else ca
         return Credentials(self._vault().identity(), self.signature_under(under), under)
-
-
-def _certificate_setting(ca: bytes, point: bytes) -> str:
-    return f"certificate:{fingerprint(ca)}:{fingerprint(point)}"

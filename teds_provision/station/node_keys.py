@@ -2,22 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any
 
 from teds_provision.errors import NoKeyring, VaultFailure, WrongPassphrase
 from teds_provision.station.identity import Identity
-from teds_provision.store import Holder, KeyRecord, Store, utc_now
+from teds_provision.store import Holder, KeyRecord, Marks, Store, utc_now
 from teds_provision.store.records import KeySource
 from teds_provision.vault.base import node_key_context
 
 if TYPE_CHECKING:
     from teds_provision.vault import Vault
 
-CA_OF, NEXT_CA, ROTATION = "ca-of:", "next-ca:", "rotate:"
-"""Names of settings by node (UUID in hex follows): the CA key that it keeps, the one that it keeps if a pending key
-(``keyId:P(CA)``, both hex) turns out to be good, and why a rotation is due."""
+_FEW = 20
+"""So many nodes are looked up one by one; for more the table of marks is read once."""
 
 RESTORED = "restored from a backup"
 """Begins the reason of a rotation that needs a tap or a person's word: nobody knows who else has that key by now."""
@@ -118,11 +117,12 @@ class NodeKeys:
         """Make a key the active one after a good Open under it; its CA is then the one that the node keeps."""
         with self._store.transaction():
             self._store.promote_key(uuid, key_id)
-            named, _, ca = (self._store.setting(NEXT_CA + uuid.hex()) or "").partition(":")
-            if named:
-                self._store.set_setting(NEXT_CA + uuid.hex(), "")
-            if named == key_id:
-                self.set_ca_of(uuid, bytes.fromhex(ca))
+            marks = self._store.marks(uuid)
+            if marks.next_ca is None:
+                return
+            self._mark(uuid, next_key_id=None, next_ca=None)
+            if marks.next_key_id == key_id:
+                self.set_ca_of(uuid, marks.next_ca)
 
     def remove(self, uuid: bytes) -> int:
         """Delete every key of a node; returns how many there were."""
@@ -136,31 +136,43 @@ class NodeKeys:
 
     def ca_of(self, uuid: bytes) -> bytes:
         """P(CA) that a node keeps: the owner's, or that of the bundle in which the node's key came."""
-        other = self._store.setting(CA_OF + uuid.hex())
-        return bytes.fromhex(other) if other else self._identity.ca
+        return self._store.marks(uuid).ca or self._identity.ca
 
     def cas_of_nodes(self) -> dict[bytes, bytes]:
         """P(CA) of every node that keeps another CA than the owner's."""
-        return {bytes.fromhex(uuid): bytes.fromhex(ca) for uuid, ca in self._store.settings(CA_OF).items() if ca}
+        return {uuid: marks.ca for uuid, marks in self._store.all_marks().items() if marks.ca is not None}
 
     def set_ca_of(self, uuid: bytes, ca: bytes) -> None:
         """Note which CA a node keeps."""
-        if ca != self.ca_of(uuid):
-            self._store.set_setting(CA_OF + uuid.hex(), "" if ca == self._identity.ca else ca.hex())
+        self.mark({uuid: {"ca": ca}})
 
-    def set_ca_with(self, uuid: bytes, key_id: str, ca: bytes) -> None:
-        """Note which CA a node keeps if the pending key ``key_id`` turns out to be good."""
-        self._store.set_setting(NEXT_CA + uuid.hex(), f"{key_id}:{ca.hex()}")
+    def mark(self, changes: Mapping[bytes, Mapping[str, Any]]) -> None:
+        """Change marks of many nodes at once, by the names of :class:`Marks`; the owner's CA is none."""
+        present = self._store.all_marks() if len(changes) > _FEW else {u: self._store.marks(u) for u in changes}
+        own = self._identity.ca
+        wanted: dict[bytes, Marks] = {}
+        for uuid, change in changes.items():
+            before = present.get(uuid, Marks())
+            after = replace(before, **change)
+            after = replace(after, ca=None) if after.ca == own else after
+            if after != before:
+                wanted[uuid] = after
+        if wanted:
+            self._store.put_marks(wanted)
+
+    def _mark(self, uuid: bytes, **change: Any) -> None:
+        self.mark({uuid: change})
 
     # -- rotations and other holders -------------------------------------------------------------------------------
 
     def rotation_due(self, uuid: bytes) -> str | None:
         """Why the next session with a node has to rotate its key first; None where it has not."""
-        return self._store.setting(ROTATION + uuid.hex()) or None
+        return self._store.marks(uuid).rotation
 
     def rotations_due(self) -> dict[bytes, str]:
         """Why a rotation is due, for every node that has one."""
-        return {bytes.fromhex(uuid): why for uuid, why in self._store.settings(ROTATION).items() if why}
+        marks = self._store.all_marks()
+        return {uuid: mark.rotation for uuid, mark in marks.items() if mark.rotation is not None}
 
     def restored(self, uuid: bytes) -> bool:
         """Whether the keys of a node came back from a backup and none was agreed since."""
@@ -168,14 +180,21 @@ class NodeKeys:
 
     def demand_rotation(self, uuid: bytes, why: str) -> None:
         """Have the next session with a node rotate its key before anything else."""
-        self._store.set_setting(ROTATION + uuid.hex(), why)
+        self._mark(uuid, rotation=why)
 
     def rotated(self, uuid: bytes) -> None:
         """Note that a node has a key that no other station holds."""
-        if self.rotation_due(uuid):
-            self._store.set_setting(ROTATION + uuid.hex(), "")
+        self._mark(uuid, rotation=None)
         for holder in self._store.holders(uuid):
             self._store.remove_holder(uuid, holder.fingerprint)
+
+    def former(self, uuid: bytes) -> str | None:
+        """Fingerprint of the board that the link keys were agreed with, once its pin was let go."""
+        return self._store.marks(uuid).former
+
+    def set_former(self, uuid: bytes, fingerprint: str | None) -> None:
+        """Note which board the link keys were agreed with; None once a session has shown it."""
+        self._mark(uuid, former=fingerprint)
 
     def holders(self, uuid: bytes | None = None) -> list[Holder]:
         """Who else holds keys: of this node, or of all."""

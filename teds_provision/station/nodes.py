@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-from teds_provision.store import Draft, NodeRecord, Store
+from teds_provision.store import DatasheetRecord, Draft, NodeRecord, Store
 from teds_provision.teds.image import Image
 
 
@@ -43,12 +43,31 @@ class Nodes:
 
     def datasheet(self, uuid: bytes) -> Image | None:
         """The image that a node had when it was last read or written, None if it never was."""
-        text = self._store.node_image(uuid)
-        return Image.from_json(text) if text is not None else None
+        record = self._store.datasheet(uuid)
+        return record.image if record is not None else None
 
-    def keep_datasheet(self, image: Image) -> None:
-        """Remember what a node has: every TEDS as it was read or written."""
-        self._store.put_node_image(image.uuid, image.to_json())
+    def keep_datasheet(self, image: Image, profile: str | None = None) -> None:
+        """Remember what a node has: every TEDS as it was read or written; the one before goes into its history.
+
+        A draft of the same content is done with. ``profile`` names the type, where that is known.
+        """
+        with self._store.transaction():
+            draft = self._store.draft(image.uuid)
+            if draft is not None and draft.image == image:
+                profile = profile or draft.profile
+                self._store.drop_draft(image.uuid)
+            self._store.put_datasheet(image, profile)
+
+    def history(self, uuid: bytes) -> list[DatasheetRecord]:
+        """The datasheets that a node had, newest first: the present one and at most ten older ones.
+
+        What was read of a node before this station knew more than its Security TEDS is not among them.
+        """
+        return [record for record in self._store.history(uuid) if record.image.unsigned_blocks()]
+
+    def drafts(self) -> list[Draft]:
+        """Every image that was built and not written, by UUID."""
+        return self._store.drafts()
 
     def draft(self, uuid: bytes) -> Draft | None:
         """The image that a node is being given, and how far it came."""
@@ -58,6 +77,6 @@ class Nodes:
         """Keep an image for a node, in place of the one before."""
         self._store.put_draft(draft)
 
-    def drop_draft(self, uuid: bytes) -> None:
-        """Forget the image of a node, if there is one."""
-        self._store.drop_draft(uuid)
+    def drop_draft(self, uuid: bytes) -> bool:
+        """Forget the image that a node was to be given; False if there was none."""
+        return self._store.drop_draft(uuid)

@@ -7,9 +7,6 @@ from teds_provision.protocol.keys import fingerprint
 from teds_provision.station.node_keys import NodeKeys
 from teds_provision.store import AuditLog, Store, WhitelistEntry
 
-_FORMER = "former-identity:"
-"""Setting by node (UUID in hex follows): the fingerprint of the board that the link keys were agreed with."""
-
 
 class Pins:
     """The whitelist, and the key of each UUID: by the whitelist, else from the first proven contact."""
@@ -66,16 +63,15 @@ class Pins:
         """Forget the pinned key; the link keys that are held still belong to the board that had it."""
         pinned = self.pinned(uuid)
         if pinned is not None:
-            self._store.set_setting(_FORMER + uuid.hex(), pinned)
+            self._keys.set_former(uuid, pinned)
             self._store.drop_draft(uuid)  # it may hold the old board's calibration
         self._store.unpin_node(uuid)
 
     def epoch_to_exceed(self, uuid: bytes, pinned: str | None) -> int:
         """Epoch that an agreement must exceed: the active key's, but 0 for a board that it was not agreed with."""
-        former = self._store.setting(_FORMER + uuid.hex())
+        former = self._keys.former(uuid)
         return 0 if former and pinned and former != pinned else self._keys.active_epoch(uuid)
 
     def settled(self, uuid: bytes) -> None:
         """A session is open: the key in use belongs to the board that lies there."""
-        if self._store.setting(_FORMER + uuid.hex()):
-            self._store.set_setting(_FORMER + uuid.hex(), "")
+        self._keys.set_former(uuid, None)

@@ -191,15 +191,9 @@ def initialise(
         if ca is None:
             raise NotFound("The vault holds no CA key.", hint="Choose another keystore, or bring the CA key back.")
         station._vault = vault
-        facts = {
-            "station_name": name or DEFAULT_NAME,
-            "station_point": key.point.hex(),
-            "ca_point": ca.point.hex(),
-            "station_signature": ca.sign(station_key_message(key.point)).hex(),
-            "keystore": keystore if keystore and keystore.startswith("pkcs11:") else vault.kind,
-            "keystore_why": why,
-        }
         with station.transaction():
-            station.identity.keep(facts)
+            where = keystore if keystore and keystore.startswith("pkcs11:") else vault.kind
+            station.identity.found(name, where, why)
+            station.identity.complete(key.point, ca.point, ca.sign(station_key_message(key.point)))
             station.audit("init", None, "done", fingerprint=fingerprint(key.point), keystore=vault.kind)
     return station, why

@@ -82,7 +82,7 @@ def build(
         return Built(image, profile.name, warnings, calibrations)
     with station.transaction():
         station.nodes.remember(uuid, profile=plan.wanted, name=plan.name)
-        station.nodes.keep_draft(Draft(uuid, image.to_json(), "built", plan.wanted))
+        station.nodes.keep_draft(Draft(uuid, image, "built", plan.wanted))
         station.audit("build", uuid, "done", profile=profile.name, teds=image.digest())
     return Built(image, profile.name, warnings, calibrations)
 
@@ -130,7 +130,7 @@ def _pending(station: Station, uuid: bytes, has: Image | None) -> Image | None:
     draft = station.nodes.draft(uuid)
     if draft is None:
         return None
-    image = Image.from_json(draft.image)
+    image = draft.image
     if draft.stage == "signed" and _sequence(image) <= _sequence(has):
         return None
     return image

@@ -117,7 +117,7 @@ class _Run:
                 on_node=present.image.security if intact and present.identity.state == NodeState.PROVISIONED else None,
                 earlier=() if earlier is None else (earlier,),
             )
-            self.station.nodes.keep_draft(Draft(who.uuid, signed.image.to_json(), "signed", built.profile))
+            self.station.nodes.keep_draft(Draft(who.uuid, signed.image, "signed", built.profile))
             step.result = NOTHING if signed.reused else DONE
             step.detail = f"sequence {signed.sequence}"
         return signed
@@ -165,4 +165,4 @@ def _signed_draft(draft: Draft | None) -> bytes | None:
     """The Security TEDS of a signed draft, None for a built one."""
     if draft is None or draft.stage != "signed":
         return None
-    return Image.from_json(draft.image).blocks.get(SECURITY)
+    return draft.image.blocks.get(SECURITY)

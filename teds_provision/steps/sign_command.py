@@ -43,8 +43,8 @@ def sign_image(station: Station, order: SignOrder, node: Conversation | None) ->
     uuid = order.uuid
     station.policy.require_whitelisted(uuid)
     draft = station.nodes.draft(uuid)
-    image = order.image or (Image.from_json(draft.image) if draft is not None else None)
-    if image is None:
+    image = order.image or (draft.image if draft is not None else known_image(station, uuid))
+    if image is None or not image.unsigned_blocks():
         raise NotFound(f"Nothing is built for node {uuid.hex()}.", hint=f"Build it: teds-provision build {uuid.hex()}")
     record = station.nodes.get(uuid)
     epoch = station.keys.active_epoch(uuid) or (record.epoch if record else 0)
@@ -74,10 +74,8 @@ def sign_image(station: Station, order: SignOrder, node: Conversation | None) ->
         on_node=has.security if has is not None and intact else None,
         earlier=_signed_before(image, draft),
     )
-    if draft is not None and (
-        order.image is None or Image.from_json(draft.image).unsigned_blocks() == image.unsigned_blocks()
-    ):
-        station.nodes.keep_draft(Draft(uuid, signed.image.to_json(), "signed", draft.profile))
+    if draft is not None and (order.image is None or draft.image.unsigned_blocks() == image.unsigned_blocks()):
+        station.nodes.keep_draft(Draft(uuid, signed.image, "signed", draft.profile))
     return SignDone(signed, told)
 
 
@@ -91,5 +89,5 @@ def _sequence_of(has: Image | None) -> int:
 
 def _signed_before(image: Image, draft: Draft | None) -> list[bytes]:
     """Security TEDS of the image at hand and of the draft: either may hold the signature that still says the same."""
-    images = [image] if draft is None else [image, Image.from_json(draft.image)]
+    images = [image] if draft is None else [image, draft.image]
     return [found.blocks[SECURITY] for found in images if SECURITY in found.blocks]

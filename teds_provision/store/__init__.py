@@ -1,13 +1,17 @@
 """What a station remembers: whitelist, nodes, wrapped keys, trust and the audit log, in one SQLite file."""
 
 from teds_provision.store.audit import AuditEntry, AuditLog, AuditVerdict
-from teds_provision.store.bulk_tables import Batch
 from teds_provision.store.lock import StoreLock
 from teds_provision.store.records import (
+    DatasheetRecord,
     Draft,
+    Facts,
+    Group,
     Handover,
     Holder,
     KeyRecord,
+    Marks,
+    Measurement,
     NodeRecord,
     Revocation,
     Tombstone,
@@ -16,16 +20,22 @@ from teds_provision.store.records import (
     utc_now,
 )
 from teds_provision.store.store import Store
+from teds_provision.store.tables.batches import Batch
 
 __all__ = [
     "AuditEntry",
     "AuditLog",
     "AuditVerdict",
     "Batch",
+    "DatasheetRecord",
     "Draft",
+    "Facts",
+    "Group",
     "Handover",
     "Holder",
     "KeyRecord",
+    "Marks",
+    "Measurement",
     "NodeRecord",
     "Revocation",
     "Store",

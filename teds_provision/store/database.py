@@ -13,11 +13,12 @@ import stat
 import threading
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager, nullcontext, suppress
 from pathlib import Path
 from typing import Any, TypeVar
 
 from teds_provision.errors import BadData, StoreFailure, StoreLocked
+from teds_provision.store.migration import carry
 from teds_provision.store.schema import APPLICATION_ID, SCHEMA_VERSION, STEPS_TO
 
 FILE_NAME = "store.sqlite3"
@@ -202,12 +203,21 @@ class Database:
             raise StoreFailure(f"The store {self.path} is empty.", hint="Run teds-provision init.")
         self._write_ahead()
         if version < SCHEMA_VERSION:
-            with self.transaction():
-                for step in range(self._version() + 1, SCHEMA_VERSION + 1):
+            try:
+                self._bring_forward()
+            except ValueError as error:  # a value of an old schema that this tool never wrote
+                raise self._damaged() from error
+
+    def _bring_forward(self) -> None:
+        """Make the tables of the present schema out of what is there, or out of nothing, all or none of them."""
+        with self.transaction(), self._translated():
+            before = self._version()  # another process may have been first
+            for step in range(before + 1, SCHEMA_VERSION + 1):
+                with carry(self._connection, step) if before else nullcontext():
                     for statement in STEPS_TO[step]:
                         self.execute(statement)
-                self.execute(f"PRAGMA application_id={APPLICATION_ID}")
-                self.execute(f"PRAGMA user_version={SCHEMA_VERSION}")
+            self.execute(f"PRAGMA application_id={APPLICATION_ID}")
+            self.execute(f"PRAGMA user_version={SCHEMA_VERSION}")
 
     def _write_ahead(self) -> None:
         """Switch to the write-ahead log; SQLite does not wait by itself here when two processes open at once."""

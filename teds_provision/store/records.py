@@ -9,12 +9,15 @@ from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from typing import Literal
 
+from teds_provision.teds.image import Image
+
 UUID_OCTETS = 10
 
 Assurance = Literal["tap", "bus", "uuid", "import"]
 KeyState = Literal["pending", "active"]
 KeySource = Literal["agreement", "import"]
 DraftStage = Literal["built", "signed"]
+MeasurementKind = Literal["periodic", "event", "free"]
 TrustRole = Literal["station", "ca"]
 Direction = Literal["out", "in"]
 HandoverMode = Literal["copy", "move"]
@@ -22,7 +25,12 @@ HandoverMode = Literal["copy", "move"]
 
 def utc_now() -> str:
     """Return the present moment as ``2026-01-31T12:00:00Z``."""
-    return datetime.now(UTC).strftime("%Y-%m-%dT%H:%M:%SZ")
+    return iso(datetime.now(UTC))
+
+
+def iso(moment: datetime) -> str:
+    """Return a moment (aware) as ``2026-01-31T12:00:00Z``."""
+    return moment.astimezone(UTC).strftime("%Y-%m-%dT%H:%M:%SZ")
 
 
 @dataclass(frozen=True)
@@ -34,6 +42,7 @@ class WhitelistEntry:
     added: str = field(default_factory=utc_now)
     assurance: Assurance = "uuid"
     name: str | None = None
+    mac: bytes | None = field(default=None, repr=False, compare=False)
 
 
 @dataclass(frozen=True)
@@ -41,7 +50,8 @@ class NodeRecord:
     """What is known of one node.
 
     ``state`` is that of Identify (0 factory, 1 keyed, 2 provisioned); ``can_address`` 1 to 239, 0 for none;
-    ``teds_sha256`` is the digest (hex) of the Security TEDS last committed; ``channels`` counts TransducerChannels.
+    ``teds_sha256`` is the digest (hex) of the Security TEDS last committed; ``channels`` counts TransducerChannels;
+    ``due`` is the day (ISO 8601) on which the first calibration of its datasheet ends.
     """
 
     uuid: bytes
@@ -57,6 +67,8 @@ class NodeRecord:
     verdict: str | None = None
     last_seen: str | None = None
     channels: int = 0
+    point_mac: bytes | None = field(default=None, repr=False, compare=False)
+    due: str | None = None
 
 
 @dataclass(frozen=True)
@@ -79,12 +91,97 @@ class KeyRecord:
 
 @dataclass(frozen=True)
 class Draft:
-    """The image (JSON) that a node is being given, and how far it came."""
+    """The image that a node is being given, and how far it came."""
 
     uuid: bytes
-    image: str = field(repr=False)
+    image: Image = field(repr=False)
     stage: DraftStage = "built"
     profile: str | None = None
+    created: str = field(default_factory=utc_now)
+
+
+@dataclass(frozen=True)
+class DatasheetRecord:
+    """A datasheet that a node had, as it was read or written.
+
+    ``sequence``, ``epoch`` and ``signed`` (ISO 8601, None for an unsigned one) are what its Security TEDS says;
+    ``digest`` is that of the image (64 hex digits), ``seen`` when it was read first.
+    """
+
+    uuid: bytes
+    sequence: int
+    epoch: int
+    signed: str | None
+    profile: str | None
+    seen: str
+    digest: str
+    image: Image = field(repr=False)
+
+
+@dataclass(frozen=True)
+class Facts:
+    """What a station knows of itself: name, keystore, and the points (65 octets) and signature (64) of its key.
+
+    ``requested`` is the point for which a certificate was asked; ``point``, ``ca`` and ``signature`` come together when
+    init is complete. ``master`` is the number of the master key that wraps link keys, ``rewrapping`` the one that they
+    are being wrapped under anew. ``seal_key`` (wrapped by the vault) makes the MACs of rows; ``taken_over`` says when
+    rows of a store of version 1 got theirs.
+    """
+
+    name: str
+    keystore: str
+    keystore_why: str = ""
+    requested: bytes | None = None
+    point: bytes | None = None
+    ca: bytes | None = None
+    signature: bytes | None = None
+    master: int = 1
+    rewrapping: int | None = None
+    seal_key: bytes | None = field(default=None, repr=False)
+    taken_over: str | None = None
+    mac: bytes | None = field(default=None, repr=False, compare=False)
+
+
+@dataclass(frozen=True)
+class Marks:
+    """What holds for the keys of one node until something ends it.
+
+    ``ca``: P(CA) that it keeps, where that is not the owner's; ``next_ca`` the one that it keeps if the pending key
+    ``next_key_id`` turns out to be good; ``rotation``: why a rotation is due; ``former``: fingerprint of the board that
+    its link keys were agreed with, once its pin was let go.
+    """
+
+    ca: bytes | None = None
+    ca_mac: bytes | None = field(default=None, repr=False, compare=False)
+    next_key_id: str | None = None
+    next_ca: bytes | None = None
+    rotation: str | None = None
+    former: str | None = None
+
+
+@dataclass(frozen=True)
+class Group:
+    """A measurement group: nodes that are measured together."""
+
+    name: str
+    uuids: tuple[bytes, ...] = ()
+    created: str = field(default_factory=utc_now)
+
+
+@dataclass(frozen=True)
+class Measurement:
+    """What the station measures after every start (operation.md section 7): a group, or nodes by UUID.
+
+    ``rate`` in Hz, None for what the datasheets say; ``sinks`` are the strings that name files and topics.
+    """
+
+    id: str
+    group: str | None = None
+    uuids: tuple[bytes, ...] = ()
+    rate: float | None = None
+    kind: MeasurementKind = "periodic"
+    trigger: bool = False
+    sinks: tuple[str, ...] = ()
     created: str = field(default_factory=utc_now)
 
 
@@ -97,6 +194,7 @@ class TrustRecord:
     point: bytes
     fingerprint: str
     added: str = field(default_factory=utc_now)
+    mac: bytes | None = field(default=None, repr=False, compare=False)
 
 
 @dataclass(frozen=True)

@@ -9,7 +9,7 @@ from __future__ import annotations
 from typing import Final
 
 APPLICATION_ID: Final = 0x54454453  # "TEDS"
-SCHEMA_VERSION: Final = 1
+SCHEMA_VERSION: Final = 2
 
 _VERSION_1: Final = (
     "CREATE TABLE meta(name TEXT PRIMARY KEY, value TEXT NOT NULL) STRICT, WITHOUT ROWID",
@@ -69,5 +69,58 @@ _VERSION_1: Final = (
         BEGIN SELECT RAISE(ABORT, 'the audit log is append-only'); END""",
 )
 
+# What came with version 2: the settings by name became tables, images lie as octets and once, rows that decide whom the
+# station believes carry a MAC. ``migration.carry`` moves what SQL alone cannot read.
+_VERSION_2: Final = (
+    "DROP TABLE steps",
+    "DROP TABLE node_images",
+    "DROP TABLE drafts",
+    "DELETE FROM meta WHERE name GLOB 'setting:*'",
+    """CREATE TABLE station(
+        one INTEGER PRIMARY KEY CHECK(one = 1), name TEXT NOT NULL CHECK(name <> ''),
+        keystore TEXT NOT NULL CHECK(keystore IN ('keyring', 'file') OR keystore GLOB 'pkcs11:*'),
+        keystore_why TEXT NOT NULL, requested BLOB CHECK(length(requested) = 65),
+        point BLOB CHECK(length(point) = 65), ca BLOB CHECK(length(ca) = 65),
+        signature BLOB CHECK(length(signature) = 64), master INTEGER NOT NULL DEFAULT 1 CHECK(master > 0),
+        rewrapping INTEGER CHECK(rewrapping > 0), seal_key BLOB, taken_over TEXT, mac BLOB CHECK(length(mac) = 16),
+        CHECK((point IS NULL) = (ca IS NULL) AND (point IS NULL) = (signature IS NULL))) STRICT""",
+    """CREATE TABLE certificates(
+        ca TEXT NOT NULL CHECK(length(ca) = 64), station TEXT NOT NULL CHECK(length(station) = 64),
+        signature BLOB NOT NULL CHECK(length(signature) = 64), PRIMARY KEY(ca, station)) STRICT, WITHOUT ROWID""",
+    """CREATE TABLE marks(
+        uuid BLOB PRIMARY KEY CHECK(length(uuid) = 10), ca BLOB CHECK(length(ca) = 65),
+        ca_mac BLOB CHECK(length(ca_mac) = 16), next_key_id TEXT CHECK(length(next_key_id) = 16),
+        next_ca BLOB CHECK(length(next_ca) = 65), rotation TEXT CHECK(rotation <> ''),
+        former TEXT CHECK(length(former) = 64), CHECK((next_key_id IS NULL) = (next_ca IS NULL)))
+        STRICT, WITHOUT ROWID""",
+    """CREATE TABLE drafts(
+        uuid BLOB PRIMARY KEY CHECK(length(uuid) = 10), blocks BLOB NOT NULL,
+        stage TEXT NOT NULL CHECK(stage IN ('built', 'signed')), profile TEXT, created TEXT NOT NULL)
+        STRICT, WITHOUT ROWID""",
+    """CREATE TABLE datasheets(
+        row INTEGER PRIMARY KEY, uuid BLOB NOT NULL CHECK(length(uuid) = 10), sequence INTEGER NOT NULL,
+        epoch INTEGER NOT NULL, signed TEXT, profile TEXT, seen TEXT NOT NULL, digest BLOB NOT NULL
+        CHECK(length(digest) = 32), blocks BLOB NOT NULL) STRICT""",
+    "CREATE INDEX datasheets_of_node ON datasheets(uuid)",
+    "ALTER TABLE nodes ADD COLUMN point_mac BLOB CHECK(length(point_mac) = 16)",
+    "ALTER TABLE nodes ADD COLUMN due TEXT CHECK(length(due) = 10)",
+    "CREATE INDEX nodes_by_name ON nodes(name) WHERE name IS NOT NULL",
+    "CREATE INDEX nodes_by_due ON nodes(due) WHERE due IS NOT NULL",
+    "ALTER TABLE whitelist ADD COLUMN mac BLOB CHECK(length(mac) = 16)",
+    "CREATE INDEX whitelist_by_name ON whitelist(name) WHERE name IS NOT NULL",
+    "ALTER TABLE trust ADD COLUMN mac BLOB CHECK(length(mac) = 16)",
+    "CREATE INDEX audit_of_node ON audit(uuid) WHERE uuid IS NOT NULL",
+    """CREATE TABLE groups(
+        name TEXT PRIMARY KEY CHECK(length(name) BETWEEN 1 AND 100), created TEXT NOT NULL) STRICT, WITHOUT ROWID""",
+    """CREATE TABLE group_members(
+        name TEXT NOT NULL REFERENCES groups(name) ON DELETE CASCADE, uuid BLOB NOT NULL CHECK(length(uuid) = 10),
+        PRIMARY KEY(name, uuid)) STRICT, WITHOUT ROWID""",
+    """CREATE TABLE measurements(
+        id TEXT PRIMARY KEY CHECK(id <> ''), group_name TEXT REFERENCES groups(name) ON DELETE CASCADE,
+        uuids TEXT NOT NULL, rate REAL CHECK(rate > 0), kind TEXT NOT NULL CHECK(kind IN ('periodic', 'event', 'free')),
+        trigger INTEGER NOT NULL CHECK(trigger IN (0, 1)), sinks TEXT NOT NULL, created TEXT NOT NULL,
+        CHECK((group_name IS NULL) <> (uuids = '[]'))) STRICT, WITHOUT ROWID""",
+)
+
 # STEPS_TO[n] are the statements that bring a store of version n - 1 to version n.
-STEPS_TO: Final[dict[int, tuple[str, ...]]] = {1: _VERSION_1}
+STEPS_TO: Final[dict[int, tuple[str, ...]]] = {1: _VERSION_1, 2: _VERSION_2}

@@ -123,13 +123,6 @@ def extend_audit(live: Store, copy: Store) -> int:
     return len(rows)
 
 
-def settings(store: Store) -> dict[str, str]:
-    """Return every named setting."""
-    prefix = "setting:"
-    rows = store._database.execute("SELECT name, value FROM meta WHERE substr(name, 1, ?) = ?", (len(prefix), prefix))
-    return {str(name).removeprefix(prefix): str(value) for name, value in rows}
-
-
 def _hash_at(store: Store, seq: int) -> str:
     if seq == 0:
         return store.audit._root.hex()

@@ -9,17 +9,20 @@ from types import TracebackType
 
 from teds_provision.errors import StoreFailure
 from teds_provision.store.audit import AuditLog
-from teds_provision.store.bulk_tables import BulkTables
 from teds_provision.store.database import Database
-from teds_provision.store.handover_tables import HandoverTables
-from teds_provision.store.key_tables import KeyTables
-from teds_provision.store.node_tables import NodeTables
+from teds_provision.store.tables.batches import BulkTables
+from teds_provision.store.tables.datasheets import DatasheetTables
+from teds_provision.store.tables.facts import FactTables
+from teds_provision.store.tables.handovers import HandoverTables
+from teds_provision.store.tables.keys import KeyTables
+from teds_provision.store.tables.measurements import MeasurementTables
+from teds_provision.store.tables.nodes import NodeTables
 
 _ID_OCTETS = 16
 
 
-class Store(NodeTables, KeyTables, HandoverTables, BulkTables):
-    """Whitelist, nodes, wrapped keys, drafts, trust, handovers and the audit log of one station.
+class Store(NodeTables, KeyTables, DatasheetTables, HandoverTables, BulkTables, FactTables, MeasurementTables):
+    """Whitelist, nodes, wrapped keys, datasheets, drafts, trust, handovers, groups and the audit log of one station.
 
     Every method is durable when it returns, and all of them raise StoreFailure (or StoreLocked) where the file cannot
     give or take what they ask. Several processes may have it open; a command that changes it holds a StoreLock.
@@ -67,15 +70,6 @@ class Store(NodeTables, KeyTables, HandoverTables, BulkTables):
     def transaction(self) -> AbstractContextManager[None]:
         """All of the block or nothing of it; may stand inside another one."""
         return self._database.transaction()
-
-    def setting(self, name: str) -> str | None:
-        """Return a named setting, None if it was never set."""
-        row = self._database.one("SELECT value FROM meta WHERE name = ?", (f"setting:{name}",))
-        return None if row is None else str(row[0])
-
-    def set_setting(self, name: str, value: str) -> None:
-        """Keep a named setting; never a secret."""
-        self._database.execute("INSERT OR REPLACE INTO meta VALUES(?, ?)", (f"setting:{name}", value))
 
     def damage(self) -> str | None:
         """Return what SQLite's quick check finds wrong with the file, None if nothing (for doctor)."""

@@ -95,7 +95,7 @@ def station(tmp_path: Path) -> Iterator[Station]:
         made.nodes.keep_datasheet(Image(uuid))
     add_key(made, TWO, 2, active=False)
     made.policy.trust(TrustRecord("owner", "ca", POINT, "ab" * 32))
-    made.nodes.keep_draft(Draft(ONE, "{}"))
+    made.nodes.keep_draft(Draft(ONE, Image(ONE)))
     made.audit("test", ONE, "ready")
     yield made
     made.close()
@@ -504,13 +504,13 @@ def test_a_lost_vault_comes_back_beside_its_store(station: Station, tmp_path: Pa
 
 def test_marks_on_nodes_do_not_go_back_and_come_forward(station: Station, tmp_path: Path) -> None:
     """For example that a rotation is due: an older backup that does not know it must not lift it."""
-    station._store.set_setting("mark", "before")
+    station.keys.demand_rotation(ONE, "before")
     back_up(station, tmp_path / "old")
-    station._store.set_setting("mark", "due")
-    station._store.set_setting("other", "due")
+    station.keys.demand_rotation(ONE, "due")
+    station.keys.demand_rotation(TWO, "due")
     station.audit("test", ONE, "marked")
     merge(station._store, opened(tmp_path / "old"), dry_run=False)
-    assert station._store.setting("mark") == "due"
+    assert station.keys.rotation_due(ONE) == "due"
     back_up(station, tmp_path / "new")
     stale = tmp_path / "stale"
     with opened(tmp_path / "old") as content:
@@ -519,7 +519,7 @@ def test_marks_on_nodes_do_not_go_back_and_come_forward(station: Station, tmp_pa
     with Store.open(stale) as store:
         done = merge(store, opened(tmp_path / "new"), dry_run=False)
         assert done.relation is Relation.NEWER
-        assert (store.setting("mark"), store.setting("other")) == ("due", "due")
+        assert (store.marks(ONE).rotation, store.marks(TWO).rotation) == ("due", "due")
 
 
 def test_a_key_that_the_vault_does_not_open_is_told_when_backing_up(station: Station, tmp_path: Path) -> None:
@@ -567,10 +567,10 @@ def test_a_passphrase_that_is_none_is_refused_before_anything_is_written(station
 
 
 def test_a_store_of_several_chunks_goes_out_and_comes_back(station: Station, tmp_path: Path) -> None:
-    text = json.dumps({"filler": "x" * 100_000})
+    filler = {(0, 1): os.urandom(100_000)}
     with station.transaction():
         for number in range(40):
-            station._store.put_draft(Draft(number.to_bytes(10, "big"), text))
+            station._store.put_draft(Draft(uuid := number.to_bytes(10, "big"), Image(uuid, filler)))
     done = back_up(station, tmp_path / "b")
     assert done.octets > 3 * CHUNK_OCTETS
     octets = (tmp_path / "b").read_bytes()
@@ -578,7 +578,7 @@ def test_a_store_of_several_chunks_goes_out_and_comes_back(station: Station, tmp
         assert list(rows.dump(content.copy))[1:] != []
         draft = content.copy.draft((39).to_bytes(10, "big"))
         assert draft is not None
-        assert draft.image == text
+        assert draft.image.blocks == filler
     head = octets.index(b"\n") + 1
     full = CHUNK_OCTETS + 16
     first, second = octets[head : head + full], octets[head + full : head + 2 * full]

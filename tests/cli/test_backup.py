@@ -13,6 +13,7 @@ from pathlib import Path
 import pytest
 
 from teds_provision.store import Draft, KeyRecord, NodeRecord, Store
+from teds_provision.teds.image import Image
 from tests.workflow.bench import PASSPHRASE, make_station
 
 from .shell import call, clean_environment, spawn
@@ -206,7 +207,7 @@ def test_killed_in_the_middle_of_a_merge_the_store_is_old_or_new(home: Path, sea
 
 def test_a_full_disk_leaves_the_old_backup_and_no_rest(home: Path, sealed: Path, tmp_path: Path) -> None:
     with Store.open(home) as store:
-        store.put_draft(Draft(ONE, "x" * 300_000))
+        store.put_draft(Draft(ONE, Image(ONE, {(0, 1): os.urandom(300_000)})))
     before, words = sealed.read_bytes(), tmp_path / "words"
     words.write_text(PASSPHRASE + "\n")
     run = f"{sys.executable} -m teds_provision --home {home} --passphrase-fd 3 backup {sealed} --yes 3<{words}"

@@ -222,7 +222,7 @@ def test_a_tampered_flash_is_mended_by_hand_too(station: Station, finished: Node
 def test_an_image_that_the_node_must_not_take_is_refused(station: Station, finished: Node, tmp_path: Path) -> None:
     links, file = station.desk.links.over("nfc"), tmp_path / "image.json"
     image = station.ask("read", finished.uuid, "--output", file, *links)
-    with unchanged(station, finished, without=("nodes", "node_images")):
+    with unchanged(station, finished, without=("nodes", "datasheets")):
         file.write_text("{")
         station.refuses("write", finished.uuid, "--image", file, *links, code=8)
         station.refuses("verify", file, code=8)
@@ -241,7 +241,7 @@ def test_an_older_datasheet_is_not_put_back(station: Station, finished: Node, tm
     links, old = station.desk.links.over("nfc"), tmp_path / "old.json"
     station.ask("read", finished.uuid, "--output", old, *links)
     station.provision("nfc", "--name", "renamed")
-    with unchanged(station, finished, without=("nodes", "node_images")):
+    with unchanged(station, finished, without=("nodes", "datasheets")):
         said = station.refuses("write", finished.uuid, "--image", old, *links, code=6)
     assert "sequence" in said["message"]
 
@@ -304,7 +304,7 @@ def test_a_passphrase_that_is_wrong_or_missing_is_7(station: Station, finished: 
 def test_a_keyring_that_is_not_there_is_7(station: Station, finished: Node, desk: Desk, tmp_path: Path) -> None:
     """A station whose keys lie in a keyring, on a machine (or in a session) that has none."""
     with closing(sqlite3.connect(station.home / "store.sqlite3")) as database, database:
-        database.execute("UPDATE meta SET value = 'keyring' WHERE name = 'setting:keystore'")
+        database.execute("UPDATE station SET keystore = 'keyring'")
     said = station.refuses("provision", "--yes", *desk.links.over("nfc"), code=7)
     assert said["code"] in ("no-keyring", "vault")
     assert said["hint"]
@@ -367,7 +367,7 @@ def test_a_full_disk_is_7_and_the_same_command_carries_on(station: Station, node
 
 def test_results_that_cannot_be_written_are_an_error(station: Station, finished: Node, tmp_path: Path) -> None:
     links = station.desk.links.over("nfc")
-    with unchanged(station, finished, without=("nodes", "node_images")):
+    with unchanged(station, finished, without=("nodes", "datasheets")):
         said = station.refuses("read", finished.uuid, "--output", tmp_path / "no" / "image.json", *links, code=2)
         assert "image.json" in said["message"]
         outcome = station.run(

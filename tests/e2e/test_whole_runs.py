@@ -12,7 +12,7 @@ from .desk import ANGLE, FINGER, Desk, Node, Station, results
 pytestmark = pytest.mark.link
 
 SECURITY = 128
-CHANGING = ("audit", "nodes", "node_images", "drafts", "steps")
+CHANGING = ("audit", "nodes", "datasheets", "drafts")
 STEPS = ["identify", "whitelist", "agree", "build", "sign", "write", "verify"]
 NODE_KEYS = {"uuid", "fingerprint", "tag_uid", "state", "whitelisted", "channels", "name"}
 CALIBRATION = """raw,value [degree]

@@ -112,17 +112,18 @@ def test_two_processes_write_at_once_and_nothing_is_lost(home: Path) -> None:
 
 
 FILLER = """
-import resource, sys
+import os, resource, sys
 from pathlib import Path
 from teds_provision.errors import StoreFailure
 from teds_provision.store import Draft, Store
+from teds_provision.teds.image import Image
 store = Store.open(Path(sys.argv[1]), create=True)
 if sys.argv[2] != "0":
     resource.setrlimit(resource.RLIMIT_FSIZE, (int(sys.argv[2]),) * 2)
 done = 0
 try:
     for number in range(1000):
-        store.put_draft(Draft(number.to_bytes(10, "big"), "x" * 20000))
+        store.put_draft(Draft(uuid := number.to_bytes(10, "big"), Image(uuid, {(0, 1): os.urandom(20000)})))
         done += 1
 except StoreFailure as failure:
     print(done, failure.exit_code, failure.message, failure.hint)

@@ -7,7 +7,7 @@ from contextlib import suppress
 import pytest
 
 from teds_provision.errors import NotFound, StoreFailure
-from teds_provision.store import KeyRecord, NodeRecord, Store
+from teds_provision.store import Facts, KeyRecord, NodeRecord, Store
 
 NODE = bytes(range(10))
 OTHER = bytes(range(1, 11))
@@ -99,8 +99,8 @@ def test_transactions_nest_and_undo_only_what_failed(store: Store) -> None:
             raise RuntimeError
     assert [node.uuid for node in store.nodes()] == [NODE]
     with suppress(RuntimeError), store.transaction():
-        store.set_setting("name", "lost")
+        store.put_facts(Facts("lost", "file"))
         with store.transaction():
             store.add_key(a_key(1))
         raise RuntimeError
-    assert (store.setting("name"), store.keys(NODE)) == (None, [])
+    assert (store.facts(), store.keys(NODE)) == (None, [])

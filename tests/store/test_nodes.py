@@ -8,6 +8,7 @@ import pytest
 
 from teds_provision.errors import BadData, NotFound, OtherKey, StoreFailure, UsageFailure
 from teds_provision.store import Draft, NodeRecord, Store, WhitelistEntry
+from teds_provision.teds.image import Image
 
 FINGER = bytes.fromhex("0102030405060708090a")
 JOINT = bytes.fromhex("0102ff0405060708090a")
@@ -139,7 +140,7 @@ def test_the_whitelist_keeps_and_removes(store: Store) -> None:
 
 
 def test_a_draft_goes_through_its_stages(store: Store) -> None:
-    draft = Draft(FINGER, '{"format": "teds-image/1"}', profile="tactile-finger-sensor")
+    draft = Draft(FINGER, Image(FINGER, {(0, 1): b"meta"}), profile="tactile-finger-sensor")
     store.put_draft(draft)
     store.put_draft(replace(draft, stage="signed"))
     assert store.draft(FINGER) == replace(draft, stage="signed")

@@ -20,7 +20,7 @@ from teds_provision.doctor.doctor import CHECKS, Finding, Place, examine, exit_c
 from teds_provision.doctor.links import READERS
 from teds_provision.doctor.station import holds_private_key
 from teds_provision.protocol.keys import SoftwareKey, to_pem
-from teds_provision.store import NodeRecord, Store, StoreLock
+from teds_provision.store import Facts, NodeRecord, Store, StoreLock
 from teds_provision.vault import forget_vaults
 
 from .bench import make_station
@@ -325,7 +325,7 @@ def test_nodes_without_a_backup_are_a_warning(stationed: Place) -> None:
 def test_a_station_whose_keyring_is_gone_is_a_failure(stationed: Place, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("DBUS_SESSION_BUS_ADDRESS", f"unix:path={stationed.home}/no-bus")
     with Store.open(stationed.home) as store:
-        store.set_setting("keystore", "keyring")
+        store.put_facts(Facts("bench", "keyring"))
     found = by_name(stationed)
     assert (found["keyring"].result, found["vault"].result) == ("failed", "failed")
     monkeypatch.setenv("PYTHON_KEYRING_BACKEND", "keyring.backends.null.Keyring")
@@ -334,7 +334,7 @@ def test_a_station_whose_keyring_is_gone_is_a_failure(stationed: Place, monkeypa
 
 def test_a_token_whose_module_is_missing_is_a_failure(stationed: Place) -> None:
     with Store.open(stationed.home) as store:
-        store.set_setting("keystore", "pkcs11:token=bench?module-path=/nowhere/module.so")
+        store.put_facts(Facts("bench", "pkcs11:token=bench?module-path=/nowhere/module.so"))
     vault = by_name(stationed)["vault"]
     assert (vault.result, "module" in vault.why) == ("failed", True)
 

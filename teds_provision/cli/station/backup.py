@@ -173,7 +173,8 @@ def _merge(app: App, store: Store, content: Content, keystore: str | None, *, ye
 
     plan = merge(store, content, dry_run=True)
     how = plan.relation.value if plan.relation is not None else ""
-    head = f"{_told(content, store.setting('keystore') or keystore)}\nIt is {how} of this station."
+    facts = store.facts()
+    head = f"{_told(content, facts.keystore if facts is not None else keystore)}\nIt is {how} of this station."
     app.note("\n".join([head, *_lines(plan)]))
     if dry_run:
         _emit(app, content, plan, f"Plan: {'bring back what is listed' if plan.back else 'nothing to do'}.", dry=True)

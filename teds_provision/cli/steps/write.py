@@ -42,7 +42,9 @@ def write(app: App, uuid: str, image: Path | None, yes: bool, dry_run: bool, lin
     if image is not None:
         wanted = Image.from_json(read_file(image))
     elif draft is not None:
-        wanted = Image.from_json(draft.image)
+        wanted = draft.image
+    elif (known := station.nodes.datasheet(octets)) is not None and known.unsigned_blocks():
+        wanted = known  # written already: the same command once more
     else:
         raise NotFound(f"Nothing is built for node {octets.hex()}.", hint="build and sign it first, or give --image.")
     if wanted.uuid != octets:

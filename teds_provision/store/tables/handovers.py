@@ -39,8 +39,8 @@ class HandoverTables:
                 "DELETE FROM trust WHERE fingerprint = ? AND role = ?", (record.fingerprint, record.role)
             )
             self._database.execute(
-                "INSERT INTO trust VALUES(?, ?, ?, ?, ?)",
-                (record.name, record.role, record.point, record.fingerprint, record.added),
+                "INSERT INTO trust VALUES(?, ?, ?, ?, ?, ?)",
+                (record.name, record.role, record.point, record.fingerprint, record.added, record.mac),
             )
 
     def remove_trust(self, name_or_fingerprint: str) -> bool:

@@ -1,4 +1,4 @@
-"""Whitelist, nodes, names, drafts and the image that each node had last."""
+"""Whitelist, nodes and names."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import Any
 
 from teds_provision.errors import NotFound, OtherKey, UsageFailure
 from teds_provision.store.database import Database
-from teds_provision.store.records import UUID_OCTETS, Draft, NodeRecord, WhitelistEntry, utc_now
+from teds_provision.store.records import UUID_OCTETS, NodeRecord, WhitelistEntry
 
 _UUID_DIGITS = 2 * UUID_OCTETS
 _MIN_PREFIX = 4
@@ -34,8 +34,8 @@ class NodeTables:
     def put_whitelist(self, entry: WhitelistEntry) -> None:
         """Add or replace the entry of a node; policy (a pinned key stays) is the caller's."""
         self._database.execute(
-            "INSERT OR REPLACE INTO whitelist VALUES(?, ?, ?, ?, ?)",
-            (entry.uuid, entry.fingerprint, entry.added, entry.assurance, entry.name),
+            "INSERT OR REPLACE INTO whitelist VALUES(?, ?, ?, ?, ?, ?)",
+            (entry.uuid, entry.fingerprint, entry.added, entry.assurance, entry.name, entry.mac),
         )
 
     def remove_whitelist(self, uuid: bytes) -> bool:
@@ -65,7 +65,8 @@ class NodeTables:
             values: dict[str, Any] = {column.name: getattr(record, column.name) for column in fields(NodeRecord)}
             values["groups"] = json.dumps(list(record.groups))
             if known:
-                values["point"] = record.point or known.point
+                if record.point is None:
+                    values["point"], values["point_mac"] = known.point, known.point_mac
                 values["epoch"] = max(record.epoch, known.epoch)
                 values["sequence"] = max(record.sequence, known.sequence)
             marks = ", ".join("?" * len(values))
@@ -75,7 +76,7 @@ class NodeTables:
 
     def unpin_node(self, uuid: bytes) -> None:
         """Forget the identity key of a node on its owner's explicit order; epoch and sequence stay."""
-        self._database.execute("UPDATE nodes SET point = NULL WHERE uuid = ?", (uuid,))
+        self._database.execute("UPDATE nodes SET point = NULL, point_mac = NULL WHERE uuid = ?", (uuid,))
 
     def resolve(self, text: str) -> bytes:
         """Return the UUID that ``text`` means, looking at nodes and whitelist.
@@ -102,30 +103,6 @@ class NodeTables:
             more = f" and {len(candidates) - _SHOWN_CANDIDATES} more" if len(candidates) > _SHOWN_CANDIDATES else ""
             raise UsageFailure(f"{asked!r} fits several nodes: {shown}{more}.", hint="Give more digits of the UUID.")
         return bytes(candidates[0])
-
-    def draft(self, uuid: bytes) -> Draft | None:
-        """Return the image that this node is being given."""
-        return self._database.read_one(Draft, "SELECT * FROM drafts WHERE uuid = ?", (uuid,))
-
-    def put_draft(self, draft: Draft) -> None:
-        """Keep an image for a node, in place of the one before."""
-        self._database.execute(
-            "INSERT OR REPLACE INTO drafts VALUES(?, ?, ?, ?, ?)",
-            (draft.uuid, draft.image, draft.stage, draft.profile, draft.created),
-        )
-
-    def drop_draft(self, uuid: bytes) -> None:
-        """Forget the image of a node, if there is one."""
-        self._database.execute("DELETE FROM drafts WHERE uuid = ?", (uuid,))
-
-    def node_image(self, uuid: bytes) -> str | None:
-        """Return the image (JSON) that this node had when it was last read, None if it never was."""
-        row = self._database.one("SELECT image FROM node_images WHERE uuid = ?", (uuid,))
-        return None if row is None else str(row[0])
-
-    def put_node_image(self, uuid: bytes, image: str) -> None:
-        """Remember what a node has: every TEDS as it was read."""
-        self._database.execute("INSERT OR REPLACE INTO node_images VALUES(?, ?, ?)", (uuid, image, utc_now()))
 
 
 def _node(*row: Any) -> NodeRecord:

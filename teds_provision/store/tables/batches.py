@@ -10,7 +10,6 @@ from typing import Any
 from teds_provision.store.database import Database
 from teds_provision.store.records import Holder, KeyRecord, NodeRecord, Tombstone, WhitelistEntry
 
-_SETTING = "setting:"
 _NODE_FIELDS = tuple(column.name for column in fields(NodeRecord))
 _NODES = f"INSERT OR REPLACE INTO nodes({', '.join(_NODE_FIELDS)}) VALUES({', '.join('?' * len(_NODE_FIELDS))})"
 _KEYS = (
@@ -29,26 +28,14 @@ class Batch:
     keys: Sequence[KeyRecord] = ()
     holders: Sequence[Holder] = ()
     tombstones: Sequence[Tombstone] = ()
-    rotations: Mapping[bytes, str] = field(default_factory=dict)
-    """Why a rotation is due, by UUID."""
-    cas: Mapping[bytes, bytes] = field(default_factory=dict)
-    """P(CA) that a node keeps, by UUID."""
-    next_cas: Mapping[bytes, tuple[str, bytes]] = field(default_factory=dict)
-    """Key id and P(CA) that a node keeps once this key is proven, by UUID."""
+    marks: Mapping[bytes, Mapping[str, Any]] = field(default_factory=dict)
+    """Changes of marks (names and values of :class:`Marks`), by UUID; the caller of ``put_batch`` makes them."""
 
 
 class BulkTables:
     """The part of the store that reads and writes many rows; see :class:`teds_provision.store.Store`."""
 
     _database: Database
-
-    def settings(self, prefix: str) -> dict[str, str]:
-        """Return every setting whose name begins with ``prefix``, by the rest of its name."""
-        low = _SETTING + prefix
-        rows = self._database.execute(
-            "SELECT name, value FROM meta WHERE name >= ? AND name < ?", (low, low + "\U0010ffff")
-        )
-        return {str(name)[len(low) :]: str(value) for name, value in rows}
 
     def slots(self) -> dict[bytes, int]:
         """Return the last slot given to each node's keys."""
@@ -59,7 +46,9 @@ class BulkTables:
         many = self._database.execute_many
         with self._database.transaction():
             many(_NODES, (_node_row(record) for record in batch.nodes))
-            many("INSERT OR REPLACE INTO whitelist VALUES(?, ?, ?, ?, ?)", (_row(entry) for entry in batch.whitelist))
+            many(
+                "INSERT OR REPLACE INTO whitelist VALUES(?, ?, ?, ?, ?, ?)", (_row(entry) for entry in batch.whitelist)
+            )
             many(_SLOTS, ((key.uuid, key.slot) for key in batch.keys))
             many(_KEYS, (_row(key)[:-1] for key in batch.keys))
             many("INSERT OR REPLACE INTO holders VALUES(?, ?, ?, ?)", (_row(holder) for holder in batch.holders))

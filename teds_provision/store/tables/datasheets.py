@@ -1,0 +1,88 @@
+"""Drafts, and the datasheets that each node had: the present one and ten older ones, as octets, each once."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from teds_provision.store.database import Database
+from teds_provision.store.packing import datasheet_row, packed, unpacked
+from teds_provision.store.records import DatasheetRecord, Draft, utc_now
+from teds_provision.teds.image import Image
+
+KEPT = 11
+"""The present datasheet of a node and ten older ones."""
+
+_COLUMNS = "uuid, sequence, epoch, signed, profile, seen, digest, blocks"
+
+
+class DatasheetTables:
+    """The part of the store that is about images; see :class:`teds_provision.store.Store`."""
+
+    _database: Database
+
+    def draft(self, uuid: bytes) -> Draft | None:
+        """Return the image that this node is being given."""
+        return self._database.read_one(_draft, "SELECT * FROM drafts WHERE uuid = ?", (uuid,))
+
+    def drafts(self) -> list[Draft]:
+        """Return every image that was built and not written, by UUID."""
+        return self._database.read(_draft, "SELECT * FROM drafts ORDER BY uuid")
+
+    def put_draft(self, draft: Draft) -> None:
+        """Keep an image for a node, in place of the one before."""
+        self._database.execute(
+            "INSERT OR REPLACE INTO drafts VALUES(?, ?, ?, ?, ?)",
+            (draft.uuid, packed(draft.image), draft.stage, draft.profile, draft.created),
+        )
+
+    def drop_draft(self, uuid: bytes) -> bool:
+        """Forget the image that a node was to be given; False if there was none."""
+        return self._database.change("DELETE FROM drafts WHERE uuid = ?", (uuid,)) > 0
+
+    def datasheet(self, uuid: bytes) -> DatasheetRecord | None:
+        """Return what this node had when it was last read or written, None if it never was."""
+        statement = f"SELECT {_COLUMNS} FROM datasheets WHERE uuid = ? ORDER BY row DESC LIMIT 1"
+        return self._database.read_one(_datasheet, statement, (uuid,))
+
+    def history(self, uuid: bytes) -> list[DatasheetRecord]:
+        """Return every datasheet that is kept of this node, newest first."""
+        statement = f"SELECT {_COLUMNS} FROM datasheets WHERE uuid = ? ORDER BY row DESC"
+        return self._database.read(_datasheet, statement, (uuid,))
+
+    def put_datasheet(self, image: Image, profile: str | None = None) -> bool:
+        """Remember what a node has: every TEDS as it was read. One that it has already is not written again.
+
+        Returns whether it was new. The oldest go when there are more than ten older ones.
+        """
+        row = datasheet_row(image, profile, utc_now())
+        with self._database.transaction():
+            last = self._database.one(
+                "SELECT digest FROM datasheets WHERE uuid = ? ORDER BY row DESC LIMIT 1", (image.uuid,)
+            )
+            if last == (row[-2],):
+                return False
+            self._database.execute(f"INSERT INTO datasheets({_COLUMNS}) VALUES(?, ?, ?, ?, ?, ?, ?, ?)", row)
+            self._database.execute(
+                "DELETE FROM datasheets WHERE uuid = ? AND row <= (SELECT row FROM datasheets WHERE uuid = ?"
+                " ORDER BY row DESC LIMIT 1 OFFSET ?)",
+                (image.uuid, image.uuid, KEPT),
+            )
+        return True
+
+    def put_history(self, records: list[DatasheetRecord]) -> None:
+        """Keep datasheets of a node, oldest first, in place of those that are there (for restore)."""
+        with self._database.transaction():
+            for uuid in {record.uuid for record in records}:
+                self._database.execute("DELETE FROM datasheets WHERE uuid = ?", (uuid,))
+            for record in records:
+                row = datasheet_row(record.image, record.profile, record.seen)
+                self._database.execute(f"INSERT INTO datasheets({_COLUMNS}) VALUES(?, ?, ?, ?, ?, ?, ?, ?)", row)
+
+
+def _draft(uuid: bytes, blocks: bytes, stage: Any, profile: str | None, created: str) -> Draft:
+    return Draft(uuid, unpacked(uuid, blocks), stage, profile, created)
+
+
+def _datasheet(uuid: bytes, *row: Any) -> DatasheetRecord:
+    sequence, epoch, signed, profile, seen, digest, blocks = row
+    return DatasheetRecord(uuid, sequence, epoch, signed, profile, seen, digest.hex(), unpacked(uuid, blocks))

@@ -1,0 +1,71 @@
+"""The station's own facts, the certificates that it knows, and the marks on nodes."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import fields
+from typing import Any
+
+from teds_provision.store.database import Database
+from teds_provision.store.records import Facts, Marks
+
+_FACTS = ", ".join(column.name for column in fields(Facts))
+_MARKS = ", ".join(column.name for column in fields(Marks))
+
+
+class FactTables:
+    """The part of the store that is about the station itself; see :class:`teds_provision.store.Store`."""
+
+    _database: Database
+
+    def facts(self) -> Facts | None:
+        """Return what the station knows of itself, None before init made anything."""
+        return self._database.read_one(Facts, f"SELECT {_FACTS} FROM station")
+
+    def put_facts(self, facts: Facts) -> None:
+        """Keep the station's facts, all of them."""
+        values = tuple(getattr(facts, column.name) for column in fields(Facts))
+        marks = ", ".join("?" * len(values))
+        self._database.execute(f"INSERT OR REPLACE INTO station(one, {_FACTS}) VALUES(1, {marks})", values)
+
+    # -- certificates ----------------------------------------------------------------------------------------------
+
+    def certificate(self, ca: str, station: str) -> bytes | None:
+        """Return SIG104 of a CA over a station's key, both by fingerprint; None where it is not known."""
+        row = self._database.one("SELECT signature FROM certificates WHERE ca = ? AND station = ?", (ca, station))
+        return None if row is None else bytes(row[0])
+
+    def certificates(self) -> dict[tuple[str, str], bytes]:
+        """Return every SIG104 by the fingerprints of CA and station."""
+        rows = self._database.execute("SELECT ca, station, signature FROM certificates")
+        return {(str(ca), str(station)): bytes(signature) for ca, station, signature in rows}
+
+    def put_certificate(self, ca: str, station: str, signature: bytes) -> None:
+        """Keep a SIG104; the caller has verified it."""
+        self._database.execute("INSERT OR REPLACE INTO certificates VALUES(?, ?, ?)", (ca, station, signature))
+
+    # -- marks on nodes --------------------------------------------------------------------------------------------
+
+    def marks(self, uuid: bytes) -> Marks:
+        """Return the marks on a node; none of them is set on one without."""
+        return self._database.read_one(Marks, f"SELECT {_MARKS} FROM marks WHERE uuid = ?", (uuid,)) or Marks()
+
+    def all_marks(self) -> dict[bytes, Marks]:
+        """Return the marks on every node that has one."""
+        return dict(self._database.read(_marked, f"SELECT uuid, {_MARKS} FROM marks"))
+
+    def put_marks(self, marks: Mapping[bytes, Marks]) -> None:
+        """Keep the marks on nodes, in place of those that are there; a node without any has no row."""
+        places = ", ".join("?" * (len(fields(Marks)) + 1))
+        rows = [(uuid, *_values(mark)) for uuid, mark in marks.items() if mark != Marks()]
+        with self._database.transaction():
+            self._database.execute_many("DELETE FROM marks WHERE uuid = ?", ((uuid,) for uuid in marks))
+            self._database.execute_many(f"INSERT INTO marks(uuid, {_MARKS}) VALUES({places})", rows)
+
+
+def _values(marks: Marks) -> tuple[Any, ...]:
+    return tuple(getattr(marks, column.name) for column in fields(Marks))
+
+
+def _marked(uuid: bytes, *row: Any) -> tuple[bytes, Marks]:
+    return uuid, Marks(*row)
