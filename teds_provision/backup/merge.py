@@ -1,0 +1,186 @@
+"""What a backup brings back into a living store, and what stays as it is although the backup says otherwise."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterable
+from dataclasses import replace
+
+from teds_provision.protocol.keys import fingerprint
+from teds_provision.store import NodeRecord, Revocation, Store, Tombstone
+from teds_provision.store.snapshot import Relation, extend_audit
+
+
+class Merge:
+    """One merge: ``back`` counts what came, ``kept`` what stayed as it is although the backup says otherwise."""
+
+    def __init__(self, live: Store, copy: Store, how: Relation) -> None:
+        self.live, self.copy = live, copy
+        self.newer = how is Relation.NEWER
+        self.older = how in (Relation.OLDER, Relation.SAME)
+        self.back: Counter[str] = Counter()
+        self.kept: Counter[str] = Counter()
+        self.epochs = _epochs(live)
+        self.held = {key.uuid for key in live.all_keys()}
+        self.barred = {gone.uuid for gone in live.revocations()} | {gone.uuid for gone in live.tombstones()}
+
+    def run(self) -> None:
+        """Bring everything in the order in which one part looks at the other."""
+        if self.newer:
+            self.back["audit entries"] = extend_audit(self.live, self.copy)
+        self._revocations()
+        self._handovers()
+        self._nodes()
+        self._whitelist()
+        self._keys()
+        self._images()
+        self._trust()
+        self._facts()
+        self._marks()
+
+    def told(self) -> list[str]:
+        """What stayed, in sentences."""
+        return [f"{what}: {count}" for what, count in self.kept.items() if count]
+
+    def _revocations(self) -> None:
+        for revocation in self.copy.revocations():
+            if self.live.revocation(revocation.uuid) is None:
+                self.live.put_revocation(revocation)
+                self.back["revocations"] += 1
+        self.kept["revocations made since"] = _more(self.live.revocations(), self.copy.revocations())
+
+    def _handovers(self) -> None:
+        for handover in self.copy.handovers():
+            known = self.live.handover(handover.id, handover.direction)
+            if known is None or (self.newer and known != handover):
+                self.live.put_handover(handover)
+                self.back["handovers"] += 1
+        if not self.older:  # what an older copy has and this store lacks was undone, or rotated away, since
+            for tombstone in self.copy.tombstones():
+                if self.live.tombstone(tombstone.uuid) is None:
+                    self.live.put_tombstone(tombstone)
+                    self.back["tombstones"] += 1
+            present = {(holder.uuid, holder.fingerprint) for holder in self.live.holders()}
+            for holder in self.copy.holders():
+                if (holder.uuid, holder.fingerprint) not in present:
+                    self.live.put_holder(holder)
+                    self.back["holders"] += 1
+        self.kept["nodes moved away since"] = _more(self.live.tombstones(), self.copy.tombstones())
+
+    def _nodes(self) -> None:
+        for record in self.copy.nodes():
+            known = self.live.node(record.uuid)
+            if known is None:
+                self.live.put_node(record)
+                self.back["nodes"] += 1
+                continue
+            other = known.point is not None and record.point is not None and known.point != record.point
+            base = record if self.newer and not other else known
+            wanted = replace(
+                base,
+                point=known.point or (record.point if self.newer else None),
+                epoch=max(known.epoch, record.epoch),
+                sequence=max(known.sequence, record.sequence),
+            )
+            if wanted != known:
+                self.live.put_node(wanted)
+                self.back["nodes"] += 1
+            self._note_node(known, record, other=other)
+
+    def _note_node(self, known: NodeRecord, record: NodeRecord, *, other: bool) -> None:
+        self.kept["nodes pinned to another key now"] += other
+        self.kept["nodes whose epoch or sequence is higher now"] += (
+            known.epoch > record.epoch or known.sequence > record.sequence
+        )
+
+    def _whitelist(self) -> None:
+        for entry in self.copy.whitelist():
+            known, node = self.live.whitelisted(entry.uuid), self.live.node(entry.uuid)
+            pin = known.fingerprint if known else None
+            if pin is None and node is not None and node.point is not None:
+                pin = fingerprint(node.point)
+            if self.live.revocation(entry.uuid) is not None:
+                self.kept["revoked nodes off the whitelist"] += known is None
+            elif entry.fingerprint is not None and pin not in (None, entry.fingerprint):
+                self.kept["whitelist entries pinned to another key now"] += 1
+            elif known is None or (self.newer and known != entry):
+                self.live.put_whitelist(entry)
+                self.back["whitelist"] += 1
+
+    def _keys(self) -> None:
+        for record in self.copy.all_keys():
+            if any(key.key_id == record.key_id for key in self.live.keys(record.uuid)):
+                continue
+            newest = self.epochs.get(record.uuid)
+            if record.uuid in self.barred:
+                self.kept["keys of revoked or moved nodes left out"] += 1
+            elif newest is None or record.epoch > newest:
+                # Beside a key that is held it comes as pending: an Open under it decides, and drops the other.
+                self.live.add_key(replace(record, state="pending") if record.uuid in self.held else record)
+                self.back["keys"] += 1
+            else:
+                self.kept["older keys left out"] += 1
+
+    def _images(self) -> None:
+        for record in self.copy.nodes():
+            draft, history = self.copy.draft(record.uuid), self.copy.history(record.uuid)
+            known = self.live.draft(record.uuid)
+            if draft is not None and draft != known and (self.newer or (known is None and not self.older)):
+                self.live.put_draft(draft)
+                self.back["drafts"] += 1
+            present = self.live.history(record.uuid)
+            if history and history != present and (not present or self.newer):
+                self.live.put_history(history[::-1])
+                self.back["datasheets"] += 1
+
+    def _trust(self) -> None:
+        names = {record.name for record in self.live.trusted()}
+        keys = {(record.fingerprint, record.role) for record in self.live.trusted()}
+        for record in self.copy.trusted():
+            if (record.fingerprint, record.role) in keys:
+                continue
+            if record.name in names:
+                self.kept[f"the name {record.name!r} for the key trusted under it now"] += 1
+                continue
+            self.live.put_trust(record)
+            self.back[f"trust in {record.role} {record.name}"] += 1
+
+    def _facts(self) -> None:
+        """Facts of the station that init had not reached here, and certificates; the keystore is this machine's."""
+        here, there = self.live.facts(), self.copy.facts()
+        if there is not None and (here is None or here.point is None):
+            kept = there if here is None else replace(there, keystore=here.keystore, keystore_why=here.keystore_why)
+            self.live.put_facts(kept)
+            self.back["station"] += 1
+        present = self.live.certificates()
+        for (ca, station), signature in self.copy.certificates().items():
+            if (ca, station) not in present:
+                self.live.put_certificate(ca, station, signature)
+                self.back["certificates"] += 1
+
+    def _marks(self) -> None:
+        """Whose CA a node keeps, a rotation that is due: from a newer copy, or with a key that is missing here.
+
+        What an older copy has and this store lacks may have been settled since.
+        """
+        present = self.live.all_marks()
+        wanted = {
+            uuid: marks
+            for uuid, marks in self.copy.all_marks().items()
+            if present.get(uuid) != marks
+            and (self.newer or (uuid not in present and not (self.older and uuid in self.held)))
+        }
+        self.live.put_marks(wanted)
+        self.back["marks"] += len(wanted)
+
+
+def _epochs(store: Store) -> dict[bytes, int]:
+    """The highest epoch known of every node."""
+    epochs = {record.uuid: record.epoch for record in store.nodes()}
+    for key in store.all_keys():
+        epochs[key.uuid] = max(epochs.get(key.uuid, 0), key.epoch)
+    return epochs
+
+
+def _more(live: Iterable[Revocation | Tombstone], copy: Iterable[Revocation | Tombstone]) -> int:
+    return len({record.uuid for record in live} - {record.uuid for record in copy})
