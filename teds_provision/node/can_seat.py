@@ -8,11 +8,11 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from typing import Final
+from typing import Final, NamedTuple
 
 from teds_provision.links.can.bus import Frame
 from teds_provision.links.can.isotp import Pair
-from teds_provision.node.handler import NodeHandler
+from teds_provision.node.handler import Measuring, NodeHandler
 from teds_provision.node.workers import Crew, Turns
 from teds_provision.protocol.announce import Announce, Claim, uuid_crc
 from teds_provision.protocol.messages.identity import Identity
@@ -21,6 +21,14 @@ from teds_provision.protocol.repetition import Repetition
 _MOST_WAITING: Final = 4
 _FIRST_KINDS: Final = (0, 1)
 """N_PDU types of a single and of a first frame: a new request begins."""
+
+
+class Request(NamedTuple):
+    """A whole request: transaction ‖ command; whether it came by CAN FD, and its tick (0 for a node without clock)."""
+
+    body: bytes
+    fd: bool
+    received: int
 
 
 class Line:
@@ -36,6 +44,7 @@ class Line:
         self.pairs: dict[int, Pair] = {}
         self.waiting = 0
         self.gone = False
+        self.replying: Pair | None = None
         self._repetition = Repetition()
 
     def put(self, job: Callable[[], None]) -> None:
@@ -49,16 +58,19 @@ class Line:
         self._repetition.forget()
         self.seat.handler.lost(self.name)
 
-    def answer(self, body: bytes) -> bytes:
-        """Run a request (transaction ‖ command) and return transaction ‖ reply; raises what the node raises."""
-        seat = self.seat
-        reply = self._repetition.answer(
-            body[0],
-            body[1:],
-            lambda frame: seat.handler.request(self.name, frame, tapped=seat.counts_as_tapped()),
-            now=time.monotonic(),
-        )
-        return body[:1] + reply
+    def answer(self, request: Request) -> bytes:
+        """Run a request and return transaction ‖ reply; raises what the node raises."""
+        seat, body = self.seat, request.body
+
+        def run(frame: bytes) -> bytes:
+            tapped = seat.counts_as_tapped()
+            if seat.measuring is None:
+                return seat.handler.request(self.name, frame, tapped=tapped)
+            return seat.measuring.request_received(
+                self.name, frame, tapped=tapped, fd=request.fd, received=request.received
+            )
+
+        return body[:1] + self._repetition.answer(body[0], body[1:], run, now=time.monotonic())
 
 
 class Seat:
@@ -70,9 +82,11 @@ class Seat:
         counts_as_tapped: Callable[[], bool],
         crew: Crew,
         send: Callable[[Seat, Frame], None],
+        measuring: Measuring | None = None,
     ) -> None:
         self.handler, self.counts_as_tapped, self._crew = handler, counts_as_tapped, crew
         self._send = send
+        self.measuring = measuring
         self.address = handler.can_address()
         identity = Identity.decode(handler.identify())
         self.uuid = identity.uuid
@@ -99,6 +113,12 @@ class Seat:
             line.pairs = {at: old for at, old in line.pairs.items() if old.sending}
             pair = line.pairs[own] = Pair(own, station, lambda frame: self._send(self, frame))
         return line, pair
+
+    def reply_left(self, line: Line) -> None:
+        """The reply that left this line is through, or was given up: data may follow."""
+        line.replying = None
+        if self.measuring is not None:
+            self.measuring.reply_left(line.name)
 
     def move(self, address: int) -> None:
         """Have another address from now on, because another node claimed this one: sessions of the old one end."""

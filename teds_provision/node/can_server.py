@@ -16,11 +16,12 @@ from teds_provision.errors import LinkFailure, NoReader, TedsProvisionError
 from teds_provision.links.can.bus import Bus, Frame
 from teds_provision.links.can.isotp import FUNCTIONAL, Pair, addresses, read_single
 from teds_provision.links.can.spec import FIRST_STATION, LAST_NODE, LAST_STATION, parse_spec
-from teds_provision.node.can_seat import Line, Seat
-from teds_provision.node.handler import NodeHandler
+from teds_provision.node.can_seat import Line, Request, Seat
+from teds_provision.node.handler import Measuring, NodeHandler
 from teds_provision.node.workers import Crew
 from teds_provision.protocol.announce import Announce, is_announce
 from teds_provision.protocol.messages.frames import Function, Reply, security_command
+from teds_provision.protocol.operation.can_frames import drive_address, trigger_station
 
 _IDENTIFY: Final = security_command(Function.IDENTIFY).encode()
 _SPREAD_SECONDS: Final = 0.05
@@ -30,6 +31,8 @@ _LOOK_ROUND: Final = 0.05
 _FLOW_CONTROL: Final = 3
 _FIRST_REOPEN, _LAST_REOPEN = 1.0, 30.0
 """Seconds until the node comes back from bus-off, doubling while it recurs (operation.md, section 6)."""
+BUS: Final = "can"
+"""What stands before the colon in the names of lines: streams of one bus share a node's budget."""
 _TOLD: Final = logging.getLogger(__name__)
 
 
@@ -55,10 +58,11 @@ class CanServer:
     ) -> None:
         self._spec = parse_spec(spec_text)
         self._tell = tell
-        self._nodes: list[tuple[NodeHandler, Callable[[], bool]]] = []
+        self._nodes: list[tuple[NodeHandler, Callable[[], bool], Measuring | None]] = []
         self._bus: Bus | None = None
         self._crew: Crew | None = None
         self._seats: list[Seat] = []
+        self._seat_of: dict[int, Seat] = {}
         self._at: dict[int, list[Seat]] = {}
         self._known: set[int] = set()
         self._active: set[tuple[Seat, Pair]] = set()
@@ -72,9 +76,15 @@ class CanServer:
         if handler is not None:
             self.add(handler, counts_as_tapped=counts_as_tapped)
 
-    def add(self, handler: NodeHandler, *, counts_as_tapped: Callable[[], bool] = _never) -> None:
-        """Hang one more node on this bus, before :meth:`start`."""
-        self._nodes.append((handler, counts_as_tapped))
+    def add(
+        self,
+        handler: NodeHandler,
+        *,
+        counts_as_tapped: Callable[[], bool] = _never,
+        measuring: Measuring | None = None,
+    ) -> None:
+        """Hang one more node on this bus, before :meth:`start`; ``measuring`` where it offers operation.md."""
+        self._nodes.append((handler, counts_as_tapped, measuring))
 
     def start(self) -> None:
         """Open the bus and listen; raises NoReader or UsageFailure where it cannot."""
@@ -82,7 +92,8 @@ class CanServer:
         self._stop.clear()
         self._crew = Crew()
         self._known, self._active, self._later, self._everyone_due = set(), set(), [], {}
-        self._seats = [Seat(node, tapped, self._crew, self._out) for node, tapped in self._nodes]
+        self._seats = [Seat(node, tapped, self._crew, self._out, more) for node, tapped, more in self._nodes]
+        self._seat_of = {id(seat.handler): seat for seat in self._seats}
         self._find_seats()
         self._announce_all()
         self._thread = threading.Thread(target=self._serve, name="can", daemon=True)
@@ -104,6 +115,13 @@ class CanServer:
         if self._bus is not None:
             self._bus.close()
             self._bus = None
+
+    def send_data(self, handler: NodeHandler, identifier: int, data: bytes, *, fd: bool) -> None:
+        """Put a data frame of a node on the bus; raises LinkFailure where that is lost."""
+        with self._lock:
+            seat = self._seat_of.get(id(handler))
+            if seat is not None and self._bus is not None and not self._stop.is_set():
+                self._out(seat, Frame(identifier, data, fd))
 
     # -- the loop --------------------------------------------------------------------------------------------------
 
@@ -157,6 +175,9 @@ class CanServer:
             self._active.add((seat, pair))
         else:
             self._active.discard((seat, pair))
+        line = seat.lines.get(pair.peer)
+        if line is not None and line.replying is pair and not pair.sending:
+            seat.reply_left(line)
 
     def _at_time(self, due: float, job: Callable[[], None]) -> None:
         heapq.heappush(self._later, (due, next(self._number), job))
@@ -196,6 +217,7 @@ class CanServer:
             return
         ends = addresses(frame.identifier)
         if ends is None:
+            self._measuring_frame(station, frame)
             return
         own = ends[0]
         for seat in self._at.get(own, ()):
@@ -207,8 +229,20 @@ class CanServer:
     def _request(self, seat: Seat, line: Line, pair: Pair, frame: Frame) -> None:
         seat.take(pair, frame)
         while (body := pair.received()) is not None:
-            line.put(functools.partial(self._run_request, line, pair, body))
+            received = seat.measuring.tick() if seat.measuring is not None else 0
+            line.put(functools.partial(self._run_request, line, pair, Request(body, frame.fd, received)))
         self._note(seat, pair)
+
+    def _measuring_frame(self, station: int, frame: Frame) -> None:
+        """A trigger, whose tick is taken at once for every node, or a Drive frame."""
+        if trigger_station(frame.identifier) == station:
+            told = [(seat.measuring, seat.measuring.tick()) for seat in self._seats if seat.measuring is not None]
+            for node, tick in told:
+                node.trigger(BUS, station, frame.data, tick)
+        elif (address := drive_address(frame.identifier)) is not None:
+            for seat in self._at.get(address.node, ()):
+                if seat.measuring is not None:
+                    seat.measuring.drive(BUS, station, frame.data)
 
     def _flow_control_of_old_address(self, station: int, own: int, frame: Frame) -> None:
         """A reply that is still leaving from the address before 128.10 needs its flow control."""
@@ -217,10 +251,10 @@ class CanServer:
                 pair.take(frame)
                 self._note(seat, pair)
 
-    def _run_request(self, line: Line, pair: Pair, body: bytes) -> None:
+    def _run_request(self, line: Line, pair: Pair, request: Request) -> None:
         """Run one request in the turn of its node and send the reply from the address that was asked."""
         try:
-            reply = line.answer(body)
+            reply = line.answer(request)
         except TedsProvisionError:
             return  # a node in trouble (its flash file is gone) is silent
         finally:
@@ -236,6 +270,7 @@ class CanServer:
                 pair.send(reply)
             except LinkFailure:
                 return  # the reading thread meets the same failure and deals with it
+            line.replying = pair
             self._note(line.seat, pair)
 
     # -- everyone --------------------------------------------------------------------------------------------------

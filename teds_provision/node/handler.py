@@ -29,3 +29,22 @@ class NodeHandler(Protocol):
 
     def actuator_claimed(self) -> bool:
         """Whether a session claims an actuator, so that the node keeps its CAN address whoever claims it."""
+
+
+class Measuring(Protocol):
+    """What a bus tells a node that measures, beside its commands (operation.md, sections 3 to 6). Thread-safe."""
+
+    def tick(self) -> int:
+        """The present tick of the node's clock, ns."""
+
+    def request_received(self, link: str, frame: bytes, *, tapped: bool, fd: bool, received: int) -> bytes:
+        """As NodeHandler.request, for a frame whose last part came by CAN FD or not, at the tick ``received``."""
+
+    def reply_left(self, link: str) -> None:
+        """The last reply on this link has left (or will not any more): data may follow."""
+
+    def trigger(self, bus: str, station: int, token: bytes, tick: int) -> None:
+        """A trigger frame of a station (F1 to F7) ended at ``tick``."""
+
+    def drive(self, bus: str, station: int, data: bytes) -> None:
+        """A Drive frame of a station came."""

@@ -1,0 +1,79 @@
+"""The real-time loop: calls in time, a wake at once, one faulty node harms no other."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable
+
+from teds_provision.node.pulse import Pulse
+
+
+class Node:
+    def __init__(self, wait: Callable[[int], float | None]) -> None:
+        self.wait, self.beats, self.came = wait, [], threading.Event()
+
+    def beat(self) -> float | None:
+        self.beats.append(time.monotonic())
+        self.came.set()
+        return self.wait(len(self.beats))
+
+
+def test_nodes_are_called_when_they_want_to_be() -> None:
+    pulse = Pulse()
+    quick, slow = Node(lambda n: 0.01), Node(lambda n: 0.05 if n < 3 else None)
+    began = time.monotonic()
+    for node in (quick, slow):
+        pulse.wake(node)
+    pulse.start()
+    try:
+        until = began + 10
+        while len(slow.beats) < 3 or len(quick.beats) < 10:
+            assert time.monotonic() < until
+            time.sleep(0.005)
+    finally:
+        pulse.stop()
+    assert slow.beats[2] - slow.beats[0] >= 0.1
+    assert len(slow.beats) == 3
+    assert quick.beats[9] - quick.beats[0] >= 0.09
+
+
+def test_a_node_that_rests_is_woken_and_a_faulty_one_harms_none() -> None:
+    pulse, resting = Pulse(), Node(lambda n: None)
+
+    def fails(n: int) -> float | None:
+        raise ValueError
+
+    faulty = Node(fails)
+    pulse.start()
+    try:
+        for node in (faulty, resting):
+            pulse.wake(node)
+            assert node.came.wait(5)
+        resting.came.clear()
+        pulse.wake(resting)
+        assert resting.came.wait(5)
+        assert len(resting.beats) == 2
+    finally:
+        pulse.stop()
+
+
+def test_a_wake_during_a_beat_is_not_lost() -> None:
+    pulse = Pulse()
+    again = threading.Event()
+
+    class Waking(Node):
+        def beat(self) -> float | None:
+            if len(self.beats) == 0:
+                pulse.wake(self)
+            else:
+                again.set()
+            return super().beat()
+
+    node = Waking(lambda n: 3600.0)
+    pulse.start()
+    try:
+        pulse.wake(node)
+        assert again.wait(5)
+    finally:
+        pulse.stop()
