@@ -5,6 +5,7 @@ teds-provision node run bench/gripper --can udp_multicast:239.74.163.2 \
     --source "exec:python examples/fmu_gripper.py GripperFmu.fmu"
 """
 
+import io
 import json
 import select
 import sys
@@ -18,7 +19,7 @@ fmu = instantiate_fmu(extract(sys.argv[1]), model, fmi_type="CoSimulation")
 fmu.setupExperiment(startTime=0.0)
 fmu.enterInitializationMode()
 fmu.exitInitializationMode()
-orders = open(0, "rb", buffering=0)
+orders = io.FileIO(0)
 start, t, step = time.monotonic(), 0.0, 0.01
 while True:
     while select.select([orders], [], [], 0)[0] and (line := orders.readline()):
