@@ -14,6 +14,7 @@ from teds_provision.measure.sinks.base import CommandTaker, Sink, ThreadedSink, 
 from teds_provision.measure.sinks.jsonl import JsonLinesSink
 from teds_provision.measure.sinks.mcap import McapSink
 from teds_provision.measure.sinks.ros1 import Ros1Sink
+from teds_provision.measure.sinks.ros2 import Ros2Sink
 from teds_provision.measure.sinks.text import TextSink
 
 __all__ = ["CommandTaker", "Sink", "ThreadedSink", "as_sink_failure", "open_sink"]
@@ -24,7 +25,7 @@ FILES: dict[str, Callable[[Path], Sink]] = {
     ".jsonl": JsonLinesSink,
     ".mcap": McapSink,
 }
-SERVICES: dict[str, Callable[[str, CommandTaker | None], Sink]] = {"ros1": Ros1Sink}
+SERVICES: dict[str, Callable[[str, CommandTaker | None], Sink]] = {"ros1": Ros1Sink, "ros2": Ros2Sink}
 
 
 def open_sink(spec: str, commands: CommandTaker | None = None) -> Sink:

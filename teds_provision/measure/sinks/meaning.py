@@ -17,7 +17,6 @@ VARIANCE_NOTE = "variance = (uncertainty / sqrt 3)^2: every error within the wor
 _KELVIN = units_of(kelvins=1)
 _STRESS = units_of(meters=-1, kilograms=1, seconds=-2)
 _LUX = units_of(meters=-2, candelas=1, steradians=1)
-_LENGTH = units_of(meters=1)
 
 
 @dataclass(frozen=True)
@@ -39,16 +38,13 @@ TEMPERATURE = Meaning("sensor_msgs/Temperature", "temperature", -KELVIN, True)
 PRESSURE = Meaning("sensor_msgs/FluidPressure", "fluid_pressure", 0.0, True)
 HUMIDITY = Meaning("sensor_msgs/RelativeHumidity", "relative_humidity", 0.0, True)
 ILLUMINANCE = Meaning("sensor_msgs/Illuminance", "illuminance", 0.0, True)
-RANGE = Meaning("sensor_msgs/Range", "range", 0.0, True)
 
 
 def meaning_of(facts: ChannelFacts) -> Meaning:
-    """Typed only where unit and meaning fit: a ratio is humidity, a length a range, only where the names say so."""
+    """Typed only where unit and meaning fit: a ratio is humidity only where the names say so."""
     if facts.kind == "actuator":
         return NUMBER
     words = f"{facts.quantity} {facts.name}".lower().replace("_", " ").replace("-", " ")
-    if facts.units == _LENGTH and facts.quantity.lower() in ("range", "range finder"):
-        return RANGE
     if "relative humidity" in words and facts.units is not None and replace(facts.units, interpretation=0) == Units():
         return HUMIDITY
     if facts.units == _STRESS and {"stress", "modulus", "strength"} & set(words.split()):

@@ -1,0 +1,220 @@
+"""ROS 2 without ROS: a DDS participant that ROS 2 tools take for a node (Humble to Lyrical).
+
+What makes it one: ``enclave=/;`` as the participant's user data, topics ``rt/…`` of types ``pkg::msg::dds_::Type_`` in
+XCDR1, the type's hash in each endpoint's user data, and ``ros_discovery_info``, written anew after each new endpoint.
+Unless the user brings a configuration (CYCLONEDDS_URI), nothing leaves this machine: loopback only, no multicast.
+Writers are reliable with a short history, so that best-effort and reliable readers both match; metadata is transient
+local, so that late comers get it.
+"""
+
+from __future__ import annotations
+
+import os
+import threading
+import time
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
+
+from teds_provision.errors import TedsProvisionError, UsageFailure
+from teds_provision.measure.blocks import StationFacts
+from teds_provision.measure.sinks.base import CommandTaker
+from teds_provision.measure.sinks.live import DIAGNOSTICS, JOINT_STATE, STRING, Status, TopicSink
+from teds_provision.measure.sinks.meaning import Meaning
+
+if TYPE_CHECKING:
+    from teds_provision.measure.blocks import ChannelFacts
+
+GRAPH = "rmw_dds_common/ParticipantEntitiesInfo"
+NODE = "teds_provision"
+DISTRIBUTIONS = ("humble", "iron", "jazzy", "kilted", "lyrical", "rolling")
+HISTORY = 10
+BLOCKING_MS = 10  # how long a slow reliable reader may hold up a write, at most
+LISTENING = 0.2  # seconds between looks whether the end has come
+THIS_MACHINE = (
+    "<CycloneDDS><Domain Id='any'><General><Interfaces><NetworkInterface name='lo' multicast='false'/></Interfaces>"
+    "<AllowMulticast>false</AllowMulticast></General><Discovery><Peers><Peer address='127.0.0.1'/></Peers>"
+    "<ParticipantIndex>auto</ParticipantIndex><MaxAutoParticipantIndex>30</MaxAutoParticipantIndex></Discovery>"
+    "<Tracing><Verbosity>none</Verbosity></Tracing></Domain></CycloneDDS>"
+)
+_domains: dict[int, Any] = {}  # a domain is configured once in a process
+
+
+class Ros2Sink(TopicSink):
+    """``ros2`` or ``ros2:DOMAIN`` (else ROS_DOMAIN_ID, else 0); ROS_DISTRO says which release the readers have."""
+
+    def __init__(self, spec: str, commands: CommandTaker | None = None) -> None:
+        super().__init__("ROS 2", commands)
+        domain = spec.partition(":")[2] or os.environ.get("ROS_DOMAIN_ID", "0")
+        if not domain.isdecimal() or int(domain) > 232:
+            raise UsageFailure(f"{domain!r} is no ROS 2 domain.", hint="Name a number from 0 to 232: ros2:7")
+        self._domain = int(domain)
+        self._distribution = os.environ.get("ROS_DISTRO", "jazzy")
+        if self._distribution not in DISTRIBUTIONS:
+            self._distribution = "jazzy"
+        self._participant: Any = None
+        self._graph: Any = None
+        self._writers: dict[str, Any] = {}
+        self._readers: dict[str, tuple[Any, str, int]] = {}
+        self._attached: list[Any] = []
+        self._ending = threading.Event()
+        self._listener: threading.Thread | None = None
+        self._types: Any = None
+
+    def _prepare(self, facts: tuple[ChannelFacts, ...], station: StationFacts) -> None:
+        super()._prepare(facts, station)
+        try:
+            from cyclonedds.core import DDSException
+            from cyclonedds.domain import Domain, DomainParticipant
+            from cyclonedds.qos import Policy, Qos
+
+            from teds_provision.measure.sinks import ros2_types
+        except ImportError:
+            raise TedsProvisionError(
+                "ROS 2 needs the package cyclonedds.", hint="Install it: pip install 'teds-provision[ros2]'"
+            ) from None
+        self._types = ros2_types
+        try:
+            if "CYCLONEDDS_URI" not in os.environ and self._domain not in _domains:
+                _domains[self._domain] = Domain(self._domain, THIS_MACHINE)
+            self._participant = DomainParticipant(self._domain, qos=Qos(Policy.Userdata(b"enclave=/;")))
+        except DDSException as error:
+            raise TedsProvisionError(
+                f"DDS domain {self._domain} cannot be joined: {error}.",
+                hint="Check CYCLONEDDS_URI, and that not more than 30 programs use the domain.",
+            ) from error
+        self._graph = self._new_writer(GRAPH, "ros_discovery_info", latched=True)
+
+    def _qos(self, kind: str, *, latched: bool) -> Any:
+        from cyclonedds.qos import Policy, Qos
+        from cyclonedds.util import duration
+
+        code = self._types.TYPE_HASHES[kind]
+        if kind == GRAPH and self._distribution == "humble":
+            code = self._types.HUMBLE_GRAPH
+        return Qos(
+            Policy.Reliability.Reliable(duration(milliseconds=BLOCKING_MS)),
+            Policy.Durability.TransientLocal if latched else Policy.Durability.Volatile,
+            Policy.History.KeepLast(1 if latched else HISTORY),
+            Policy.DataRepresentation(use_cdrv0_representation=True),
+            Policy.Userdata(f"typehash=RIHS01_{code};".encode()),
+        )
+
+    def _topic(self, kind: str, name: str) -> Any:
+        from cyclonedds.topic import Topic
+
+        type_ = self._types.TYPES[kind]
+        if kind == GRAPH and self._distribution == "humble":
+            type_ = self._types.HumbleParticipantEntitiesInfo
+        return Topic(self._participant, name, type_)
+
+    def _new_writer(self, kind: str, name: str, *, latched: bool = False) -> Any:
+        from cyclonedds.pub import DataWriter
+
+        return DataWriter(self._participant, self._topic(kind, name), qos=self._qos(kind, latched=latched))
+
+    def _writer(self, topic: str, kind: str, *, latched: bool = False) -> Any:
+        if topic not in self._writers:
+            self._writers[topic] = self._new_writer(kind, f"rt{topic}", latched=latched)
+            self._show_node()
+        return self._writers[topic]
+
+    def _show_node(self) -> None:
+        """Tell the graph which endpoints are this node's."""
+        humble = self._distribution == "humble"
+        types = self._types
+        gid, info = (types.HumbleGid, types.HumbleNodeEntitiesInfo) if humble else (types.Gid, types.NodeEntitiesInfo)
+        whole = types.HumbleParticipantEntitiesInfo if humble else types.ParticipantEntitiesInfo
+
+        def of(entity: Any) -> Any:
+            return gid(data=list(entity.guid.bytes) + [0] * (8 if humble else 0))
+
+        node = info(
+            node_namespace=f"/{self._topics.station}",
+            node_name=NODE,
+            reader_gid_seq=[of(reader) for reader, _, _ in self._readers.values()],
+            writer_gid_seq=[of(writer) for writer in self._writers.values()],
+        )
+        self._write(self._graph, whole(gid=of(self._participant), node_entities_info_seq=[node]), 0)
+
+    def _write(self, writer: Any, message: Any, values: int) -> None:
+        """A reader that takes nothing costs at most BLOCKING_MS, and the values of this message."""
+        from cyclonedds.core import DDSException
+
+        try:
+            writer.write(message)
+        except DDSException:
+            self._count(dropped=values)
+
+    def _header(self, stamp: float, frame: str = "") -> Any:
+        seconds, nanoseconds = divmod(round(stamp * 1e9), 10**9)
+        return self._types.Header(self._types.Time(seconds, nanoseconds), frame)
+
+    def _array(self, topic: str, stamp: float, names: Sequence[str], values: Sequence[float]) -> None:
+        message = self._types.JointState(self._header(stamp), names, values, [], [])
+        self._write(self._writer(topic, JOINT_STATE), message, len(values))
+
+    def _scalar(self, topic: str, meaning: Meaning, stamp: float, frame: str, value: float, variance: float) -> None:
+        type_ = self._types.TYPES[meaning.type]
+        message = type_(self._header(stamp, frame), value, variance) if meaning.variance else type_(value)
+        self._write(self._writer(topic, meaning.type), message, 1)
+
+    def _latched(self, topic: str, words: str) -> None:
+        self._write(self._writer(topic, STRING, latched=True), self._types.String(words), 0)
+
+    def _parameter(self, name: str, value: object) -> None:
+        """ROS 2 has no parameter server; the latched metadata holds the same facts."""
+
+    def _listen(self, topic: str, uuid: str, channel: int) -> None:
+        from cyclonedds.sub import DataReader
+
+        if topic in self._readers:
+            return
+        kind = "std_msgs/Float64"
+        reader = DataReader(self._participant, self._topic(kind, f"rt{topic}"), qos=self._qos(kind, latched=False))
+        self._readers[topic] = (reader, uuid, channel)
+        self._show_node()
+        if self._listener is None:
+            self._listener = threading.Thread(target=self._hear, name="ROS 2 commands", daemon=True)
+            self._listener.start()
+
+    def _hear(self) -> None:
+        """Set points, on a thread of their own: each goes on within microseconds, not at the next look."""
+        from cyclonedds.core import DDSException, ReadCondition, SampleState, WaitSet
+        from cyclonedds.util import duration
+
+        waiting = WaitSet(self._participant)
+        known: set[str] = set()
+        while not self._ending.is_set():
+            for topic, (reader, _, _) in list(self._readers.items()):
+                if topic not in known:
+                    known.add(topic)
+                    condition = ReadCondition(reader, SampleState.NotRead)
+                    self._attached.append(condition)
+                    waiting.attach(condition)
+            try:
+                waiting.wait(duration(milliseconds=int(LISTENING * 1000)))
+                for reader, uuid, channel in list(self._readers.values()):
+                    for message in reader.take(N=HISTORY):
+                        if isinstance(message, self._types.Float64):
+                            self._command(uuid, channel, float(message.data))
+            except DDSException:
+                time.sleep(LISTENING)
+
+    def _diagnose(self, stamp: float, statuses: Sequence[Status]) -> None:
+        types = self._types
+        entries = []
+        for one in statuses:
+            values = [types.KeyValue(key, value) for key, value in one.values]
+            entries.append(types.DiagnosticStatus(one.level, one.name, one.message, one.hardware, values))
+        message = types.DiagnosticArray(self._header(stamp), entries)
+        self._write(self._writer("/diagnostics", DIAGNOSTICS), message, 0)
+
+    def _finish(self) -> None:
+        self._ending.set()
+        if self._listener is not None:
+            self._listener.join(10 * LISTENING)
+        # Entities go with their last reference; the participant says good-bye to the others.
+        self._attached.clear()
+        self._readers.clear()
+        self._writers.clear()
+        self._graph = self._participant = None
