@@ -13,6 +13,7 @@ from teds_provision.errors import UsageFailure
 from teds_provision.measure.sinks.base import CommandTaker, Sink, ThreadedSink, as_sink_failure
 from teds_provision.measure.sinks.jsonl import JsonLinesSink
 from teds_provision.measure.sinks.mcap import McapSink
+from teds_provision.measure.sinks.mqtt import MqttSink
 from teds_provision.measure.sinks.ros1 import Ros1Sink
 from teds_provision.measure.sinks.ros2 import Ros2Sink
 from teds_provision.measure.sinks.text import TextSink
@@ -25,7 +26,12 @@ FILES: dict[str, Callable[[Path], Sink]] = {
     ".jsonl": JsonLinesSink,
     ".mcap": McapSink,
 }
-SERVICES: dict[str, Callable[[str, CommandTaker | None], Sink]] = {"ros1": Ros1Sink, "ros2": Ros2Sink}
+SERVICES: dict[str, Callable[[str, CommandTaker | None], Sink]] = {
+    "ros1": Ros1Sink,
+    "ros2": Ros2Sink,
+    "mqtt": MqttSink,
+    "mqtts": MqttSink,
+}
 
 
 def open_sink(spec: str, commands: CommandTaker | None = None) -> Sink:

@@ -1,0 +1,129 @@
+"""MQTT by Debian's mosquitto: discovery for late comers, values in people's units, a broker that dies."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import socket
+import subprocess
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from teds_provision.errors import TedsProvisionError, UsageFailure
+from teds_provision.measure.blocks import NodeReport
+from teds_provision.measure.sinks import open_sink
+from teds_provision.teds.units.units import parse_units
+from tests.measure.sinks.parts import ANGLE, ARM, FORCE, HAND, STATION, block
+
+MOSQUITTO = shutil.which("mosquitto", path="/usr/sbin:/usr/bin:/usr/local/sbin")
+OIL = replace(FORCE, number=3, name="oil", unit="K", units=parse_units("K"))
+
+
+def until(what: Callable[[], object], seconds: float = 60.0) -> None:
+    end = time.monotonic() + seconds
+    while not what():
+        assert time.monotonic() < end, "it did not come to that"
+        time.sleep(0.05)
+
+
+class Broker:
+    def __init__(self, folder: Path) -> None:
+        with socket.socket() as free:
+            free.bind(("127.0.0.1", 0))
+            self.port = free.getsockname()[1]
+        self.config = folder / "mosquitto.conf"
+        self.config.write_text(f"listener {self.port} 127.0.0.1\nallow_anonymous true\n")
+        self.process: subprocess.Popen[bytes] | None = None
+
+    def start(self) -> None:
+        assert MOSQUITTO
+        self.process = subprocess.Popen([MOSQUITTO, "-c", str(self.config)], stderr=subprocess.DEVNULL)
+
+    def stop(self) -> None:
+        if self.process is not None:
+            self.process.kill()
+            self.process.wait()
+            self.process = None
+
+    def heard(self) -> tuple[Any, dict[str, Any]]:
+        """A late comer, and the newest of each topic that it hears."""
+        import paho.mqtt.client as paho
+
+        topics: dict[str, Any] = {}
+        client = paho.Client(paho.CallbackAPIVersion.VERSION2)
+        client.on_connect = lambda *_: client.subscribe("#")
+        client.on_message = lambda _c, _u, message: topics.update({message.topic: message.payload.decode()})
+        client.connect_async("127.0.0.1", self.port)
+        client.loop_start()
+        return client, topics
+
+
+@pytest.fixture
+def broker(tmp_path: Path) -> Iterator[Broker]:
+    one = Broker(tmp_path)
+    yield one
+    one.stop()
+
+
+@pytest.mark.system
+@pytest.mark.skipif(not MOSQUITTO, reason="mosquitto is not installed")
+class TestWithMosquitto:
+    def test_a_late_comer_finds_every_channel_with_its_unit(self, broker: Broker) -> None:
+        broker.start()
+        sink = open_sink(f"mqtt://127.0.0.1:{broker.port}")
+        sink.open([ANGLE, OIL], STATION)
+        until(lambda: sink.stats.state == "running")
+        sink.report(NodeReport(ARM, "lost", "no frame"))
+        client, heard = broker.heard()
+        key = f"homeassistant/sensor/{HAND}/3/config"
+        try:
+            until(lambda: key in heard and "bench/arm/state" in heard)
+            config = json.loads(heard[key])
+            assert config["unit_of_measurement"] == "°C"
+            assert config["device_class"] == "temperature"
+            assert config["value_template"] == "{{ value_json.oil_3 }}"
+            warm = block([[7]], [[293.15]], uuid=HAND, channels=(3,))
+            until(lambda: (sink.write(warm), config["state_topic"] in heard)[1])
+            assert json.loads(heard[config["state_topic"]])["oil_3"] == pytest.approx(20.0)
+            assert heard["bench/status"] == "online"
+            assert json.loads(heard["bench/arm/state"])["why"] == "no frame"
+            sink.close()
+            until(lambda: heard["bench/status"] == "offline")
+        finally:
+            client.disconnect()
+            client.loop_stop()
+            sink.close()
+        assert sink.stats.error == ""
+
+    def test_a_broker_that_comes_late_and_dies_is_survived(self, broker: Broker) -> None:
+        sink = open_sink(f"mqtt://127.0.0.1:{broker.port}")
+        sink.open([ANGLE], STATION)
+        try:
+            assert "waits" in sink.stats.detail or sink.stats.state == "starting"
+            sink.write(block())
+            until(lambda: sink.stats.dropped == 1)
+            for _ in range(2):
+                broker.start()
+                until(lambda: sink.stats.state == "running")
+                broker.stop()
+                until(lambda: sink.stats.state == "waiting")
+        finally:
+            sink.close()
+
+
+@pytest.mark.parametrize("spec", ["mqtt://", "mqtt:host", "mqtt://user:secret@host"])
+def test_what_is_no_url_or_holds_a_password_is_refused(spec: str) -> None:
+    with pytest.raises(UsageFailure) as caught:
+        open_sink(spec)
+    assert "secret" not in str(caught.value)
+
+
+def test_a_password_file_that_is_not_there_is_told(tmp_path: Path) -> None:
+    sink = open_sink(f"mqtt://user@127.0.0.1:1?password-file={tmp_path}/none")
+    with pytest.raises(TedsProvisionError, match="password file"):
+        sink.open([ANGLE], STATION)
