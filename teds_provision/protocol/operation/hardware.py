@@ -1,0 +1,137 @@
+"""What the firmware below a node gives to measurement operation: channels, values, clock (operation.md 1, 2, 5). Node.
+
+The TEDS does not command the hardware: kind, widths, halt and shortest period of a channel stand here, and a channel
+whose stored TEDS says otherwise is not claimed.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Final, NamedTuple, Protocol
+
+from teds_provision.protocol.operation.commands import Power
+from teds_provision.teds.codec.decode import decode
+from teds_provision.teds.sheet import Kind, channel_from
+
+_CHANNEL_CODE: Final = 3
+_MILLION: Final = 10**6
+_ONCE_A_SECOND: Final = 10**9
+
+
+@dataclass(frozen=True)
+class ChannelHardware:
+    """One channel as the firmware knows it.
+
+    ``octets`` is ModLenth, ``model`` DatModel, ``halt`` ActHalt (None: none), ``shortest`` the shortest period in ns.
+    """
+
+    kind: Kind
+    octets: int
+    model: int = 0
+    halt: int | None = None
+    shortest: int = 1
+
+    @property
+    def actuator(self) -> bool:
+        """Whether it acts."""
+        return self.kind is Kind.ACTUATOR
+
+
+class Reading(NamedTuple):
+    """One data set, ModLenth octets; not valid where out of range, warming up, or with a fault."""
+
+    octets: bytes
+    valid: bool = True
+
+
+class Hardware(Protocol):
+    """The firmware. All calls return at once; ticks are ns of the node's clock, which never goes back.
+
+    ``step`` in ns and ``drift`` in ppm describe that clock. ``safe`` must not depend on links, flash or cryptography.
+    """
+
+    @property
+    def channels(self) -> Mapping[int, ChannelHardware]:
+        """Channels 1 to 255."""
+
+    @property
+    def step(self) -> int:
+        """Step of the clock, ns."""
+
+    @property
+    def drift(self) -> int:
+        """How far the clock may run off, ppm."""
+
+    def now(self) -> int:
+        """The present tick."""
+
+    def keeps(self, period: int) -> bool:
+        """Whether the clock keeps a period of so many ns on average."""
+
+    def read(self, channel: int, tick: int) -> Reading:
+        """The value of a sensor at ``tick``, which is now or a little before."""
+
+    def bears(self, channel: int, data_set: bytes) -> bool:
+        """Whether the hardware of an actuator bears this raw value."""
+
+    def apply(self, values: Mapping[int, bytes]) -> None:
+        """Give actuators their values, all together."""
+
+    def set_point(self, channel: int) -> bytes:
+        """The present value of an actuator."""
+
+    def safe(self, channel: int) -> None:
+        """Bring an actuator to its safe state, as ActHalt says."""
+
+    def self_test(self, channels: Sequence[int]) -> None:
+        """Begin a self-test; it never moves an actuator."""
+
+    def testing(self, channel: int) -> bool:
+        """Whether its self-test runs."""
+
+    def fault(self, channel: int) -> bool:
+        """Whether its hardware has a fault, or its last self-test failed."""
+
+    def power(self) -> Power:
+        """Battery and charge."""
+
+
+class Port(NamedTuple):
+    """Where a session's link lies: ``kind`` nfc, can or ble; streams of one ``bus`` share its budget.
+
+    ``source`` is the station's address there (F1 to F7 on CAN, 1 on NFC, 2 and up on BLE); ``fd`` says that the command
+    came by CAN FD, ``mtu`` is that of a BLE connection.
+    """
+
+    kind: str
+    bus: str
+    source: int
+    fd: bool = False
+    mtu: int = 23
+
+
+def port_of(link: str) -> Port:
+    """The port that a link's name says: ``nfc``, ``can:f1``, ``ble:2`` (bus = what stands before the last colon)."""
+    bus, _, source = link.rpartition(":")
+    bus = bus or link
+    kind = bus.partition(":")[0].rstrip("0123456789")
+    number = int(source, 16) if source and bus != link else 1
+    return Port(kind, bus, number)
+
+
+def teds_fits(own: ChannelHardware, teds: bytes | None) -> bool:
+    """Whether a stored Channel TEDS says what the firmware is: ChanType, DatModel, ModLenth, ActHalt where there."""
+    if teds is None:
+        return False
+    said = channel_from(decode(teds))
+    if said.kind is not own.kind or said.sample is None:
+        return False
+    halts = not own.actuator or said.halt is None or said.halt == own.halt
+    return halts and (said.sample.model, said.sample.octets) == (own.model, own.octets)
+
+
+def teds_period(teds: bytes | None) -> int:
+    """SPeriod of a Channel TEDS in ns, less 1 ppm (it is a Float32); 0 where it is absent, NaN or not positive."""
+    period = channel_from(decode(teds)).period if teds is not None else 0.0
+    return int(period * 1e9 * (1 - 1 / _MILLION)) if period > 0 else 0

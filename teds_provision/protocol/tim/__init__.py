@@ -1,0 +1,20 @@
+"""The node's half of the profile: every command, every state, every refusal. The reference for firmware authors.
+
+Pure code, no I/O: a link server gives whole command frames and gets whole reply frames; flash, clock, randomness and
+the hardware are injected. One :class:`Tim` serves all links of a node.
+
+==============  ======================================================================================================
+``node``        :class:`Tim`: routing, the table of states and permissions (section 4), Prove, Reset, List
+``lines``       Open, Sealed, the lives of sessions
+``agreeing``    Request and Confirm (section 3)
+``teds_access`` Query, Read, Write, Update (section 5); the commit is ``protocol.commit``
+``origin``      where a command came from
+==============  ======================================================================================================
+
+Measuring and acting is ``protocol.operation`` (its ``role``, ``claims``, ``stream_role``, ``streams``); a node without
+hardware to measure with leaves it out.
+"""
+
+from teds_provision.protocol.tim.node import Tim
+
+__all__ = ["Tim"]

@@ -1,0 +1,86 @@
+"""The node's half of the key agreement: Request, Confirm, and what lies in RAM between them (profile section 3)."""
+
+from __future__ import annotations
+
+import hmac
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from typing import Final
+
+from teds_provision.protocol.agreement import (
+    LAST_EPOCH,
+    REQUEST_OCTETS,
+    TAG_OCTETS,
+    NodeAgreement,
+    RequestPayload,
+    good_point,
+)
+from teds_provision.protocol.flash import Flash
+from teds_provision.protocol.keys import PrivateKey, station_key_message, verify
+from teds_provision.protocol.messages.frames import Reason, Refused
+from teds_provision.protocol.session import NodeSession
+from teds_provision.protocol.tim.origin import Origin
+
+PENDING_SECONDS: Final = 60.0
+
+
+@dataclass
+class _Pending:
+    """What a good Request left in RAM, and where its Confirm must come from."""
+
+    agreement: NodeAgreement = field(repr=False)
+    link: str
+    session: NodeSession | None
+    at: float
+
+
+class Agreeing:
+    """One agreement at a time over all links."""
+
+    def __init__(self, key: PrivateKey, clock: Callable[[], float], random: Callable[[int], bytes]) -> None:
+        self._key, self._clock, self._random = key, clock, random
+        self._pending: _Pending | None = None
+
+    def request(self, payload: bytes, origin: Origin, flash: Flash) -> bytes:
+        """Request: length 4, points 15, P(CA) other than the kept one 14, SIG104 5; a good one replaces what pends."""
+        if len(payload) != REQUEST_OCTETS:
+            raise Refused(Reason.BAD_FORM)
+        request = RequestPayload.decode(payload)
+        for point in (request.station, request.ca, request.one_time):
+            if not good_point(point, flash.node_key):
+                raise Refused(Reason.BAD_POINT)
+        if flash.ca is not None and request.ca != flash.ca:
+            raise Refused(Reason.UNTRUSTED_STATION)
+        if not verify(request.ca, station_key_message(request.station), request.station_signature):
+            raise Refused(Reason.BAD_SIGNATURE)
+        if flash.epoch == LAST_EPOCH:
+            raise Refused(Reason.WRONG_EPOCH)
+        agreement = NodeAgreement.answer(
+            self._key, flash.uuid, payload, epoch=flash.epoch + 1, teds=flash.security_teds(), nonce=self._random(16)
+        )
+        self._pending = _Pending(agreement, origin.link, origin.session, self._clock())
+        return agreement.reply
+
+    def confirm(self, payload: bytes, origin: Origin, flash: Flash) -> Flash:
+        """Confirm: the state to commit. What pends is left (2, 4), or goes with a wrong tag (12)."""
+        pending = self._pending
+        if (
+            pending is None
+            or self._clock() - pending.at >= PENDING_SECONDS
+            or pending.link != origin.link
+            or pending.session is not origin.session
+        ):
+            raise Refused(Reason.WRONG_STATE)
+        if len(payload) != TAG_OCTETS:
+            raise Refused(Reason.BAD_FORM)
+        agreement = pending.agreement
+        if not hmac.compare_digest(payload, agreement.station_tag):
+            self._pending = None
+            raise Refused(Reason.BAD_TAG)
+        ca = agreement.ca if flash.ca is None else flash.ca
+        return replace(flash, key=agreement.key, epoch=agreement.epoch, station=agreement.station, ca=ca)
+
+    def forget(self, link: str | None = None) -> None:
+        """What pends goes: with its link, or (None) whatever it is."""
+        if link is None or (self._pending is not None and self._pending.link == link):
+            self._pending = None

@@ -1,0 +1,178 @@
+"""The node's sessions: Open, Sealed, lives and ends, on every link (profile section 4).
+
+A link has at most one session and one half-open Open; all links together have room for so many of each.
+"""
+
+from __future__ import annotations
+
+import hmac
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Final, NamedTuple
+
+from teds_provision.protocol.agreement import good_point, key_id
+from teds_provision.protocol.flash import Flash
+from teds_provision.protocol.messages.frames import Reason, Refused
+from teds_provision.protocol.session import (
+    BLOCK_OCTETS,
+    COUNTER_OCTETS,
+    KEY_ID_OCTETS,
+    OPEN_OCTETS,
+    SEALED_HEAD_OCTETS,
+    TAG_OCTETS,
+    NodeSession,
+    OneTime,
+    open_mac,
+)
+
+HALF_OPEN_SECONDS: Final = 60.0
+IDLE_SECONDS: Final = 600.0
+
+
+@dataclass
+class _Line:
+    """One link: at most one session and one half-open Open."""
+
+    session: NodeSession | None = None
+    half_open: NodeSession | None = None
+    half_open_at: float = 0.0
+
+
+class Taken(NamedTuple):
+    """A good Sealed frame: its session, counter and inner frame. ``room`` is False where a new session found none."""
+
+    session: NodeSession
+    counter: int
+    inner: bytes
+    room: bool = True
+
+
+class Lines:
+    """Sessions by link. ``claims`` says whether a session has a claim, ``ended`` is told of each that is over.
+
+    ``room`` is how many sessions, and how many half-open Opens, there may be over all links, at least two.
+    """
+
+    def __init__(
+        self,
+        clock: Callable[[], float],
+        random: Callable[[int], bytes],
+        one_time: OneTime,
+        *,
+        room: int,
+        claims: Callable[[NodeSession], bool],
+        ended: Callable[[NodeSession], None],
+    ) -> None:
+        self._clock, self._one_time, self._room, self._claims, self._ended = clock, one_time, room, claims, ended
+        # c of Open: random at the start, so that no mac from before a restart is good again
+        self._opens = int.from_bytes(random(COUNTER_OCTETS), "big")
+        self._lines: dict[str, _Line] = {}
+
+    def open(self, payload: bytes, link: str, flash: Flash) -> bytes:
+        """Open: c for an empty payload, else the checks in their order and a new half-open Open on this link."""
+        counter = self._opens.to_bytes(COUNTER_OCTETS, "big")
+        if not payload:
+            return counter
+        if len(payload) != OPEN_OCTETS:
+            raise Refused(Reason.BAD_FORM)
+        key, station = flash.key, payload[KEY_ID_OCTETS:-TAG_OCTETS]
+        if key is None or not hmac.compare_digest(payload[:KEY_ID_OCTETS], key_id(key)):
+            raise Refused(Reason.UNKNOWN_KEY)
+        # The mac before the point: a stranger costs no point arithmetic, and each Open is good once.
+        if not hmac.compare_digest(payload[-TAG_OCTETS:], open_mac(key, flash.uuid, counter, station)):
+            raise Refused(Reason.BAD_TAG)
+        self._opens = (self._opens + 1) % (1 << 8 * COUNTER_OCTETS)
+        if not good_point(station, flash.node_key):
+            raise Refused(Reason.BAD_POINT)
+        made = NodeSession(key, flash.uuid, station, self._one_time())
+        line = self._lines.setdefault(link, _Line())
+        line.half_open, line.half_open_at = made, self._clock()
+        half_open = [each for each in self._lines.values() if each.half_open is not None]
+        if len(half_open) > self._room:
+            min(half_open, key=lambda each: each.half_open_at).half_open = None
+        return made.reply
+
+    def any_on(self, link: str) -> bool:
+        """Whether a session or half-open Open of this link lives; drops those whose time is over."""
+        line = self._lines.get(link)
+        if line is None:
+            return False
+        self._drop_old(line)
+        return line.session is not None or line.half_open is not None
+
+    def on(self, link: str) -> NodeSession | None:
+        """The session of a link."""
+        line = self._lines.get(link)
+        return line.session if line is not None else None
+
+    def take(self, payload: bytes, link: str) -> Taken:
+        """A Sealed frame: tried under the session, then under the half-open Open. Raises Refused; changes nothing then.
+
+        A link must have a session or half-open Open (:meth:`any_on`).
+        """
+        if len(payload) < SEALED_HEAD_OCTETS + BLOCK_OCTETS:
+            raise Refused(Reason.BAD_FORM)
+        line = self._lines[link]
+        for session in (line.session, line.half_open):
+            inner = session.unseal(payload) if session is not None else None
+            if session is not None and inner is not None:
+                break
+        else:
+            raise Refused(Reason.BAD_TAG)
+        counter = int.from_bytes(payload[:4], "big")
+        if counter <= session.counter:
+            raise Refused(Reason.REPLAY)
+        if session is line.half_open:
+            line.half_open = None
+            if not self._make_room(line):
+                return Taken(session, counter, inner, room=False)
+            self._end(line)
+            line.session = session
+        session.counter, session.good_at = counter, self._clock()
+        return Taken(session, counter, inner)
+
+    def end(self, link: str, session: NodeSession) -> None:
+        """End this session, if it still is the one of its link."""
+        line = self._lines.get(link)
+        if line is not None and line.session is session:
+            self._end(line)
+
+    def lose(self, link: str) -> None:
+        """Loss of the field or link."""
+        line = self._lines.pop(link, None)
+        if line is not None:
+            self._end(line)
+
+    def end_all(self) -> None:
+        """End every session and half-open Open on every link."""
+        lines, self._lines = self._lines, {}
+        for line in lines.values():
+            self._end(line)
+
+    # -- the inside ------------------------------------------------------------------------------------------------
+
+    def _end(self, line: _Line) -> None:
+        session, line.session = line.session, None
+        if session is not None:
+            self._ended(session)
+
+    def _drop_old(self, line: _Line) -> None:
+        now = self._clock()
+        if line.session is not None and now - line.session.good_at >= IDLE_SECONDS:
+            self._end(line)
+        if line.half_open is not None and now - line.half_open_at >= HALF_OPEN_SECONDS:
+            line.half_open = None
+
+    def _make_room(self, line: _Line) -> bool:
+        """Room for one more session: where there is none, that without a claim goes which was silent longest."""
+        others = [each for each in self._lines.values() if each is not line]
+        for each in others:
+            self._drop_old(each)
+        living = [(each, each.session) for each in others if each.session is not None]
+        if len(living) < self._room:
+            return True
+        idle = [(session.good_at, number) for number, (_, session) in enumerate(living) if not self._claims(session)]
+        if not idle:
+            return False
+        self._end(living[min(idle)[1]][0])
+        return True

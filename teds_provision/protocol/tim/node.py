@@ -1,0 +1,376 @@
+"""One node: routing of commands, the table of states and permissions, and what needs no state (profile section 4)."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Final
+
+from teds_provision.protocol.flash import Flash, FlashFailure, FlashMemory
+from teds_provision.protocol.keys import PrivateKey, SoftwareKey, prove_message, reset_message
+from teds_provision.protocol.messages.frames import (
+    COMMAND_HEADER,
+    COMMON,
+    SECURITY,
+    Command,
+    Function,
+    Reason,
+    Refused,
+    Reply,
+    TedsFunction,
+    refusal,
+)
+from teds_provision.protocol.messages.identity import Identity, NodeState
+from teds_provision.protocol.operation.can_frames import TOKEN_OCTETS
+from teds_provision.protocol.operation.hardware import Hardware, Port, port_of
+from teds_provision.protocol.operation.role import Inner, OperationRole
+from teds_provision.protocol.operation.streams import DataFrame
+from teds_provision.protocol.session import LAST_COUNTER, OPEN_OCTETS, NodeSession, OneTime
+from teds_provision.protocol.tim.agreeing import Agreeing
+from teds_provision.protocol.tim.lines import Lines
+from teds_provision.protocol.tim.origin import Origin
+from teds_provision.protocol.tim.teds_access import TedsAccess
+
+CHALLENGE_OCTETS: Final = 32
+LAST_CAN_ADDRESS: Final = 239
+_SESSION_ONLY = {Function.CLOSE, *range(Function.SAMPLE, Function.DRIVE + 1)}
+_STRANGER_SECONDS: Final = 1.0
+"""While a stream runs, plain Read and List are answered once in so many seconds."""
+
+
+@dataclass
+class Tim:
+    """One transducer interface module.
+
+    ``max_message`` octets (1024 to 4094); ``clock`` gives monotonic seconds; ``random`` gives that many octets, good
+    from the first moment after a start; ``one_time`` makes the key pair of one Open (a board may have one ready).
+    ``sessions`` and ``streams`` are its room for them; ``hardware`` is what it measures and acts with, None: nothing.
+    ``quick_points``: its point arithmetic holds no Sealed frame up by more than 5 ms.
+    """
+
+    key: PrivateKey
+    memory: FlashMemory
+    clock: Callable[[], float]
+    max_message: int = 2048
+    max_teds: int = 16384
+    random: Callable[[int], bytes] = os.urandom
+    one_time: OneTime = SoftwareKey.generate
+    hardware: Hardware | None = None
+    sessions: int = 8
+    streams: int = 8
+    quick_points: bool = True
+
+    def __post_init__(self) -> None:
+        self._flash = self.memory.load()
+        self._taken_address: int | None = None
+        self._ending: list[Callable[[], None]] = []
+        self._teds = TedsAccess(self.max_message, self.max_teds)
+        self._agreeing = Agreeing(self.key, self.clock, self.random)
+        self._lines = Lines(
+            self.clock,
+            self.random,
+            self.one_time,
+            room=self.sessions,
+            claims=lambda session: self._role is not None and bool(self._role.claims.of(session)),
+            ended=self._session_ended,
+        )
+        self._stranger_at: float | None = None
+        self._role: OperationRole | None = None
+        if self.hardware is not None:
+            self._role = OperationRole(
+                self.hardware,
+                flash=lambda: self._flash,
+                clock=self.clock,
+                address=lambda: self.can_address,
+                max_message=self.max_message,
+                streams=self.streams,
+            )
+
+    # -- what links call -------------------------------------------------------------------------------------------
+
+    @property
+    def flash(self) -> Flash:
+        """The durable state as it is."""
+        return self._flash
+
+    def identity(self) -> Identity:
+        """What Identify says now."""
+        flash = self._flash
+        return Identity(flash.uuid, flash.state, flash.epoch, flash.sequence, self.max_message, self.can_address)
+
+    @property
+    def can_address(self) -> int:
+        """The present CAN address: the durable one, or one taken in a claim of addresses, which lasts till restart."""
+        return self._flash.can_address if self._taken_address is None else self._taken_address
+
+    def take_can_address(self, address: int) -> None:
+        """Move to another CAN address because another node claimed this one (profile: wire, "Claim")."""
+        self._taken_address = address
+
+    def handle(
+        self, frame: bytes, *, link: str, tapped: bool, port: Port | None = None, received: int | None = None
+    ) -> bytes:
+        """Run one whole command frame and return the whole reply frame. Never raises on any octets.
+
+        ``port`` says more than the link's name does (CAN FD, MTU); ``received`` is the tick at the frame's last octet,
+        by default now. When the reply has left, call :meth:`reply_left`.
+        """
+        tick = received if received is not None else self._role.now() if self._role is not None else 0
+        reply = self._run(frame, Origin(link, tapped, port or port_of(link), tick)).encode()
+        while self._ending:  # what ends with the reply: sessions after Close, Confirm, Reset
+            self._ending.pop()()
+        return reply
+
+    def link_lost(self, link: str) -> None:
+        """Loss of the field or link: its session, half-open Open and pending agreement go."""
+        self._lines.lose(link)
+        self._agreeing.forget(link)
+
+    def reset_by_hand(self) -> None:
+        """Button, pad or magnet held 5 s: the effect of Reset."""
+        self._commit(_factory(self._flash), safe=True)
+        self._end_everything()
+
+    # -- what links that measure call as well ----------------------------------------------------------------------
+
+    def reply_left(self, link: str) -> None:
+        """The reply to the last command of this link has left: what its session streams may follow."""
+        session = self._lines.on(link)
+        if self._role is not None and session is not None:
+            self._role.streams.reply_left(session)
+
+    def poll(self) -> float | None:
+        """Take samples, run leases and dead-men; gives seconds until it should be called again, None: not before."""
+        return self._role.poll() if self._role is not None else None
+
+    def next_frame(self, bus: str) -> DataFrame | None:
+        """The next data frame of a bus (the link's name without its last part), where one may begin now.
+
+        Ask again when the frame before has left; the times between are :meth:`poll`'s.
+        """
+        return self._role.frame(bus) if self._role is not None else None
+
+    def event(self, channel: int, tick: int, octets: bytes, *, valid: bool = True) -> None:
+        """An event sensor has seen something at ``tick``."""
+        if self._role is not None:
+            self._role.streams.event(channel, tick, octets, valid=valid)
+
+    def trigger(self, link: str, token: bytes, tick: int) -> None:
+        """A trigger frame of the station of this link; ``tick`` is that of the frame's end."""
+        session = self._lines.on(link)
+        if self._role is not None and session is not None and len(token) == TOKEN_OCTETS:
+            self._role.streams.trigger(session, token, tick)
+
+    def drive(self, link: str, octets: bytes) -> None:
+        """A Drive frame from CAN, or a whole Drive message from BLE (without its first octet)."""
+        session = self._lines.on(link)
+        if self._role is None or session is None:
+            return
+        self._role.poll()
+        if port_of(link).kind == "can":
+            self._role.streams.drive_frame(session, octets)
+        else:
+            self._role.streams.drive_message(session, octets)
+
+    def actuator_claimed(self) -> bool:
+        """Whether a session claims an actuator."""
+        return self._role is not None and bool(self._role.claims.actuators)
+
+    # -- routing ---------------------------------------------------------------------------------------------------
+
+    def _run(self, frame: bytes, origin: Origin) -> Reply:
+        try:
+            if len(frame) < COMMAND_HEADER:
+                raise Refused(Reason.BAD_FORM)
+            length = int.from_bytes(frame[4:6], "big")
+            command = Command(int.from_bytes(frame[:2], "big"), frame[2], frame[3], frame[COMMAND_HEADER:])
+            self._permit(command, origin)
+            if length != len(command.payload):
+                raise Refused(Reason.BAD_FORM)
+            if self._measures(command) and self._role is not None and origin.session is not None:
+                return self._role.run(Inner(command, origin.session, origin.port, origin.received))
+            if command.command_class == COMMON:
+                return self._common(command, origin)
+            return self._security(Function(command.function), command.payload, origin)
+        except Refused as refused:
+            return refusal(refused.reason)
+        except FlashFailure:
+            return refusal(Reason.FLASH_FAILURE)
+
+    def _measures(self, command: Command) -> bool:
+        return self._role is not None and self._role.knows(command)
+
+    def _permit(self, command: Command, origin: Origin) -> None:
+        """State and permission: the table of section 4."""
+        inside = origin.session is not None
+        if command.command_class == SECURITY:
+            if command.channel != 0 or command.function not in set(Function):
+                raise Refused(Reason.UNKNOWN_COMMAND)
+            self._permit_security(Function(command.function), command.payload, origin)
+        elif command.command_class == COMMON and command.function in set(TedsFunction):
+            if command.function not in (TedsFunction.QUERY, TedsFunction.READ) and not inside:
+                raise Refused(Reason.NOT_PERMITTED)
+            if command.function == TedsFunction.READ and not inside:
+                self._hold_strangers_back()
+        elif not inside:
+            raise Refused(Reason.NOT_PERMITTED)
+        elif not self._measures(command):
+            raise Refused(Reason.UNKNOWN_COMMAND)
+        self._permit_change(command, origin)
+
+    def _permit_security(self, function: Function, payload: bytes, origin: Origin) -> None:
+        factory = self._flash.state == NodeState.FACTORY
+        if origin.session is not None:
+            if function in (Function.OPEN, Function.SEALED):
+                raise Refused(Reason.NOT_PERMITTED)
+            return
+        if function in (Function.REQUEST, Function.CONFIRM, Function.SET_CAN_ADDRESS):
+            if not origin.tapped:
+                raise Refused(Reason.NOT_PERMITTED)
+        elif function in _SESSION_ONLY or (function == Function.RESET and not factory):
+            raise Refused(Reason.NOT_PERMITTED)
+        elif (function == Function.OPEN and factory) or (
+            function == Function.SEALED and not self._lines.any_on(origin.link)
+        ):
+            raise Refused(Reason.WRONG_STATE)
+        elif function == Function.PROVE or (function == Function.OPEN and len(payload) == OPEN_OCTETS):
+            if self.actuator_claimed() and not self.quick_points:
+                raise Refused(Reason.BUSY)
+        elif function == Function.LIST:
+            self._hold_strangers_back()
+
+    def _permit_change(self, command: Command, origin: Origin) -> None:
+        """The datasheet and the address do not change under a claim (operation.md section 1)."""
+        pair = (command.command_class, command.function)
+        changes = ((COMMON, TedsFunction.WRITE), (COMMON, TedsFunction.UPDATE), (SECURITY, Function.SET_CAN_ADDRESS))
+        if self._role is not None and pair in changes:
+            over_nfc = origin.port.kind == "nfc" and pair == (COMMON, TedsFunction.WRITE)
+            self._role.demand_configuration(origin.session, writes_over_nfc=over_nfc)
+
+    def _hold_strangers_back(self) -> None:
+        """While a stream runs, plain Read and List beyond one a second get 17, together and over all links."""
+        if self._role is None or not self._role.streams.running:
+            return
+        now = self.clock()
+        if self._stranger_at is not None and now - self._stranger_at < _STRANGER_SECONDS:
+            raise Refused(Reason.BUSY)
+        self._stranger_at = now
+
+    def _security(self, function: Function, payload: bytes, origin: Origin) -> Reply:
+        flash = self._flash
+        match function:
+            case Function.REQUEST:
+                return Reply(True, self._agreeing.request(payload, origin, flash))
+            case Function.CONFIRM:
+                self._commit(self._agreeing.confirm(payload, origin, flash), safe=True)
+                self._agreeing.forget()
+                self._ending.append(self._end_everything)
+                return Reply(True)
+            case Function.OPEN:
+                return Reply(True, self._lines.open(payload, origin.link, flash))
+            case Function.SEALED:
+                return self._sealed(payload, origin)
+            case Function.CLOSE:
+                _length(payload, 0)
+                self._end_with_reply(origin)
+                return Reply(True)
+            case Function.IDENTIFY:
+                _length(payload, 0)
+                return Reply(True, self.identity().encode())
+            case Function.PROVE:
+                _length(payload, CHALLENGE_OCTETS)
+                return Reply(True, self.key.sign(prove_message(flash.uuid, payload)))
+            case Function.RESET:
+                return self._reset(payload)
+            case Function.SET_CAN_ADDRESS:
+                return self._set_can_address(payload)
+            case Function.LIST:
+                _length(payload, 0)
+                entries = [channel.to_bytes(2, "big") + bytes([code]) for channel, code in flash.present()]
+                return Reply(True, b"".join(entries))
+            case _:
+                raise Refused(Reason.UNKNOWN_COMMAND)
+
+    # -- sessions --------------------------------------------------------------------------------------------------
+
+    def _sealed(self, payload: bytes, origin: Origin) -> Reply:
+        self.poll()  # a lease that ran out before this frame came is over: the frame does not revive it
+        taken = self._lines.take(payload, origin.link)
+        if not taken.room:
+            return Reply(True, taken.session.seal(taken.counter, refusal(Reason.NO_ROOM).encode()))
+        sealed_from = replace(origin, session=taken.session)
+        if taken.counter == LAST_COUNTER:
+            self._end_with_reply(sealed_from)
+        return Reply(True, taken.session.seal(taken.counter, self._run(taken.inner, sealed_from).encode()))
+
+    def _end_with_reply(self, origin: Origin) -> None:
+        session = origin.session
+        assert session is not None
+        self._ending.append(lambda: self._lines.end(origin.link, session))
+
+    def _session_ended(self, session: NodeSession) -> None:
+        if self._role is not None:
+            self._role.session_ended(session)
+
+    def _end_everything(self) -> None:
+        self._lines.end_all()
+        self._agreeing.forget()
+
+    # -- the rest --------------------------------------------------------------------------------------------------
+
+    def _common(self, command: Command, origin: Origin) -> Reply:
+        flash, teds, session = self._flash, self._teds, origin.session
+        match TedsFunction(command.function):
+            case TedsFunction.QUERY:
+                return teds.query(flash, command)
+            case TedsFunction.READ:
+                return teds.read(flash, command)
+            case TedsFunction.WRITE:
+                assert session is not None
+                reply = teds.write(flash, command, session.staging)
+                if self._role is not None and origin.port.kind == "nfc":
+                    self._role.claims.yield_sensors(session)
+                return reply
+            case TedsFunction.UPDATE:
+                assert session is not None
+                reply, state = teds.update(flash, command, session.staging)
+                if state is not None:
+                    self._commit(state)
+                    session.staging.clear()
+                return reply
+
+    def _reset(self, payload: bytes) -> Reply:
+        _length(payload, CHALLENGE_OCTETS)
+        flash = self._flash
+        proof = self.key.sign(reset_message(flash.uuid, flash.epoch, payload))
+        if flash.state != NodeState.FACTORY:
+            self._commit(_factory(flash), safe=True)
+            self._ending.append(self._end_everything)
+        return Reply(True, proof)
+
+    def _set_can_address(self, payload: bytes) -> Reply:
+        _length(payload, 1)
+        if not 1 <= payload[0] <= LAST_CAN_ADDRESS:
+            raise Refused(Reason.BAD_FORM)
+        self._commit(replace(self._flash, can_address=payload[0]))
+        self._taken_address = None
+        return Reply(True)
+
+    def _commit(self, state: Flash, *, safe: bool = False) -> None:
+        """Put the new state; ``safe``: every actuator goes to its safe state before that."""
+        if safe and self._role is not None:
+            self._role.claims.everything_safe()
+        self.memory.commit(state)
+        self._flash = state
+
+
+def _factory(flash: Flash) -> Flash:
+    """Factory state: no key, no CA, no station, initial Security TEDS; identity, epoch and sequence stay."""
+    blocks = {block: teds for block, teds in flash.blocks.items() if block != (0, SECURITY)}
+    return replace(flash, key=None, ca=None, station=None, provisioned=False, blocks=blocks)
+
+
+def _length(payload: bytes, octets: int) -> None:
+    if len(payload) != octets:
+        raise Refused(Reason.BAD_FORM)
