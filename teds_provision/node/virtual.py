@@ -15,6 +15,10 @@ from teds_provision.protocol.messages.identity import NodeState
 from teds_provision.protocol.tim import Tim
 
 
+QUICK_SECONDS = 0.005
+"""Point operations up to here hold no Sealed frame up for long (operation.md section 2)."""
+
+
 @dataclass(frozen=True)
 class Delays:
     """Seconds that a board would need: for one point operation (signature, ECDH, key pair), for one flash commit."""
@@ -82,6 +86,7 @@ class VirtualNode:
             clock,
             max_message=self.flash_file.max_message,
             one_time=lambda: _slow_one_time(delays.crypto),
+            quick_points=delays.crypto <= QUICK_SECONDS,
         )
 
     def request(self, link: str, frame: bytes, *, tapped: bool) -> bytes:
@@ -108,7 +113,7 @@ class VirtualNode:
 
     def actuator_claimed(self) -> bool:
         """Whether an actuator is claimed; see NodeHandler."""
-        return False
+        return self.tim.actuator_claimed()
 
     def in_factory_state(self) -> bool:
         """Whether the node holds no key."""
