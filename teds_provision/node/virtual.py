@@ -14,7 +14,6 @@ from teds_provision.protocol.keys import PrivateKey, SoftwareKey
 from teds_provision.protocol.messages.identity import NodeState
 from teds_provision.protocol.tim import Tim
 
-
 QUICK_SECONDS = 0.005
 """Point operations up to here hold no Sealed frame up for long (operation.md section 2)."""
 
