@@ -103,6 +103,7 @@ class NfcPort:
         0.7 s.
         """
         here: bytes | None = None  # the node of the visit that is not over yet
+        link: NfcLink | None = None
         gone_at, told = -_CHANGING, ""
         waiting = Notice("waiting", f"Hold a node to the reader{self._named}.")
         notice(waiting)
@@ -127,7 +128,12 @@ class NfcPort:
                 yield Contact(seen.identity, link, tag_uid=seen.tag.uid)
                 link.close()
                 seen = link.visit
-            self._stay(seen, stop, None)
+            if link is not None and link.lost:  # whoever comes next is a new visit, the same node too
+                notice(Notice("node-left", f"Node {seen.identity.uuid.hex().upper()} was taken off the reader."))
+                notice(waiting)
+                here, link = None, None
+            else:
+                self._stay(seen, stop, None)
             gone_at = time.monotonic()
 
     def close(self) -> None:
@@ -225,6 +231,8 @@ class NfcLink:
         self._notice = notice
         self._poller: Poller | None = Poller(visit.tag, visit.service)
         self.visit = visit
+        self.lost = False
+        """Whether the node left in the middle of an exchange and did not come back in time."""
 
     @property
     def via(self) -> str:
@@ -252,7 +260,7 @@ class NfcLink:
         attempt = 0
         while True:
             try:
-                poller = self._ready()
+                poller = self._ready()  # a node that is gone for good ends it here
                 try:
                     return poller.transact(transaction, frame)
                 except (NodeSilent, Garbled) as error:
@@ -284,7 +292,9 @@ class NfcLink:
 
     def _ready(self) -> Poller:
         if self._poller is None:
+            self.lost = True
             self.visit = self._port.back(self.visit.identity.uuid, RETURN_WITHIN)
+            self.lost = False
             self._poller = Poller(self.visit.tag, self.visit.service)
         return self._poller
 
