@@ -1,0 +1,543 @@
+"""Every parser of octets as a fuzz target: one input in, nothing but an error of ours out.
+
+A target takes any octets. It raises nothing, or AssertionError, or whatever a parser should not have let out. Inputs to
+begin with stand in ``seeds``; what fuzzing found stands in ``corpus/<target>``.
+"""
+
+from __future__ import annotations
+
+import json
+import struct
+from collections.abc import Callable, Iterable
+from contextlib import suppress
+from dataclasses import dataclass
+from datetime import UTC, datetime, timedelta
+from functools import cache, partial
+from io import BytesIO
+from pathlib import Path
+
+from teds_provision.errors import TedsProvisionError
+from teds_provision.links.nfc.pieces import Piece, Requester, Responder
+from teds_provision.protocol.keys import SoftwareKey
+
+CORPUS = Path(__file__).parent / "corpus"
+NOW = datetime(2026, 11, 21, tzinfo=UTC)
+VECTORS = Path(__file__).parents[1] / "vectors"
+
+
+@dataclass(frozen=True)
+class Target:
+    """One parser: ``check`` reads an input, ``seeds`` are what to begin with, ``words`` what its texts are made of."""
+
+    name: str
+    check: Callable[[bytes], None]
+    seeds: Callable[[], Iterable[bytes]]
+    words: tuple[str, ...] = ()
+
+    def kept(self) -> list[bytes]:
+        """Seeds, and every input that is kept in the repository."""
+        folder = CORPUS / self.name
+        return [*self.seeds(), *(path.read_bytes() for path in sorted(folder.glob("*")))]
+
+
+def as_text(data: bytes) -> str:
+    return data.decode("utf-8", "replace")
+
+
+def reads(*readers: Callable[[], object]) -> None:
+    """Call each; an error of ours is an answer."""
+    for reader in readers:
+        with suppress(TedsProvisionError):
+            reader()
+
+
+# -- TEDS --------------------------------------------------------------------------------------------------------------
+
+
+def check_teds(data: bytes) -> None:
+    """The decoder; even first octet: as it is, odd: a data block that gets Length and checksum first."""
+    from teds_provision import teds
+    from teds_provision.errors import BadData
+    from teds_provision.teds.codec.frame import frame
+
+    if not data:
+        return
+    octets = frame(data[1:]) if data[0] & 1 else data[1:]
+    decoded = teds.decode(octets)
+    assert teds.encode(decoded) == octets
+    errors = [finding for finding in decoded.findings if finding.severity == "error"]
+    assert bool(errors) == (decoded.verdict not in {"clean", "block-clean", "message"})
+    try:
+        teds.decode(octets, strict=True)
+        assert not errors
+    except BadData:
+        assert errors
+    try:
+        again = teds.recompose(decoded)
+    except BadData:
+        assert decoded.verdict in {"malformed", "message"}
+    else:
+        assert again == octets or decoded.verdict not in {"clean", "block-clean"}
+    for edition in (2007, 2024):
+        try:
+            other, findings = teds.convert(decoded, edition)
+        except BadData:
+            continue
+        if decoded.verdict == "clean" and not findings:
+            assert teds.decode(other).edition == edition
+            assert teds.decode(other).verdict == "clean"
+    for field in decoded.fields:
+        teds.unpack_uuid(field.raw)
+        teds.read_key(field.raw)
+
+
+def check_sheet(data: bytes) -> None:
+    """The typed datasheet, its interpreter and the guard: pieces of ``channel u8 ‖ code u8 ‖ length u16 ‖ block``."""
+    from teds_provision.teds.calibration import ChannelInterpreter
+    from teds_provision.teds.codec.frame import frame
+    from teds_provision.teds.formats import Block
+    from teds_provision.teds.guard.guard import check_calibration
+    from teds_provision.teds.image import Image
+    from teds_provision.teds.sheet import Sheet
+    from teds_provision.teds.show import describe
+
+    blocks, at = {}, 0
+    while at + 4 <= len(data):
+        channel, code, length = struct.unpack_from(">BBH", data, at)
+        blocks[channel, code] = frame(data[at + 4 : at + 4 + length])
+        at += 4 + length
+    sheet = Sheet.of(Image(bytes(10), blocks))
+    for channel in sheet.channels:
+        assert channel.value_problem == "" or channel.value_problem.endswith(".")
+        channel.show(channel.low)
+        with suppress(TedsProvisionError):
+            interpreter = ChannelInterpreter(sheet, channel.number)
+            other = {n: bytes(3 * s.octets) for n in interpreter.others if (s := sheet.channel(n).sample)}  # type: ignore[union-attr]
+            values = interpreter.decode(b"\x7f" * (3 * interpreter.octets), other)
+            assert len(values.value) == 3
+            interpreter.encode(1.0)
+    check_calibration(blocks, now=NOW)
+    for (number, code), octets in blocks.items():
+        describe(Block(number, code, octets), blocks, now=NOW)
+
+
+def sheet_seeds() -> Iterable[bytes]:
+    from teds_provision.teds.calibration import fit
+    from teds_provision.teds.codec.frame import unframe
+    from teds_provision.teds.profile import load_profile
+
+    line = fit([(0, 0.0), (100, 4.0), (60000, 9.0)], "table", channel=1)
+    for name in ("magnetic-angular-position-sensor", "gripper"):
+        built = load_profile(name).build(bytes(10), calibration={1: line}).blocks
+        yield b"".join(
+            struct.pack(">BBH", channel, code, len(teds) - 6) + unframe(teds)
+            for (channel, code), teds in built.items()
+            if channel < 3
+        )
+
+
+def check_security(data: bytes) -> None:
+    """The canonical Security TEDS: what is read is written again octet for octet."""
+    from teds_provision.teds.codec import security
+    from teds_provision.teds.codec.frame import frame
+
+    octets = frame(data)
+    security.has_profile_version(octets)
+    reads(lambda: security.tbs(bytes(10), octets))
+    with suppress(TedsProvisionError):
+        assert security.decode(octets).encode() == octets
+
+
+def security_seeds() -> Iterable[bytes]:
+    from teds_provision.teds.codec import security
+
+    made = security.initial(b"\4" + bytes(64), bytes(64), sequence=1, key_epoch=2)
+    yield made[4:-2]
+
+
+# -- frames ------------------------------------------------------------------------------------------------------------
+
+
+def check_frames(data: bytes) -> None:
+    """Frames of commands and replies, and the payloads of the profile."""
+    from teds_provision.protocol.messages import frames
+    from teds_provision.protocol.messages.identity import Identity
+    from teds_provision.teds.messages import decode_message, looks_like_message
+
+    looks_like_message(data)
+    decode_message(data)
+    reads(
+        lambda: frames.decode_reply(data),
+        lambda: frames.TedsStatus.decode(data),
+        lambda: frames.decode_list(data),
+        lambda: Identity.decode(data),
+    )
+
+
+def frame_seeds() -> Iterable[bytes]:
+    from teds_provision.protocol.messages import frames
+    from teds_provision.protocol.messages.identity import Identity, NodeState
+
+    yield frames.read_teds(1, 3, 0).encode()
+    yield frames.Reply(True, bytes(12)).encode()
+    yield frames.TedsStatus(1, 60, 0xABCD, 4000).encode()
+    yield Identity(bytes(10), NodeState.KEYED, 1, 2, 4094, 33).encode()
+    for file in sorted(VECTORS.glob("*/m*.hex"))[:30]:
+        with suppress(ValueError):
+            yield bytes.fromhex(file.read_text().partition("#")[0])
+
+
+def check_operation(data: bytes) -> None:
+    """Payloads and data frames of measurement operation, as node and as station."""
+    from teds_provision.protocol.messages.frames import Refused
+    from teds_provision.protocol.operation import can_frames, commands, datagram
+
+    for read in (
+        lambda: commands.Operate.decode(1, data, actuator=True),
+        lambda: commands.Operate.decode(1, data, actuator=False),
+        lambda: commands.Operation.decode(data),
+        lambda: commands.Sampled.decode(data, 4),
+        lambda: commands.Power.decode(data),
+        lambda: commands.decode_data_set(data, 2),
+        lambda: commands.channel_list(data, 16),
+        lambda: datagram.Sealer(bytes(16)).open(data),
+    ):
+        with suppress(TedsProvisionError, Refused):
+            read()
+    can_frames.read_ble_frame(data)
+    assembly = can_frames.Assembly(63, fd=bool(data[:1] and data[0] & 1))
+    for at in range(1, len(data), 9):
+        found = assembly.take(data[at] & 7, data[at + 1 : at + 9])
+        assert found is None or len(found) == 63
+
+
+def check_nfc(data: bytes) -> None:
+    """NDEF messages, the pieces in them and TNEP; both halves of a transaction."""
+    from teds_provision.links.nfc import message, pieces, tnep
+
+    records: tuple[message.Record, ...] = ()
+    with suppress(TedsProvisionError):
+        records = message.decode(data)
+        assert message.decode(message.encode(records)) == records
+    tnep.our_service(records)
+    tnep.selection(records)
+    reads(lambda: tnep.status_of(records), lambda: tnep.ServiceParameters.decode(data))
+    requester = pieces.Requester(data[0] if data else 0, b"command" * 20, 30)
+    responder = pieces.Responder(lambda _transaction, frame: frame[::-1])
+    for record in [*(record.payload for record in records), data]:
+        with suppress(TedsProvisionError):
+            piece = pieces.Piece.decode(record)
+            reads(partial(requester.take, piece), partial(responder.answer, piece, 20))
+    _pieces_without_checksum(data, requester, responder)
+
+
+def _pieces_without_checksum(data: bytes, requester: Requester, responder: Responder) -> None:
+    """The rest as pieces ``transaction u8 ‖ total u8 ‖ offset u8 ‖ flags u8 ‖ length u8 ‖ body``, checksums right."""
+    at = 0
+    while at + 5 <= len(data):
+        transaction, total, offset, flags, length = data[at : at + 5]
+        body = data[at + 5 : at + 5 + length]
+        at += 5 + length
+        piece = Piece(transaction, total, offset, body, bool(flags & 1), bool(flags & 2))
+        with suppress(TedsProvisionError):
+            read = Piece.decode(piece.encode())
+            reads(partial(requester.take, read), partial(responder.answer, read, 20))
+    requester.next()
+
+
+def nfc_seeds() -> Iterable[bytes]:
+    from teds_provision.links.nfc import message, pieces, tnep
+
+    first = pieces.Piece(1, 20, 0, b"twenty octets of it!", answer=True)
+    yield message.encode([tnep.status(0), tnep.payload_record(first.encode())])
+    yield message.encode([tnep.ServiceParameters(b"urn:nfc:sn:x", 20, 3, 500).record(), tnep.id_record(bytes(23))])
+    yield message.encode([tnep.select(b"urn:nfc:sn:x")])
+    yield first.encode()
+
+
+def check_can(data: bytes) -> None:
+    """ISO-TP as a stranger drives it: pieces ``kind u8 ‖ length u8 ‖ data``, to a gathering and to a pair."""
+    from teds_provision.links.can import isotp
+    from teds_provision.links.can.bus import Frame
+    from teds_provision.links.can.gathering import Gathering
+
+    gathering, sent = Gathering(0xF1, 7), []
+    pair = isotp.Pair(0xF1, 0x21, sent.append)
+    at = 0
+    while at + 2 <= len(data):
+        kind, length = data[at], data[at + 1] % 65
+        octets = data[at + 2 : at + 2 + length]
+        at += 2 + length
+        node = 0x21 + (kind >> 1 & 3)
+        frame = Frame(isotp.physical_id(0xF1, node), octets, bool(kind & 1))
+        gathering.take(frame)
+        pair.take(frame)
+        pair.received()
+    isotp.read_single(data)
+
+
+def can_seeds() -> Iterable[bytes]:
+    yield b"\0\x08\x06\7hello\0"
+    yield b"\0\x08\x10\x14\7abcde" + b"\0\x08\x21abcdefg" + b"\0\x08\x22abcdefg"
+    yield b"\1\x40\x10\x60\7" + bytes(61) + b"\1\x40\x21" + bytes(63)
+    yield b"\0\x08\x30\0\0\0\0\0\0\0"
+
+
+# -- signed and sealed documents ------------------------------------------------------------------------------------
+
+
+@cache
+def _key(number: int) -> SoftwareKey:
+    return SoftwareKey.from_secret(number.to_bytes(32, "big"))
+
+
+def _trusted(kid: str) -> bytes | None:
+    from teds_provision.protocol.keys import fingerprint
+
+    points = [_key(n).point for n in (1, 2)]
+    return next((point for point in points if fingerprint(point) == kid), None)
+
+
+def check_bundle(data: bytes) -> None:
+    """A bundle from outside in; even first octet: the sealed file, odd: what stands inside, under a right signature."""
+    from teds_provision.protocol.handover import bundle, jose
+    from teds_provision.protocol.handover.strict_json import load_object
+
+    if not data:
+        return
+    body = data[1:]
+    if data[0] & 1:
+        reads(lambda: bundle._from_json(load_object(body, "the bundle")))
+    else:
+        reads(
+            lambda: bundle.peek_bundle(body),
+            lambda: bundle.open_bundle(body, _key(1), _trusted, NOW),
+            lambda: jose.verify_compact(body, _trusted, typ=bundle.TYPE, max_octets=1 << 16),
+        )
+
+
+def bundle_seeds() -> Iterable[bytes]:
+    from teds_provision.protocol.handover import bundle
+    from teds_provision.protocol.keys import fingerprint
+
+    one, other = _key(1), _key(2)
+    whole = bundle.Bundle(
+        id="A" * 22,
+        sender=fingerprint(one.point),
+        to=(fingerprint(other.point),),
+        created=NOW,
+        expires=NOW + timedelta(days=1),
+        mode="copy",
+        ca=one.point,
+        nodes=(bundle.BundledNode(bytes(10), one.point, bytes(16), 1, 5, name="x", teds_sha256="0" * 64),),
+    )
+    yield b"\0" + bundle.seal_bundle(whole, one, [other.point])
+    yield b"\1" + json.dumps(bundle._to_json(whole)).encode()
+
+
+def check_receipt(data: bytes) -> None:
+    """Receipts and revocations; even first octet: the signed text, odd: the members under a right signature."""
+    from teds_provision.protocol.handover import jose, receipt, revocation
+
+    if not data:
+        return
+    body = data[1:]
+    for module, open_it in (
+        (receipt, lambda octets: receipt.open_receipt(octets, _trusted)),
+        (revocation, lambda octets: revocation.open_revocation(octets.decode("latin-1"), _trusted)),
+    ):
+        if data[0] & 1:
+            signed = jose.sign_compact(body, _key(1), typ=module.TYPE)
+            reads(lambda open_it=open_it, signed=signed: open_it(signed))  # type: ignore[misc]
+        else:
+            reads(lambda open_it=open_it: open_it(body))  # type: ignore[misc]
+
+
+def receipt_seeds() -> Iterable[bytes]:
+    from teds_provision.protocol.handover import receipt, revocation
+    from teds_provision.protocol.handover.strict_json import dump
+    from teds_provision.protocol.keys import fingerprint
+
+    key = _key(1)
+    sender = fingerprint(key.point)
+    statement = revocation.seal_revocation(key, uuid=bytes(10), node=None, why="lost", created=NOW)
+    yield b"\0" + statement.statement.encode()
+    members = {"format": receipt.FORMAT, "id": "0" * 32, "bundle_sha256": "0" * 64, "from": sender, "to": sender}
+    members |= {
+        "imported": ["00" * 10],
+        "refused": [{"uuid": "11" * 10, "why": "no"}],
+        "created": "2026-11-21T00:00:00Z",
+    }  # type: ignore[dict-item]
+    yield b"\1" + dump(members)
+
+
+def check_backup(data: bytes) -> None:
+    """A backup: its sealed chunks, its head, and the dump of rows behind right seals."""
+    from teds_provision.backup import chunks, sealed_file, version_1
+    from teds_provision.store.dump import load
+
+    if not data:
+        return
+    kind, body = data[0] % 4, data[1:]
+    if kind == 0:
+        reader = chunks.ChunkReader(BytesIO(body), bytes(32), b"")
+        reads(lambda: reader.read(len(body)), reader.require_end)
+    elif kind == 1:
+        reads(lambda: sealed_file._head_of(body))
+    elif kind == 2:
+        reads(
+            lambda: version_1._parsed(body),
+            lambda: version_1._verified(body),
+            lambda: version_1.is_for_key(body),
+        )
+    else:
+        out = BytesIO()
+        writer = chunks.ChunkWriter(out, bytes(32), b"")
+        writer.write(body)
+        writer.end()
+        with suppress(TedsProvisionError):
+            load(chunks.ChunkReader(BytesIO(out.getvalue()), bytes(32), b"")).close()
+
+
+def backup_seeds() -> Iterable[bytes]:
+    from teds_provision.backup import sealed_file
+    from teds_provision.backup.content import Head
+    from teds_provision.protocol.handover.strict_json import dump
+    from teds_provision.store.schema import SCHEMA_VERSION
+
+    head = Head("0" * 32, _key(1).point, "x", "2026-11-21T00:00:00Z", "file", "{}")
+    yield b"\1" + dump(sealed_file._members(head))
+    tables = {"whitelist": ["uuid", "fingerprint"], "setting": ["name", "value"]}
+    row = struct.pack(">BI", 0, 20) + b"\3" + struct.pack(">I", 10) + bytes(10) + b"\0"
+    yield b"\3" + json.dumps({"schema": SCHEMA_VERSION, "tables": tables}).encode() + b"\n" + row + b"\xff" + bytes(4)
+    yield b"\3" + json.dumps({"schema": SCHEMA_VERSION, "tables": {}}).encode() + b"\n\xff" + bytes(4)
+
+
+# -- files -------------------------------------------------------------------------------------------------------------
+
+
+def check_whitelist(data: bytes) -> None:
+    """Whitelists that other people write: XML, CSV, JSON by the first octet."""
+    from teds_provision.steps import whitelist_files
+
+    if not data:
+        return
+    readers = (whitelist_files._read_xml, whitelist_files._read_csv, whitelist_files._read_json)
+    reads(lambda: readers[data[0] % 3](as_text(data[1:]), whitelist_files._Reading("list")))
+
+
+def whitelist_seeds() -> Iterable[bytes]:
+    uuid, pin = "0x00112233445566778899", "ab" * 32
+    yield f'\0<whitelist><transducer uuid="{uuid}" fingerprint="{pin}" name="a"/></whitelist>'.encode()
+    yield f"\0<list><uuid>{uuid}</uuid><node><uuid>{uuid}</uuid><name>b</name></node></list>".encode()
+    yield f"\1uuid;fingerprint;name\n{uuid};{pin};a\n".encode()
+    yield f'\2{{"whitelist": [{{"uuid": "{uuid}", "fingerprint": "{pin}"}}, "{uuid}"]}}'.encode()
+
+
+@cache
+def _profile() -> object:
+    from teds_provision.teds.profile import load_profile
+
+    return load_profile("tactile-finger-sensor")
+
+
+def check_calibration(data: bytes) -> None:
+    """Files of calibrations: CSV, TOML, JSON by the first octet."""
+    from teds_provision.teds.calibration import read_calibrations
+
+    if not data:
+        return
+    name = ("c.csv", "c.toml", "c.json")[data[0] % 3]
+    reads(lambda: read_calibrations(as_text(data[1:]), name, _profile()))  # type: ignore[arg-type]
+
+
+def calibration_seeds() -> Iterable[bytes]:
+    yield b"\0# channel: 1\n# method: table\n# unit: N\nraw, value\n0, 0\n100, 1.5\n65535, 10\n"
+    yield b"\0channel;from;to;offset;c0;c1\n1;0;512;0;0,5;0,001\n1;512;1024;512;1;0,002\n"
+    yield b"\1channel = 1\nmethod = 'polynomial'\ndegree = 2\ndate = 2026-01-01\npoints = [[0, 0], [1, 1], [3, 9]]\n"
+    yield b"\1channel='all'\ncoefficients=[1,2]\n[[inputs]]\nchannel=1\ndegree=1\nboundaries=[0,9]\noffsets=[0]\n"
+    yield b'\2{"channel": "1-3", "slope": 0.001, "intercept": 0, "interval": "1 year", "uncertainty": "5 mN"}'
+
+
+def check_profile(data: bytes) -> None:
+    """Profiles, and the sheets of ``--require``."""
+    from teds_provision.teds.fits import parse_require
+    from teds_provision.teds.formats.profileform import read_profile
+
+    text = as_text(data)
+    reads(lambda: read_profile(text), lambda: parse_require(text, "task.toml"))
+
+
+def profile_seeds() -> Iterable[bytes]:
+    for path in sorted((Path(__file__).parents[2] / "profiles").glob("*.toml"))[:4]:
+        yield path.read_bytes()
+    yield b"[angle]\nrange = '>= 360 deg'\nuncertainty = '1 deg'\nrate = '1 kHz'\n"
+
+
+def check_image(data: bytes) -> None:
+    """Every file of TEDS that is told apart by its content: image, JSON, XML, hex, Intel HEX, binary."""
+    from teds_provision.teds.formats import detect, read_blocks, write_blocks
+    from teds_provision.teds.image import Image
+    from teds_provision.teds.sheet import Sheet
+
+    with suppress(TedsProvisionError):
+        Sheet.of(Image.from_json(data))
+    with suppress(TedsProvisionError):
+        kind = detect(data)
+        blocks = read_blocks(data, kind)
+        if kind in ("hex", "json", "xml") and blocks:
+            written = write_blocks(blocks, "hex")
+            assert isinstance(written, str)
+            assert read_blocks(written.encode(), "hex") == blocks
+
+
+def image_seeds() -> Iterable[bytes]:
+    from teds_provision.teds.formats import Block, write_blocks
+    from teds_provision.teds.profile import load_profile
+
+    built = load_profile("magnetic-angular-position-sensor").build(bytes(10)).blocks
+    blocks = [Block(channel, code, teds) for (channel, code), teds in built.items() if code in (1, 12)]
+    for form in ("image", "json", "xml", "hex", "ihex", "binary"):
+        written = write_blocks(blocks, form)  # type: ignore[arg-type]
+        yield written if isinstance(written, bytes) else written.encode()
+
+
+def check_units(data: bytes) -> None:
+    """Units, times and ``--fits`` expressions."""
+    from teds_provision.teds.fits import parse_fits
+    from teds_provision.teds.units.units import parse_seconds, parse_unit
+
+    text = as_text(data)
+    reads(lambda: parse_unit(text), lambda: parse_seconds(text), lambda: parse_fits(text))
+
+
+def unit_seeds() -> Iterable[bytes]:
+    for text in ("m/s²", "kg*m^2/s^2", "mV/V", "degC", "100 us", "10 kHz", "V/(m*K)", "1/s"):
+        yield text.encode()
+    yield b"angle >= 360 deg, uncertainty <= 1 deg, rate >= 1 kHz"
+
+
+_JSON = ("{", "}", "[", "]", '"', ":", ",", "null", "true", "1e9")
+_TOML = ("[[", "]]", "[channel.1]", " = ", '"""', "'", "extends", "unit", "points", "calibration", "inf", "nan")
+_XML = ("<", "/>", "</", "<!DOCTYPE", "<![CDATA[", "&#0;", "uuid=", "<teds", "<field", "xmlns=")
+
+TARGETS = {
+    target.name: target
+    for target in (
+        Target("teds", check_teds, lambda: [b"\1\3\4\0\1\1\1"]),
+        Target("sheet", check_sheet, sheet_seeds),
+        Target("security", check_security, security_seeds),
+        Target("frames", check_frames, frame_seeds),
+        Target("operation", check_operation, lambda: [bytes(8), bytes(20), b"\0" + bytes(26)]),
+        Target("nfc", check_nfc, nfc_seeds, ("Tp", "Ts", "Te", "urn:nfc:sn:")),
+        Target("can", check_can, can_seeds),
+        Target("bundle", check_bundle, bundle_seeds, (*_JSON, "protected", "recipients", "nodes", "alg", "kid")),
+        Target("receipt", check_receipt, receipt_seeds, (*_JSON, "imported", "refused", "format", ".")),
+        Target("backup", check_backup, backup_seeds, (*_JSON, "schema", "tables")),
+        Target("whitelist", check_whitelist, whitelist_seeds, (*_JSON, *_XML, "whitelist", "fingerprint", ";", "\t")),
+        Target("calibration", check_calibration, calibration_seeds, (*_JSON, *_TOML, "# unit:", "method", "all")),
+        Target("profile", check_profile, profile_seeds, _TOML),
+        Target("image", check_image, image_seeds, (*_JSON, *_XML, ":00000001FF", "# channel 1 access code 3")),
+        Target("units", check_units, unit_seeds, ("**", "^", "·", "/", "deg", "count", ">=", "<=", "rate", "²")),
+    )
+}
