@@ -220,8 +220,7 @@ def check_nfc(data: bytes) -> None:
         records = message.decode(data)
         assert message.decode(message.encode(records)) == records
     tnep.our_service(records)
-    tnep.selection(records)
-    reads(lambda: tnep.status_of(records), lambda: tnep.ServiceParameters.decode(data))
+    reads(lambda: tnep.selection(records), lambda: tnep.status_of(records), lambda: tnep.ServiceParameters.decode(data))
     requester = pieces.Requester(data[0] if data else 0, b"command" * 20, 30)
     responder = pieces.Responder(lambda _transaction, frame: frame[::-1])
     for record in [*(record.payload for record in records), data]:
