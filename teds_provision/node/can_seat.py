@@ -23,6 +23,15 @@ _FIRST_KINDS: Final = (0, 1)
 """N_PDU types of a single and of a first frame: a new request begins."""
 
 
+BUS: Final = "can"
+"""What stands before the colon in the names of lines: streams of one bus share a node's budget."""
+
+
+def link_name(station: int) -> str:
+    """Name of the link to a station, as sessions hang on it."""
+    return f"{BUS}:{station:02x}"
+
+
 class Request(NamedTuple):
     """A whole request: transaction ‖ command; whether it came by CAN FD, and its tick (0 for a node without clock)."""
 
@@ -40,7 +49,7 @@ class Line:
 
     def __init__(self, seat: Seat, station: int, turns: Turns) -> None:
         self.seat, self.station, self.turns = seat, station, turns
-        self.name = f"can:{station:02x}"
+        self.name = link_name(station)
         self.pairs: dict[int, Pair] = {}
         self.waiting = 0
         self.gone = False

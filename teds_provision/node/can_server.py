@@ -16,7 +16,7 @@ from teds_provision.errors import LinkFailure, NoReader, TedsProvisionError
 from teds_provision.links.can.bus import Bus, Frame
 from teds_provision.links.can.isotp import FUNCTIONAL, Pair, addresses, read_single
 from teds_provision.links.can.spec import FIRST_STATION, LAST_NODE, LAST_STATION, parse_spec
-from teds_provision.node.can_seat import Line, Request, Seat
+from teds_provision.node.can_seat import Line, Request, Seat, link_name
 from teds_provision.node.handler import Measuring, NodeHandler
 from teds_provision.node.workers import Crew
 from teds_provision.protocol.announce import Announce, is_announce
@@ -31,8 +31,6 @@ _LOOK_ROUND: Final = 0.05
 _FLOW_CONTROL: Final = 3
 _FIRST_REOPEN, _LAST_REOPEN = 1.0, 30.0
 """Seconds until the node comes back from bus-off, doubling while it recurs (operation.md, section 6)."""
-BUS: Final = "can"
-"""What stands before the colon in the names of lines: streams of one bus share a node's budget."""
 _TOLD: Final = logging.getLogger(__name__)
 
 
@@ -238,11 +236,11 @@ class CanServer:
         if trigger_station(frame.identifier) == station:
             told = [(seat.measuring, seat.measuring.tick()) for seat in self._seats if seat.measuring is not None]
             for node, tick in told:
-                node.trigger(BUS, station, frame.data, tick)
+                node.trigger(link_name(station), frame.data, tick)
         elif (address := drive_address(frame.identifier)) is not None:
             for seat in self._at.get(address.node, ()):
                 if seat.measuring is not None:
-                    seat.measuring.drive(BUS, station, frame.data)
+                    seat.measuring.drive(link_name(station), frame.data)
 
     def _flow_control_of_old_address(self, station: int, own: int, frame: Frame) -> None:
         """A reply that is still leaving from the address before 128.10 needs its flow control."""

@@ -43,8 +43,8 @@ class Measuring(Protocol):
     def reply_left(self, link: str) -> None:
         """The last reply on this link has left (or will not any more): data may follow."""
 
-    def trigger(self, bus: str, station: int, token: bytes, tick: int) -> None:
-        """A trigger frame of a station (F1 to F7) ended at ``tick``."""
+    def trigger(self, link: str, token: bytes, tick: int) -> None:
+        """A trigger frame of this link's station ended at ``tick``."""
 
-    def drive(self, bus: str, station: int, data: bytes) -> None:
-        """A Drive frame of a station came."""
+    def drive(self, link: str, data: bytes) -> None:
+        """A Drive frame of this link's station came."""

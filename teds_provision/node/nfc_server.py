@@ -12,6 +12,7 @@ from teds_provision.errors import NoReader, UsageFailure
 from teds_provision.links.nfc.library import nfc
 from teds_provision.links.nfc.udp import NodeDevice, address_of, frontend
 from teds_provision.node import nfc_type2, nfc_type4
+from teds_provision.node.charging import NO_EXTRAS, Extras
 from teds_provision.node.handler import NodeHandler
 from teds_provision.node.nfc_air import Air
 from teds_provision.node.nfc_tnep import TnepTag
@@ -31,7 +32,7 @@ class NfcServer:
     ``uid`` has 4, 7 or 10 octets (Type 2: 7), random when None. ``wt_int`` (0 to 63) and ``n_wait`` (0 to 15) are
     announced; ``max_ndef`` octets is the longest NDEF message, by default 4160 (Type 4) or 499 (Type 2, its most).
     ``pace`` makes every frame last as long as on air at 106 kbit/s; with ``queue`` it waits while another node lies
-    there. Raises UsageFailure for what does not fit.
+    there. ``extras`` are further records of the initial message. Raises UsageFailure for what does not fit.
     """
 
     def __init__(
@@ -46,6 +47,7 @@ class NfcServer:
         max_ndef: int | None = None,
         pace: bool = False,
         queue: bool = False,
+        extras: Extras = NO_EXTRAS,
     ) -> None:
         self._path = path
         self._device: Any = None
@@ -58,8 +60,8 @@ class NfcServer:
             self._type4 = nfc_type4.Type4Memory(max_ndef or TYPE4_MAX_NDEF)
         else:
             self._type2 = nfc_type2.Type2Memory(self._uid, max_ndef or nfc_type2.MAX_NDEF)
-        self._tnep = TnepTag(self._type4 or self._memory2(), handler, wt_int=wt_int, n_wait=n_wait)
-        self._pace, self._queue = pace, queue
+        self._tnep = TnepTag(self._type4 or self._memory2(), handler, wt_int=wt_int, n_wait=n_wait, extras=extras)
+        self._pace, self._queue, self._extras = pace, queue, extras
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self._serve, name="nfc-tag", daemon=True)
 
@@ -129,6 +131,7 @@ class NfcServer:
     def _activation(self, clf: Any, respond: _Respond, command: bytes, answer: bytes | None) -> None:
         """Serve one activation, from its first command (or the answer to it) until the field is gone."""
         self._tnep.activated()
+        self._extras.field(True)
         while not self._stop.is_set():
             if command:
                 answer = respond(command)
@@ -142,4 +145,5 @@ class NfcServer:
             except nfc.clf.CommunicationError:
                 pass
             answer = None
+        self._extras.field(False)
         self._tnep.lost()

@@ -15,6 +15,7 @@ from typing import Protocol
 from teds_provision.errors import Garbled
 from teds_provision.links.nfc import message, tnep
 from teds_provision.links.nfc.pieces import Piece, Responder, room
+from teds_provision.node.charging import NO_EXTRAS, Extras, is_poller_information
 from teds_provision.node.handler import NodeHandler
 from teds_provision.protocol.repetition import Repetition
 
@@ -33,13 +34,25 @@ class Memory(Protocol):
 
 
 class TnepTag:
-    """Serves one node's requests through the NDEF message of an emulated tag."""
+    """Serves one node's requests through the NDEF message of an emulated tag.
 
-    def __init__(self, memory: Memory, handler: NodeHandler, *, wt_int: int, n_wait: int) -> None:
+    ``extras`` are further records of the initial message.
+    """
+
+    def __init__(
+        self,
+        memory: Memory,
+        handler: NodeHandler,
+        *,
+        wt_int: int,
+        n_wait: int,
+        extras: Extras = NO_EXTRAS,
+    ) -> None:
         self._memory = memory
         self._handler = handler
         self._service = tnep.ServiceParameters(tnep.SERVICE, wt_int, n_wait, memory.max_ndef).record()
         self._repetition = Repetition()
+        self._extras = extras
         self._responder = Responder(self._run)
         self._lock = threading.Lock()
         self._serial = 0  # of the activation or message that the mailbox belongs to
@@ -121,6 +134,8 @@ class TnepTag:
                 with self._lock:
                     self._selected = uri == tnep.SERVICE and serial == self._serial
                 return message.encode([tnep.status(tnep.SUCCESS)]) if uri == tnep.SERVICE else None
+            if not self._selected and records and is_poller_information(records[0]):
+                return None
             payload = tnep.external(records, tnep.TIM_TYPE)
             if payload is None or not self._selected:
                 return message.encode([tnep.status(tnep.PROTOCOL_ERROR)])
@@ -152,4 +167,5 @@ class TnepTag:
         self._handler.lost(LINE)
 
     def _initial_message(self) -> bytes:
-        return message.encode([self._service, tnep.id_record(self._handler.identify())])
+        own = (self._service, tnep.id_record(self._handler.identify()))
+        return message.encode([*self._extras.before(), *own, *self._extras.after()])

@@ -1,21 +1,35 @@
-"""The virtual transducer: one Tim behind both link servers, as slow as it is told to be."""
+"""The virtual transducer: one Tim behind its link servers, as slow as it is told to be, in real time."""
 
 from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Protocol
+from typing import Final, Protocol
 
+from teds_provision.node.board import Board
+from teds_provision.node.can_seat import BUS
 from teds_provision.node.flash_file import FlashFile
+from teds_provision.node.pulse import Pulse
+from teds_provision.protocol.flash import Flash
 from teds_provision.protocol.keys import PrivateKey, SoftwareKey
 from teds_provision.protocol.messages.identity import NodeState
+from teds_provision.protocol.operation.hardware import port_of
+from teds_provision.protocol.operation.streams import DataFrame
 from teds_provision.protocol.tim import Tim
 
-QUICK_SECONDS = 0.005
-"""Point operations up to here hold no Sealed frame up for long (operation.md section 2)."""
+_COARSE: Final = 0.001
+"""Seconds: samples are taken with their own ticks, so that looking more often than this is of no use."""
+_QUICK: Final = 0.005
+"""Seconds that a point operation may take without holding a Sealed frame up (operation.md, section 2)."""
+_EVENTS: Final = 0.005
+"""Seconds between two looks at event sensors."""
+_SIMULATION_WAITS: Final = 0.5
+
+SendData = Callable[[DataFrame], None]
 
 
 @dataclass(frozen=True)
@@ -26,34 +40,8 @@ class Delays:
     flash: float = 0.0
 
 
-@dataclass(frozen=True)
-class _SlowKey:
-    """A node's key on a slow chip."""
-
-    key: PrivateKey
-    delay: float
-
-    @property
-    def point(self) -> bytes:
-        return self.key.point
-
-    def sign(self, message: bytes) -> bytes:
-        time.sleep(self.delay)
-        return self.key.sign(message)
-
-    def ecdh(self, peer: bytes) -> bytes:
-        time.sleep(self.delay)
-        return self.key.ecdh(peer)
-
-
-def _slow_one_time(delay: float) -> PrivateKey:
-    """A key pair for one Open, made on a slow chip."""
-    time.sleep(delay)
-    return _SlowKey(SoftwareKey.generate(), delay)
-
-
 class LinkServer(Protocol):
-    """One link of the node, served in a thread of its own."""
+    """One link of the node, served in threads of its own."""
 
     def start(self) -> None:
         """Open the link; raises a LinkFailure where it cannot."""
@@ -62,10 +50,75 @@ class LinkServer(Protocol):
         """Close it; never raises."""
 
 
-class VirtualNode:
-    """A NodeHandler: runs one command at a time, whichever link it came by, like the one core of a small board.
+class _Core:
+    """The one core of a small board: a command at a time, and interrupts while it waits for its chip or its flash."""
 
-    ``exclusive`` takes the node for this process; see FlashFile.
+    def __init__(self) -> None:
+        self._turn = threading.Lock()
+        self._state = threading.Lock()
+
+    @contextmanager
+    def command(self) -> Iterator[None]:
+        """Run a command; others wait for their turn."""
+        with self._turn, self._state:
+            yield
+
+    @contextmanager
+    def interrupt(self) -> Iterator[None]:
+        """Do what cannot wait for the command that runs: samples, dead-men, triggers."""
+        with self._state:
+            yield
+
+    @contextmanager
+    def waiting(self) -> Iterator[None]:
+        """Inside a command: what is done here holds up nothing that cannot wait."""
+        self._state.release()
+        try:
+            yield
+        finally:
+            self._state.acquire()
+
+
+@dataclass(frozen=True)
+class _SlowKey:
+    """A node's key on a slow chip."""
+
+    key: PrivateKey
+    work: Callable[[], None]
+
+    @property
+    def point(self) -> bytes:
+        return self.key.point
+
+    def sign(self, message: bytes) -> bytes:
+        self.work()
+        return self.key.sign(message)
+
+    def ecdh(self, peer: bytes) -> bytes:
+        self.work()
+        return self.key.ecdh(peer)
+
+
+@dataclass(frozen=True)
+class _Flash:
+    """The flash of the node; what has to wait for it waits outside the core."""
+
+    file: FlashFile
+    core: _Core
+
+    def load(self) -> Flash:
+        return self.file.load()
+
+    def commit(self, state: Flash) -> None:
+        with self.core.waiting():
+            self.file.commit(state)
+
+
+class VirtualNode:
+    """A NodeHandler that measures: one command at a time, whichever link it came by, like the one core of a board.
+
+    ``exclusive`` takes the node for this process; see FlashFile. ``board`` makes the hardware from the flash file,
+    None: a node that does not measure. With a ``pulse`` it runs in real time: samples, leases, dead-men, data frames.
     """
 
     def __init__(
@@ -75,28 +128,65 @@ class VirtualNode:
         delays: Delays | None = None,
         clock: Callable[[], float] = time.monotonic,
         exclusive: bool = False,
+        board: Callable[[FlashFile], Board | None] = lambda file: None,
+        pulse: Pulse | None = None,
     ) -> None:
-        delays = delays or Delays()
-        self.flash_file = FlashFile(folder, delay=delays.flash, exclusive=exclusive)
-        self._one = threading.Lock()
+        self._delays = delays or Delays()
+        self.flash_file = FlashFile(folder, delay=self._delays.flash, exclusive=exclusive)
+        self.board = board(self.flash_file)
+        self._core, self._pulse = _Core(), pulse
+        self._wire = threading.Lock()
+        self._buses: dict[str, SendData] = {}
+        self._one_time_at = time.monotonic() + self._delays.crypto
         self.tim = Tim(
-            _SlowKey(self.flash_file.key, delays.crypto),
-            self.flash_file,
+            _SlowKey(self.flash_file.key, self._work),
+            _Flash(self.flash_file, self._core),
             clock,
             max_message=self.flash_file.max_message,
-            one_time=lambda: _slow_one_time(delays.crypto),
-            quick_points=delays.crypto <= QUICK_SECONDS,
+            one_time=self._one_time,
+            hardware=self.board,
+            quick_points=self._delays.crypto <= _QUICK,
         )
+        if self.board is not None:
+            self.board.clock.due = self._simulated
+
+    # -- what links call -------------------------------------------------------------------------------------------
 
     def request(self, link: str, frame: bytes, *, tapped: bool) -> bytes:
         """Run one command frame; see NodeHandler."""
-        with self._one:
-            return self.tim.handle(frame, link=link, tapped=tapped)
+        return self.request_received(link, frame, tapped=tapped, fd=False, received=self.tick())
+
+    def request_received(self, link: str, frame: bytes, *, tapped: bool, fd: bool, received: int) -> bytes:
+        """Run one command frame; see Measuring."""
+        with self._core.command():
+            port = port_of(link)._replace(fd=fd)
+            reply = self.tim.handle(frame, link=link, tapped=tapped, port=port, received=received)
+        with self._wire:
+            pass  # a data frame that was on its way out is out: nothing of a stream leaves behind the reply to Stop
+        self._wake()
+        return reply
+
+    def reply_left(self, link: str) -> None:
+        """Data may follow; see Measuring."""
+        with self._core.interrupt():
+            self.tim.reply_left(link)
+        self._wake()
 
     def lost(self, link: str) -> None:
         """The link is gone; see NodeHandler."""
-        with self._one:
+        with self._core.command():
             self.tim.link_lost(link)
+
+    def trigger(self, link: str, token: bytes, tick: int) -> None:
+        """A trigger came; see Measuring."""
+        with self._core.interrupt():
+            self.tim.trigger(link, token, tick)
+        self._wake()
+
+    def drive(self, link: str, data: bytes) -> None:
+        """A Drive frame came; see Measuring."""
+        with self._core.interrupt():
+            self.tim.drive(link, data)
 
     def identify(self) -> bytes:
         """Identify as it is now; see NodeHandler."""
@@ -114,11 +204,77 @@ class VirtualNode:
         """Whether an actuator is claimed; see NodeHandler."""
         return self.tim.actuator_claimed()
 
+    def tick(self) -> int:
+        """The present tick; 0 for a node without clock."""
+        return self.board.now() if self.board is not None else 0
+
+    # -- its own life ----------------------------------------------------------------------------------------------
+
     def in_factory_state(self) -> bool:
         """Whether the node holds no key."""
         return self.tim.flash.state == NodeState.FACTORY
 
     def reset_by_hand(self) -> None:
         """Hold the button 5 s."""
-        with self._one:
+        with self._core.command():
             self.tim.reset_by_hand()
+
+    def streams_over(self, send: SendData, bus: str = BUS) -> None:
+        """Give the data frames of a bus to its server."""
+        self._buses[bus] = send
+
+    def beat(self) -> float | None:
+        """Do what is due in real time; see Pulse."""
+        if self.board is None:
+            return None
+        with self._core.interrupt():
+            wait = self.tim.poll()
+            if wait is not None:
+                self._look_for_events(self.board)
+        if wait is None:
+            return None
+        self._send_frames()
+        with self._core.interrupt():
+            frame = self.tim.next_frame_in()
+        wait = min(max(wait, _COARSE), _EVENTS if self.board.has_events else wait + _COARSE)
+        return wait if frame is None else min(frame, wait)
+
+    def _look_for_events(self, board: Board) -> None:
+        for channel, tick, reading in board.events():
+            self.tim.event(channel, tick, reading.octets, valid=reading.valid)
+
+    def _send_frames(self) -> None:
+        """Send what may begin now, a frame for each bus."""
+        for bus, send in self._buses.items():
+            with self._wire:
+                with self._core.interrupt():
+                    frame = self.tim.next_frame(bus)
+                if frame is not None:
+                    send(frame)
+
+    def _wake(self) -> None:
+        if self._pulse is not None and self.board is not None:
+            self._pulse.wake(self)
+
+    # -- slow parts ------------------------------------------------------------------------------------------------
+
+    def _work(self) -> None:
+        """One point operation."""
+        self._sleep(self._delays.crypto)
+
+    def _sleep(self, seconds: float) -> None:
+        if seconds > 0:
+            with self._core.waiting():
+                time.sleep(seconds)
+
+    def _one_time(self) -> PrivateKey:
+        """A key pair for one Open; the chip makes the next one while it has nothing else to do."""
+        self._sleep(self._one_time_at - time.monotonic())
+        self._one_time_at = time.monotonic() + self._delays.crypto
+        return _SlowKey(SoftwareKey.generate(), self._work)
+
+    def _simulated(self) -> None:
+        """A simulation moved the clock: take what fell due, and let full messages leave before it goes on."""
+        until = time.monotonic() + _SIMULATION_WAITS
+        while (wait := self.beat()) is not None and wait < _COARSE and time.monotonic() < until:
+            time.sleep(wait)

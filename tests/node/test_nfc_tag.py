@@ -14,10 +14,12 @@ from teds_provision.errors import Garbled, NodeSilent, UsageFailure
 from teds_provision.links.nfc import message, tnep
 from teds_provision.links.nfc.pieces import Piece
 from teds_provision.links.nfc.poller import Poller
+from teds_provision.node import charging
 from teds_provision.node.nfc_air import ETU, Air, answer_seconds, command_seconds
 from teds_provision.node.nfc_tnep import TnepTag
 from teds_provision.node.nfc_type2 import Type2Memory
 from teds_provision.node.nfc_type4 import IsoDepTag, NdefApplication, Type4Memory
+from teds_provision.protocol.operation.commands import Power, PowerFlag
 
 SELECT_APPLICATION = bytes.fromhex("00A4040007D276000085010100")
 SELECT_CC, SELECT_NDEF = bytes.fromhex("00A4000C02E103"), bytes.fromhex("00A4000C02E104")
@@ -236,7 +238,7 @@ GOOD = answer(Piece(3, 2, 0, b"ok", answer=True))
         [OK, GOOD[:-3], GOOD],
         [OK, answer(Piece(2, 2, 0, b"no", answer=True)), GOOD],  # another transaction
         [OK, answer(Piece(3, 2, 0, b"o", answer=True, more=True)), answer(Piece(3, 2, 1, b"k", answer=True))],
-        [OK, *[b""] * 200, GOOD],  # far past N_wait
+        [OK, *[b""] * 100, GOOD],  # far past N_wait, within 5 s at an interval of 32 ms
     ],
 )
 def test_a_station_bears_with_other_peoples_nodes(reads: list[bytes]) -> None:
@@ -443,3 +445,40 @@ def test_a_tag_that_cannot_be_is_refused() -> None:
         NfcServer("udp:localhost:5000", Handler(), tag="2", uid=bytes(4))
     with pytest.raises(UsageFailure):
         NfcServer("udp:0.0.0.0:5000", Handler())
+
+
+@pytest.mark.parametrize("max_ndef", [300, 499])
+def test_a_battery_stands_first_in_the_initial_message_and_the_service_is_found(max_ndef: int) -> None:
+    power = [Power(PowerFlag.BATTERY, 80)]
+    tag = Type4Memory(max_ndef)
+    node = TnepTag(
+        tag,
+        Handler(),
+        wt_int=4,
+        n_wait=15,
+        extras=charging.Extras(
+            before=lambda: charging.charge_records(power[0]),
+            after=lambda: (charging.out_of_band_record(bytes.fromhex("C1D857000101"), random=True),),
+        ),
+    )
+    node.start()
+    try:
+        records = message.decode(Mailbox(tag).read())
+        assert [record.type for record in records[:2]] == [b"WLCCAP", b"WLCSTAI"]
+        assert records[1].payload == b"\x01\x50"
+        assert records[-1].payload.hex() == "081b0101005" + "7d8c101021c00"  # the octets of a real record
+        assert tnep.our_service(records) is not None
+        power[0] = Power(PowerFlag.BATTERY | PowerFlag.FULL, 100)
+        node.activated()
+        assert node.ready(5)
+        renewed = message.decode(Mailbox(tag).read())
+        assert renewed[0].payload[1] >> 6 == 2
+        assert renewed[1].payload == b"\x01\x64"
+    finally:
+        node.stop()
+
+
+def test_a_charging_reader_that_writes_its_power_disturbs_nobody(desk: Desk) -> None:
+    before = desk.mailbox.read()
+    assert desk.say(message.encode([message.Record(message.WELL_KNOWN, b"WLCINF", bytes(6))])) == message.decode(before)
+    assert tnep.status_of(desk.say(select())) == tnep.SUCCESS

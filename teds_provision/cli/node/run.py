@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import functools
 import signal
 import threading
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -15,7 +16,13 @@ from teds_provision.cli.options import command
 from teds_provision.errors import UsageFailure
 
 if TYPE_CHECKING:
+    from teds_provision.cli.node.actuators import ActuatorLines
+    from teds_provision.node.board import Board
+    from teds_provision.node.can_server import CanServer
+    from teds_provision.node.charging import Extras
+    from teds_provision.node.flash_file import FlashFile
     from teds_provision.node.virtual import LinkServer, VirtualNode
+    from teds_provision.protocol.operation.streams import DataFrame
 
 
 @command(
@@ -52,15 +59,30 @@ if TYPE_CHECKING:
     metavar="WT_INT",
     help="TNEP minimum waiting time, a multiple of 4 (4 is 1 ms, 20 is 16 ms).",
 )
+@click.option(
+    "--battery",
+    type=click.FloatRange(0, 100),
+    metavar="PERCENT",
+    help="It has a battery, so full: a reader's field charges it (2 % a minute), else it empties (0.1 %).",
+)
 @click.option("--pace", is_flag=True, help="Let every NFC frame last as long as at 106 kbit/s.")
 @pass_app
 def run(
-    app: App, /, folders: Sequence[Path], crypto_delay: float, flash_delay: float, source: str, **links: Any
+    app: App,
+    /,
+    folders: Sequence[Path],
+    crypto_delay: float,
+    flash_delay: float,
+    source: str,
+    battery: float | None,
+    **links: Any,
 ) -> None:
     """Run the nodes in DIR … until SIGTERM or Ctrl-C; SIGUSR1 is their reset by hand.
 
     Prints one line when the links are up, then a line for what an actuator does.
     """
+    from teds_provision.cli.node.actuators import ActuatorLines
+    from teds_provision.node.pulse import Pulse
     from teds_provision.node.sources import ONE_NODE_ONLY, kind_of
     from teds_provision.node.virtual import Delays, VirtualNode
 
@@ -72,22 +94,49 @@ def run(
         what = "--nfc" if links["nfc"] else f"--source {source}"
         raise UsageFailure(f"{what} is for one node.", hint="Run the others in processes of their own.")
     delays = Delays(crypto_delay / 1000, flash_delay / 1000)
-    nodes = [VirtualNode(folder, delays=delays, exclusive=True) for folder in folders]
+    lines, pulse = ActuatorLines(app), Pulse()
+    make = _boards(app, lines, source, battery)
+    nodes = [VirtualNode(folder, delays=delays, exclusive=True, board=make, pulse=pulse) for folder in folders]
     stop = threading.Event()
     for number in (signal.SIGTERM, signal.SIGINT):
         signal.signal(number, lambda *_: stop.set())
     signal.signal(signal.SIGUSR1, lambda *_: threading.Thread(target=_reset_all, args=(nodes,)).start())
     running: list[Any] = []
     try:
-        for part in _servers(app, nodes, **links):
+        boards = [node.board for node in nodes if node.board is not None]
+        parts: list[LinkServer] = [pulse, *boards, *_servers(app, nodes, **links)]
+        for part in parts:
             part.start()
             running.append(part)
         _say_ready(app, nodes, [links[kind] for kind in ("nfc", "can") if links[kind]], source)
+        lines.start()
+        running.append(lines)
         while not stop.wait(0.5):
             pass
     finally:
         for part in reversed(running):
             part.stop()
+
+
+def _boards(app: App, lines: ActuatorLines, source: str, percent: float | None) -> Callable[[FlashFile], Board | None]:
+    from teds_provision.node.battery import Battery
+    from teds_provision.node.board import Board
+    from teds_provision.teds.image import Image
+    from teds_provision.teds.sheet import Sheet
+
+    def make(file: FlashFile) -> Board | None:
+        uuid, hardware = file.load().uuid, file.hardware
+        if not hardware and percent is None:
+            return None
+        return Board(
+            Sheet.of(Image(uuid, hardware)),
+            source=source,
+            battery=None if percent is None else Battery(percent),
+            shown=lines.of(uuid.hex()),
+            tell=app.warn,
+        )
+
+    return make
 
 
 def _reset_all(nodes: Sequence[VirtualNode]) -> None:
@@ -114,12 +163,30 @@ def _servers(
     if nfc:
         from teds_provision.node.nfc_server import NfcServer
 
-        servers.append(NfcServer(nfc, nodes[0], tag=tag, pace=pace, wt_int=wait_time // 4 * 4))
+        servers.append(
+            NfcServer(nfc, nodes[0], tag=tag, pace=pace, wt_int=wait_time // 4 * 4, extras=_extras(nodes[0]))
+        )
     if can:
         from teds_provision.node.can_server import CanServer
 
         bus = CanServer(can, tell=app.warn)
         for node in nodes:
-            bus.add(node, counts_as_tapped=node.in_factory_state if nfc is None else lambda: False)
+            tapped = node.in_factory_state if nfc is None else lambda: False
+            bus.add(node, counts_as_tapped=tapped, measuring=node)
+            node.streams_over(functools.partial(_send, bus, node))
         servers.append(bus)
     return servers
+
+
+def _send(bus: CanServer, node: VirtualNode, frame: DataFrame) -> None:
+    bus.send_data(node, frame.identifier, frame.data, fd=frame.fd)
+
+
+def _extras(node: VirtualNode) -> Extras:
+    """What a node with a battery says in its initial message, and how a field charges it."""
+    from teds_provision.node.charging import NO_EXTRAS, Extras, charge_records
+
+    battery = node.board.battery if node.board is not None else None
+    if battery is None:
+        return NO_EXTRAS
+    return Extras(before=lambda: charge_records(battery.power()), field=lambda present: battery.field(present=present))

@@ -151,6 +151,11 @@ class OperationRole:
         waits += [at - real for at in (self.claims.next_deadline(), self.streams.next_frame()) if at is not None]
         return max(0, min(waits)) / SECOND if waits else None
 
+    def next_frame_in(self) -> float | None:
+        """Seconds until the next data frame of any bus may begin; None where none is waiting."""
+        due = self.streams.next_frame()
+        return None if due is None else max(0, due - self._real()) / SECOND
+
     def frame(self, bus: str) -> DataFrame | None:
         """The next data frame of a bus, where one may begin now."""
         return self.streams.frame(bus)

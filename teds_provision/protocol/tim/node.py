@@ -151,6 +151,10 @@ class Tim:
         """
         return self._role.frame(bus) if self._role is not None else None
 
+    def next_frame_in(self) -> float | None:
+        """Seconds until the next data frame of any bus may begin; None where none is waiting."""
+        return self._role.next_frame_in() if self._role is not None else None
+
     def event(self, channel: int, tick: int, octets: bytes, *, valid: bool = True) -> None:
         """An event sensor has seen something at ``tick``."""
         if self._role is not None:

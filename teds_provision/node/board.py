@@ -1,0 +1,225 @@
+"""The hardware of a virtual transducer: the channels of the datasheet that it was made with, fed by a source.
+
+It is what :class:`~teds_provision.protocol.operation.hardware.Hardware` asks of a firmware. Whatever datasheet is
+written to the node later changes nothing here.
+"""
+
+from __future__ import annotations
+
+import math
+import threading
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Final
+
+from teds_provision.errors import BadData
+from teds_provision.node import sources
+from teds_provision.node.battery import Battery
+from teds_provision.node.clock import NANOSECONDS, NodeClock
+from teds_provision.node.converter import Converter
+from teds_provision.node.sources.base import Place, Tell
+from teds_provision.node.sources.base import Reading as Given
+from teds_provision.protocol.operation.commands import Power
+from teds_provision.protocol.operation.hardware import ChannelHardware, Reading
+from teds_provision.teds.sheet import Channel, Kind, Sheet
+
+_DRIFT: Final = 50
+_DRIFT_OF_SIMULATION: Final = 0xFFFF
+_SELF_TEST: Final = 0.1
+_LONGEST_SELF_TEST: Final = 10.0
+_TOLERANCE: Final = 0.5  # raw numbers of integer channels: limits are rounded to the nearest
+_PPM: Final = 1e-6
+
+
+@dataclass(frozen=True)
+class Shown:
+    """What an actuator does: its raw number, the value in ``unit`` (None: nothing says), and whether it is safe."""
+
+    channel: int
+    name: str
+    value: float | None
+    unit: str
+    raw: float
+    safe: bool
+
+
+class Board:
+    """Channels of ``sheet``; ``source`` is the text of ``--source``.
+
+    ``shown`` is called with what actuators do, from any thread, and must return at once; ``tell`` is given what a
+    person should know. Raises BadData where a channel cannot be imitated, and what the source raises.
+    """
+
+    def __init__(
+        self,
+        sheet: Sheet,
+        *,
+        source: str = "noise",
+        clock: NodeClock | None = None,
+        battery: Battery | None = None,
+        shown: Callable[[Shown], None] = lambda shown: None,
+        tell: Tell = lambda text: None,
+    ) -> None:
+        self.clock = clock or NodeClock()
+        self.battery = battery
+        self.shown = shown
+        self.faults: set[int] = set()
+        self._lock = threading.Lock()
+        kinds = {channel.number: channel for channel in sheet.channels if channel.kind is not None}
+        self._facts = kinds
+        self.channels: Mapping[int, ChannelHardware] = {n: _facts(channel) for n, channel in kinds.items()}
+        self.converters = {number: Converter(sheet, channel) for number, channel in kinds.items()}
+        self._test_seconds = min(max(sheet.meta.self_test_time, 0.0), _LONGEST_SELF_TEST)
+        if not math.isfinite(self._test_seconds):
+            self._test_seconds = _SELF_TEST
+        self._seen: dict[int, Reading | None] = {
+            n: None for n, facts in self.channels.items() if facts.kind is Kind.EVENT_SENSOR
+        }
+        self._testing: dict[int, int] = {}
+        self._safe_state = {n: self._lowest(n) for n, facts in self.channels.items() if facts.actuator}
+        self._bounds = {number: self._raw_limits(number) for number in self._safe_state}
+        self._set_points = dict(self._safe_state)
+        self.source = sources.make_source(source, self.places, tell)
+
+    @property
+    def places(self) -> list[Place]:
+        """The sensors, as sources see them."""
+        return [self.converters[n].place for n, facts in self.channels.items() if not facts.actuator]
+
+    def start(self) -> None:
+        """Let the source begin."""
+        self.source.start(self.clock)
+
+    def stop(self) -> None:
+        """End the source."""
+        self.source.stop()
+
+    # -- clock -----------------------------------------------------------------------------------------------------
+
+    @property
+    def step(self) -> int:
+        """Step of the clock, ns."""
+        return self.clock.step
+
+    @property
+    def drift(self) -> int:
+        """ppm: of a simulation nobody knows how fast its time runs."""
+        return _DRIFT if self.clock.runs_by_itself else _DRIFT_OF_SIMULATION
+
+    def now(self) -> int:
+        """The present tick."""
+        return self.clock.tick()
+
+    def keeps(self, period: int) -> bool:
+        """Any whole number of nanoseconds is kept on average."""
+        return period > 0
+
+    # -- sensors ---------------------------------------------------------------------------------------------------
+
+    def read(self, channel: int, tick: int) -> Reading:
+        """What the source gives for ``tick``; zeros that are not valid where it gives nothing."""
+        given = self.source.at(channel, tick / NANOSECONDS)
+        converter = self.converters[channel]
+        if given is None or channel in self.faults:
+            return Reading(bytes(converter.form.octets), valid=False)
+        try:
+            return Reading(converter.octets(given))
+        except BadData:  # no way from a value to a sample: nothing that could be shown
+            return Reading(bytes(converter.form.octets), valid=False)
+
+    @property
+    def has_events(self) -> bool:
+        """Whether it has event sensors."""
+        return bool(self._seen)
+
+    def events(self) -> Iterator[tuple[int, int, Reading]]:
+        """Event sensors that show something else than at the last look: channel, tick, what they show."""
+        tick = self.now()
+        for channel, before in list(self._seen.items()):
+            reading = self.read(channel, tick)
+            if reading != before:
+                self._seen[channel] = reading
+                if before is not None:
+                    yield channel, tick, reading
+
+    # -- actuators -------------------------------------------------------------------------------------------------
+
+    def bears(self, channel: int, data_set: bytes) -> bool:
+        """Whether a raw value lies between those of LowLimit and HiLimit."""
+        low, high = self._bounds[channel]
+        return low <= self.converters[channel].raw_of(data_set) <= high
+
+    def apply(self, values: Mapping[int, bytes]) -> None:
+        """Show what actuators were told, and tell the source."""
+        with self._lock:
+            self._set_points.update(values)
+        for channel in values:
+            self._show(channel, safe=False)
+
+    def set_point(self, channel: int) -> bytes:
+        """The present value of an actuator."""
+        return self._set_points[channel]
+
+    def safe(self, channel: int) -> None:
+        """The safe state: LowLimit."""
+        with self._lock:
+            self._set_points[channel] = self._safe_state[channel]
+        self._show(channel, safe=True)
+
+    def _show(self, channel: int, *, safe: bool) -> None:
+        facts, converter, octets = self._facts[channel], self.converters[channel], self._set_points[channel]
+        value = converter.value(octets)
+        self.shown(Shown(channel, facts.name, value, facts.unit.text, converter.raw_of(octets), safe))
+        if facts.name and value is not None:
+            self.source.acted({facts.name: value})
+
+    def _lowest(self, channel: int) -> bytes:
+        converter = self.converters[channel]
+        try:
+            return converter.octets(Given(value=converter.low) if math.isfinite(converter.low) else Given(raw=0.0))
+        except BadData:
+            return bytes(converter.form.octets)
+
+    def _raw_limits(self, channel: int) -> tuple[float, float]:
+        """Raw numbers that the hardware bears, rounded outwards by half a step; all where the sheet states none."""
+        converter = self.converters[channel]
+        try:
+            ends = sorted(converter.raw(limit) for limit in (converter.low, converter.high))
+        except (BadData, OverflowError):
+            return -math.inf, math.inf
+        if not all(map(math.isfinite, ends)):
+            return -math.inf, math.inf
+        slack = _TOLERANCE if converter.form.integer else _PPM * max(map(abs, ends))
+        return ends[0] - slack, ends[1] + slack
+
+    # -- self-test, faults, power ----------------------------------------------------------------------------------
+
+    def self_test(self, channels: Sequence[int]) -> None:
+        """It takes TestTime of the Meta-TEDS, 0.1 s where that says nothing, 10 s at most; it always passes."""
+        end = self.now() + round(self._test_seconds * NANOSECONDS)
+        self._testing.update(dict.fromkeys(channels, end))
+
+    def testing(self, channel: int) -> bool:
+        """Whether its self-test runs."""
+        return self.now() < self._testing.get(channel, 0)
+
+    def fault(self, channel: int) -> bool:
+        """Whether a test put a fault in (``faults``)."""
+        return channel in self.faults
+
+    def power(self) -> Power:
+        """Battery and charge; without a battery nothing is known."""
+        return self.battery.power() if self.battery is not None else Power()
+
+
+def _facts(channel: Channel) -> ChannelHardware:
+    if channel.sample is None or channel.kind is None:
+        raise BadData(f"The datasheet does not say how a sample of channel {channel.number} is coded.")
+    period = channel.period if math.isfinite(channel.period) and channel.period > 0 else 0.0
+    return ChannelHardware(
+        Kind(channel.kind),
+        channel.sample.octets,
+        channel.sample.model,
+        channel.halt,
+        shortest=max(1, math.floor(period * NANOSECONDS * (1 - _PPM))),
+    )
