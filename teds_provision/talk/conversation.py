@@ -35,8 +35,13 @@ _MEANING = {
     Reason.UNTRUSTED_STATION: "it belongs to another owner's CA",
     Reason.BAD_POINT: "a public key is not a valid point",
     Reason.UNKNOWN_KEY: "it does not know this station's key",
-    Reason.BUSY: "it is busy with another station",
+    Reason.BUSY: "it is busy, or another station claims what is asked for",
     Reason.NO_SUCH_TEDS: "it has no such TEDS",
+    Reason.OUT_OF_RANGE: "a value is out of the range that it takes",
+    Reason.TOO_LATE: "the start is past, or too far ahead",
+    Reason.DOES_NOT_FIT: "it does not fit the link, or the node's budget there",
+    Reason.NO_ROOM: "it has no room for one more",
+    Reason.FAULT: "a hardware fault, or too little power",
 }
 _CURE = {
     Reason.UNTRUSTED_STATION: "Have this station signed by that CA, or reset the node by hand (button held 5 s).",
@@ -45,6 +50,9 @@ _CURE = {
     Reason.STALE_SEQUENCE: "Sign again against the node: sign UUID --read-node.",
     Reason.WRONG_EPOCH: "Sign again after the key agreement: sign UUID --read-node.",
     Reason.TOO_LARGE: "Use a smaller calibration table, or a node with more flash.",
+    Reason.DOES_NOT_FIT: "Ask for a lower rate, more samples in a message, or CAN FD; NFC and BLE do not offer all.",
+    Reason.NO_ROOM: "Let another measurement of this node end first.",
+    Reason.FAULT: "Look at its power and self-test: sample UUID, mode UUID.",
     Reason.FLASH_FAILURE: "Try again; if it stays, the board is broken.",
 }
 

@@ -132,6 +132,15 @@ def test_a_segment_that_only_begins_like_tagged_arguments_is_plain():
         (9, "Reset", 32),
         (10, "Set CAN address", 1),
         (11, "List", 0),
+        (12, "Sample", 3),
+        (13, "Set", 6),
+        (14, "Subscribe", 22),
+        (15, "Stop", 1),
+        (16, "Clock", 0),
+        (17, "Arm", 18),
+        (18, "Power", 0),
+        (19, "Operation", 0),
+        (20, "Drive", 2),
     ],
 )
 def test_functions_of_the_profile_by_name(function, name, octets):

@@ -128,6 +128,19 @@ _PROFILE: Final[dict[int, Spec]] = {
     Function.RESET: Spec("Reset", "challenge:o32", "signature:o64"),
     Function.SET_CAN_ADDRESS: Spec("Set CAN address", "can_address:u8", ""),
     Function.LIST: Spec("List", "", "blocks:blocks"),
+    Function.SAMPLE: Spec("Sample", "channels:octets", "tick:o8 flags:u8 data_sets:octets"),
+    Function.SET: Spec("Set", "values:octets", ""),
+    Function.SUBSCRIBE: Spec(
+        "Subscribe",
+        "stream:u8 stream_kind:u8 n:u8 gap_us:u16 period_ns:o8 start:o8 channels:octets",
+        "run:u16 message_octets:u16 start:o8",
+    ),
+    Function.STOP: Spec("Stop", "stream:u8", "next_counter:u32"),
+    Function.CLOCK: Spec("Clock", "", "received:o8 sent:o8 mark:o8 step_ns:u32 drift_ppm:u16 last:u32"),
+    Function.ARM: Spec("Arm", "commitment:o16 life_s:u8 action:u8", ""),
+    Function.POWER: Spec("Power", "", "power_flags:u8 level:u8 millivolts:u16 milliamperes:o2 celsius:o1"),
+    Function.OPERATION: Spec("Operation", "", "mode:u8 channel_states:octets"),
+    Function.DRIVE: Spec("Drive", "channels:octets", "run:u16 message_octets:u16"),
 }
 
 COMMANDS: Final[dict[tuple[int, int], Spec]] = {
@@ -148,9 +161,12 @@ COMMANDS: Final[dict[tuple[int, int], Spec]] = {
 REASONS: Final = {int(reason): reason.name.lower().replace("_", " ") for reason in Reason} | {
     Reason.BAD_FORM: "bad length, checksum or form",
     Reason.UNKNOWN_KEY: "unknown key (never agree anew because of it)",
-    Reason.BUSY: "busy with another station's transfer",
+    Reason.BUSY: "busy with another station's transfer, or claimed by another session",
     Reason.NO_SUCH_TEDS: "no such TEDS",
     Reason.WRONG_UUID: "wrong UUID",
+    Reason.TOO_LATE: "too late, or too far ahead",
+    Reason.DOES_NOT_FIT: "does not fit link or budget",
+    Reason.FAULT: "hardware fault or no power",
 }
 
 STATUS_BITS: Final = (
