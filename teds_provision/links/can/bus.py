@@ -8,10 +8,11 @@ import select
 import socket
 import sys
 import time
-from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Final, NoReturn
 
 from teds_provision.errors import LinkFailure, NoReader, UsageFailure
+from teds_provision.links.can.echoes import Echoes
+from teds_provision.links.can.frame import Frame
 from teds_provision.links.can.pacing import Pacer
 from teds_provision.links.can.spec import CanSpec
 
@@ -29,18 +30,7 @@ _BUS_OFF: Final = 0x40
 """Error class of a SocketCAN error frame (linux/can/error.h, CAN_ERR_BUSOFF)."""
 
 
-@dataclass(frozen=True)
-class Frame:
-    """One CAN data frame with a 29-bit identifier; ``data`` 0 to 8 octets, in FD up to 64.
-
-    ``at`` is when it came in, in seconds of ``time.monotonic()``, taken back by what it lay in the kernel's queue;
-    0 for a frame that is sent.
-    """
-
-    identifier: int
-    data: bytes
-    fd: bool = False
-    at: float = field(default=0.0, compare=False)
+__all__ = ["Bus", "Frame"]
 
 
 class Bus:
@@ -51,6 +41,7 @@ class Bus:
         self._bus = _open(spec)
         self._descriptor = _descriptor(self._bus)
         self._pacer = Pacer(spec.bitrate, spec.data_bitrate) if spec.pace else None
+        self._echoes = Echoes() if spec.interface == "udp_multicast" else None
 
     @property
     def busy_seconds(self) -> float:
@@ -70,13 +61,18 @@ class Bus:
             is_fd=frame.fd,
             bitrate_switch=frame.fd,
         )
+        if self._echoes:
+            self._echoes.sent(frame)
         try:
             self._bus.send(message, timeout=_SEND_SECONDS)
         except (can.CanError, OSError, ValueError) as error:
             self._failed("does not take a frame", error)
 
     def receive(self, seconds: float) -> Frame | None:
-        """Return the next data frame, None when there is none within ``seconds``; raises LinkFailure (also bus-off)."""
+        """Return the next data frame that another sent, None when there is none; raises LinkFailure (also bus-off).
+
+        Waits ``seconds`` at most, and returns None before for what is no such frame.
+        """
         import can
 
         try:
@@ -94,9 +90,10 @@ class Bus:
             if message.arbitration_id & _BUS_OFF:
                 self._bus_off()
             return None
-        if message.is_remote_frame or not message.is_extended_id:
+        if message.is_remote_frame or not message.is_extended_id or not message.is_rx:
             return None
-        return Frame(message.arbitration_id, bytes(message.data), message.is_fd, _arrival(message.timestamp))
+        frame = Frame(message.arbitration_id, bytes(message.data), message.is_fd, _arrival(message.timestamp))
+        return None if self._echoes and self._echoes.take(frame) else frame
 
     def wait(self, seconds: float, wake: socket.socket) -> None:
         """Sleep until there may be a frame to receive, ``wake`` can be read, or ``seconds`` are over.

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from typing import Final
 
 from teds_provision.errors import AddressConflict, BadData, Garbled, NodeSilent, TedsProvisionError
-from teds_provision.links.can.bus import Frame
+from teds_provision.links.can.frame import Frame
 from teds_provision.links.can.gathering import Gathering
 from teds_provision.links.can.isotp import FUNCTIONAL, single
 from teds_provision.links.can.link import conflict

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
-from teds_provision.links.can.bus import Frame
+from teds_provision.links.can.frame import Frame
 from teds_provision.links.can.isotp import addresses, read_single
 from teds_provision.links.can.transfer import CONTINUE, OVERFLOW, Reassembly, flow
 

@@ -11,7 +11,7 @@ from collections import deque
 from collections.abc import Callable
 from typing import Any, Final
 
-from teds_provision.links.can.bus import Frame
+from teds_provision.links.can.frame import Frame
 
 LONGEST: Final = 4095
 """Octets of the longest message: transaction ‖ a frame of the largest maxMessage."""

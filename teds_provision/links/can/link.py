@@ -8,7 +8,7 @@ from queue import Empty
 from typing import Final
 
 from teds_provision.errors import AddressConflict, Garbled, LinkFailure, NodeSilent
-from teds_provision.links.can.bus import Frame
+from teds_provision.links.can.frame import Frame
 from teds_provision.links.can.isotp import physical_id, single
 from teds_provision.links.can.shared import Line, SharedBus
 from teds_provision.links.can.transfer import OVERFLOW, WAIT, consecutive_frames, first_frame, gap_seconds

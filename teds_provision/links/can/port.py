@@ -10,7 +10,7 @@ from typing import Final
 
 from teds_provision.errors import LinkFailure, NoNode
 from teds_provision.links.can.arrivals import Arrivals
-from teds_provision.links.can.bus import Bus, Frame
+from teds_provision.links.can.bus import Bus
 from teds_provision.links.can.finding import (
     LONGEST_SECONDS,
     SILENCE_SECONDS,
@@ -22,6 +22,7 @@ from teds_provision.links.can.finding import (
     twice_text,
     unfinished_text,
 )
+from teds_provision.links.can.frame import Frame
 from teds_provision.links.can.link import CanLink, conflict
 from teds_provision.links.can.shared import Ear, SharedBus
 from teds_provision.links.can.spec import LAST_NODE, parse_spec

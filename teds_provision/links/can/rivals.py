@@ -8,15 +8,12 @@ from __future__ import annotations
 
 import threading
 import time
-from collections import OrderedDict
 from typing import Final
 
-from teds_provision.links.can.bus import Frame
+from teds_provision.links.can.frame import Frame
 from teds_provision.links.can.isotp import FUNCTIONAL, addresses
 
-_ECHO_SECONDS: Final = 3.0
-"""How long an interface may take to give back a frame that we sent; also until a claim is old."""
-_KEPT: Final = 512
+_KEPT: Final = 64
 _FRAMES_NEEDED: Final = 2
 _REPLIES_NEEDED: Final = 4
 
@@ -26,33 +23,15 @@ class Rivals:
 
     def __init__(self, own: int) -> None:
         self._own = own
-        self._sent: OrderedDict[tuple[int, bytes], list[float]] = OrderedDict()
         self._frames: list[float] = []
         self._replies: list[float] = []
         self._lock = threading.Lock()
 
-    def sent(self, frame: Frame) -> None:
-        """Note a frame of ours: some interfaces give it back."""
-        key = (frame.identifier, frame.data)
-        with self._lock:
-            self._sent.setdefault(key, []).append(time.monotonic())
-            self._sent.move_to_end(key)
-            while len(self._sent) > _KEPT:
-                self._sent.popitem(last=False)
-
     def heard(self, frame: Frame) -> None:
-        """Look at a frame of the bus."""
-        if frame.identifier & 0xFF != self._own or not _of_a_station(frame.identifier):
-            return
-        now = time.monotonic()
-        with self._lock:
-            times = self._sent.get((frame.identifier, frame.data), [])
-            while times and now - times[0] > _ECHO_SECONDS:
-                times.pop(0)
-            if times:
-                times.pop(0)
-            else:
-                self._frames.append(now)
+        """Look at a frame of the bus that we did not send."""
+        if frame.identifier & 0xFF == self._own and _of_a_station(frame.identifier):
+            with self._lock:
+                self._frames.append(time.monotonic())
                 del self._frames[:-_KEPT]
 
     def unasked(self, node: int) -> None:

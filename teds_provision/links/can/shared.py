@@ -20,7 +20,8 @@ from types import TracebackType
 from typing import Final
 
 from teds_provision.errors import LinkFailure
-from teds_provision.links.can.bus import Bus, Frame
+from teds_provision.links.can.bus import Bus
+from teds_provision.links.can.frame import Frame
 from teds_provision.links.can.gathering import Gathering
 from teds_provision.links.can.isotp import addresses, read_single
 from teds_provision.links.can.rivals import Rivals
@@ -187,7 +188,6 @@ class SharedBus:
     def send(self, frame: Frame) -> None:
         """Put one frame on the bus; raises LinkFailure."""
         self.check()
-        self.rivals.sent(frame)
         with self._sending:
             self._bus.send(frame)
 
@@ -351,7 +351,6 @@ class SharedBus:
             asked.news.put(node)
 
     def _reply(self, frame: Frame) -> None:
-        self.rivals.sent(frame)
         with self._sending:
             self._bus.send(frame)
 

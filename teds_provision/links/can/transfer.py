@@ -10,7 +10,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Final, Literal
 
-from teds_provision.links.can.bus import Frame
+from teds_provision.links.can.frame import Frame
 from teds_provision.links.can.isotp import BLOCK_SIZE, LONGEST, padded, physical_id
 
 CONTINUE, WAIT, OVERFLOW = 0x30, 0x31, 0x32

@@ -41,9 +41,14 @@ def test_a_datagram_that_is_no_frame_is_passed_over(group: str) -> None:
         stranger.setsockopt(socket.IPPROTO_IP, socket.IP_MULTICAST_TTL, 0)
         stranger.sendto(b"\xc1nonsense", (spec.channel, port))
     assert bus.receive(0.3) is None
-    bus.send(Frame(0x18DA21F1, b"still here"[:8]))
+    other = Bus(spec)
+    other.send(Frame(0x18DA21F1, b"still here"[:8]))
     assert bus.receive(0.3) == Frame(0x18DA21F1, b"still he")
+    assert other.receive(0.1) is None  # its own, given back by the kernel, is no frame of another
+    bus.send(Frame(0x18DA21F1, b"still here"[:8]))
+    assert other.receive(0.3) == Frame(0x18DA21F1, b"still he")
     bus.close()
+    other.close()
 
 
 def test_socketcand_has_no_fd() -> None:
