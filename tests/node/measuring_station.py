@@ -1,0 +1,119 @@
+"""A station of the tests' own: a session over a real bus, and what the node's streams bring."""
+
+from __future__ import annotations
+
+import hashlib
+import time
+from dataclasses import replace
+from pathlib import Path
+
+from teds_provision.errors import NodeRefused
+from teds_provision.links.can.bus import Frame
+from teds_provision.links.can.port import CanPort
+from teds_provision.links.can.shared import Ear
+from teds_provision.node import described
+from teds_provision.node.flash_file import FlashFile
+from teds_provision.protocol.messages.frames import Command, Reply, decode_reply
+from teds_provision.protocol.operation.can_frames import Assembly, cut, data_address, trigger_identifier
+from teds_provision.protocol.operation.commands import Operate, Operation
+from teds_provision.protocol.operation.stream_commands import CLOCK, Clock, Subscribed
+from teds_provision.protocol.operation.subscription import Message, Plan, Receiver, TickBounds
+from teds_provision.protocol.operation.timing import ClockSample
+from teds_provision.protocol.session import StationSession
+
+KEY = bytes(range(16))
+
+
+def keyed_node(folder: Path, **order: object) -> FlashFile:
+    """A node made from a datasheet that has a link key already; nothing is signed."""
+    made = described.create(folder, **order)  # type: ignore[arg-type]
+    flash = made.load()
+    made.commit(replace(flash, key=KEY, epoch=1))
+    return made
+
+
+class MeasuringStation:
+    """One session with the node at an address; ``fd`` as in ``--can``."""
+
+    def __init__(self, spec: str, uuid: bytes, address: int) -> None:
+        self.port = CanPort(spec)
+        self.address, self.fd = address, "fd=1" in spec
+        self.link = self.port.link(address)
+        self.session = StationSession(KEY, uuid)
+        self.ear: Ear = self.port.listen(lambda frame: data_address(frame.identifier) is not None)
+        counter = self._plain(self.session.ask()).payload
+        self.session.accept(self._plain(self.session.open(counter)).payload)
+        self.digest = hashlib.sha256(self.teds()).digest()[:16]
+        self.clock = self.read_clock()
+
+    def close(self) -> None:
+        self.port.close()
+
+    def _plain(self, command: Command) -> Reply:
+        return decode_reply(self.link.exchange(command.encode()))
+
+    def send(self, command: Command) -> bytes:
+        """Send sealed; the payload of a good reply, NodeRefused for a refusal."""
+        reply = self.session.unseal(self._plain(self.session.seal(command)).payload)
+        if not reply.ok:
+            raise NodeRefused("refused", reason=reply.payload[0])
+        return reply.payload
+
+    def teds(self) -> bytes:
+        """The Security TEDS, which is short enough for one Read."""
+        return self._plain(Command(0, 1, 2, b"\x80" + bytes(4))).payload[4:]
+
+    def read_clock(self) -> ClockSample:
+        left = time.monotonic_ns()
+        reply = Clock.decode(self.send(CLOCK))
+        self.last_clock = reply
+        return ClockSample(left, time.monotonic_ns(), reply)
+
+    def now(self) -> TickBounds:
+        return self.clock.tick(time.monotonic_ns())
+
+    def operate(self, channel: int = 0, *, lease: int = 10, dead_man: int | None = None) -> None:
+        self.send(Operate(channel, self.digest, lease, dead_man).command())
+
+    def states(self) -> Operation:
+        from teds_provision.protocol.messages.frames import Function, security_command
+
+        return Operation.decode(self.send(security_command(Function.OPERATION)))
+
+    def subscribe(self, plan: Plan) -> tuple[Receiver, Subscribed]:
+        reply = plan.accept(self.send(plan.command()), self.now())
+        return Receiver(plan, reply, self.session.message_key), reply
+
+    def hear(self, receiver: Receiver, messages: int, seconds: float = 20.0) -> list[Message]:
+        """The next messages of one stream."""
+        assembly, heard = Assembly(receiver.plan.length, fd=self.fd), []
+        until = time.monotonic() + seconds
+        while len(heard) < messages:
+            left = until - time.monotonic()
+            assert left > 0, (heard, receiver.counts)
+            frame = self.ear.get(left)
+            address = data_address(frame.identifier) if frame is not None else None
+            if (
+                frame is None
+                or address is None
+                or (address.node, address.stream)
+                != (
+                    self.address,
+                    receiver.plan.subscribe.stream,
+                )
+            ):
+                continue
+            octets = assembly.take(address.segment, frame.data)
+            message = receiver.take(octets, self.now()) if octets is not None else None
+            if message is not None:
+                heard.append(message)
+        return heard
+
+    def drive(self, message: bytes) -> None:
+        for piece in cut(message, fd=self.fd, drive=True):
+            self.port.send(Frame(0x18EF0000 | self.address << 8 | 0xF1, piece.data, self.fd))
+
+    def trigger(self, token: bytes) -> int:
+        """Send a trigger frame; the host's time when it left."""
+        self.port.send(Frame(trigger_identifier(0xF1), token))
+        return time.monotonic_ns()
