@@ -64,6 +64,7 @@ class Board:
         self.battery = battery
         self.shown = shown
         self.faults: set[int] = set()
+        self.sampling: int | None = None
         self._lock = threading.Lock()
         kinds = {channel.number: channel for channel in sheet.channels if channel.kind is not None}
         self._facts = kinds
@@ -107,8 +108,8 @@ class Board:
         return _DRIFT if self.clock.runs_by_itself else _DRIFT_OF_SIMULATION
 
     def now(self) -> int:
-        """The present tick."""
-        return self.clock.tick()
+        """The present tick, or the one up to which samples are being taken."""
+        return self.clock.tick() if self.sampling is None else self.sampling
 
     def keeps(self, period: int) -> bool:
         """Any whole number of nanoseconds is kept on average."""

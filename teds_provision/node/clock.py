@@ -5,6 +5,7 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Callable
+from contextlib import AbstractContextManager, nullcontext
 from typing import Final
 
 NANOSECONDS: Final = 1_000_000_000
@@ -17,7 +18,7 @@ class NodeClock:
     """Ticks in ns since the node's start; they never go back. Thread-safe.
 
     A simulation takes the clock over (:meth:`own_clock`) and moves it on (:meth:`advance`); ``due`` is called for each
-    move, twice: with the values before, and with the new ones.
+    move, twice: with the values before, and with the new ones. A move happens inside ``guard``.
     """
 
     def __init__(self, host: Callable[[], int] = time.monotonic_ns) -> None:
@@ -27,6 +28,7 @@ class NodeClock:
         self._own = False
         self._step = _HOST_STEP
         self.due: Callable[[], None] = lambda: None
+        self.guard: Callable[[], AbstractContextManager[None]] = nullcontext
 
     def tick(self) -> int:
         """The present tick in ns."""
@@ -62,13 +64,13 @@ class NodeClock:
     def advance(self, seconds: float, change: Callable[[], None]) -> None:
         """Go to ``seconds`` since the start; see ``sources.base.Drive``."""
         target = round(seconds * NANOSECONDS)
-        with self._lock:
+        with self.guard(), self._lock:
             step = target - self._base
             if step > 0:
                 self._step = min(step, _MOST_STEP)
                 self._base = target - 1
         self.due()
         change()
-        with self._lock:
+        with self.guard(), self._lock:
             self._base = max(self._base, target)
         self.due()

@@ -12,6 +12,7 @@ from typing import Final, Protocol
 
 from teds_provision.node.board import Board
 from teds_provision.node.can_seat import BUS
+from teds_provision.node.clock import NANOSECONDS
 from teds_provision.node.flash_file import FlashFile
 from teds_provision.node.pulse import Pulse
 from teds_provision.protocol.flash import Flash
@@ -25,6 +26,10 @@ _COARSE: Final = 0.001
 """Seconds: samples are taken with their own ticks, so that looking more often than this is of no use."""
 _QUICK: Final = 0.005
 """Seconds that a point operation may take without holding a Sealed frame up (operation.md, section 2)."""
+_MOST_BEHIND: Final = 200_000_000
+"""ns that sampling may be behind the clock; what is older is lost, and shows as lost."""
+_STEP: Final = 1_000_000
+"""ns: the least step of samples that are caught up with."""
 _EVENTS: Final = 0.005
 """Seconds between two looks at event sensors."""
 _SIMULATION_WAITS: Final = 0.5
@@ -136,6 +141,7 @@ class VirtualNode:
         self.board = board(self.flash_file)
         self._core, self._pulse = _Core(), pulse
         self._wire = threading.Lock()
+        self._sampled = 0
         self._buses: dict[str, SendData] = {}
         self._one_time_at = time.monotonic() + self._delays.crypto
         self.tim = Tim(
@@ -148,7 +154,7 @@ class VirtualNode:
             quick_points=self._delays.crypto <= _QUICK,
         )
         if self.board is not None:
-            self.board.clock.due = self._simulated
+            self.board.clock.due, self.board.clock.guard = self._simulated, self._core.interrupt
 
     # -- what links call -------------------------------------------------------------------------------------------
 
@@ -158,9 +164,11 @@ class VirtualNode:
 
     def request_received(self, link: str, frame: bytes, *, tapped: bool, fd: bool, received: int) -> bytes:
         """Run one command frame; see Measuring."""
+        simulated = self.board is not None and not self.board.clock.runs_by_itself
+        at = None if simulated else received  # a simulation's tick stands still while a command runs
         with self._core.command():
             port = port_of(link)._replace(fd=fd)
-            reply = self.tim.handle(frame, link=link, tapped=tapped, port=port, received=received)
+            reply = self.tim.handle(frame, link=link, tapped=tapped, port=port, received=at)
         with self._wire:
             pass  # a data frame that was on its way out is out: nothing of a stream leaves behind the reply to Stop
         self._wake()
@@ -206,7 +214,7 @@ class VirtualNode:
 
     def tick(self) -> int:
         """The present tick; 0 for a node without clock."""
-        return self.board.now() if self.board is not None else 0
+        return self.board.clock.tick() if self.board is not None else 0
 
     # -- its own life ----------------------------------------------------------------------------------------------
 
@@ -225,19 +233,42 @@ class VirtualNode:
 
     def beat(self) -> float | None:
         """Do what is due in real time; see Pulse."""
-        if self.board is None:
+        board = self.board
+        if board is None:
             return None
         with self._core.interrupt():
-            wait = self.tim.poll()
+            wait = self._sample(board)
             if wait is not None:
-                self._look_for_events(self.board)
+                self._look_for_events(board)
         if wait is None:
             return None
         self._send_frames()
         with self._core.interrupt():
             frame = self.tim.next_frame_in()
-        wait = min(max(wait, _COARSE), _EVENTS if self.board.has_events else wait + _COARSE)
+        wait = min(max(wait, _COARSE), _EVENTS if board.has_events else wait + _COARSE)
         return wait if frame is None else min(frame, wait)
+
+    def _sample(self, board: Board) -> float | None:
+        """Take the samples that are due, in their order, and no more while a full message waits to leave.
+
+        So a host that let the process wait for a moment costs no samples; one that is too slow for long does. Returns
+        what Tim.poll returns.
+        """
+        real = board.clock.tick()
+        at = max(self._sampled, real - _MOST_BEHIND)
+        while True:
+            board.sampling = at
+            try:
+                wait = self.tim.poll()
+            finally:
+                board.sampling = None
+            if at >= real or wait is None:
+                self._sampled = real
+                return wait
+            if self.tim.backlog:
+                self._sampled = at
+                return 0.0
+            at = min(real, at + max(round(wait * NANOSECONDS), _STEP))
 
     def _look_for_events(self, board: Board) -> None:
         for channel, tick, reading in board.events():
@@ -276,5 +307,7 @@ class VirtualNode:
     def _simulated(self) -> None:
         """A simulation moved the clock: take what fell due, and let full messages leave before it goes on."""
         until = time.monotonic() + _SIMULATION_WAITS
-        while (wait := self.beat()) is not None and wait < _COARSE and time.monotonic() < until:
-            time.sleep(wait)
+        while (wait := self.beat()) is not None and time.monotonic() < until:
+            if self._sampled >= self.tick() and self.tim.next_frame_in() is None:
+                return
+            time.sleep(min(wait, _COARSE))

@@ -110,6 +110,11 @@ class StreamRole:
         """Whether a stream runs."""
         return bool(self._streams)
 
+    @property
+    def backlog(self) -> bool:
+        """Whether a full message waits to be begun."""
+        return any(stream.waiting is not None and stream.ready for stream in self._streams)
+
     # -- commands --------------------------------------------------------------------------------------------------
 
     def subscribe(self, payload: bytes, session: NodeSession, port: Port) -> bytes:

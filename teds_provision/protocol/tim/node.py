@@ -155,6 +155,11 @@ class Tim:
         """Seconds until the next data frame of any bus may begin; None where none is waiting."""
         return self._role.next_frame_in() if self._role is not None else None
 
+    @property
+    def backlog(self) -> bool:
+        """Whether a full message waits for the one before it: what is sampled now may push it out."""
+        return self._role is not None and self._role.streams.backlog
+
     def event(self, channel: int, tick: int, octets: bytes, *, valid: bool = True) -> None:
         """An event sensor has seen something at ``tick``."""
         if self._role is not None:
