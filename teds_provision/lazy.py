@@ -30,3 +30,23 @@ def lazy(package: str, where: Mapping[str, str]) -> Callable[[str], object]:
         return value
 
     return load
+
+
+class _Late:
+    """Stands for a module until something of it is asked for; keeps what was asked for."""
+
+    def __init__(self, module: str) -> None:
+        self.__dict__["_module"] = module
+
+    def __getattr__(self, name: str) -> object:
+        value: object = getattr(import_module(self.__dict__["_module"]), name)
+        self.__dict__[name] = value
+        return value
+
+
+def late(module: str) -> object:
+    """Return what stands for a heavy library until its first use, so that its import can stand on top.
+
+    For type checkers: ``if TYPE_CHECKING: import numpy as np``, ``else: np = late("numpy")``.
+    """
+    return _Late(module)

@@ -8,6 +8,7 @@ from teds_provision import teds
 from teds_provision.harmless import printable
 from teds_provision.teds.codec.codes import AccessCode
 from teds_provision.teds.image import Image
+from teds_provision.teds.sheet import described
 
 
 @dataclass(frozen=True)
@@ -41,15 +42,11 @@ def _name(image: Image, channel: int) -> str | None:
     return printable(found) if isinstance(found, str) else None
 
 
-def _channel(image: Image, channel: int) -> ChannelSummary:
-    from teds_provision.teds.units.units import display_unit, format_value
-
-    decoded = teds.decode(image.blocks[channel, AccessCode.CHANNEL])
-    units, low, high = decoded.get("PhyUnits"), decoded.get("LowLimit"), decoded.get("HiLimit")
+def _channel(image: Image, number: int) -> ChannelSummary:
+    channel = described(number, image.blocks)
     unit = text = ""
-    if isinstance(units, teds.Units) and isinstance(low, float) and isinstance(high, float):
-        shown = display_unit(units)
-        unit, text = shown.text, f"{format_value(low, shown)} to {format_value(high, shown)}"
+    if channel.units_stated and channel.has_range:
+        unit, text = channel.unit.text, f"{channel.show(channel.low)} to {channel.show(channel.high)}"
     return ChannelSummary(
-        channel, _name(image, channel) or "", unit, text, (channel, AccessCode.CALIBRATION) in image.blocks
+        number, _name(image, number) or "", unit, text, (number, AccessCode.CALIBRATION) in image.blocks
     )

@@ -10,40 +10,46 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
-from datetime import datetime
-from enum import IntEnum
-from functools import cached_property
 from typing import Final
 
 from teds_provision.errors import BadData
 from teds_provision.teds.calibration.decoded import from_decoded, is_finite
 from teds_provision.teds.calibration.model import Calibration
-from teds_provision.teds.calibration.samples import DataModel, SampleForm
+from teds_provision.teds.channel import (
+    NOT_STATED,
+    Channel,
+    Kind,
+    Sampling,
+    Timing,
+    channel_from,
+    described,
+    number_of,
+    read_channel,
+)
 from teds_provision.teds.codec.codes import AccessCode
 from teds_provision.teds.codec.decode import decode
-from teds_provision.teds.codec.model import Decoded, Finding, Severity, Units, Verdict
+from teds_provision.teds.codec.model import Decoded, Finding, Severity, Verdict
 from teds_provision.teds.codec.tables import name_of
 from teds_provision.teds.image import BlockId, Image
-from teds_provision.teds.units.names import ARBITRARY, DIGITAL, RATIO
-from teds_provision.teds.units.units import WrittenUnit, display_unit, format_units, format_value
 
-NOT_STATED: Final = math.nan
-"""Stands for a number that the TEDS do not give, or call not available: IEEE 1451.0 writes NaN for that itself."""
+__all__ = [
+    "NOT_STATED",
+    "Channel",
+    "Kind",
+    "Meta",
+    "Sampling",
+    "Sheet",
+    "SheetFinding",
+    "Timing",
+    "channel_from",
+    "channel_of",
+    "computable",
+    "described",
+    "name_among",
+    "node_name",
+]
 
 _DAMAGED: Final = (Verdict.MALFORMED, Verdict.FRAME_BAD, Verdict.FRAME_AND_CONTENT_BAD, Verdict.MESSAGE)
-
-
-class Kind(IntEnum):
-    """ChanType (field 11 of the TransducerChannel TEDS): what a channel is."""
-
-    SENSOR = 0
-    ACTUATOR = 1
-    EVENT_SENSOR = 2
-
-    @property
-    def word(self) -> str:
-        """``sensor``, ``actuator``, ``event sensor``."""
-        return self.name.lower().replace("_", " ")
 
 
 @dataclass(frozen=True)
@@ -71,130 +77,6 @@ class Meta:
     operation_timeout: float = NOT_STATED
     slow_access_timeout: float = NOT_STATED
     self_test_time: float = NOT_STATED
-
-
-@dataclass(frozen=True)
-class Sampling:
-    """How a channel samples: SampMode (a mask), SDefault as it stands (sources disagree on it); None: not stated."""
-
-    modes: int | None = None
-    default: int | None = None
-
-
-@dataclass(frozen=True)
-class Timing:
-    """Times of a channel in seconds, NaN where not stated; ``period`` is SPeriod."""
-
-    period: float = NOT_STATED
-    update: float = NOT_STATED
-    write_setup: float = NOT_STATED
-    read_setup: float = NOT_STATED
-    read_delay: float = NOT_STATED
-    warm_up: float = NOT_STATED
-
-
-@dataclass(frozen=True)
-class Channel:
-    """One TransducerChannel. Limits and uncertainty are in SI units as its own TEDS states them, NaN where it does not.
-
-    ``units`` are the exponents of PhyUnits, ``unit`` the unit in which people see its values. ``kind`` is None for a
-    ChanType that is not known, ``halt`` is ActHalt (field 36). ``described`` is False where there is no
-    TransducerChannel TEDS at all. ``calibration`` is None where there is none or none that can be computed;
-    ``calibration_problem`` then says why.
-    """
-
-    number: int
-    name: str = ""
-    described: bool = False
-    kind: Kind | None = None
-    units: Units = Units()  # noqa: RUF009 - frozen
-    low: float = NOT_STATED
-    high: float = NOT_STATED
-    uncertainty: float = NOT_STATED
-    sample: SampleForm | None = None
-    sampling: Sampling = Sampling()
-    timing: Timing = Timing()
-    halt: int | None = None
-    calibration_key: int | None = None
-    calibration: Calibration | None = None
-    calibration_problem: str = ""
-
-    @property
-    def actuator(self) -> bool:
-        """Whether it acts; everything else gives values."""
-        return self.kind is Kind.ACTUATOR
-
-    @property
-    def period(self) -> float:
-        """SPeriod in seconds, NaN where not stated."""
-        return self.timing.period
-
-    @cached_property
-    def unit(self) -> WrittenUnit:
-        """Unit in which people see its values: the calibrated one where that has a usual name, else a friendly one."""
-        if self.calibration is not None and self.calibration.unit.text[:1] not in ("", "("):
-            return self.calibration.unit
-        return display_unit(self.units)
-
-    @property
-    def si_unit(self) -> str:
-        """Name of the SI unit of limits and uncertainty: ``rad``, ``N``; ``count`` for plain numbers."""
-        return format_units(self.units) or "count"
-
-    @property
-    def has_range(self) -> bool:
-        """Whether both limits are stated."""
-        return math.isfinite(self.low) and math.isfinite(self.high)
-
-    @property
-    def stated_uncertainty(self) -> float:
-        """Uncertainty in SI units: that of the calibration where it states one, else that of the channel."""
-        own = self.calibration
-        if own is not None and own.uncertainty is not None and math.isfinite(own.uncertainty):
-            return own.unit.difference_to_si(own.uncertainty)
-        return self.uncertainty
-
-    @property
-    def calibrated_at(self) -> datetime | None:
-        """Date of the last calibration, None where there is none."""
-        return self.calibration.date if self.calibration is not None else None
-
-    @property
-    def due(self) -> datetime | None:
-        """When the next calibration is due, None where nothing says so."""
-        return self.calibration.due if self.calibration is not None else None
-
-    def overdue(self, now: datetime) -> bool:
-        """Whether the next calibration was due before ``now``."""
-        return self.calibration is not None and self.calibration.overdue(now)
-
-    @property
-    def value_problem(self) -> str:
-        """Why its samples give no values in a unit, as a sentence; "" where they do.
-
-        Without a calibration only floats (in SI units), counts, bits, times and fractions of a ratio are values.
-        """
-        if self.calibration_problem:
-            return f"Channel {self.number} has a calibration that cannot be used: {self.calibration_problem}"
-        if self.sample is None:
-            return f"The datasheet does not say how a sample of channel {self.number} is coded."
-        if self.sample.problem:
-            return f"The samples of channel {self.number} cannot be read: {self.sample.problem}."
-        if self.calibration is None and not self._speaks_for_itself(self.sample.model):
-            unit = self.unit.text
-            return f"Channel {self.number} has no calibration: its raw values cannot be turned into {unit}."
-        return ""
-
-    def _speaks_for_itself(self, model: int) -> bool:
-        if model in (DataModel.FLOAT32, DataModel.FLOAT64, DataModel.TIME_OF_DAY):
-            return True
-        if self.units.interpretation in (DIGITAL, ARBITRARY) or self.units == Units(extension=self.units.extension):
-            return True
-        return self.units.interpretation == RATIO and model in (DataModel.FRACTION, DataModel.LONG_FRACTION)
-
-    def show(self, value: float, *, difference: bool = False, digits: int = 6) -> str:
-        """Value in SI units as people see it: ``360 °``, ``0.35 N``; a difference leaves the unit's offset out."""
-        return format_value(value, self.unit, difference=difference, digits=digits)
 
 
 @dataclass(frozen=True)
@@ -241,9 +123,10 @@ def channel_of(number: int, blocks: Mapping[BlockId, bytes]) -> Channel:
     return _Reader(b"", blocks).channel(number)
 
 
-def channel_from(decoded: Decoded, number: int = 0) -> Channel:
-    """What a decoded TransducerChannel TEDS alone says of its channel."""
-    return _channel(number, "", decoded)
+def name_among(number: int, blocks: Mapping[BlockId, bytes]) -> str:
+    """Name of a channel (0: of the node) among framed TEDS, "" where there is none that can be printed."""
+    octets = blocks.get((number, AccessCode.NAME))
+    return node_name(decode(octets) if octets is not None else None)
 
 
 def node_name(decoded: Decoded | None) -> str:
@@ -274,7 +157,7 @@ class _Reader:
         return node_name(self.decoded(channel, AccessCode.NAME))
 
     def channel(self, number: int) -> Channel:
-        own = _channel(number, self.name(number), self.decoded(number, AccessCode.CHANNEL))
+        own = read_channel(number, self.name(number), self.decoded(number, AccessCode.CHANNEL))
         teds = self.decoded(number, AccessCode.CALIBRATION)
         if teds is None:
             return own
@@ -297,7 +180,7 @@ class _Reader:
             uuid if isinstance(uuid, bytes) else None,
             self.name(0),
             channels if isinstance(channels, int) else None,
-            *(_float(teds, name) for name in ("OholdOff", "SHoldOff", "TestTime")),
+            *(number_of(teds, name) for name in ("OholdOff", "SHoldOff", "TestTime")),
         )
 
     def sheet(self) -> Sheet:
@@ -353,30 +236,6 @@ def _between(uuid: bytes, meta: Meta, channels: list[Channel]) -> Iterator[Sheet
                 yield SheetFinding(channel.number, AccessCode.NAME, "warning", "same-name", message)
 
 
-def _channel(number: int, name: str, teds: Decoded | None) -> Channel:
-    if teds is None:
-        return Channel(number, name)
-    units, kind = teds.get("PhyUnits"), _integer(teds, "ChanType")
-    model, octets = _integer(teds, "DatModel"), _integer(teds, "ModLenth")
-    return Channel(
-        number,
-        name,
-        described=True,
-        kind=Kind(kind) if kind in set(Kind) else None,
-        units=units if isinstance(units, Units) else Units(),
-        low=_float(teds, "LowLimit"),
-        high=_float(teds, "HiLimit"),
-        uncertainty=_float(teds, "OError"),
-        sample=None if model is None or octets is None else SampleForm(model, octets, _integer(teds, "SigBits") or 0),
-        sampling=Sampling(_integer(teds, "SampMode"), _integer(teds, "SDefault")),
-        timing=Timing(
-            *(_float(teds, name) for name in ("SPeriod", "UpdateT", "WSetupT", "RSetupT", "RDelayT", "WarmUpT"))
-        ),
-        halt=_integer(teds, "ActHalt"),
-        calibration_key=_integer(teds, "CalKey"),
-    )
-
-
 def computable(calibration: Calibration) -> str:
     """Why nothing can be computed with a calibration; "" where it can."""
     unit = calibration.unit
@@ -387,13 +246,3 @@ def computable(calibration: Calibration) -> str:
     if not math.isfinite(unit.scale) or not math.isfinite(unit.offset) or unit.scale == 0:
         return "The calibrated unit has no way into SI units: its slope is 0 or not finite."
     return ""
-
-
-def _float(teds: Decoded, name: str) -> float:
-    value = teds.get(name)
-    return float(value) if isinstance(value, (int, float)) else NOT_STATED
-
-
-def _integer(teds: Decoded, name: str) -> int | None:
-    value = teds.get(name)
-    return value if isinstance(value, int) else None

@@ -12,8 +12,9 @@ from hypothesis import strategies as st
 
 from teds_provision import teds
 from teds_provision.teds.calibration import Calibration, CalibrationInput, fit
-from teds_provision.teds.diff.datasheets import Change, diff_blocks, show_seconds
+from teds_provision.teds.diff.datasheets import Change, diff_blocks
 from teds_provision.teds.profile import Profile, load_profile, shipped_profiles
+from teds_provision.teds.show.values import seconds
 from teds_provision.teds.units.units import parse_unit
 
 UUID = bytes(10)
@@ -82,7 +83,7 @@ def test_a_change_of_method_date_and_uncertainty_is_told(finger: Profile) -> Non
     told = " ".join(texts(diff_blocks(*(finger.build(UUID, calibration={1: c}).blocks for c in (one, other)))))
     assert "linear -> table of 2 segments" in told
     assert "LstCalDt removed (was 2026-10-31 12:00:00 UTC)" in told
-    assert "CalInrvl removed (was 180 d)" in told
+    assert "CalInrvl removed (was 180 days)" in told
     assert "stated uncertainty 0.1 -> 0.05" in told
 
 
@@ -121,8 +122,8 @@ def test_fields_added_and_removed_and_repeated_are_told() -> None:
     new = {(0, 1): teds.compose(1, [*meta, ("SHoldOff", 2.0), group, other])}
     told = texts(diff_blocks(old, new))
     assert "node: slow-access time-out added: 2 s." in told
-    assert "node: VGroup 2, MemList added: [3]." in told
-    assert "node: VGroup 2, MemList removed (was [3])." in texts(diff_blocks(new, old))
+    assert "node: VGroup 2, MemList added: 3." in told
+    assert "node: VGroup 2, MemList removed (was 3)." in texts(diff_blocks(new, old))
 
 
 def test_the_same_content_in_other_octets_is_said() -> None:
@@ -148,7 +149,8 @@ def test_any_octets_can_be_compared(old: dict[tuple[int, int], bytes], new: dict
 
 
 @pytest.mark.parametrize(
-    ("value", "shown"), [(1e-4, "100 µs"), (0.5, "500 ms"), (2.0, "2 s"), (0.0, "0 s"), (31536000.0, "365 d")]
+    ("value", "shown"),
+    [(1e-4, "100 µs"), (0.5, "500 ms"), (2.0, "2 s"), (0.0, "0 s"), (31536000.0, "365 days"), (86400.0, "86400 s")],
 )
 def test_times_are_shown_in_the_unit_people_use(value: float, shown: str) -> None:
-    assert show_seconds(value) == shown
+    assert seconds(value) == shown

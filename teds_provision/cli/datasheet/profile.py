@@ -11,8 +11,21 @@ import click
 
 from teds_provision.cli.context import App, pass_app
 from teds_provision.cli.options import COMMAND_SETTINGS, command, dry_run_option, examples
+from teds_provision.cli.rendering import print_table
 from teds_provision.errors import BadData, UsageFailure
 from teds_provision.files import SHARED, write_new
+from teds_provision.teds.profile import check as check_profile
+from teds_provision.teds.profile import (
+    default_folders,
+    describe,
+    find_profile,
+    list_profiles,
+    listed,
+    load_profile,
+    template,
+)
+from teds_provision.teds.show.values import seconds
+from teds_provision.teds.units.units import short_unit
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -33,15 +46,11 @@ def profile() -> None:
 @pass_app
 def list_(app: App) -> None:
     """Name every known type."""
-    from teds_provision.teds.profile import default_folders, list_profiles, listed
-
     entries = [listed(entry) for entry in list_profiles(default_folders(app.home))]
 
     def human(console: Console) -> None:
         from rich.markup import escape
         from rich.table import Table
-
-        from teds_provision.cli.rendering import print_table
 
         table = Table(box=None, pad_edge=False)
         for title in ("Profile", "Channels", "Links"):
@@ -67,16 +76,12 @@ def list_(app: App) -> None:
 @pass_app
 def show(app: App, name: str) -> None:
     """Show one type: channels with units, ranges, and what is asked of a calibration."""
-    from teds_provision.teds.profile import default_folders, describe, load_profile
-
     data = describe(load_profile(name, default_folders(app.home)))
     app.emit({"profiles": [data]}, lambda console: _show(console, data))
 
 
 def _show(console: Console, data: dict[str, Any]) -> None:
     from rich.markup import escape
-
-    from teds_provision.cli.rendering import print_table
 
     console.print(f"[bold]{escape(data['title'])}[/bold]  {escape(data['file'])}")
     if data["extends"]:
@@ -94,9 +99,6 @@ def _channels(channels: list[dict[str, Any]]) -> Table:
     from rich.table import Table
     from rich.text import Text
 
-    from teds_provision.teds.diff.datasheets import show_seconds
-    from teds_provision.teds.units.units import short_unit
-
     table = Table(box=None, pad_edge=False)
     for title in ("Ch", "Name", "Type", "Range", "Uncertainty", "Period"):
         table.add_column(title, no_wrap=True)
@@ -110,7 +112,7 @@ def _channels(channels: list[dict[str, Any]]) -> Table:
             channel["type"],
             f"{channel['low_limit']:.6g} to {channel['high_limit']:.6g} {unit}",
             f"{channel['uncertainty']:.6g} {unit}",
-            show_seconds(period) if period is not None else "",
+            seconds(period) if period is not None else "",
             _demand(channel["calibration"]),
         )
         table.add_row(*map(Text, row))
@@ -142,9 +144,6 @@ def _demand(demand: dict[str, Any]) -> str:
 @pass_app
 def check(app: App, names: tuple[str, ...]) -> None:
     """Look for every mistake: file, line, field, and what is wrong. Exits 8 where there is one."""
-    from teds_provision.teds.profile import check as check_profile
-    from teds_provision.teds.profile import default_folders, find_profile
-
     folders = default_folders(app.home)
     told: list[dict[str, Any]] = []
     first: Problem | None = None
@@ -188,8 +187,6 @@ profile.add_command(check)
 def new(app: App, name: str, extends: str | None, output: Path | None, dry_run: bool) -> None:
     """Write a commented template of a new type, every key in it."""
     import re
-
-    from teds_provision.teds.profile import default_folders, find_profile, template
 
     if not re.fullmatch(r"[a-z0-9][a-z0-9._-]{0,63}", name):
         raise UsageFailure(

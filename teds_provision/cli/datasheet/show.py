@@ -12,8 +12,15 @@ import click
 
 from teds_provision.cli.context import App, pass_app
 from teds_provision.cli.context import to_json as dumps
+from teds_provision.cli.datasheet.show_files import guard_to_json, load, placed
+from teds_provision.cli.datasheet.show_json import to_json
+from teds_provision.cli.datasheet.show_table import print_files
 from teds_provision.cli.options import command
 from teds_provision.errors import BadData, UsageFailure
+from teds_provision.teds.diff.datasheets import diff_blocks
+from teds_provision.teds.formats import lost, write_blocks
+from teds_provision.teds.guard.guard import check_calibration
+from teds_provision.teds.show.plot import plot_blocks
 
 if TYPE_CHECKING:
     from teds_provision.cli.datasheet.show_files import ShownFile
@@ -54,8 +61,6 @@ def show(
 
     A file of - is standard input. Exits 0 where it could decode, 8 where not even the tuples close, 3 for no such file.
     """
-    from teds_provision.cli.datasheet.show_files import load
-
     if diff is not None and (files or plot or form not in {"table", "json"}):
         raise UsageFailure("--diff compares two files and goes with nothing else.")
     if diff is not None:
@@ -78,21 +83,15 @@ def _tell(app: App, files: Sequence[ShownFile], form: str) -> None:
         for note in file.notes:
             app.note(f"{file.name}: {note}")
     if app.json or form == "json":
-        from teds_provision.cli.datasheet.show_json import to_json
-
         result = to_json(files)
         print(dumps(result, indent=None if app.json else 1), flush=True)
     elif form == "table":
-        from teds_provision.cli.datasheet.show_table import print_files
-
         print_files(app.console(), files)
     else:
         _convert(app, files, cast("Format", form))
 
 
 def _convert(app: App, files: Sequence[ShownFile], form: Format) -> None:
-    from teds_provision.teds.formats import lost, write_blocks
-
     for file in files:
         if file.bundle is not None:
             raise BadData(f"{file.name} holds no TEDS that could be written as {form}.")
@@ -122,10 +121,6 @@ def _judge(files: Sequence[ShownFile], strict: bool) -> None:
 
 
 def _diff(app: App, before: str, after: str, *, as_json: bool) -> None:
-    from teds_provision.cli.datasheet.show_files import guard_to_json, load, placed
-    from teds_provision.teds.diff.datasheets import diff_blocks
-    from teds_provision.teds.guard.guard import check_calibration
-
     old, new = (placed(load(name).blocks) for name in (before, after))
     changes = diff_blocks(old, new)
     guard = check_calibration(new, old)
@@ -142,9 +137,6 @@ def _diff(app: App, before: str, after: str, *, as_json: bool) -> None:
 
 
 def _plot(app: App, files: Sequence[ShownFile], path: Path) -> None:
-    from teds_provision.cli.datasheet.show_files import placed
-    from teds_provision.teds.show.plot import plot_blocks
-
     if len(files) != 1:
         raise UsageFailure("A plot shows the calibrations of one file.", hint="Call show once for each.")
     channels = plot_blocks(placed(files[0].blocks), path)

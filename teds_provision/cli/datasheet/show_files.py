@@ -11,9 +11,12 @@ from typing import TYPE_CHECKING, Any
 from teds_provision.errors import BadData
 from teds_provision.files import read_limited
 from teds_provision.limits import LIMITS
+from teds_provision.protocol.handover.bundle import peek_bundle
+from teds_provision.teds import convert, decode
 from teds_provision.teds.codec.codes import AccessCode
 from teds_provision.teds.codec.model import Decoded, Edition, Finding, Verdict
 from teds_provision.teds.formats import Block, Kind, class_of, detect, read_blocks
+from teds_provision.teds.guard.guard import check_calibration
 from teds_provision.teds.messages import Message, decode_message, looks_like_message
 from teds_provision.teds.show import Shown, describe
 
@@ -67,8 +70,6 @@ def load(name: str, edition: Edition | None = None) -> ShownFile:
     try:
         kind = detect(octets)
         if kind == "bundle":
-            from teds_provision.protocol.handover.bundle import peek_bundle
-
             return ShownFile(name, kind, bundle=peek_bundle(octets))
         path = Path(name) if name != STDIN else None
         blocks = read_blocks(octets, kind, path=path)
@@ -93,7 +94,6 @@ def is_message(octets: bytes) -> bool:
     """Whether octets are a message rather than a TEDS."""
     if looks_like_message(octets):
         return True
-    from teds_provision.teds import decode
 
     return class_of(octets) is None and decode(octets).verdict is Verdict.MESSAGE
 
@@ -116,14 +116,10 @@ def _guard(beside: dict[tuple[int, int], bytes]) -> tuple[GuardFinding, ...]:
         return ()
     from datetime import UTC, datetime
 
-    from teds_provision.teds.guard.guard import check_calibration
-
     return tuple(check_calibration(beside, now=datetime.now(UTC)))
 
 
 def _converted(blocks: Sequence[Block], edition: Edition) -> tuple[list[Block], dict[int, tuple[Finding, ...]]]:
-    from teds_provision.teds import convert, decode
-
     out: list[Block] = []
     said: dict[int, tuple[Finding, ...]] = {}
     for number, block in enumerate(blocks):

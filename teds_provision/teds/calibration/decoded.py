@@ -34,7 +34,7 @@ def from_decoded(
         METHODS[method] if isinstance(method, int) and method < len(METHODS) else _guess(inputs),
         inputs,
         tuple(float(value) for value in coefficients),
-        unit=_unit(decoded, units or Units()),
+        unit=calibrated_unit(decoded, units or Units()),
         zero_offset=_number(decoded, "ZeroOffset") or 0.0,
         low_limit=_number(decoded, "LowLimit"),
         high_limit=_number(decoded, "HiLimit"),
@@ -88,7 +88,8 @@ def _number(decoded: Decoded, name: str) -> float | None:
     return float(value) if isinstance(value, (int, float)) else None
 
 
-def _unit(decoded: Decoded, units: Units) -> WrittenUnit:
+def calibrated_unit(decoded: Decoded, units: Units) -> WrittenUnit:
+    """Calibrated unit of a decoded Calibration TEDS: exponents of the channel, SIConvrt as the way into SI."""
     convert = next((field for field in decoded.fields if field.name == "SIConvrt"), None)
     if convert is None:
         return recognize(units, 1.0, 0.0)

@@ -5,13 +5,18 @@ from __future__ import annotations
 from collections import defaultdict
 from collections.abc import Sequence
 from dataclasses import dataclass
-
-import numpy as np
-from numpy.typing import NDArray
+from typing import TYPE_CHECKING
 
 from teds_provision.errors import BadData
+from teds_provision.lazy import late
 from teds_provision.teds.calibration.formula import evaluate
 from teds_provision.teds.calibration.model import Calibration, CalibrationInput, Method
+
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+else:
+    np = late("numpy")
 
 Points = Sequence[tuple[float, float]]
 MAXIMUM_DEGREE = 12

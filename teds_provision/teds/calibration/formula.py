@@ -8,16 +8,18 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Final, Generic, TypeVar, overload
 
-import numpy as np
-
 from teds_provision.errors import BadData
+from teds_provision.lazy import late
 
 if TYPE_CHECKING:
+    import numpy as np
     from numpy.typing import NDArray
 
     from teds_provision.teds.calibration.model import Calibration, CalibrationInput
 
     Floats = NDArray[np.float64]
+else:
+    np = late("numpy")
 
 _Value = TypeVar("_Value")
 

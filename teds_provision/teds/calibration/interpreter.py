@@ -12,9 +12,8 @@ from dataclasses import dataclass
 from functools import cached_property
 from typing import TYPE_CHECKING, Final
 
-import numpy as np
-
 from teds_provision.errors import BadData
+from teds_provision.lazy import late
 from teds_provision.teds.calibration.formula import PreparedCurve, PreparedInverse
 from teds_provision.teds.calibration.reading import SampleReader
 from teds_provision.teds.calibration.samples import Range, SampleForm
@@ -22,11 +21,14 @@ from teds_provision.teds.sheet import Channel, Sheet
 from teds_provision.teds.units.units import WrittenUnit
 
 if TYPE_CHECKING:
+    import numpy as np
     from numpy.typing import NDArray
 
     from teds_provision.teds.calibration.reading import Octets
 
     Floats = NDArray[np.float64]
+else:
+    np = late("numpy")
 
 _ROUNDING: Final = 4 * 2.0**-23
 """Limits and coefficients are Float32: a value this much of the limit beyond it is not beyond it."""

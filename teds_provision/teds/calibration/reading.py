@@ -11,15 +11,17 @@ from dataclasses import dataclass
 from functools import cached_property
 from typing import TYPE_CHECKING, Final
 
-import numpy as np
-
 from teds_provision.errors import BadData
+from teds_provision.lazy import late
 from teds_provision.teds.calibration.samples import DataModel, SampleForm
 
 if TYPE_CHECKING:
+    import numpy as np
     from numpy.typing import NDArray
 
     Octets = bytes | bytearray | memoryview | NDArray[np.uint8]
+else:
+    np = late("numpy")
 
 _WORD: Final = 8
 _NEGATIVE: Final = 1 << 31

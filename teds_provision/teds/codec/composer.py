@@ -11,6 +11,7 @@ from teds_provision.teds.codec.codes import AccessCode
 from teds_provision.teds.codec.frame import TEDSID, frame, raw_tuple
 from teds_provision.teds.codec.model import Decoded, Edition, Field, Units
 from teds_provision.teds.codec.tables import TEXT_BASED, FieldSpec, Table, table
+from teds_provision.teds.codec.text import compose_text
 from teds_provision.teds.codec.values import pairs_of
 
 NO_SUBFAMILY: Final = 0xFF
@@ -65,8 +66,6 @@ class Composer:
         head = self.tedsid(dict(pairs).get("TEDSID"))
         content = [pair for pair in pairs if pair[0] not in _NOT_CONTENT]
         if self.table.access_code in TEXT_BASED:
-            from teds_provision.teds.codec.text import compose_text
-
             return compose_text(head, content, self.tuples, self.width)
         return head + self.tuples(content, self.table.by_name)
 

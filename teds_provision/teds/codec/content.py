@@ -7,9 +7,12 @@ from collections.abc import Callable, Iterable
 from math import isinf, isnan
 from typing import Final
 
+from teds_provision.teds.codec import security
 from teds_provision.teds.codec.codes import AccessCode
+from teds_provision.teds.codec.frame import frame
 from teds_provision.teds.codec.model import Field, TimeInstance, Units
 from teds_provision.teds.codec.tables import FieldSpec, Table
+from teds_provision.teds.codec.tables.other import LEVELS
 
 Find = Callable[..., None]
 
@@ -163,8 +166,6 @@ def _sample(fields: tuple[Field, ...], find: Find) -> None:
 
 
 def _level(fields: tuple[Field, ...], find: Find) -> None:
-    from teds_provision.teds.codec.tables.other import LEVELS
-
     for field in fields:
         if field.name == "Level" and isinstance(field.value, str) and field.value not in LEVELS:
             message = f"Level is {str(field.value)!r}; A to E and N are known."
@@ -187,8 +188,6 @@ def _security(fields: tuple[Field, ...], find: Find, octets: bytes, framed: bool
     if not any(field.type == PROFILE_VERSION for field in fields):
         find("note", "foreign", "This Security TEDS is not of our profile (no field 105).", None)
         return
-    from teds_provision.teds.codec import security
-    from teds_provision.teds.codec.frame import frame
 
     try:
         security.decode(frame(octets[4:-2] if framed else octets))

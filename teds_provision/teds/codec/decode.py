@@ -11,11 +11,13 @@ from typing import Final
 
 from teds_provision.errors import BadData
 from teds_provision.teds.codec.codes import AccessCode
+from teds_provision.teds.codec.content import check
 from teds_provision.teds.codec.frame import TEDSID
 from teds_provision.teds.codec.head import MAX_TUPLES, Head
 from teds_provision.teds.codec.model import Decoded, Field, Severity, Value, Verdict
 from teds_provision.teds.codec.shape import shape_of, verdict_of
 from teds_provision.teds.codec.tables import MANUFACTURER, TEXT_BASED, FieldSpec, Table, name_of
+from teds_provision.teds.codec.text import split_text
 from teds_provision.teds.codec.values import READERS, is_packed_units, units_of
 
 SUB_SUM: Final = 12
@@ -60,8 +62,6 @@ class _Walk(Head):
             self.tedsid(start, end)
             fields = self.block(start, end)
         if self.table is not None and fields:
-            from teds_provision.teds.codec.content import check
-
             check(self.table, fields, self.find, self.octets, self.framed)
         name = name_of(self.access_code) if self.access_code is not None else ""
         findings = tuple(self.findings)
@@ -287,6 +287,4 @@ class _Walk(Head):
 
     def text_area(self, fields: list[Field], at: int, end: int) -> None:
         """What stands behind the directory of a text-based TEDS."""
-        from teds_provision.teds.codec.text import split_text
-
         self.text = split_text(fields, self.octets[at:end], at, self.find)

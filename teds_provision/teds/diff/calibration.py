@@ -7,15 +7,21 @@ from dataclasses import replace
 from typing import TYPE_CHECKING, Final
 
 from teds_provision.errors import BadData
+from teds_provision.lazy import late
 from teds_provision.teds.calibration.decoded import from_decoded, is_finite
 from teds_provision.teds.calibration.describe import kind_of
 from teds_provision.teds.calibration.model import Calibration
 from teds_provision.teds.codec.codes import AccessCode
 from teds_provision.teds.codec.decode import decode
+from teds_provision.teds.guard.curve import channel_of, curve_of
 from teds_provision.teds.image import BlockId
 
 if TYPE_CHECKING:
+    import numpy as np
+
     from teds_provision.teds.guard.curve import Channel, Curve
+else:
+    np = late("numpy")
 
 CURVE_FIELDS: Final = frozenset({"CalInput", "Coefs", "Method", "ZeroOffset", "SIConvrt"})
 """Fields that make the curve: they are told as one change."""
@@ -26,8 +32,6 @@ def curve_change(channel: int, old: Mapping[BlockId, bytes], new: Mapping[BlockI
 
     None where one of the calibrations cannot be computed: then its fields are to be compared one by one.
     """
-    from teds_provision.teds.guard.curve import channel_of, curve_of
-
     one, other = channel_of(channel, old, None), channel_of(channel, new, None)
     before, after = _calibration(channel, old, one), _calibration(channel, new, other)
     if before is None or after is None or len(before.inputs) != len(after.inputs):
@@ -58,8 +62,6 @@ def _calibration(channel: int, blocks: Mapping[BlockId, bytes], own: Channel) ->
 
 
 def _parts(was: Curve, curve: Curve) -> list[str]:
-    import numpy as np
-
     difference = curve.result - was.result
     if not np.isfinite(difference).all():
         return ["the readings are no numbers"]
@@ -84,7 +86,6 @@ def _parts(was: Curve, curve: Curve) -> list[str]:
 
 def _gain(was: Curve, curve: Curve) -> float | None:
     """Change in percent of the mean slope over the range (least squares), None where it was nothing."""
-    import numpy as np
 
     def slope(one: Curve) -> float:
         along = np.moveaxis(one.result, one.main, 0).reshape(len(one.axes[one.main]), -1).mean(axis=1)

@@ -2,17 +2,18 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import Final
 
 from teds_provision.teds.codec.codes import AccessCode
 from teds_provision.teds.codec.decode import decode
-from teds_provision.teds.codec.model import Decoded, Field, TimeInstance, Units
+from teds_provision.teds.codec.model import Decoded, Field, Units
 from teds_provision.teds.codec.tables import FieldSpec, name_of, table
+from teds_provision.teds.diff.calibration import CURVE_FIELDS, curve_change
 from teds_provision.teds.image import BlockId
-from teds_provision.teds.units.units import display_unit, format_units, format_value
+from teds_provision.teds.sheet import described, name_among
+from teds_provision.teds.show.values import Context, meaning_of, text_of
 
 _BLOCKS: Final[Mapping[int, str]] = {
     AccessCode.META: "Meta-TEDS",
@@ -23,7 +24,6 @@ _BLOCKS: Final[Mapping[int, str]] = {
     AccessCode.PHY: "PHY TEDS",
     AccessCode.SECURITY: "Security TEDS",
 }
-_CHANNEL_VALUES: Final = {"LowLimit": False, "HiLimit": False, "OError": True}
 _LABELS: Final = {
     "LowLimit": "low limit",
     "HiLimit": "high limit",
@@ -41,6 +41,7 @@ _LABELS: Final = {
     "CalKey": "calibration key",
 }
 _OPAQUE: Final = 48
+_OPAQUE_OCTETS: Final = 16
 
 
 @dataclass(frozen=True)
@@ -77,9 +78,8 @@ def diff_blocks(old: Mapping[BlockId, bytes], new: Mapping[BlockId, bytes]) -> l
 def _where(channel: int, old: Mapping[BlockId, bytes], new: Mapping[BlockId, bytes]) -> str:
     if channel == 0:
         return "node"
-    octets = new.get((channel, AccessCode.NAME), old.get((channel, AccessCode.NAME)))
-    name = decode(octets).get("TCName") if octets else None
-    return f"channel {channel} ({name})" if isinstance(name, str) and name.isprintable() else f"channel {channel}"
+    name = name_among(channel, new if (channel, AccessCode.NAME) in new else old)
+    return f"channel {channel} ({name})" if name else f"channel {channel}"
 
 
 def _label(access_code: int) -> str:
@@ -92,15 +92,13 @@ def _block(key: BlockId, where: str, old: Mapping[BlockId, bytes], new: Mapping[
     skip: frozenset[str] = frozenset()
     found = False
     if access_code == AccessCode.CALIBRATION:
-        from teds_provision.teds.diff.calibration import CURVE_FIELDS, curve_change
-
         text = curve_change(channel, old, new)
         if text is not None:
             skip = CURVE_FIELDS
             if text:
                 found = True
                 yield Change(channel, access_code, "curve", "", "", f"{where}: {text}.")
-    units = _units(channel, old), _units(channel, new)
+    contexts = _context(channel, old), _context(channel, new)
     ones, others = _flat(before), _flat(after)
     for path in dict.fromkeys((*ones, *others)):
         one, other = ones.get(path), others.get(path)
@@ -109,8 +107,8 @@ def _block(key: BlockId, where: str, old: Mapping[BlockId, bytes], new: Mapping[
             continue
         found = True
         was, now = (
-            _shown(field, access_code, path, unit) if field else ""
-            for field, unit in zip((one, other), units, strict=True)
+            _shown(field, access_code, path, context) if field else ""
+            for field, context in zip((one, other), contexts, strict=True)
         )
         yield Change(channel, access_code, name, was, now, _sentence(where, path, was, now))
     if not found:
@@ -144,10 +142,9 @@ def _flat(decoded: Decoded) -> dict[_Path, Field]:
     return out
 
 
-def _units(channel: int, blocks: Mapping[BlockId, bytes]) -> Units | None:
-    octets = blocks.get((channel, AccessCode.CHANNEL))
-    units = decode(octets).get("PhyUnits") if octets else None
-    return units if isinstance(units, Units) else None
+def _context(channel: int, blocks: Mapping[BlockId, bytes]) -> Context:
+    own = described(channel, blocks)
+    return Context(own.unit if own.units_stated else None, channel=channel)
 
 
 def _sentence(where: str, path: _Path, before: str, after: str) -> str:
@@ -161,27 +158,16 @@ def _sentence(where: str, path: _Path, before: str, after: str) -> str:
     return f"{where}: {label} {before} -> {after}."
 
 
-def _shown(field: Field, access_code: int, path: _Path, units: Units | None) -> str:
-    value = field.value
+def _shown(field: Field, access_code: int, path: _Path, context: Context) -> str:
     spec = _spec(access_code, path)
-    if isinstance(value, Units):
-        return format_units(value) or "count"
-    if isinstance(value, TimeInstance):
-        return _moment(value, spec)
-    if isinstance(value, float):
-        if access_code == AccessCode.CHANNEL and field.name in _CHANNEL_VALUES and units is not None:
-            return format_value(value, display_unit(units), difference=_CHANNEL_VALUES[field.name])
-        return show_seconds(value) if spec is not None and _is_time(access_code, spec) else f"{value:.6g}"
-    if isinstance(value, int) and spec is not None and value in spec.enumeration:
-        return spec.enumeration[value]
-    if isinstance(value, str):
-        return value if len(value) <= _OPAQUE else f"{len(value)} octets"
-    if isinstance(value, bytes):
-        return value.hex() if len(value) <= 16 else f"{len(value)} octets"
-    if isinstance(value, tuple):
-        inside = ", ".join(f"{part:.6g}" if isinstance(part, float) else str(part) for part in value[:8])
-        return f"[{inside}{', and so on' if len(value) > 8 else ''}]"
-    return str(value) if value is not None else field.raw.hex() or "nothing"
+    word, _ = meaning_of(field, spec)
+    if word:
+        return word
+    opaque = isinstance(field.value, bytes) or (spec is not None and spec.kind == "key")
+    if (opaque and len(field.raw) > _OPAQUE_OCTETS) or (isinstance(field.value, str) and len(field.value) > _OPAQUE):
+        return f"{len(field.raw)} octets"
+    plain = context if access_code == AccessCode.CHANNEL else Context(channel=context.channel)
+    return text_of(field, plain, spec) or "nothing"
 
 
 def _spec(access_code: int, path: _Path) -> FieldSpec | None:
@@ -193,32 +179,3 @@ def _spec(access_code: int, path: _Path) -> FieldSpec | None:
             return None
         rows = spec.by_name
     return spec
-
-
-def _is_time(access_code: int, spec: FieldSpec) -> bool:
-    """Whether a Float32 of Meta or TransducerChannel TEDS counts seconds."""
-    if access_code == AccessCode.META:
-        return spec.type in (10, 11, 12)
-    return access_code == AccessCode.CHANNEL and (20 <= spec.type <= 26 or 28 <= spec.type <= 30)
-
-
-def _moment(value: TimeInstance, spec: FieldSpec | None) -> str:
-    if spec is not None and spec.kind == "duration":
-        return show_seconds(value.seconds + value.nanoseconds * 1e-9)
-    from datetime import UTC, datetime, timedelta
-
-    seconds = -value.seconds if value.negative else value.seconds
-    try:
-        return f"{datetime(1970, 1, 1, tzinfo=UTC) + timedelta(seconds=seconds):%Y-%m-%d %H:%M:%S} UTC"
-    except OverflowError:
-        return f"{seconds} s"
-
-
-def show_seconds(value: float) -> str:
-    """``100 µs``, ``2 s``, ``365 d``: a time in the unit people would use."""
-    if not math.isfinite(value):
-        return "not available"
-    for least, scale, unit in ((2 * 86_400, 86_400, "d"), (1, 1, "s"), (1e-3, 1e-3, "ms"), (1e-6, 1e-6, "µs")):
-        if abs(value) >= least * 0.9999999:
-            return f"{value / scale:.6g} {unit}"
-    return f"{value:.6g} s"

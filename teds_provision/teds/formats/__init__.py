@@ -24,7 +24,14 @@ from typing import Final, Literal, get_args
 
 from teds_provision.errors import BadData
 from teds_provision.limits import LIMITS, check_count, check_size, load_json
+from teds_provision.teds.codec.decode import decode
 from teds_provision.teds.formats.block import Block, class_of, is_run, split_run, with_class
+from teds_provision.teds.formats.hextext import looks_like_hex, read_hex, write_hex
+from teds_provision.teds.formats.intelhex import read_intel_hex, write_intel_hex
+from teds_provision.teds.formats.jsonform import read_json, write_json
+from teds_provision.teds.formats.profileform import read_profile, write_profile
+from teds_provision.teds.formats.xmlform import read_xml, write_xml
+from teds_provision.teds.image import Image
 
 __all__ = [
     "FORMATS",
@@ -61,7 +68,6 @@ def detect(octets: bytes) -> Kind:
         return _json_kind(text)
     if stripped.startswith(":"):
         return "ihex"
-    from teds_provision.teds.formats.hextext import looks_like_hex
 
     if looks_like_hex(text):
         return "hex"
@@ -104,8 +110,6 @@ def _read(octets: bytes, kind: Kind, path: Path | None) -> list[Block]:
     if kind == "binary":
         return [with_class(piece) for piece in split_run(octets)]
     if kind == "xml":
-        from teds_provision.teds.formats.xmlform import read_xml
-
         return read_xml(octets)
     try:
         text = octets.decode("utf-8-sig")
@@ -116,25 +120,15 @@ def _read(octets: bytes, kind: Kind, path: Path | None) -> list[Block]:
 
 def _read_text(text: str, kind: Kind, path: Path | None) -> list[Block]:
     if kind == "hex":
-        from teds_provision.teds.formats.hextext import read_hex
-
         return read_hex(text)
     if kind == "ihex":
-        from teds_provision.teds.formats.intelhex import read_intel_hex
-
         return read_intel_hex(text)
     if kind == "json":
-        from teds_provision.teds.formats.jsonform import read_json
-
         return read_json(text)
     if kind == "image":
-        from teds_provision.teds.image import Image
-
         image = Image.from_json(text)
         return [Block(channel, code, image.blocks[channel, code]) for channel, code in image]
     if kind == "toml":
-        from teds_provision.teds.formats.profileform import read_profile
-
         return read_profile(text, path)
     raise BadData("A sealed bundle holds keys for other stations, no TEDS that can be read here.")
 
@@ -153,24 +147,15 @@ def write_blocks(blocks: Sequence[Block], format: Format) -> bytes | str:
             )
         return b"".join(block.octets for block in blocks)
     if format == "hex":
-        from teds_provision.teds.formats.hextext import write_hex
-
         return write_hex(blocks)
     if format == "ihex":
-        from teds_provision.teds.formats.intelhex import write_intel_hex
-
         return write_intel_hex(blocks)
     if format == "json":
-        from teds_provision.teds.formats.jsonform import write_json
-
         return write_json(blocks)
     if format == "xml":
-        from teds_provision.teds.formats.xmlform import write_xml
-
         return write_xml(blocks)
     if format == "image":
         return _image(blocks)
-    from teds_provision.teds.formats.profileform import write_profile
 
     return write_profile(blocks)[0]
 
@@ -178,8 +163,6 @@ def write_blocks(blocks: Sequence[Block], format: Format) -> bytes | str:
 def lost(blocks: Sequence[Block], format: Format) -> tuple[str, ...]:
     """What the format cannot hold of these TEDS, one sentence each; empty where writing loses nothing."""
     if format == "toml":
-        from teds_provision.teds.formats.profileform import write_profile
-
         return write_profile(blocks)[1]
     if format in {"binary", "ihex"} and any(block.channel is not None for block in blocks):
         return ("the channels of the TEDS.",)
@@ -187,9 +170,6 @@ def lost(blocks: Sequence[Block], format: Format) -> tuple[str, ...]:
 
 
 def _image(blocks: Sequence[Block]) -> str:
-    from teds_provision.teds import decode
-    from teds_provision.teds.image import Image
-
     placed: dict[tuple[int, int], bytes] = {}
     for channel, code, octets in blocks:
         if channel is None or code is None:

@@ -12,6 +12,7 @@ from typing import Final
 
 from teds_provision.errors import BadData
 from teds_provision.limits import LIMITS, check_count
+from teds_provision.teds.codec.tables import name_of
 from teds_provision.teds.formats.block import Block, class_of, split_run, with_class
 
 _PLACE: Final = re.compile(r"#\s*channel (\d{1,5}|-) access code (\d{1,3}|-)(?=\s|$)")
@@ -71,8 +72,6 @@ def _finish(place: tuple[int | None, int | None] | None, parts: list[str]) -> li
 
 def write_hex(blocks: Sequence[Block]) -> str:
     """Write one comment and the digits of each TEDS; nothing is lost."""
-    from teds_provision.teds.codec.tables import name_of
-
     lines: list[str] = []
     for channel, code, octets in blocks:
         if channel is not None or code != class_of(octets) or len(blocks) > 1 or split_run(octets) != [octets]:

@@ -13,8 +13,9 @@ from tempfile import TemporaryDirectory
 from typing import Final
 
 from teds_provision.errors import BadData
-from teds_provision.teds import decode
+from teds_provision.teds.channel import channel_from
 from teds_provision.teds.codec.codes import AccessCode
+from teds_provision.teds.codec.decode import decode
 from teds_provision.teds.codec.model import UNIT_PARTS, Decoded, Edition, Field, Units
 from teds_provision.teds.codec.tables import name_of
 from teds_provision.teds.formats.block import Block
@@ -129,15 +130,15 @@ def _meta(teds: Decoded | None) -> Iterator[str]:
 def _channel(teds: Decoded, name: str, number: int) -> Iterator[str]:
     if name:
         yield f"name = {_quoted(name)}"
-    units = teds.get("PhyUnits")
-    if isinstance(units, Units):
-        yield f"unit = {_quoted(spell(units))}"
-        shown = display_unit(units)
+    channel = channel_from(teds)
+    if channel.units_stated:
+        yield f"unit = {_quoted(spell(channel.units))}"
+        shown = display_unit(channel.units)
         if shown.scale != 1 or shown.offset:
             yield f"display-unit = {_quoted(shown.text.replace('°C', 'degC').replace('°', 'degree'))}"
     yield from _keys(CHANNEL_KEYS, teds.fields)
-    key = teds.get("CalKey")
-    if isinstance(key, int):
+    key = channel.calibration_key
+    if key is not None:
         word = next((word for word, code in CALIBRATION_KEYS.items() if code == key), None)
         yield f"calibration-key = {key if word is None else _quoted(word)}"
     sample = teds.field("Sample")

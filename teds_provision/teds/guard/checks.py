@@ -5,13 +5,17 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from dataclasses import replace
-from typing import Final, Literal
+from typing import TYPE_CHECKING, Final, Literal
 
-import numpy as np
-
+from teds_provision.lazy import late
 from teds_provision.teds.calibration.fitting import residuals
 from teds_provision.teds.calibration.model import Calibration
 from teds_provision.teds.guard.curve import FLOAT32_STEP, Curve
+
+if TYPE_CHECKING:
+    import numpy as np
+else:
+    np = late("numpy")
 
 Raised = tuple[str, Literal["error", "warning"], str]
 """Code, severity, message."""

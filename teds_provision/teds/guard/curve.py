@@ -8,21 +8,21 @@ from dataclasses import dataclass
 from functools import cached_property
 from typing import TYPE_CHECKING, Final
 
-import numpy as np
-
+from teds_provision.lazy import late
 from teds_provision.teds.calibration.formula import evaluate
 from teds_provision.teds.calibration.model import Calibration
-from teds_provision.teds.calibration.samples import raw_range
-from teds_provision.teds.codec.codes import AccessCode
-from teds_provision.teds.codec.decode import decode
-from teds_provision.teds.codec.model import Decoded, Units
+from teds_provision.teds.codec.model import Units
 from teds_provision.teds.image import BlockId
+from teds_provision.teds.sheet import described
 from teds_provision.teds.units.units import WrittenUnit, display_unit, format_value, parse_unit
 
 if TYPE_CHECKING:
+    import numpy as np
     from numpy.typing import NDArray
 
-    from teds_provision.teds.profile.model import ChannelProfile, Profile
+    from teds_provision.teds.profile.model import Profile
+else:
+    np = late("numpy")
 
 SAMPLES: Final = 65_537
 GRID: Final = 250_000
@@ -67,41 +67,21 @@ class Channel:
 
 def channel_of(number: int, blocks: Mapping[BlockId, bytes], profile: Profile | None) -> Channel:
     """What TEDS and profile say of a channel; the limits are those of the TEDS."""
-    own = decode(blocks[number, AccessCode.CHANNEL]) if (number, AccessCode.CHANNEL) in blocks else None
+    own = described(number, blocks)
     said = profile.channel(number) if profile is not None else None
-    units = own.get("PhyUnits") if own else None
-    model = _integer(own, "DatModel")
-    ends = None
-    if said is not None:
-        ends = said.raw_range
-    elif own is not None and own.get("ModLenth") is not None:
-        ends = raw_range(model, _integer(own, "ModLenth"), _integer(own, "SigBits"))
+    ends = said.raw_range if said is not None else own.sample.raw_range if own.sample is not None else None
     return Channel(
         number,
-        units if isinstance(units, Units) else _units(said),
-        _float(own, "LowLimit"),
-        _float(own, "HiLimit"),
-        _float(own, "OError"),
+        own.units if own.units_stated or said is None else said.units,
+        own.low,
+        own.high,
+        own.uncertainty,
         ends,
-        _integer(own, "ChanType") == 1,
-        model in (0, 5),
+        own.actuator,
+        own.sample is None or own.sample.integer,
         said.display or said.unit.text if said else None,
         said.calibration.monotone if said else None,
     )
-
-
-def _units(said: ChannelProfile | None) -> Units:
-    return said.units if said else Units()
-
-
-def _float(decoded: Decoded | None, name: str) -> float:
-    value = decoded.get(name) if decoded else None
-    return float(value) if isinstance(value, (int, float)) else math.nan
-
-
-def _integer(decoded: Decoded | None, name: str) -> int:
-    value = decoded.get(name) if decoded else None
-    return value if isinstance(value, int) else 0
 
 
 @dataclass(frozen=True)

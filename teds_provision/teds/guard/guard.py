@@ -19,6 +19,8 @@ from teds_provision.teds.calibration.model import Calibration
 from teds_provision.teds.codec.codes import AccessCode
 from teds_provision.teds.codec.decode import decode
 from teds_provision.teds.codec.model import Decoded
+from teds_provision.teds.guard import checks as guard_checks
+from teds_provision.teds.guard.curve import channel_of, curve_of
 from teds_provision.teds.image import BlockId
 
 if TYPE_CHECKING:
@@ -112,8 +114,6 @@ class _Judge:
         return from_decoded(decoded, channel=self.number, units=channel.units, actuator=channel.actuator)
 
     def _channel(self, number: int, blocks: Mapping[BlockId, bytes]) -> Channel:
-        from teds_provision.teds.guard.curve import channel_of
-
         return channel_of(number, blocks, self.profile)
 
     def _damage(self, calibration: Calibration) -> Iterator[GuardFinding]:
@@ -138,9 +138,6 @@ class _Judge:
                 yield self._error("inconsistent", f"the segment boundaries of input {number} do not ascend.")
 
     def _judged(self, calibration: Calibration) -> Iterator[GuardFinding]:
-        from teds_provision.teds.guard import checks as guard_checks
-        from teds_provision.teds.guard.curve import curve_of
-
         channel = self._demanded(self._channel(self.number, self.new), calibration)
         numbers = {part.channel for part in calibration.inputs}
         channels = {number: self._channel(number, self.new) for number in numbers}

@@ -6,6 +6,7 @@ import re
 from typing import Final, cast
 
 from teds_provision.errors import BadData
+from teds_provision.teds.calibration.model import Monotone
 from teds_provision.teds.codec.model import Units
 from teds_provision.teds.profile.keys import (
     CALIBRATION_KEYS,
@@ -24,7 +25,6 @@ from teds_provision.teds.profile.keys import (
 from teds_provision.teds.profile.model import (
     CalibrationDemand,
     ChannelProfile,
-    Monotone,
     Pairs,
     Profile,
     TextProfile,

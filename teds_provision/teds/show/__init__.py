@@ -7,12 +7,14 @@ from dataclasses import dataclass
 from datetime import UTC, datetime
 from typing import Any
 
-from teds_provision.teds import decode
+from teds_provision.teds.calibration.decoded import calibrated_unit
 from teds_provision.teds.codec.codes import AccessCode
+from teds_provision.teds.codec.decode import decode
 from teds_provision.teds.codec.model import Decoded, Field, Finding, Units
 from teds_provision.teds.codec.tables import FieldSpec, Table, table
 from teds_provision.teds.formats import Block
 from teds_provision.teds.formats.jsonform import teds_to_json
+from teds_provision.teds.sheet import channel_from, described
 from teds_provision.teds.show.summary import Line, summary_of
 from teds_provision.teds.show.values import Context, meaning_of, text_of
 from teds_provision.teds.units.units import WrittenUnit, display_unit
@@ -94,21 +96,14 @@ def _context(block: Block, decoded: Decoded, beside: dict[tuple[int, int], bytes
 
 
 def _unit(block: Block, decoded: Decoded, beside: Mapping[tuple[int, int], bytes]) -> WrittenUnit | None:
-    """Unit of LowLimit, HiLimit and OError: the channel's, or the calibrated one."""
+    """Unit of LowLimit, HiLimit and OError: the channel's, or the calibrated one; None where nothing names one."""
     if decoded.access_code == AccessCode.CHANNEL:
-        units = decoded.get("PhyUnits")
-        return display_unit(units) if isinstance(units, Units) else None
+        channel = channel_from(decoded)
+        return channel.unit if channel.units_stated else None
     if decoded.access_code != AccessCode.CALIBRATION:
         return None
-    from teds_provision.teds.units.units import recognize
-
-    own = beside.get((block.channel or 1, AccessCode.CHANNEL))
-    units = decode(own).get("PhyUnits") if own is not None else None
-    slope, intercept = decoded.get("Slope"), decoded.get("Intercept")
-    if not isinstance(units, Units):
-        return None
-    scale = slope if isinstance(slope, float) else 1.0
-    return recognize(units, scale, intercept if isinstance(intercept, float) else 0.0)
+    channel = described(block.channel or 1, beside)
+    return calibrated_unit(decoded, channel.units) if channel.units_stated else None
 
 
 def finding_to_json(finding: Finding) -> dict[str, Any]:

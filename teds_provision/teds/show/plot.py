@@ -14,20 +14,23 @@ from typing import TYPE_CHECKING, Any, Final
 
 from teds_provision.errors import BadData, UsageFailure
 from teds_provision.files import SHARED, write_whole
-from teds_provision.teds import calibration as calibrating
+from teds_provision.lazy import late
 from teds_provision.teds.calibration.decoded import is_finite
 from teds_provision.teds.calibration.describe import kind_of
+from teds_provision.teds.calibration.fitting import residuals
 from teds_provision.teds.calibration.model import Calibration
-from teds_provision.teds.codec.codes import AccessCode
-from teds_provision.teds.codec.decode import decode
+from teds_provision.teds.guard.curve import channel_of, curve_of
 from teds_provision.teds.image import BlockId
-from teds_provision.teds.sheet import Sheet
+from teds_provision.teds.sheet import Sheet, name_among
 
 if TYPE_CHECKING:
+    import numpy as np
     from matplotlib.figure import Figure
 
     from teds_provision.teds.guard.curve import Channel, Curve
     from teds_provision.teds.profile.model import Profile
+else:
+    np = late("numpy")
 
 FORMATS: Final = ("png", "svg")
 COLUMNS: Final = 3
@@ -76,8 +79,6 @@ def _panels(
     profile: Profile | None,
     calibrations: Mapping[int, Calibration],
 ) -> list[_Panel]:
-    from teds_provision.teds.guard.curve import channel_of, curve_of
-
     panels = []
     for number, calibration in Sheet.of_blocks(blocks).calibrations.items():
         if channel is not None and number != channel:
@@ -94,9 +95,8 @@ def _panels(
 
 
 def _name(number: int, blocks: Mapping[BlockId, bytes]) -> str:
-    octets = blocks.get((number, AccessCode.NAME))
-    name = decode(octets).get("TCName") if octets else None
-    return f"channel {number}: {name}" if isinstance(name, str) and name.isprintable() else f"channel {number}"
+    name = name_among(number, blocks)
+    return f"channel {number}: {name}" if name else f"channel {number}"
 
 
 def _picture(panels: list[_Panel], kind: str) -> bytes:
@@ -157,7 +157,7 @@ class _View:
     def __init__(self, panel: _Panel) -> None:
         import numpy as np
 
-        self.panel, self.np = panel, np
+        self.panel = panel
         curve = panel.curve
         self.channel: Channel = curve.channel
         self.calibration = curve.calibration
@@ -177,13 +177,12 @@ class _View:
 
     def _thinned(self, mask: Any) -> Any:
         """Indices to draw where the mask holds: about 2000, corners of the curve kept by the spread."""
-        places = self.np.flatnonzero(mask)
+        places = np.flatnonzero(mask)
         step = max(1, len(places) // _LINE_POINTS)
-        return self.np.unique(self.np.append(places[::step], places[-1:]))
+        return np.unique(np.append(places[::step], places[-1:]))
 
     def curve(self, axes: Any) -> None:
         """Draw the curve, solid where it was calibrated and dotted beyond; its points, or the nodes of a table."""
-        np = self.np
         inside = self._thinned(self.inside)
         for number, line in enumerate(self.lines):
             label = "calibration" if number == 0 else None
@@ -219,7 +218,7 @@ class _View:
 
     def residuals(self, axes: Any) -> None:
         """Draw the residuals of the points, and the stated uncertainty."""
-        own = calibrating.residuals(replace(self.calibration, points=self.panel.points, actuator=self.channel.actuator))
+        own = residuals(replace(self.calibration, points=self.panel.points, actuator=self.channel.actuator))
         if own is None:
             return
         axes.plot(own.inputs, own.differences, "o-", color=_ORANGE, markersize=3, linewidth=0.7)
@@ -229,7 +228,6 @@ class _View:
 
     def straightness(self, axes: Any) -> None:
         """Without points: draw how far the curve departs from the straight line through it."""
-        np = self.np
         line = self.lines[len(self.lines) // 2]
         places = self._thinned(self.inside)
         x, y = self.axis[places], line[places]

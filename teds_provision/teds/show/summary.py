@@ -2,12 +2,18 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from datetime import datetime
 
 from teds_provision.errors import BadData
+from teds_provision.teds.calibration.decoded import from_decoded
+from teds_provision.teds.codec import security
 from teds_provision.teds.codec.codes import AccessCode
-from teds_provision.teds.codec.model import Decoded, Units
+from teds_provision.teds.codec.keyforms import read_key
+from teds_provision.teds.codec.model import Decoded, TimeInstance
+from teds_provision.teds.codec.uuid import unpack_uuid
+from teds_provision.teds.sheet import channel_from, described
 from teds_provision.teds.show.values import FINGERPRINT_DIGITS, Context, fingerprint, instant
 
 _PROFILE_VERSION = "ProfileVersion"
@@ -31,8 +37,6 @@ def summary_of(decoded: Decoded, context: Context, now: datetime) -> tuple[Line,
 
 
 def _uuid(decoded: Decoded, _context: Context) -> Iterator[Line]:
-    from teds_provision.teds.codec.uuid import unpack_uuid
-
     value = decoded.get("UUID")
     parts = unpack_uuid(value) if isinstance(value, bytes) else None
     if parts is None:
@@ -50,24 +54,19 @@ def _uuid(decoded: Decoded, _context: Context) -> Iterator[Line]:
 
 
 def _range(decoded: Decoded, context: Context) -> Iterator[Line]:
-    from teds_provision.teds.units.units import format_value
-
-    low, high, error = (decoded.get(name) for name in ("LowLimit", "HiLimit", "OError"))
-    if context.unit is None or not isinstance(low, float) or not isinstance(high, float):
+    channel = channel_from(decoded)
+    if context.unit is None or not channel.has_range:
         return
-    text = f"{format_value(low, context.unit)} to {format_value(high, context.unit)}"
-    if isinstance(error, float):
-        text += f", uncertainty {format_value(error, context.unit, difference=True)}"
+    text = f"{channel.show(channel.low)} to {channel.show(channel.high)}"
+    if not math.isnan(channel.uncertainty):
+        text += f", uncertainty {channel.show(channel.uncertainty, difference=True)}"
     yield "range", text
 
 
 def _calibration(decoded: Decoded, context: Context, now: datetime) -> Iterator[Line]:
-    from teds_provision.teds.calibration.decoded import from_decoded
-
-    own = context.beside.get((context.channel or 1, AccessCode.CHANNEL))
-    units, actuator = _channel_of(own)
+    own = described(context.channel or 1, context.beside)
     try:
-        calibration = from_decoded(decoded, channel=context.channel, units=units, actuator=actuator)
+        calibration = from_decoded(decoded, channel=context.channel, units=own.units, actuator=own.actuator)
     except BadData as error:
         yield "calibration", f"{error.message} {error.hint}".strip()
         return
@@ -80,20 +79,7 @@ def _calibration(decoded: Decoded, context: Context, now: datetime) -> Iterator[
         yield "due", f"{calibration.due:%Y-%m-%d}{' (overdue)' if calibration.overdue(now) else ''}"
 
 
-def _channel_of(octets: bytes | None) -> tuple[Units | None, bool]:
-    if octets is None:
-        return None, False
-    from teds_provision.teds import decode
-
-    channel = decode(octets)
-    units = channel.get("PhyUnits")
-    return units if isinstance(units, Units) else None, channel.get("ChanType") == 1
-
-
 def _security(decoded: Decoded, context: Context) -> Iterator[Line]:
-    from teds_provision.teds.codec.keyforms import read_key
-    from teds_provision.teds.codec.model import TimeInstance
-
     ours = decoded.field(_PROFILE_VERSION) is not None
     if not ours:
         yield "kind", "somebody else's Security TEDS (no field 105): shown, never trusted"
@@ -118,8 +104,6 @@ def _security(decoded: Decoded, context: Context) -> Iterator[Line]:
 
 
 def _form(decoded: Decoded) -> Iterator[Line]:
-    from teds_provision.teds.codec import security
-
     try:
         security.decode(decoded.octets)
     except BadData as error:

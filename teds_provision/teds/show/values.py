@@ -7,14 +7,15 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from dataclasses import field as dataclass_field
 from datetime import UTC, datetime, timedelta
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
+from teds_provision.teds.codec.keyforms import read_key
 from teds_provision.teds.codec.model import Field, TimeInstance, Units
 from teds_provision.teds.codec.tables import FieldSpec, name_of
+from teds_provision.teds.formats.tree import shortest
+from teds_provision.teds.units.units import WrittenUnit, format_value, name_of_units
 
-if TYPE_CHECKING:
-    from teds_provision.teds.units.units import WrittenUnit
-
+_DAY: Final = 86_400
 SHOWN_NUMBERS: Final = 8
 SHOWN_OCTETS: Final = 24
 FINGERPRINT_DIGITS: Final = 16
@@ -57,9 +58,7 @@ def text_of(field: Field, context: Context, spec: FieldSpec | None) -> str:
     """Value of a field for people; hex digits where nothing better is known."""
     value = field.value
     if isinstance(value, Units):
-        from teds_provision.teds.units.units import format_units
-
-        return format_units(value) or "plain number"
+        return name_of_units(value)
     if isinstance(value, TimeInstance):
         return span(value) if spec is not None and spec.kind == "duration" else instant(value)
     if isinstance(value, float):
@@ -81,9 +80,6 @@ def _integer(value: int, spec: FieldSpec | None) -> str:
 
 
 def _number(field: Field, value: float, context: Context, spec: FieldSpec | None) -> str:
-    from teds_provision.teds.formats.tree import shortest
-    from teds_provision.teds.units.units import format_value
-
     value = shortest(value)
     if field.name in _IN_CHANNEL_UNIT and context.unit is not None:
         difference = field.name in _DIFFERENCES
@@ -98,9 +94,11 @@ def _number(field: Field, value: float, context: Context, spec: FieldSpec | None
 
 
 def seconds(value: float) -> str:
-    """Seconds in the unit that suits: ``100 µs``, ``0.5 s``."""
+    """Seconds in the unit that suits: ``100 µs``, ``500 ms``, ``365 days``."""
     if value != value:  # noqa: PLR0124 - NaN
         return "not available"
+    if abs(value) >= 2 * _DAY:
+        return f"{value / _DAY:.6g} days"
     for scale, unit in ((1.0, "s"), (1e-3, "ms"), (1e-6, "µs"), (1e-9, "ns")):
         if abs(value) >= scale * 0.999999:
             return f"{value / scale:.6g} {unit}"
@@ -123,7 +121,7 @@ def instant(value: TimeInstance) -> str:
 def span(value: TimeInstance) -> str:
     """Length of a time, in days where it is that long."""
     total = value.seconds + value.nanoseconds / 1e9
-    text = f"{total / 86_400:.6g} days" if total >= 86_400 else seconds(total)
+    text = seconds(total)
     return f"-{text}" if value.negative else text
 
 
@@ -136,8 +134,6 @@ def hexadecimal(octets: bytes) -> str:
 
 def key(field: Field) -> str:
     """A key or signature: the form it came in, and the fingerprint of a P-256 point."""
-    from teds_provision.teds.codec.keyforms import read_key
-
     found = read_key(field.raw)
     if found.point is not None:
         return f"P-256 key, fingerprint {fingerprint(found.point)[:FINGERPRINT_DIGITS]} ({found.form})"

@@ -45,6 +45,7 @@ __all__ = [
     "format_units",
     "format_value",
     "in_display_units",
+    "name_of_units",
     "parse_seconds",
     "parse_unit",
     "parse_units",
@@ -248,6 +249,11 @@ def format_units(units: Units) -> str:
             return "arbitrary"
         case other:
             return f"interpretation {other} (reserved) {name}".strip()
+
+
+def name_of_units(units: Units) -> str:
+    """Name of the SI unit for people, ``count`` for a plain number: the one place that says so."""
+    return format_units(units) or "count"
 
 
 _FRIENDLY: Final = {

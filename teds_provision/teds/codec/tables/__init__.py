@@ -9,6 +9,9 @@ from __future__ import annotations
 from functools import cache
 
 from teds_provision.teds.codec.codes import MANUFACTURER, ONLY_2024, TEXT_BASED, AccessCode
+from teds_provision.teds.codec.tables import other as tables_more
+from teds_provision.teds.codec.tables import standard as tables_standard
+from teds_provision.teds.codec.tables.calibration import calibration_table
 from teds_provision.teds.codec.tables.form import (
     NAMES,
     OCTETS,
@@ -23,13 +26,8 @@ __all__ = ["MANUFACTURER", "NAMES", "OCTETS", "ONLY_2024", "TEXT_BASED", "FieldS
 @cache
 def table(access_code: int) -> Table:
     """Field table of a TEDS class; one without rows where no fields are known (their tuples stay raw)."""
-    from teds_provision.teds.codec.tables import other as tables_more
-    from teds_provision.teds.codec.tables import standard as tables_standard
-
     name = name_of(access_code)
     if access_code == AccessCode.CALIBRATION:
-        from teds_provision.teds.codec.tables.calibration import calibration_table
-
         return calibration_table()
     if access_code in TEXT_BASED:
         return Table(access_code, name, tables_more.TEXT, source="ieee-1451.0.md section 4.6")

@@ -1,0 +1,210 @@
+"""One TransducerChannel of a datasheet, as values with types and units; see :mod:`teds_provision.teds.sheet`."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from datetime import datetime
+from enum import IntEnum
+from functools import cached_property
+from typing import Final
+
+from teds_provision.teds.calibration.model import Calibration
+from teds_provision.teds.calibration.samples import DataModel, SampleForm
+from teds_provision.teds.codec.codes import AccessCode
+from teds_provision.teds.codec.decode import decode
+from teds_provision.teds.codec.model import Decoded, Units
+from teds_provision.teds.image import BlockId
+from teds_provision.teds.units.names import ARBITRARY, DIGITAL, RATIO
+from teds_provision.teds.units.units import WrittenUnit, display_unit, format_value, name_of_units
+
+NOT_STATED: Final = math.nan
+"""Stands for a number that the TEDS do not give, or call not available: IEEE 1451.0 writes NaN for that itself."""
+
+
+class Kind(IntEnum):
+    """ChanType (field 11 of the TransducerChannel TEDS): what a channel is."""
+
+    SENSOR = 0
+    ACTUATOR = 1
+    EVENT_SENSOR = 2
+
+    @property
+    def word(self) -> str:
+        """``sensor``, ``actuator``, ``event sensor``."""
+        return self.name.lower().replace("_", " ")
+
+
+@dataclass(frozen=True)
+class Sampling:
+    """How a channel samples: SampMode (a mask), SDefault as it stands (sources disagree on it); None: not stated."""
+
+    modes: int | None = None
+    default: int | None = None
+
+
+@dataclass(frozen=True)
+class Timing:
+    """Times of a channel in seconds, NaN where not stated; ``period`` is SPeriod."""
+
+    period: float = NOT_STATED
+    update: float = NOT_STATED
+    write_setup: float = NOT_STATED
+    read_setup: float = NOT_STATED
+    read_delay: float = NOT_STATED
+    warm_up: float = NOT_STATED
+
+
+@dataclass(frozen=True)
+class Channel:
+    """One TransducerChannel. Limits and uncertainty are in SI units as its own TEDS states them, NaN where it does not.
+
+    ``units`` are the exponents of PhyUnits, ``unit`` the unit in which people see its values. ``kind`` is None for a
+    ChanType that is not known, ``halt`` is ActHalt (field 36). ``described`` is False where there is no
+    TransducerChannel TEDS at all. ``calibration`` is None where there is none or none that can be computed;
+    ``calibration_problem`` then says why.
+    """
+
+    number: int
+    name: str = ""
+    described: bool = False
+    kind: Kind | None = None
+    units: Units = Units()  # noqa: RUF009 - frozen
+    units_stated: bool = False
+    low: float = NOT_STATED
+    high: float = NOT_STATED
+    uncertainty: float = NOT_STATED
+    sample: SampleForm | None = None
+    sampling: Sampling = Sampling()
+    timing: Timing = Timing()
+    halt: int | None = None
+    calibration_key: int | None = None
+    calibration: Calibration | None = None
+    calibration_problem: str = ""
+
+    @property
+    def actuator(self) -> bool:
+        """Whether it acts; everything else gives values."""
+        return self.kind is Kind.ACTUATOR
+
+    @property
+    def period(self) -> float:
+        """SPeriod in seconds, NaN where not stated."""
+        return self.timing.period
+
+    @cached_property
+    def unit(self) -> WrittenUnit:
+        """Unit in which people see its values: the calibrated one where that has a usual name, else a friendly one."""
+        if self.calibration is not None and self.calibration.unit.text[:1] not in ("", "("):
+            return self.calibration.unit
+        return display_unit(self.units)
+
+    @property
+    def si_unit(self) -> str:
+        """Name of the SI unit of limits and uncertainty: ``rad``, ``N``; ``count`` for plain numbers."""
+        return name_of_units(self.units)
+
+    @property
+    def has_range(self) -> bool:
+        """Whether both limits are stated."""
+        return math.isfinite(self.low) and math.isfinite(self.high)
+
+    @property
+    def stated_uncertainty(self) -> float:
+        """Uncertainty in SI units: that of the calibration where it states one, else that of the channel."""
+        own = self.calibration
+        if own is not None and own.uncertainty is not None and math.isfinite(own.uncertainty):
+            return own.unit.difference_to_si(own.uncertainty)
+        return self.uncertainty
+
+    @property
+    def calibrated_at(self) -> datetime | None:
+        """Date of the last calibration, None where there is none."""
+        return self.calibration.date if self.calibration is not None else None
+
+    @property
+    def due(self) -> datetime | None:
+        """When the next calibration is due, None where nothing says so."""
+        return self.calibration.due if self.calibration is not None else None
+
+    def overdue(self, now: datetime) -> bool:
+        """Whether the next calibration was due before ``now``."""
+        return self.calibration is not None and self.calibration.overdue(now)
+
+    @property
+    def value_problem(self) -> str:
+        """Why its samples give no values in a unit, as a sentence; "" where they do.
+
+        Without a calibration only floats (in SI units), counts, bits, times and fractions of a ratio are values.
+        """
+        if self.calibration_problem:
+            return f"Channel {self.number} has a calibration that cannot be used: {self.calibration_problem}"
+        if self.sample is None:
+            return f"The datasheet does not say how a sample of channel {self.number} is coded."
+        if self.sample.problem:
+            return f"The samples of channel {self.number} cannot be read: {self.sample.problem}."
+        if self.calibration is None and not self._speaks_for_itself(self.sample.model):
+            unit = self.unit.text
+            return f"Channel {self.number} has no calibration: its raw values cannot be turned into {unit}."
+        return ""
+
+    def _speaks_for_itself(self, model: int) -> bool:
+        if model in (DataModel.FLOAT32, DataModel.FLOAT64, DataModel.TIME_OF_DAY):
+            return True
+        if self.units.interpretation in (DIGITAL, ARBITRARY) or self.units == Units(extension=self.units.extension):
+            return True
+        return self.units.interpretation == RATIO and model in (DataModel.FRACTION, DataModel.LONG_FRACTION)
+
+    def show(self, value: float, *, difference: bool = False, digits: int = 6) -> str:
+        """Value in SI units as people see it: ``360 °``, ``0.35 N``; a difference leaves the unit's offset out."""
+        return format_value(value, self.unit, difference=difference, digits=digits)
+
+
+def described(number: int, blocks: Mapping[BlockId, bytes]) -> Channel:
+    """One channel as its TransducerChannel TEDS alone describes it, without name and calibration."""
+    octets = blocks.get((number, AccessCode.CHANNEL))
+    return read_channel(number, "", decode(octets) if octets is not None else None)
+
+
+def channel_from(decoded: Decoded, number: int = 0) -> Channel:
+    """What a decoded TransducerChannel TEDS alone says of its channel."""
+    return read_channel(number, "", decoded)
+
+
+def read_channel(number: int, name: str, teds: Decoded | None) -> Channel:
+    """Channel of that number and name as its decoded TransducerChannel TEDS describes it, None for none."""
+    if teds is None:
+        return Channel(number, name)
+    units, kind = teds.get("PhyUnits"), integer_of(teds, "ChanType")
+    model, octets = integer_of(teds, "DatModel"), integer_of(teds, "ModLenth")
+    return Channel(
+        number,
+        name,
+        described=True,
+        kind=Kind(kind) if kind in set(Kind) else None,
+        units=units if isinstance(units, Units) else Units(),
+        units_stated=isinstance(units, Units),
+        low=number_of(teds, "LowLimit"),
+        high=number_of(teds, "HiLimit"),
+        uncertainty=number_of(teds, "OError"),
+        sample=None if model is None or octets is None else SampleForm(model, octets, integer_of(teds, "SigBits") or 0),
+        sampling=Sampling(integer_of(teds, "SampMode"), integer_of(teds, "SDefault")),
+        timing=Timing(
+            *(number_of(teds, name) for name in ("SPeriod", "UpdateT", "WSetupT", "RSetupT", "RDelayT", "WarmUpT"))
+        ),
+        halt=integer_of(teds, "ActHalt"),
+        calibration_key=integer_of(teds, "CalKey"),
+    )
+
+
+def number_of(teds: Decoded, name: str) -> float:
+    """Number of a field, NaN where it is not stated."""
+    value = teds.get(name)
+    return float(value) if isinstance(value, (int, float)) else NOT_STATED
+
+
+def integer_of(teds: Decoded, name: str) -> int | None:
+    """Integer of a field, None where it is not stated."""
+    value = teds.get(name)
+    return value if isinstance(value, int) else None
