@@ -162,7 +162,7 @@ def check_frames(data: bytes) -> None:
     """Frames of commands and replies, and the payloads of the profile."""
     from teds_provision.protocol.messages import frames
     from teds_provision.protocol.messages.identity import Identity
-    from teds_provision.teds.messages import decode_message, looks_like_message
+    from teds_provision.protocol.messages.message import decode_message, looks_like_message
 
     looks_like_message(data)
     decode_message(data)

@@ -12,12 +12,12 @@ from teds_provision.errors import BadData
 from teds_provision.files import read_limited
 from teds_provision.limits import LIMITS
 from teds_provision.protocol.handover.bundle import peek_bundle
+from teds_provision.protocol.messages.message import Message, decode_message, looks_like_message
 from teds_provision.teds import convert, decode
 from teds_provision.teds.codec.codes import AccessCode
 from teds_provision.teds.codec.model import Decoded, Edition, Finding, Verdict
 from teds_provision.teds.formats import Block, Kind, class_of, detect, read_blocks
 from teds_provision.teds.guard.guard import check_calibration
-from teds_provision.teds.messages import Message, decode_message, looks_like_message
 from teds_provision.teds.show import Shown, describe
 
 if TYPE_CHECKING:

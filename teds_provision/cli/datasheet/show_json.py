@@ -7,9 +7,9 @@ from dataclasses import asdict
 from typing import Any
 
 from teds_provision.cli.datasheet.show_files import ShownFile, guard_to_json
+from teds_provision.protocol.messages.message import Argument, Message
 from teds_provision.teds.formats import with_class
 from teds_provision.teds.formats.jsonform import FORMAT, value_to_json
-from teds_provision.teds.messages import Argument, Message
 from teds_provision.teds.show import describe, finding_to_json, shown_to_json
 
 

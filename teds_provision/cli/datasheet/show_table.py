@@ -10,10 +10,10 @@ from rich import markup
 from rich.table import Table
 
 from teds_provision.cli.datasheet.show_files import ShownFile
+from teds_provision.protocol.messages.message import Argument, Message
 from teds_provision.teds.codec.model import Finding, TimeInstance, Verdict
 from teds_provision.teds.formats import with_class
 from teds_provision.teds.formats.jsonform import value_to_json
-from teds_provision.teds.messages import Argument, Message
 from teds_provision.teds.show import Shown, ShownField, describe
 from teds_provision.teds.show.values import hexadecimal, instant
 

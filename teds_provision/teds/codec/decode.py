@@ -11,11 +11,11 @@ from typing import Final
 
 from teds_provision.errors import BadData
 from teds_provision.teds.codec.codes import AccessCode
-from teds_provision.teds.codec.content import check
 from teds_provision.teds.codec.frame import TEDSID
-from teds_provision.teds.codec.head import MAX_TUPLES, Head
+from teds_provision.teds.codec.frame_checks import MAX_TUPLES, Head
 from teds_provision.teds.codec.model import Decoded, Field, Severity, Value, Verdict
-from teds_provision.teds.codec.shape import shape_of, verdict_of
+from teds_provision.teds.codec.plausibility import check
+from teds_provision.teds.codec.recognition import shape_of, verdict_of
 from teds_provision.teds.codec.tables import MANUFACTURER, TEXT_BASED, FieldSpec, Table, name_of
 from teds_provision.teds.codec.text import split_text
 from teds_provision.teds.codec.values import READERS, is_packed_units, units_of

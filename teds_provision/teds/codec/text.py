@@ -13,7 +13,7 @@ from teds_provision.errors import BadData
 from teds_provision.teds.codec.frame import RawTuple, checksum, raw_tuple, tuples
 from teds_provision.teds.codec.model import Field
 from teds_provision.teds.codec.tables import FieldSpec
-from teds_provision.teds.codec.tables.other import TEXT
+from teds_provision.teds.codec.tables.phy_text_security import TEXT
 
 Tuples = Callable[[list[tuple[str, object]], Mapping[str, FieldSpec]], bytes]
 _BY_NAME = {row.name: row for row in TEXT}

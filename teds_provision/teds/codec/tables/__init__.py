@@ -1,6 +1,6 @@
 """Field tables of every TEDS class, one per access code, open to inspection (ieee-1451.0.md sections 3 and 4).
 
-The rows stand in ``tables_standard`` (Meta, TransducerChannel, names), ``tables_more`` (PHY, text-based, security) and
+The rows stand in ``standard`` (Meta, TransducerChannel, names), ``phy_text_security`` (PHY, text-based, security) and
 the data file ``calibration_fields.toml``, whose numbers nobody has checked against the standard.
 """
 
@@ -9,10 +9,9 @@ from __future__ import annotations
 from functools import cache
 
 from teds_provision.teds.codec.codes import MANUFACTURER, ONLY_2024, TEXT_BASED, AccessCode
-from teds_provision.teds.codec.tables import other as tables_more
-from teds_provision.teds.codec.tables import standard as tables_standard
+from teds_provision.teds.codec.tables import phy_text_security, standard
 from teds_provision.teds.codec.tables.calibration import calibration_table
-from teds_provision.teds.codec.tables.form import (
+from teds_provision.teds.codec.tables.field_spec import (
     NAMES,
     OCTETS,
     FieldSpec,
@@ -30,8 +29,8 @@ def table(access_code: int) -> Table:
     if access_code == AccessCode.CALIBRATION:
         return calibration_table()
     if access_code in TEXT_BASED:
-        return Table(access_code, name, tables_more.TEXT, source="ieee-1451.0.md section 4.6")
-    entry = tables_standard.TABLES.get(access_code) or tables_more.TABLES.get(access_code)
+        return Table(access_code, name, phy_text_security.TEXT, source="ieee-1451.0.md section 4.6")
+    entry = standard.TABLES.get(access_code) or phy_text_security.TABLES.get(access_code)
     if entry is None:
         return Table(access_code, name, verified=False)
     return Table(access_code, name, **entry)

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from teds_provision.teds.codec.codes import AccessCode
-from teds_provision.teds.codec.tables.form import FieldSpec, Table, name_of
+from teds_provision.teds.codec.tables.field_spec import FieldSpec, Table, name_of
 
 
 def calibration_table() -> Table:

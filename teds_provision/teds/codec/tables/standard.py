@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Any, Final
 
 from teds_provision.teds.codec.codes import AccessCode
-from teds_provision.teds.codec.tables.form import FieldSpec, Need
+from teds_provision.teds.codec.tables.field_spec import FieldSpec, Need
 
 UNITS_NAMES: Final = {
     50: "UnitType",

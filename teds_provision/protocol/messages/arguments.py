@@ -9,9 +9,9 @@ from dataclasses import dataclass
 from typing import Final
 
 from teds_provision.errors import BadData
+from teds_provision.protocol.messages.tables import ENUMERATIONS, ERROR_SOURCES, ERRORS, FLAGS
 from teds_provision.teds.codec.model import Finding, TimeInstance
 from teds_provision.teds.codec.tables import name_of
-from teds_provision.teds.messages.tables import ENUMERATIONS, ERROR_SOURCES, ERRORS, FLAGS
 
 MessageValue = int | float | str | bytes | TimeInstance | tuple[int, ...] | tuple[str, ...] | tuple[bytes, ...]
 Blocks = tuple[tuple[int, int], ...]

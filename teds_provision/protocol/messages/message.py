@@ -11,8 +11,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 from teds_provision.errors import BadData
-from teds_provision.teds.codec.model import Edition, Finding
-from teds_provision.teds.messages.arguments import (
+from teds_provision.protocol.messages.arguments import (
     Argument,
     Blocks,
     MessageValue,
@@ -20,7 +19,7 @@ from teds_provision.teds.messages.arguments import (
     read_tagged,
     write_plain,
 )
-from teds_provision.teds.messages.tables import (
+from teds_provision.protocol.messages.tables import (
     CLASSES,
     COMMANDS,
     MESSAGE_TYPES,
@@ -31,6 +30,7 @@ from teds_provision.teds.messages.tables import (
     STATUS,
     Spec,
 )
+from teds_provision.teds.codec.model import Edition, Finding
 
 __all__ = ["Argument", "Message", "compose_command", "compose_service", "decode_message", "looks_like_message"]
 

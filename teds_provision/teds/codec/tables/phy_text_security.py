@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from typing import Any, Final
 
 from teds_provision.teds.codec.codes import AccessCode
-from teds_provision.teds.codec.tables.form import Confidence, FieldSpec, Need
+from teds_provision.teds.codec.tables.field_spec import Confidence, FieldSpec, Need
 
 RADIO: Final = {0: "IEEE 802.11", 1: "Bluetooth", 2: "ZigBee", 3: "6LoWPAN", 255: "manufacturer"}
 

@@ -8,15 +8,15 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from teds_provision.errors import BadData
-from teds_provision.teds.codec.model import TimeInstance
-from teds_provision.teds.messages import (
+from teds_provision.protocol.messages.arguments import size_of, words
+from teds_provision.protocol.messages.message import (
     compose_command,
     compose_service,
     decode_message,
     looks_like_message,
 )
-from teds_provision.teds.messages.arguments import size_of, words
-from teds_provision.teds.messages.tables import COMMANDS, MESSAGE_TYPES, NETWORK
+from teds_provision.protocol.messages.tables import COMMANDS, MESSAGE_TYPES, NETWORK
+from teds_provision.teds.codec.model import TimeInstance
 
 VECTORS = Path(__file__).parent.parent / "vectors" / "ieee1451"
 INDEX = json.loads((VECTORS / "index.json").read_text())["vectors"]

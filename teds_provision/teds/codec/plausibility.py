@@ -12,7 +12,7 @@ from teds_provision.teds.codec.codes import AccessCode
 from teds_provision.teds.codec.frame import frame
 from teds_provision.teds.codec.model import Field, TimeInstance, Units
 from teds_provision.teds.codec.tables import FieldSpec, Table
-from teds_provision.teds.codec.tables.other import LEVELS
+from teds_provision.teds.codec.tables.phy_text_security import LEVELS
 
 Find = Callable[..., None]
 
