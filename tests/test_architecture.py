@@ -41,8 +41,6 @@ ARROWS = {
     "cli": _BELOW_TALK | {"talk", "steps", "handover", "backup", "doctor", "demo", "node", "measure"},
     "__main__": {"cli"},
 }
-# `teds` names the commands that it shows: numbers and names, from modules which import nothing of `teds` themselves.
-NAMES_FOR_TEDS = {"teds_provision.protocol.messages.frames"}
 # Too slow to load before they are needed: --help, --version and a pure decode must not wait for them.
 HEAVY = {"nfc", "ndef", "can", "isotp", "keyring", "rich", "cryptography", "pint", "numpy", "matplotlib", "pkcs11"}
 HEAVY |= {"mcap", "zstandard", "cyclonedds", "paho"}
@@ -87,17 +85,57 @@ def test_arrows_between_rooms_point_one_way(path: Path) -> None:
     wrong = [
         f"line {line}: {name}"
         for name, line in imports(parsed(path))
-        if name.startswith("teds_provision.")
-        and name.split(".")[1] not in allowed | {"__version__"}
-        and not (room == "teds" and name.rpartition(".")[0] in NAMES_FOR_TEDS)
+        if name.startswith("teds_provision.") and name.split(".")[1] not in allowed | {"__version__"}
     ]
     assert not wrong, f"{room} imports what it may not: {wrong}"
 
 
-@pytest.mark.parametrize("module", sorted(NAMES_FOR_TEDS))
-def test_names_that_teds_uses_make_no_circle(module: str) -> None:
-    path = PACKAGE.parent / (module.replace(".", "/") + ".py")
-    assert not [name for name, _ in imports(parsed(path)) if name.startswith("teds_provision.teds")]
+def file_of(name: str) -> Path | None:
+    """File of ours that a dotted name stands for or stands in: a module, a package, or a name in either."""
+    for dotted in (name, name.rpartition(".")[0]):
+        path = PACKAGE.parent / dotted.replace(".", "/")
+        for file in (path.with_suffix(".py"), path / "__init__.py"):
+            if file.is_file():
+                return file
+    return None
+
+
+def circles() -> list[list[str]]:
+    """Files that import each other, imports inside functions and for type checkers counted (Tarjan's algorithm)."""
+    graph = {
+        path: {file_of(name) for name, _ in imports(parsed(path)) if name.startswith("teds_provision")}
+        for path in MODULES
+    }
+    order: dict[Path, int] = {}
+    low: dict[Path, int] = {}
+    stack: list[Path] = []
+    found: list[list[str]] = []
+
+    def visit(path: Path) -> None:
+        order[path] = low[path] = len(order)
+        stack.append(path)
+        for other in graph[path] - {None, path}:
+            assert other is not None
+            if other not in order:
+                visit(other)
+                low[path] = min(low[path], low[other])
+            elif other in stack:
+                low[path] = min(low[path], order[other])
+        if low[path] == order[path]:
+            at = stack.index(path)
+            circle = stack[at:]
+            del stack[at:]
+            if len(circle) > 1:
+                found.append(sorted(map(name_of, circle)))
+
+    for path in MODULES:
+        if path not in order:
+            visit(path)
+    return found
+
+
+def test_no_files_import_each_other() -> None:
+    assert not circles()
 
 
 def test_the_rooms_are_those_of_the_page() -> None:

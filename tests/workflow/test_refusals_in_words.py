@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+from teds_provision.teds.messages.tables import REASONS
+
 from teds_provision.protocol.messages.frames import Reason
 from teds_provision.talk.conversation import refused
-from teds_provision.teds.messages.tables import REASONS
 
 
 def test_every_reason_is_told_in_words() -> None:

@@ -6,15 +6,15 @@ import threading
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Final, Protocol
 
 from teds_provision.errors import AddressConflict
 from teds_provision.links.can.finding import Found, ask_all, conflict_text, settle
+from teds_provision.links.can.spec import CanSpec
 from teds_provision.links.ports import Notice, NoticeSink
 from teds_provision.protocol.messages.identity import Identity, NodeState
 
 if TYPE_CHECKING:
-    from teds_provision.links.can.port import CanPort
     from teds_provision.links.can.shared import Ear, SharedBus
 
 _ANNOUNCE: Final = 0x1CFF0000
@@ -39,10 +39,28 @@ class _Seen:
     silent: float | None = None
 
 
+class Watched(Protocol):
+    """What is asked of the port whose bus is watched."""
+
+    spec: CanSpec
+
+    def bus(self) -> SharedBus:
+        """The open bus with its receiving loop."""
+
+    def next_transaction(self) -> int:
+        """A transaction number, 0 to 255."""
+
+    def identify(self, address: int) -> Identity | None:
+        """Ask one address who is there; None for nobody."""
+
+    def tell_of_rivals(self, notice: NoticeSink) -> None:
+        """Say which other stations use our source address."""
+
+
 class Arrivals:
     """The nodes of one bus; :meth:`round` asks everyone once and yields what is new."""
 
-    def __init__(self, port: CanPort, notice: NoticeSink) -> None:
+    def __init__(self, port: Watched, notice: NoticeSink) -> None:
         self._port, self._notice = port, notice
         self._seen: dict[bytes, _Seen] = {}
         self._conflicts: set[int] = set()
