@@ -36,9 +36,10 @@ A node
 ``Tim(..., hardware=...)``; the link tells it what only a link knows:
 
 * ``tim.handle(frame, link=…, tapped=…)`` as before; then, when the reply has left, ``tim.reply_left(link)``;
-* ``tim.poll()`` again and again: takes samples, runs leases and dead-men; gives the tick at which it wants to be called
-  again. ``tim.event(channel, tick, data_set, valid)`` whenever an event sensor has seen one;
-* ``tim.next_frame(bus)`` for a link that streams: the next data frame of a bus, and the tick before which it must not
-  begin;
-* ``tim.trigger(bus, station, token, tick)`` and ``tim.drive(bus, station, frame)`` for what comes without a reply.
+* ``tim.poll()`` again and again: takes samples, runs leases and dead-men; gives the seconds until it wants to be
+  called again. ``tim.event(channel, tick, data_set, valid)`` whenever an event sensor has seen one;
+* ``tim.next_frame_in()`` and ``tim.next_frame(bus)`` for a link that streams: when the next data frame may begin, and
+  that frame; one at a time to the controller;
+* ``tim.trigger(link, token, tick)`` and ``tim.drive(link, octets)`` for what comes without a reply;
+* ``tim.actuator_claimed()`` before it moves to another CAN address; ``tim.link_lost(link)`` at bus-off, as ever.
 """

@@ -140,15 +140,17 @@ class OperationRole:
     # -- what links tell and ask -----------------------------------------------------------------------------------
 
     def poll(self) -> float | None:
-        """Take what is due; gives seconds until there is something to do again, None where nothing is known."""
+        """Take what is due; gives seconds until a sample, lease or dead-man is due again, None where none is known.
+
+        Frames that wait are told by :meth:`next_frame_in`: only the link knows when its controller is free for one.
+        """
         if self.claims.sessions() and self._hardware.power().flags & PowerFlag.TOO_LOW:
             self.claims.release_all()
         self.claims.expire(self._real())
         now = self._hardware.now()
         self.streams.sample(now)
         waits = [at - now for at in (self.streams.next_instant(),) if at is not None]
-        real = self._real()
-        waits += [at - real for at in (self.claims.next_deadline(), self.streams.next_frame()) if at is not None]
+        waits += [at - self._real() for at in (self.claims.next_deadline(),) if at is not None]
         return max(0, min(waits)) / SECOND if waits else None
 
     def next_frame_in(self) -> float | None:

@@ -76,7 +76,7 @@ class Plan:
         return self.subscribe.command()
 
     def accept(self, payload: bytes, now: TickBounds) -> Subscribed:
-        """Read the reply; ``now`` bounds the node's tick when it came.
+        """Read the reply; ``now`` bounds the node's tick when it came (it may have been made up to 1 s before).
 
         Raises Garbled, or NotAuthentic where length or start are not those that were asked: end and report the stream.
         """
@@ -94,7 +94,7 @@ class Plan:
 def most_instants(kind: Kind, octets: int, most: int = MOST_OCTETS) -> int:
     """The largest n whose message has at most ``most`` octets, one instant having ``octets``; 0 where none fits."""
     room = most - message_length(kind, 0, 0)
-    return min(255, room // octets, 1 if kind == Kind.EVENT else 255) if octets else 0
+    return max(0, min(255, room // octets, 1 if kind == Kind.EVENT else 255)) if octets else 0
 
 
 @dataclass(frozen=True, slots=True)

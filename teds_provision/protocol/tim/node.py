@@ -141,13 +141,16 @@ class Tim:
             self._role.streams.reply_left(session)
 
     def poll(self) -> float | None:
-        """Take samples, run leases and dead-men; gives seconds until it should be called again, None: not before."""
+        """Take samples, run leases and dead-men; gives seconds until one is due again, None: none is known.
+
+        When a data frame may begin is :meth:`next_frame_in`'s.
+        """
         return self._role.poll() if self._role is not None else None
 
     def next_frame(self, bus: str) -> DataFrame | None:
         """The next data frame of a bus (the link's name without its last part), where one may begin now.
 
-        Ask again when the frame before has left; the times between are :meth:`poll`'s.
+        Ask again when the frame before has left, after :meth:`next_frame_in`.
         """
         return self._role.frame(bus) if self._role is not None else None
 

@@ -191,11 +191,12 @@ class Bench:
     def until(self, tick: int) -> Bench:
         """Let time pass as a server does: at each moment at which the node wants to be called, and at ``tick``."""
         while True:
-            wait = self.tim.poll()
+            waits = [self.tim.poll()]
             for bus in self.buses:
                 while (sent := self.tim.next_frame(bus)) is not None:
                     self.frames.append((self.hardware.tick, sent))
-            wait = self.tim.poll()
+                waits.append(self.tim.next_frame_in())
+            wait = min((each for each in waits if each is not None), default=None)
             due = tick if wait is None else self.hardware.tick + max(1, round(wait * SECOND))
             if due >= tick:
                 break

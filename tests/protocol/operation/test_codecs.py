@@ -1,0 +1,277 @@
+"""Every codec of measurement operation, both ways: what is written is read, and no octets do harm."""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Callable
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from teds_provision.errors import Garbled
+from teds_provision.protocol.messages.frames import Refused
+from teds_provision.protocol.operation import budget
+from teds_provision.protocol.operation.can_frames import (
+    Assembly,
+    DataAddress,
+    DriveAddress,
+    ble_frame,
+    cut,
+    data_address,
+    drive_address,
+    fd_length,
+    frames_of,
+    next_segment,
+    read_ble_frame,
+    trigger_identifier,
+    trigger_station,
+)
+from teds_provision.protocol.operation.commands import (
+    ChannelState,
+    Operate,
+    Operation,
+    Power,
+    Sampled,
+    decode_data_set,
+)
+from teds_provision.protocol.operation.datagram import DriveValues, Layout, Sealer, drive_length, pattern
+from teds_provision.protocol.operation.hardware import Port, port_of
+from teds_provision.protocol.operation.stream_commands import (
+    Arm,
+    Clock,
+    Driven,
+    Kind,
+    Subscribe,
+    Subscribed,
+    decode_stopped,
+)
+
+u8, u16, u32, u64 = (st.integers(0, (1 << bits) - 1) for bits in (8, 16, 32, 64))
+stations, nodes = st.integers(0xF1, 0xF7), st.integers(1, 0xEF)
+channel_lists = st.lists(st.integers(1, 255), min_size=1, max_size=16, unique=True).map(tuple)
+
+
+@given(stations, st.integers(0, 3), st.integers(0, 7), nodes)
+def test_data_identifiers(station: int, stream: int, segment: int, node: int) -> None:
+    address = DataAddress(station, stream, segment, node)
+    assert data_address(address.identifier) == address
+    assert address.identifier > 0x18DBFFFF, "every command and reply wins arbitration against it"
+
+
+@given(nodes, stations)
+def test_drive_and_trigger_identifiers(node: int, station: int) -> None:
+    address = DriveAddress(node, station)
+    assert drive_address(address.identifier) == address
+    assert trigger_station(trigger_identifier(station)) == station
+    assert data_address(address.identifier) is None
+    assert drive_address(trigger_identifier(station)) is None
+
+
+@given(st.integers(0, (1 << 29) - 1))
+def test_an_identifier_is_one_thing_at_most(identifier: int) -> None:
+    found = [data_address(identifier), drive_address(identifier), trigger_station(identifier)]
+    assert sum(each is not None for each in found) <= 1
+
+
+@given(st.binary(min_size=9, max_size=240), st.booleans(), st.booleans())
+def test_messages_are_cut_and_put_together(message: bytes, fd: bool, drive: bool) -> None:
+    pieces = list(cut(message, fd=fd, drive=drive))
+    assert len(pieces) == frames_of(len(message), fd=fd, drive=drive)
+    assert [piece.segment for piece in pieces[:9]] == [0, 1, 2, 3, 4, 5, 6, 7, 1][: len(pieces)]
+    assembly = Assembly(len(message), fd=fd, drive=drive)
+    take: Callable[[int, bytes], bytes | None] = (lambda _, data: assembly.take_drive(data)) if drive else assembly.take
+    assert [take(*piece) for piece in pieces] == [None] * (len(pieces) - 1) + [message]
+    assert assembly.broken == 0
+    assert all(len(piece.data) <= (64 if fd else 8) for piece in pieces)
+    if fd:
+        assert all(len(piece.data) == fd_length(len(piece.data)) for piece in pieces)
+
+
+@given(st.data())
+def test_a_missing_doubled_or_swapped_frame_drops_its_message_and_no_other(data: st.DataObject) -> None:
+    length = data.draw(st.integers(17, 240))
+    messages = [data.draw(st.binary(min_size=length, max_size=length)) for _ in range(3)]
+    pieces = [list(cut(message, fd=False)) for message in messages]
+    at = data.draw(st.integers(0, len(pieces[1]) - 1))
+    fault = data.draw(st.sampled_from(["missing", "doubled", "swapped"]))
+    hurt = list(pieces[1])
+    if fault == "missing":
+        del hurt[at]
+    elif fault == "doubled":
+        hurt.insert(at, hurt[at])
+    else:
+        other = (at + 1) % len(hurt)
+        hurt[at], hurt[other] = hurt[other], hurt[at]
+    assembly = Assembly(length, fd=False)
+    whole = [assembly.take(*piece) for piece in (*pieces[0], *hurt, *pieces[2])]
+    found = [message for message in whole if message is not None]
+    harmless = fault == "doubled" and at in (0, len(pieces[1]) - 1)  # segment 0 begins anew; after the last is nothing
+    assert found == (messages if harmless else [messages[0], messages[2]])
+    assert assembly.broken >= (0 if harmless else 1) if fault != "missing" or at else True
+
+
+@given(st.lists(st.tuples(st.integers(0, 7), st.binary(max_size=64)), max_size=60), st.integers(9, 240), st.booleans())
+def test_junk_frames_make_no_message_of_another_length(frames: list[tuple[int, bytes]], length: int, fd: bool) -> None:
+    assembly = Assembly(length, fd=fd)
+    for frame in frames:
+        message = assembly.take(*frame)
+        assert message is None or len(message) == length
+
+
+def test_segments_count_from_1_to_7_and_round() -> None:
+    segments, segment = [], 0
+    for _ in range(16):
+        segments.append(segment)
+        segment = next_segment(segment)
+    assert segments == [0, 1, 2, 3, 4, 5, 6, 7, 1, 2, 3, 4, 5, 6, 7, 1]
+
+
+@given(st.integers(0, 3), st.binary(min_size=1, max_size=240))
+def test_ble_notifications(stream: int, message: bytes) -> None:
+    assert read_ble_frame(ble_frame(stream, message)) == (stream, message)
+    assert read_ble_frame(ble_frame(stream + 4, message)) is None
+    assert read_ble_frame(b"") is None
+
+
+# -- payloads ----------------------------------------------------------------------------------------------------------
+
+
+@given(st.integers(0, 3), st.sampled_from(Kind), st.integers(1, 255), u16, u64, u64, channel_lists, st.booleans())
+def test_subscribe(
+    stream: int, kind: Kind, n: int, gap: int, period: int, start: int, channels: tuple[int, ...], test: bool
+) -> None:
+    if kind == Kind.EVENT:
+        n, channels = 1, channels[:1]
+    asked = Subscribe(stream, kind, n, gap, period, start, channels, test)
+    assert Subscribe.decode(asked.encode()) == asked
+
+
+@given(
+    st.builds(Subscribed, u16, u16, u64), st.builds(Driven, u16, u16), st.builds(Clock, u64, u64, u64, u32, u16, u32)
+)
+def test_replies(subscribed: Subscribed, driven: Driven, clock: Clock) -> None:
+    assert Subscribed.decode(subscribed.encode()) == subscribed
+    assert Driven.decode(driven.encode()) == driven
+    assert Clock.decode(clock.encode()) == clock
+
+
+@given(st.binary(min_size=16, max_size=16), u8, u8, st.integers(1, 255), u16)
+def test_operate_and_arm(octets: bytes, life: int, action: int, channel: int, dead_man: int) -> None:
+    arm = Arm(octets, life, action)
+    assert Arm.decode(arm.command().payload) == arm
+    sensor, actuator = Operate(channel, octets, life), Operate(channel, octets, life, dead_man)
+    assert Operate.decode(channel, sensor.command().payload, actuator=False) == sensor
+    assert Operate.decode(channel, actuator.command().payload, actuator=True) == actuator
+
+
+@given(st.booleans(), st.dictionaries(st.integers(1, 255), st.tuples(u8.map(ChannelState), u8)))
+def test_operation(measuring: bool, channels: dict[int, tuple[ChannelState, int]]) -> None:
+    told = Operation(measuring, channels)
+    assert Operation.decode(told.encode()) == told
+
+
+@given(
+    u8,
+    st.none() | st.integers(0, 100),
+    st.none() | st.integers(0, 0xFFFE),
+    st.none() | st.integers(-0x8000, 0x7FFE),
+    st.none() | st.integers(-128, 126),
+)
+def test_power(flags: int, level: int | None, mv: int | None, ma: int | None, celsius: int | None) -> None:
+    told = Power(flags, level, None if mv is None else mv / 1000, None if ma is None else ma / 1000, celsius)
+    assert Power.decode(told.encode()) == told
+
+
+@given(u64, u8, st.binary(max_size=100), u32)
+def test_samples_and_drive_values(tick: int, flags: int, data: bytes, until: int) -> None:
+    told = Sampled(tick, flags, data)
+    assert Sampled.decode(told.encode(), len(data)) == told
+    values = DriveValues(until, data)
+    assert DriveValues.decode(values.encode()) == values
+    assert drive_length(len(data)) == 4 + len(values.encode()) + 8
+
+
+@given(st.binary(max_size=60))
+def test_no_octets_of_a_node_do_harm(octets: bytes) -> None:
+    """A reply is read or it is Garbled; nothing else comes out."""
+    for decode in (Subscribed.decode, Driven.decode, Clock.decode, Operation.decode, Power.decode, decode_stopped):
+        with contextlib.suppress(Garbled):
+            decode(octets)
+    for width in (0, 1, 8):
+        with contextlib.suppress(Garbled):
+            Sampled.decode(octets, width)
+        with contextlib.suppress(Garbled):
+            assert len(decode_data_set(octets, width)) == width
+
+
+@given(st.binary(max_size=60))
+def test_no_octets_of_a_station_do_harm(octets: bytes) -> None:
+    for decode in (Subscribe.decode, Arm.decode, lambda o: Operate.decode(1, o, actuator=True)):
+        with contextlib.suppress(Refused):
+            decode(octets)
+
+
+# -- sealing -----------------------------------------------------------------------------------------------------------
+
+
+@given(st.binary(min_size=16, max_size=16), u32, st.binary(min_size=1, max_size=200), st.data())
+def test_a_message_opens_whole_and_unchanged_alone(key: bytes, counter: int, plain: bytes, data: st.DataObject) -> None:
+    sealer = Sealer(key)
+    message = sealer.seal(counter, plain)
+    assert len(message) == 4 + len(plain) + 8
+    assert sealer.open(message) == plain
+    at = data.draw(st.integers(0, 8 * len(message) - 1))
+    bent = bytearray(message)
+    bent[at // 8] ^= 1 << at % 8
+    assert sealer.open(bytes(bent)) is None
+    assert sealer.open(message[: data.draw(st.integers(0, len(message) - 1))]) is None
+
+
+@given(st.lists(st.integers(1, 8), min_size=1, max_size=16), st.data())
+def test_a_layout_cuts_an_instant(widths: list[int], data: st.DataObject) -> None:
+    layout = Layout(tuple(range(1, len(widths) + 1)), tuple(widths))
+    parts = tuple(data.draw(st.binary(min_size=width, max_size=width)) for width in widths)
+    assert layout.cut(b"".join(parts)) == parts
+    assert layout.octets == sum(widths)
+
+
+def test_the_test_pattern_counts_and_runs_over() -> None:
+    assert [pattern(3, 1, k)[0] for k in (0, 1, 252, 253)] == [3, 4, 255, 0]
+    assert pattern(1, 2, 65_535) == b"\0\0"
+
+
+# -- links -------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("link", "port"),
+    [
+        ("nfc", Port("nfc", "nfc", 1)),
+        ("can:f1", Port("can", "can", 0xF1)),
+        ("can1:f7", Port("can", "can1", 0xF7)),
+        ("ble:2", Port("ble", "ble", 2)),
+    ],
+)
+def test_a_links_name_says_its_port(link: str, port: Port) -> None:
+    assert port_of(link) == port
+
+
+@pytest.mark.parametrize(
+    ("n", "classic", "worst"), [(1, 5.3, 6.2), (25, 0.86, 1.02), (57, 0.76, 0.90), (113, 0.72, 0.85)]
+)
+def test_the_load_of_the_papers_sensor_on_500_kbit(n: int, classic: float, worst: float) -> None:
+    """16 bits at 10 kHz: the table of section 6. The mean lies between no stuffing and the worst."""
+    length = 13 + 2 * n
+    assert budget.bus_load(length, n, 100_000, bitrate=500_000) == pytest.approx(worst, abs=0.006)
+    bare = budget.bus_load(length, n, 100_000, bitrate=500_000, worst=False)
+    assert bare < classic < worst
+
+
+@pytest.mark.parametrize(("n", "mean"), [(1, 1.86), (25, 0.155), (57, 0.136), (113, 0.131)])
+def test_the_load_of_the_papers_sensor_on_can_fd(n: int, mean: float) -> None:
+    length = 13 + 2 * n
+    bare = budget.bus_load(length, n, 100_000, bitrate=500_000, data_bitrate=2_000_000, worst=False)
+    most = budget.bus_load(length, n, 100_000, bitrate=500_000, data_bitrate=2_000_000)
+    assert bare < mean < most
+    assert most / bare < 1.35

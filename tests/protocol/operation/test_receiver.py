@@ -1,0 +1,244 @@
+"""What a station believes of a stream: each cause of a drop counted apart; clocks and triggers (section 3, 5)."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import pytest
+
+from teds_provision.errors import Garbled, NotAuthentic
+from teds_provision.protocol.operation.commands import TEST_PATTERN
+from teds_provision.protocol.operation.datagram import MOST_OCTETS, Layout, Sealer, drive_key, stream_key
+from teds_provision.protocol.operation.driving import Driver
+from teds_provision.protocol.operation.stream_commands import NONE, SOON, WAITS, Action, Clock, Driven, Kind, Subscribed
+from teds_provision.protocol.operation.subscription import (
+    MOST_HELD,
+    Counts,
+    Message,
+    Plan,
+    Receiver,
+    TickBounds,
+    most_instants,
+)
+from teds_provision.protocol.operation.timing import ClockSample, Token, mark_is_honest
+
+MS = 1_000_000
+K_M = bytes(range(32))
+START = 3000 * MS
+LATER = TickBounds(START + 100 * MS, START + 100 * MS)
+
+
+def plan(**changes: object) -> Plan:
+    asked: dict[str, object] = {"n": 2, "period": 10 * MS} | changes
+    return Plan.of(0, ((1, 2),), **asked)  # type: ignore[arg-type]
+
+
+def receiver(run: int = 1, *, start: int = START, previous: Receiver | None = None, **changes: object) -> Receiver:
+    made = plan(**changes)
+    return Receiver(made, Subscribed(run, made.length, start), K_M, previous=previous)
+
+
+def sealed(counter: int, run: int = 1, *, flags: int = 0, body: bytes = bytes(4)) -> bytes:
+    return Sealer(stream_key(K_M, run)).seal(counter, bytes([flags]) + body)
+
+
+def counted(taker: Receiver, **counts: int) -> None:
+    assert dataclasses.asdict(taker.counts) == dataclasses.asdict(Counts(**counts))
+
+
+def test_good_messages_carry_index_and_tick() -> None:
+    taker = receiver()
+    assert taker.take(sealed(0, body=b"abcd"), LATER) == Message(0, 0, START, 0, b"abcd")
+    found = taker.take(sealed(3), LATER)
+    assert found is not None
+    assert (found.index, found.tick) == (6, START + 60 * MS)
+    counted(taker, good=2, lost=2)
+
+
+def test_each_cause_is_counted_apart_and_each_message_once() -> None:
+    taker = receiver()
+    first = sealed(5)
+    assert taker.take(first, LATER) is not None
+    counted(taker, good=1, lost=5)
+    assert taker.take(first, LATER) is None
+    assert taker.take(sealed(4), LATER) is None
+    counted(taker, good=1, lost=5, late=2)
+    assert taker.take(sealed(6)[:-1], LATER) is None
+    counted(taker, good=1, lost=5, late=2, junk=1)
+    bent = bytearray(sealed(9))
+    bent[-1] ^= 1
+    assert taker.take(bytes(bent), LATER) is None
+    assert taker.last == 5, "only a good tag changes anything"
+    counted(taker, good=1, lost=5, late=2, junk=1, bad=1)
+    assert taker.take(sealed(6, flags=TEST_PATTERN), LATER) is None
+    counted(taker, good=1, lost=5, late=2, junk=1, bad=1, unasked=1)
+    taker.finish(9)
+    counted(taker, good=1, lost=7, late=2, junk=1, bad=1, unasked=1)
+
+
+def test_a_measurement_in_place_of_a_test_pattern_is_unasked_too() -> None:
+    taker = receiver(test_pattern=True)
+    assert taker.take(sealed(0), LATER) is None
+    counted(taker, unasked=1)
+
+
+def test_messages_of_an_earlier_run_are_dropped_and_not_counted() -> None:
+    before = receiver(1)
+    taker = receiver(2, previous=before)
+    assert taker.take(sealed(7, 1), LATER) is None
+    counted(taker)
+    assert taker.take(sealed(7, 3), LATER) is None
+    counted(taker, bad=1)
+
+
+def test_a_message_from_the_future_or_held_back_is_dropped() -> None:
+    """Counter 0 begins at START and ends at START + 10 ms; it may be 2 · 20 + 200 ms old."""
+    first = sealed(0)
+    for now, cause in [
+        (TickBounds(START - 50 * MS, START - 1), "future"),
+        (TickBounds(START - 50 * MS, START), "good"),
+        (TickBounds(START + 250 * MS, START + 900 * MS), "good"),
+        (TickBounds(START + 250 * MS + 1, START + 900 * MS), "stale"),
+    ]:
+        taker = receiver()
+        assert (taker.take(first, now) is not None) is (cause == "good")
+        counted(taker, **{cause: 1})
+
+
+def test_the_consumer_may_set_another_age() -> None:
+    made = plan()
+    taker = Receiver(made, Subscribed(1, made.length, START), K_M, oldest=5 * MS)
+    assert taker.take(sealed(0), TickBounds(START + 16 * MS, START + 16 * MS)) is None
+    counted(taker, stale=1)
+
+
+def test_messages_are_held_until_the_mark_is_read() -> None:
+    taker = receiver(start=WAITS)
+    for counter in range(MOST_HELD + 2):
+        assert taker.take(sealed(counter), LATER) is None
+    early, *rest = taker.begin(START + 100 * MS - 40 * MS)
+    assert (early.counter, early.tick) == (2, START + 100 * MS)
+    assert rest == [], "the others came before their first tick: from the future"
+    assert taker.counts.overflow == 2
+    assert taker.counts.future == MOST_HELD - 1
+    late = TickBounds(START + 3000 * MS, START + 3000 * MS)
+    assert taker.take(sealed(140), late) is not None, "from now on they are handed on at once"
+
+
+def test_events_and_free_streams_carry_their_tick() -> None:
+    taker = receiver(kind=Kind.EVENT, n=1)
+    found = taker.take(sealed(4, body=START.to_bytes(8, "big") + b"ab"), LATER)
+    assert found == Message(4, 4, START, 0, b"ab")
+    waiting = receiver(start=WAITS, kind=Kind.FREE)
+    assert waiting.take(sealed(0, body=START.to_bytes(8, "big") + b"abcd"), LATER) is not None
+
+
+# -- the plan ----------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("asked", "start", "good"),
+    [
+        (SOON, START, True),
+        (SOON, START + 1000 * MS, True),
+        (SOON, START + 1000 * MS + 1, False),
+        (SOON, START - 1000 * MS - 1, False),
+        (SOON, WAITS, False),
+        (START + 5, START + 5, True),
+        (START + 5, START + 6, False),
+        (WAITS, WAITS, True),
+        (WAITS, START, False),
+    ],
+)
+def test_a_start_that_was_not_asked_is_reported(asked: int, start: int, good: bool) -> None:
+    made, now = plan(start=asked), TickBounds(START, START)
+    reply = Subscribed(1, made.length, start).encode()
+    if good:
+        assert made.accept(reply, now).start == start
+    else:
+        with pytest.raises(NotAuthentic, match="another time"):
+            made.accept(reply, now)
+
+
+def test_a_length_that_was_not_computed_is_reported() -> None:
+    made = plan()
+    with pytest.raises(NotAuthentic, match="18 octets a message; 17"):
+        made.accept(Subscribed(1, 18, START).encode(), LATER)
+    with pytest.raises(NotAuthentic, match="run 0"):
+        made.accept(Subscribed(0, 17, START).encode(), TickBounds(START, START))
+    with pytest.raises(Garbled):
+        made.accept(bytes(11), LATER)
+
+
+def test_how_many_instants_fit() -> None:
+    assert [most_instants(Kind.PERIODIC, octets) for octets in (1, 2, 6, 227, 228, 0)] == [227, 113, 37, 1, 0, 0]
+    assert most_instants(Kind.FREE, 2) == 109
+    assert most_instants(Kind.EVENT, 2) == 1
+    assert most_instants(Kind.PERIODIC, 2, most=23 - 4) == 3, "BLE with an MTU of 23"
+    assert most_instants(Kind.EVENT, 1, most=23 - 4) == 0
+    assert plan(n=113).fits
+    assert not plan(n=114).fits
+    assert plan(n=113).length == MOST_OCTETS - 1
+
+
+# -- clock -------------------------------------------------------------------------------------------------------------
+
+
+def clock(received: int, sent: int) -> Clock:
+    return Clock(received, sent, 0, 1000, 50, NONE)
+
+
+def test_a_clock_that_lies_is_caught() -> None:
+    with pytest.raises(NotAuthentic, match="lies"):
+        ClockSample(0, 10 * MS, clock(5 * MS, 5 * MS - 1))
+    with pytest.raises(NotAuthentic, match="lies"):
+        ClockSample(0, 10 * MS, clock(0, 10 * MS + 1))
+    ClockSample(0, 10 * MS, clock(0, 10 * MS))
+
+
+def test_delay_makes_the_bound_worse_and_never_wrong() -> None:
+    true = 500 * MS  # node's tick = station's time + true
+    for there, back in [(0, 0), (3 * MS, 1 * MS), (0, 90 * MS), (90 * MS, 0)]:
+        seen = ClockSample(0, there + back, clock(true + there, true + there))
+        assert abs(seen.offset - true) <= seen.error(there + back)
+        bounds = seen.tick(there + back)
+        assert bounds.low <= true + there + back <= bounds.high
+
+
+def test_two_exchanges_whose_bounds_do_not_meet_show_a_lie() -> None:
+    first = ClockSample(0, 2 * MS, clock(501 * MS, 501 * MS))
+    same = ClockSample(1000 * MS, 1002 * MS, clock(1501 * MS, 1501 * MS))
+    jumped = ClockSample(1000 * MS, 1002 * MS, clock(1511 * MS, 1511 * MS))
+    assert first.meets(same)
+    assert not first.meets(jumped)
+    assert first.error(1002 * MS, own_drift=50) == 1 * MS + 1000 + 100 * 1000
+
+
+def test_tokens_are_new_each_time_and_marks_are_held_against_the_frame() -> None:
+    one, other = Token.draw(), Token.draw()
+    assert one.octets != other.octets
+    assert len(one.octets) == 8
+    assert one.arm(Action.STOP, 5).commitment == one.commitment != other.commitment
+    seen = TickBounds(START, START + MS)
+    assert mark_is_honest(START, seen)
+    assert not mark_is_honest(START + MS + 1, seen)
+
+
+# -- Drive -------------------------------------------------------------------------------------------------------------
+
+
+def test_a_drive_message_holds_no_longer_than_the_dead_man() -> None:
+    driver = Driver(Layout((4,), (2,)), Driven(3, 18), K_M, dead_man=50)
+    opener = Sealer(drive_key(K_M, 3))
+    for hold, until in [(None, 50), (20 * MS, 20), (80 * MS, 50)]:
+        plain = opener.open(driver.seal((b"ab",), TickBounds(START, START + 5 * MS), hold=hold))
+        assert plain is not None
+        assert int.from_bytes(plain[:4], "big") == (START + until * MS) // 1000
+    assert driver.next == 3
+    with pytest.raises(Garbled, match="widths"):
+        driver.seal((b"abc",), LATER)
+    driver.next = 1 << 32
+    with pytest.raises(Garbled, match="used up"):
+        driver.seal((b"ab",), LATER)
+    with pytest.raises(NotAuthentic, match="19 octets; 18"):
+        Driver(Layout((4,), (2,)), Driven(3, 19), K_M, dead_man=50)
