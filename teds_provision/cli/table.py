@@ -43,6 +43,13 @@ SECTIONS: Final[dict[str, dict[str, Entry]]] = {
         "log": Entry("station.log", "log", "The audit log, and whether its hash chain holds."),
         "show": Entry("datasheet.show", "show", "Decode TEDS, images, profiles, bundles and messages."),
     },
+    "Measure": {
+        "measure": Entry("measure.measure", "measure", "Stream nodes or a group into files and topics, calibrated."),
+        "sample": Entry("measure.values", "sample", "One reading now, verified and calibrated."),
+        "set": Entry("measure.values", "set_value", "Operate an actuator within its limits; let go: safe state."),
+        "mode": Entry("measure.values", "mode", "What a node claims and does."),
+        "group": Entry("measure.group", "group", "Measurement groups: create, add, remove, delete, list."),
+    },
     "A key's life": {
         "export-keys": Entry(
             "handover.bundles", "export_keys", "Hand node keys to another base station in a sealed bundle."
@@ -63,5 +70,5 @@ SECTIONS: Final[dict[str, dict[str, Entry]]] = {
 }
 
 COMMANDS: Final = {name: entry for section in SECTIONS.values() for name, entry in section.items()}
-GROUPS: Final = frozenset({"vault", "trust", "profile", "whitelist", "handover", "node"})
+GROUPS: Final = frozenset({"vault", "group", "trust", "profile", "whitelist", "handover", "node"})
 """The commands that have commands of their own."""

@@ -19,6 +19,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from teds_provision.protocol.operation.subscription import TickBounds
+
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
@@ -76,6 +78,7 @@ class ClockMap:
         self._exchanges: deque[Exchange] = deque(maxlen=EXCHANGES)
         self._arrivals: deque[tuple[int, int]] = deque()  # (tick, host - tick), the best of each bucket
         self._bucket = -1
+        self._low, self._high, self._when = -np.inf, np.inf, 0  # what the evidence allows, at tick `_when`
         self._origin = 0  # tick at which the line's offset stands
         self._offset = 0.0
         self._skew = 0.0
@@ -89,6 +92,11 @@ class ClockMap:
         """Whether there is any evidence yet."""
         return self._known
 
+    @property
+    def exchanges(self) -> tuple[Exchange, ...]:
+        """Those that are kept, oldest first."""
+        return tuple(self._exchanges)
+
     def exchange(self, one: Exchange) -> bool:
         """Take an exchange; False where the clock lies (``lie`` says how). A lying exchange changes nothing else."""
         if one.sent < one.received:
@@ -96,12 +104,15 @@ class ClockMap:
         elif one.sent - one.received > (one.answered - one.asked) * (1 + one.drift / 1e6) + 2 * one.step:
             self.lie = "the node says that it took longer over the reply than the whole exchange"
         else:
-            self._rate = max(self._rate, (one.drift + self._own) / 1e6)
+            if (one.drift + self._own) / 1e6 > self._rate:
+                self._rate = (one.drift + self._own) / 1e6
+                self._low, self._high = -np.inf, np.inf  # what was gathered held for a better clock
             low, high = self._limits(one.tick)
             if one.offset - one.error > high or one.offset + one.error < low:
                 self.lie = "two exchanges contradict each other: the node's clock was set, or runs at another speed"
                 return False
             self._exchanges.append(one)
+            self._narrow(one.tick, one.offset - one.error, one.offset + one.error)
             self._refit(one.tick)
             return True
         return False
@@ -109,6 +120,7 @@ class ClockMap:
     def arrival(self, tick: int, host: int) -> None:
         """Take a sample's tick and when the message that held it had come (host, monotonic ns)."""
         upper = host - tick
+        self._narrow(tick, -np.inf, upper)
         if tick // BUCKET == self._bucket and self._arrivals:
             if upper < self._arrivals[-1][1]:
                 self._arrivals[-1] = (tick, upper)
@@ -130,6 +142,10 @@ class ClockMap:
         whole: NDArray[np.float64] = (ticks.astype(np.int64) + np.rint(slope).astype(np.int64)) / 1e9
         return whole
 
+    def host_of(self, tick: int) -> float:
+        """Host time (monotonic, seconds) of one tick."""
+        return float(self.host(np.array([tick], dtype=np.uint64))[0])
+
     def tick_at(self, host: int) -> int:
         """Node's tick at a host time (monotonic ns), by the present line."""
         guess = host - round(self._offset)
@@ -141,20 +157,30 @@ class ClockMap:
         now = self._line(tick)
         return max(high - now, now - low, 0.0) / 1e9
 
+    def ticks_at(self, host: int) -> TickBounds:
+        """What the node's tick may be at a host time (monotonic ns), by all evidence."""
+        tick = self.tick_at(host)
+        low, high = self._limits(tick)
+        if np.isinf(low) or np.isinf(high):
+            return TickBounds(0, 1 << 64)
+        return TickBounds(int(host - high), int(host - low) + 1)
+
     def _line(self, tick: int) -> float:
         left = min(max(1.0 - (tick - self._refitted) / SLEW, 0.0), 1.0)
         return self._offset + self._skew * (tick - self._origin) + self._residue * left
 
     def _limits(self, tick: int) -> tuple[float, float]:
-        """The offsets that all evidence allows at a tick: each piece widens with its age."""
-        low, high = -np.inf, np.inf
-        for one in self._exchanges:
-            doubt = one.error + self._rate * abs(tick - one.tick)
-            low = max(low, one.offset - doubt)
-            high = min(high, one.offset + doubt)
-        for at, upper in self._arrivals:
-            high = min(high, upper + self._rate * abs(tick - at))
-        return low, high
+        """The offsets that all evidence allows at a tick."""
+        doubt = self._rate * abs(tick - self._when)
+        return self._low - doubt, self._high + doubt
+
+    def _narrow(self, tick: int, low: float, high: float) -> None:
+        """Evidence of a tick: what was known by then widens with its age, and the narrower of the two counts."""
+        now = max(tick, self._when)
+        known, new = self._rate * (now - self._when), self._rate * (now - tick)
+        self._low = max(self._low - known, low - new)
+        self._high = min(self._high + known, high + new)
+        self._when = now
 
     def _refit(self, tick: int) -> None:
         before = self._line(tick) if self._handed_out else None

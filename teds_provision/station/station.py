@@ -8,6 +8,7 @@ part          what it knows
 ``pins``      the whitelist, and which key each UUID is pinned to
 ``policy``    trusted stations and CAs, the deny list, nodes given away
 ``nodes``     what is known of each node, its datasheets and drafts
+``groups``    which nodes are measured together
 ``handovers`` bundles that left and came
 ============  ======================================================================
 
@@ -24,6 +25,7 @@ from typing import TYPE_CHECKING
 from teds_provision.errors import NotFound
 from teds_provision.protocol.agreement import Credentials
 from teds_provision.protocol.keys import fingerprint, station_key_message
+from teds_provision.station.groups import Groups
 from teds_provision.station.handovers import Handovers
 from teds_provision.station.identity import DEFAULT_NAME, Identity
 from teds_provision.station.node_keys import NodeKey, NodeKeys
@@ -51,6 +53,7 @@ class Station:
         self.pins = Pins(store, self.keys, store.audit)
         self.policy = Policy(store, self.identity, self.keys)
         self.nodes = Nodes(store)
+        self.groups = Groups(store, store.home)
         self.handovers = Handovers(store, self.keys)
 
     @classmethod

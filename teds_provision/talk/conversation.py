@@ -109,6 +109,12 @@ class Conversation:
         """Whether a session is open."""
         return self._session is not None
 
+    @property
+    def message_key(self) -> bytes:
+        """k_m of the open session, 32 octets: the root of the keys of streams and of Drive (operation.md section 3)."""
+        assert self._session is not None, "message_key without a session"
+        return self._session.message_key
+
     # -- sessions --------------------------------------------------------------------------------------------------
 
     def open(self, key: bytes) -> None:

@@ -38,6 +38,10 @@ class Sink(Protocol):
         """For people and events: ``run.csv``, ``ROS 1``, ``mqtt://host``."""
 
     @property
+    def wants_rows(self) -> bool:
+        """Whether rows of a group are of use to it."""
+
+    @property
     def files(self) -> tuple[str, ...]:
         """Paths that it wrote so far."""
 
@@ -72,6 +76,7 @@ class ThreadedSink(ABC):
     """
 
     recorder = False
+    wants_rows = False  # whether rows of a group's grid are of use to it
 
     def __init__(self, name: str) -> None:
         self.name = name
@@ -109,7 +114,8 @@ class ThreadedSink(ABC):
 
     def write_group(self, rows: GroupRows) -> None:
         """Rows of the grid."""
-        self._put(rows, int(rows.value.size))
+        if self.wants_rows:
+            self._put(rows, int(rows.value.size))
 
     def report(self, report: NodeReport) -> None:
         """State of a node."""

@@ -60,6 +60,8 @@ class _Scalars:
 class TopicSink(ThreadedSink):
     """Decides what goes out; subclasses carry it: six steps, all on the sink's thread."""
 
+    wants_rows = True
+
     def __init__(self, name: str, commands: CommandTaker | None) -> None:
         super().__init__(name)
         self._commands = commands

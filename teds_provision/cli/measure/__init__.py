@@ -1,0 +1,1 @@
+"""Commands of measuring and acting."""

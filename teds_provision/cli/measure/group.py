@@ -1,0 +1,102 @@
+"""``group``: which nodes are measured together."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+import click
+
+from teds_provision.cli.context import App, pass_app
+from teds_provision.cli.options import command, dry_run_option
+
+if TYPE_CHECKING:
+    from teds_provision.store.records import Group
+
+
+@click.group()
+def group() -> None:
+    """Measurement groups: a name for nodes that are measured together. A running group is frozen."""
+
+
+def _told(groups: Sequence[Group]) -> dict[str, object]:
+    return {"groups": [{"name": one.name, "uuids": [uuid.hex() for uuid in one.uuids]} for one in groups]}
+
+
+def _tell(app: App, groups: Sequence[Group]) -> None:
+    lines = [f"{one.name}: {', '.join(uuid.hex() for uuid in one.uuids) or 'no node yet'}" for one in groups]
+    app.emit(
+        _told(groups), "\n".join(lines) or "There is no group yet. Make one: teds-provision group create NAME UUID …"
+    )
+
+
+@group.command("list")
+@pass_app
+def list_groups(app: App) -> None:
+    """List every group."""
+    _tell(app, app.station().groups.all())
+
+
+@command("teds-provision group create hand 8d4d 91aa", name="create")
+@click.argument("name")
+@click.argument("nodes", nargs=-1, metavar="[UUID …]")
+@dry_run_option
+@pass_app
+def create(app: App, name: str, nodes: Sequence[str], *, dry_run: bool) -> None:
+    """Make a group of these nodes."""
+    station = app.station()
+    uuids = [station.nodes.resolve(text) for text in nodes]
+    if dry_run:
+        app.emit({"groups": [{"name": name, "uuids": [uuid.hex() for uuid in uuids]}]}, f"Would make group {name}.")
+        return
+    with station.lock("group create", app.note):
+        _tell(app, [station.groups.create(name, uuids)])
+
+
+@command("teds-provision group add hand 77f0", name="add")
+@click.argument("name")
+@click.argument("nodes", nargs=-1, required=True, metavar="UUID …")
+@dry_run_option
+@pass_app
+def add(app: App, name: str, nodes: Sequence[str], *, dry_run: bool) -> None:
+    """Add nodes to a group."""
+    station = app.station()
+    uuids = [station.nodes.resolve(text) for text in nodes]
+    if dry_run:
+        _tell(app, [station.groups.get(name)])
+        return
+    with station.lock("group add", app.note):
+        _tell(app, [station.groups.add(name, uuids)])
+
+
+@command("teds-provision group remove hand 77f0", name="remove")
+@click.argument("name")
+@click.argument("nodes", nargs=-1, required=True, metavar="UUID …")
+@dry_run_option
+@pass_app
+def remove(app: App, name: str, nodes: Sequence[str], *, dry_run: bool) -> None:
+    """Take nodes out of a group."""
+    station = app.station()
+    uuids = [station.nodes.resolve(text) for text in nodes]
+    if dry_run:
+        _tell(app, [station.groups.get(name)])
+        return
+    with station.lock("group remove", app.note):
+        _tell(app, [station.groups.remove(name, uuids)])
+
+
+@command("teds-provision group delete hand", name="delete")
+@click.argument("name")
+@dry_run_option
+@pass_app
+def delete(app: App, name: str, *, dry_run: bool) -> None:
+    """Delete a group; its nodes stay as they are."""
+    station = app.station()
+    if not dry_run:
+        with station.lock("group delete", app.note):
+            station.groups.delete(name)
+    _tell(app, station.groups.all())
+
+
+for one in (create, add, remove, delete):
+    group.add_command(one)

@@ -1,0 +1,197 @@
+"""``measure``: nodes or a group, streamed, verified, calibrated, into files and topics; ``measure recover``."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Sequence
+from contextlib import ExitStack
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from teds_provision.cli.context import App, pass_app
+from teds_provision.cli.measure.values import ending, over_the_bus
+from teds_provision.cli.options import command, link_options
+from teds_provision.errors import PolicyRefused, UsageFailure
+from teds_provision.links import LinkSettings
+
+if TYPE_CHECKING:
+    from teds_provision.measure.runner import Ended
+    from teds_provision.station.station import Station
+
+KINDS = ("periodic", "event", "free")
+
+
+@command(
+    "teds-provision measure 8d4d --can socketcan:can0 --to run.csv --to run.mcap",
+    "teds-provision measure hand --can socketcan:can0 --duration 60 --ros2",
+    "teds-provision measure recover run.mcap",
+)
+@click.argument("what", nargs=-1, required=True, metavar="NAME|UUID …")
+@click.option("--rate", type=click.FloatRange(min=0.001), metavar="HZ", help="Samples a second; else the datasheet's.")
+@click.option("--duration", type=click.FloatRange(min=0.1), metavar="S", help="Seconds; without it until Ctrl-C.")
+@click.option(
+    "--channel", "channels", type=click.IntRange(1, 255), multiple=True, metavar="N", help="This channel alone."
+)
+@click.option("--kind", type=click.Choice(KINDS), help="How the node samples; without it as each channel is.")
+@click.option("--trigger", is_flag=True, help="Begin on all nodes at one moment, by one frame.")
+@click.option("--test-pattern", is_flag=True, help="Stream the test pattern and check it: no measurement.")
+@click.option("--to", "files", multiple=True, metavar="FILE", help="Record: .csv, .txt, .mcap, .jsonl.")
+@click.option("--ros1", is_flag=True, help="Publish to ROS 1 (ROS_MASTER_URI).")
+@click.option("--ros2", is_flag=True, help="Publish to ROS 2 (ROS_DOMAIN_ID), on this machine.")
+@click.option("--mqtt", metavar="URL", help="Publish to a broker: mqtt://HOST, with Home Assistant discovery.")
+@click.option("--require", type=click.Path(path_type=Path, dir_okay=False), metavar="FILE", help="What the task needs.")
+@click.option("--scalar-rate", type=click.FloatRange(0, 1000), default=10.0, show_default=True, metavar="HZ",
+              help="Rate of topics of one value.")  # fmt: skip
+@link_options
+@pass_app
+def measure(
+    app: App,
+    /,
+    what: Sequence[str],
+    links: LinkSettings,
+    duration: float | None,
+    files: Sequence[str],
+    mqtt: str | None,
+    require: Path | None,
+    scalar_rate: float,
+    **wished: Any,
+) -> None:
+    """Measure a group or nodes: session, datasheet verified, claim, stream; ends by Ctrl-C or --duration.
+
+    `measure recover FILE` makes a recording whole that was cut.
+    """
+    if what[0] == "recover":
+        _recover(app, what[1:])
+        return
+    from teds_provision.measure.orders import Wish
+    from teds_provision.measure.sinks import open_sink
+    from teds_provision.protocol.operation.stream_commands import Kind
+
+    links = over_the_bus(links)
+    if links.via != "can":
+        raise UsageFailure("Streams need a bus.", hint="Name it with --can; over NFC: teds-provision sample UUID")
+    specs = [*files, *(name for name in ("ros1", "ros2") if wished[name])]
+    sinks = [open_sink(spec) for spec in [*specs, *([mqtt] if mqtt else [])]]
+    wish = Wish(
+        channels=tuple(dict.fromkeys(wished["channels"])),
+        rate=wished["rate"],
+        kind=None if wished["kind"] is None else Kind[wished["kind"].upper()],
+        trigger=wished["trigger"],
+        test_pattern=wished["test_pattern"],
+        timeout=links.timeout,
+    )
+    station = app.station()
+    group, uuids = _who(station, what)
+    with ExitStack() as stack:
+        if group:
+            stack.enter_context(station.groups.frozen(group))
+        for uuid in uuids:
+            station.unlock(uuid)
+        if require is not None:
+            _require(app, station, uuids, require)
+        ended = _run(app, station, links, uuids, group, wish, sinks, duration, scalar_rate)
+    _tell_end(app, ended)
+
+
+def _who(station: Station, what: Sequence[str]) -> tuple[str, list[bytes]]:
+    """The group's name ("" where nodes are named) and the UUIDs."""
+    if len(what) == 1 and (group := station.groups.find(what[0])) is not None:
+        if not group.uuids:
+            raise UsageFailure(f"Group {group.name!r} has no node.", hint=f"Add one: group add {group.name} UUID")
+        return group.name, list(group.uuids)
+    return "", list(dict.fromkeys(station.nodes.resolve(text) for text in what))
+
+
+def _run(
+    app: App,
+    station: Station,
+    links: LinkSettings,
+    uuids: Sequence[bytes],
+    group: str,
+    wish: Any,
+    sinks: Sequence[Any],
+    duration: float | None,
+    scalar_rate: float,
+) -> Ended:
+    from teds_provision.cli.measure.showing import watcher_for
+    from teds_provision.links import open_port
+    from teds_provision.links.can.port import CanPort
+    from teds_provision.measure.blocks import StationFacts
+    from teds_provision.measure.runner import Measurement
+
+    port = open_port(links)
+    assert isinstance(port, CanPort)
+    stop = threading.Event()
+    facts = StationFacts(
+        station.name, group=group, started=time.time(), scalar_rate=scalar_rate, test_pattern=wish.test_pattern
+    )
+    try:
+        with watcher_for(app, station, sinks, stop) as watcher, ending(stop):
+            station.audit("measure", None, "begun", nodes=[uuid.hex() for uuid in uuids], group=group)
+            measurement = Measurement(station, port, uuids, wish, sinks, facts, watcher)
+            ended = measurement.run(stop, duration)
+    finally:
+        port.close()
+    outcome = "done" if ended.error is None else ended.error.code
+    station.audit("measure", None, outcome, nodes=[uuid.hex() for uuid in uuids], group=group)
+    return ended
+
+
+def _tell_end(app: App, ended: Ended) -> None:
+    result: dict[str, Any] = {"event": "end", "nodes": ended.nodes, "files": ended.files}
+    if ended.apart:
+        result["began_apart"] = ended.apart
+    lines = []
+    for node in ended.nodes:
+        for stream in node["streams"]:
+            lost = f", lost {stream['lost']}, late {stream['late']}, bad {stream['bad']}"
+            lines.append(f"{node['uuid']}: {stream['samples']} values in {stream['messages']} messages{lost}")
+    lines += [f"Written: {name}" for name in ended.files]
+    app.conclude(result, "\n".join(lines) or "Nothing was measured.", ended.error)
+
+
+def _require(app: App, station: Station, uuids: Sequence[bytes], file: Path) -> None:
+    """Judge the datasheets as this station knows them against what the task needs; raises PolicyRefused (6)."""
+    from teds_provision.cli.steps.build import read_file
+    from teds_provision.teds.fits import judge, met, parse_require
+    from teds_provision.teds.sheet import Sheet
+
+    requirements = parse_require(read_file(file).decode(errors="replace"), str(file))
+    sheets = {}
+    for uuid in uuids:
+        image = station.nodes.datasheet(uuid)
+        if image is not None:
+            sheets[uuid] = Sheet.of(image)
+    fits: list[dict[str, object]] = []
+    unmet: list[str] = []
+    for requirement in requirements:
+        found = []
+        for uuid, sheet in sheets.items():
+            for fit in judge(requirement, sheet):
+                found.append(fit)
+                fits.append({"uuid": uuid.hex(), "channel": fit.channel, "result": fit.result, "why": fit.why})
+        if not met(requirement, found):
+            unmet.append(requirement.subject)
+    if unmet:
+        error = PolicyRefused(
+            f"The datasheets do not suffice for: {', '.join(unmet)}.", hint="See the reasons: nodes --fits, or --json."
+        )
+        app.conclude({"fits": fits}, "\n".join(str(fit["why"]) for fit in fits), error)
+
+
+def _recover(app: App, files: Sequence[str]) -> None:
+    if len(files) != 1:
+        raise UsageFailure("Name one recording.", hint="teds-provision measure recover FILE.mcap")
+    from teds_provision.measure.sinks.lines import iso
+    from teds_provision.measure.sinks.recover import recover
+
+    done = recover(Path(files[0]))
+    until = iso(done.until) if done.until is not None else None
+    told = "is whole" if done.was_whole else f"made whole ({done.cut} octets of a torn end cut off)"
+    app.emit(
+        {"recovered": {"messages": done.messages, "until": until}, "file": files[0], "cut": done.cut},
+        f"{files[0]} {told}: {done.messages} messages" + (f" until {until}" if until else ""),
+    )

@@ -1,0 +1,234 @@
+"""``sample``, ``set``, ``mode``: one node, one moment."""
+
+from __future__ import annotations
+
+import math
+import signal
+import threading
+import time
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from teds_provision.cli.context import App, pass_app
+from teds_provision.cli.options import command, link_options
+from teds_provision.errors import LinkFailure, UsageFailure
+from teds_provision.links import LinkSettings
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+    from teds_provision.measure.sampling import Sample
+    from teds_provision.measure.trusting import Trusted
+    from teds_provision.protocol.operation.commands import Operation, Power
+    from teds_provision.station.station import Station
+
+
+def over_the_bus(links: LinkSettings) -> LinkSettings:
+    """The links of a command for which a bus that is named is meant, also without ``--via can``."""
+    return replace(links, via="can") if links.via == "nfc" and links.can and not links.nfc else links
+
+
+@contextmanager
+def trusted_node(app: App, station: Station, links: LinkSettings, uuid: bytes) -> Iterator[Trusted]:
+    """A node in a session, its datasheet verified; left in order."""
+    from teds_provision.cli.rendering import reporter_for
+    from teds_provision.measure.trusting import open_trusted
+    from teds_provision.talk.conversation import SessionLost
+    from teds_provision.talk.meeting import meet
+
+    reporter = reporter_for(app)
+    with meet(station, over_the_bus(links), uuid, reporter, before=lambda: station.unlock(uuid)) as node:
+        try:
+            yield open_trusted(station, node)
+        except SessionLost as lost:
+            raise lost.cause from lost
+
+
+@command(
+    "teds-provision sample 8d4d --can socketcan:can0",
+    "teds-provision sample 8d4d 1 3 --nfc usb",
+)
+@click.argument("node", metavar="UUID")
+@click.argument("channels", nargs=-1, type=click.IntRange(1, 255), metavar="[CHANNEL …]")
+@link_options
+@pass_app
+def sample(app: App, node: str, channels: Sequence[int], links: LinkSettings) -> None:
+    """Take one reading now: datasheet verified, values calibrated. Without channels every sensor is read."""
+    from teds_provision.measure.sampling import take_samples
+
+    station = app.station()
+    uuid = station.nodes.resolve(node)
+    with trusted_node(app, station, links, uuid) as trusted:
+        samples = take_samples(trusted, channels)
+    result = {"uuid": uuid.hex(), "samples": [one.as_json() for one in samples]}
+    app.emit(result, lambda console: _samples(console, samples))
+
+
+def _samples(console: Console, samples: Sequence[Sample]) -> None:
+    from rich.markup import escape
+    from rich.table import Table
+
+    from teds_provision.cli.rendering import print_table, shown
+
+    table = Table("channel", "name", "value", "±", "unit", "raw", box=None, pad_edge=False)
+    for one in samples:
+        value = f"{one.value:.6g}" if one.value is not None else f"not valid: {one.why}"
+        uncertainty = f"{one.uncertainty:.3g}" if one.uncertainty is not None else ""
+        table.add_row(str(one.channel), escape(shown(one.name)), escape(value), uncertainty, one.unit, str(one.raw))
+    print_table(console, table)
+
+
+@command("teds-provision mode 8d4d --can socketcan:can0")
+@click.argument("node", metavar="UUID")
+@link_options
+@pass_app
+def mode(app: App, node: str, links: LinkSettings) -> None:
+    """What a node claims and does: mode, the state of each channel, power."""
+    from teds_provision.errors import NodeRefused
+    from teds_provision.measure.trusting import operation
+    from teds_provision.protocol.operation.commands import POWER, Power
+
+    station = app.station()
+    uuid = station.nodes.resolve(node)
+    power: Power | None = None
+    with trusted_node(app, station, links, uuid) as trusted:
+        found = operation(trusted.node)
+        try:
+            power = Power.decode(trusted.node.send(POWER, "to tell its power"))
+        except NodeRefused:
+            power = None
+        names = {one.number: one.name for one in trusted.sheet.channels}
+    result = {
+        "uuid": uuid.hex(),
+        "mode": "measurement" if found.measuring else "configuration",
+        "channels": [
+            {"channel": number, "name": names.get(number, ""), "state": words(state), "claimant": claimant}
+            for number, (state, claimant) in sorted(found.channels.items())
+        ],
+        "power": _power(power),
+    }
+    app.emit(result, lambda console: _mode(console, found, names, power))
+
+
+def words(state: int) -> list[str]:
+    """State bits of a channel as words."""
+    from teds_provision.protocol.operation.commands import ChannelState
+
+    return [bit.name.lower().replace("_", " ") for bit in ChannelState if state & bit and bit.name]
+
+
+def _power(power: Power | None) -> dict[str, Any] | None:
+    if power is None:
+        return None
+    from teds_provision.protocol.operation.commands import PowerFlag
+
+    return {
+        "flags": [flag.name.lower().replace("_", " ") for flag in PowerFlag if power.flags & flag and flag.name],
+        "level": power.level,
+        "voltage": power.voltage,
+        "current": power.current,
+        "temperature": power.temperature,
+    }
+
+
+def _mode(console: Console, found: Operation, names: dict[int, str], power: Power | None) -> None:
+    from rich.markup import escape
+    from rich.table import Table
+
+    from teds_provision.cli.rendering import print_table, shown
+
+    console.print(f"{'measurement' if found.measuring else 'configuration'} mode")
+    table = Table("channel", "name", "state", "claimed by", box=None, pad_edge=False)
+    for number, (state, claimant) in sorted(found.channels.items()):
+        by = f"0x{claimant:02X}" if claimant else ""
+        table.add_row(str(number), escape(shown(names.get(number))), ", ".join(words(state)) or "idle", by)
+    print_table(console, table)
+    if power is not None and power.level is not None:
+        console.print(f"Battery {power.level} %")
+
+
+@command(
+    "teds-provision set 91aa 1 0.5 --can socketcan:can0",
+    "teds-provision set 91aa 1 45 --unit degree --hold 3 --can socketcan:can0",
+    name="set",
+)
+@click.argument("node", metavar="UUID")
+@click.argument("channel", type=click.IntRange(1, 255))
+@click.argument("value", type=float)
+@click.option("--unit", metavar="U", help="Unit of VALUE; without it the SI unit of the datasheet.")
+@click.option("--hold", type=click.FloatRange(min=0), metavar="S", help="Seconds; without it until Ctrl-C.")
+@click.option(
+    "--dead-man",
+    type=click.IntRange(20, 10_000),
+    default=1000,
+    show_default=True,
+    metavar="MS",
+    help="Safe state after.",
+)
+@link_options
+@pass_app
+def set_value(
+    app: App,
+    node: str,
+    channel: int,
+    value: float,
+    links: LinkSettings,
+    unit: str | None,
+    hold: float | None,
+    dead_man: int,
+) -> None:
+    """Operate an actuator, hold the value, let go: safe state. The limits of the datasheet are kept (exit 6).
+
+    This is no safety function: see docs/actuators.md.
+    """
+    from teds_provision.measure.acting import Acting
+    from teds_provision.measure.trusting import require_whitelisted
+
+    if not math.isfinite(value):
+        raise UsageFailure("VALUE is not a finite number.")
+    station = app.station()
+    uuid = station.nodes.resolve(node)
+    require_whitelisted(station, uuid)
+    stop = threading.Event()
+    with trusted_node(app, station, links, uuid) as trusted, ending(stop):
+        acting = Acting(trusted, channel, unit=unit, dead_man=dead_man)
+        acting.octets_of(value)  # the limits, before anything is claimed
+        station.audit("set", uuid, "begun", channel=channel, value=value, unit=acting.unit.text)
+        with acting:
+            until = None if hold is None else time.monotonic() + hold
+            told = False
+            while True:
+                applied = acting.apply(value)
+                if not told:
+                    told = True
+                    app.emit({"applied": applied.as_json()}, f"Channel {channel}: {applied.value:g} {applied.unit}")
+                left = acting.pause if until is None else min(acting.pause, until - time.monotonic())
+                if left <= 0 or stop.wait(left):
+                    break
+    station.audit("set", uuid, "done", channel=channel, safe=acting.safe)
+    if acting.safe is None:
+        raise LinkFailure(
+            "The node did not say that its actuator is safe.", hint="Its dead-man brings it there; look: mode UUID."
+        )
+    app.emit({"event": "end", "safe": acting.safe}, "safe" if acting.safe else "NOT in its safe state")
+
+
+@contextmanager
+def ending(stop: threading.Event) -> Iterator[None]:
+    """The first Ctrl-C or SIGTERM ends in order, a second one at once with 130."""
+
+    def end(*_: object) -> None:
+        if stop.is_set():
+            raise KeyboardInterrupt
+        stop.set()
+
+    before = {number: signal.signal(number, end) for number in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)

@@ -1,0 +1,114 @@
+"""Operating one actuator: a set point, kept alive by the loop that computes it, and the safe state at the end.
+
+The dead-man (operation.md section 2) is fed only by :meth:`Acting.apply`, which sends a value. No thread keeps it
+alive: whatever dies, the node brings its actuator to its safe state within the dead-man.
+"""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass
+from types import TracebackType
+from typing import Any
+
+import numpy as np
+
+from teds_provision.errors import BadData, LinkFailure, PolicyRefused, TedsProvisionError
+from teds_provision.measure.sinks.lines import plain
+from teds_provision.measure.trusting import Trusted, claim, operation
+from teds_provision.protocol.operation.commands import ChannelState, idle, write_data_set
+from teds_provision.talk.conversation import SessionLost
+from teds_provision.teds.calibration.interpreter import ChannelInterpreter
+from teds_provision.teds.sheet import Channel
+from teds_provision.teds.units.units import WrittenUnit, parse_unit
+
+LEASE = 10  # seconds
+DEAD_MAN = 1000  # milliseconds
+
+
+@dataclass(frozen=True)
+class Applied:
+    """What an actuator was told: ``value`` in ``unit``, as the raw value stands for it after rounding."""
+
+    channel: int
+    value: float
+    unit: str
+    raw: Any
+
+    def as_json(self) -> dict[str, Any]:
+        """As `set --json` has it."""
+        return {"channel": self.channel, "value": self.value, "unit": self.unit, "raw": self.raw}
+
+
+def unit_for(channel: Channel, text: str | None) -> WrittenUnit:
+    """The unit of a set point: the one that was named, else the datasheet's SI unit; raises BadData, UsageFailure."""
+    if text is None:
+        return WrittenUnit(channel.si_unit, channel.units, 1.0, 0.0)
+    unit = parse_unit(text)
+    if unit.units != channel.units:
+        raise BadData(
+            f"{text} is no unit of channel {channel.number}, whose values are in {channel.si_unit}.",
+            hint=f"Use {channel.unit.text} or {channel.si_unit}.",
+        )
+    return unit
+
+
+class Acting:
+    """One claimed actuator: ``with Acting(…) as acting: acting.apply(value)`` again and again; let go at the end."""
+
+    def __init__(self, trusted: Trusted, number: int, *, unit: str | None = None, dead_man: int = DEAD_MAN) -> None:
+        channel = trusted.channel(number)
+        if not channel.actuator:
+            raise BadData(f"Channel {number} of node {trusted.uuid} is no actuator.")
+        self.unit = unit_for(channel, unit)
+        self.channel, self._trusted, self._dead_man = channel, trusted, dead_man
+        self._interpreter = ChannelInterpreter(trusted.sheet, number)
+        if self._interpreter.problem:
+            raise BadData(self._interpreter.problem)
+        self.safe: bool | None = None
+
+    def octets_of(self, value: float) -> bytes:
+        """The data set for a value in :attr:`unit`; raises PolicyRefused (6) beyond the limits of the datasheet."""
+        one = self._interpreter
+        own = one.unit.from_si(self.unit.to_si(value))
+        beyond = one.beyond(own)
+        if beyond:
+            raise PolicyRefused(beyond, hint="The limits of the signed datasheet are kept.")
+        return one.encode(own)
+
+    def __enter__(self) -> Acting:
+        claim(self._trusted, self.channel.number, lease=LEASE, dead_man=self._dead_man)
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        try:
+            self._trusted.node.send(idle(self.channel.number), "to let go of the actuator")
+            state, _ = operation(self._trusted.node).channels[self.channel.number]
+            self.safe = bool(state & ChannelState.SAFE)
+        except (TedsProvisionError, SessionLost, KeyError):
+            self.safe = None  # nobody can say so from here; the node's dead-man sees to it
+
+    @property
+    def pause(self) -> float:
+        """Seconds after which a value that stays is sent again."""
+        return self._dead_man / 4000
+
+    def apply(self, value: float) -> Applied:
+        """Send one value; raises PolicyRefused (limits, the node), LinkFailure where it was not taken in time."""
+        octets = self.octets_of(value)
+        began = time.monotonic()
+        try:
+            self._trusted.node.send(write_data_set(self.channel.number, octets), "to set the actuator")
+        except SessionLost as lost:
+            raise LinkFailure(
+                f"The session was lost while the actuator was operated: {lost.cause.message}",
+                hint="The node brings it to its safe state by itself.",
+            ) from lost
+        if time.monotonic() - began > self._dead_man / 1000:
+            raise LinkFailure("The value took longer than the dead-man.", hint="The actuator is in its safe state.")
+        raw = self._interpreter.reader.raw(octets)
+        shown = float(np.asarray(self._interpreter.values(raw).value)[0])
+        taken = self.unit.from_si(self._interpreter.unit.to_si(shown)) if np.isfinite(shown) else value
+        return Applied(self.channel.number, taken, self.unit.text, plain(raw.tolist()[0]))

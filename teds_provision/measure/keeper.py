@@ -1,0 +1,344 @@
+"""One node of a measurement: found, trusted, claimed, streaming; found again when it was lost; let go at the end.
+
+A thread of its own for each node, so the steps stay plain sequential code (operation.md section 7): Open, verify,
+Clock, Operate, Subscribe, then Clock every lease / 3. After an error again after 1 s, doubling to 30 s; after an
+Announce at once.
+"""
+
+from __future__ import annotations
+
+import threading
+import time
+from contextlib import suppress
+
+from teds_provision.errors import (
+    BadData,
+    LinkFailure,
+    NodeRefused,
+    NotAuthentic,
+    PolicyRefused,
+    StoreFailure,
+    TedsProvisionError,
+)
+from teds_provision.links.can.port import CanPort
+from teds_provision.links.ports import Contact, Notice
+from teds_provision.measure.blocks import NodeReport, State
+from teds_provision.measure.clock import AT_FIRST, ClockMap, Monotone, Wall
+from teds_provision.measure.facts import facts_of
+from teds_provision.measure.hearing import HeardStream, Hearing
+from teds_provision.measure.interpreter import StreamInterpreter
+from teds_provision.measure.orders import BusShare, Events, StreamTotals, Wish
+from teds_provision.measure.planning import Plans, plan_node, sensors_of
+from teds_provision.measure.trusting import Trusted, claim, exchange_clock, open_trusted
+from teds_provision.protocol.messages.frames import Reason
+from teds_provision.protocol.operation.can_frames import Assembly
+from teds_provision.protocol.operation.commands import idle
+from teds_provision.protocol.operation.stream_commands import SOON, WAITS, Kind, decode_stopped, stop
+from teds_provision.protocol.operation.subscription import Plan, Receiver
+from teds_provision.station.station import Station
+from teds_provision.talk.conversation import Conversation, SessionLost
+from teds_provision.teds.sheet import Channel
+
+FIRST_PAUSE, LAST_PAUSE = 1.0, 30.0
+SILENT = 2.0  # seconds without a good message, beside two messages' time: then the node is lost
+SLOWER = 10  # halvings of the rate while the firmware says that its shortest period is longer
+_CURED_BY_TIME = frozenset({Reason.WRONG_STATE, Reason.BUSY, Reason.BAD_TAG, 21, 22, 23})
+_FINAL = (NotAuthentic, PolicyRefused, BadData, StoreFailure)
+
+
+class NodeKeeper:
+    """Keeps one node measuring until :meth:`stop`; ``error`` is what it ended with, None where all is well."""
+
+    def __init__(
+        self,
+        station: Station,
+        port: CanPort,
+        hearing: Hearing,
+        bus: BusShare,
+        uuid: bytes,
+        wish: Wish,
+        wall: Wall,
+        events: Events,
+    ) -> None:
+        self.uuid = uuid
+        self.error: TedsProvisionError | None = None
+        self.state: State = "waiting"
+        self.ever_ran = False
+        self.totals: dict[int, StreamTotals] = {}
+        self.trusted: Trusted | None = None
+        self.clock = ClockMap()
+        self.running: dict[int, HeardStream] = {}
+        self.turn = threading.Lock()  # of the session: one exchange at a time
+        self.ready = threading.Event()  # streams were asked for
+        self.done = threading.Event()
+        self._station, self._port, self._hearing, self._bus = station, port, hearing, bus
+        self._wish, self._wall, self._events = wish, wall, events
+        self._mapping = threading.Lock()
+        self._monotone: dict[int, Monotone] = {}
+        self._stop = threading.Event()
+        self._anew = threading.Event()
+        self._address: int | None = None
+        self._halved = 0
+        self._told = ""
+        self._thread = threading.Thread(target=self._run, name=f"node {uuid.hex()[:8]}", daemon=True)
+
+    def start(self) -> None:
+        """Begin."""
+        self._thread.start()
+
+    def stop(self) -> None:
+        """Ask it to end in order: Stop, Idle, Close."""
+        self._stop.set()
+        self._anew.set()
+
+    def join(self, seconds: float) -> None:
+        """Wait for its end."""
+        self._thread.join(seconds)
+
+    # -- the thread --------------------------------------------------------------------------------------------------
+
+    def _run(self) -> None:
+        pause = FIRST_PAUSE
+        try:
+            while not self._stop.is_set():
+                self._anew.clear()
+                began = time.monotonic()
+                try:
+                    self._once()
+                    break
+                except SessionLost as lost:
+                    error: TedsProvisionError = lost.cause
+                except TedsProvisionError as caught:
+                    error = caught
+                if self._stop.is_set():
+                    break
+                self.error = error
+                # Before the first value a refusal ends it; later anyone could have sent it, so it is tried again.
+                if isinstance(error, _FINAL) and not self.ever_ran and not self._passing(error):
+                    self._say("refused", error)
+                    return
+                if time.monotonic() - began > LAST_PAUSE:
+                    pause = FIRST_PAUSE
+                self._say("lost" if self.ever_ran else "waiting", error, f"; again in {pause:.0f} s")
+                self._anew.wait(pause)
+                pause = min(2 * pause, LAST_PAUSE)
+            self._say("ended")
+        finally:
+            self.done.set()
+            self.ready.set()
+
+    def _passing(self, error: TedsProvisionError) -> bool:
+        """A refusal that time cures: another claim, no room, a node that is busy or starts anew."""
+        return isinstance(error, NodeRefused) and error.reason in _CURED_BY_TIME
+
+    def _once(self) -> None:
+        contact = self._find()
+        address = contact.address or 0
+        self._address = address
+        with Conversation(contact, notice=lambda _notice: None) as node:
+            trusted = open_trusted(self._station, node)
+            self.trusted = trusted
+            self._hearing.on_announce(address, self._anew.set)
+            try:
+                channels = self._measure(trusted, address)
+                self._keep(trusted, channels)
+            finally:
+                self._end(trusted, address)
+
+    def _find(self) -> Contact:
+        record = self._station.nodes.get(self.uuid)
+        known = record.can_address if record is not None and record.can_address else None
+
+        def wanted(identity: object) -> bool:
+            return getattr(identity, "uuid", None) == self.uuid
+
+        seconds = self._wish.timeout if not self.ever_ran else 2.0
+        until = time.monotonic() + seconds
+        while True:
+            try:
+                left = max(0.5, min(2.0, until - time.monotonic()))
+                return self._port.find(wanted, seconds=left, notice=_nothing, address=self._address or known)
+            except LinkFailure:
+                if self._stop.is_set() or time.monotonic() >= until:
+                    raise
+
+    def _measure(self, trusted: Trusted, address: int) -> list[Channel]:
+        """Clock, Operate, Subscribe; every stream is heard from then on."""
+        wish = self._wish
+        with self._mapping:
+            self.clock = ClockMap()
+        for _ in range(AT_FIRST):
+            self._tell_time(trusted)
+        channels = sensors_of(trusted.sheet.channels, wish.channels, wish.kind)
+        if len(channels) == sum(1 for one in trusted.sheet.channels if not one.actuator):
+            claim(trusted, 0, lease=wish.lease)
+        else:
+            for one in channels:
+                claim(trusted, one.number, lease=wish.lease)
+        plans = self._subscribe(trusted, channels, address)
+        periods = {number: p.subscribe.period / 1e9 for p in plans.streams for number in p.layout.channels}
+        self._events.facts(
+            [
+                facts_of(
+                    trusted.sheet,
+                    one,
+                    name=trusted.name,
+                    fingerprint=trusted.fingerprint,
+                    period=None if _is_event(one) else periods[one.number],
+                )
+                for one in channels
+            ]
+        )
+        notes = [plans.slowed] if plans.slowed else []
+        notes += [problem for heard in self.running.values() for problem in heard.interpreter.problems.values()]
+        self.ever_ran, self.error = True, None
+        self._say("running", why="; ".join(notes))
+        self.ready.set()
+        return channels
+
+    def _subscribe(self, trusted: Trusted, channels: list[Channel], address: int) -> Plans:
+        while True:
+            rate = self._wish.rate
+            with self._bus.lock:
+                plans = plan_node(
+                    channels,
+                    self._bus.others(self.uuid),
+                    rate=rate,
+                    kind=self._wish.kind,
+                    test_pattern=self._wish.test_pattern,
+                    start=WAITS if self._wish.trigger else SOON,
+                    slower=2**self._halved,
+                )
+                self._bus.taken[self.uuid] = plans.load
+            try:
+                for plan in plans.streams:
+                    self._stream(trusted, plan, address)
+            except NodeRefused as refusal:
+                if refusal.reason != Reason.OUT_OF_RANGE or rate is not None or self._halved >= SLOWER:
+                    raise
+                self._halved += 1  # the firmware's shortest period is longer than the datasheet's: nobody says it
+                self._stop_streams(trusted, address)
+                continue
+            return plans
+
+    def _stream(self, trusted: Trusted, plan: Plan, address: int) -> None:
+        number = plan.subscribe.stream
+        payload = trusted.node.send(plan.command(), "to stream")
+        with self._mapping:
+            reply = plan.accept(payload, self.clock.ticks_at(time.monotonic_ns()))
+        before = self.running.get(number)
+        receiver = Receiver(
+            plan, reply, trusted.node.message_key, previous=before.receiver if before is not None else None
+        )
+        monotone = self._monotone.setdefault(number, Monotone())
+        interpreter = StreamInterpreter(trusted.sheet, plan, reply.run, self.clock, self._wall, monotone)
+        assembly = Assembly(plan.length, fd=self._port.spec.fd)
+        heard = HeardStream(receiver, assembly, interpreter, self.clock, self._mapping, self._events.block)
+        self.running[number] = heard
+        self.totals.setdefault(number, StreamTotals(plan.layout.channels, plan.subscribe.period / 1e9))
+        self._hearing.register(address, number, heard)
+
+    def _tell_time(self, trusted: Trusted) -> None:
+        """One Clock: sends and waits without the map's lock, which the hearing thread needs."""
+        fresh = ClockMap()
+        exchange_clock(trusted.node, fresh)
+        with self._mapping:
+            for one in fresh.exchanges:
+                self.clock.exchange(one)
+            if fresh.lie:
+                self.clock.lie = fresh.lie
+
+    def _keep(self, trusted: Trusted, channels: list[Channel]) -> None:
+        """Clock every lease / 3 until the end, or until the node is lost."""
+        told = time.monotonic()
+        every = self._wish.lease / 3
+        lied = False
+        while not self._stop.is_set():
+            if self._anew.wait(0.2) and not self._stop.is_set():
+                raise LinkFailure("The node has started anew.")
+            now = time.monotonic()
+            if now - told >= every:
+                with self.turn:
+                    self._tell_time(trusted)
+                told = now
+            if self.clock.lie and not lied:
+                lied = True
+                self._say("running", why=f"its clock lies: {self.clock.lie}")
+            silent = self._silent(now)
+            if silent:
+                raise LinkFailure(
+                    f"No message of the node came for {silent:.1f} s.", hint="Check its power and the bus."
+                )
+
+    def _silent(self, now: float) -> float:
+        """Seconds of silence where that is too long; events may be silent for ever, and so may what waits."""
+        for heard in self.running.values():
+            plan = heard.receiver.plan
+            if plan.subscribe.kind == Kind.EVENT or heard.receiver.start is None:
+                continue
+            if now - heard.heard > SILENT + 3 * plan.span / 1e9:
+                return now - heard.heard
+        return 0.0
+
+    def _stop_streams(self, trusted: Trusted | None, address: int) -> None:
+        for number, heard in list(self.running.items()):
+            if trusted is not None:
+                with suppress(TedsProvisionError, SessionLost):
+                    counter = decode_stopped(trusted.node.send(stop(number), "to stop a stream"))
+                    heard.receiver.finish(counter)
+            self._hearing.forget(address, number)
+            self.totals[number].add(heard)
+        self.running.clear()
+
+    def _end(self, trusted: Trusted, address: int) -> None:
+        """Let go in order, as far as the node still answers."""
+        alive = self._stop.is_set()
+        self._hearing.on_announce(address, None)
+        self._stop_streams(trusted if alive else None, address)
+        with self._bus.lock:
+            self._bus.taken.pop(self.uuid, None)
+        if alive:
+            with suppress(TedsProvisionError, SessionLost):
+                trusted.node.send(idle(0), "to let go")
+        else:
+            trusted.node.forget()
+        self.trusted = None
+
+    # -- telling ---------------------------------------------------------------------------------------------------
+
+    def report(self) -> NodeReport:
+        """How the node does now."""
+        sums = [StreamTotals(one.channels, one.period) for one in self.totals.values()]
+        for mine, (number, past) in zip(sums, self.totals.items(), strict=True):
+            for name in ("messages", "samples", "lost", "late", "bad", "invalid"):
+                setattr(mine, name, getattr(past, name))
+            mine.clock_error = past.clock_error
+            heard = self.running.get(number)
+            if heard is not None:
+                mine.add(heard)
+        errors = [one.clock_error for one in sums if one.clock_error is not None]
+        return NodeReport(
+            uuid=self.uuid.hex(),
+            state=self.state,
+            why=self._told,
+            samples=sum(one.samples for one in sums),
+            lost=sum(one.lost for one in sums),
+            late=sum(one.late for one in sums),
+            bad=sum(one.bad for one in sums),
+            invalid=sum(one.invalid for one in sums),
+            clock_error=max(errors) if errors else None,
+            time=time.time(),
+        )
+
+    def _say(self, state: State, error: TedsProvisionError | None = None, more: str = "", *, why: str = "") -> None:
+        self.state = state
+        self._told = why or (error.message.rstrip(".") + more if error is not None else "")
+        self._events.report(self.report())
+
+
+def _is_event(channel: Channel) -> bool:
+    return channel.kind is not None and channel.kind.name == "EVENT_SENSOR"
+
+
+def _nothing(_notice: Notice) -> None:
+    """Looking for a node is told once, as its state."""

@@ -1,0 +1,191 @@
+"""Which streams a node is asked for: channels by period, instants in a message, the gap, what the bus bears.
+
+Raises PolicyRefused where an asked rate does not fit, with the fastest that does; without one the datasheet's periods
+are slowed to what fits, and ``Plans.slowed`` says so.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+from teds_provision.errors import BadData, PolicyRefused
+from teds_provision.protocol.operation.budget import MOST_LOAD, bus_load, frames, share
+from teds_provision.protocol.operation.stream_commands import LAST_STREAM, MOST_STREAM_CHANNELS, SOON, Kind
+from teds_provision.protocol.operation.subscription import Plan, most_instants
+from teds_provision.teds.sheet import Channel
+from teds_provision.teds.sheet import Kind as ChannelKind
+
+BLOCK = 20_000_000  # ns of samples in one message, about: what calibrates well in blocks and is not late yet
+UNSTATED = 100_000_000  # ns: the period of a channel whose datasheet says none
+LONGEST = 10**12  # ns, the contract's
+MILLION = 10**6
+NODE_SHARE = 0.5  # of the node's own budget: room for commands between data frames
+MOST_GAP = 2_000  # µs
+
+
+@dataclass(frozen=True)
+class BusTime:
+    """What a CAN bus carries: bit/s, and whether frames are FD; ``taken`` is the share of others' data frames."""
+
+    bitrate: int = 500_000
+    data_bitrate: int | None = None
+    taken: float = 0.0
+
+    @property
+    def fd(self) -> bool:
+        """Whether data goes in frames of 64 octets."""
+        return self.data_bitrate is not None
+
+
+@dataclass(frozen=True)
+class Plans:
+    """Streams of one node; ``load`` is the share of the bus that they take at worst-case stuffing."""
+
+    streams: tuple[Plan, ...]
+    load: float
+    slowed: str = ""
+
+
+def plan_node(
+    channels: Sequence[Channel],
+    bus: BusTime,
+    *,
+    rate: float | None = None,
+    kind: Kind | None = None,
+    test_pattern: bool = False,
+    start: int = SOON,
+    slower: float = 1.0,
+) -> Plans:
+    """Streams over these channels of one node; ``rate`` in Hz for all of them, ``slower`` multiplies every period."""
+    groups = _groups(channels, rate, kind)
+    asked = min(period for period, _, _ in groups)
+    factor = slower
+    for _ in range(200):
+        paced = [(round(period * factor), how, members) for period, how, members in groups]
+        plans = [_plan(number, *group, bus, test_pattern, start) for number, group in enumerate(paced)]
+        load = bus.taken + sum(_load(plan, bus) for plan in plans)
+        gap = _gap(plans, bus)
+        if load <= MOST_LOAD and gap is not None:
+            break
+        factor *= max(1.02, load / MOST_LOAD)
+    else:
+        raise PolicyRefused("The bus has no room for another node's data.", hint="Measure fewer nodes, or more slowly.")
+    fastest = min(period for period, _, _ in paced)
+    if fastest > asked * 1.000001:
+        text = f"{1e9 / fastest:.6g} Hz"
+        if rate is not None:
+            raise PolicyRefused(
+                f"{rate:g} Hz does not fit the bus ({MOST_LOAD:.0%} of it for data).",
+                hint=f"The fastest is --rate {text[:-3]}",
+            )
+        why = "more does not fit the bus" if factor > slower else "the node takes no shorter period"
+        slowed = f"slowed from {1e9 / asked:.6g} Hz to {text}: {why}"
+    else:
+        slowed = ""
+    streams = tuple(replace(plan, subscribe=replace(plan.subscribe, gap=gap)) for plan in plans)
+    return Plans(streams, load - bus.taken, slowed)
+
+
+def sensors_of(channels: Sequence[Channel], wanted: Sequence[int], kind: Kind | None) -> list[Channel]:
+    """The sensors to measure: those that were asked for, or all; raises BadData where one cannot be."""
+    fitting = [one for one in channels if one.kind in (ChannelKind.SENSOR, ChannelKind.EVENT_SENSOR) and one.sample]
+    if kind == Kind.EVENT:
+        fitting = [one for one in fitting if one.kind == ChannelKind.EVENT_SENSOR]
+    elif kind is not None:
+        fitting = [one for one in fitting if one.kind == ChannelKind.SENSOR]
+    if not wanted:
+        if not fitting:
+            raise BadData("The datasheet describes no sensor that can be measured so.")
+        return fitting
+    numbers = {one.number: one for one in fitting}
+    strangers = [number for number in wanted if number not in numbers]
+    if strangers:
+        raise BadData(
+            f"Channel {strangers[0]} is no sensor of this datasheet that can be measured so.",
+            hint=f"It has {', '.join(map(str, numbers)) or 'none'}.",
+        )
+    return [numbers[number] for number in dict.fromkeys(wanted)]
+
+
+_Group = tuple[int, Kind, list[Channel]]
+
+
+def _groups(channels: Sequence[Channel], rate: float | None, kind: Kind | None) -> list[_Group]:
+    """Channels by period and kind, at most 16 each; all at the slowest period where that makes too many streams."""
+    by: dict[tuple[int, Kind], list[Channel]] = {}
+    for one in channels:
+        event = one.kind == ChannelKind.EVENT_SENSOR
+        how = Kind.EVENT if event else Kind.FREE if kind == Kind.FREE else Kind.PERIODIC
+        by.setdefault((period_of(one, rate), how), []).append(one)
+    groups = _cut(by)
+    if len(groups) > LAST_STREAM + 1:
+        slowest = max(period for (period, how) in by if how != Kind.EVENT) if any(h != Kind.EVENT for _, h in by) else 0
+        together: dict[tuple[int, Kind], list[Channel]] = {}
+        for (period, how), members in by.items():
+            together.setdefault((period if how == Kind.EVENT else slowest, how), []).extend(members)
+        groups = _cut(together)
+    if len(groups) > LAST_STREAM + 1:
+        raise PolicyRefused(
+            f"{len(channels)} channels need {len(groups)} streams; a node has {LAST_STREAM + 1}.",
+            hint="Name fewer with --channel.",
+        )
+    return groups
+
+
+def _cut(by: dict[tuple[int, Kind], list[Channel]]) -> list[_Group]:
+    groups: list[_Group] = []
+    for (period, how), members in by.items():
+        step = 1 if how == Kind.EVENT else MOST_STREAM_CHANNELS
+        # As even as can be: 25 channels as 13 and 12 make shorter messages than 16 and 9.
+        parts = math.ceil(len(members) / step)
+        size = math.ceil(len(members) / parts)
+        groups += [(period, how, members[at : at + size]) for at in range(0, len(members), size)]
+    return groups
+
+
+def period_of(channel: Channel, rate: float | None) -> int:
+    """Nanoseconds between samples: of the rate, never below the datasheet's SPeriod; whole microseconds if need be."""
+    stated = round(channel.period * 1e9) if math.isfinite(channel.period) and channel.period > 0 else 0
+    if rate is None:
+        return min(stated or UNSTATED, LONGEST)
+    period = round(1e9 / rate)
+    if period < stated * (1 - 1e-6):
+        raise PolicyRefused(
+            f"Channel {channel.number} gives at most {1e9 / stated:g} samples a second.",
+            hint=f"Use --rate {1e9 / stated:g}",
+        )
+    return min(period, LONGEST)
+
+
+def _plan(
+    number: int, period: int, kind: Kind, members: list[Channel], bus: BusTime, test_pattern: bool, start: int
+) -> Plan:
+    widths = tuple((one.number, one.sample.octets if one.sample else 0) for one in members)
+    octets = sum(width for _, width in widths)
+    most = most_instants(kind, octets)
+    if most < 1:
+        raise BadData(f"One instant of channels {', '.join(str(n) for n, _ in widths)} does not fit a message.")
+    n = max(1, min(most, BLOCK // period)) if kind != Kind.EVENT else 1
+    plan = Plan.of(number, widths, n=n, period=period, kind=kind, start=start, test_pattern=test_pattern)
+    # Fuller messages where the bus is short of room: the overhead of a message is 13 octets.
+    while n < most and _load(plan, bus) > MOST_LOAD / 2 and kind != Kind.EVENT:
+        n = min(most, 2 * n)
+        plan = Plan.of(number, widths, n=n, period=period, kind=kind, start=start, test_pattern=test_pattern)
+    return plan
+
+
+def _load(plan: Plan, bus: BusTime) -> float:
+    n, period = plan.subscribe.n, plan.subscribe.period
+    return bus_load(plan.length, n, period, bitrate=bus.bitrate, data_bitrate=bus.data_bitrate)
+
+
+def _gap(plans: Sequence[Plan], bus: BusTime) -> int | None:
+    """Microseconds between the node's data frames: what spreads them and still lets all leave in time."""
+    unit = sum(
+        share(frames(plan.length, link="can", fd=bus.fd), 1, plan.subscribe.n, plan.subscribe.period) for plan in plans
+    )
+    if unit > MILLION:
+        return None
+    return max(1, min(MOST_GAP, int(MILLION * NODE_SHARE / max(unit, 1))))

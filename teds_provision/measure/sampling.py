@@ -1,0 +1,106 @@
+"""One reading now: Operate, Sample, Idle, over whichever link the node is on (operation.md section 2)."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from teds_provision.measure.clock import ClockMap, Wall
+from teds_provision.measure.planning import sensors_of
+from teds_provision.measure.sinks.lines import plain
+from teds_provision.measure.trusting import Trusted, claim, exchange_clock
+from teds_provision.protocol.operation.commands import MOST_SAMPLE_CHANNELS, Sampled, idle, sample
+from teds_provision.teds.calibration.interpreter import ChannelInterpreter
+
+LEASE = 5
+ROOM = 180  # octets of data sets in one reply, so that it fits any node's maxMessage
+
+
+@dataclass(frozen=True)
+class Sample:
+    """One value; ``value`` and ``uncertainty`` in ``unit`` (SI), None where not valid or not stated."""
+
+    channel: int
+    name: str
+    value: float | None
+    unit: str
+    raw: Any
+    uncertainty: float | None
+    valid: bool
+    time: float
+    why: str = ""
+
+    def as_json(self) -> dict[str, Any]:
+        """As `sample --json` has it."""
+        told = {key: getattr(self, key) for key in ("channel", "name", "value", "unit", "raw", "uncertainty", "valid")}
+        return {**told, "time": self.time, **({"why": self.why} if self.why else {})}
+
+
+def take_samples(trusted: Trusted, numbers: Sequence[int]) -> list[Sample]:
+    """Fresh values of these channels (none: every sensor), taken together as far as one reply holds them."""
+    channels = sensors_of(trusted.sheet.channels, numbers, None)
+    interpreters = {one.number: ChannelInterpreter(trusted.sheet, one.number) for one in channels}
+    more = {other for one in interpreters.values() for other in one.others}
+    known = {one.number for one in trusted.sheet.channels}
+    for other in sorted((more & known) - set(interpreters)):  # what the calibration of an asked one takes
+        interpreters[other] = ChannelInterpreter(trusted.sheet, other)
+    clock, wall = ClockMap(), Wall.now()
+    for _ in range(3):
+        exchange_clock(trusted.node, clock)
+    for number in interpreters:
+        claim(trusted, number, lease=LEASE)
+    raws: dict[int, np.ndarray] = {}
+    times: dict[int, float] = {}
+    good: dict[int, bool] = {}
+    for part in _parts(interpreters):
+        width = sum(interpreters[number].octets for number in part)
+        reply = Sampled.decode(trusted.node.send(sample(part), "to sample"), width)
+        at, stamp = 0, float(wall.unix(clock.host(np.array([reply.tick], dtype=np.uint64)))[0])
+        for number in part:
+            one = interpreters[number]
+            raws[number] = one.reader.raw(reply.data[at : at + one.octets])
+            times[number], good[number] = stamp, reply.valid
+            at += one.octets
+    trusted.node.send(idle(0), "to let go")
+    return [_sample(interpreters[one.number], raws, good, times[one.number]) for one in channels]
+
+
+def _parts(interpreters: dict[int, ChannelInterpreter]) -> list[list[int]]:
+    parts: list[list[int]] = [[]]
+    size = 0
+    for number, one in interpreters.items():
+        if parts[-1] and (size + one.octets > ROOM or len(parts[-1]) == MOST_SAMPLE_CHANNELS):
+            parts.append([])
+            size = 0
+        parts[-1].append(number)
+        size += one.octets
+    return parts
+
+
+def _sample(one: ChannelInterpreter, raws: dict[int, np.ndarray], good: dict[int, bool], stamp: float) -> Sample:
+    channel = one.channel
+    missing = [other for other in one.others if other not in raws]
+    why = one.problem or (f"channel {missing[0]}, which compensates it, is not there" if missing else "")
+    value, valid = math.nan, False
+    if not why:
+        found = one.values(raws[channel.number], {other: raws[other] for other in one.others})
+        valid = bool(found.valid[0]) and all(good[other] for other in (channel.number, *one.others))
+        value = one.unit.to_si(float(found.value[0]))
+        why = "" if valid else "the node or the datasheet says that it is not valid"
+    uncertainty = channel.stated_uncertainty
+    return Sample(
+        channel=channel.number,
+        name=channel.name,
+        value=plain(value) if valid else None,
+        unit=channel.si_unit,
+        raw=plain(raws[channel.number].tolist()[0]),
+        uncertainty=plain(uncertainty),
+        valid=valid,
+        time=stamp if stamp else time.time(),
+        why=why,
+    )

@@ -1,0 +1,105 @@
+"""A session with a node whose datasheet stands: what has to hold before a value of it counts (operation.md section 1).
+
+The node's Security TEDS is read in the session. Where it is octet for octet the one that this station has verified and
+kept, the rest need not be read again: it names the digest of every other TEDS. Everything is judged anew all the same,
+for trust, bans and pins may have changed since.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import time
+from dataclasses import dataclass
+
+from teds_provision.errors import BadData, PolicyRefused
+from teds_provision.measure.clock import ClockMap, Exchange
+from teds_provision.protocol.operation import commands
+from teds_provision.protocol.operation.commands import Operate, Operation
+from teds_provision.protocol.operation.stream_commands import CLOCK, Clock
+from teds_provision.station.station import Station
+from teds_provision.steps.agree import require_session
+from teds_provision.steps.read import read_block, read_identity, read_image
+from teds_provision.steps.verify import Verified, known_of, require_authentic, session, verify_image
+from teds_provision.talk.conversation import Conversation
+from teds_provision.teds.image import SECURITY
+from teds_provision.teds.sheet import Channel, Sheet
+
+
+@dataclass(frozen=True)
+class Trusted:
+    """A node in a session, with a datasheet that was verified just now.
+
+    ``digest`` is what Operate takes (16 octets), ``fingerprint`` the SHA-256 of the Security TEDS in hex.
+    """
+
+    node: Conversation
+    sheet: Sheet
+    fingerprint: str
+    name: str
+
+    @property
+    def uuid(self) -> str:
+        """20 hex digits."""
+        return self.sheet.uuid.hex()
+
+    @property
+    def digest(self) -> bytes:
+        """First 16 octets of the fingerprint."""
+        return bytes.fromhex(self.fingerprint)[: commands.DIGEST_OCTETS]
+
+    def channel(self, number: int) -> Channel:
+        """A channel of the datasheet; raises BadData where there is none."""
+        found = self.sheet.channel(number)
+        if found is None:
+            numbers = ", ".join(str(one.number) for one in self.sheet.channels) or "none"
+            raise BadData(f"Node {self.uuid} has no channel {number}; its datasheet has {numbers}.")
+        return found
+
+
+def open_trusted(station: Station, node: Conversation) -> Trusted:
+    """Open a session and verify the datasheet.
+
+    Raises PolicyRefused (no key, banned), NotAuthentic and Unproven (the datasheet), LinkFailure.
+    """
+    require_session(station, node)
+    identity = read_identity(node)
+    octets = read_block(node, SECURITY)
+    kept = station.nodes.datasheet(node.uuid)
+    image = kept if kept is not None and kept.security == octets else read_image(node)
+    checks = verify_image(station, image, known=known_of(station, node.uuid, identity))
+    checks.append(session("opened under the key that is held here", ""))
+    require_authentic(Verified(node.uuid, tuple(checks)))
+    if image is not kept:
+        station.nodes.keep_datasheet(image)
+    record = station.nodes.get(node.uuid)
+    name = record.name if record is not None and record.name else ""
+    return Trusted(node, Sheet.of(image), hashlib.sha256(octets).hexdigest(), name)
+
+
+def require_whitelisted(station: Station, uuid: bytes) -> None:
+    """Actuators move only for nodes on the whitelist (operation.md section 7); raises PolicyRefused."""
+    if station.pins.entry(uuid) is None:
+        raise PolicyRefused(
+            f"Node {uuid.hex()} is not on the whitelist: its actuators are not moved.",
+            hint=f"Put it there: teds-provision whitelist add {uuid.hex()}",
+        )
+
+
+def exchange_clock(node: Conversation, clock: ClockMap) -> Clock:
+    """One Clock command, taken into the map; the map's ``lie`` says where the node's clock cannot be believed."""
+    asked = time.monotonic_ns()
+    reply = Clock.decode(node.send(CLOCK, "to tell its time"))
+    answered = time.monotonic_ns()
+    clock.exchange(Exchange(asked, answered, reply.received, reply.sent, reply.step, reply.drift))
+    return reply
+
+
+def claim(trusted: Trusted, channel: int, *, lease: int, dead_man: int | None = None) -> None:
+    """Operate: claim a channel, 0 for every sensor; ``lease`` in s, ``dead_man`` in ms for an actuator."""
+    command = Operate(channel, trusted.digest, lease, dead_man).command()
+    trusted.node.send(command, f"to measure with channel {channel}" if channel else "to measure")
+
+
+def operation(node: Conversation) -> Operation:
+    """What the node claims and does (128.19)."""
+    return Operation.decode(node.send(commands.OPERATION, "to tell its mode"))

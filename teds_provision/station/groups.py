@@ -1,0 +1,91 @@
+"""Measurement groups: a name, and the UUIDs that are measured together (operation.md section 5)."""
+
+from __future__ import annotations
+
+import fcntl
+import os
+import re
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+
+from teds_provision.errors import NotFound, PolicyRefused, UsageFailure
+from teds_provision.store import Store
+from teds_provision.store.records import Group
+
+_LIKE_A_UUID = re.compile(r"(0x)?[0-9a-fA-F]{4,}\Z")
+LONGEST = 64
+
+
+class Groups:
+    """The groups of one station. A group that is measured is frozen: it cannot be changed until the measurement ends.
+
+    The mark of that is a lock that the system takes away with the process, however that ends.
+    """
+
+    def __init__(self, store: Store, home: Path) -> None:
+        self._store, self._home = store, home
+
+    def all(self) -> list[Group]:
+        """Every group, by name."""
+        return self._store.groups()
+
+    def get(self, name: str) -> Group:
+        """One group; raises NotFound."""
+        found = self._store.group(name)
+        if found is None:
+            known = ", ".join(group.name for group in self.all()) or "none"
+            raise NotFound(f"There is no group {name!r}.", hint=f"There is: {known}.")
+        return found
+
+    def find(self, name: str) -> Group | None:
+        """One group, None where there is none of exactly this name."""
+        return self._store.group(name)
+
+    def create(self, name: str, uuids: Sequence[bytes]) -> Group:
+        """Make a group, or give the one that is there back where it has the same members; raises UsageFailure."""
+        if not name.strip() or not name.isprintable() or len(name) > LONGEST or _LIKE_A_UUID.match(name):
+            raise UsageFailure(
+                f"{name!r} cannot be the name of a group.", hint="Use up to 64 characters, not hex digits alone."
+            )
+        present = self._store.group(name)
+        if present is not None and set(present.uuids) != set(uuids):
+            raise UsageFailure(f"There is a group {name!r} already.", hint=f"Add nodes to it: group add {name} UUID …")
+        if present is None:
+            self._store.put_group(Group(name, tuple(dict.fromkeys(uuids))))
+        return self.get(name)
+
+    def add(self, name: str, uuids: Iterable[bytes]) -> Group:
+        """Add nodes; raises NotFound, PolicyRefused while it is measured."""
+        self.get(name)
+        with self.frozen(name):
+            self._store.add_to_group(name, uuids)
+        return self.get(name)
+
+    def remove(self, name: str, uuids: Iterable[bytes]) -> Group:
+        """Take nodes out; raises NotFound, PolicyRefused while it is measured."""
+        self.get(name)
+        with self.frozen(name):
+            self._store.remove_from_group(name, uuids)
+        return self.get(name)
+
+    def delete(self, name: str) -> bool:
+        """Delete a group; False where there is none. Raises PolicyRefused while it is measured."""
+        with self.frozen(name):
+            return self._store.remove_group(name)
+
+    @contextmanager
+    def frozen(self, name: str) -> Iterator[None]:
+        """Hold a group as it is; raises PolicyRefused where another process does."""
+        place = self._home / f"measuring-{name.encode().hex()}.lock"
+        descriptor = os.open(place, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
+        try:
+            try:
+                fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except BlockingIOError:
+                raise PolicyRefused(
+                    f"Group {name!r} is being measured: it stays as it is.", hint="End that measurement first."
+                ) from None
+            yield
+        finally:
+            os.close(descriptor)
