@@ -5,7 +5,7 @@ PYTHON ?= python3
 VENV ?= .venv
 BIN := $(VENV)/bin
 
-.PHONY: demo test lint types unit bench bench-teds bench-handover fuzz model clean
+.PHONY: demo test lint types unit bench bench-teds bench-handover fuzz faults model clean
 
 demo: $(VENV)/.run
 	@$(BIN)/teds-provision demo
@@ -41,6 +41,10 @@ fuzz: .venv-fuzz/.ready
 	@mkdir -p build/fuzz
 	@set -e; for target in $(or $(TARGET),$(FUZZ_TARGETS)); do \
 	  echo "== $$target"; .venv-fuzz/bin/python tests/fuzz/run.py $$target -runs=$(RUNS); done
+
+# Cuts at every durable write and message of every changing command, failing disks, power loss; an hour, or all (FULL=1).
+faults: $(VENV)/.dev
+	$(BIN)/python -m tests.faults.bench $(if $(FULL),--full,--minutes 60)
 
 # The model of a key's life, by SPIN: the rules hold, each broken one is found.
 model: $(VENV)/.made
