@@ -125,6 +125,12 @@ class StoreFailure(TedsProvisionError):
     code = "store"
 
 
+class StoreChanged(StoreFailure):
+    """Another program changed a row that decides whom the station believes."""
+
+    code = "store-changed"
+
+
 class StoreLocked(StoreFailure):
     """Another process holds the store."""
 

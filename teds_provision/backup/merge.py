@@ -76,9 +76,11 @@ class Merge:
                 continue
             other = known.point is not None and record.point is not None and known.point != record.point
             base = record if self.newer and not other else known
+            kept = record if known.point is None and self.newer else known
             wanted = replace(
                 base,
-                point=known.point or (record.point if self.newer else None),
+                point=kept.point,
+                point_mac=kept.point_mac,
                 epoch=max(known.epoch, record.epoch),
                 sequence=max(known.sequence, record.sequence),
             )

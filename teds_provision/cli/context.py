@@ -170,7 +170,7 @@ class App:
         """Open this base station (store now, vault when a key is first needed); NotFound says to run init."""
         from teds_provision.station.station import Station
 
-        station = Station.open(self.home, ask=self.ask_secret)
+        station = Station.open(self.home, ask=self.ask_secret, tell=self.warn)
         self.closing(station.close)
         return station
 

@@ -116,6 +116,7 @@ def ask_for_certificate(home: Path, *, name: str | None, keystore: str | None, a
         if station.identity.requested is None:
             vault, why = create_vault(home, store.id, keystore, ask, with_ca=False)
             where = keystore if keystore and keystore.startswith("pkcs11:") else vault.kind
+            station.adopt(vault)
             with station.transaction():
                 station.identity.found(name, where, why, requested=vault.identity().point)
                 station.audit("init", None, "requested", fingerprint=fingerprint(vault.identity().point))

@@ -48,7 +48,7 @@ def candidate(station: Station, name: str, path: Path, role: TrustRole) -> Candi
         raise PolicyRefused(f"{path} holds this station's own key ({digits[:16]}); it needs no trust.")
     _check_name(name)
     record = TrustRecord(name, role, point, digits)
-    present = [known for known in station.policy.trusted() if known.name == name or known.fingerprint == digits]
+    present = [known for known in station.policy.listed() if known.name == name or known.fingerprint == digits]
     known = any((old.name, old.role, old.point) == (name, role, point) for old in present)
     for old in present:
         if old.name == name and (old.role, old.point) != (role, point):
@@ -131,7 +131,7 @@ def find_trusted(station: Station, text: str, role: TrustRole | None = None) -> 
 
     Raises NotFound, UsageFailure (several fit), BadData (file), PolicyRefused (the file's key is not trusted).
     """
-    known = [record for record in station.policy.trusted() if role in (None, record.role)]
+    known = station.policy.listed() if role is None else station.policy.trusted(role)
     digits = text.replace(" ", "").lower()
     by_digits = len(digits) >= _MIN_PREFIX and not set(digits) - set("0123456789abcdef")
     fits = [record for record in known if record.name == text] or [

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 from teds_provision.station.node_keys import NodeKeys
+from teds_provision.station.seals import Seals
 from teds_provision.store import Batch, Handover, Store
 from teds_provision.store.records import Direction
 
@@ -10,9 +13,10 @@ from teds_provision.store.records import Direction
 class Handovers:
     """The handovers of one station."""
 
-    def __init__(self, store: Store, keys: NodeKeys) -> None:
+    def __init__(self, store: Store, keys: NodeKeys, seals: Seals) -> None:
         self._store = store
         self._keys = keys
+        self._seals = seals
 
     def all(self) -> list[Handover]:
         """Every bundle that left or came, oldest first."""
@@ -33,5 +37,8 @@ class Handovers:
     def take_in(self, batch: Batch) -> None:
         """Add or replace many rows, all or none; the caller has held them against what is there."""
         with self._store.transaction():
-            self._store.put_batch(batch)
+            seals = self._seals
+            nodes = [replace(n, point_mac=seals.point(n.uuid, n.point) if n.point else None) for n in batch.nodes]
+            entries = [seals.entry(entry) for entry in batch.whitelist]
+            self._store.put_batch(replace(batch, nodes=nodes, whitelist=entries))
             self._keys.mark(batch.marks)

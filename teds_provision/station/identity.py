@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 from teds_provision.errors import NotAuthentic, NotFound, PolicyRefused
 from teds_provision.protocol.agreement import Credentials
 from teds_provision.protocol.keys import fingerprint, station_key_message, verify
+from teds_provision.station.seals import Seals
 from teds_provision.store import Facts, Store
 
 if TYPE_CHECKING:
@@ -20,9 +21,10 @@ DEFAULT_NAME = "station"
 class Identity:
     """The facts of one station, and the certificates (SIG104) that it knows; secrets come from the vault."""
 
-    def __init__(self, store: Store, vault: Callable[[], Vault]) -> None:
+    def __init__(self, store: Store, vault: Callable[[], Vault], seals: Seals) -> None:
         self._store = store
         self._vault = vault
+        self._seals = seals
 
     # -- facts -----------------------------------------------------------------------------------------------------
 
@@ -39,11 +41,12 @@ class Identity:
 
     def found(self, name: str | None, keystore: str, keystore_why: str, *, requested: bytes | None = None) -> None:
         """Keep where the secrets of a new station lie, and the key for which it asks a certificate, if it does."""
-        self._store.put_facts(Facts(name or DEFAULT_NAME, keystore, keystore_why, requested))
+        self._store.put_facts(self._seals.facts(Facts(name or DEFAULT_NAME, keystore, keystore_why, requested)))
 
     def complete(self, point: bytes, ca: bytes, signature: bytes) -> None:
         """Keep the station's key, its owner's CA and SIG104: init is finished."""
-        self._store.put_facts(replace(self._facts, point=point, ca=ca, signature=signature))
+        self._seals.require()
+        self._store.put_facts(self._seals.facts(replace(self._facts, point=point, ca=ca, signature=signature)))
 
     @property
     def _facts(self) -> Facts:

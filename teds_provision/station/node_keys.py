@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 from teds_provision.errors import NoKeyring, VaultFailure, WrongPassphrase
 from teds_provision.station.identity import Identity
+from teds_provision.station.seals import Seals
 from teds_provision.store import Holder, KeyRecord, Marks, Store, utc_now
 from teds_provision.store.records import KeySource
 from teds_provision.vault.base import node_key_context
@@ -37,12 +38,18 @@ class NodeKeys:
     """The link keys of one station: wrapped in the store, opened by the vault."""
 
     def __init__(
-        self, store: Store, vault: Callable[[], Vault], identity: Identity, reopened: Callable[[], Vault] | None = None
+        self,
+        store: Store,
+        vault: Callable[[], Vault],
+        identity: Identity,
+        seals: Seals,
+        reopened: Callable[[], Vault],
     ) -> None:
         self._store = store
         self._vault = vault
         self._identity = identity
-        self._reopened = reopened or vault
+        self._seals = seals
+        self._reopened = reopened
 
     def of(self, uuid: bytes) -> list[KeyRecord]:
         """The keys of a node, wrapped, in the order to try them: newest pending first, the active one last."""
@@ -136,11 +143,20 @@ class NodeKeys:
 
     def ca_of(self, uuid: bytes) -> bytes:
         """P(CA) that a node keeps: the owner's, or that of the bundle in which the node's key came."""
-        return self._store.marks(uuid).ca or self._identity.ca
+        marks = self._store.marks(uuid)
+        if marks.ca is None:
+            return self._identity.ca
+        self._seals.check_ca(uuid, marks.ca, marks.ca_mac)
+        return marks.ca
 
     def cas_of_nodes(self) -> dict[bytes, bytes]:
         """P(CA) of every node that keeps another CA than the owner's."""
-        return {uuid: marks.ca for uuid, marks in self._store.all_marks().items() if marks.ca is not None}
+        cas: dict[bytes, bytes] = {}
+        for uuid, marks in self._store.all_marks().items():
+            if marks.ca is not None:
+                self._seals.check_ca(uuid, marks.ca, marks.ca_mac)
+                cas[uuid] = marks.ca
+        return cas
 
     def set_ca_of(self, uuid: bytes, ca: bytes) -> None:
         """Note which CA a node keeps."""
@@ -154,7 +170,10 @@ class NodeKeys:
         for uuid, change in changes.items():
             before = present.get(uuid, Marks())
             after = replace(before, **change)
-            after = replace(after, ca=None) if after.ca == own else after
+            if after.ca == own:
+                after = replace(after, ca=None, ca_mac=None)
+            elif after.ca is not None and after.ca != before.ca:
+                after = replace(after, ca_mac=self._seals.ca(uuid, after.ca))
             if after != before:
                 wanted[uuid] = after
         if wanted:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+from teds_provision.station.seals import Seals
 from teds_provision.store import DatasheetRecord, Draft, NodeRecord, Store
 from teds_provision.teds.image import Image
 
@@ -11,8 +12,9 @@ from teds_provision.teds.image import Image
 class Nodes:
     """The nodes of one station, by UUID."""
 
-    def __init__(self, store: Store) -> None:
+    def __init__(self, store: Store, seals: Seals) -> None:
         self._store = store
+        self._seals = seals
 
     def all(self) -> list[NodeRecord]:
         """All nodes, by UUID."""
@@ -24,16 +26,25 @@ class Nodes:
 
     def put(self, record: NodeRecord) -> None:
         """Add or replace a node. Epoch and sequence never go back; raises OtherKey for another identity key."""
-        self._store.put_node(record)
+        self._store.put_node(self._sealed(record, self._store.node(record.uuid)))
 
     def remember(self, uuid: bytes, **facts: object) -> NodeRecord:
         """Bring what is known of a node up to date and return it."""
         with self._store.transaction():  # no other process changes what was read before it is written
             present = self._store.node(uuid)
             changed = replace(present or NodeRecord(uuid), **facts)  # type: ignore[arg-type]
-            if changed != present:
-                self._store.put_node(changed)
-        return changed
+            sealed = self._sealed(changed, present)
+            if present is None or changed != present or sealed.point_mac != present.point_mac:
+                self._store.put_node(sealed)
+        return sealed
+
+    def _sealed(self, record: NodeRecord, present: NodeRecord | None) -> NodeRecord:
+        """A record whose identity key carries a seal, where it is new and the vault is open; else it is a hint."""
+        if record.point is None:
+            return record
+        if present is not None and present.point == record.point and present.point_mac is not None:
+            return replace(record, point_mac=present.point_mac)
+        return replace(record, point_mac=self._seals.point(record.uuid, record.point))
 
     def resolve(self, text: str) -> bytes:
         """The UUID that ``text`` (a UUID, a prefix of it, or a name) means; raises NotFound, UsageFailure."""

@@ -5,63 +5,81 @@ from __future__ import annotations
 from teds_provision.protocol.agreement import other_key
 from teds_provision.protocol.keys import fingerprint
 from teds_provision.station.node_keys import NodeKeys
-from teds_provision.store import AuditLog, Store, WhitelistEntry
+from teds_provision.station.seals import Seals
+from teds_provision.store import Store, WhitelistEntry
 
 
 class Pins:
-    """The whitelist, and the key of each UUID: by the whitelist, else from the first proven contact."""
+    """The whitelist, and the key of each UUID: by the whitelist, else from the first proven contact.
 
-    def __init__(self, store: Store, keys: NodeKeys, audit: AuditLog) -> None:
+    With an open vault every row that is used has to carry this station's seal: StoreChanged otherwise.
+    """
+
+    def __init__(self, store: Store, keys: NodeKeys, seals: Seals) -> None:
         self._store = store
         self._keys = keys
-        self._audit = audit
+        self._seals = seals
 
     def pinned(self, uuid: bytes) -> str | None:
         """Fingerprint of the key that this UUID has to show, None where none is known yet."""
-        entry = self._store.whitelisted(uuid)
+        entry = self.entry(uuid)
         if entry is not None and entry.fingerprint is not None:
             return entry.fingerprint
         node = self._store.node(uuid)
-        return fingerprint(node.point) if node is not None and node.point is not None else None
+        if node is None or node.point is None:
+            return None
+        self._seals.check_point(node)
+        return fingerprint(node.point)
 
     def all(self) -> dict[bytes, str]:
         """Fingerprint of every pinned UUID."""
-        pins = {node.uuid: fingerprint(node.point) for node in self._store.nodes() if node.point is not None}
-        listed = {entry.uuid: entry.fingerprint for entry in self._store.whitelist() if entry.fingerprint is not None}
-        return pins | listed
+        pins: dict[bytes, str] = {}
+        for node in self._store.nodes():
+            if node.point is not None:
+                self._seals.check_point(node)
+                pins[node.uuid] = fingerprint(node.point)
+        return pins | {entry.uuid: entry.fingerprint for entry in self.whitelist() if entry.fingerprint is not None}
 
     def check(self, uuid: bytes, point: bytes) -> None:
         """Raise OtherKey where this UUID is known with another key than ``point``."""
         pinned = self.pinned(uuid)
         if pinned is not None and pinned != fingerprint(point):
-            self._audit.append("identify", uuid, "other key", {"shown": fingerprint(point), "pinned": pinned})
+            self._store.audit.append("identify", uuid, "other key", {"shown": fingerprint(point), "pinned": pinned})
             raise other_key(pinned, point)
 
     # -- the whitelist ---------------------------------------------------------------------------------------------
 
     def whitelist(self) -> list[WhitelistEntry]:
         """All entries, by UUID."""
-        return self._store.whitelist()
+        entries = self._store.whitelist()
+        for entry in entries:
+            self._seals.check_entry(entry)
+        return entries
 
     def entry(self, uuid: bytes) -> WhitelistEntry | None:
         """The whitelist entry of a node, None where it is not on it."""
-        return self._store.whitelisted(uuid)
+        return self._seals.check_entry(self._store.whitelisted(uuid))
 
     def put(self, *entries: WhitelistEntry) -> None:
-        """Add or replace entries of the whitelist; a key that is pinned stays: the caller has held it against it."""
+        """Add or replace entries of the whitelist (the vault opens); the caller has held keys against pinned ones."""
+        self._seals.require()
         with self._store.transaction():
-            for entry in entries:
-                self._store.put_whitelist(entry)
+            self._store.put_whitelist_entries(self._seals.entry(entry) for entry in entries)
 
     def remove(self, uuid: bytes) -> bool:
-        """Take a node off the whitelist; False if it was not on it. A key from a contact stays pinned."""
+        """Take a node off the whitelist (the vault opens); False if it was not on it. A contact's key stays pinned."""
+        self._seals.require()
         return self._store.remove_whitelist(uuid)
 
     # -- a board that was replaced under its UUID ------------------------------------------------------------------
 
     def let_go(self, uuid: bytes) -> None:
         """Forget the pinned key; the link keys that are held still belong to the board that had it."""
-        pinned = self.pinned(uuid)
+        self._seals.require()
+        entry, node = self._store.whitelisted(uuid), self._store.node(uuid)  # whatever it is: it is forgotten
+        pinned = entry.fingerprint if entry is not None else None
+        if pinned is None and node is not None and node.point is not None:
+            pinned = fingerprint(node.point)
         if pinned is not None:
             self._keys.set_former(uuid, pinned)
             self._store.drop_draft(uuid)  # it may hold the old board's calibration

@@ -7,6 +7,8 @@ from collections.abc import Iterable
 from teds_provision.errors import NotWhitelisted, PolicyRefused
 from teds_provision.station.identity import Identity
 from teds_provision.station.node_keys import NodeKeys
+from teds_provision.station.pins import Pins
+from teds_provision.station.seals import Seals
 from teds_provision.store import Revocation, Store, Tombstone, TrustRecord, WhitelistEntry
 from teds_provision.store.records import TrustRole
 
@@ -14,23 +16,31 @@ from teds_provision.store.records import TrustRole
 class Policy:
     """What this station trusts and refuses."""
 
-    def __init__(self, store: Store, identity: Identity, keys: NodeKeys) -> None:
+    def __init__(self, store: Store, identity: Identity, keys: NodeKeys, pins: Pins, seals: Seals) -> None:
         self._store = store
         self._identity = identity
         self._keys = keys
+        self._pins = pins
+        self._seals = seals
 
     # -- trust -----------------------------------------------------------------------------------------------------
 
     def trusted(self, role: TrustRole | None = None) -> list[TrustRecord]:
-        """Every trusted station and CA, or those of one role, by name."""
-        return [record for record in self._store.trusted() if role in (None, record.role)]
+        """Every station and CA whose key counts here, or those of one role, by name."""
+        return [record for record in self.listed() if role in (None, record.role) and self._seals.trusted(record)]
+
+    def listed(self) -> list[TrustRecord]:
+        """Every station and CA that is listed as trusted, by name; also one that another program put there."""
+        return self._store.trusted()
 
     def trust(self, record: TrustRecord) -> None:
-        """Trust a key under a name; raises PolicyRefused if the name stands for another key or role."""
-        self._store.put_trust(record)
+        """Trust a key under a name (the vault opens); PolicyRefused if the name stands for another key or role."""
+        self._seals.require()
+        self._store.put_trust(self._seals.trust(record))
 
     def distrust(self, name_or_fingerprint: str) -> bool:
-        """Trust a key no more; False if none fits, raises UsageFailure if several do."""
+        """Trust a key no more (the vault opens); False if none fits, raises UsageFailure if several do."""
+        self._seals.require()
         return self._store.remove_trust(name_or_fingerprint)
 
     def trusted_cas(self, uuid: bytes | None = None) -> list[bytes]:
@@ -88,7 +98,7 @@ class Policy:
             raise PolicyRefused(f"Node {uuid.hex()} was revoked: {revoked.why}.")
         if not returning:
             self.require_not_given_away(uuid)
-        entry = self._store.whitelisted(uuid)
+        entry = self._pins.entry(uuid)
         if entry is None:
             raise NotWhitelisted(
                 f"Node {uuid.hex()} is not on the whitelist.", hint=f"Add it: teds-provision whitelist add {uuid.hex()}"

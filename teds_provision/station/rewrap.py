@@ -47,6 +47,7 @@ def rewrap(station: Station) -> Rewrapped:
         return vault.wrap(key, context=context)
 
     count = station.keys.wrap_anew(anew)
+    station.seals.rewrap(vault)
     vault.retire_masters()
     with station.transaction():
         identity.end_rewrapping()

@@ -10,6 +10,7 @@ part          what it knows
 ``nodes``     what is known of each node, its datasheets and drafts
 ``groups``    which nodes are measured together
 ``handovers`` bundles that left and came
+``seals``     MACs over the rows that decide whom the station believes
 ============  ======================================================================
 
 Opening a station reads the store only; the vault opens at the first secret.
@@ -32,6 +33,7 @@ from teds_provision.station.node_keys import NodeKey, NodeKeys
 from teds_provision.station.nodes import Nodes
 from teds_provision.station.pins import Pins
 from teds_provision.station.policy import Policy
+from teds_provision.station.seals import Seals
 from teds_provision.store import AuditLog, Store, StoreLock
 from teds_provision.store.dump import dump
 
@@ -44,24 +46,28 @@ __all__ = ["DEFAULT_NAME", "NodeKey", "Station", "initialise", "not_certified", 
 class Station:
     """A base station (NCAP) on this machine."""
 
-    def __init__(self, store: Store, ask: Ask) -> None:
+    def __init__(self, store: Store, ask: Ask, tell: Callable[[str], object] = lambda text: None) -> None:
         self._store = store
         self._ask = ask
         self._vault: Vault | None = None
-        self.identity = Identity(store, self._opened)
-        self.keys = NodeKeys(store, self._opened, self.identity, self._reopened)
-        self.pins = Pins(store, self.keys, store.audit)
-        self.policy = Policy(store, self.identity, self.keys)
-        self.nodes = Nodes(store)
+        self.seals = Seals(store, self._opened, tell)
+        self.identity = Identity(store, self._opened, self.seals)
+        self.keys = NodeKeys(store, self._opened, self.identity, self.seals, self._reopened)
+        self.pins = Pins(store, self.keys, self.seals)
+        self.policy = Policy(store, self.identity, self.keys, self.pins, self.seals)
+        self.nodes = Nodes(store, self.seals)
         self.groups = Groups(store, store.home)
-        self.handovers = Handovers(store, self.keys)
+        self.handovers = Handovers(store, self.keys, self.seals)
 
     @classmethod
-    def open(cls, home: Path, *, ask: Ask) -> Station:
-        """Open the station of ``home``; raises NotFound where init was never finished."""
+    def open(cls, home: Path, *, ask: Ask, tell: Callable[[str], object] = lambda text: None) -> Station:
+        """Open the station of ``home``; raises NotFound where init was never finished.
+
+        ``ask`` gives a passphrase when the vault opens, ``tell`` gets what the user has to know then.
+        """
         if not (home / "store.sqlite3").exists():
             raise not_initialised(home)
-        station = cls(Store.open(home), ask)
+        station = cls(Store.open(home), ask, tell)
         if not station.identity.is_complete():
             asked = station.identity.requested is not None
             station.close()
@@ -115,8 +121,18 @@ class Station:
         if self._vault is None:
             from teds_provision.vault import open_vault  # argon2 and the keyrings: not for commands that only list
 
-            self._vault = open_vault(self.home, self.id, self.identity.keystore, self._ask)
+            self.adopt(open_vault(self.home, self.id, self.identity.keystore, self._ask))
+        assert self._vault is not None
         return self._vault
+
+    def adopt(self, vault: Vault) -> None:
+        """Use a vault that is open; raises StoreChanged where the store does not go with it any more."""
+        self._vault = vault  # the seals below are made and checked with it
+        try:
+            self.seals.unlocked(vault)
+        except BaseException:
+            self._vault = None
+            raise
 
     def _reopened(self) -> Vault:
         """Open the vault again: another process has replaced what this one read."""
@@ -193,7 +209,7 @@ def initialise(
         key, ca = vault.identity(), vault.ca()
         if ca is None:
             raise NotFound("The vault holds no CA key.", hint="Choose another keystore, or bring the CA key back.")
-        station._vault = vault
+        station.adopt(vault)
         with station.transaction():
             where = keystore if keystore and keystore.startswith("pkcs11:") else vault.kind
             station.identity.found(name, where, why)

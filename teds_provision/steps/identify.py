@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import os
+from contextlib import suppress
 from dataclasses import dataclass, replace
 
-from teds_provision.errors import BadData, NodeRefused, NotAuthentic
+from teds_provision.errors import BadData, NodeRefused, NoKeyring, NotAuthentic, WrongPassphrase
 from teds_provision.harmless import printable
 from teds_provision.protocol.keys import fingerprint, is_point, node_key_message, prove_message, verify
 from teds_provision.protocol.messages.frames import Function, security_command
@@ -66,7 +67,8 @@ def identify(station: Station, node: Conversation) -> Identified:
         **({"point": who.point} if node.tapped or pinned else {}),
     )
     if node.tapped and who.whitelisted is not None and not pinned:
-        who = replace(who, whitelisted=_pin(station, who.whitelisted, who.fingerprint))
+        with suppress(WrongPassphrase, NoKeyring):  # nobody gives the passphrase: the first agreement will pin it
+            who = replace(who, whitelisted=_pin(station, who.whitelisted, who.fingerprint))
     known = known_key(station, node.uuid)
     if known != who.point:
         station.nodes.keep_datasheet(Image(node.uuid, {SECURITY: who.security_teds}))
@@ -76,6 +78,7 @@ def identify(station: Station, node: Conversation) -> Identified:
 def _pin(station: Station, entry: WhitelistEntry, key: str) -> WhitelistEntry:
     """Give an entry that was made without a fingerprint the key that was just tapped and proven (section 2)."""
     pinned = replace(entry, fingerprint=key, assurance="tap")
+    station.unlock()  # its seal: nobody is asked while the store is locked
     with station.transaction():
         station.pins.put(pinned)
         station.audit("whitelist", entry.uuid, "pinned", fingerprint=key, assurance="tap")

@@ -21,6 +21,7 @@ from teds_provision.steps.whitelist_files import FIELDS, FORMATS, Listed
 from teds_provision.store import WhitelistEntry
 
 _SHOWN = 5
+_FEW = 50
 
 
 @dataclass(frozen=True)
@@ -37,9 +38,7 @@ def plan_addition(station: Station, listed: Sequence[Listed]) -> Plan:
 
     Raises OtherKey where a UUID is pinned to another key, PolicyRefused for a revoked node: then none may be added.
     """
-    pinned = station.pins.all()
-    present = {entry.uuid: entry for entry in station.pins.whitelist()}
-    revoked = {revocation.uuid: revocation.why for revocation in station.policy.revocations()}
+    pinned, present, revoked = _known(station, [entry.uuid for entry in listed])
     _refuse_revoked([entry.uuid for entry in listed if entry.uuid in revoked], revoked)
     write: list[WhitelistEntry] = []
     conflicts: list[tuple[Listed, str]] = []
@@ -55,6 +54,19 @@ def plan_addition(station: Station, listed: Sequence[Listed]) -> Plan:
     _refuse_conflicts(conflicts)
     new = sum(entry.uuid not in present for entry in write)
     return Plan(tuple(write), new, len(listed) - len(write))
+
+
+def _known(
+    station: Station, uuids: Sequence[bytes]
+) -> tuple[dict[bytes, str], dict[bytes, WhitelistEntry], dict[bytes, str]]:
+    """Pinned keys, whitelist entries and reasons of revocations: one by one for a few, whole tables for many."""
+    if len(uuids) > _FEW:
+        present = {entry.uuid: entry for entry in station.pins.whitelist()}
+        return station.pins.all(), present, {one.uuid: one.why for one in station.policy.revocations()}
+    pins = {uuid: pin for uuid in uuids if (pin := station.pins.pinned(uuid)) is not None}
+    entries = {uuid: entry for uuid in uuids if (entry := station.pins.entry(uuid)) is not None}
+    revoked = {uuid: one.why for uuid in uuids if (one := station.policy.revocation(uuid)) is not None}
+    return pins, entries, revoked
 
 
 def _merged(known: WhitelistEntry | None, entry: Listed) -> WhitelistEntry:

@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from teds_provision.cli.main import run
+from tests.workflow.bench import PASSPHRASE
 
 
 @dataclass(frozen=True)
@@ -31,16 +32,23 @@ class Outcome:
         return json.loads(self.out)
 
 
-def call(home: Path, *words: object) -> Outcome:
-    """Run a command in this process; stdin is no terminal."""
+def call(home: Path, *words: object, passphrase: str | None = PASSPHRASE) -> Outcome:
+    """Run a command in this process; stdin is no terminal, the passphrase comes through --passphrase-fd."""
     out, err = io.StringIO(), io.StringIO()
     before = sys.stdin
     sys.stdin = io.StringIO("")
+    read, write = os.pipe()
+    given = []
+    if passphrase is not None and "--passphrase-fd" not in words:
+        given = ["--passphrase-fd", str(read)]
+        os.write(write, passphrase.encode() + b"\n")
+    os.close(write)
     try:
         with redirect_stdout(out), redirect_stderr(err):
-            code = run(["--home", str(home), *map(str, words)])
+            code = run(["--home", str(home), *given, *map(str, words)])
     finally:
         sys.stdin = before
+        os.close(read)
     return Outcome(code, out.getvalue(), err.getvalue())
 
 

@@ -18,6 +18,7 @@ import pytest
 
 from teds_provision import __version__
 from teds_provision.cli.table import COMMANDS, GROUPS
+from tests.workflow.bench import PASSPHRASE
 
 from .shell import Outcome, call, clean_environment, spawn
 
@@ -27,18 +28,28 @@ HEAVY = ("nfc", "can", "isotp", "keyring", "rich", "cryptography", "pint", "nump
 
 
 def on_terminal(
-    home: Path, *words: object, answers: bytes = b"", environment: dict[str, str] | None = None
+    home: Path,
+    *words: object,
+    answers: bytes = b"",
+    passphrase: str | None = None,
+    environment: dict[str, str] | None = None,
 ) -> tuple[int, str, str]:
     """Run with a terminal as stdin, stdout and stderr in pipes; returns exit code, stdout and stderr."""
     master, terminal = pty.openpty()
+    read, write = os.pipe()
+    os.write(write, (passphrase or "").encode() + b"\n")
+    os.close(write)
+    given = ["--passphrase-fd", str(read)] if passphrase is not None else []
     process = subprocess.Popen(
-        [sys.executable, "-m", "teds_provision", "--home", str(home), *map(str, words)],
+        [sys.executable, "-m", "teds_provision", "--home", str(home), *given, *map(str, words)],
         stdin=terminal,
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
         env=environment or clean_environment(),
         start_new_session=True,
+        pass_fds=(read,),
     )
+    os.close(read)
     os.close(terminal)
     try:
         if answers:
@@ -274,7 +285,7 @@ def test_a_question_can_be_answered_on_a_terminal(home: Path) -> None:
     call(home, "whitelist", "add", ONE)
     code, _, err = on_terminal(home, "whitelist", "remove", ONE, answers=b"n\n")
     assert (code, "[y/N]" in err) == (130, True)
-    code, out, _ = on_terminal(home, "whitelist", "remove", ONE, answers=b"y\n")
+    code, out, _ = on_terminal(home, "whitelist", "remove", ONE, answers=b"y\n", passphrase=PASSPHRASE)
     assert (code, "is off the whitelist" in out) == (0, True)
 
 

@@ -21,7 +21,7 @@ from teds_provision.steps.sign_command import SignOrder, sign_image
 from teds_provision.store import StoreLock, WhitelistEntry
 from teds_provision.talk.progress import Silent
 
-from ..workflow.bench import Board, make_station, talk
+from ..workflow.bench import PASSPHRASE, Board, make_station, talk
 from .shell import call, clean_environment, spawn
 
 ANGLE = BuildOrder(profile="magnetic-angular-position-sensor")
@@ -137,7 +137,7 @@ def test_json_is_json_whatever_stdout_can_write(tmp_path: Path) -> None:
     environment = clean_environment(PYTHONIOENCODING="ascii")
     name = "fräse \N{GEAR} \U0001f916"
     for words in (["whitelist", "add", "8d4d9da65281f7000000", "--name", name], ["whitelist", "list"]):
-        said = spawn("--home", tmp_path, "--json", *words, environment=environment)
+        said = spawn("--home", tmp_path, "--json", *words, passphrase=PASSPHRASE, environment=environment)
         assert said.json["whitelist"][0]["name"] == name
 
 

@@ -126,10 +126,17 @@ def test_each_key_of_a_folder_is_asked_for(home: Path, pem: Path) -> None:
     (pem.parent / "west.pem").write_text(to_pem(SoftwareKey(53).point))
     main, side = os.openpty()
     os.write(main, b"n\ny\n")
-    command = [sys.executable, "-m", "teds_provision", "--home", str(home), "trust", "add", "--from", str(pem.parent)]
+    read, write = os.pipe()
+    os.write(write, PASSPHRASE.encode() + b"\n")
+    os.close(write)
+    program = [sys.executable, "-m", "teds_provision", "--home", str(home), "--passphrase-fd", str(read)]
+    command = [*program, "trust", "add", "--from", str(pem.parent)]
     try:
-        done = subprocess.run(command, stdin=side, capture_output=True, text=True, timeout=60, check=False)
+        done = subprocess.run(
+            command, stdin=side, capture_output=True, text=True, timeout=60, check=False, pass_fds=(read,)
+        )
     finally:
+        os.close(read)
         os.close(main)
         os.close(side)
     assert done.returncode == 0, done

@@ -7,7 +7,10 @@ from pathlib import Path
 
 import pytest
 
-from teds_provision.store import Store, WhitelistEntry
+from teds_provision.station.station import Station
+from teds_provision.store import WhitelistEntry
+from teds_provision.vault import forget_vaults
+from tests.workflow.bench import PASSPHRASE
 
 from .shell import call
 
@@ -85,8 +88,9 @@ def test_the_list_shows_keys_short_and_names_as_they_are(home: Path) -> None:
 
 def test_a_name_that_no_terminal_and_no_xml_can_hold_is_refused_or_made_harmless(home: Path, tmp_path: Path) -> None:
     assert call(home, "whitelist", "add", ONE, "--name", "a\x1b[31m").code == 8
-    with Store.open(home) as store:
-        store.put_whitelist(WhitelistEntry(bytes.fromhex(ONE), name="a\x1b[31m\x01"))
+    station = Station.open(home, ask=lambda prompt, confirm: PASSPHRASE)
+    station.pins.put(WhitelistEntry(bytes.fromhex(ONE), name="a\x1b[31m\x01"))
+    station.close()
     assert "\x1b" not in call(home, "whitelist", "list").out
     call(home, "whitelist", "export", tmp_path / "list.xml")
     assert call(home, "whitelist", "import", tmp_path / "list.xml").code == 0
@@ -96,3 +100,13 @@ def test_a_name_that_no_terminal_and_no_xml_can_hold_is_refused_or_made_harmless
 def test_a_fingerprint_that_is_none_is_usage(home: Path) -> None:
     assert call(home, "whitelist", "add", ONE, "--fingerprint", "12").code == 2
     assert call(home, "whitelist", "add", "8d4d").code == 3
+
+
+def test_changing_a_pin_needs_the_vault_and_a_list_does_not(home: Path) -> None:
+    assert call(home, "whitelist", "add", ONE, passphrase=None).code == 7
+    assert call(home, "whitelist", "add", ONE).code == 0
+    forget_vaults()
+    assert call(home, "whitelist", "add", ONE, passphrase=None).code == 0  # nothing to do
+    assert call(home, "whitelist", "remove", ONE, "--yes", passphrase=None).code == 7
+    listed = call(home, "--json", "whitelist", "list", passphrase=None).json["whitelist"]
+    assert [entry["uuid"] for entry in listed] == [ONE]

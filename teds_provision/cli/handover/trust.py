@@ -59,19 +59,22 @@ def add(
     if (folder is None) == (name is None) or (name is not None and file is None):
         raise click.UsageError("Give NAME and FILE, or --from DIR.")
     station = app.station()
-    with station.lock("trust add", app.note):
-        if folder is not None:
-            found = candidates_of(station, folder, role)
-        else:
-            assert name is not None
-            assert file is not None
-            found = [candidate(station, name, file, role)]
-        fresh = [one for one in found if not one.known]
+
+    if folder is not None:
+        found = candidates_of(station, folder, role)
+    else:
+        assert name is not None
+        assert file is not None
+        found = [candidate(station, name, file, role)]
+    fresh = [one for one in found if not one.known]
+    if dry_run:
         told = {"trusted": [_record(one.record) for one in found], "added": len(fresh)}
-        if dry_run:
-            app.emit({**told, "plan": True}, _shown(found))
-            return
-        chosen = [one for one in found if one.known or _agreed(app, one, yes)]
+        app.emit({**told, "plan": True}, _shown(found))
+        return
+    chosen = [one for one in found if one.known or _agreed(app, one, yes)]
+    if any(not one.known for one in chosen):
+        station.unlock()
+    with station.lock("trust add", app.note):
         added = run(station, chosen)
     told = {"trusted": [_record(one.record) for one in chosen], "added": added}
     names = ", ".join(one.record.name for one in chosen if not one.known)
@@ -123,6 +126,7 @@ def remove(app: App, name: str, yes: bool, dry_run: bool) -> None:
         app.emit({**told, "plan": True}, f"Plan: trust the {text} no more.")
         return
     app.confirm(f"Trust the {text} no more?", yes=yes)
+    station.unlock()
     with station.lock("trust remove", app.note):
         run(station, find_trusted(station, name))
     app.emit(told, f"Not trusted any more: {text}.")
@@ -135,7 +139,7 @@ def list_(app: App) -> None:
     from teds_provision.protocol.keys import fingerprint
 
     station = app.station()
-    records = station.policy.trusted()
+    records = station.policy.listed()
     ca, certificate = station.ca, station.identity.certificate
     certified = {record.fingerprint: certificate(ca, record.point) is not None for record in records}
     told = [

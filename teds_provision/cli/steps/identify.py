@@ -30,6 +30,8 @@ def identify(app: App, links: LinkSettings, watch: bool, add: bool) -> None:
     from teds_provision.talk.meeting import meet_everyone
 
     station, reporter = app.station(), reporter_for(app)
+    if add:
+        station.unlock()  # before a node lies there: a pin is sealed by the vault
     if not watch:
         with meet_everyone(links, reporter) as nodes:
             found = [_one(station, node, add) for node in nodes]

@@ -64,9 +64,11 @@ def add(app: App, uuid: str, fingerprint: str | None, name: str | None, dry_run:
     octets = station.nodes.resolve(uuid)
     require_name(name)
     wanted = Listed(0, octets, fingerprint, name)
-    if dry_run:
-        _emit_plan(app, station, plan_addition(station, [wanted]), dry_run=True)
+    plan = plan_addition(station, [wanted])
+    if dry_run or not plan.write:
+        _emit_plan(app, station, plan, dry_run=dry_run)
         return
+    station.unlock()
     with station.lock("whitelist add", app.note):
         plan = plan_addition(station, [wanted])
         run(station, plan)
@@ -98,6 +100,7 @@ def remove(app: App, uuid: str, yes: bool, dry_run: bool) -> None:
         text = f"Plan: take {told} off the whitelist, forget its key {(pinned or 'that it showed')[:16]}."
     else:
         app.confirm(f"Take {told} off the whitelist and forget its pinned key?", yes=yes)
+        station.unlock()
         with station.lock("whitelist remove", app.note):
             run(station, octets)
         text = f"{told} is off the whitelist{'' if entry else ' as before, and its key is forgotten'}."
@@ -158,6 +161,7 @@ def import_file(app: App, file: Path, form: str | None, dry_run: bool) -> None:
     if dry_run:
         _emit_plan(app, station, plan_addition(station, listed), dry_run=True)
         return
+    station.unlock()
     with station.lock("whitelist import", app.note):
         plan = plan_addition(station, listed)
         run(station, plan, source=str(file))

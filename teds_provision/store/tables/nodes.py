@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+from collections.abc import Iterable, Mapping
 from dataclasses import fields
 from typing import Any
 
@@ -37,6 +38,19 @@ class NodeTables:
             "INSERT OR REPLACE INTO whitelist VALUES(?, ?, ?, ?, ?, ?)",
             (entry.uuid, entry.fingerprint, entry.added, entry.assurance, entry.name, entry.mac),
         )
+
+    def put_whitelist_entries(self, entries: Iterable[WhitelistEntry]) -> None:
+        """Add or replace many entries at once, all or none."""
+        rows = ((e.uuid, e.fingerprint, e.added, e.assurance, e.name, e.mac) for e in entries)
+        with self._database.transaction():
+            self._database.execute_many("INSERT OR REPLACE INTO whitelist VALUES(?, ?, ?, ?, ?, ?)", rows)
+
+    def put_seals(self, entries: Mapping[bytes, bytes | None], points: Mapping[bytes, bytes]) -> None:
+        """Put the seals of whitelist entries and of nodes' identity keys beside them, by UUID."""
+        with self._database.transaction():
+            many = self._database.execute_many
+            many("UPDATE whitelist SET mac = ? WHERE uuid = ?", ((mac, uuid) for uuid, mac in entries.items()))
+            many("UPDATE nodes SET point_mac = ? WHERE uuid = ?", ((mac, uuid) for uuid, mac in points.items()))
 
     def remove_whitelist(self, uuid: bytes) -> bool:
         """Take a node off the whitelist; False if it was not on it."""

@@ -1,0 +1,221 @@
+"""Seals (MACs) over the rows that decide whom this station believes: its own key and CA, trust, pins, CAs of nodes.
+
+Whoever can write the store's file can change rows in it, but makes no seal: HMAC-SHA-256 (RFC 2104), cut to 16 octets,
+under a key of 32 octets that the vault wraps. A seal binds a row's kind and values to this store. When the vault opens,
+the station's own facts and the trusted keys are looked at; a pin, or the CA of a node, when it is used; everything by
+``doctor``. What fails is named and not believed.
+
+Not promised: a row that this station once sealed and removed since can be put back, and a row can be removed. A store
+of version 0.1 has no seals; its rows are taken over once, told in a line and in the audit log.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import hmac
+import os
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+from teds_provision.errors import StoreChanged
+from teds_provision.store import Facts, NodeRecord, Store, TrustRecord, WhitelistEntry, utc_now
+
+if TYPE_CHECKING:
+    from teds_provision.vault import Vault
+
+SEAL_OCTETS = 16
+_KEY_OCTETS = 32
+_SHOWN = 5
+
+
+class Seals:
+    """Makes and checks the seals of one store; ``vault`` opens the vault, ``tell`` gets a sentence for the user."""
+
+    def __init__(self, store: Store, vault: Callable[[], Vault], tell: Callable[[str], object]) -> None:
+        self._store = store
+        self._vault = vault
+        self._tell = tell
+        self._key: bytes | None = None
+        self.broken_trust: tuple[str, ...] = ()
+        """Names of trusted keys whose seal does not hold; they do not count."""
+
+    @property
+    def active(self) -> bool:
+        """Whether the vault was opened, so that seals can be made and checked without asking anybody."""
+        return self._key is not None
+
+    def require(self) -> None:
+        """Open the vault if it is not open yet: what decides whom the station believes is changed by its owner only."""
+        self._vault()
+
+    # -- making ----------------------------------------------------------------------------------------------------
+
+    def facts(self, facts: Facts) -> Facts:
+        """The station's facts with their seal, and a seal key if there is none yet."""
+        if facts.seal_key is None:
+            self._key = os.urandom(_KEY_OCTETS)
+            facts = replace(facts, seal_key=self._vault().wrap(self._key, context=self._context()))
+        return replace(facts, mac=self._mac("station", *_facts(facts)))
+
+    def entry(self, entry: WhitelistEntry) -> WhitelistEntry:
+        """A whitelist entry with its seal."""
+        return replace(entry, mac=self._mac("whitelist", *_entry(entry)))
+
+    def trust(self, record: TrustRecord) -> TrustRecord:
+        """A trusted key with its seal."""
+        return replace(record, mac=self._mac("trust", *_trust(record)))
+
+    def point(self, uuid: bytes, point: bytes) -> bytes | None:
+        """The seal of a node's identity key; None, and so only a hint, as long as the vault is closed."""
+        return self._mac("node", uuid, point) if self.active else None
+
+    def ca(self, uuid: bytes, ca: bytes) -> bytes:
+        """The seal of the CA that a node keeps."""
+        return self._mac("ca", uuid, ca)
+
+    # -- checking --------------------------------------------------------------------------------------------------
+
+    def check_entry(self, entry: WhitelistEntry | None) -> WhitelistEntry | None:
+        """Return a whitelist entry; raises StoreChanged where its seal does not hold. Unchecked with a closed vault."""
+        if entry is not None and self.active and not self._holds(entry.mac, "whitelist", *_entry(entry)):
+            raise changed([f"the whitelist entry of {entry.uuid.hex()}"], "Take it off the whitelist, and add it anew.")
+        return entry
+
+    def check_point(self, node: NodeRecord) -> None:
+        """Raise StoreChanged where a node's sealed identity key was changed."""
+        bad = node.point is not None and node.point_mac is not None
+        if bad and self.active and not self._holds(node.point_mac, "node", node.uuid, node.point):
+            remove = f"teds-provision whitelist remove {node.uuid.hex()}, then tap the node."
+            raise changed([f"the key of node {node.uuid.hex()}"], remove)
+
+    def check_ca(self, uuid: bytes, ca: bytes, mac: bytes | None) -> None:
+        """Raise StoreChanged where the CA that a node keeps is not the one that this station noted."""
+        if self.active and not self._holds(mac, "ca", uuid, ca):
+            raise changed([f"the CA of node {uuid.hex()}"], "Restore a backup, or reset the node and agree anew.")
+
+    def trusted(self, record: TrustRecord) -> bool:
+        """Whether a trusted key counts: its seal holds, or the vault is closed and nobody can say."""
+        return not self.active or record.name not in self.broken_trust
+
+    def all_broken(self) -> Iterator[str]:
+        """Name every row whose seal does not hold (the vault is open), for doctor."""
+        facts = self._store.facts()
+        if facts is not None and not self._holds(facts.mac, "station", *_facts(facts)):
+            yield "the station's own key and CA"
+        yield from (
+            f"trust in {one.name}" for one in self._store.trusted() if not self._holds(one.mac, "trust", *_trust(one))
+        )
+        for entry in self._store.whitelist():
+            if not self._holds(entry.mac, "whitelist", *_entry(entry)):
+                yield f"the whitelist entry of {entry.uuid.hex()}"
+        for node in self._store.nodes():
+            sealed = node.point is not None and node.point_mac is not None
+            if sealed and not self._holds(node.point_mac, "node", node.uuid, node.point):
+                yield f"the key of node {node.uuid.hex()}"
+        for uuid, marks in self._store.all_marks().items():
+            if marks.ca is not None and not self._holds(marks.ca_mac, "ca", uuid, marks.ca):
+                yield f"the CA of node {uuid.hex()}"
+
+    # -- when the vault opens --------------------------------------------------------------------------------------
+
+    def unlocked(self, vault: Vault) -> None:
+        """The vault has opened: look at the station's own facts and at trust, or take over a store of version 0.1.
+
+        Raises StoreChanged where the station's own key or CA is not what this station sealed, VaultFailure.
+        """
+        facts = self._store.facts()
+        if facts is None:
+            return
+        if facts.seal_key is None:
+            self._take_over(facts, vault)
+            return
+        self._key = vault.unwrap(facts.seal_key, context=self._context())
+        if not self._holds(facts.mac, "station", *_facts(facts)):
+            raise changed(["the station's own key or CA"], "Restore a backup: teds-provision restore FILE")
+        self.broken_trust = tuple(
+            record.name for record in self._store.trusted() if not self._holds(record.mac, "trust", *_trust(record))
+        )
+        if self.broken_trust:
+            names = ", ".join(self.broken_trust[:_SHOWN])
+            self._tell(f"Trust in {names} was changed by another program than this one and does not count.")
+
+    def _take_over(self, facts: Facts, vault: Vault) -> None:
+        key = os.urandom(_KEY_OCTETS)
+        wrapped = vault.wrap(key, context=self._context())
+        self._key = key
+        with self._store.transaction():
+            self._store.put_facts(self.facts(replace(facts, seal_key=wrapped, taken_over=utc_now())))
+            counts = self.seal_what_has_none()
+            self._store.audit.append("seal", None, "taken over", counts)
+        names = ", ".join(record.name for record in self._store.trusted()) or "nobody"
+        self._tell(
+            f"This store is of version 0.1: {counts['whitelist']} whitelist entries, {counts['nodes']} keys of nodes"
+            f" and trust in {names} are taken over as they are, and sealed from now on. Look through them once:"
+            " whitelist list, trust list."
+        )
+
+    def seal_what_has_none(self) -> dict[str, int]:
+        """Seal every row without a seal, as it is; returns how many of each kind. For what version 0.1 wrote."""
+        counts = dict.fromkeys(("trust", "whitelist", "nodes", "cas"), 0)
+        for record in self._store.trusted():
+            if record.mac is None:
+                self._store.put_trust(self.trust(record))
+                counts["trust"] += 1
+        entries = [self.entry(entry) for entry in self._store.whitelist() if entry.mac is None]
+        nodes = [node for node in self._store.nodes() if node.point is not None and node.point_mac is None]
+        self._store.put_seals(
+            {entry.uuid: entry.mac for entry in entries},
+            {node.uuid: self._mac("node", node.uuid, node.point) for node in nodes},
+        )
+        marks = {
+            uuid: replace(mark, ca_mac=self.ca(uuid, mark.ca))
+            for uuid, mark in self._store.all_marks().items()
+            if mark.ca is not None and mark.ca_mac is None
+        }
+        self._store.put_marks(marks)
+        return counts | {"whitelist": len(entries), "nodes": len(nodes), "cas": len(marks)}
+
+    def rewrap(self, vault: Vault) -> None:
+        """Wrap the seal key under the vault's newest master key; the seals stay as they are."""
+        facts = self._store.facts()
+        if facts is not None and facts.seal_key is not None:
+            key = vault.unwrap(facts.seal_key, context=self._context())
+            self._store.put_facts(replace(facts, seal_key=vault.wrap(key, context=self._context())))
+
+    # -- the MAC itself --------------------------------------------------------------------------------------------
+
+    def _context(self) -> bytes:
+        return b"TEDS1 seal key\0" + self._store.id.encode()
+
+    def _mac(self, kind: str, *values: str | bytes | None) -> bytes:
+        if self._key is None:
+            self.require()
+        assert self._key is not None
+        whole = hmac.new(self._key, kind.encode() + b"\0", hashlib.sha256)
+        for value in values:
+            octets = value.encode() if isinstance(value, str) else value
+            # None is not the empty text: a length that no value has
+            whole.update(b"\xff\xff\xff\xff" if octets is None else len(octets).to_bytes(4, "big") + octets)
+        return whole.digest()[:SEAL_OCTETS]
+
+    def _holds(self, mac: bytes | None, kind: str, *values: str | bytes | None) -> bool:
+        return mac is not None and hmac.compare_digest(mac, self._mac(kind, *values))
+
+
+def _facts(facts: Facts) -> tuple[str | bytes | None, ...]:
+    return (facts.requested, facts.point, facts.ca, facts.signature, facts.taken_over)
+
+
+def _entry(entry: WhitelistEntry) -> tuple[str | bytes | None, ...]:
+    return (entry.uuid, entry.fingerprint, entry.assurance, entry.name)
+
+
+def _trust(record: TrustRecord) -> tuple[str | bytes | None, ...]:
+    return (record.name, record.role, record.point, record.fingerprint)
+
+
+def changed(what: list[str], cure: str) -> StoreChanged:
+    """The error for rows that another program changed."""
+    shown = ", ".join(what[:_SHOWN]) + (f" and {len(what) - _SHOWN} more" if len(what) > _SHOWN else "")
+    return StoreChanged(f"Another program than this one changed {shown} in the store; it is not believed.", hint=cure)

@@ -1,0 +1,228 @@
+"""Rows that decide whom the station believes carry a seal; what another program changed is named, never believed."""
+
+from __future__ import annotations
+
+import shutil
+import sqlite3
+from collections.abc import Callable, Iterator
+from contextlib import closing
+from pathlib import Path
+
+import pytest
+
+from teds_provision.errors import StoreChanged, WrongPassphrase
+from teds_provision.protocol.keys import SoftwareKey, fingerprint
+from teds_provision.station.rewrap import rewrap
+from teds_provision.station.station import Station, initialise
+from teds_provision.store import TrustRecord, WhitelistEntry
+from teds_provision.vault import forget_vaults, passphrase
+
+from .test_migration import MADE, PASSPHRASE
+
+NODE = bytes(range(10))
+POINT = SoftwareKey.generate().point
+OTHER = SoftwareKey.generate().point
+
+
+def ask(prompt: str, confirm: bool) -> str:
+    return PASSPHRASE
+
+
+def nobody(prompt: str, confirm: bool) -> str:
+    raise WrongPassphrase("Nobody can be asked.")
+
+
+Open = Callable[..., Station]
+
+
+@pytest.fixture
+def home(tmp_path: Path) -> Path:
+    """A station with one pinned node, one trusted station, one trusted CA, and a node of another CA."""
+    forget_vaults()
+    made, _ = initialise(tmp_path / "home", name="n", keystore="file", ask=ask, costs=passphrase.THROWAWAY)
+    made.pins.put(WhitelistEntry(NODE, fingerprint(POINT), assurance="tap"))
+    made.nodes.remember(NODE, point=POINT)
+    made.policy.trust(TrustRecord("peer", "station", OTHER, fingerprint(OTHER)))
+    made.policy.trust(TrustRecord("owner", "ca", POINT, fingerprint(POINT)))
+    made.keys.set_ca_of(NODE, POINT)
+    made.close()
+    return tmp_path / "home"
+
+
+@pytest.fixture
+def opened(home: Path) -> Iterator[Open]:
+    """Open the station of ``home`` as a new process would; everything is closed at the end."""
+    stations: list[Station] = []
+
+    def open_one(said: list[str] | None = None, ask: Callable[[str, bool], str] = ask) -> Station:
+        forget_vaults()
+        told: list[str] = [] if said is None else said
+        stations.append(Station.open(home, ask=ask, tell=told.append))
+        return stations[-1]
+
+    yield open_one
+    for station in stations:
+        station.close()
+    forget_vaults()
+
+
+def behind_its_back(home: Path, *statements: str) -> None:
+    with closing(sqlite3.connect(home / "store.sqlite3")) as database, database:
+        for statement in statements:
+            database.execute(statement)
+
+
+def test_an_untouched_store_says_nothing(opened: Open) -> None:
+    said: list[str] = []
+    station = opened(said)
+    station.unlock()
+    assert said == []
+    assert list(station.seals.all_broken()) == []
+    assert station.pins.pinned(NODE) == fingerprint(POINT)
+    assert {record.name for record in station.policy.trusted()} == {"peer", "owner"}
+
+
+@pytest.mark.parametrize("column", ["ca", "point"])
+def test_a_changed_ca_or_station_key_stops_the_vault_from_opening(home: Path, opened: Open, column: str) -> None:
+    behind_its_back(home, f"UPDATE station SET {column} = x'{OTHER.hex()}'")
+    station = opened()
+    for _ in range(2):  # and it is not believed at the second try either
+        with pytest.raises(StoreChanged, match="own key or CA"):
+            station.unlock()
+
+
+@pytest.mark.parametrize(
+    "statement",
+    [
+        f"UPDATE trust SET point = x'{POINT.hex()}', fingerprint = '{'ab' * 32}' WHERE name = 'peer'",
+        "UPDATE trust SET mac = NULL WHERE name = 'peer'",
+        "UPDATE trust SET role = 'ca' WHERE name = 'peer'",
+        "UPDATE trust SET mac = (SELECT mac FROM trust WHERE name = 'owner') WHERE name = 'peer'",
+    ],
+)
+def test_changed_trust_is_named_and_does_not_count(home: Path, opened: Open, statement: str) -> None:
+    behind_its_back(home, statement)
+    said: list[str] = []
+    station = opened(said)
+    station.unlock()
+    assert "peer" in said[0]
+    assert "peer" not in {record.name for record in station.policy.trusted()}
+    assert OTHER not in station.policy.trusted_stations()
+    assert list(station.seals.all_broken()) == ["trust in peer"]
+    assert station.policy.distrust("peer")  # it is still listed, and can be taken away
+    assert list(station.seals.all_broken()) == []
+
+
+def test_planted_trust_does_not_count(home: Path, opened: Open) -> None:
+    row = f"'evil', 'ca', x'{OTHER.hex()}', '{fingerprint(OTHER)}', 't', zeroblob(16)"
+    behind_its_back(home, f"INSERT INTO trust VALUES({row})")
+    station = opened()
+    station.unlock()
+    assert OTHER not in station.policy.trusted_cas()
+
+
+@pytest.mark.parametrize(
+    "statement",
+    [
+        f"UPDATE whitelist SET fingerprint = '{fingerprint(OTHER)}'",
+        "UPDATE whitelist SET fingerprint = NULL",
+        "UPDATE whitelist SET assurance = 'uuid'",
+        "UPDATE whitelist SET mac = NULL",
+    ],
+)
+def test_a_changed_pin_is_not_believed_and_can_be_made_anew(home: Path, opened: Open, statement: str) -> None:
+    behind_its_back(home, statement)
+    station = opened()
+    station.unlock()
+    for use in (station.pins.pinned, station.pins.entry, station.policy.require_whitelisted):
+        with pytest.raises(StoreChanged, match=NODE.hex()):
+            use(NODE)
+    station.pins.let_go(NODE)
+    station.pins.remove(NODE)
+    station.pins.put(WhitelistEntry(NODE, fingerprint(POINT)))
+    assert station.pins.pinned(NODE) == fingerprint(POINT)
+
+
+def test_a_pin_moved_to_another_node_is_not_believed(home: Path, opened: Open) -> None:
+    behind_its_back(home, f"UPDATE whitelist SET uuid = x'{'ee' * 10}'")
+    station = opened()
+    station.unlock()
+    with pytest.raises(StoreChanged):
+        station.pins.entry(b"\xee" * 10)
+
+
+def test_a_changed_identity_key_of_a_node_is_not_believed(home: Path, opened: Open) -> None:
+    behind_its_back(home, f"UPDATE nodes SET point = x'{OTHER.hex()}'", "DELETE FROM whitelist")
+    station = opened()
+    station.unlock()
+    with pytest.raises(StoreChanged):
+        station.pins.pinned(NODE)
+
+
+def test_a_changed_ca_of_a_node_is_not_believed(home: Path, opened: Open) -> None:
+    behind_its_back(home, f"UPDATE marks SET ca = x'{OTHER.hex()}'")
+    station = opened()
+    station.unlock()
+    with pytest.raises(StoreChanged):
+        station.policy.trusted_cas(NODE)
+
+
+def test_lists_need_no_passphrase_and_changes_do(opened: Open) -> None:
+    station = opened(ask=nobody)
+    assert station.pins.pinned(NODE) == fingerprint(POINT)
+    assert len(station.policy.listed()) == 2
+    for change in (
+        lambda: station.pins.put(WhitelistEntry(b"\1" * 10)),
+        lambda: station.pins.remove(NODE),
+        lambda: station.pins.let_go(NODE),
+        lambda: station.policy.trust(TrustRecord("x", "ca", OTHER, fingerprint(OTHER))),
+        lambda: station.policy.distrust("peer"),
+    ):
+        with pytest.raises(WrongPassphrase):
+            change()
+    assert station.pins.entry(NODE) is not None
+    assert len(station.policy.listed()) == 2
+
+
+def test_a_key_seen_with_a_closed_vault_is_a_hint_that_can_only_refuse(opened: Open) -> None:
+    station = opened(ask=nobody)
+    fresh = b"\2" * 10
+    station.nodes.remember(fresh, point=POINT)
+    node = station.nodes.get(fresh)
+    assert node is not None
+    assert node.point_mac is None
+    assert station.pins.pinned(fresh) == fingerprint(POINT)
+
+
+def test_a_new_master_key_leaves_the_seals_whole(opened: Open) -> None:
+    rewrap(opened())
+    station = opened()
+    station.unlock()
+    assert list(station.seals.all_broken()) == []
+
+
+def test_a_store_of_version_1_is_taken_over_once_and_listed(tmp_path: Path) -> None:
+    home = tmp_path / "home"
+    home.mkdir(mode=0o700)
+    for name in ("store.sqlite3", "vault.json"):
+        shutil.copy(MADE / name, home / name)
+    for round_ in range(2):
+        forget_vaults()
+        said: list[str] = []
+        station = Station.open(home, ask=ask, tell=said.append)
+        station.unlock()
+        assert list(station.seals.all_broken()) == []
+        acts = [entry.act for entry in station.audit_log.entries()]
+        assert acts.count("seal") == 1
+        assert len(said) == (1 if round_ == 0 else 0)
+        if round_ == 0:
+            assert "6 whitelist entries" in said[0]
+            assert "east, owner, south" in said[0]
+        station.close()
+    behind_its_back(home, "UPDATE whitelist SET mac = NULL")
+    forget_vaults()
+    station = Station.open(home, ask=ask)
+    station.unlock()
+    with pytest.raises(StoreChanged):  # a row without a seal is taken over once, not a second time
+        station.pins.whitelist()
+    station.close()
