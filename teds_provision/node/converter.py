@@ -19,6 +19,7 @@ from teds_provision.teds.sheet import Channel, Sheet
 _KNOTS: Final = 257
 _INTEGER_TOLERANCE: Final = 0.01  # of a step: what lies so near a rounding edge may go either way
 _FLOAT_TOLERANCE: Final = 1e-9
+_MOST_FLOAT: Final = 3e38
 _PACKING: Final = {DataModel.FLOAT32: struct.Struct(">f"), DataModel.FLOAT64: struct.Struct(">d")}
 
 
@@ -37,6 +38,11 @@ class Converter:
         self._channel = channel
         self._interpreter = ChannelInterpreter(sheet, channel.number)
         self.low, self.high = self._interpreter.limits
+        self._octets = self.form.octets
+        width = 8 * self._octets
+        bits = self.form.bits if 0 < self.form.bits < width else width
+        self._most = (1 << bits) - 1 if self.form.integer else None
+        self._packing = _PACKING.get(DataModel(self.form.model))
         self._table = self._tabulated()
 
     @property
@@ -53,22 +59,20 @@ class Converter:
 
     def raw(self, value: float) -> float:
         """The raw number, not rounded, of a value in the unit in which people see it."""
-        value = min(max(value, self.low), self.high)
+        value = self.low if value < self.low else self.high if value > self.high else value
         if self._table is None:
             return float(self._interpreter.raw_numbers(np.array([value]))[0])
         values, raws = self._table
-        at = min(max(bisect.bisect_right(values, value), 1), len(values) - 1)
+        at = bisect.bisect_right(values, value, 1, len(values) - 1)
         share = (value - values[at - 1]) / (values[at] - values[at - 1])
         return raws[at - 1] + share * (raws[at] - raws[at - 1])
 
     def write(self, raw: float) -> bytes:
         """Octets of a raw number, rounded and kept within what a sample can hold."""
-        form = self.form
-        if form.integer and form.raw_range is not None:
-            return int(min(max(round(raw), 0), int(form.raw_range[1]))).to_bytes(form.octets, "big")
-        packing = _PACKING.get(DataModel(form.model))
-        if packing is not None and abs(raw) < 3e38:
-            return packing.pack(raw)
+        if self._most is not None:
+            return min(max(round(raw), 0), self._most).to_bytes(self._octets, "big")
+        if self._packing is not None and abs(raw) < _MOST_FLOAT:
+            return self._packing.pack(raw)
         return self._writer.write(np.array([raw]))
 
     def value(self, octets: bytes) -> float | None:

@@ -5,13 +5,13 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Protocol
+from functools import cached_property
+from typing import NamedTuple, Protocol
 
 from teds_provision.errors import UsageFailure
 
 
-@dataclass(frozen=True)
-class Reading:
+class Reading(NamedTuple):
     """What a channel shows at one instant: a ``value`` in the unit in which people see it, or a ``raw`` number."""
 
     value: float | None = None
@@ -27,7 +27,7 @@ class Place:
     low: float = math.nan
     high: float = math.nan
 
-    @property
+    @cached_property
     def span(self) -> tuple[float, float]:
         """Low and high of its range; 0 to 1 where the datasheet states none."""
         stated = math.isfinite(self.low) and math.isfinite(self.high)
