@@ -62,7 +62,7 @@ class Board:
     ) -> None:
         self.clock = clock or NodeClock()
         self.battery = battery
-        self.shown = shown
+        self.shown, self.tell = shown, tell
         self.faults: set[int] = set()
         self.sampling: int | None = None
         self._lock = threading.Lock()
@@ -92,7 +92,9 @@ class Board:
         self.source.start(self.clock)
 
     def stop(self) -> None:
-        """End the source."""
+        """Bring every actuator to its safe state, and end the source."""
+        for channel in self._safe_state:
+            self.safe(channel)
         self.source.stop()
 
     # -- clock -----------------------------------------------------------------------------------------------------

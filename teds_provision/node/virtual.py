@@ -16,7 +16,7 @@ from teds_provision.node.clock import NANOSECONDS
 from teds_provision.node.flash_file import FlashFile
 from teds_provision.node.pulse import Pulse
 from teds_provision.protocol.flash import Flash
-from teds_provision.protocol.keys import PrivateKey, SoftwareKey
+from teds_provision.protocol.keys import PrivateKey, SoftwareKey, verify
 from teds_provision.protocol.messages.identity import NodeState
 from teds_provision.protocol.operation.hardware import port_of
 from teds_provision.protocol.operation.streams import DataFrame
@@ -30,6 +30,8 @@ _MOST_BEHIND: Final = 200_000_000
 """ns that sampling may be behind the clock; what is older is lost, and shows as lost."""
 _STEP: Final = 1_000_000
 """ns: the least step of samples that are caught up with."""
+_TELL_EVERY: Final = 10.0
+"""Seconds between two lines about messages that were lost here."""
 _EVENTS: Final = 0.005
 """Seconds between two looks at event sensors."""
 _SIMULATION_WAITS: Final = 0.5
@@ -39,7 +41,7 @@ SendData = Callable[[DataFrame], None]
 
 @dataclass(frozen=True)
 class Delays:
-    """Seconds that a board would need: for one point operation (signature, ECDH, key pair), for one flash commit."""
+    """Seconds that a board needs: for a point operation (signature, its check, ECDH, key pair), for a flash commit."""
 
     crypto: float = 0.0
     flash: float = 0.0
@@ -142,6 +144,7 @@ class VirtualNode:
         self._core, self._pulse = _Core(), pulse
         self._wire = threading.Lock()
         self._sampled = 0
+        self._told_missed, self._tell_at = 0, 0.0
         self._buses: dict[str, SendData] = {}
         self._one_time_at = time.monotonic() + self._delays.crypto
         self.tim = Tim(
@@ -150,6 +153,7 @@ class VirtualNode:
             clock,
             max_message=self.flash_file.max_message,
             one_time=self._one_time,
+            verify=self._verify,
             hardware=self.board,
             quick_points=self._delays.crypto <= _QUICK,
         )
@@ -245,6 +249,8 @@ class VirtualNode:
         self._send_frames()
         with self._core.interrupt():
             frame = self.tim.next_frame_in()
+            missed = self.tim.missed
+        self._tell_misses(board, missed)
         wait = min(max(wait, _COARSE), _EVENTS if board.has_events else wait + _COARSE)
         return wait if frame is None else min(frame, wait)
 
@@ -270,6 +276,13 @@ class VirtualNode:
                 return 0.0
             at = min(real, at + max(round(wait * NANOSECONDS), _STEP))
 
+    def _tell_misses(self, board: Board, missed: int) -> None:
+        now = time.monotonic()
+        if missed > self._told_missed and now >= self._tell_at:
+            more = missed - self._told_missed
+            board.tell(f"{more} data messages of node {self.tim.flash.uuid.hex()} could not leave in time ({missed}).")
+            self._told_missed, self._tell_at = missed, now + _TELL_EVERY
+
     def _look_for_events(self, board: Board) -> None:
         for channel, tick, reading in board.events():
             self.tim.event(channel, tick, reading.octets, valid=reading.valid)
@@ -292,6 +305,10 @@ class VirtualNode:
     def _work(self) -> None:
         """One point operation."""
         self._sleep(self._delays.crypto)
+
+    def _verify(self, point: bytes, message: bytes, signature: bytes) -> bool:
+        self._work()
+        return verify(point, message, signature)
 
     def _sleep(self, seconds: float) -> None:
         if seconds > 0:

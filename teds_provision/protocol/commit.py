@@ -8,6 +8,7 @@ from dataclasses import replace
 
 from teds_provision.protocol import datasheet
 from teds_provision.protocol.flash import Flash
+from teds_provision.protocol.keys import Verify, verify
 from teds_provision.protocol.messages.frames import Reason, Refused
 from teds_provision.teds.codec import security
 from teds_provision.teds.codec.codes import AccessCode
@@ -20,7 +21,7 @@ def _demand(holds: bool, reason: Reason) -> None:
         raise Refused(reason)
 
 
-def verified_commit(flash: Flash, staged: Mapping[BlockId, bytes]) -> Flash:
+def verified_commit(flash: Flash, staged: Mapping[BlockId, bytes], verify: Verify = verify) -> Flash:
     """Return the state that the commit of ``staged`` leads to; raises Refused with the first check that fails."""
     for block, teds in staged.items():
         _demand(datasheet.passes_own_check(block, teds), Reason.BAD_FORM)
@@ -32,8 +33,8 @@ def verified_commit(flash: Flash, staged: Mapping[BlockId, bytes]) -> Flash:
     _demand(datasheet.own_values(signed), Reason.BAD_FORM)
     own = (flash.node_key, flash.node_key_signature)
     _demand((signed.node_key, signed.node_key_signature) == own, Reason.BAD_SIGNATURE)
-    _demand(datasheet.station_signature_good(signed, flash.ca or b""), Reason.BAD_SIGNATURE)
-    _demand(datasheet.signature_good(signed, staged[SECURITY], flash.uuid), Reason.BAD_SIGNATURE)
+    _demand(datasheet.station_signature_good(signed, flash.ca or b"", verify), Reason.BAD_SIGNATURE)
+    _demand(datasheet.signature_good(signed, staged[SECURITY], flash.uuid, verify), Reason.BAD_SIGNATURE)
     blocks = _listed_blocks(flash, staged, signed)
     for (_, access_code), teds in blocks.items():
         _demand(access_code != AccessCode.META or datasheet.meta_names(teds, flash.uuid), Reason.WRONG_UUID)

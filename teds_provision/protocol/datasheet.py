@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 from teds_provision.errors import BadData
 from teds_provision.protocol.agreement import Credentials
-from teds_provision.protocol.keys import is_point, station_key_message, verify
+from teds_provision.protocol.keys import Verify, is_point, station_key_message, verify
 from teds_provision.teds.codec import frame, security
 from teds_provision.teds.codec.codes import AccessCode
 from teds_provision.teds.codec.security import SecurityTeds
@@ -72,14 +72,14 @@ def own_values(teds: SecurityTeds) -> bool:
     return teds.values == security.OUR_VALUES
 
 
-def station_signature_good(teds: SecurityTeds, ca: bytes) -> bool:
+def station_signature_good(teds: SecurityTeds, ca: bytes, verify: Verify = verify) -> bool:
     """Whether 104 is the CA's signature over 103, and 103 a point."""
     if teds.station_key is None or teds.station_key_signature is None or not is_point(teds.station_key):
         return False
     return verify(ca, station_key_message(teds.station_key), teds.station_key_signature)
 
 
-def signature_good(teds: SecurityTeds, octets: bytes, uuid: bytes) -> bool:
+def signature_good(teds: SecurityTeds, octets: bytes, uuid: bytes, verify: Verify = verify) -> bool:
     """Whether 100 verifies under 103 over the octets as they are."""
     if teds.station_key is None or teds.signature is None:
         return False

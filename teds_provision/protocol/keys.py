@@ -7,6 +7,7 @@ uses :class:`PrivateKey` alone.
 from __future__ import annotations
 
 import hashlib
+from collections.abc import Callable
 from typing import Protocol
 
 from cryptography.exceptions import InvalidSignature, UnsupportedAlgorithm
@@ -104,6 +105,10 @@ def is_point(point: bytes) -> bool:
     except BadData:
         return False
     return True
+
+
+Verify = Callable[[bytes, bytes, bytes], bool]
+"""Whether a signature (64 octets) is SIG(point, message); :func:`verify`, or a chip that does it."""
 
 
 def verify(point: bytes, message: bytes, signature: bytes) -> bool:

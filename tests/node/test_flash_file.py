@@ -11,13 +11,14 @@ import pytest
 from teds_provision.errors import BadData, NotFound, StoreFailure, StoreLocked
 from teds_provision.node.flash_file import FlashFile
 from teds_provision.node.virtual import Delays, VirtualNode
-from teds_provision.protocol.messages.frames import decode_reply
+from teds_provision.protocol.agreement import StationAgreement
+from teds_provision.protocol.messages.frames import Function, decode_reply, security_command
 from teds_provision.protocol.messages.identity import NodeState
 from teds_provision.protocol.session import StationSession
 from teds_provision.teds.codec import security
 from teds_provision.teds.image import SECURITY
 
-from ..protocol.desk import UUID, Desk
+from ..protocol.desk import CREDENTIALS, UUID, Desk
 
 
 def test_a_running_node_is_refused_to_another_process(tmp_path: Path) -> None:
@@ -102,3 +103,18 @@ def test_an_open_costs_a_slow_node_an_ecdh_and_what_is_left_of_a_key_pair(
     pair, ecdh = slept
     assert 0 < pair <= 0.25, "the chip began with the key pair at the node's start"
     assert ecdh == 0.25
+
+
+def test_every_point_operation_of_an_agreement_and_a_proof_is_slow(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    slept: list[float] = []
+    monkeypatch.setattr("teds_provision.node.virtual.time.sleep", slept.append)
+    FlashFile.create(tmp_path / "node", uuid=UUID)
+    node = VirtualNode(tmp_path / "node", delays=Delays(crypto=0.25))
+    request = StationAgreement(CREDENTIALS, UUID).request().encode()
+    assert decode_reply(node.request("nfc", request, tapped=True)).ok
+    assert slept == [0.25] * 3, "SIG104 is checked, and two ECDH"
+    prove = security_command(Function.PROVE, bytes(32)).encode()
+    assert decode_reply(node.request("nfc", prove, tapped=True)).ok
+    assert slept == [0.25] * 4

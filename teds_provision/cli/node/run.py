@@ -110,7 +110,7 @@ def run(
             running.append(part)
         _say_ready(app, nodes, [links[kind] for kind in ("nfc", "can") if links[kind]], source)
         lines.start()
-        running.append(lines)
+        running.insert(0, lines)  # the last to end: it tells that actuators are safe
         while not stop.wait(0.5):
             pass
     finally:

@@ -104,11 +104,17 @@ class StreamRole:
         self._streams: list[Stream] = []
         self._senders: dict[str, Sender] = {}
         self._sessions: dict[NodeSession, _Measuring] = {}
+        self._missed = 0
 
     @property
     def running(self) -> bool:
         """Whether a stream runs."""
         return bool(self._streams)
+
+    @property
+    def missed(self) -> int:
+        """Messages that were full and could not leave in time, since the start."""
+        return self._missed + sum(stream.missed for stream in self._streams)
 
     @property
     def backlog(self) -> bool:
@@ -324,6 +330,7 @@ class StreamRole:
                 stream.start = start
 
     def _end(self, stream: Stream) -> None:
+        self._missed += stream.missed
         self._streams.remove(stream)
         self._sender(stream.port.bus).take_back(stream)
 

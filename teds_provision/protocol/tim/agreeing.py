@@ -16,7 +16,7 @@ from teds_provision.protocol.agreement import (
     good_point,
 )
 from teds_provision.protocol.flash import Flash
-from teds_provision.protocol.keys import PrivateKey, station_key_message, verify
+from teds_provision.protocol.keys import PrivateKey, Verify, station_key_message, verify
 from teds_provision.protocol.messages.frames import Reason, Refused
 from teds_provision.protocol.session import NodeSession
 from teds_provision.protocol.tim.origin import Origin
@@ -37,8 +37,10 @@ class _Pending:
 class Agreeing:
     """One agreement at a time over all links."""
 
-    def __init__(self, key: PrivateKey, clock: Callable[[], float], random: Callable[[int], bytes]) -> None:
-        self._key, self._clock, self._random = key, clock, random
+    def __init__(
+        self, key: PrivateKey, clock: Callable[[], float], random: Callable[[int], bytes], verify: Verify = verify
+    ) -> None:
+        self._key, self._clock, self._random, self._verify = key, clock, random, verify
         self._pending: _Pending | None = None
 
     def request(self, payload: bytes, origin: Origin, flash: Flash) -> bytes:
@@ -51,7 +53,7 @@ class Agreeing:
                 raise Refused(Reason.BAD_POINT)
         if flash.ca is not None and request.ca != flash.ca:
             raise Refused(Reason.UNTRUSTED_STATION)
-        if not verify(request.ca, station_key_message(request.station), request.station_signature):
+        if not self._verify(request.ca, station_key_message(request.station), request.station_signature):
             raise Refused(Reason.BAD_SIGNATURE)
         if flash.epoch == LAST_EPOCH:
             raise Refused(Reason.WRONG_EPOCH)

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 from typing import Final
 
 from teds_provision.protocol.flash import Flash, FlashFailure, FlashMemory
-from teds_provision.protocol.keys import PrivateKey, SoftwareKey, prove_message, reset_message
+from teds_provision.protocol.keys import PrivateKey, SoftwareKey, Verify, prove_message, reset_message, verify
 from teds_provision.protocol.messages.frames import (
     COMMAND_HEADER,
     COMMON,
@@ -44,7 +44,8 @@ class Tim:
     """One transducer interface module.
 
     ``max_message`` octets (1024 to 4094); ``clock`` gives monotonic seconds; ``random`` gives that many octets, good
-    from the first moment after a start; ``one_time`` makes the key pair of one Open (a board may have one ready).
+    from the first moment after a start; ``one_time`` makes the key pair of one Open (a board may have one ready),
+    ``verify`` checks a signature.
     ``sessions`` and ``streams`` are its room for them; ``hardware`` is what it measures and acts with, None: nothing.
     ``quick_points``: its point arithmetic holds no Sealed frame up by more than 5 ms.
     """
@@ -56,6 +57,7 @@ class Tim:
     max_teds: int = 16384
     random: Callable[[int], bytes] = os.urandom
     one_time: OneTime = SoftwareKey.generate
+    verify: Verify = verify
     hardware: Hardware | None = None
     sessions: int = 8
     streams: int = 8
@@ -65,8 +67,8 @@ class Tim:
         self._flash = self.memory.load()
         self._taken_address: int | None = None
         self._ending: list[Callable[[], None]] = []
-        self._teds = TedsAccess(self.max_message, self.max_teds)
-        self._agreeing = Agreeing(self.key, self.clock, self.random)
+        self._teds = TedsAccess(self.max_message, self.max_teds, self.verify)
+        self._agreeing = Agreeing(self.key, self.clock, self.random, self.verify)
         self._lines = Lines(
             self.clock,
             self.random,
@@ -157,6 +159,11 @@ class Tim:
     def next_frame_in(self) -> float | None:
         """Seconds until the next data frame of any bus may begin; None where none is waiting."""
         return self._role.next_frame_in() if self._role is not None else None
+
+    @property
+    def missed(self) -> int:
+        """Data messages that could not leave in time, since the start."""
+        return self._role.streams.missed if self._role is not None else 0
 
     @property
     def backlog(self) -> bool:

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from teds_provision.protocol.commit import verified_commit
 from teds_provision.protocol.datasheet import can_be_stored, passes_own_check
 from teds_provision.protocol.flash import Flash
+from teds_provision.protocol.keys import Verify, verify
 from teds_provision.protocol.messages.frames import Attribute, Command, Reason, Refused, Reply, TedsStatus
 from teds_provision.teds.image import SECURITY, BlockId
 
@@ -20,10 +21,14 @@ Staging = dict[BlockId, bytes]
 
 @dataclass(frozen=True)
 class TedsAccess:
-    """Query, Read, Write and Update over a node's state; ``max_teds`` octets is the largest TEDS it takes."""
+    """Query, Read, Write and Update over a node's state.
+
+    ``max_teds`` octets is the largest TEDS it takes; ``verify`` checks signatures.
+    """
 
     max_message: int
     max_teds: int
+    verify: Verify = verify
 
     def query(self, flash: Flash, command: Command) -> Reply:
         """Query TEDS (1.1)."""
@@ -66,7 +71,7 @@ class TedsAccess:
             return self.query(flash, command), None
         state = None
         if block == SECURITY:
-            state = verified_commit(flash, staging)
+            state = verified_commit(flash, staging, self.verify)
         elif not passes_own_check(block, staging[block]):
             raise Refused(Reason.BAD_FORM)
         return Reply(True, self._status(flash, block, staging[block]).encode()), state
