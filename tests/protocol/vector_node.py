@@ -9,11 +9,12 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+from cryptography.exceptions import InvalidTag
 from cryptography.hazmat.primitives import hashes
 from cryptography.hazmat.primitives.asymmetric import ec
 from cryptography.hazmat.primitives.asymmetric.utils import encode_dss_signature
 from cryptography.hazmat.primitives.ciphers.aead import AESCCM
-from cryptography.hazmat.primitives.kdf.hkdf import HKDF
+from cryptography.hazmat.primitives.kdf.hkdf import HKDF, HKDFExpand
 
 from teds_provision.protocol.flash import Flash
 from teds_provision.protocol.keys import SoftwareKey, node_key_message
@@ -148,3 +149,12 @@ def padded(frame: bytes) -> bytes:
     """PKCS #7."""
     count = 16 - len(frame) % 16
     return frame + bytes([count] * count)
+
+
+def open_message(message_key: bytes, run: int, message: bytes) -> bytes | None:
+    """The plain octets of a data message of this run, None for a bad tag."""
+    key = HKDFExpand(hashes.SHA256(), 16, b"TEDS1 stream\0" + run.to_bytes(2, "big")).derive(message_key)
+    try:
+        return AESCCM(key, tag_length=8).decrypt(bytes(9) + message[:4], message[4:], None)
+    except InvalidTag:
+        return None

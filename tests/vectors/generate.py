@@ -13,13 +13,29 @@ import sys
 from collections.abc import Callable, Iterator
 from typing import Any
 
-from . import recipes, recipes_handover, recipes_links, recipes_refusals, recipes_repetition, recipes_teds
+from . import (
+    recipes,
+    recipes_handover,
+    recipes_links,
+    recipes_operation,
+    recipes_refusals,
+    recipes_repetition,
+    recipes_teds,
+)
 from .scene import FOLDER, KAT, Scene, keys
 
 logging.getLogger("isotp").setLevel(logging.CRITICAL)  # it tells of every flow control that came late
 FORMAT = "teds1-vectors/1"
 Recipe = Callable[[], Iterator[Any]]
-_MODULES = (recipes, recipes_refusals, recipes_teds, recipes_repetition, recipes_links, recipes_handover)
+_MODULES = (
+    recipes,
+    recipes_refusals,
+    recipes_teds,
+    recipes_repetition,
+    recipes_links,
+    recipes_operation,
+    recipes_handover,
+)
 FILES: dict[str, Recipe] = {name: recipe for module in _MODULES for name, recipe in module.FILES.items()}
 
 
