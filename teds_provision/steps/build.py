@@ -100,14 +100,16 @@ class _Composed:
 
 
 def _composed(station: Station, uuid: bytes, order: BuildOrder, has: Image | None, edition: int) -> _Composed:
-    from teds_provision.teds.profile import default_folders, load_profile
+    from teds_provision.teds.profile import default_folders, load_profile, passed_over
 
     record = station.nodes.get(uuid)
     wanted = order.profile or (record.profile if record else None)
     if wanted is None:
         raise UsageFailure(f"No profile is known for node {uuid.hex()}.", hint="Add --profile; see: profile list")
-    profile = load_profile(wanted, default_folders(station.home))
+    folders = default_folders(station.home)
+    profile = load_profile(wanted, folders)
     calibrations, warnings = _calibrations(order, profile, has)
+    warnings = passed_over(wanted, folders) + warnings
     name = order.name or (record.name if record else None)
     try:
         made = profile.build(uuid, calibration=calibrations, name=name, edition=edition)  # type: ignore[arg-type]

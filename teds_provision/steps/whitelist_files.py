@@ -17,6 +17,7 @@ from typing import Any, Final
 
 from teds_provision.errors import BadData
 from teds_provision.files import read_limited
+from teds_provision.limits import load_json
 from teds_provision.store.records import UUID_OCTETS
 
 MAX_FILE_OCTETS: Final = 64 * 1024 * 1024
@@ -27,6 +28,8 @@ FIELDS: Final = ("uuid", "fingerprint", "added", "assurance", "name")
 _SHOWN_MISTAKES = 10
 _MAX_NAME = 200
 _MAX_DEPTH = 16
+_MAX_TAG = 65_536
+_LONG_TAG = re.compile(f"[^<]{{{_MAX_TAG}}}")
 _UUID_DIGITS = 2 * UUID_OCTETS
 _NAME_RULE = f"a name is printable and has at most {_MAX_NAME} characters"
 _ENTRY_ELEMENTS = frozenset({"transducer", "tim", "node", "entry", "item", "device", "uuid"})
@@ -177,6 +180,10 @@ def _read_xml(text: str, reading: _Reading) -> None:
             element = self.open.pop()
             _close_element(element, self.open[-1] if self.open else None, reading)
 
+    long = _LONG_TAG.search(text)  # a million attributes of one element would be held in memory all at once
+    if long is not None:
+        line = text.count("\n", 0, long.start()) + 1
+        raise BadData(f"{reading.file}:{line}: a tag or text of more than {_MAX_TAG} characters.")
     parser = DefusedExpatParser(forbid_dtd=True)
     handler = Handler()
     parser.setContentHandler(handler)
@@ -279,12 +286,7 @@ def _read_csv(text: str, reading: _Reading) -> None:
 
 
 def _read_json(text: str, reading: _Reading) -> None:
-    try:
-        value = json.loads(text)
-    except json.JSONDecodeError as error:
-        raise BadData(f"{reading.file}:{error.lineno}: this is not JSON: {error.msg}.") from error
-    except (RecursionError, ValueError) as error:
-        raise BadData(f"{reading.file}: this JSON is nested too deeply or has a number that is too long.") from error
+    value = load_json(text, "the whitelist", octets=MAX_FILE_OCTETS, file=reading.file)
     listed = value.get("whitelist") if isinstance(value, dict) else value
     if not isinstance(listed, list):
         raise BadData(f'{reading.file}:1: whitelist: a list is needed, or an object with "whitelist": […].')

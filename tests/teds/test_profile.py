@@ -24,6 +24,7 @@ from teds_provision.teds.profile import (
     keys,
     list_profiles,
     load_profile,
+    passed_over,
     shipped_profiles,
     template,
 )
@@ -431,3 +432,19 @@ def test_the_manual_names_every_key() -> None:
         assert f"`{key.key}`" in manual, key.key
         assert all(f"`{choice}`" in manual for choice in key.choices)
     assert all(f"`{name}`" in manual for name in shipped())
+
+
+def test_a_file_in_the_working_folder_never_stands_in_for_a_shipped_type(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "profiles").mkdir()
+    write(tmp_path / "profiles", "load-cell", GOOD)
+    write(tmp_path / "profiles", "mine", GOOD)
+    folders = default_folders(tmp_path / "home")
+    assert find_profile("load-cell", folders).parent == shipped_profiles()
+    assert find_profile("mine", folders) == Path("profiles/mine.toml")
+    (told,) = passed_over("load-cell", folders)
+    assert told.startswith("profiles/load-cell.toml was not used: load-cell is ")
+    assert passed_over("mine", folders) == ()
+    assert passed_over("profiles/load-cell.toml", folders) == ()

@@ -8,6 +8,7 @@ import click
 
 from teds_provision.cli.context import App, pass_app
 from teds_provision.cli.options import command
+from teds_provision.errors import BadData, UsageFailure
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -17,8 +18,11 @@ _COLOURS = {"authentic": "green", None: "dim"}
 
 @command("teds-provision nodes", "teds-provision --json nodes 8d4d")
 @click.argument("uuid", required=False)
+@click.option(
+    "--fits", metavar="EXPR", help='Judge datasheets: "angle >= 360 deg, uncertainty <= 1 deg, rate >= 1 kHz".'
+)
 @pass_app
-def nodes(app: App, uuid: str | None) -> None:
+def nodes(app: App, uuid: str | None, fits: str | None) -> None:
     """Show every node that this station has met or been given, or all about one.
 
     UUID may be a prefix of four digits or more, or the node's name. Nothing is asked of the nodes themselves.
@@ -26,8 +30,41 @@ def nodes(app: App, uuid: str | None) -> None:
     from teds_provision.station.inventory import inventory
 
     station = app.station()
+    if fits is not None:
+        _fits(app, fits, [station.nodes.resolve(uuid)] if uuid else [record.uuid for record in station.nodes.all()])
+        return
     found = inventory(station, station.nodes.resolve(uuid) if uuid else None)
     app.emit({"nodes": found}, lambda console: _one(console, found[0]) if uuid else _table(console, found))
+
+
+def _fits(app: App, expression: str, uuids: list[bytes]) -> None:
+    from datetime import UTC, datetime
+
+    from teds_provision.steps.fits import fits_of
+    from teds_provision.teds.fits import parse_fits
+
+    try:
+        requirement = parse_fits(expression)
+    except BadData as error:
+        raise UsageFailure(f"--fits: {error.message}", hint=error.hint) from error
+    found = [fit.to_json() for fit in fits_of(app.station(), [requirement], uuids, datetime.now(UTC))]
+    app.emit({"fits": found}, lambda console: _fit_table(console, found))
+
+
+def _fit_table(console: Console, found: list[dict[str, Any]]) -> None:
+    from rich.table import Table
+    from rich.text import Text
+
+    from teds_provision.cli.rendering import print_table, shown
+
+    table = Table("UUID", "channel", "result", "why", box=None, pad_edge=False)
+    style = {"passed": "green", "failed": "red", "skipped": "dim"}
+    for fit in found:
+        channel = "" if fit["channel"] is None else f"{fit['channel']} {fit['name']}".strip()
+        table.add_row(
+            fit["uuid"], Text(shown(channel)), Text(fit["result"], style[fit["result"]]), Text(shown(fit["why"]))
+        )
+    print_table(console, table)
 
 
 def _table(console: Console, found: list[dict[str, Any]]) -> None:

@@ -11,6 +11,7 @@ from teds_provision.teds.profile.load import (
     find_profile,
     list_profiles,
     load_profile,
+    passed_over,
     shipped_profiles,
 )
 from teds_provision.teds.profile.model import (
@@ -39,6 +40,7 @@ __all__ = [
     "list_profiles",
     "listed",
     "load_profile",
+    "passed_over",
     "shipped_profiles",
     "summary",
     "template",

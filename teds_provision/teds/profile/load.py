@@ -37,8 +37,12 @@ def shipped_profiles() -> Path:
 
 
 def default_folders(home: Path | None = None) -> tuple[Path, ...]:
-    """Where profiles are looked for, the first wins: ./profiles, <home>/profiles, the shipped ones."""
-    folders = [Path("profiles"), *([home / "profiles"] if home else []), shipped_profiles()]
+    """Where profiles are looked for, the first wins: <home>/profiles, the shipped ones, ./profiles.
+
+    So no file that lies about in the working folder stands in for a type that comes with the tool; one's own version
+    of such a type lies in the home, or is named by its path.
+    """
+    folders = [*([home / "profiles"] if home else []), shipped_profiles(), Path("profiles")]
     unique: dict[Path, Path] = {}
     for folder in folders:
         unique.setdefault(folder.resolve(), folder)
@@ -57,6 +61,14 @@ def load_profile(name_or_path: str | Path, folders: Sequence[Path] | None = None
     if profile is None:  # no error and no profile cannot be
         raise BadData(f"The profile {name} cannot be read.")
     return profile
+
+
+def passed_over(name: str, folders: Sequence[Path]) -> tuple[str, ...]:
+    """Sentences about files of that name which were not taken, because a folder before theirs has one."""
+    if _NAME.match(name) is None or name.endswith(".toml"):
+        return ()
+    found = [folder / f"{name}.toml" for folder in folders if (folder / f"{name}.toml").is_file()]
+    return tuple(f"{other} was not used: {name} is {found[0]}. Give its path to use it." for other in found[1:])
 
 
 def check(name_or_path: str | Path, folders: Sequence[Path] | None = None) -> tuple[Profile | None, list[Problem]]:
