@@ -8,13 +8,16 @@ from typing import TYPE_CHECKING
 import click
 
 from teds_provision.cli.context import App, pass_app
-from teds_provision.cli.options import command, dry_run_option
+from teds_provision.cli.options import COMMAND_SETTINGS, command, dry_run_option, examples
 
 if TYPE_CHECKING:
     from teds_provision.store.records import Group
 
 
-@click.group()
+@click.group(
+    context_settings=COMMAND_SETTINGS,
+    epilog=examples("teds-provision group create hand 8d4d 91aa", "teds-provision group list"),
+)
 def group() -> None:
     """Measurement groups: a name for nodes that are measured together. A running group is frozen."""
 
@@ -30,7 +33,7 @@ def _tell(app: App, groups: Sequence[Group]) -> None:
     )
 
 
-@group.command("list")
+@group.command("list", context_settings=COMMAND_SETTINGS, epilog=examples("teds-provision group list"))
 @pass_app
 def list_groups(app: App) -> None:
     """List every group."""

@@ -1,0 +1,281 @@
+"""`measure`, `sample`, `set`, `mode`, `group` at two virtual nodes over a real CAN bus, every command a process."""
+
+from __future__ import annotations
+
+import csv
+import json
+import signal
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+from mcap.reader import make_reader
+
+from teds_provision.measure.sinks.recover import recover
+from tests.e2e.desk import ANGLE, Desk, Node, Station
+from tests.workflow.bench import make_station
+
+pytestmark = pytest.mark.link
+CALIBRATIONS = {
+    ANGLE: "# date: 2026-10-01\nraw,value [degree]\n0,0\n65535,359.9\n",
+    "gripper": "# date: 2026-10-01\nraw,value,channel\n0,0,1\n4095,110,1\n0,0,2\n4095,110,2\n0,0,3\n4095,140,3\n",
+}
+
+
+class Bench:
+    """A station that has provisioned an angle sensor and a gripper, both on one bus and running."""
+
+    def __init__(self, desk: Desk) -> None:
+        self.desk, self.station = desk, desk.station()
+        self.can = ["--can", f"{desk.links.can}&fd=1"]
+        self.angle, self.gripper = (self.node(name, type_) for name, type_ in (("a", ANGLE), ("g", "gripper")))
+
+    def node(self, name: str, type_: str) -> Node:
+        folder = self.desk.folder / name
+        made = self.desk.start("--json", "node", "create", folder, "--name", name, "--profile", type_).end()
+        assert made.code == 0, made
+        node = Node(self.desk, folder, made.json["uuid"])
+        self.power(node)
+        calibration = self.desk.folder / f"{name}.csv"
+        calibration.write_text(CALIBRATIONS[type_])
+        words = ["--profile", type_, "--calibration", calibration, "--name", name, "--via", "can", *self.can]
+        done = self.station.ask("provision", *words, "--yes")
+        assert done["uuid"] == node.uuid
+        assert done["verdict"] == "authentic"
+        return node
+
+    def power(self, node: Node) -> None:
+        node.process = self.desk.start("--json", "node", "run", node.folder, *self.can, "--source", "ramp:2")
+        node.process.wait_for('"ready": true')
+
+    def ask(self, *words: object, code: int = 0) -> Any:
+        return self.station.ask(*words, *self.can, code=code)
+
+    def measure(self, *words: object, code: int = 0) -> list[dict[str, Any]]:
+        """A measurement to its end: its lines of JSON."""
+        outcome = self.station.run("--json", "measure", *words, *self.can)
+        assert outcome.code == code, outcome
+        return [json.loads(line) for line in outcome.out.splitlines()]
+
+
+@pytest.fixture(scope="module")
+def bench(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Bench]:
+    prepared = tmp_path_factory.mktemp("stations")
+    make_station(prepared / "bench", "bench").close()
+    desk = Desk(tmp_path_factory.mktemp("measuring"), prepared)
+    try:
+        yield Bench(desk)
+    finally:
+        desk.clear()
+
+
+def data(lines: list[dict[str, Any]], channel: int = 1) -> list[dict[str, Any]]:
+    return [line for line in lines if line["event"] == "data" and line["channel"] == channel]
+
+
+def test_sample_gives_calibrated_values_with_unit_and_uncertainty(bench: Bench) -> None:
+    before = time.time()
+    [sample] = bench.ask("sample", bench.angle.uuid)["samples"]
+    assert (sample["channel"], sample["name"], sample["unit"], sample["valid"]) == (1, "angle", "rad", True)
+    assert sample["value"] == pytest.approx(sample["raw"] * 6.281440 / 65535, abs=1e-4)
+    assert sample["uncertainty"] == pytest.approx(0.01745, abs=1e-4)
+    assert before - 0.5 < sample["time"] < time.time() + 0.5
+    some = bench.ask("sample", bench.gripper.uuid, 3)["samples"]
+    assert [one["channel"] for one in some] == [3]
+
+
+def test_sample_of_an_actuator_or_of_nothing_is_refused(bench: Bench) -> None:
+    assert bench.ask("sample", bench.gripper.uuid, 1, code=8)["error"]["code"] == "bad-data"
+    assert bench.ask("sample", bench.gripper.uuid, 9, code=8)["error"]["code"] == "bad-data"
+
+
+def test_a_measurement_ends_with_its_counts_and_every_file_says_the_same(bench: Bench) -> None:
+    folder = bench.desk.folder
+    files = [folder / f"run.{suffix}" for suffix in ("csv", "jsonl", "mcap")]
+    targets = [word for file in files for word in ("--to", file)]
+    lines = bench.measure(bench.angle.uuid, bench.gripper.uuid, "--rate", 100, "--duration", 2, *targets)
+    end = lines[-1]
+    assert end["event"] == "end"
+    assert [node["uuid"] for node in end["nodes"]] == [bench.angle.uuid, bench.gripper.uuid]
+    assert end["files"] == [str(file) for file in files]
+    for node in end["nodes"]:
+        for stream in node["streams"]:
+            assert stream["period"] == 0.01
+            assert stream["samples"] >= 100 * len(stream["channels"])
+            assert (stream["bad"], stream["invalid"]) == (0, 0)
+            assert stream["clock_error"] < 0.1
+    angles = data(lines)
+    values = [value for line in angles for value in line["value"]]
+    times = [instant for line in angles for instant in line["time"]]
+    raws = [raw for line in angles for raw in line["raw"]]
+    assert times == sorted(times)
+    assert all(b == pytest.approx(a * 6.281440 / 65535, abs=1e-4) for a, b in zip(raws, values, strict=True))
+    assert all(line["unit"] == "rad" and line["uncertainty"] for line in angles)
+    running = [line for line in lines if line["event"] == "status" and line["state"] == "running"]
+    assert {line["uuid"] for line in running} == {bench.angle.uuid, bench.gripper.uuid}
+    text = [line for line in files[0].read_text().splitlines() if not line.startswith("#")]
+    rows = [row for row in csv.DictReader(text) if row["uuid"] == bench.angle.uuid]
+    assert [int(row["a/angle raw"]) for row in rows] == raws
+    recorded = [json.loads(line) for line in files[1].read_text().splitlines()]
+    assert [raw for line in data(recorded) if line["uuid"] == bench.angle.uuid for raw in line["raw"]] == raws
+    with files[2].open("rb") as file:
+        topics = [channel.topic for _, channel, _ in make_reader(file).iter_messages()]
+    assert topics.count("/bench/a/stream_0") == len(raws)
+
+
+def test_a_group_is_measured_by_name_begins_together_and_is_frozen_meanwhile(bench: Bench) -> None:
+    made = bench.station.ask("group", "create", "crane", bench.angle.uuid, bench.gripper.uuid)
+    assert made["groups"] == [{"name": "crane", "uuids": sorted([bench.angle.uuid, bench.gripper.uuid])}]
+    running = bench.station.start("--json", "measure", "crane", "--rate", 50, "--trigger", *bench.can)
+    running.wait_for('"event":"data"')
+    refused = bench.station.refuses("group", "remove", "crane", bench.angle.uuid, code=6)
+    assert "measured" in refused["message"]
+    running.signal(signal.SIGTERM)
+    outcome = running.end()
+    assert outcome.code == 0, outcome.err
+    lines = [json.loads(line) for line in outcome.out.splitlines()]
+    assert lines[-1]["began_apart"] < 0.05
+    firsts = [next(line for line in lines if line["event"] == "data" and line["uuid"] == uuid and line["index"] == 0)
+              for uuid in (bench.angle.uuid, bench.gripper.uuid)]  # fmt: skip
+    assert abs(firsts[0]["time"][0] - firsts[1]["time"][0]) < 0.05
+    assert bench.station.ask("group", "remove", "crane", bench.angle.uuid)["groups"][0]["uuids"] == [bench.gripper.uuid]
+    assert bench.station.ask("group", "delete", "crane")["groups"] == []
+
+
+def test_names_of_groups(bench: Bench) -> None:
+    bench.station.refuses("group", "create", "8d4d", bench.angle.uuid, code=2)
+    bench.station.refuses("group", "add", "nothing", bench.angle.uuid, code=3)
+    assert bench.station.ask("group", "list") == {"groups": []}
+
+
+def test_a_test_pattern_is_checked_and_never_a_measurement(bench: Bench) -> None:
+    file = bench.desk.folder / "pattern.csv"
+    lines = bench.measure(bench.angle.uuid, "--rate", 100, "--duration", 1, "--test-pattern", "--to", file)
+    assert data(lines)
+    for line in data(lines):
+        assert line["test_pattern"] is True
+        assert set(line["value"]) == {None}
+        assert line["raw"] == [(line["index"] + k + 1) % 65536 for k in range(len(line["raw"]))]
+    assert lines[-1]["nodes"][0]["streams"][0]["bad"] == 0
+    rows = list(csv.DictReader(line for line in file.read_text().splitlines() if not line.startswith("#")))
+    assert {row["note"] for row in rows} == {"test pattern"}
+
+
+def test_a_rate_that_the_datasheet_does_not_give_is_6_with_the_fastest(bench: Bench) -> None:
+    *_, end = bench.measure(bench.angle.uuid, "--rate", 20000, "--duration", 1, code=6)
+    assert "10000" in end["error"]["hint"]
+    assert end["event"] == "end"
+
+
+def test_a_node_that_starts_anew_is_carried_on_with(bench: Bench) -> None:
+    running = bench.station.start("--json", "measure", bench.gripper.uuid, "--rate", 20, *bench.can)
+    running.wait_for('"event":"data"')
+    bench.gripper.kill()
+    bench.power(bench.gripper)
+    before = running.out.count('"event":"data"')
+    running.wait_for('"state":"lost"')
+    until = time.monotonic() + 30
+    while running.out.count('"state":"running"') < 2 or running.out.count('"event":"data"') < before + 5:
+        assert time.monotonic() < until, running.out[-2000:]
+        running.read(0.1)
+    running.signal(signal.SIGINT)
+    outcome = running.end()
+    assert outcome.code == 0, outcome
+    lines = [json.loads(line) for line in outcome.out.splitlines()]
+    times = [instant for line in data(lines, 2) for instant in line["time"]]
+    assert times == sorted(times), "also over a restart"
+
+
+def test_a_killed_measurement_leaves_a_recording_and_a_node_that_can_be_measured_again(bench: Bench) -> None:
+    file = bench.desk.folder / "killed.mcap"
+    running = bench.station.start("--json", "measure", bench.gripper.uuid, "--rate", 100, "--to", file, *bench.can)
+    running.wait_for('"index":100')
+    running.process.kill()
+    running.end()
+    done = bench.station.ask("measure", "recover", file)
+    assert done["recovered"]["messages"] >= 50
+    assert recover(file).was_whole
+    lines = bench.measure(bench.gripper.uuid, "--rate", 100, "--duration", 1)
+    assert data(lines, 2)
+
+
+def test_set_applies_within_the_limits_and_ends_safe(bench: Bench) -> None:
+    outcome = bench.station.run("--json", "set", bench.gripper.uuid, 1, 55, "--unit", "mm", "--hold", 0.5, *bench.can)
+    assert outcome.code == 0, outcome
+    applied, end = [json.loads(line) for line in outcome.out.splitlines()]
+    assert applied["applied"]["channel"] == 1
+    assert applied["applied"]["value"] == pytest.approx(55, abs=0.05)
+    assert applied["applied"]["unit"] == "mm"
+    assert applied["applied"]["raw"] == pytest.approx(2048, abs=2)
+    assert end == {"event": "end", "safe": True}
+    assert bench.gripper.process is not None
+    bench.gripper.process.wait_for('"safe": true')
+
+
+@pytest.mark.parametrize(
+    ("words", "code"), [((1, 0.5), 6), ((1, 5, "--unit", "N"), 8), ((2, 0.01), 8), ((1, "nan"), 2)]
+)
+def test_set_refuses_what_the_datasheet_does_not_allow(bench: Bench, words: tuple[Any, ...], code: int) -> None:
+    assert "error" in bench.ask("set", bench.gripper.uuid, *words, "--hold", 0.1, code=code)
+    state = bench.ask("mode", bench.gripper.uuid)["channels"][0]["state"]
+    assert "claimed here" not in state
+    assert "safe" in state
+
+
+def test_a_dead_station_leaves_a_safe_actuator(bench: Bench) -> None:
+    words = ["--json", "set", bench.gripper.uuid, 1, 0.05, "--dead-man", 300, *bench.can]
+    running = bench.station.start(*words)
+    running.wait_for('"applied"')
+    assert bench.gripper.process is not None
+    bench.gripper.process.read(0.1)
+    before = bench.gripper.process.out.count('"safe": true')
+    running.process.kill()
+    killed = time.monotonic()
+    running.end()
+    while bench.gripper.process.out.count('"safe": true') == before:
+        assert time.monotonic() < killed + 10
+        bench.gripper.process.read(0.1)
+
+
+def test_mode_tells_who_claims_what(bench: Bench) -> None:
+    running = bench.station.start("--json", "measure", bench.gripper.uuid, "--rate", 20, *bench.can)
+    running.wait_for('"event":"data"')
+    other = [word + "&source=0xF2" if "udp_multicast" in word else word for word in bench.can]
+    told = bench.station.ask("mode", bench.gripper.uuid, *other)
+    assert told["mode"] == "measurement"
+    by_channel = {one["channel"]: one for one in told["channels"]}
+    assert "claimed by other" in by_channel[2]["state"]
+    assert by_channel[2]["claimant"] == 0xF1
+    running.signal(signal.SIGTERM)
+    assert running.end().code == 0
+    assert bench.ask("mode", bench.gripper.uuid)["mode"] == "configuration"
+
+
+def test_a_node_that_is_not_there_is_5_after_the_time_allowed(bench: Bench, tmp_path: Path) -> None:
+    bench.angle.kill()
+    try:
+        *_, end = bench.measure(bench.angle.uuid, "--duration", 1, "--timeout", 2, code=5)
+    finally:
+        bench.power(bench.angle)
+    assert end["event"] == "end"
+    assert end["error"]["code"] == "no-node"
+
+
+def test_what_a_task_requires_is_judged_before_anything_is_measured(bench: Bench, tmp_path: Path) -> None:
+    file = tmp_path / "task.toml"
+    file.write_text('[angle]\nrange = ">= 720 deg"\n')
+    told = bench.ask("measure", bench.angle.uuid, "--duration", 1, "--require", file, code=6)
+    assert told["fits"][0]["uuid"] == bench.angle.uuid
+    assert "360" in told["fits"][0]["why"]
+
+
+def test_measuring_over_nfc_says_what_to_do(station_home: Station) -> None:
+    refused = station_home.refuses("measure", "8d4d9da65281f7000000", code=2)
+    assert "sample" in refused["hint"]
+
+
+@pytest.fixture
+def station_home(bench: Bench) -> Station:
+    return bench.station
