@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     import can
 
 _SEND_SECONDS: Final = 1.0
+_OPENINGS: Final = 5
 _SOCKETCAND_PORT: Final = 29536
 _RECEIVE_BUFFER: Final = 4 << 20
 _LATEST_SECONDS: Final = 1.0
@@ -166,7 +167,7 @@ def _open(spec: CanSpec) -> can.BusABC:
         options = {"host": "127.0.0.1", "port": _SOCKETCAND_PORT, "tcp_tune": True} | options
         _probe(spec, options)
     try:
-        bus = can.Bus(interface=spec.interface, channel=spec.channel, **options)
+        bus = _opened(spec, options)
     except can.CanInterfaceNotImplementedError as error:
         raise NoReader(
             f"The CAN interface {spec.interface!r} is not usable here: {_reason(error)}.",
@@ -180,6 +181,19 @@ def _open(spec: CanSpec) -> can.BusABC:
     if spec.interface == "socketcan":
         bus.set_filters([{"can_id": value, "can_mask": mask, "extended": True} for value, mask in _OURS])
     return bus
+
+
+def _opened(spec: CanSpec, options: dict[str, Any]) -> can.BusABC:
+    """Open; once more where a frame of a busy bus came between python-can's question and socketcand's answer."""
+    import can
+
+    for _ in range(_OPENINGS - 1):
+        try:
+            return can.Bus(interface=spec.interface, channel=spec.channel, **options)
+        except can.CanError as error:
+            if spec.interface != "socketcand" or "< frame" not in str(error):
+                raise
+    return can.Bus(interface=spec.interface, channel=spec.channel, **options)
 
 
 def _descriptor(bus: can.BusABC) -> int:

@@ -83,6 +83,7 @@ class Pair:
         self._wait_fc = isotp.TransportLayerLogic.TxState.WAIT_FC
         self.error = ""
         self.overflow = False
+        self._last = b""
         address = isotp.Address(isotp.AddressingMode.NormalFixed_29bits, source_address=own, target_address=peer)
         self._logic = isotp.TransportLayerLogic(
             self._next, self._put, address, error_handler=self._note_error, params=_parameters(fd)
@@ -99,7 +100,13 @@ class Pair:
             return False
         if (data := _tolerable(frame.data)) is None:
             return True
-        if data[0] >> 4 != _FLOW:
+        kind = data[0] >> 4
+        if kind == _CONSECUTIVE and data == self._last:
+            return True  # the same frame twice: an error in its last bit doubles a frame on CAN
+        self._last = data if kind == _CONSECUTIVE else b""
+        if kind in (_SINGLE, _FIRST) and self.waits_for_flow:
+            self.stop_sending()  # who asks anew has given up what we were about to send
+        if kind != _FLOW:
             self.speak(fd=frame.fd)
         self._waiting.append(
             self._message(arbitration_id=frame.identifier, data=data, extended_id=True, is_fd=frame.fd)

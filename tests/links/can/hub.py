@@ -69,7 +69,7 @@ class Hub:
                     client.sendall(b"< ok >")
                 elif words[:1] == [b"rawmode"]:
                     with self._lock:
+                        client.sendall(b"< ok >")
                         self._clients.append(client)
-                    client.sendall(b"< ok >")
                 elif words[:1] == [b"send"]:
                     self.send(int(words[1], 16), bytes(int(word, 16) for word in words[3:]), client)

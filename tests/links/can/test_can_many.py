@@ -18,7 +18,7 @@ from tests.links.can.hub import Hub
 
 pytestmark = pytest.mark.link
 Start = Callable[..., None]
-ANNOUNCE = 0x1CFF0021
+ANNOUNCE = 0x1CFF0030
 
 
 def write(octets: bytes) -> bytes:

@@ -1,0 +1,146 @@
+"""Exchanges on a bus that loses, doubles, swaps, delays and corrupts frames; every node of a bus is found."""
+
+from __future__ import annotations
+
+import os
+import time
+from collections.abc import Callable
+
+import pytest
+
+from teds_provision.errors import LinkFailure
+from teds_provision.links import Notice
+from teds_provision.links.can.port import CanPort
+from tests.links.can import lossy
+from tests.links.can.hub import Hub
+
+pytestmark = pytest.mark.link
+Start = Callable[..., None]
+lossy.install()
+
+
+def write(octets: bytes) -> bytes:
+    return b"\x00\x00\x01\x03" + len(octets).to_bytes(2, "big") + octets
+
+
+def over(group: str, **faults: object) -> str:
+    return group.replace("udp_multicast:", "lossy:", 1) + "".join(f"&{key}={value}" for key, value in faults.items())
+
+
+def tally(port: CanPort, octets: int, count: int) -> int:
+    """How many of so many exchanges come through; a reply that is another is an error at once."""
+    good = 0
+    for _ in range(count):
+        body = os.urandom(octets)
+        try:
+            assert port.link(0x21).exchange(write(body)) == body[::-1]
+            good += 1
+        except LinkFailure:
+            continue
+    return good
+
+
+def test_doubled_frames_harm_nobody(group: str, nodes: Start) -> None:
+    nodes(group, 0x21)
+    port = CanPort(over(group, seed=1, double=0.05))
+    began = time.monotonic()
+    assert tally(port, 100, 20) == 20
+    assert time.monotonic() - began < 10  # a sequence error would cost a second or more each time
+    port.close()
+
+
+def test_small_pieces_come_through_where_frames_are_lost_and_large_ones_are_said_to_be_too_large(
+    group: str, nodes: Start
+) -> None:
+    nodes(group, 0x21)
+    port = CanPort(over(group, seed=2, loss=0.03))
+    link = port.link(0x21)
+    good = 0
+    for _ in range(10):
+        body = os.urandom(40)
+        try:
+            assert link.exchange(write(body)) == body[::-1]
+            good += 1
+        except LinkFailure:
+            continue
+    assert good >= 7
+    assert link.comfortable is not None
+    assert 64 <= link.comfortable <= 256
+    assert port.link(0x22).comfortable is None
+    port.close()
+
+
+def test_a_lost_flow_control_ends_the_wait_at_once(hub: Hub, nodes: Start) -> None:
+    nodes(hub.spec, 0x21)
+    lost: list[bytes] = []
+
+    def lose_flow(identifier: int, data: bytes) -> bool:
+        if identifier == 0x18DAF121 and data[0] >> 4 == 3 and not lost:
+            lost.append(data)
+            return True
+        return False
+
+    hub.lose = lose_flow
+    port = CanPort(hub.spec)
+    began = time.monotonic()
+    assert port.link(0x21).exchange(write(bytes(300))) == bytes(300)
+    assert lost
+    assert time.monotonic() - began < 2.0
+    port.close()
+
+
+def test_all_of_sixty_nodes_answer_one_question(hub: Hub, nodes: Start) -> None:
+    addresses = list(range(0x21, 0x21 + 60))
+    nodes(hub.spec, *addresses)
+    port = CanPort(hub.spec)
+    for _ in range(3):
+        found = [contact.address for contact in port.everyone(seconds=10, notice=quiet)]
+        assert found == addresses
+    port.close()
+
+
+def test_a_torn_answer_to_everyone_is_asked_again_and_no_conflict(hub: Hub, nodes: Start) -> None:
+    nodes(hub.spec, 0x21, 0x22, 0x23)
+    lost: set[int] = set()
+
+    def lose_second_frame(identifier: int, data: bytes) -> bool:
+        first = identifier in (0x18DAF121, 0x18DAF122) and data[0] == 0x22 and identifier not in lost
+        if first:
+            lost.add(identifier)
+        return first
+
+    hub.lose = lose_second_frame
+    port = CanPort(hub.spec)
+    assert [contact.address for contact in port.everyone(seconds=5, notice=quiet)] == [0x21, 0x22, 0x23]
+    assert len(lost) == 2
+    port.close()
+
+
+def test_what_began_and_did_not_end_is_named(hub: Hub, nodes: Start) -> None:
+    nodes(hub.spec, 0x21, 0x22)
+    hub.lose = lambda identifier, data: identifier == 0x18DAF122 and data[0] == 0x23  # its last frame, always
+    port = CanPort(hub.spec)
+    told: list[Notice] = []
+    assert [contact.address for contact in port.everyone(seconds=5, notice=told.append)] == [0x21]
+    assert [(notice.kind, "0x22" in notice.text) for notice in told[1:]] == [("unfinished", True)]
+    port.close()
+
+
+def test_one_uuid_at_two_addresses_is_named(hub: Hub) -> None:
+    from teds_provision.node.can_server import CanServer
+    from tests.links.can.echo_node import EchoNode
+
+    servers = [CanServer(hub.spec, EchoNode(address, uuid=b"U" * 10)) for address in (0x21, 0x22)]
+    for server in servers:
+        server.start()
+    port = CanPort(hub.spec)
+    told: list[Notice] = []
+    assert [contact.address for contact in port.everyone(seconds=5, notice=told.append)] == [0x21, 0x22]
+    assert any(notice.kind == "conflict" and "0x21 and 0x22" in notice.text for notice in told)
+    for server in servers:
+        server.stop()
+    port.close()
+
+
+def quiet(_: Notice) -> None:
+    pass
