@@ -64,6 +64,7 @@ class CanServer:
         self._at: dict[int, list[Seat]] = {}
         self._known: set[int] = set()
         self._active: set[tuple[Seat, Pair]] = set()
+        self._pushing: set[tuple[Seat, Pair]] = set()
         self._looked = 0.0
         self._later: list[tuple[float, int, Callable[[], None]]] = []
         self._everyone_due: dict[Line, int] = {}
@@ -89,7 +90,7 @@ class CanServer:
         self._bus = Bus(self._spec)
         self._stop.clear()
         self._crew = Crew()
-        self._known, self._active, self._later, self._everyone_due = set(), set(), [], {}
+        self._known, self._active, self._pushing, self._later, self._everyone_due = set(), set(), set(), [], {}
         self._seats = [Seat(node, tapped, self._crew, self._out, more) for node, tapped, more in self._nodes]
         self._seat_of = {id(seat.handler): seat for seat in self._seats}
         self._find_seats()
@@ -151,7 +152,7 @@ class CanServer:
         """Seconds until a consecutive frame, an answer to everyone or an Announce is due."""
         with self._lock:
             wait = _IDLE
-            for _, pair in self._active:
+            for _, pair in self._pushing:
                 wait = pair.due_in(wait)
             if self._later:
                 wait = min(wait, max(0.0, self._later[0][0] - time.monotonic()))
@@ -162,17 +163,21 @@ class CanServer:
         look_round = now - self._looked >= _LOOK_ROUND
         if look_round:
             self._looked = now
-        for seat, pair in list(self._active):
+        for seat, pair in list(self._active if look_round else self._pushing):
             if look_round or pair.due_in(1.0) <= 0:
                 pair.run()
                 self._note(seat, pair)
 
     def _note(self, seat: Seat, pair: Pair) -> None:
-        """Keep a pair among those that are looked after as long as a message of either side is under way."""
-        if pair.sending or pair.receiving:
-            self._active.add((seat, pair))
-        else:
-            self._active.discard((seat, pair))
+        """Look after a pair while a message of either side is under way, and closely while we send."""
+        for pairs, belongs in (
+            (self._active, pair.sending or pair.receiving),
+            (self._pushing, pair.sending and not pair.waits_for_flow),
+        ):
+            if belongs:
+                pairs.add((seat, pair))
+            else:
+                pairs.discard((seat, pair))
         line = seat.lines.get(pair.peer)
         if line is not None and line.replying is pair and not pair.sending:
             seat.reply_left(line)
@@ -340,7 +345,8 @@ class CanServer:
                 f"from the CAN address 0x{before:02x}: take one of the two from the bus."
             )
         if address != before:
-            self._active = {(other, pair) for other, pair in self._active if other is not seat}
+            for pairs in (self._active, self._pushing):
+                pairs.difference_update([entry for entry in pairs if entry[0] is seat])
             seat.move(address)
             self._find_seats()
         self._announce_when_due(seat)
@@ -349,6 +355,7 @@ class CanServer:
 
     def _lose_lines(self) -> None:
         self._active.clear()
+        self._pushing.clear()
         self._later.clear()
         self._everyone_due.clear()
         for seat in self._seats:
