@@ -18,8 +18,9 @@ from pathlib import Path
 
 from jwcrypto import jwe, jwk, jws
 
-from teds_provision.handover.export_keys import ExportOrder, export_keys, plan_export
+from teds_provision.handover.export_keys import export_keys, plan_export
 from teds_provision.handover.import_keys import Imported, import_keys, plan_import
+from teds_provision.handover.selection import ExportOrder
 from teds_provision.protocol.agreement import key_id
 from teds_provision.protocol.handover import jose
 from teds_provision.protocol.handover.bundle import TYPE, _to_json, open_bundle

@@ -6,10 +6,11 @@ from typing import Literal
 
 from teds_provision.demo.desk import Demo, verify_from
 from teds_provision.errors import LinkFailure, PolicyRefused
-from teds_provision.handover.export_keys import ExportOrder, export_keys, plan_export
+from teds_provision.handover.export_keys import export_keys, plan_export
 from teds_provision.handover.import_keys import Imported, import_keys, plan_import
 from teds_provision.handover.pending import close
 from teds_provision.handover.prove import Proven, prove_nodes
+from teds_provision.handover.selection import ExportOrder
 from teds_provision.handover.trust import Candidate, add
 from teds_provision.protocol.keys import fingerprint
 from teds_provision.station.station import Station

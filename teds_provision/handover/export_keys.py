@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import hashlib
 import uuid as uuids
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
@@ -16,26 +16,16 @@ from pathlib import Path
 from teds_provision.errors import NotFound, PolicyRefused, UsageFailure
 from teds_provision.files import require_new, write_new
 from teds_provision.handover.pending import OPEN, Notes, content_digest
+from teds_provision.handover.selection import Chosen, ExportOrder, Selection
 from teds_provision.handover.trust import find_trusted
-from teds_provision.protocol.handover.bundle import Bundle, BundledNode, Mode, seal_bundle
+from teds_provision.protocol.handover.bundle import Bundle, BundledNode, Mode, seal_signed
 from teds_provision.protocol.handover.payload import time_text
 from teds_provision.protocol.keys import fingerprint
 from teds_provision.station.station import Station
 from teds_provision.store import Batch, Handover, Holder, KeyRecord, NodeRecord, Tombstone, TrustRecord, utc_now
 
-DEFAULT_DAYS = 7
-OUT_OF_SERVICE = ("decommissioned", "replaced by")  # verdicts that workflow.life gives
-
-
-@dataclass(frozen=True)
-class ExportOrder:
-    """What to hand over: to whom (as typed), which nodes (None: all that can be), how, and for how many days."""
-
-    to: tuple[str, ...]
-    nodes: tuple[bytes, ...] | None
-    mode: Mode = "copy"
-    days: int = DEFAULT_DAYS
-    ca: str | None = None
+NODES_IN_A_BUNDLE = 50_000
+"""Well below what a bundle can hold (64 MiB), so that a few long names do not burst one."""
 
 
 @dataclass(frozen=True)
@@ -57,6 +47,8 @@ class ExportPlan:
     expires: datetime
     earlier: Handover | None
     also_held_by: tuple[str, ...] = ()
+    run: str = ""
+    """Id of the first bundle where one command made several."""
 
 
 @dataclass(frozen=True)
@@ -70,10 +62,21 @@ class Exported:
 
 
 def plan_export(station: Station, order: ExportOrder, now: datetime | None = None) -> ExportPlan:
+    """:func:`plan_exports` for what fits into one bundle; raises UsageFailure for more."""
+    plans = plan_exports(station, order, now)
+    if len(plans) > 1:
+        raise UsageFailure("These are too many nodes for one bundle.", hint="Export them in several.")
+    return plans[0]
+
+
+def plan_exports(
+    station: Station, order: ExportOrder, now: datetime | None = None, *, most: int = NODES_IN_A_BUNDLE
+) -> list[ExportPlan]:
     """Find the receivers and nodes, and the CA's signature over each receiver; changes nothing.
 
-    Raises NotFound, UsageFailure (two receivers of a move), PolicyRefused (a node without proven key, given away,
-    revoked or due for rotation; nodes of several CAs; a receiver that is not certified), BadData (a receiver's file).
+    Returns a plan for each bundle, of at most ``most`` nodes. Raises NotFound, UsageFailure (two receivers of a move),
+    PolicyRefused (a node without proven key, given away, revoked, due for rotation or, for a move, with an agreement
+    that is not settled; nodes of several CAs; a receiver that is not certified), BadData (a receiver's file).
     """
     now = now or datetime.now(UTC)
     receivers = tuple({record.point: record for record in _receivers(station, order)}.values())
@@ -81,31 +84,53 @@ def plan_export(station: Station, order: ExportOrder, now: datetime | None = Non
         raise UsageFailure("A move has exactly one receiver.", hint="Use --mode copy for several.")
     if order.days < 1:
         raise UsageFailure("A bundle is valid for at least one day.")
-    nodes, skipped = _Selection(station, order, {record.fingerprint for record in receivers}).choose()
+    selection = Selection(station, order, {record.fingerprint for record in receivers})
+    nodes, skipped = selection.choose()
     ca = _one_ca(station, order, nodes)
     if order.ca is not None:
-        nodes = [(node, key) for node, key in nodes if station.keys.ca_of(node.uuid) == ca]
-    listed = ((node.uuid, key.key_id, key.epoch) for node, key in nodes)
-    content = content_digest(station.fingerprint, [r.fingerprint for r in receivers], order.mode, ca, listed)
-    earlier = next((row for row in station.handovers.all() if _is_same(row, content, now)), None)
+        cas, own = station.keys.cas_of_nodes(), station.ca
+        nodes = [(node, key) for node, key in nodes if cas.get(node.uuid, own) == ca]
     signatures = {record.fingerprint: _signature(station, ca, record) for record in receivers}
-    expires = datetime.fromisoformat(Notes.from_json(earlier.nodes).expires) if earlier else None
-    if expires is None or expires <= now:
-        expires = now.replace(microsecond=0) + timedelta(days=order.days)
-    handover_id = earlier.id if earlier else str(uuids.uuid4())
-    return ExportPlan(
-        handover_id,
-        order.mode,
-        receivers,
-        ca,
-        signatures,
-        tuple(nodes),
-        tuple(skipped),
-        content,
-        expires,
-        earlier,
-        _other_holders(station, nodes, receivers),
-    )
+    common = _Common(order, receivers, ca, signatures, now, station.fingerprint, selection.rows)
+    plans = [common.plan(part, _other_holders(station, part, receivers)) for part in selection.parts(nodes, most)]
+    return [replace(plans[0], skipped=tuple(skipped)), *plans[1:]]
+
+
+@dataclass(frozen=True)
+class _Common:
+    """What the bundles of one command share."""
+
+    order: ExportOrder
+    receivers: tuple[TrustRecord, ...]
+    ca: bytes
+    signatures: Mapping[str, bytes]
+    now: datetime
+    sender: str
+    rows: Sequence[Handover]
+
+    def plan(self, nodes: Chosen, also_held_by: tuple[str, ...]) -> ExportPlan:
+        """The plan of one bundle; an open one of the same content is carried on."""
+        mode, to = self.order.mode, [record.fingerprint for record in self.receivers]
+        listed = ((node.uuid, key.key_id, key.epoch) for node, key in nodes)
+        content = content_digest(self.sender, to, mode, self.ca, listed)
+        earlier = next((row for row in self.rows if _is_same(row, content, self.now)), None)
+        expires = datetime.fromisoformat(Notes.from_json(earlier.nodes).expires) if earlier else None
+        if expires is None or expires <= self.now:
+            expires = self.now.replace(microsecond=0) + timedelta(days=self.order.days)
+        return ExportPlan(
+            earlier.id if earlier else str(uuids.uuid4()),
+            mode,
+            self.receivers,
+            self.ca,
+            self.signatures,
+            tuple(nodes),
+            (),
+            content,
+            expires,
+            earlier,
+            also_held_by,
+            Notes.from_json(earlier.nodes).run if earlier else "",
+        )
 
 
 def export_keys(station: Station, plan: ExportPlan, output: Path, now: datetime | None = None) -> Exported:
@@ -118,86 +143,46 @@ def export_keys(station: Station, plan: ExportPlan, output: Path, now: datetime 
     if before is not None:
         return Exported(plan, before, output.stat().st_size, fresh=False)
     require_new(output)
-    now = now or datetime.now(UTC)
-    sealed = _seal(station, plan, now)
+    sealed, signed = _seal(station, plan, now or datetime.now(UTC))
     digest = hashlib.sha256(sealed).hexdigest()
     with station.transaction():
-        _record(station, plan, digest)
+        _record(station, plan, (digest, signed))
     write_new(output, sealed)
     return Exported(plan, digest, len(sealed), fresh=True)
+
+
+def export_all(
+    station: Station, plans: Sequence[ExportPlan], outputs: Sequence[Path], now: datetime | None = None
+) -> list[Exported]:
+    """Seal each plan into its file. Of several, all keys of a move rest before the first file exists.
+
+    Raises what :func:`export_keys` raises; the same command carries on.
+    """
+    for plan, output in zip(plans, outputs, strict=True):
+        if _already(plan, output) is None:
+            require_new(output)
+    ready = list(plans)
+    if len(plans) > 1:
+        run = plans[0].earlier and Notes.from_json(plans[0].earlier.nodes).run
+        with station.transaction():
+            ready = [plan if plan.earlier else _announced(station, plan, run or plans[0].id) for plan in plans]
+    return [export_keys(station, plan, output, now) for plan, output in zip(ready, outputs, strict=True)]
+
+
+def _announced(station: Station, plan: ExportPlan, run: str) -> ExportPlan:
+    """Record a bundle of several that is not sealed yet."""
+    return replace(plan, earlier=_record(station, replace(plan, run=run), ()))
+
+
+def outputs_of(output: Path, count: int) -> list[Path]:
+    """Return ``FILE``, ``FILE.2``, ``FILE.3`` and so on."""
+    return [output, *(output.with_name(f"{output.name}.{number}") for number in range(2, count + 1))]
 
 
 def _receivers(station: Station, order: ExportOrder) -> list[TrustRecord]:
     if not order.to:
         raise UsageFailure("Nobody is named to hand the keys to.", hint="Add --to STATION; see: trust list")
     return [find_trusted(station, text, "station") for text in order.to]
-
-
-class _Selection:
-    """Which nodes go, by the tables as they are now (read once: there may be ten thousand)."""
-
-    def __init__(self, station: Station, order: ExportOrder, receivers: set[str]) -> None:
-        self.station, self.order, self.receivers = station, order, receivers
-        self.nodes = {node.uuid: node for node in station.nodes.all()}
-        held = list(station.keys.all())
-        self.keys = {key.uuid: key for key in held if key.state == "active"}
-        self.pending = {key.uuid for key in held if key.state == "pending"}
-        self.due = station.keys.rotations_due().keys()
-        self.tombstones = {tombstone.uuid: tombstone for tombstone in station.policy.tombstones()}
-        self.revoked = {revocation.uuid for revocation in station.policy.revocations()}
-        self.open = {row.id: row for row in station.handovers.all() if row.direction == "out" and row.state == OPEN}
-
-    def choose(self) -> tuple[list[tuple[NodeRecord, KeyRecord]], list[tuple[bytes, str]]]:
-        """The nodes with their keys, and those that ``--all`` leaves out."""
-        wanted = sorted(self.keys.keys() | self.pending) if self.order.nodes is None else sorted(set(self.order.nodes))
-        why = {uuid: self._obstacle(uuid) for uuid in wanted}
-        if self.order.nodes is None and all(why.values()):
-            carried_on = self._cut_move()
-            if carried_on:
-                wanted, why = carried_on, dict.fromkeys(carried_on, "")
-        if self.order.nodes is not None:
-            for uuid, obstacle in why.items():
-                if obstacle:
-                    raise PolicyRefused(f"Node {uuid.hex()} cannot be handed over: {obstacle}.", hint=_CURE)
-        chosen = [(self.nodes[uuid], self.keys[uuid]) for uuid in wanted if not why[uuid]]
-        if not chosen:
-            raise NotFound("There is no node to hand over.", hint="Name nodes, or see: teds-provision nodes")
-        return chosen, [(uuid, obstacle) for uuid, obstacle in why.items() if obstacle]
-
-    def _obstacle(self, uuid: bytes) -> str:
-        node, tombstone = self.nodes.get(uuid), self.tombstones.get(uuid)
-        if uuid in self.revoked:
-            return "it is revoked"
-        if tombstone is not None and not (self.order.nodes is not None and self._is_cut(uuid)):
-            return f"it was moved to station {tombstone.to_fingerprint[:16]}"
-        if uuid not in self.keys:
-            return "its key was never proven in a session" if uuid in self.pending else "no key of it is held here"
-        if uuid in self.due:
-            return "its key must be rotated first"
-        if node is not None and (node.verdict or "").startswith(OUT_OF_SERVICE):
-            return "it is out of service"
-        if node is None or node.point is None:
-            return "its public key is not known"
-        return ""
-
-    def _is_cut(self, uuid: bytes) -> bool:
-        """Whether this node rests because of a move to the same receiver that is still open."""
-        tombstone = self.tombstones[uuid]
-        return (
-            self.order.mode == "move"
-            and tombstone.handover_id in self.open
-            and tombstone.to_fingerprint in self.receivers
-        )
-
-    def _cut_move(self) -> list[bytes]:
-        """The nodes of the newest open move to this receiver: ``--all`` again after a cut means that one."""
-        if self.order.mode != "move":
-            return []
-        rows = [row for row in self.open.values() if row.mode == "move" and set(row.peers) == self.receivers]
-        return sorted(map(bytes.fromhex, Notes.from_json(rows[-1].nodes).uuids)) if rows else []
-
-
-_CURE = "See teds-provision nodes UUID; rotate with: teds-provision agree UUID --rotate"
 
 
 def _one_ca(station: Station, order: ExportOrder, nodes: list[tuple[NodeRecord, KeyRecord]]) -> bytes:
@@ -258,7 +243,7 @@ def _already(plan: ExportPlan, output: Path) -> str | None:
     return digest if digest in Notes.from_json(plan.earlier.nodes).files else None
 
 
-def _seal(station: Station, plan: ExportPlan, now: datetime) -> bytes:
+def _seal(station: Station, plan: ExportPlan, now: datetime) -> tuple[bytes, str]:
     own = station.identity.certificate(plan.ca, station.point)
     bundle = Bundle(
         id=plan.id,
@@ -273,7 +258,7 @@ def _seal(station: Station, plan: ExportPlan, now: datetime) -> bytes:
         station_signatures={**plan.signatures, **({station.fingerprint: own} if own else {})},
         revoked=tuple(revocation.statement for revocation in station.policy.revocations()),
     )
-    return seal_bundle(bundle, station.vault.identity(), [record.point for record in plan.receivers])
+    return seal_signed(bundle, station.vault.identity(), [record.point for record in plan.receivers])
 
 
 def _bundled(station: Station, node: NodeRecord, key: KeyRecord) -> BundledNode:
@@ -291,14 +276,20 @@ def _bundled(station: Station, node: NodeRecord, key: KeyRecord) -> BundledNode:
     )
 
 
-def _record(station: Station, plan: ExportPlan, digest: str) -> None:
-    """What must be durable before the file: who holds what, the bundle's row, and for a move the tombstones."""
-    files = (*(Notes.from_json(plan.earlier.nodes).files if plan.earlier else ()), digest)
+def _record(station: Station, plan: ExportPlan, digests: tuple[str, ...]) -> Handover:
+    """What must be durable before the file: who holds what, the bundle's row, and for a move the tombstones.
+
+    ``digests`` are those of the file and of what was signed in it; none where a bundle of several is announced.
+    """
+    before = Notes.from_json(plan.earlier.nodes) if plan.earlier else None
+    files = (*(before.files if before else ()), *digests)
     uuids_hex = tuple(node.uuid.hex() for node, _ in plan.nodes)
-    notes = Notes(uuids_hex, plan.content, plan.ca.hex(), time_text(plan.expires), files)
+    keys = tuple(key.key_id for _, key in plan.nodes)
+    notes = Notes(uuids_hex, plan.content, plan.ca.hex(), time_text(plan.expires), files, (), keys, plan.run)
     peers = tuple(record.fingerprint for record in plan.receivers)
     row = plan.earlier or Handover(plan.id, "out", plan.mode, peers, OPEN, "")
-    station.handovers.put(replace(row, nodes=notes.to_json(), bundle_sha256=digest))
+    row = replace(row, nodes=notes.to_json(), bundle_sha256=digests[0] if digests else row.bundle_sha256)
+    station.handovers.put(row)
     for record in plan.receivers:
         station.identity.keep_certificate(plan.ca, record.point, plan.signatures[record.fingerprint])
     if plan.mode == "copy":
@@ -309,5 +300,8 @@ def _record(station: Station, plan: ExportPlan, digest: str) -> None:
         now = utc_now()
         tombstones = [Tombstone(node.uuid, peers[0], plan.id, now) for node, _ in plan.nodes]
         station.handovers.take_in(Batch(tombstones=tombstones))
-    detail = {"handover": plan.id, "mode": plan.mode, "to": list(peers), "nodes": list(uuids_hex), "file": digest}
-    station.audit("export", None, "again" if plan.earlier else "done", **detail)
+    if digests:
+        detail = {"handover": plan.id, "mode": plan.mode, "to": list(peers), "nodes": list(uuids_hex)}
+        again = before is not None and bool(before.files)
+        station.audit("export", None, "again" if again else "done", file=digests[0], **detail)
+    return row

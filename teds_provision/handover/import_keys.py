@@ -6,34 +6,41 @@ the CA's signature over this station, the deny list and the receipt. The same bu
 
 from __future__ import annotations
 
-import hashlib
+import re
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from typing import Any, Literal
 
 from teds_provision.errors import NotAuthentic, PolicyRefused
+from teds_provision.handover.deny import deny_all, why_not
 from teds_provision.handover.pending import IMPORTED, Notes, digest_of
 from teds_provision.protocol.agreement import key_id
-from teds_provision.protocol.handover.bundle import BundledNode, OpenedBundle, open_bundle
+from teds_provision.protocol.handover.bundle import Bundle, BundledNode, OpenedBundle, check_times, open_bundle
 from teds_provision.protocol.handover.payload import time_text
 from teds_provision.protocol.handover.receipt import Receipt, RefusedNode, seal_receipt
 from teds_provision.protocol.handover.revocation import Revocation as Statement
 from teds_provision.protocol.keys import fingerprint, station_key_message, verify
 from teds_provision.protocol.messages.identity import NodeState
 from teds_provision.station.station import Station
-from teds_provision.store import Batch, Handover, Holder, KeyRecord, NodeRecord, Revocation, WhitelistEntry, utc_now
+from teds_provision.store import Batch, Handover, Holder, KeyRecord, NodeRecord, WhitelistEntry, utc_now
 
 Decision = Literal["new", "newer", "same", "refused"]
+_LIKE_UUID = re.compile("(0x)?[0-9a-f]{4,}", re.IGNORECASE)
 
 
 @dataclass(frozen=True)
 class PlannedNode:
-    """What becomes of one node of the bundle, and why where it is refused."""
+    """What becomes of one node of the bundle, and why where it is refused.
+
+    ``name`` is the one that it gets here, ``notes`` say what a person should know of a node that is taken.
+    """
 
     node: BundledNode
     decision: Decision
     why: str = ""
+    name: str | None = None
+    notes: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -45,6 +52,8 @@ class ImportPlan:
     nodes: tuple[PlannedNode, ...]
     denied: tuple[Statement, ...]
     ca_is_known: bool
+    passed_over: tuple[tuple[Statement, str], ...] = ()
+    """Revocations that ban nothing here, and why."""
 
     @property
     def taken(self) -> tuple[PlannedNode, ...]:
@@ -75,17 +84,15 @@ class Imported:
 def plan_import(station: Station, octets: bytes, now: datetime | None = None) -> ImportPlan | Imported:
     """Open and check a bundle, and say what would become of each node; changes nothing.
 
-    A bundle that was taken in before is returned as such, even when it has expired since. Raises what
+    A bundle that was taken in before is returned as such, even when it has expired since. What it says of sequences
+    and epochs is hearsay: none of it is kept but the epoch of a pending key, which the first session corrects. A node
+    that was moved away comes back only from the station that it went to. Raises what
     :func:`open_bundle` raises, and PolicyRefused: an id seen with other content, no signature of the bundle's CA over
     this station, or every node refused.
     """
-    digest = hashlib.sha256(octets).hexdigest()
     came = [row for row in station.handovers.all() if row.direction == "in"]
-    for row in came:
-        if row.bundle_sha256 == digest:
-            return _before(row)
     stations = {record.fingerprint: record.point for record in station.policy.trusted() if record.role == "station"}
-    opened = open_bundle(octets, station.vault.identity(), stations.get, now or datetime.now(UTC))
+    opened = open_bundle(octets, station.vault.identity(), stations.get, None)
     bundle, content = opened.bundle, digest_of(opened.bundle)
     for row in came:
         if row.id == bundle.id:
@@ -95,9 +102,12 @@ def plan_import(station: Station, octets: bytes, now: datetime | None = None) ->
                     hint="Ask its sender, by voice, what was sent.",
                 )
             return _before(row)
+    check_times(bundle, now or datetime.now(UTC))
     _check_certified(station, opened)
-    denied = tuple(one for one in opened.revocations if station.policy.revocation(one.uuid) is None)
-    nodes = tuple(_Judge(station, denied, bundle.sender).each(bundle.nodes))
+    news = [one for one in opened.revocations if station.policy.revocation(one.uuid) is None]
+    judged = [(one, why_not(station, one, bundle)) for one in news]
+    denied = tuple(one for one, why in judged if not why)
+    nodes = tuple(_Judge(station, denied, bundle).each(bundle.nodes))
     if nodes and all(node.decision == "refused" for node in nodes):
         first = nodes[0]
         raise PolicyRefused(
@@ -105,8 +115,8 @@ def plan_import(station: Station, octets: bytes, now: datetime | None = None) ->
             hint="Nothing was imported. Tell the sender.",
         )
     certified = station.identity.certificate(bundle.ca, station.point) is not None
-    known = certified or bundle.ca in station.policy.trusted_cas()
-    return ImportPlan(opened, content, nodes, denied, known)
+    known = station.policy.counts(bundle.ca) and (certified or bundle.ca in station.policy.trusted_cas())
+    return ImportPlan(opened, content, nodes, denied, known, tuple((one, why) for one, why in judged if why))
 
 
 def import_keys(station: Station, plan: ImportPlan, now: datetime | None = None) -> Imported:
@@ -114,7 +124,7 @@ def import_keys(station: Station, plan: ImportPlan, now: datetime | None = None)
     bundle = plan.opened.bundle
     receipt = Receipt(
         id=bundle.id,
-        bundle_sha256=plan.opened.sha256,
+        bundle_sha256=plan.opened.signed_sha256,
         sender=station.fingerprint,
         to=bundle.sender,
         imported=tuple(node.node.uuid for node in plan.taken),
@@ -127,7 +137,7 @@ def import_keys(station: Station, plan: ImportPlan, now: datetime | None = None)
         plan.content,
         bundle.ca.hex(),
         time_text(bundle.expires),
-        (plan.opened.sha256,),
+        (plan.opened.signed_sha256, plan.opened.sha256),
         tuple((refused.uuid.hex(), refused.why) for refused in receipt.refused),
     )
     row = Handover(
@@ -137,28 +147,18 @@ def import_keys(station: Station, plan: ImportPlan, now: datetime | None = None)
         (bundle.sender,),
         IMPORTED,
         notes.to_json(),
-        plan.opened.sha256,
+        plan.opened.signed_sha256,
         text.decode("ascii"),
     )
     with station.transaction():
         _keep_ca(station, plan)
-        for statement in plan.denied:
-            deny(station, statement)
+        deny_all(station, plan.denied, bundle)
         _Arrivals(station, plan).take_in()
         station.handovers.put(row)
         taken = [node.node.uuid.hex() for node in plan.taken]
         detail = {"handover": bundle.id, "mode": bundle.mode, "from": bundle.sender, "nodes": taken}
         station.audit("import", None, "done", refused=len(receipt.refused), **detail)
     return Imported(row, notes, text, fresh=True)
-
-
-def deny(station: Station, statement: Statement) -> None:
-    """Put a signed statement on the deny list; one that is there already stays."""
-    if station.policy.revocation(statement.uuid) is None:
-        created = time_text(statement.created)
-        entry = Revocation(statement.uuid, statement.fingerprint, statement.why, statement.statement, created)
-        station.policy.deny(entry)
-        station.audit("revoke", statement.uuid, "on the deny list", why=statement.why, by=statement.sender)
 
 
 def _before(row: Handover) -> Imported:
@@ -179,12 +179,15 @@ def _check_certified(station: Station, opened: OpenedBundle) -> None:
 class _Judge:
     """Holds a bundle's nodes against the store, whose tables are read once."""
 
-    def __init__(self, station: Station, denied: Iterable[Statement], sender: str) -> None:
+    def __init__(self, station: Station, denied: Iterable[Statement], bundle: Bundle) -> None:
         policy = station.policy
-        self.sender = sender
+        self.sender, self.mode = bundle.sender, bundle.mode
         self.nodes = {node.uuid: node for node in station.nodes.all()}
         self.pins = station.pins.all()
-        self.denied = {entry.uuid: entry.why for entry in policy.revocations()} | {one.uuid: one.why for one in denied}
+        self.names = {entry.name: entry.uuid for entry in station.pins.whitelist() if entry.name}
+        self.names |= {node.name: node.uuid for node in self.nodes.values() if node.name}
+        self.denied = {entry.uuid: (entry.fingerprint, entry.why) for entry in policy.revocations()}
+        self.denied |= {one.uuid: (one.fingerprint, one.why) for one in denied}
         self.tombstones = {tombstone.uuid: tombstone for tombstone in policy.tombstones()}
         self.held: dict[bytes, dict[str, tuple[str, int]]] = {}
         for key in station.keys.all():
@@ -194,24 +197,50 @@ class _Judge:
         """Judge every node."""
         for node in nodes:
             why = self._obstacle(node)
-            yield PlannedNode(node, "refused", why) if why else PlannedNode(node, self._decision(node))
+            yield PlannedNode(node, "refused", why) if why else self._taken(node)
 
     def _obstacle(self, node: BundledNode) -> str:
         known, pin = self.nodes.get(node.uuid), self.pins.get(node.uuid)
-        if node.uuid in self.denied:
-            return f"it is revoked: {self.denied[node.uuid]}"
+        key, why = self.denied.get(node.uuid, (None, ""))
+        if why and key in (None, fingerprint(node.node_key)):
+            return f"it is revoked: {why}"
+        tombstone = self.tombstones.get(node.uuid)
+        if tombstone is not None and (self.sender != tombstone.to_fingerprint or self.mode != "move"):
+            return f"it was moved to station {tombstone.to_fingerprint[:32]}, which alone can move it back"
         if pin is not None and pin != fingerprint(node.node_key):
             return "this UUID is known here with another node key"
         held = self.held.get(node.uuid, {})
         if key_id(node.key).hex() in held:
             return ""
         active = max((epoch for state, epoch in held.values() if state == "active"), default=0)
-        latest = max(active, known.epoch if known is not None else 0)
+        hearsay = max((epoch for _, epoch in held.values()), default=0)
+        latest = max(active, hearsay, known.epoch if known is not None else 0)
         if node.epoch < latest:
             return f"its key epoch {node.epoch} is older than {latest}, which is known here"
         if node.epoch == active:
             return f"another key of epoch {node.epoch} is in use here"
         return ""
+
+    def _taken(self, node: BundledNode) -> PlannedNode:
+        notes = []
+        if node.uuid in self.tombstones:
+            notes.append("it comes back: its key is rotated at the first contact")
+        known = self.nodes.get(node.uuid)
+        name = known.name if known is not None and known.name else node.name
+        if name is not None and name == node.name:
+            name = self._free_name(node.uuid, name)
+            if name != node.name:
+                notes.append(f"it is called {name} here: {node.name} is the name of another node, or like a UUID")
+            self.names[name] = node.uuid
+        return PlannedNode(node, self._decision(node), name=name, notes=tuple(notes))
+
+    def _free_name(self, uuid: bytes, name: str) -> str:
+        """A name that no other node has and that cannot be taken for the first digits of a UUID."""
+        tried, digits = name, 4
+        while self.names.get(tried, uuid) != uuid or _LIKE_UUID.fullmatch(tried):
+            tried = f"{name}-{uuid.hex()[-digits:]}"
+            digits += 2
+        return tried
 
     def _decision(self, node: BundledNode) -> Decision:
         held = self.held.get(node.uuid, {})
@@ -225,6 +254,7 @@ def _keep_ca(station: Station, plan: ImportPlan) -> None:
     bundle, signature = plan.opened.bundle, plan.opened.station_signature
     if signature is not None:
         station.identity.keep_certificate(bundle.ca, station.point, signature)
+    station.policy.renew_ca(bundle.ca)
     points = {record.fingerprint: record.point for record in station.policy.trusted() if record.role == "station"}
     for digits, signature in bundle.station_signatures.items():
         point = points.get(digits)
@@ -259,8 +289,8 @@ class _Arrivals:
         mode = self.bundle.mode
         self.station.handovers.take_in(
             Batch(
-                nodes=[self._node(one.node) for one in taken],
-                whitelist=[entry for entry in (self._entry(one.node) for one in taken) if entry is not None],
+                nodes=[self._node(one) for one in taken],
+                whitelist=[entry for entry in (self._entry(one) for one in taken) if entry is not None],
                 keys=[self._key(one.node) for one in taken if one.decision != "same"],
                 holders=[Holder(one.node.uuid, other, now, mode) for one in taken for other in self.others],
                 marks=self._marks(),
@@ -278,38 +308,37 @@ class _Arrivals:
             created=self.now,
         )
 
-    def _entry(self, node: BundledNode) -> WhitelistEntry | None:
+    def _entry(self, one: PlannedNode) -> WhitelistEntry | None:
         """The whitelist entry, pinned to the node's key; None where it is pinned already."""
+        node = one.node
         pin, digits = self.pins.get(node.uuid), fingerprint(node.node_key)
         if pin is None:
-            return WhitelistEntry(node.uuid, digits, self.now, "import", node.name)
+            return WhitelistEntry(node.uuid, digits, self.now, "import", one.name)
         return None if pin.fingerprint is not None else replace(pin, fingerprint=digits, assurance="import")
 
-    def _node(self, node: BundledNode) -> NodeRecord:
+    def _node(self, one: PlannedNode) -> NodeRecord:
+        """What is known of the node from now on; not its epoch and sequence, which a session has to tell."""
+        node = one.node
         state = int(NodeState.PROVISIONED if node.teds_sha256 else NodeState.KEYED)
         known = self.known.get(node.uuid)
         if known is None:
             return NodeRecord(
                 node.uuid,
                 node.node_key,
-                node.name,
+                one.name,
                 node.profile,
                 state,
-                node.epoch,
-                node.sequence,
                 groups=node.groups,
                 teds_sha256=node.teds_sha256,
             )
         return replace(
             known,
             point=node.node_key,
-            name=known.name or node.name,
+            name=known.name or one.name,
             profile=known.profile or node.profile,
             groups=tuple(dict.fromkeys((*known.groups, *node.groups))),
             state=known.state or state,
-            epoch=max(known.epoch, node.epoch),
-            sequence=max(known.sequence, node.sequence),
-            teds_sha256=node.teds_sha256 if node.sequence >= known.sequence else known.teds_sha256,
+            teds_sha256=known.teds_sha256 or node.teds_sha256,
         )
 
     def _marks(self) -> dict[bytes, dict[str, Any]]:
@@ -318,6 +347,8 @@ class _Arrivals:
         marks: dict[bytes, dict[str, Any]] = {}
         for one in self.plan.taken:
             uuid = one.node.uuid
+            if uuid in self.resting:
+                marks[uuid] = {"rotation": f"it came back by {self.bundle.id}: others have had this key"}
             if self.bundle.mode == "move":
                 marks[uuid] = {"rotation": f"moved here by {self.bundle.id}: the sender has had this key"}
             if one.decision == "same" or self.cas.get(uuid, own) == ca:

@@ -7,7 +7,7 @@ from datetime import UTC, datetime
 from typing import TYPE_CHECKING
 
 from teds_provision.errors import BadData, NotFound, UsageFailure
-from teds_provision.handover.import_keys import deny
+from teds_provision.handover.deny import deny
 from teds_provision.protocol.handover.payload import is_label
 from teds_provision.protocol.handover.revocation import seal_revocation
 from teds_provision.station.station import Station
@@ -47,7 +47,7 @@ def revoke(station: Station, uuid: bytes, why: str) -> Revoked:
         statement = seal_revocation(key, uuid=uuid, node=station.pins.pinned(uuid), why=why, created=now)
     with station.transaction():
         if statement is not None:
-            deny(station, statement)
+            deny(station, statement, key=statement.fingerprint)
         station.pins.remove(uuid)
         keys = station.keys.remove(uuid)
         station.nodes.drop_draft(uuid)

@@ -13,10 +13,11 @@ from dataclasses import dataclass, replace
 from datetime import datetime
 from typing import Any
 
-from teds_provision.errors import NotAuthentic, NotFound, PolicyRefused
+from teds_provision.errors import BadData, NotAuthentic, NotFound, PolicyRefused
 from teds_provision.protocol.agreement import key_id
 from teds_provision.protocol.handover.bundle import Bundle
 from teds_provision.protocol.handover.receipt import Receipt, open_receipt
+from teds_provision.protocol.handover.strict_json import decode_base64url, load_object
 from teds_provision.station.station import Station
 from teds_provision.store import Handover, Holder
 
@@ -27,7 +28,9 @@ OPEN, CLOSED, UNDONE, IMPORTED = "open", "closed", "undone", "imported"
 class Notes:
     """What is kept with a bundle: its nodes (UUIDs in hex), what it says in one digest, and its files.
 
-    ``files`` are the SHA-256 of every file that was sealed with this content: sealing again gives other octets.
+    ``files`` are the SHA-256 of every file that was sealed with this content, and of what was signed in each: sealing
+    again gives other octets. ``keys`` are the ids of the keys that left, one for each node (empty in rows of version
+    1); ``run`` is the id of the first bundle of those that one command made.
     """
 
     uuids: tuple[str, ...]
@@ -36,6 +39,8 @@ class Notes:
     expires: str
     files: tuple[str, ...] = ()
     refused: tuple[tuple[str, str], ...] = ()
+    keys: tuple[str, ...] = ()
+    run: str = ""
 
     def to_json(self) -> str:
         """Return what the store keeps."""
@@ -53,6 +58,8 @@ class Notes:
             members["expires"],
             tuple(members["files"]),
             refused,
+            tuple(members.get("keys", ())),
+            members.get("run", ""),
         )
 
 
@@ -138,7 +145,8 @@ class Closed:
 def close(station: Station, octets: bytes) -> Closed:
     """Take in the receipt of a bundle that left here; a move is then over: its keys are deleted.
 
-    A copy for several stations is closed when each has sent its receipt.
+    Only the keys that were in the bundle are deleted, and only while this very move stands: a receipt that comes after
+    the node's return deletes nothing. A copy for several stations is closed when each has sent its receipt.
 
     What the receiver refused comes back to this station, to be rotated at the next contact. Raises NotAuthentic
     (signature, sender, another file), PolicyRefused (not ours, undone), NotFound (unknown id), BadData.
@@ -151,7 +159,7 @@ def close(station: Station, octets: bytes) -> Closed:
     _check_receipt(station, row, receipt)
     text = octets.strip().decode("ascii")
     texts = (row.receipt or "").split()
-    if text in texts or (row.state == CLOSED and row.mode == "move"):
+    if receipt.sender in map(signer_of, texts) or (row.state == CLOSED and row.mode == "move"):
         return Closed(row, receipt, fresh=False)
     if row.state == UNDONE:
         station.audit("handover", None, "receipt of an undone move", handover=row.id)
@@ -161,9 +169,8 @@ def close(station: Station, octets: bytes) -> Closed:
             hint="Rotate them at once: teds-provision agree UUID --rotate. Or export the move anew.",
         )
     with station.transaction():
-        for uuid in receipt.imported if row.mode == "move" else ():
-            station.keys.remove(uuid)
-            station.nodes.drop_draft(uuid)
+        if row.mode == "move":
+            _delete_what_left(station, row, receipt.imported)
         for refused in receipt.refused:
             if row.mode == "move":
                 _lift(station, refused.uuid, row)
@@ -178,6 +185,30 @@ def close(station: Station, octets: bytes) -> Closed:
     return Closed(row, receipt, fresh=True)
 
 
+def _delete_what_left(station: Station, row: Handover, uuids: Iterable[bytes]) -> None:
+    """Delete the keys that were in the bundle, of the nodes that rest because of this very move."""
+    notes = Notes.from_json(row.nodes)
+    left = dict(zip(notes.uuids, notes.keys, strict=False))
+    for uuid in uuids:
+        tombstone = station.policy.tombstone(uuid)
+        if tombstone is None or tombstone.handover_id != row.id:
+            continue
+        for key in station.keys.of(uuid):
+            # rows of version 1 do not name the keys: then those that were in use when the bundle was made
+            in_bundle = left.get(uuid.hex(), "") or (key.key_id if key.created <= row.created else "")
+            if key.key_id == in_bundle:
+                station.keys.remove_key(uuid, key.key_id)
+        station.nodes.drop_draft(uuid)
+
+
+def signer_of(text: str) -> str:
+    """Who signed a receipt or revocation that was verified when it came, "" where that cannot be read."""
+    try:
+        return str(load_object(decode_base64url(text.split(".")[1], "The receipt"), "The receipt").get("from", ""))
+    except (BadData, IndexError):
+        return ""
+
+
 def _check_receipt(station: Station, row: Handover, receipt: Receipt) -> None:
     notes = Notes.from_json(row.nodes)
     if receipt.to != station.fingerprint or receipt.sender not in row.peers:
@@ -186,7 +217,7 @@ def _check_receipt(station: Station, row: Handover, receipt: Receipt) -> None:
             " that the bundle was sealed to."
         )
     if receipt.bundle_sha256 not in notes.files:
-        raise NotAuthentic("The receipt is for another file than any that left here under this id.")
+        raise NotAuthentic("The receipt is for another bundle than any that left here under this id.")
     named = [uuid.hex() for uuid in receipt.imported] + [refused.uuid.hex() for refused in receipt.refused]
     if sorted(named) != sorted(notes.uuids):
         raise NotAuthentic("The receipt names other nodes than the bundle held.")

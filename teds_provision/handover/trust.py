@@ -9,6 +9,7 @@ from pathlib import Path
 from teds_provision.errors import BadData, NotFound, PolicyRefused, UsageFailure
 from teds_provision.files import read_limited
 from teds_provision.handover.certify import CERTIFICATE_FORMAT, Certificate, read_certificate
+from teds_provision.handover.pending import OPEN, Notes, signer_of
 from teds_provision.protocol.keys import fingerprint, from_pem
 from teds_provision.station.station import Station
 from teds_provision.store import TrustRecord
@@ -156,11 +157,65 @@ def find_trusted(station: Station, text: str, role: TrustRole | None = None) -> 
     )
 
 
-def remove(station: Station, record: TrustRecord) -> None:
-    """Trust a key no more. What it signed before is not trusted any more either."""
+@dataclass(frozen=True)
+class Removal:
+    """What ends with the trust in a key.
+
+    ``shared`` are nodes whose key that station holds: each is rotated at the next contact. ``cas`` are CAs that count
+    for some nodes only because this key's owner brought them, or that were trusted by themselves; ``under`` counts the
+    nodes that keep one of them: datasheets of its stations are not authentic any more. ``bans`` are nodes that this
+    station alone has banned. ``open`` are ids of bundles that left for it and are not closed.
+    """
+
+    record: TrustRecord
+    shared: tuple[bytes, ...]
+    cas: tuple[bytes, ...]
+    under: int
+    bans: tuple[bytes, ...]
+    open: tuple[str, ...]
+
+
+def plan_removal(station: Station, record: TrustRecord) -> Removal:
+    """Find what hangs on the trust in a key; changes nothing."""
+    cas = _cas_of(station, record)
+    under = sum(ca in cas for ca in station.keys.cas_of_nodes().values())
+    if record.role == "ca":
+        return Removal(record, (), cas, under, (), ())
+    digits = record.fingerprint
+    shared = {holder.uuid for holder in station.keys.holders() if holder.fingerprint == digits}
+    bans = [entry.uuid for entry in station.policy.revocations() if signer_of(entry.statement) == digits]
+    left = [row.id for row in station.handovers.all() if row.state == OPEN and digits in row.peers]
+    return Removal(record, tuple(sorted(shared)), cas, under, tuple(bans), tuple(left))
+
+
+def remove(station: Station, record: TrustRecord) -> Removal:
+    """Trust a key no more, and end all that hung on it, in one transaction (see :class:`Removal`)."""
     with station.transaction():
-        station.policy.distrust(record.name)
-        station.audit("trust", None, "removed", name=record.name, role=record.role, key=record.fingerprint)
+        removal = plan_removal(station, record)
+        station.policy.distrust(record.fingerprint if record.role == "station" else record.name)
+        for uuid in removal.shared:
+            station.keys.demand_rotation(uuid, f"station {record.name} is trusted no more, and holds this key")
+        for ca in removal.cas:
+            station.policy.end_ca(ca)
+        for uuid in removal.bans:
+            station.policy.lift(uuid)
+        ended = {"rotations": len(removal.shared), "cas": len(removal.cas), "bans": len(removal.bans)}
+        station.audit("trust", None, "removed", name=record.name, role=record.role, key=record.fingerprint, **ended)
+    return removal
+
+
+def _cas_of(station: Station, record: TrustRecord) -> tuple[bytes, ...]:
+    """The CAs whose standing here ends with this key: itself, or those that no other trusted station brought."""
+    trusted = {one.point for one in station.policy.trusted("ca")} | {station.ca}
+    if record.role == "ca":
+        return () if record.point == station.ca else (record.point,)
+    stations = {one.fingerprint for one in station.policy.trusted("station")} - {record.fingerprint}
+    brought: dict[bytes, set[str]] = {}
+    for row in station.handovers.all():
+        if row.direction == "in":
+            brought.setdefault(bytes.fromhex(Notes.from_json(row.nodes).ca), set()).update(row.peers)
+    ended = [ca for ca, by in brought.items() if record.fingerprint in by and not by & stations and ca not in trusted]
+    return tuple(ended)
 
 
 def _read(path: Path) -> tuple[bytes, Certificate | None]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
+from datetime import UTC, datetime, timedelta
 from typing import TYPE_CHECKING, Any
 
 from teds_provision.errors import NoKeyring, VaultFailure, WrongPassphrase
@@ -21,6 +22,8 @@ _FEW = 20
 
 RESTORED = "restored from a backup"
 """Begins the reason of a rotation that needs a tap or a person's word: nobody knows who else has that key by now."""
+CONFIRM_MAY_ARRIVE = timedelta(minutes=2)
+"""For how long after an agreement its Confirm may still reach the node: 60 s of the profile, and a bus that is slow."""
 
 
 @dataclass(frozen=True)
@@ -120,10 +123,37 @@ class NodeKeys:
                 raise
         return self._reopened().unwrap(record.wrapped, context=context)
 
+    def outdated(self, record: KeyRecord) -> list[KeyRecord]:
+        """The keys of a node that a good Open under ``record`` shows to be of no use any more.
+
+        A newer agreement may still become good: its Confirm can be held back on the way, until the node has forgotten
+        the Request (60 seconds). Such a key stays, else a Confirm that arrives late would leave a node whose key
+        nobody has.
+        """
+        late = (datetime.now(UTC) - CONFIRM_MAY_ARRIVE).strftime("%Y-%m-%dT%H:%M:%SZ")
+        return [
+            other
+            for other in self._store.keys(record.uuid)
+            if other.key_id != record.key_id
+            and not (
+                other.state == "pending"
+                and other.source == "agreement"
+                and other.epoch > record.epoch
+                and other.created >= late
+            )
+        ]
+
     def promote(self, uuid: bytes, key_id: str) -> None:
-        """Make a key the active one after a good Open under it; its CA is then the one that the node keeps."""
+        """Make a key the active one after a good Open under it; its CA is then the one that the node keeps.
+
+        Raises NotFound for a key that is not held.
+        """
         with self._store.transaction():
-            self._store.promote_key(uuid, key_id)
+            record = next((held for held in self._store.keys(uuid) if held.key_id == key_id), None)
+            if record is not None:
+                for other in self.outdated(record):
+                    self._store.remove_key(uuid, other.key_id)
+            self._store.activate_key(uuid, key_id)
             marks = self._store.marks(uuid)
             if marks.next_ca is None:
                 return
@@ -138,6 +168,24 @@ class NodeKeys:
     def wrap_anew(self, rewrap: Callable[[KeyRecord], bytes]) -> int:
         """Replace the wrapped form of every key by what ``rewrap`` gives, all or none; returns how many."""
         return self._store.replace_keys(rewrap)
+
+    def remove_key(self, uuid: bytes, key_id: str) -> bool:
+        """Delete one key of a node; False if it is not held."""
+        return self._store.remove_key(uuid, key_id)
+
+    def correct_epoch(self, record: KeyRecord, epoch: int) -> KeyRecord:
+        """Note the true epoch of a key whose epoch was hearsay, as a node told it in a session; the key stays.
+
+        The wrapped form is bound to the epoch, so it is made anew, in one transaction.
+        """
+        key = self.unwrap(record)
+        with self._store.transaction():
+            slot = self._store.next_slot(record.uuid)
+            context = node_key_context(self._store.id, record.uuid, epoch, slot)
+            corrected = replace(record, epoch=epoch, slot=slot, wrapped=self._vault().wrap(key, context=context))
+            self._store.remove_key(record.uuid, record.key_id)
+            self._store.add_key(corrected)
+        return corrected
 
     # -- the CA that a node keeps ----------------------------------------------------------------------------------
 
@@ -198,8 +246,12 @@ class NodeKeys:
         return (self.rotation_due(uuid) or "").startswith(RESTORED)
 
     def demand_rotation(self, uuid: bytes, why: str) -> None:
-        """Have the next session with a node rotate its key before anything else."""
+        """Have the next session with a node rotate its key before anything else.
+
+        Only a key that is agreed on from now on ends that: one that is pending already may be known to others.
+        """
         self._mark(uuid, rotation=why)
+        self._store.count_as_imported(uuid)
 
     def rotated(self, uuid: bytes) -> None:
         """Note that a node has a key that no other station holds."""

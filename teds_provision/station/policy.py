@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Iterable
 
 from teds_provision.errors import NotWhitelisted, PolicyRefused
+from teds_provision.protocol.keys import fingerprint
 from teds_provision.station.identity import Identity
 from teds_provision.station.node_keys import NodeKeys
 from teds_provision.station.pins import Pins
@@ -36,7 +38,9 @@ class Policy:
     def trust(self, record: TrustRecord) -> None:
         """Trust a key under a name (the vault opens); PolicyRefused if the name stands for another key or role."""
         self._seals.require()
-        self._store.put_trust(self._seals.trust(record))
+        with self._store.transaction():
+            self._store.put_trust(self._seals.trust(record))
+            self._store.renew_ca(record.fingerprint)
 
     def distrust(self, name_or_fingerprint: str) -> bool:
         """Trust a key no more (the vault opens); False if none fits, raises UsageFailure if several do."""
@@ -44,11 +48,26 @@ class Policy:
         return self._store.remove_trust(name_or_fingerprint)
 
     def trusted_cas(self, uuid: bytes | None = None) -> list[bytes]:
-        """CA keys that count here: the owner's, those added, and for one node that of the bundle it came in."""
+        """CA keys that count here: the owner's, those added, and for one node that of the bundle it came in.
+
+        The last one counts no more once trust in those who brought it has ended (:meth:`end_ca`).
+        """
         cas = [self._identity.ca, *(record.point for record in self.trusted("ca"))]
-        if uuid is None or (kept := self._keys.ca_of(uuid)) in cas:
+        if uuid is None or (kept := self._keys.ca_of(uuid)) in cas or fingerprint(kept) in self._store.ended_cas():
             return cas
         return [*cas, kept]
+
+    def counts(self, ca: bytes) -> bool:
+        """Whether trust in a CA has not been ended."""
+        return fingerprint(ca) not in self._store.ended_cas()
+
+    def end_ca(self, ca: bytes) -> None:
+        """Have a CA that came in a bundle count no more for the nodes that keep it."""
+        self._store.end_ca(fingerprint(ca))
+
+    def renew_ca(self, ca: bytes) -> None:
+        """Have a CA count again for the nodes that keep it: a person took in a bundle that names it."""
+        self._store.renew_ca(fingerprint(ca))
 
     def trusted_stations(self) -> list[bytes]:
         """Station keys that count here: its own, and those added."""
@@ -69,8 +88,22 @@ class Policy:
         self._store.put_revocation(revocation)
 
     def lift(self, uuid: bytes) -> bool:
-        """Take a node off the deny list; False if it was not on it."""
-        return self._store.remove_revocation(uuid)
+        """Take a node off the deny list, and remember that this statement counts no more; False if it was not on it."""
+        entry = self.revocation(uuid)
+        if entry is None:
+            return False
+        with self._store.transaction():
+            self._store.put_lifted(_digest(entry.statement))
+            return self._store.remove_revocation(uuid)
+
+    def was_lifted(self, statement: str) -> bool:
+        """Whether a person has lifted the ban of this very statement here."""
+        return self._store.was_lifted(_digest(statement))
+
+    def denied(self, uuid: bytes, key: str | None) -> Revocation | None:
+        """Why a node with this key (fingerprint, None: not known) is denied; a ban of another key is none."""
+        entry = self.revocation(uuid)
+        return None if entry is None or (key and entry.fingerprint not in (None, key)) else entry
 
     def tombstones(self) -> list[Tombstone]:
         """Every node that was given away, by UUID."""
@@ -93,12 +126,15 @@ class Policy:
 
         ``returning``: a node given away may come back here, if a key agreement shows that it was reset.
         """
-        revoked = self.revocation(uuid)
+        entry = self._pins.entry(uuid)
+        revoked = self.denied(uuid, entry.fingerprint if entry is not None else None)
         if revoked is not None:
-            raise PolicyRefused(f"Node {uuid.hex()} was revoked: {revoked.why}.")
+            raise PolicyRefused(
+                f"Node {uuid.hex()} was revoked: {revoked.why}.",
+                hint=f"If that was a mistake: teds-provision revoke --lift {uuid.hex()}",
+            )
         if not returning:
             self.require_not_given_away(uuid)
-        entry = self._pins.entry(uuid)
         if entry is None:
             raise NotWhitelisted(
                 f"Node {uuid.hex()} is not on the whitelist.", hint=f"Add it: teds-provision whitelist add {uuid.hex()}"
@@ -125,3 +161,7 @@ class Policy:
             f"Node {uuid.hex()} was moved to station {tombstone.to_fingerprint[:16]}; its key rests here.",
             hint=undo if row is not None and row.state == "open" else back,
         )
+
+
+def _digest(statement: str) -> str:
+    return hashlib.sha256(statement.encode()).hexdigest()

@@ -151,6 +151,10 @@ class Station:
         """What the station shows and signs with: to node ``uuid`` under the CA that this node keeps, else its own."""
         return self.identity.credentials(None if uuid is None else self.keys.ca_of(uuid))
 
+    def version(self) -> int:
+        """Changes when another process has changed the store, and only then: what was planned before is stale."""
+        return self._store.version()
+
     def rows(self) -> Iterator[bytes]:
         """The whole store as it is at one moment, as a stream (see :mod:`teds_provision.store.dump`)."""
         return dump(self._store)

@@ -27,7 +27,8 @@ class Agreed:
 def open_session(station: Station, node: Conversation, *, word: bool = False) -> NodeKey | None:
     """Open a session under the first key that the node knows, newest pending first; None where it knows none.
 
-    The key that worked becomes the active one and all others go: that is the only thing that ever deletes a key.
+    The key that worked becomes the active one and the others go, but for a newer one whose Confirm may still be on its
+    way (:meth:`NodeKeys.outdated`): that is the only thing that ever deletes a key.
     ``word``: a person said that this node may be used although its key came back from a backup. Raises PolicyRefused
     for a node that was moved away, or that is neither tapped nor vouched for then; LinkFailure.
     """
@@ -43,17 +44,31 @@ def open_session(station: Station, node: Conversation, *, word: bool = False) ->
             raise
         except NotAuthentic:
             continue
-        with station.transaction():
-            station.pins.settled(node.uuid)
-            # what is signed without the node is for this epoch
-            station.nodes.remember(node.uuid, epoch=held.record.epoch)
-            if held.record.state == "pending" or len(station.keys.of(node.uuid)) > 1:
-                station.keys.promote(node.uuid, held.record.key_id)
-                if held.record.state == "pending" and held.record.source == "agreement":
-                    station.keys.rotated(node.uuid)
-                station.audit("key", node.uuid, "active", key_id=held.record.key_id, epoch=held.record.epoch)
-        return held
+        return _take_up(station, node, held)
     return None
+
+
+def _take_up(station: Station, node: Conversation, held: NodeKey) -> NodeKey:
+    """Make a key the active one after a good Open under it.
+
+    Epoch and sequence of a bundle are hearsay until here: the node's own words in this session replace them.
+    """
+    uuid, record = node.uuid, held.record
+    fresh = record.state == "pending"
+    told = read_identity(node) if fresh and record.source == "import" else None
+    with station.transaction():
+        if told is not None and told.epoch != record.epoch:
+            station.audit("key", uuid, "epoch corrected", key_id=record.key_id, said=record.epoch, epoch=told.epoch)
+            record = station.keys.correct_epoch(record, told.epoch)
+        station.pins.settled(uuid)
+        # what is signed without the node is for this epoch
+        station.nodes.remember(uuid, epoch=record.epoch, **({} if told is None else {"sequence": told.sequence}))
+        if fresh or station.keys.outdated(record):
+            station.keys.promote(uuid, record.key_id)
+            if fresh and record.source == "agreement":
+                station.keys.rotated(uuid)
+            station.audit("key", uuid, "active", key_id=record.key_id, epoch=record.epoch)
+    return NodeKey(record, held.key)
 
 
 def session_if_keyed(station: Station, node: Conversation) -> NodeKey | None:

@@ -33,13 +33,20 @@ class Written:
 
 
 def write(
-    station: Station, node: Conversation, image: Image, *, has: Image | None = None, progress: Progress | None = None
+    station: Station,
+    node: Conversation,
+    image: Image,
+    *,
+    has: Image | None = None,
+    progress: Progress | None = None,
+    jump: bool = False,
 ) -> Written:
     """Bring a signed image onto the node, inside the open session, and prove by reading that it is there.
 
     ``has`` is what the node was read to hold in this session: blocks that are the same are not sent again. Raises
-    NodeRefused with the node's reason, PolicyRefused where the image is older than what the node has, NotAuthentic
-    where the read-back differs.
+    NodeRefused with the node's reason, PolicyRefused where the image is older than what the node has, or so far ahead
+    that more than one step of 65,536 would be needed and no person said so (``jump``): that uses up the sequence of
+    the node for good. NotAuthentic where the read-back differs.
     """
     started = time.monotonic()
     signed = security.decode(image.blocks[SECURITY])
@@ -59,6 +66,12 @@ def write(
         raise PolicyRefused(
             f"The image was signed for key epoch {signed.key_epoch}; the node is at {identity.epoch}.",
             hint="Sign again for this key: teds-provision sign UUID --read-node",
+        )
+    if signed.sequence > identity.sequence + SEQUENCE_WINDOW and not jump:
+        raise PolicyRefused(
+            f"The image has sequence {signed.sequence}, far ahead of the node's {identity.sequence}: somebody may have"
+            " lied about this node.",
+            hint="Sign anew (sign UUID --read-node), or if you know why: write UUID --sequence-jump --yes",
         )
     octets = 0
     for step in range(identity.sequence + SEQUENCE_WINDOW, signed.sequence, SEQUENCE_WINDOW):

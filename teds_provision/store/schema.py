@@ -110,6 +110,10 @@ _VERSION_2: Final = (
     "CREATE INDEX whitelist_by_name ON whitelist(name) WHERE name IS NOT NULL",
     "ALTER TABLE trust ADD COLUMN mac BLOB CHECK(length(mac) = 16)",
     "CREATE INDEX audit_of_node ON audit(uuid) WHERE uuid IS NOT NULL",
+    """CREATE TABLE lifted(
+        statement TEXT PRIMARY KEY CHECK(length(statement) = 64), at TEXT NOT NULL) STRICT, WITHOUT ROWID""",
+    """CREATE TABLE ended_cas(
+        ca TEXT PRIMARY KEY CHECK(length(ca) = 64), at TEXT NOT NULL) STRICT, WITHOUT ROWID""",
     """CREATE TABLE groups(
         name TEXT PRIMARY KEY CHECK(length(name) BETWEEN 1 AND 100), created TEXT NOT NULL) STRICT, WITHOUT ROWID""",
     """CREATE TABLE group_members(

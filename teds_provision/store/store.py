@@ -71,6 +71,10 @@ class Store(NodeTables, KeyTables, DatasheetTables, HandoverTables, BulkTables, 
         """All of the block or nothing of it; may stand inside another one."""
         return self._database.transaction()
 
+    def version(self) -> int:
+        """Return a number that changes when another connection has changed the file."""
+        return int(self._database.execute("PRAGMA data_version")[0][0])
+
     def damage(self) -> str | None:
         """Return what SQLite's quick check finds wrong with the file, None if nothing (for doctor)."""
         try:

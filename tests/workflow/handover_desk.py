@@ -6,8 +6,9 @@ from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
-from teds_provision.handover.export_keys import Exported, ExportOrder, export_keys, plan_export
+from teds_provision.handover.export_keys import Exported, export_keys, plan_export
 from teds_provision.handover.import_keys import Imported, ImportPlan, import_keys, plan_import
+from teds_provision.handover.selection import ExportOrder
 from teds_provision.protocol.agreement import key_id
 from teds_provision.protocol.handover.bundle import Mode
 from teds_provision.protocol.keys import SoftwareKey, fingerprint

@@ -11,9 +11,10 @@ from pathlib import Path
 from typing import Any
 from unittest.mock import patch
 
-from teds_provision.handover import files as handover_files
-from teds_provision.handover.export_keys import ExportOrder, export_keys, plan_export
+from teds_provision import files
+from teds_provision.handover.export_keys import export_keys, plan_export
 from teds_provision.handover.import_keys import ImportPlan, import_keys, plan_import
+from teds_provision.handover.selection import ExportOrder
 from teds_provision.station.station import Station
 from teds_provision.store.database import Database
 
@@ -39,9 +40,9 @@ def counted(at: Callable[[int], None]) -> Iterator[None]:
         return run
 
     def filed(real: Callable[..., Any]) -> Callable[..., Any]:
-        def run(*words: Any) -> Any:
+        def run(*words: Any, **more: Any) -> Any:
             step()
-            return real(*words)
+            return real(*words, **more)
 
         return run
 
@@ -49,8 +50,8 @@ def counted(at: Callable[[int], None]) -> Iterator[None]:
         patch.object(Database, "execute", hooked(Database.execute)),
         patch.object(Database, "change", hooked(Database.change)),
         patch.object(Database, "execute_many", hooked(Database.execute_many)),
-        patch.object(handover_files, "_publish", filed(handover_files._publish)),
-        patch.object(handover_files, "_sync_folder", filed(handover_files._sync_folder)),
+        patch.object(files, "_publish", filed(files._publish)),
+        patch.object(files, "sync_folder", filed(files.sync_folder)),
     ):
         yield
 

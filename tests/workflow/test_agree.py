@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from datetime import timedelta
+
 import pytest
 
 from teds_provision.errors import NodeRefused, NodeSilent, NotAuthentic, NotWhitelisted, OtherKey, PolicyRefused
@@ -125,23 +127,57 @@ def test_whatever_message_is_lost_the_same_command_carries_on(
 
 @pytest.mark.parametrize("lost", range(1, EXCHANGES + 2))
 @pytest.mark.parametrize("half", ["lose_request", "lose_reply"])
-def test_a_cut_rotation_leaves_a_working_key(station: Station, board: Board, half: str, lost: int) -> None:
+def test_a_cut_rotation_leaves_a_working_key(
+    station: Station, board: Board, half: str, lost: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
     whitelist(station, board)
     run(station, board)
     with pytest.raises(NodeSilent):
         run(station, board, MemoryLink(board, **{half: lost}), rotate=True)  # type: ignore[arg-type]
     run(station, board)
+    later(monkeypatch)
+    run(station, board)
     assert [state for state, _ in held(station, board)] == ["active"]
 
 
+def later(monkeypatch: pytest.MonkeyPatch) -> None:
+    """So much later that no Confirm can arrive any more."""
+    monkeypatch.setattr("teds_provision.station.node_keys.CONFIRM_MAY_ARRIVE", timedelta(seconds=-5))
+
+
+def test_a_confirm_that_is_held_back_finds_its_key_at_the_station(station: Station, board: Board) -> None:
+    """Model, HELD_BACK: the station opened a session under the old key meanwhile; the new one must not be gone."""
+    whitelist(station, board)
+    run(station, board)
+    with talk(board) as node:
+        who, real, sends = identify(station, node), node.send, list[str]()
+
+        def hold_back(command: bytes, why: str) -> bytes:
+            sends.append(why)
+            if len(sends) == 2:
+                raise KeyboardInterrupt  # the Confirm is on its way, and this station ends here
+            return real(command, why)
+
+        node.send = hold_back  # type: ignore[method-assign]
+        with pytest.raises(KeyboardInterrupt):
+            agree(station, node, who, rotate=True)
+    assert [state for state, _ in held(station, board)] == ["pending", "active"]
+    run(station, board)  # a session under the old key, before that Confirm arrives
+    assert [state for state, _ in held(station, board)] == ["pending", "active"]
+
+
 @pytest.mark.parametrize("when", ["die_before", "die_after"])
-def test_a_node_that_dies_inside_confirm_heals(station: Station, board: Board, when: str) -> None:
+def test_a_node_that_dies_inside_confirm_heals(
+    station: Station, board: Board, when: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
     whitelist(station, board)
     run(station, board)
     setattr(board.flash, when, True)
     with pytest.raises(NodeSilent):
         run(station, board, rotate=True)
     assert len(held(station, board)) == 2
+    run(station, board)
+    later(monkeypatch)
     run(station, board)
     assert held(station, board) == [("active", 2 if when == "die_after" else 1)]
 

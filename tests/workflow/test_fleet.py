@@ -17,8 +17,9 @@ from teds_provision.handover.certify import (
     sign_request,
     write_certificate,
 )
-from teds_provision.handover.export_keys import ExportOrder, export_keys, plan_export
+from teds_provision.handover.export_keys import export_keys, plan_export
 from teds_provision.handover.import_keys import ImportPlan, import_keys, plan_import
+from teds_provision.handover.selection import ExportOrder
 from teds_provision.handover.trust import add, candidate
 from teds_provision.station.station import Station, initialise
 from teds_provision.steps.agree import agree

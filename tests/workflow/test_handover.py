@@ -12,10 +12,11 @@ from pathlib import Path
 import pytest
 
 from teds_provision.errors import NodeRefused, NotAuthentic, NotFound, PolicyRefused, UsageFailure
-from teds_provision.handover.export_keys import ExportOrder, export_keys, plan_export
+from teds_provision.handover.export_keys import export_keys, plan_export
 from teds_provision.handover.import_keys import Imported, ImportPlan, import_keys, plan_import
 from teds_provision.handover.pending import close, find_handover, list_handovers, undo
 from teds_provision.handover.prove import is_proven, prove_node
+from teds_provision.handover.selection import ExportOrder
 from teds_provision.protocol.agreement import key_id
 from teds_provision.protocol.handover.bundle import open_bundle
 from teds_provision.protocol.handover.receipt import open_receipt

@@ -8,10 +8,11 @@ from pathlib import Path
 import pytest
 
 from teds_provision.handover import certify as fleet
-from teds_provision.handover.export_keys import ExportOrder, export_keys, plan_export
+from teds_provision.handover.export_keys import export_keys, plan_export
 from teds_provision.handover.import_keys import ImportPlan, import_keys, plan_import
 from teds_provision.handover.life import revoke
 from teds_provision.handover.pending import close
+from teds_provision.handover.selection import ExportOrder
 from teds_provision.station.station import Station, initialise
 from teds_provision.vault import forget_vaults
 from tests.vault.softhsm import PIN, loaded, unload

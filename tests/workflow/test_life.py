@@ -8,9 +8,10 @@ from pathlib import Path
 import pytest
 
 from teds_provision.errors import NotFound, NotWhitelisted, PolicyRefused, UsageFailure
-from teds_provision.handover.export_keys import ExportOrder, plan_export
+from teds_provision.handover.export_keys import plan_export
 from teds_provision.handover.import_keys import ImportPlan, import_keys, plan_import
 from teds_provision.handover.life import is_finished, plan_takeover, retire, revoke, take_over
+from teds_provision.handover.selection import ExportOrder
 from teds_provision.protocol.messages.identity import NodeState
 from teds_provision.station.station import Station
 from teds_provision.steps.agree import agree

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -65,13 +66,14 @@ def export_keys(
     yes: bool,
     dry_run: bool,
 ) -> None:
-    """Hand node keys to other base stations in one bundle, sealed to them and signed by this one.
+    """Hand node keys to other base stations in a bundle, sealed to them and signed by this one.
 
     Nothing is ever written unsealed. A move marks the nodes as given away before the file exists; its receipt closes
-    it ("handover receipt"); before that "handover undo" takes it back.
+    it ("handover receipt"); before that "handover undo" takes it back. More nodes than one bundle holds go into FILE,
+    FILE.2 and so on, each with a receipt of its own.
     """
-    from teds_provision.handover.export_keys import ExportOrder, plan_export
-    from teds_provision.handover.export_keys import export_keys as run
+    from teds_provision.handover.export_keys import export_all, outputs_of, plan_exports
+    from teds_provision.handover.selection import ExportOrder
 
     if everything == bool(uuids):
         raise click.UsageError("Name the nodes, or say --all.")
@@ -80,48 +82,64 @@ def export_keys(
     order = ExportOrder(receivers, nodes, mode, expires, ca)
     if not dry_run:
         station.unlock()
-    shown = plan_export(station, order)
+    shown = plan_exports(station, order)
+    outputs = outputs_of(output, len(shown))
     if dry_run:
-        told = _exported(shown, output, station)
-        app.emit({**told, "id": None if shown.earlier is None else shown.id, "plan": True}, _plan_text(shown, station))
+        told = _exported(shown, outputs, station)
+        id_ = None if shown[0].earlier is None else shown[0].id
+        app.emit({**told, "id": id_, "plan": True}, _plan_text(shown, station))
         return
+    state = station.version()
     app.note(_plan_text(shown, station))
-    app.confirm(f"{mode.capitalize()} {count_of(len(shown.nodes))}?", yes=yes)
+    app.confirm(f"{mode.capitalize()} {_count(shown)}?", yes=yes)
     with station.lock("export-keys", app.note):
-        plan = plan_export(station, order)
-        _require_same(plan.content == shown.content)
-        told = _exported(plan, output, station)
-        done = run(station, plan, output)
-    told |= {"sha256": done.sha256, "octets": done.octets, "fresh": done.fresh}
-    again = "" if done.fresh else " (nothing to do, it is there already)"
+        plans = shown if station.version() == state else plan_exports(station, order)
+        _require_same([plan.content for plan in plans] == [plan.content for plan in shown])
+        told = _exported(plans, outputs, station)
+        done = export_all(station, plans, outputs)
+    for bundle, one in zip(told["bundles"], done, strict=True):
+        bundle |= {"sha256": one.sha256, "octets": one.octets, "fresh": one.fresh}
+    fresh = any(one.fresh for one in done)
+    told |= {"sha256": done[0].sha256, "octets": sum(one.octets for one in done), "fresh": fresh}
+    again = "" if fresh else " (nothing to do, it is there already)"
     next_step = "\nIts receipt closes the move: teds-provision handover receipt FILE.receipt" if mode == "move" else ""
-    app.emit(told, f"{count_of(len(plan.nodes))} in {output}, handover {plan.id}{again}.{next_step}")
+    files = ", ".join(map(str, outputs))
+    app.emit(told, f"{_count(plans)} in {files}, handover {plans[0].id}{again}.{next_step}")
 
 
-def _exported(plan: ExportPlan, output: Path, station: Station) -> dict[str, Any]:
+def _count(plans: Sequence[ExportPlan]) -> str:
+    return count_of(sum(len(plan.nodes) for plan in plans))
+
+
+def _exported(plans: Sequence[ExportPlan], outputs: Sequence[Path], station: Station) -> dict[str, Any]:
+    plan = plans[0]
     return {
-        "bundle": str(output),
+        "bundle": str(outputs[0]),
         "from": station.fingerprint,
         "to": [{"name": record.name, "fingerprint": record.fingerprint} for record in plan.receivers],
         "mode": plan.mode,
-        "count": len(plan.nodes),
+        "count": sum(len(one.nodes) for one in plans),
         "id": plan.id,
         "expires": plan.expires.strftime("%Y-%m-%dT%H:%M:%SZ"),
-        "nodes": [node.uuid.hex() for node, _ in plan.nodes],
+        "nodes": [node.uuid.hex() for one in plans for node, _ in one.nodes],
         "skipped": [{"uuid": uuid.hex(), "why": why} for uuid, why in plan.skipped],
-        "also_held_by": list(plan.also_held_by),
+        "also_held_by": sorted({digits for one in plans for digits in one.also_held_by}),
+        "bundles": [
+            {"bundle": str(output), "id": one.id, "count": len(one.nodes)}
+            for one, output in zip(plans, outputs, strict=True)
+        ],
     }
 
 
-def _plan_text(plan: ExportPlan, station: Station) -> str:
+def _plan_text(plans: Sequence[ExportPlan], station: Station) -> str:
     from teds_provision.handover.pending import peer_name
     from teds_provision.handover.trust import spoken
 
-    lines = [
-        f"{plan.mode.capitalize()} {count_of(len(plan.nodes))}, to be imported by {plan.expires:%Y-%m-%d %H:%M} UTC"
-    ]
-    lines += [f"  {node.uuid.hex()}  epoch {key.epoch}  {node.name or ''}".rstrip() for node, key in plan.nodes[:20]]
-    lines += [f"  … and {len(plan.nodes) - 20} more"] if len(plan.nodes) > 20 else []
+    plan, chosen = plans[0], [one for part in plans for one in part.nodes]
+    lines = [f"{plan.mode.capitalize()} {_count(plans)}, to be imported by {plan.expires:%Y-%m-%d %H:%M} UTC"]
+    lines += [f"  in {len(plans)} bundles"] if len(plans) > 1 else []
+    lines += [f"  {node.uuid.hex()}  epoch {key.epoch}  {node.name or ''}".rstrip() for node, key in chosen[:20]]
+    lines += [f"  … and {len(chosen) - 20} more"] if len(chosen) > 20 else []
     lines += [f"  not {uuid.hex()}: {why}" for uuid, why in plan.skipped]
     if plan.also_held_by:
         names = ", ".join(peer_name(station, digits) for digits in plan.also_held_by)
@@ -176,6 +194,7 @@ def import_keys(
     octets = read_limited(file, MAX_BUNDLE_OCTETS, "bundle")
     station.unlock()
     shown = plan_import(station, octets)
+    state = station.version()
     told, text = _import_plan(station, shown)
     if dry_run:
         app.emit({**told, "receipt": None, "plan": True}, text)
@@ -185,7 +204,7 @@ def import_keys(
         app.note(text)
         app.confirm(f"Take {count_of(len(shown.taken))} in?", yes=yes)
     with station.lock("import-keys", app.note):
-        plan = plan_import(station, octets)
+        plan = shown if station.version() == state else plan_import(station, octets)
         if isinstance(plan, Imported):
             done = plan
         else:
@@ -221,15 +240,20 @@ def _import_plan(station: Station, plan: ImportPlan | Imported) -> tuple[dict[st
     nodes = [{"uuid": one.node.uuid.hex(), "decision": one.decision, "why": one.why} for one in plan.nodes]
     denied = [{"uuid": one.uuid.hex(), "why": one.why} for one in plan.denied]
     told = _import_result(bundle.sender, bundle.mode, bundle.id, nodes, denied)
+    notes = {one.node.uuid.hex(): list(one.notes) for one in plan.nodes if one.notes}
+    passed_over = [{"uuid": one.uuid.hex(), "why": why} for one, why in plan.passed_over]
+    told |= {"notes": notes, "revocations_passed_over": passed_over}
     lines = [f"A {bundle.mode} of {count_of(len(nodes))} from {peer_name(station, bundle.sender)}"]
     lines += [f"  {node['decision']:<8} {node['uuid']}  {node['why']}".rstrip() for node in nodes[:40]]
     lines += [f"  … and {len(nodes) - 40} more"] if len(nodes) > 40 else []
+    lines += [f"  {uuid}: {note}" for uuid, said in [*notes.items()][:40] for note in said]
     lines += [f"  revoked  {one['uuid']}  {one['why']}" for one in denied]
+    lines += [f"  its ban of {one['uuid']} does not count: {one['why']}" for one in passed_over]
     lines += [f"For comparison by voice:\n  from {spoken(bundle.sender)}\n  to   {spoken(station.fingerprint)}"]
     if not plan.ca_is_known:
         from teds_provision.protocol.keys import fingerprint
 
-        lines.append(f"The CA {fingerprint(bundle.ca)[:16]} will be trusted for these nodes, and for no others.")
+        lines.append(f"The CA {fingerprint(bundle.ca)[:32]} will be trusted for these nodes, and for no others.")
     lines.append(
         "A copy: the sender keeps the same keys, and either can pose as a node to the other."
         if bundle.mode == "copy"

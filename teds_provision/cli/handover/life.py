@@ -17,21 +17,29 @@ if TYPE_CHECKING:
 _LINK_OPTIONS = ("via", "nfc", "can", "ble")
 
 
-@command('teds-provision revoke 8d4d --why "stolen with the arm"')
+@command('teds-provision revoke 8d4d --why "stolen with the arm"', "teds-provision revoke --lift 8d4d --yes")
 @click.argument("uuid")
-@click.option("--why", required=True, metavar="TEXT", help="Told to everyone who meets the node; goes into the log.")
+@click.option("--why", metavar="TEXT", help="Told to everyone who meets the node; goes into the log.")
+@click.option("--lift", is_flag=True, help="Take the ban back here, whoever made it.")
 @yes_option
 @dry_run_option
 @pass_app
-def revoke(app: App, uuid: str, why: str, yes: bool, dry_run: bool) -> None:
+def revoke(app: App, uuid: str, why: str | None, lift: bool, yes: bool, dry_run: bool) -> None:
     """Ban a node: off the whitelist, its keys deleted here, and a signed statement in every bundle from now on.
 
-    Stations that trust this one honour it when they import: the node is refused there too. This cannot be undone.
+    Stations that trust this one and know the node honour it when they import. --lift takes a ban back at this station,
+    also one that another station made; deleted keys do not come back.
     """
     from teds_provision.handover.life import revoke as run
 
+    if lift == (why is not None):
+        raise click.UsageError("Say --why TEXT to revoke, or --lift alone to take it back.")
     station = app.station()
     octets = station.nodes.resolve(uuid)
+    if lift:
+        _lift(app, station, octets, yes=yes, dry_run=dry_run)
+        return
+    assert why is not None
     if dry_run:
         keys = len(station.keys.of(octets))
         app.emit(
@@ -40,7 +48,7 @@ def revoke(app: App, uuid: str, why: str, yes: bool, dry_run: bool) -> None:
         return
     station.unlock()
     if station.policy.revocation(octets) is None:
-        app.confirm(f"Revoke node {octets.hex()} for good?", yes=yes)
+        app.confirm(f"Revoke node {octets.hex()}? Its keys are deleted here.", yes=yes)
     with station.lock("revoke", app.note):
         done = run(station, octets, why)
     told = {
@@ -51,6 +59,24 @@ def revoke(app: App, uuid: str, why: str, yes: bool, dry_run: bool) -> None:
         "fresh": done.fresh,
     }
     app.emit(told, f"Node {octets.hex()} is revoked: {done.entry.why}" + ("" if done.fresh else " (known before)."))
+
+
+def _lift(app: App, station: Station, uuid: bytes, *, yes: bool, dry_run: bool) -> None:
+    from teds_provision.handover.deny import lift as run
+
+    entry = station.policy.revocation(uuid)
+    told: dict[str, Any] = {"lifted": uuid.hex(), "why": entry.why if entry else None, "fresh": entry is not None}
+    if entry is None:
+        app.emit(told, f"Nothing to do: node {uuid.hex()} is not banned here.")
+        return
+    if dry_run:
+        app.emit({**told, "plan": True}, f"Plan: lift the ban of {uuid.hex()}: {entry.why}")
+        return
+    station.unlock()
+    app.confirm(f"Lift the ban of node {uuid.hex()} ({entry.why}, {entry.created})?", yes=yes)
+    with station.lock("revoke --lift", app.note):
+        run(station, uuid)
+    app.emit(told, f"The ban of node {uuid.hex()} is lifted here; whitelist it and agree on a key to use it.")
 
 
 @command("teds-provision decommission 8d4d --yes --via can --can udp_multicast:239.74.163.2")

@@ -3,12 +3,18 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import click
 
 from teds_provision.cli.context import App, pass_app
 from teds_provision.cli.handover.bundles import count_of
 from teds_provision.cli.options import COMMAND_SETTINGS, dry_run_option, examples, yes_option
+from teds_provision.errors import TedsProvisionError
+
+if TYPE_CHECKING:
+    from teds_provision.handover.pending import Closed
+    from teds_provision.station.station import Station
 
 
 @click.group(
@@ -56,34 +62,59 @@ def list_(app: App) -> None:
     short_help="Close a handover with the receiver's signed receipt.",
     epilog=examples("teds-provision handover receipt lab.jwe.receipt"),
 )
-@click.argument("file", type=click.Path(path_type=Path, dir_okay=False))
+@click.argument("file", type=click.Path(path_type=Path))
 @pass_app
 def receipt(app: App, file: Path) -> None:
-    """Close a handover with the receiver's signed receipt; the keys of a move are then deleted here."""
+    """Close a handover with the receiver's signed receipt; the keys of a move are then deleted here.
+
+    FILE may be a folder: every *.receipt in it is taken.
+    """
+    from teds_provision.errors import NotFound
     from teds_provision.files import read_limited
-    from teds_provision.handover.pending import close, peer_name
+    from teds_provision.handover.pending import close
     from teds_provision.protocol.handover.receipt import MAX_RECEIPT_OCTETS
 
     station = app.station()
-    octets = read_limited(file, MAX_RECEIPT_OCTETS, "receipt")
+    files = sorted(file.glob("*.receipt")) if file.is_dir() else [file]
+    if not files:
+        raise NotFound(f"There is no receipt (*.receipt) in {file}.")
+    closed, failed = [], None
     with station.lock("handover receipt", app.note):
-        done = close(station, octets)
-    imported, refused = done.receipt.imported, done.receipt.refused
-    told = {
+        for path in files:
+            try:
+                closed.append(close(station, read_limited(path, MAX_RECEIPT_OCTETS, "receipt")))
+            except TedsProvisionError as error:
+                if not file.is_dir():
+                    raise
+                app.warn(f"{path.name}: {error.message}")
+                failed = failed or error
+    told = [_closed(one) for one in closed]
+    text = "\n".join(_closed_text(station, one) for one in closed)
+    app.conclude({**told[0], "receipts": told} if told else {"receipts": []}, text or None, failed)
+
+
+def _closed(done: Closed) -> dict[str, Any]:
+    return {
         "id": done.row.id,
         "from": done.receipt.sender,
         "mode": done.row.mode,
         "state": done.row.state,
-        "imported": [uuid.hex() for uuid in imported],
-        "refused": [{"uuid": one.uuid.hex(), "why": one.why} for one in refused],
+        "imported": [uuid.hex() for uuid in done.receipt.imported],
+        "refused": [{"uuid": one.uuid.hex(), "why": one.why} for one in done.receipt.refused],
         "fresh": done.fresh,
     }
+
+
+def _closed_text(station: Station, done: Closed) -> str:
+    from teds_provision.handover.pending import peer_name
+
+    imported, refused = done.receipt.imported, done.receipt.refused
     text = f"Station {peer_name(station, done.receipt.sender)} took {count_of(len(imported))} in"
     text += ("; their keys are deleted here." if done.row.mode == "move" else ".") if done.fresh else " (known before)."
     lines = [f"  refused {one.uuid.hex()}: {one.why}" for one in refused]
     if refused and done.row.mode == "move":
         lines.append("What was refused is this station's again, to be rotated at the next contact.")
-    app.emit(told, "\n".join([text, *lines]))
+    return "\n".join([text, *lines])
 
 
 @handover.command(

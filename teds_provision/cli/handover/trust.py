@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import click
 
@@ -11,7 +11,7 @@ from teds_provision.cli.context import App, pass_app
 from teds_provision.cli.options import COMMAND_SETTINGS, dry_run_option, examples, yes_option
 
 if TYPE_CHECKING:
-    from teds_provision.handover.trust import Candidate
+    from teds_provision.handover.trust import Candidate, Removal
     from teds_provision.store import TrustRecord
 
 _FILE = click.Path(path_type=Path, dir_okay=False)
@@ -59,7 +59,6 @@ def add(
     if (folder is None) == (name is None) or (name is not None and file is None):
         raise click.UsageError("Give NAME and FILE, or --from DIR.")
     station = app.station()
-
     if folder is not None:
         found = candidates_of(station, folder, role)
     else:
@@ -67,13 +66,13 @@ def add(
         assert file is not None
         found = [candidate(station, name, file, role)]
     fresh = [one for one in found if not one.known]
+    told = {"trusted": [_record(one.record) for one in found], "added": len(fresh)}
     if dry_run:
-        told = {"trusted": [_record(one.record) for one in found], "added": len(fresh)}
         app.emit({**told, "plan": True}, _shown(found))
         return
     chosen = [one for one in found if one.known or _agreed(app, one, yes)]
     if any(not one.known for one in chosen):
-        station.unlock()
+        station.unlock()  # whom this station trusts is sealed under its vault
     with station.lock("trust add", app.note):
         added = run(station, chosen)
     told = {"trusted": [_record(one.record) for one in chosen], "added": added}
@@ -114,22 +113,57 @@ def _record(record: TrustRecord) -> dict[str, str]:
 @dry_run_option
 @pass_app
 def remove(app: App, name: str, yes: bool, dry_run: bool) -> None:
-    """Trust a key no more; what it signed counts no more either."""
-    from teds_provision.handover.trust import find_trusted
+    """Trust a key no more, and end what hung on it; it is listed before.
+
+    Nodes whose key that station holds are rotated at the next contact; CAs that it alone brought count no more for the
+    nodes that keep them; bans that it made are lifted.
+    """
+    from teds_provision.handover.trust import find_trusted, plan_removal
     from teds_provision.handover.trust import remove as run
 
     station = app.station()
     record = find_trusted(station, name)
-    told = {"removed": _record(record)}
-    text = f"{record.role} {record.name}, {record.fingerprint[:16]}"
+    plan = plan_removal(station, record)
+    told = {"removed": _record(record), "ends": _ends(plan)}
+    text = f"{record.role} {record.name}, {record.fingerprint[:32]}"
     if dry_run:
-        app.emit({**told, "plan": True}, f"Plan: trust the {text} no more.")
+        app.emit({**told, "plan": True}, "\n".join([f"Plan: trust the {text} no more.", *_ended(plan)]))
         return
+    app.note("\n".join([f"Trusted as {text}", *_ended(plan)]))
     app.confirm(f"Trust the {text} no more?", yes=yes)
     station.unlock()
     with station.lock("trust remove", app.note):
-        run(station, find_trusted(station, name))
-    app.emit(told, f"Not trusted any more: {text}.")
+        done = run(station, find_trusted(station, name))
+    app.emit({**told, "ends": _ends(done)}, "\n".join([f"Not trusted any more: {text}.", *_ended(done)]))
+
+
+def _ends(removal: Removal) -> dict[str, Any]:
+    from teds_provision.protocol.keys import fingerprint
+
+    return {
+        "rotations": [uuid.hex() for uuid in removal.shared],
+        "cas": [fingerprint(ca) for ca in removal.cas],
+        "nodes_under_them": removal.under,
+        "bans": [uuid.hex() for uuid in removal.bans],
+        "open_handovers": list(removal.open),
+    }
+
+
+def _ended(removal: Removal) -> list[str]:
+    """What ends with it, for people."""
+    from teds_provision.cli.handover.bundles import count_of
+    from teds_provision.protocol.keys import fingerprint
+
+    lines = []
+    if removal.shared:
+        lines.append(f"  {count_of(len(removal.shared))} whose key it holds: rotated at the next contact")
+        lines += [f"    {uuid.hex()}" for uuid in removal.shared[:20]]
+    lines += [f"  the CA {fingerprint(ca)[:32]} counts no more" for ca in removal.cas]
+    if removal.under:
+        lines.append(f"    {count_of(removal.under)} keep it: reset them and provision them anew")
+    lines += [f"  its ban of node {uuid.hex()} is lifted" for uuid in removal.bans]
+    lines += [f"  handover {id_} to it is open: it may have these keys; see handover list" for id_ in removal.open]
+    return lines
 
 
 @trust.command("list", context_settings=COMMAND_SETTINGS, epilog=examples("teds-provision trust list"))

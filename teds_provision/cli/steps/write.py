@@ -19,11 +19,14 @@ from teds_provision.links import LinkSettings
 @click.option(
     "--image", type=click.Path(path_type=Path, dir_okay=False), metavar="IMAGE", help="Write this file's image."
 )
+@click.option("--sequence-jump", is_flag=True, help="Write although its sequence is far ahead of the node's.")
 @yes_option
 @dry_run_option
 @link_options
 @pass_app
-def write(app: App, uuid: str, image: Path | None, yes: bool, dry_run: bool, links: LinkSettings) -> None:
+def write(
+    app: App, uuid: str, image: Path | None, sequence_jump: bool, yes: bool, dry_run: bool, links: LinkSettings
+) -> None:
     """Write a signed datasheet over a session, commit it, read it back and compare."""
     from teds_provision.cli.rendering import reporter_for
     from teds_provision.cli.steps.build import read_file
@@ -34,7 +37,6 @@ def write(app: App, uuid: str, image: Path | None, yes: bool, dry_run: bool, lin
     from teds_provision.talk.meeting import meet
     from teds_provision.teds.image import Image
 
-    del yes  # what is written was signed for this node before, and the commit is all or nothing
     station, reporter = app.station(), reporter_for(app)
     octets = station.nodes.resolve(uuid)
     station.policy.require_whitelisted(octets)
@@ -56,11 +58,13 @@ def write(app: App, uuid: str, image: Path | None, yes: bool, dry_run: bool, lin
         plan = {"uuid": octets.hex(), "plan": "write", "blocks": len(wanted.blocks), "octets": total}
         app.emit(plan, f"Plan: write {len(wanted.blocks)} TEDS, {total} octets, to {octets.hex()}.")
         return
+    if sequence_jump:
+        app.confirm("The sequence of this node is then used up that far, for good. Write it?", yes=yes)
     meeting = meet(station, links, octets, reporter, before=lambda: station.unlock(octets))
     with meeting as node, station.lock("write", app.note):
         identify(station, node)
         require_session(station, node)
-        written = run(station, node, wanted, progress=reporter.written)
+        written = run(station, node, wanted, progress=reporter.written, jump=sequence_jump)
     result = {
         "uuid": octets.hex(),
         "octets_written": written.octets,

@@ -80,7 +80,8 @@ class OpenedBundle:
     """A bundle that passed every check but those of the store.
 
     ``station_signature`` is the CA's over this station's key, None where the bundle brings none; ``revocations`` are
-    those of trusted signers, ``unknown_revocations`` counts the others; ``sha256`` is over the octets of the file.
+    those of trusted signers, ``unknown_revocations`` counts the others; ``sha256`` is over the octets of the file,
+    ``signed_sha256`` over the JWS in it, which nobody on the way can change: receipts name that.
     """
 
     bundle: Bundle
@@ -89,6 +90,7 @@ class OpenedBundle:
     station_signature: bytes | None
     revocations: tuple[Revocation, ...]
     unknown_revocations: int
+    signed_sha256: str
 
 
 @dataclass(frozen=True)
@@ -104,7 +106,14 @@ class BundleHeader:
 
 
 def seal_bundle(payload: Bundle, sender: PrivateKey, recipients: Sequence[bytes]) -> bytes:
-    """Sign with ``sender`` and seal to the points ``recipients``; returns the octets of the file.
+    """Like :func:`seal_signed`, but returns the octets of the file alone."""
+    return seal_signed(payload, sender, recipients)[0]
+
+
+def seal_signed(payload: Bundle, sender: PrivateKey, recipients: Sequence[bytes]) -> tuple[bytes, str]:
+    """Sign with ``sender`` and seal to the points ``recipients``.
+
+    Returns the octets of the file, and the SHA-256 of what was signed, which the receipt will name.
 
     Raises BadData or PolicyRefused where the payload breaks a rule that :func:`open_bundle` would hold against it.
     """
@@ -123,28 +132,29 @@ def seal_bundle(payload: Bundle, sender: PrivateKey, recipients: Sequence[bytes]
     sealed = jose.encrypt(signed, recipients, cty=CONTENT_TYPE)
     if len(sealed) > MAX_BUNDLE_OCTETS:
         raise BadData(f"{len(payload.nodes)} nodes are too many for one bundle.", hint="Export them in groups.")
-    return sealed
+    return sealed, hashlib.sha256(signed).hexdigest()
 
 
 def open_bundle(
-    octets: bytes, recipient: PrivateKey, trusted: FindKey, now: datetime, *, max_octets: int = MAX_BUNDLE_OCTETS
+    octets: bytes,
+    recipient: PrivateKey,
+    trusted: FindKey,
+    now: datetime | None,
+    *,
+    max_octets: int = MAX_BUNDLE_OCTETS,
 ) -> OpenedBundle:
     """Open a bundle for ``recipient``; ``trusted`` gives the point of a trusted station by its fingerprint.
+
+    Without ``now`` its times are left to :func:`check_times`: one that was taken in before gives its receipt again.
 
     Raises PolicyRefused (not for this station, expired, dated in the future, algorithm), NotAuthentic (unknown sender,
     signature, tag, SIG104, kid of a key) or BadData (form, ranges, count, an UUID twice).
     """
-    bundle, sender_key = _opened(octets, recipient, trusted, max_octets)
+    bundle, sender_key, signed_sha256 = _opened(octets, recipient, trusted, max_octets)
     if fingerprint(recipient.point) not in bundle.to:
         raise PolicyRefused("The bundle does not name this station as a receiver, though it is sealed to it.")
-    if bundle.created > now + CLOCK_TOLERANCE:
-        raise PolicyRefused(
-            f"The bundle was made in the future ({time_text(bundle.created)}).", hint="Compare both stations' clocks."
-        )
-    if now >= bundle.expires:
-        raise PolicyRefused(
-            f"The bundle expired at {time_text(bundle.expires)}.", hint="Ask the sender to export it again."
-        )
+    if now is not None:
+        check_times(bundle, now)
     revocations, unknown = open_revocations(bundle.revoked, trusted)
     return OpenedBundle(
         bundle,
@@ -153,7 +163,20 @@ def open_bundle(
         _station_signature(bundle, recipient.point),
         revocations,
         unknown,
+        signed_sha256,
     )
+
+
+def check_times(bundle: Bundle, now: datetime) -> None:
+    """Raise PolicyRefused for a bundle that has expired, or that was made in the future."""
+    if bundle.created > now + CLOCK_TOLERANCE:
+        raise PolicyRefused(
+            f"The bundle was made in the future ({time_text(bundle.created)}).", hint="Compare both stations' clocks."
+        )
+    if now >= bundle.expires:
+        raise PolicyRefused(
+            f"The bundle expired at {time_text(bundle.expires)}.", hint="Ask the sender to export it again."
+        )
 
 
 def peek_bundle(octets: bytes, *, max_octets: int = MAX_BUNDLE_OCTETS) -> BundleHeader:
@@ -169,10 +192,11 @@ def peek_bundle(octets: bytes, *, max_octets: int = MAX_BUNDLE_OCTETS) -> Bundle
     )
 
 
-def _opened(octets: bytes, recipient: PrivateKey, trusted: FindKey, max_octets: int) -> tuple[Bundle, bytes]:
+def _opened(octets: bytes, recipient: PrivateKey, trusted: FindKey, max_octets: int) -> tuple[Bundle, bytes, str]:
     """Unseal, verify and read; each form of the payload is let go as soon as the next one is there."""
     signed = jose.decrypt(octets, recipient, cty=CONTENT_TYPE, max_octets=max_octets)
     verified = jose.verify_compact(signed, trusted, typ=TYPE, max_octets=max_octets)
+    signed_sha256 = hashlib.sha256(signed).hexdigest()
     del signed
     kid, signer, payload = verified.kid, verified.signer, verified.payload
     del verified
@@ -181,7 +205,7 @@ def _opened(octets: bytes, recipient: PrivateKey, trusted: FindKey, max_octets: 
     bundle = _from_json(members)
     if bundle.sender != kid:
         raise NotAuthentic("The bundle names another sender than the one who signed it.")
-    return bundle, signer
+    return bundle, signer, signed_sha256
 
 
 def _check_rules(bundle: Bundle) -> None:

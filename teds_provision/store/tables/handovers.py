@@ -9,7 +9,7 @@ from typing import Any
 
 from teds_provision.errors import PolicyRefused, UsageFailure
 from teds_provision.store.database import Database
-from teds_provision.store.records import Direction, Handover, Holder, Revocation, Tombstone, TrustRecord
+from teds_provision.store.records import Direction, Handover, Holder, Revocation, Tombstone, TrustRecord, utc_now
 
 _MIN_FINGERPRINT_PREFIX = 16  # what people are shown
 
@@ -147,6 +147,26 @@ class HandoverTables:
     def remove_revocation(self, uuid: bytes) -> bool:
         """Deny a node no more; False if it was not denied."""
         return self._database.change("DELETE FROM revocations WHERE uuid = ?", (uuid,)) > 0
+
+    def was_lifted(self, statement: str) -> bool:
+        """Say whether a ban was lifted by a person; ``statement`` is the SHA-256 of its signed text."""
+        return self._database.one("SELECT 1 FROM lifted WHERE statement = ?", (statement,)) is not None
+
+    def put_lifted(self, statement: str) -> None:
+        """Note that a person lifted a ban."""
+        self._database.execute("INSERT OR REPLACE INTO lifted VALUES(?, ?)", (statement, utc_now()))
+
+    def ended_cas(self) -> set[str]:
+        """Return the CAs (fingerprints) that came in bundles and count no more."""
+        return {str(ca) for (ca,) in self._database.execute("SELECT ca FROM ended_cas")}
+
+    def end_ca(self, ca: str) -> None:
+        """Have a CA (fingerprint) count no more for the nodes that keep it."""
+        self._database.execute("INSERT OR REPLACE INTO ended_cas VALUES(?, ?)", (ca, utc_now()))
+
+    def renew_ca(self, ca: str) -> None:
+        """Have a CA (fingerprint) count again: a person trusts it, or took in a bundle that names it."""
+        self._database.execute("DELETE FROM ended_cas WHERE ca = ?", (ca,))
 
 
 def _handover(*row: Any) -> Handover:

@@ -54,6 +54,22 @@ class KeyTables:
                 ),
             )
 
+    def activate_key(self, uuid: bytes, key_id: str) -> None:
+        """Make this key the active one; another active one goes, pending ones stay. Raises NotFound."""
+        with self._database.transaction():
+            if not self._database.one("SELECT 1 FROM keys WHERE uuid = ? AND key_id = ?", (uuid, key_id)):
+                raise NotFound(f"The store has no key {key_id} of node {uuid.hex()}.")
+            self._database.execute(
+                "DELETE FROM keys WHERE uuid = ? AND key_id <> ? AND state = 'active'", (uuid, key_id)
+            )
+            self._database.execute(
+                "UPDATE keys SET state = 'active' WHERE uuid = ? AND key_id = ? AND state <> 'active'", (uuid, key_id)
+            )
+
+    def count_as_imported(self, uuid: bytes) -> None:
+        """Have no pending key of a node count as agreed on here: a rotation became due after it was made."""
+        self._database.execute("UPDATE keys SET source = 'import' WHERE uuid = ? AND state = 'pending'", (uuid,))
+
     def promote_key(self, uuid: bytes, key_id: str) -> None:
         """Make this key the active one and delete all others of the node, in one transaction.
 
@@ -68,6 +84,10 @@ class KeyTables:
     def remove_keys(self, uuid: bytes) -> int:
         """Delete every key of a node (decommission); returns how many there were."""
         return self._database.change("DELETE FROM keys WHERE uuid = ?", (uuid,))
+
+    def remove_key(self, uuid: bytes, key_id: str) -> bool:
+        """Delete one key of a node; False if there is none of that id."""
+        return self._database.change("DELETE FROM keys WHERE uuid = ? AND key_id = ?", (uuid, key_id)) > 0
 
     def all_keys(self) -> Iterator[KeyRecord]:
         """Give every key of every node, in the order they came, a page at a time."""

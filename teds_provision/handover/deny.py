@@ -1,0 +1,77 @@
+"""The deny list: whose word bans a node here, and how a ban is taken back.
+
+A statement counts when its signer has authority over the node: this station itself; a station that holds a key of it,
+or that it was given to; one that is certified by the CA that the node keeps; or the sender of the very bundle that
+brings the node. And only for the key that it names, or for the one that the UUID is pinned to here: whoever could ban
+any UUID could take other people's nodes out of service.
+"""
+
+from __future__ import annotations
+
+from teds_provision.protocol.handover.bundle import Bundle
+from teds_provision.protocol.handover.payload import time_text
+from teds_provision.protocol.handover.revocation import Revocation as Statement
+from teds_provision.protocol.keys import fingerprint
+from teds_provision.station.station import Station
+from teds_provision.store import Revocation
+
+
+def why_not(station: Station, statement: Statement, bundle: Bundle) -> str:
+    """Why a statement that came in ``bundle`` bans nothing here; "" where it counts."""
+    if station.policy.was_lifted(statement.statement):
+        return "it was lifted here"
+    brought = next((node for node in bundle.nodes if node.uuid == statement.uuid), None)
+    key = _key_of(station, statement.uuid, bundle)
+    if key is None:
+        return "nothing is known of this node here"
+    if statement.fingerprint not in (None, key):
+        return f"it names the key {str(statement.fingerprint)[:32]}, and the node here has another"
+    if not _has_authority(station, statement) and not (brought is not None and statement.sender == bundle.sender):
+        return f"station {statement.sender[:32]} has no authority over this node"
+    return ""
+
+
+def deny(station: Station, statement: Statement, *, key: str | None) -> None:
+    """Put a signed statement on the deny list, bound to ``key`` where it names none; one that is there stays."""
+    if station.policy.revocation(statement.uuid) is None:
+        created = time_text(statement.created)
+        named = statement.fingerprint or key
+        entry = Revocation(statement.uuid, named, statement.why, statement.statement, created)
+        station.policy.deny(entry)
+        station.audit("revoke", statement.uuid, "on the deny list", why=statement.why, by=statement.sender)
+
+
+def deny_all(station: Station, statements: tuple[Statement, ...], bundle: Bundle) -> None:
+    """Put what counts of a bundle on the deny list."""
+    for statement in statements:
+        deny(station, statement, key=_key_of(station, statement.uuid, bundle))
+
+
+def lift(station: Station, uuid: bytes) -> bool:
+    """Take a ban back, by a person's word; the same statement bans nothing here any more. False if there is none."""
+    entry = station.policy.revocation(uuid)
+    if entry is None:
+        return False
+    with station.transaction():
+        station.policy.lift(uuid)
+        station.audit("revoke", uuid, "lifted", why=entry.why)
+    return True
+
+
+def _key_of(station: Station, uuid: bytes, bundle: Bundle) -> str | None:
+    """The key that a UUID is pinned to here, else the one that the bundle brings with it."""
+    pinned = station.pins.pinned(uuid)
+    brought = next((fingerprint(node.node_key) for node in bundle.nodes if node.uuid == uuid), None)
+    return pinned or brought
+
+
+def _has_authority(station: Station, statement: Statement) -> bool:
+    uuid, signer = statement.uuid, statement.sender
+    if signer == station.fingerprint or any(holder.fingerprint == signer for holder in station.keys.holders(uuid)):
+        return True
+    tombstone = station.policy.tombstone(uuid)
+    if tombstone is not None and tombstone.to_fingerprint == signer:
+        return True
+    point = next((one.point for one in station.policy.trusted("station") if one.fingerprint == signer), None)
+    known = station.nodes.get(uuid) is not None or station.pins.entry(uuid) is not None
+    return known and point is not None and station.identity.certificate(station.keys.ca_of(uuid), point) is not None

@@ -1,0 +1,110 @@
+"""Which nodes an export takes, and why others stay."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from teds_provision.errors import NotFound, PolicyRefused
+from teds_provision.handover.pending import OPEN, Notes
+from teds_provision.protocol.handover.bundle import Mode
+from teds_provision.station.station import Station
+from teds_provision.store import KeyRecord, NodeRecord
+
+DEFAULT_DAYS = 7
+OUT_OF_SERVICE = ("decommissioned", "replaced by")  # verdicts that workflow.life gives
+_CURE = "See teds-provision nodes UUID; settle it by any session, or: teds-provision agree UUID --rotate"
+
+
+@dataclass(frozen=True)
+class ExportOrder:
+    """What to hand over: to whom (as typed), which nodes (None: all that can be), how, and for how many days."""
+
+    to: tuple[str, ...]
+    nodes: tuple[bytes, ...] | None
+    mode: Mode = "copy"
+    days: int = DEFAULT_DAYS
+    ca: str | None = None
+
+
+Chosen = list[tuple[NodeRecord, KeyRecord]]
+
+
+class Selection:
+    """Which nodes go, by the tables as they are now (read once: there may be ten thousand)."""
+
+    def __init__(self, station: Station, order: ExportOrder, receivers: set[str]) -> None:
+        self.station, self.order, self.receivers = station, order, receivers
+        self.nodes = {node.uuid: node for node in station.nodes.all()}
+        held = list(station.keys.all())
+        self.keys = {key.uuid: key for key in held if key.state == "active"}
+        self.pending = {key.uuid for key in held if key.state == "pending"}
+        self.due = station.keys.rotations_due().keys()
+        self.tombstones = {tombstone.uuid: tombstone for tombstone in station.policy.tombstones()}
+        self.revoked = {revocation.uuid for revocation in station.policy.revocations()}
+        self.rows = [row for row in station.handovers.all() if row.direction == "out" and row.state == OPEN]
+        self.open = {row.id: row for row in self.rows}
+
+    def parts(self, nodes: Chosen, most: int) -> list[Chosen]:
+        """Divide the nodes into bundles: those of an open move as they were, the others by ``most``."""
+        resting: dict[str, Chosen] = {}
+        free: Chosen = []
+        for node, key in nodes:
+            tombstone = self.tombstones.get(node.uuid)
+            (free if tombstone is None else resting.setdefault(tombstone.handover_id, [])).append((node, key))
+        return [*resting.values(), *(free[start : start + most] for start in range(0, len(free), most))]
+
+    def choose(self) -> tuple[Chosen, list[tuple[bytes, str]]]:
+        """The nodes with their keys, and those that ``--all`` leaves out."""
+        wanted = sorted(self.keys.keys() | self.pending) if self.order.nodes is None else sorted(set(self.order.nodes))
+        why = {uuid: self._obstacle(uuid) for uuid in wanted}
+        if self.order.nodes is None and all(why.values()):
+            carried_on = self._cut_move()
+            if carried_on:
+                wanted, why = carried_on, dict.fromkeys(carried_on, "")
+        if self.order.nodes is not None:
+            for uuid, obstacle in why.items():
+                if obstacle:
+                    raise PolicyRefused(f"Node {uuid.hex()} cannot be handed over: {obstacle}.", hint=_CURE)
+        chosen = [(self.nodes[uuid], self.keys[uuid]) for uuid in wanted if not why[uuid]]
+        if not chosen:
+            raise NotFound("There is no node to hand over.", hint="Name nodes, or see: teds-provision nodes")
+        return chosen, [(uuid, obstacle) for uuid, obstacle in why.items() if obstacle]
+
+    def _obstacle(self, uuid: bytes) -> str:
+        node, tombstone = self.nodes.get(uuid), self.tombstones.get(uuid)
+        if uuid in self.revoked:
+            return "it is revoked"
+        if tombstone is not None and not (self.order.nodes is not None and self._is_cut(uuid)):
+            return f"it was moved to station {tombstone.to_fingerprint[:16]}"
+        if uuid not in self.keys:
+            return "its key was never proven in a session" if uuid in self.pending else "no key of it is held here"
+        if self.order.mode == "move" and uuid in self.pending:
+            return "an agreement with it is not settled: the key that it has now may be a newer one"
+        if uuid in self.due:
+            return "its key must be rotated first"
+        if node is not None and (node.verdict or "").startswith(OUT_OF_SERVICE):
+            return "it is out of service"
+        if node is None or node.point is None:
+            return "its public key is not known"
+        return ""
+
+    def _is_cut(self, uuid: bytes) -> bool:
+        """Whether this node rests because of a move to the same receiver that is still open."""
+        tombstone = self.tombstones[uuid]
+        return (
+            self.order.mode == "move"
+            and tombstone.handover_id in self.open
+            and tombstone.to_fingerprint in self.receivers
+        )
+
+    def _cut_move(self) -> list[bytes]:
+        """The nodes of the newest open move to this receiver, and of the bundles that one command made with it.
+
+        ``--all`` again after a cut means these.
+        """
+        if self.order.mode != "move":
+            return []
+        rows = [row for row in self.open.values() if row.mode == "move" and set(row.peers) == self.receivers]
+        notes = [Notes.from_json(row.nodes) for row in rows]
+        together = [one for one in notes if one.run and one.run == notes[-1].run] or notes[-1:]
+        return sorted(bytes.fromhex(uuid) for one in together for uuid in one.uuids)
