@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 import time
+from datetime import datetime
 from typing import TYPE_CHECKING
 
 from teds_provision.cli.context import harmless
@@ -24,6 +25,14 @@ _PIPE_COLUMNS = 1000
 def shown(text: str | None) -> str:
     """A name or remark from outside, fit for a terminal: what cannot be printed becomes ``?``."""
     return "".join(character if character.isprintable() else "?" for character in text or "")
+
+
+def local_time(text: str) -> str:
+    """A moment of the store (UTC) in local time with its offset; anything else as it is."""
+    try:
+        return datetime.fromisoformat(text).astimezone().isoformat(sep=" ", timespec="seconds")
+    except ValueError:
+        return text
 
 
 def print_table(console: Console, table: Table) -> None:

@@ -7,13 +7,15 @@ from dataclasses import replace
 from typing import TYPE_CHECKING
 
 from teds_provision.errors import NotAuthentic, NotFound, PolicyRefused
-from teds_provision.protocol.agreement import Credentials
-from teds_provision.protocol.keys import fingerprint, station_key_message, verify
+from teds_provision.lazy import late
 from teds_provision.station.seals import Seals
 from teds_provision.store import Facts, Store
 
 if TYPE_CHECKING:
+    from teds_provision.protocol import agreement, keys
     from teds_provision.vault import Vault
+else:  # cryptography: not for commands that only list
+    agreement, keys = late("teds_provision.protocol.agreement"), late("teds_provision.protocol.keys")
 
 DEFAULT_NAME = "station"
 
@@ -73,7 +75,7 @@ class Identity:
     @property
     def fingerprint(self) -> str:
         """Fingerprint of the station's key."""
-        return fingerprint(self.point)
+        return keys.fingerprint(self.point)
 
     @property
     def ca(self) -> bytes:
@@ -122,32 +124,34 @@ class Identity:
         ca = self._vault().ca()
         if ca is None or ca.point != self.ca:
             raise NotFound("The CA key is not in this vault.", hint="Do this where the CA key is kept.")
-        return ca.sign(station_key_message(point))
+        return ca.sign(keys.station_key_message(point))
 
     def certificate(self, ca: bytes, point: bytes) -> bytes | None:
         """SIG104 of ``ca`` over a station's key as far as it is known here."""
         if (ca, point) == (self.ca, self.point):
             return self.signature
-        return self._store.certificate(fingerprint(ca), fingerprint(point))
+        return self._store.certificate(keys.fingerprint(ca), keys.fingerprint(point))
 
     def keep_certificate(self, ca: bytes, point: bytes, signature: bytes) -> None:
         """Keep a SIG104; raises NotAuthentic where it does not verify."""
-        if not verify(ca, station_key_message(point), signature):
-            raise NotAuthentic(f"The CA {fingerprint(ca)[:16]} did not sign the station {fingerprint(point)[:16]}.")
+        if not keys.verify(ca, keys.station_key_message(point), signature):
+            raise NotAuthentic(
+                f"The CA {keys.fingerprint(ca)[:16]} did not sign the station {keys.fingerprint(point)[:16]}."
+            )
         if self.certificate(ca, point) is None:
-            self._store.put_certificate(fingerprint(ca), fingerprint(point), signature)
+            self._store.put_certificate(keys.fingerprint(ca), keys.fingerprint(point), signature)
 
     def signature_under(self, ca: bytes) -> bytes:
         """SIG104 of ``ca`` over this station's key; raises PolicyRefused where there is none."""
         signature = self.certificate(ca, self.point)
         if signature is None:
             raise PolicyRefused(
-                f"This station is not certified by the CA {fingerprint(ca)[:16]}.",
+                f"This station is not certified by the CA {keys.fingerprint(ca)[:16]}.",
                 hint="Have it signed where that CA key is kept: teds-provision trust ca sign REQUEST",
             )
         return signature
 
-    def credentials(self, ca: bytes | None = None) -> Credentials:
+    def credentials(self, ca: bytes | None = None) -> agreement.Credentials:
         """What the station shows and signs with under ``ca``, the owner's where none is named."""
         under = self.ca if ca is None else ca
-        return Credentials(self._vault().identity(), self.signature_under(under), under)
+        return agreement.Credentials(self._vault().identity(), self.signature_under(under), under)

@@ -2,81 +2,83 @@
 
 from __future__ import annotations
 
+import hashlib
+import json
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 from teds_provision.errors import NotFound
-from teds_provision.protocol.keys import fingerprint
 from teds_provision.protocol.messages.identity import NodeState
 from teds_provision.station.station import Station
-from teds_provision.store import KeyRecord, NodeRecord
+from teds_provision.store import Known, Search
+
+STATES = ("factory", "keyed", "provisioned", "moved", "revoked", "retired", "unseen")
+"""What a node can be searched by: the states of Identify, and what the station has noted."""
+
+_UUID_DIGITS = 20
 
 
-def inventory(station: Station, uuid: bytes | None = None) -> list[dict[str, Any]]:
-    """Describe every node, or the one of ``uuid``; raises NotFound where nothing at all is known of it."""
-    store = station._store
-    if uuid is not None:
-        known = store.node(uuid)
-        named = known or store.whitelisted(uuid) or store.keys(uuid) or store.tombstone(uuid) or store.revocation(uuid)
-        if not named:
-            raise NotFound(f"Nothing is known of node {uuid.hex()}.", hint="See: teds-provision nodes.")
-        records = [known or NodeRecord(uuid)]
-        keys = {uuid: store.keys(uuid)}
-    else:
-        records, keys = store.nodes(), {}
-        for key in store.all_keys():
-            keys.setdefault(key.uuid, []).append(key)
-    whitelist = {entry.uuid: entry for entry in store.whitelist()}
-    tombstones = {tombstone.uuid: tombstone for tombstone in store.tombstones()}
-    revocations = {revocation.uuid: revocation for revocation in store.revocations()}
-    holders: dict[bytes, list[dict[str, str]]] = {}
-    for holder in store.holders(uuid):
-        told = {"fingerprint": holder.fingerprint, "mode": holder.mode, "since": holder.since}
-        holders.setdefault(holder.uuid, []).append(told)
-    described = []
-    for record in records:
-        entry, tombstone = whitelist.get(record.uuid), tombstones.get(record.uuid)
-        revocation = revocations.get(record.uuid)
-        point = fingerprint(record.point) if record.point is not None else None
-        described.append(
-            {
-                "uuid": record.uuid.hex(),
-                "name": record.name or (entry.name if entry else None),
-                "profile": record.profile,
-                "state": _state(record),
-                "epoch": record.epoch,
-                "sequence": record.sequence,
-                "fingerprint": point or (entry.fingerprint if entry else None),
-                "whitelisted": entry is not None,
-                "assurance": entry.assurance if entry else None,
-                "verdict": record.verdict,
-                "last_seen": record.last_seen,
-                "channels": record.channels,
-                "can_address": record.can_address,
-                "groups": list(record.groups),
-                "teds_sha256": record.teds_sha256,
-                "keys": [_key(key) for key in keys.get(record.uuid, [])],
-                "moved_to": tombstone and {"fingerprint": tombstone.to_fingerprint, "handover": tombstone.handover_id},
-                "holders": holders.get(record.uuid, []),
-                "revoked": revocation and {"why": revocation.why, "since": revocation.created},
-            }
-        )
-    return described
+def search(station: Station, text: str | None = None, *, state: str | None = None, **more: str | None) -> list[bytes]:
+    """The UUIDs of the nodes that are meant; ``more``: the other fields of :class:`Search`.
+
+    ``text``: a whole UUID, an exact name, or any part of UUID, name or profile. Raises NotFound where nothing fits it.
+    """
+    number: str | int | None = NodeState[state.upper()].value if state in STATES[:3] else state
+    if text is None:
+        return station.nodes.find(Search(state=number, **more))
+    exact = _exact(station, text) if number is None and not any(more.values()) else None
+    found = [exact] if exact is not None else station.nodes.find(Search(text, number, **more))
+    if not found:
+        raise NotFound(f"Nothing is known of {text!r}.", hint="See: teds-provision nodes.")
+    return found
 
 
-def _state(record: NodeRecord) -> str | None:
-    if record.last_seen is None and record.point is None:
+def _exact(station: Station, text: str) -> bytes | None:
+    digits = text.strip().lower().removeprefix("0x")
+    if len(digits) == _UUID_DIGITS and not set(digits) - set("0123456789abcdef"):
+        return bytes.fromhex(digits) if station.nodes.is_known(bytes.fromhex(digits)) else None
+    return station.nodes.named(text)
+
+
+def inventory(station: Station, uuids: Sequence[bytes]) -> Iterator[dict[str, Any]]:
+    """Describe nodes, in their order, a page at a time."""
+    return map(_described, station.nodes.overview(uuids))
+
+
+def _described(known: Known) -> dict[str, Any]:
+    node, entry, moved, revoked = known.node or {}, known.whitelist or {}, known.moved, known.revoked
+    point = node.get("point")
+    groups = list(dict.fromkeys((*json.loads(node.get("groups", "[]")), *known.groups)))
+    return {
+        "uuid": known.uuid.hex(),
+        "name": node.get("name") or entry.get("name"),
+        "profile": node.get("profile"),
+        "state": _state(node),
+        "epoch": node.get("epoch", 0),
+        "sequence": node.get("sequence", 0),
+        "fingerprint": hashlib.sha256(point).hexdigest() if point is not None else entry.get("fingerprint"),
+        "whitelisted": known.whitelist is not None,
+        "assurance": entry.get("assurance"),
+        "verdict": node.get("verdict"),
+        "last_seen": node.get("last_seen"),
+        "due": node.get("due"),
+        "channels": node.get("channels", 0),
+        "can_address": node.get("can_address", 0),
+        "group": groups[0] if groups else None,
+        "groups": groups,
+        "teds_sha256": node.get("teds_sha256"),
+        "keys": known.keys,
+        "rotation_due": known.rotation,
+        "moved_to": moved and {"fingerprint": moved["to_fingerprint"], "handover": moved["handover_id"]},
+        "holders": known.holders,
+        "revoked": revoked and {"why": revoked["why"], "since": revoked["created"]},
+    }
+
+
+def _state(node: dict[str, Any]) -> str | None:
+    if node.get("last_seen") is None and node.get("point") is None:
         return None
     try:
-        return NodeState(record.state).name.lower()
+        return NodeState(node["state"]).name.lower()
     except ValueError:
-        return f"unknown ({record.state})"
-
-
-def _key(key: KeyRecord) -> dict[str, Any]:
-    return {
-        "key_id": key.key_id,
-        "epoch": key.epoch,
-        "state": key.state,
-        "source": key.source,
-        "created": key.created,
-    }
+        return f"unknown ({node['state']})"

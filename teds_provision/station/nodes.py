@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 
 from teds_provision.station.seals import Seals
-from teds_provision.store import DatasheetRecord, Draft, NodeRecord, Store
+from teds_provision.store import DatasheetRecord, Draft, Known, NodeRecord, Search, Store
 from teds_provision.teds.image import Image
 
 
@@ -49,6 +50,22 @@ class Nodes:
     def resolve(self, text: str) -> bytes:
         """The UUID that ``text`` (a UUID, a prefix of it, or a name) means; raises NotFound, UsageFailure."""
         return self._store.resolve(text)
+
+    def find(self, search: Search) -> list[bytes]:
+        """UUIDs of the nodes that are meant, ascending; of all that is known, imported and merely listed ones too."""
+        return self._store.find(search)
+
+    def overview(self, uuids: Sequence[bytes]) -> Iterator[Known]:
+        """All that is known of these nodes, in their order, a page at a time."""
+        return self._store.overview(uuids)
+
+    def is_known(self, uuid: bytes) -> bool:
+        """Whether anything at all is known of a node."""
+        return self._store.is_known(uuid)
+
+    def named(self, name: str) -> bytes | None:
+        """UUID of the one node of exactly this name, None where none or several have it."""
+        return self._store.named(name)
 
     # -- datasheets ------------------------------------------------------------------------------------------------
 

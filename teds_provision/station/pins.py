@@ -2,11 +2,17 @@
 
 from __future__ import annotations
 
-from teds_provision.protocol.agreement import other_key
-from teds_provision.protocol.keys import fingerprint
+from typing import TYPE_CHECKING
+
+from teds_provision.lazy import late
 from teds_provision.station.node_keys import NodeKeys
 from teds_provision.station.seals import Seals
 from teds_provision.store import Store, WhitelistEntry
+
+if TYPE_CHECKING:
+    from teds_provision.protocol import agreement, keys
+else:  # cryptography: not for commands that only list
+    agreement, keys = late("teds_provision.protocol.agreement"), late("teds_provision.protocol.keys")
 
 
 class Pins:
@@ -29,7 +35,7 @@ class Pins:
         if node is None or node.point is None:
             return None
         self._seals.check_point(node)
-        return fingerprint(node.point)
+        return keys.fingerprint(node.point)
 
     def all(self) -> dict[bytes, str]:
         """Fingerprint of every pinned UUID."""
@@ -37,15 +43,17 @@ class Pins:
         for node in self._store.nodes():
             if node.point is not None:
                 self._seals.check_point(node)
-                pins[node.uuid] = fingerprint(node.point)
+                pins[node.uuid] = keys.fingerprint(node.point)
         return pins | {entry.uuid: entry.fingerprint for entry in self.whitelist() if entry.fingerprint is not None}
 
     def check(self, uuid: bytes, point: bytes) -> None:
         """Raise OtherKey where this UUID is known with another key than ``point``."""
         pinned = self.pinned(uuid)
-        if pinned is not None and pinned != fingerprint(point):
-            self._store.audit.append("identify", uuid, "other key", {"shown": fingerprint(point), "pinned": pinned})
-            raise other_key(pinned, point)
+        if pinned is not None and pinned != keys.fingerprint(point):
+            self._store.audit.append(
+                "identify", uuid, "other key", {"shown": keys.fingerprint(point), "pinned": pinned}
+            )
+            raise agreement.other_key(pinned, point)
 
     # -- the whitelist ---------------------------------------------------------------------------------------------
 
@@ -79,7 +87,7 @@ class Pins:
         entry, node = self._store.whitelisted(uuid), self._store.node(uuid)  # whatever it is: it is forgotten
         pinned = entry.fingerprint if entry is not None else None
         if pinned is None and node is not None and node.point is not None:
-            pinned = fingerprint(node.point)
+            pinned = keys.fingerprint(node.point)
         if pinned is not None:
             self._keys.set_former(uuid, pinned)
             self._store.drop_draft(uuid)  # it may hold the old board's calibration

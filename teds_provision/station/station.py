@@ -24,8 +24,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from teds_provision.errors import NotFound
-from teds_provision.protocol.agreement import Credentials
-from teds_provision.protocol.keys import fingerprint, station_key_message
+from teds_provision.lazy import late
 from teds_provision.station.groups import Groups
 from teds_provision.station.handovers import Handovers
 from teds_provision.station.identity import DEFAULT_NAME, Identity
@@ -38,7 +37,10 @@ from teds_provision.store import AuditLog, Store, StoreLock
 from teds_provision.store.dump import dump
 
 if TYPE_CHECKING:
+    from teds_provision.protocol import agreement, keys
     from teds_provision.vault import Ask, Vault
+else:  # cryptography: not for commands that only list
+    keys = late("teds_provision.protocol.keys")
 
 __all__ = ["DEFAULT_NAME", "NodeKey", "Station", "initialise", "not_certified", "not_initialised"]
 
@@ -147,7 +149,7 @@ class Station:
         if uuid is None or self.keys.held(uuid):
             _ = self.vault
 
-    def credentials(self, uuid: bytes | None = None) -> Credentials:
+    def credentials(self, uuid: bytes | None = None) -> agreement.Credentials:
         """What the station shows and signs with: to node ``uuid`` under the CA that this node keeps, else its own."""
         return self.identity.credentials(None if uuid is None else self.keys.ca_of(uuid))
 
@@ -217,6 +219,6 @@ def initialise(
         with station.transaction():
             where = keystore if keystore and keystore.startswith("pkcs11:") else vault.kind
             station.identity.found(name, where, why)
-            station.identity.complete(key.point, ca.point, ca.sign(station_key_message(key.point)))
-            station.audit("init", None, "done", fingerprint=fingerprint(key.point), keystore=vault.kind)
+            station.identity.complete(key.point, ca.point, ca.sign(keys.station_key_message(key.point)))
+            station.audit("init", None, "done", fingerprint=keys.fingerprint(key.point), keystore=vault.kind)
     return station, why

@@ -1,6 +1,6 @@
 """What a station remembers: whitelist, nodes, wrapped keys, trust and the audit log, in one SQLite file."""
 
-from teds_provision.store.audit import AuditEntry, AuditLog, AuditVerdict
+from teds_provision.store.audit import AuditEntry, AuditLog, AuditVerdict, Choice, is_failure
 from teds_provision.store.lock import StoreLock
 from teds_provision.store.records import (
     DatasheetRecord,
@@ -21,12 +21,14 @@ from teds_provision.store.records import (
 )
 from teds_provision.store.store import Store
 from teds_provision.store.tables.batches import Batch
+from teds_provision.store.tables.overview import Known, Search
 
 __all__ = [
     "AuditEntry",
     "AuditLog",
     "AuditVerdict",
     "Batch",
+    "Choice",
     "DatasheetRecord",
     "Draft",
     "Facts",
@@ -34,14 +36,17 @@ __all__ = [
     "Handover",
     "Holder",
     "KeyRecord",
+    "Known",
     "Marks",
     "Measurement",
     "NodeRecord",
     "Revocation",
+    "Search",
     "Store",
     "StoreLock",
     "Tombstone",
     "TrustRecord",
     "WhitelistEntry",
+    "is_failure",
     "utc_now",
 ]

@@ -21,6 +21,7 @@ from typing import Any
 from teds_provision.store.database import Database
 from teds_provision.store.records import utc_now
 
+_quoted = json.encoder.encode_basestring_ascii
 _PAGE_OF_ENTRIES = "SELECT * FROM audit WHERE seq > ? ORDER BY seq LIMIT ?"
 
 
@@ -36,6 +37,27 @@ class AuditEntry:
     outcome: str
     detail: dict[str, Any]
     hash: str
+
+
+@dataclass(frozen=True)
+class Choice:
+    """Which entries are meant; every field that is set has to fit."""
+
+    uuid: bytes | None = None
+    act: str | None = None
+    failed: bool = False
+
+
+FAILED = (
+    "failed", "refused", "error", "not authentic", "unproven", "unsigned", "other key", "read-back differs",
+    "interrupted", "skipped", "lost",
+)  # fmt: skip
+"""How the outcome of an act begins that did not do what it should."""
+
+
+def is_failure(outcome: str) -> bool:
+    """Whether an act did not do what it should."""
+    return outcome.startswith(FAILED)
 
 
 @dataclass(frozen=True)
@@ -73,10 +95,41 @@ class AuditLog:
         """Give the entries numbered above ``after``, oldest first; raises StoreFailure."""
         return self._database.stream(_entry, _PAGE_OF_ENTRIES, after)
 
-    def check(self) -> AuditVerdict:
-        """Recompute the whole chain; raises StoreFailure only where the file itself cannot be read."""
-        expected, previous = 0, self._root
-        for seq, good, digest in self._database.stream(_linked, _PAGE_OF_ENTRIES):
+    def chosen(self, choice: Choice, after: int = 0) -> Iterator[AuditEntry]:
+        """Give the entries numbered above ``after`` that are meant, oldest first; raises StoreFailure."""
+        terms = _terms(choice)
+        statement = f"SELECT * FROM audit WHERE seq > ?{terms} ORDER BY seq LIMIT ?"
+        return self._database.stream(_entry, statement, after)
+
+    def before(self, choice: Choice, *, since: str | None = None, last: int | None = None) -> int:
+        """Return the number of the entry before the first that is meant: seen ``since``, among the ``last`` of them.
+
+        Looks from the end, so that it costs what is shown and not what the log holds.
+        """
+        terms = _terms(choice)
+        after = 0
+        if since is not None:
+            row = self._database.one("SELECT seq FROM audit WHERE at < ? ORDER BY seq DESC LIMIT 1", (since,))
+            after = int(row[0]) if row is not None else 0
+        if last is not None:
+            statement = f"SELECT seq FROM audit WHERE seq > ?{terms} ORDER BY seq DESC LIMIT ?"
+            rows = self._database.execute(statement, (after, last))
+            end = self._database.one("SELECT coalesce(max(seq), 0) FROM audit")
+            after = int(rows[-1][0]) - 1 if rows else int(end[0] if end is not None else 0)
+        return after
+
+    def check(self, after: int = 0) -> AuditVerdict:
+        """Recompute the chain from entry ``after`` on (0: the whole of it); raises StoreFailure for an unreadable file.
+
+        From the middle on it says that what stands there was not changed since the entry before was as it is.
+        """
+        expected, previous = after, self._root
+        if after:
+            row = self._database.one("SELECT hash FROM audit WHERE seq = ?", (after,))
+            if row is None:
+                return self._broken(after, after - 1, self._root, f"entry {after} is missing")
+            previous = bytes(row[0])
+        for seq, good, digest in self._database.stream(_linked, _PAGE_OF_ENTRIES, after):
             expected += 1
             if seq != expected:
                 return self._broken(expected, expected - 1, previous, f"entry {expected} is missing")
@@ -135,17 +188,26 @@ def _linked(*row: Any) -> tuple[int, Callable[[bytes], bytes], bytes]:
 
 
 def _chained(previous: bytes, row: tuple[Any, ...]) -> bytes:
+    """The hash of an entry. Its canonical JSON is put together by hand: a log has a million entries."""
     seq, at, who, act, uuid, outcome, detail = row
-    entry = {
-        "seq": seq,
-        "at": at,
-        "who": who,
-        "act": act,
-        "uuid": None if uuid is None else uuid.hex(),
-        "outcome": outcome,
-        "detail": detail,
-    }
-    return hashlib.sha256(previous + _canonical(entry).encode()).digest()
+    node = "null" if uuid is None else f'"{uuid.hex()}"'
+    text = (
+        f'{{"act":{_quoted(act)},"at":{_quoted(at)},"detail":{_quoted(detail)},"outcome":{_quoted(outcome)},'
+        f'"seq":{seq},"uuid":{node},"who":{_quoted(who)}}}'
+    )
+    return hashlib.sha256(previous + text.encode()).digest()
+
+
+def _terms(choice: Choice) -> str:
+    """SQL of a choice. Its values were written by this program, or are UUID digits, or are quoted here."""
+    terms = ""
+    if choice.uuid is not None:
+        terms += f" AND uuid = x'{choice.uuid.hex()}'"
+    if choice.act is not None:
+        terms += " AND act = '" + choice.act.replace("'", "''") + "'"
+    if choice.failed:
+        terms += " AND (" + " OR ".join(f"outcome GLOB '{word}*'" for word in FAILED) + ")"
+    return terms
 
 
 def _canonical(value: dict[str, Any]) -> str:

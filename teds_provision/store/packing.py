@@ -5,12 +5,17 @@ from __future__ import annotations
 import struct
 import zlib
 from datetime import UTC, datetime
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from teds_provision.errors import BadData
+from teds_provision.lazy import late
 from teds_provision.store.records import iso
-from teds_provision.teds.codec import security
 from teds_provision.teds.image import BlockId, Image
+
+if TYPE_CHECKING:
+    from teds_provision.teds.codec import security
+else:  # commands that only list decode no TEDS
+    security = late("teds_provision.teds.codec.security")
 
 _BLOCK = struct.Struct(">HBI")
 _MAX_OCTETS = 64 << 20

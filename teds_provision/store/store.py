@@ -17,11 +17,14 @@ from teds_provision.store.tables.handovers import HandoverTables
 from teds_provision.store.tables.keys import KeyTables
 from teds_provision.store.tables.measurements import MeasurementTables
 from teds_provision.store.tables.nodes import NodeTables
+from teds_provision.store.tables.overview import OverviewTables
 
 _ID_OCTETS = 16
 
 
-class Store(NodeTables, KeyTables, DatasheetTables, HandoverTables, BulkTables, FactTables, MeasurementTables):
+class Store(
+    NodeTables, KeyTables, DatasheetTables, HandoverTables, BulkTables, FactTables, MeasurementTables, OverviewTables
+):
     """Whitelist, nodes, wrapped keys, datasheets, drafts, trust, handovers, groups and the audit log of one station.
 
     Every method is durable when it returns, and all of them raise StoreFailure (or StoreLocked) where the file cannot

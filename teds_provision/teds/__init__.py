@@ -9,25 +9,24 @@ from __future__ import annotations
 from importlib import import_module
 from typing import TYPE_CHECKING, Final
 
-from teds_provision.teds.codec.codes import AccessCode
-from teds_provision.teds.codec.decode import decode
-from teds_provision.teds.codec.model import (
-    Decoded,
-    Edition,
-    Field,
-    Finding,
-    Severity,
-    TimeInstance,
-    Units,
-    Value,
-    Verdict,
-)
-from teds_provision.teds.codec.tables import FieldSpec, Table, name_of, table
-
 if TYPE_CHECKING:
+    from teds_provision.teds.codec.codes import AccessCode
     from teds_provision.teds.codec.composer import compose, encode, recompose
+    from teds_provision.teds.codec.decode import decode
     from teds_provision.teds.codec.editions import convert
     from teds_provision.teds.codec.keyforms import ReadKey, read_key
+    from teds_provision.teds.codec.model import (
+        Decoded,
+        Edition,
+        Field,
+        Finding,
+        Severity,
+        TimeInstance,
+        Units,
+        Value,
+        Verdict,
+    )
+    from teds_provision.teds.codec.tables import FieldSpec, Table, name_of, table
     from teds_provision.teds.codec.uuid import UuidParts, pack_uuid, unpack_uuid
     from teds_provision.teds.sheet import Sheet
 
@@ -60,6 +59,13 @@ __all__ = [
 ]
 
 _LAZY: Final = {
+    "AccessCode": "codec.codes",
+    "decode": "codec.decode",
+    **dict.fromkeys(
+        ("Decoded", "Edition", "Field", "Finding", "Severity", "TimeInstance", "Units", "Value", "Verdict"),
+        "codec.model",
+    ),
+    **dict.fromkeys(("FieldSpec", "Table", "name_of", "table"), "codec.tables"),
     "compose": "codec.composer",
     "encode": "codec.composer",
     "recompose": "codec.composer",

@@ -7,8 +7,11 @@ import signal
 import sqlite3
 import subprocess
 import sys
+import time
 from contextlib import closing
+from datetime import datetime
 from pathlib import Path
+from zoneinfo import ZoneInfo
 
 import pytest
 
@@ -91,3 +94,57 @@ def test_following_gives_one_object_per_line_until_it_is_ended(home: Path, numbe
         follower.kill()
     assert follower.returncode == code
     assert "Traceback" not in err
+
+
+def acts(home: Path, *words: object) -> list[str]:
+    return [f"{entry['act']} {entry['outcome']}" for entry in call(home, "--json", "log", *words).json["entries"]]
+
+
+def test_entries_are_found_by_time_act_outcome_and_node(home: Path) -> None:
+    with Store.open(home) as store:
+        for outcome in ("authentic", "not authentic", "unproven"):
+            store.audit.append("verify", bytes.fromhex(ONE), outcome)
+        store.audit.append("write", bytes.fromhex(TWO), "refused", {"why": "'"})
+    assert acts(home, "--failed") == ["verify not authentic", "verify unproven", "write refused"]
+    assert acts(home, "--act", "verify") == ["verify authentic", "verify not authentic", "verify unproven"]
+    assert acts(home, "--failed", "--last", 1) == ["write refused"]
+    assert acts(home, ONE, "--failed", "--last", 1) == ["verify unproven"]
+    assert acts(home, "--act", "it's") == []
+    assert len(acts(home, "--today")) == len(acts(home, "--since", "2h")) == 5
+    assert acts(home, "--since", "2099-01-01") == []
+    assert acts(home, "--last", 0) == []
+    totals = call(home, "--json", "log", "--act", "verify").json["totals"]
+    assert totals == {"entries": 3, "failed": 2, "acts": {"verify": 3}}
+    assert "2 failed" in call(home, "log", "--act", "verify").err
+    assert call(home, "log", "--today", "--since", "2h").code == 2
+
+
+def test_a_part_of_the_log_is_checked_from_its_first_entry_on(home: Path) -> None:
+    with Store.open(home) as store:
+        for number in range(6):
+            store.audit.append("test", None, str(number))
+    tamper(home, "UPDATE audit SET outcome = 'nothing' WHERE seq = 3")
+    assert call(home, "log").code == 7
+    assert call(home, "log", "--last", 5).code == 7
+    said = call(home, "--json", "log", "--last", 3)
+    assert (said.code, said.json["intact"], said.json["checked"]) == (0, True, {"after": 4, "to": 7})
+    tamper_again = "DELETE FROM audit WHERE seq = 7"
+    with closing(sqlite3.connect(home / "store.sqlite3")) as connection, connection:
+        connection.execute(tamper_again)
+    assert call(home, "log", "--last", 1).code == 7  # the end that was cut off is noticed from anywhere
+
+
+def test_times_are_shown_in_local_time_with_offset(home: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    with Store.open(home) as store:
+        store.audit.append("test", None, "done")
+        at = next(iter(store.audit.entries(1))).at
+    monkeypatch.setenv("TZ", "Asia/Kolkata")
+    time.tzset()
+    try:
+        out = call(home, "log", "--last", 1).out
+    finally:
+        monkeypatch.undo()
+        time.tzset()
+    moment = datetime.fromisoformat(at).astimezone(ZoneInfo("Asia/Kolkata"))
+    assert moment.isoformat(sep=" ", timespec="seconds") in out
+    assert "+05:30" in out

@@ -2,11 +2,23 @@
 
 from __future__ import annotations
 
+import csv
+import fcntl
+import json
+import os
+import pty
+import struct
+import subprocess
+import sys
+import termios
+from contextlib import suppress
+from datetime import date
 from pathlib import Path
 
 import pytest
 
 from teds_provision.store import (
+    Group,
     Holder,
     KeyRecord,
     NodeRecord,
@@ -16,7 +28,7 @@ from teds_provision.store import (
     WhitelistEntry,
 )
 
-from .shell import call
+from .shell import call, clean_environment
 
 ONE, TWO = bytes.fromhex("8d4d9da65281f7000000"), bytes.fromhex("8d4e9da65281f7000001")
 POINT = bytes.fromhex("04") + bytes(range(64))
@@ -70,7 +82,10 @@ def test_json_holds_all_that_is_known_but_no_key(known: Path) -> None:
         "last_seen": "2026-01-31T12:00:00Z",
         "channels": 4,
         "can_address": 0x21,
+        "group": "hand",
         "groups": ["hand"],
+        "due": None,
+        "rotation_due": None,
         "teds_sha256": None,
         "keys": None,
         "moved_to": None,
@@ -111,3 +126,104 @@ def test_a_node_that_is_only_whitelisted_can_be_asked_for(home: Path) -> None:
     call(home, "whitelist", "add", ONE.hex(), "--name", "spare")
     (node,) = call(home, "--json", "nodes", "spare").json["nodes"]
     assert (node["uuid"], node["name"], node["state"], node["assurance"]) == (ONE.hex(), "spare", None, "uuid")
+
+
+@pytest.fixture
+def fleet(home: Path) -> Path:
+    """Five nodes in five ways known: met, listed, brought by a bundle, moved away, out of service."""
+    with Store.open(home) as store:
+        for number in range(5):
+            uuid = bytes([number]) * 10
+            store.put_node(
+                NodeRecord(
+                    uuid,
+                    POINT,
+                    name=f"finger-{number}",
+                    profile="load-cell" if number % 2 else "tactile-finger-sensor",
+                    state=number % 3,
+                    last_seen=f"2026-0{number + 1}-01T00:00:00Z",
+                    due=f"2026-0{number + 1}-15",
+                )
+            )
+        store.put_node(NodeRecord(b"\xaa" * 10, POINT, state=2, name="imported"))  # never seen here
+        store.put_group(Group("left hand", (bytes(10), b"\1" * 10)))
+        store.put_tombstone(Tombstone(b"\2" * 10, STATION, "an-id"))
+    return home
+
+
+@pytest.mark.parametrize(
+    ("words", "names"),
+    [
+        (["INGER-3"], ["finger-3"]),
+        (["load"], ["finger-1", "finger-3"]),
+        (["0303"], ["finger-3"]),
+        (["--state", "keyed"], ["finger-1", "finger-4"]),
+        (["--state", "moved"], ["finger-2"]),
+        (["--profile", "load-cell"], ["finger-1", "finger-3"]),
+        (["--group", "left hand"], ["finger-0", "finger-1"]),
+        (["--since", "2026-04-01"], ["finger-3", "finger-4"]),
+        (["imp"], ["imported"]),
+        (["finger", "--state", "factory", "--group", "left hand"], ["finger-0"]),
+    ],
+    ids=str,
+)
+def test_nodes_are_found_by_every_part(fleet: Path, words: list[str], names: list[str]) -> None:
+    assert [node["name"] for node in call(fleet, "--json", "nodes", *words).json["nodes"]] == names
+
+
+def test_due_counts_days_from_today_and_what_is_overdue(fleet: Path) -> None:
+    ahead = (date(2026, 3, 15) - date.today()).days
+    found = call(fleet, "--json", "nodes", "--due", str(max(ahead, 0))).json["nodes"]
+    assert {"finger-0", "finger-1", "finger-2"} <= {node["name"] for node in found}
+    assert all(node["due"] for node in found)
+
+
+def test_a_narrow_terminal_drops_columns_and_never_a_digit(fleet: Path) -> None:
+    for columns in (80, 60, 40, 24):
+        code, out, _ = on_terminal_of(fleet, columns, "nodes")
+        assert code == 0
+        lines = out.splitlines()
+        assert all(len(line) <= columns for line in lines)
+        assert sum(("aa" * 10) in line for line in lines) == 1, columns
+        assert ("remarks" in lines[0]) == (columns >= 80), lines[0]
+
+
+def test_csv_and_json_hold_the_same_nodes(fleet: Path) -> None:
+    rows = list(csv.DictReader(call(fleet, "nodes", "--format", "csv").out.splitlines()))
+    listed = json.loads(call(fleet, "nodes", "--format", "json").out)["nodes"]
+    assert [row["uuid"] for row in rows] == [node["uuid"] for node in listed]
+    assert len(rows) == 6
+
+
+@pytest.mark.parametrize("text", ["soon", "2026-13-01", "99999999h", ""])
+def test_a_time_that_is_none_is_usage(home: Path, text: str) -> None:
+    assert call(home, "nodes", "--since", text).code == 2
+
+
+def test_listing_loads_no_cryptography_and_decodes_no_teds(home: Path) -> None:
+    """They cost more than the list itself."""
+    heavy = ("cryptography", "numpy", "rich", "argon2", "teds_provision.teds.codec.decode", "xml.sax")
+    script = (
+        "import sys; from teds_provision.cli.main import run\n"
+        f"for words in (['nodes'], ['log', '--last', '1']): run(['--home', {str(home)!r}, *words])\n"
+        f"print([name for name in {heavy!r} if name in sys.modules])"
+    )
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True, timeout=60)
+    assert done.stdout.splitlines()[-1] == "[]"
+
+
+def on_terminal_of(home: Path, columns: int, *words: str) -> tuple[int, str, str]:
+    """Run with stdout on a terminal of so many columns."""
+    master, side = pty.openpty()
+    fcntl.ioctl(side, termios.TIOCSWINSZ, struct.pack("HHHH", 40, columns, 0, 0))
+    command = [sys.executable, "-m", "teds_provision", "--home", str(home), *words]
+    environment = {name: value for name, value in clean_environment().items() if name not in ("COLUMNS", "LINES")}
+    process = subprocess.Popen(command, stdin=side, stdout=side, stderr=subprocess.PIPE, env=environment)
+    os.close(side)
+    out = b""
+    with suppress(OSError):  # EIO: the other side is closed
+        while part := os.read(master, 65536):
+            out += part
+    _, err = process.communicate(timeout=60)
+    os.close(master)
+    return process.returncode, out.decode().replace("\r\n", "\n"), err.decode()

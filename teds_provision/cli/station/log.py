@@ -1,79 +1,108 @@
-"""``log``: the audit log, and whether its hash chain holds."""
+"""``log``: the audit log, and whether its hash chain holds; streamed, and from the end where only that is asked for."""
 
 from __future__ import annotations
 
 import json
 import signal
+import sys
 import threading
+from collections import Counter
 from typing import TYPE_CHECKING, Any
 
 import click
 
 from teds_provision.cli.context import App, pass_app
+from teds_provision.cli.moments import moment
 from teds_provision.cli.options import command
-from teds_provision.cli.rendering import shown
-from teds_provision.errors import StoreFailure
+from teds_provision.cli.rendering import local_time, shown
+from teds_provision.errors import StoreFailure, UsageFailure
+from teds_provision.store import Choice, is_failure
 
 if TYPE_CHECKING:
-    from rich.console import Console
-
     from teds_provision.station.station import Station
     from teds_provision.store import AuditEntry, AuditVerdict
 
 _POLL_SECONDS = 0.3
 
 
-@command("teds-provision log --last 20", "teds-provision --json log 8d4d", "teds-provision log --follow")
+@command("teds-provision log --last 20", "teds-provision log --today --failed", "teds-provision log --follow")
 @click.argument("uuid", required=False)
 @click.option("--follow", "-f", is_flag=True, help="Go on: one line per entry as it comes (with --json one object).")
 @click.option("--last", "-n", type=click.IntRange(min=0), metavar="N", help="Only the last N entries.")
+@click.option("--today", is_flag=True, help="Only entries of today.")
+@click.option("--since", metavar="TIME", help="Only entries since: ISO 8601, today, or 2h, 3d.")
+@click.option("--act", metavar="A", help="Only entries of this act: agree, write, verify, whitelist …")
+@click.option("--failed", is_flag=True, help="Only what was refused or failed.")
 @pass_app
-def log(app: App, uuid: str | None, follow: bool, last: int | None) -> None:
+def log(
+    app: App,
+    uuid: str | None,
+    follow: bool,
+    last: int | None,
+    today: bool,
+    since: str | None,
+    act: str | None,
+    failed: bool,
+) -> None:
     """Show who did what to which node, and whether the hash chain of the log holds.
 
-    The whole chain is checked, whatever is shown. Exits 7 where an entry was changed, removed or added by hand.
+    The chain is checked from the first entry that is shown to the end, the whole of it without --last, --today and
+    --since. Exits 7 where an entry was changed, removed or added by hand.
     """
+    if today and since is not None:
+        raise UsageFailure("--today and --since are the same thing said twice.", hint="Give one of them.")
     station = app.station()
-    wanted = station.nodes.resolve(uuid) if uuid else None
-    verdict = station.audit_log.check()
+    audit_log = station.audit_log
+    choice = Choice(station.nodes.resolve(uuid) if uuid else None, act, failed)
+    wanted = "today" if today else since
+    moment_of = moment(wanted) if wanted is not None else None
+    after = audit_log.before(choice, since=moment_of, last=last)
+    verdict = audit_log.check(after)
     if follow:
-        _follow(app, station, wanted, verdict, last)
+        _follow(app, station, choice, verdict, after)
         return
-    entries = [entry for entry in station.audit_log.entries() if wanted in (None, entry.uuid)]
-    shown = entries if last is None else entries[max(0, len(entries) - last) :]
-    app.emit(
-        {
-            "entries": [_as_dict(entry) for entry in shown],
+    totals = Counter[str]()
+    acts = Counter[str]()
+    out = sys.stdout
+    if app.json:
+        out.write('{"entries": [')
+    for number, entry in enumerate(audit_log.chosen(choice, after)):
+        totals["entries"] += 1
+        totals["failed"] += is_failure(entry.outcome)
+        acts[entry.act] += 1
+        out.write((", " if number else "") + json.dumps(_as_dict(entry)) if app.json else _line(entry) + "\n")
+    told = {"entries": totals["entries"], "failed": totals["failed"], "acts": dict(acts)}
+    if app.json:
+        rest = {
             "intact": verdict.intact,
+            "checked": {"after": after, "to": verdict.count},
             "count": verdict.count,
             "head": verdict.head,
             "first_bad": verdict.first_bad,
             "why": verdict.why,
-        },
-        lambda console: _print(console, shown),
-    )
+            "totals": told,
+        }
+        out.write("], " + json.dumps(rest)[1:] + "\n")
+    out.flush()
     if not verdict.intact and app.json:
         raise click.exceptions.Exit(7)
     _require_intact(verdict)
-    app.note(f"{verdict.count} entries, chain intact, head {verdict.head[:16]}.")
+    by_act = ", ".join(f"{count} {name}" for name, count in acts.most_common())
+    if choice != Choice() or moment_of is not None:
+        app.note(f"{told['entries']} entries, {told['failed']} failed{': ' if by_act else '.'}{by_act}")
+    part = f" from entry {after + 1} on" if after else ""
+    app.note(f"{verdict.count} entries, chain intact{part}, head {verdict.head[:16]}.")
 
 
-def _print(console: Console, entries: list[AuditEntry]) -> None:
-    for entry in entries:
-        console.print(_line(entry), markup=False)
-
-
-def _follow(app: App, station: Station, wanted: bytes | None, verdict: AuditVerdict, last: int | None) -> None:
+def _follow(app: App, station: Station, choice: Choice, verdict: AuditVerdict, after: int) -> None:
     """Give entries as they come, until SIGTERM (exit 0) or Ctrl-C (exit 130)."""
     stop = threading.Event()
     signal.signal(signal.SIGTERM, lambda *_: stop.set())
     _require_intact(verdict)
-    after = 0 if last is None else max(0, verdict.count - last)
     while True:
-        for entry in station.audit_log.entries(after):
+        for entry in station.audit_log.chosen(choice, after):
             after = entry.seq
-            if wanted in (None, entry.uuid):
-                print(json.dumps(_as_dict(entry)) if app.json else _line(entry), flush=True)
+            print(json.dumps(_as_dict(entry)) if app.json else _line(entry), flush=True)
         if stop.wait(_POLL_SECONDS):
             return
 
@@ -102,7 +131,7 @@ def _as_dict(entry: AuditEntry) -> dict[str, Any]:
 def _line(entry: AuditEntry) -> str:
     node = entry.uuid.hex() if entry.uuid else "-"
     detail = ", ".join(f"{key} {_short(value)}" for key, value in entry.detail.items() if value is not None)
-    line = f"{entry.seq:>5}  {entry.at}  {entry.who}  {entry.act:<10} {node:<20}  {entry.outcome}"
+    line = f"{entry.seq:>5}  {local_time(entry.at)}  {entry.who}  {entry.act:<10} {node:<20}  {entry.outcome}"
     return shown(f"{line}  {detail}".rstrip())
 
 

@@ -1,95 +1,158 @@
-"""``nodes``: what this station knows of its nodes."""
+"""``nodes``: what this station knows of its nodes, as a table, CSV or JSON; streamed, so a big list costs little."""
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+import csv
+import json
+import shutil
+import sys
+from collections.abc import Callable, Iterable, Iterator
+from datetime import UTC, datetime, timedelta
+from itertools import chain, islice
+from typing import Any
 
 import click
 
 from teds_provision.cli.context import App, pass_app
+from teds_provision.cli.moments import moment
 from teds_provision.cli.options import command
-from teds_provision.errors import BadData, UsageFailure
+from teds_provision.cli.rendering import local_time, shown
+from teds_provision.cli.station.fits import show_fits
+from teds_provision.station.inventory import STATES, inventory, search
 
-if TYPE_CHECKING:
-    from rich.console import Console
+_FIRST = 200  # the rows that decide how wide each column is
+_NAME_COLUMNS = 24
+_GAP = "  "
 
-_COLOURS = {"authentic": "green", None: "dim"}
 
-
-@command("teds-provision nodes", "teds-provision --json nodes 8d4d")
-@click.argument("uuid", required=False)
+@command("teds-provision nodes", "teds-provision nodes finger --state provisioned", "teds-provision --json nodes 8d4d")
+@click.argument("text", required=False, metavar="[UUID|TEXT]")
+@click.option("--state", type=click.Choice(STATES), help="Only nodes in this state.")
+@click.option("--profile", metavar="P", help="Only nodes of this type.")
+@click.option("--group", metavar="G", help="Only nodes of this group.")
+@click.option(
+    "--due",
+    type=click.IntRange(min=0, max=36500),
+    metavar="DAYS",
+    help="Only nodes with a calibration that ends within so many days, or has ended.",
+)
+@click.option("--since", metavar="TIME", help="Only nodes seen since: ISO 8601, today, or 2h, 3d.")
 @click.option(
     "--fits", metavar="EXPR", help='Judge datasheets: "angle >= 360 deg, uncertainty <= 1 deg, rate >= 1 kHz".'
 )
+@click.option("--format", "form", type=click.Choice(["table", "csv", "json"]), help="Default: table.")
 @pass_app
-def nodes(app: App, uuid: str | None, fits: str | None) -> None:
-    """Show every node that this station has met or been given, or all about one.
+def nodes(
+    app: App,
+    text: str | None,
+    state: str | None,
+    profile: str | None,
+    group: str | None,
+    due: int | None,
+    since: str | None,
+    fits: str | None,
+    form: str | None,
+) -> None:
+    """Show every node that this station has met, listed or been given, or all about one.
 
-    UUID may be a prefix of four digits or more, or the node's name. Nothing is asked of the nodes themselves.
+    TEXT is any part of UUID, name or profile; a whole UUID or an exact name means that one node. Nothing is asked of
+    the nodes themselves.
     """
-    from teds_provision.station.inventory import inventory
-
     station = app.station()
+    day = (datetime.now(UTC) + timedelta(days=due)).strftime("%Y-%m-%d") if due is not None else None
+    seen = moment(since) if since is not None else None
+    found = search(station, text, state=state, profile=profile, group=group, due=day, since=seen)
     if fits is not None:
-        _fits(app, fits, [station.nodes.resolve(uuid)] if uuid else [record.uuid for record in station.nodes.all()])
+        show_fits(app, station, fits, found)
         return
-    found = inventory(station, station.nodes.resolve(uuid) if uuid else None)
-    app.emit({"nodes": found}, lambda console: _one(console, found[0]) if uuid else _table(console, found))
+    described = inventory(station, found)
+    if app.json or form == "json":
+        _json(described)
+    elif form == "csv":
+        _csv(described)
+    elif not found:
+        print("No node is known yet. Tap one: teds-provision identify --add")
+    elif text is not None and len(found) == 1:
+        _one(next(described))
+    else:
+        _table(described)
 
 
-def _fits(app: App, expression: str, uuids: list[bytes]) -> None:
-    from datetime import UTC, datetime
-
-    from teds_provision.steps.fits import fits_of
-    from teds_provision.teds.fits import parse_fits
-
-    try:
-        requirement = parse_fits(expression)
-    except BadData as error:
-        raise UsageFailure(f"--fits: {error.message}", hint=error.hint) from error
-    found = [fit.to_json() for fit in fits_of(app.station(), [requirement], uuids, datetime.now(UTC))]
-    app.emit({"fits": found}, lambda console: _fit_table(console, found))
-
-
-def _fit_table(console: Console, found: list[dict[str, Any]]) -> None:
-    from rich.table import Table
-    from rich.text import Text
-
-    from teds_provision.cli.rendering import print_table, shown
-
-    table = Table("UUID", "channel", "result", "why", box=None, pad_edge=False)
-    style = {"passed": "green", "failed": "red", "skipped": "dim"}
-    for fit in found:
-        channel = "" if fit["channel"] is None else f"{fit['channel']} {fit['name']}".strip()
-        table.add_row(
-            fit["uuid"], Text(shown(channel)), Text(fit["result"], style[fit["result"]]), Text(shown(fit["why"]))
-        )
-    print_table(console, table)
+def _json(described: Iterable[dict[str, Any]]) -> None:
+    """One JSON object, written as it is made."""
+    out, first = sys.stdout, True
+    wide = (out.encoding or "utf-8").lower().replace("-", "") == "utf8"
+    encode = json.JSONEncoder(ensure_ascii=not wide).encode
+    out.write('{"nodes": [')
+    for node in described:
+        out.write(encode(node) if first else f", {encode(node)}")
+        first = False
+    out.write("]}\n")
+    out.flush()
 
 
-def _table(console: Console, found: list[dict[str, Any]]) -> None:
-    from rich.table import Table
-    from rich.text import Text
+_FIELDS = (
+    "uuid", "name", "profile", "state", "epoch", "sequence", "fingerprint", "whitelisted", "assurance", "verdict",
+    "last_seen", "due", "channels", "can_address", "group",
+)  # fmt: skip
 
-    from teds_provision.cli.rendering import print_table, shown
 
-    if not found:
-        console.print("No node is known yet. Tap one: teds-provision identify --add")
-        return
-    columns = ("UUID", "name", "state", "epoch", "sequence", "key", "verdict", "remarks")
-    table = Table(*columns, box=None, pad_edge=False)
-    for node in found:
-        table.add_row(
-            node["uuid"],
-            Text(shown(node["name"])),
-            node["state"] or "unseen",
-            str(node["epoch"]),
-            str(node["sequence"]),
-            (node["fingerprint"] or "")[:16],
-            Text(node["verdict"] or "", style=_COLOURS.get(node["verdict"], "red")),
-            Text(shown(_remarks(node))),
-        )
-    print_table(console, table)
+def _csv(described: Iterable[dict[str, Any]]) -> None:
+    writer = csv.writer(sys.stdout, lineterminator="\n")
+    writer.writerow((*_FIELDS, "remarks"))
+    for node in described:
+        row = [node[name] for name in _FIELDS]
+        writer.writerow([shown(value) if isinstance(value, str) else value for value in (*row, _remarks(node))])
+
+
+# Title, the text of a cell, and how gladly the column is dropped where a terminal is narrow (0: never).
+_COLUMNS: tuple[tuple[str, Callable[[dict[str, Any]], str], int], ...] = (
+    ("UUID", lambda node: node["uuid"], 0),
+    ("name", lambda node: _cut(shown(node["name"]), _NAME_COLUMNS), 1),
+    ("state", lambda node: node["state"] or "unseen", 2),
+    ("verdict", lambda node: node["verdict"] or "", 3),
+    ("profile", lambda node: node["profile"] or "", 6),
+    ("epoch", lambda node: str(node["epoch"]), 8),
+    ("sequence", lambda node: str(node["sequence"]), 9),
+    ("due", lambda node: node["due"] or "", 5),
+    ("key", lambda node: (node["fingerprint"] or "")[:16], 7),
+    ("remarks", lambda node: shown(_remarks(node)), 4),
+)
+
+
+def _table(described: Iterator[dict[str, Any]]) -> None:
+    """A line per node as it is read. The first rows decide the widths; a narrow terminal gets fewer columns."""
+    head = list(islice(described, _FIRST))
+    widths = [max(len(title), *(len(cell(node)) for node in head)) for title, cell, _ in _COLUMNS]
+    kept = _fitting(widths)
+    columns = [(*_COLUMNS[number][:2], widths[number]) for number in kept]
+    limit = shutil.get_terminal_size().columns if sys.stdout.isatty() else None
+    lines = chain(
+        [_GAP.join(title.ljust(width) for title, _, width in columns)],
+        (_GAP.join(cell(node).ljust(width) for _, cell, width in columns) for node in chain(head, described)),
+    )
+    sys.stdout.writelines(f"{_cut(line.rstrip(), limit)}\n" for line in lines)
+    sys.stdout.flush()
+
+
+def _fitting(widths: list[int]) -> list[int]:
+    """Numbers of the columns that fit side by side; those that are missed least go first, a UUID never."""
+    kept = list(range(len(widths)))
+    if not sys.stdout.isatty():
+        return kept
+    room = shutil.get_terminal_size().columns
+    remarks = len(_COLUMNS) - 1
+    while len(kept) > 1:
+        # the last column may be cut at the edge, if a useful part of it is seen
+        needed = sum(min(widths[number], 24) if number == remarks else widths[number] for number in kept)
+        if needed + len(_GAP) * (len(kept) - 1) <= room:
+            break
+        kept.remove(max(kept, key=lambda number: _COLUMNS[number][2]))
+    return kept
+
+
+def _cut(text: str, limit: int | None) -> str:
+    return text if limit is None or len(text) <= limit else f"{text[: limit - 1]}…"
 
 
 def _remarks(node: dict[str, Any]) -> str:
@@ -100,6 +163,8 @@ def _remarks(node: dict[str, Any]) -> str:
         remarks.append(f"moved to {node['moved_to']['fingerprint'][:16]}")
     if not node["whitelisted"]:
         remarks.append("not whitelisted")
+    if node["rotation_due"]:
+        remarks.append("rotation due")
     if node["holders"]:
         remarks.append("also held by " + ", ".join(holder["fingerprint"][:16] for holder in node["holders"]))
     pending = sum(key["state"] == "pending" for key in node["keys"])
@@ -108,27 +173,29 @@ def _remarks(node: dict[str, Any]) -> str:
     return "; ".join(remarks)
 
 
-def _one(console: Console, node: dict[str, Any]) -> None:
-    from teds_provision.cli.rendering import shown
-
+def _one(node: dict[str, Any]) -> None:
     address = f"0x{node['can_address']:02x}" if node["can_address"] else "none"
-    keys = [f"{key['key_id']} {key['state']}, epoch {key['epoch']}, {key['created']}" for key in node["keys"]]
+    keys = [
+        f"{key['key_id']} {key['state']}, epoch {key['epoch']}, {local_time(key['created'])}" for key in node["keys"]
+    ]
     rows = [
         ("UUID", node["uuid"]),
         ("name", node["name"] or ""),
         ("profile", node["profile"] or ""),
         ("state", node["state"] or "unseen"),
         ("epoch", f"{node['epoch']}, sequence {node['sequence']}"),
-        ("key", (node["fingerprint"] or "not pinned yet")[:16]),
+        ("key", (node["fingerprint"] or "not pinned yet")[:32]),
         ("whitelist", f"yes, assurance {node['assurance']}" if node["whitelisted"] else "no"),
         ("verdict", node["verdict"] or "never verified"),
-        ("last seen", node["last_seen"] or "never"),
+        ("last seen", local_time(node["last_seen"]) if node["last_seen"] else "never"),
+        ("calibration", f"due {node['due']}" if node["due"] else ""),
         ("channels", str(node["channels"])),
         ("CAN address", address),
         ("groups", ", ".join(node["groups"])),
         *(("link key", key) for key in keys or ["none"]),
+        ("rotation", node["rotation_due"] or ""),
         ("remarks", _remarks(node)),
     ]
     for title, text in rows:
         if text:
-            console.print(f"{title:<12} {shown(text)}", markup=False)
+            print(f"{title:<12} {shown(text)}")

@@ -1,0 +1,167 @@
+"""All that is known of nodes, put together from every table: found by one query, read a page at a time.
+
+A node is known here that was met, whitelisted, brought by a bundle, moved away or denied.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+from teds_provision.store.database import Database
+from teds_provision.store.records import UUID_OCTETS
+
+_PAGE = 500
+_KNOWN = """(SELECT uuid FROM nodes UNION SELECT uuid FROM whitelist UNION SELECT uuid FROM keys
+    UNION SELECT uuid FROM tombstones UNION SELECT uuid FROM revocations)"""
+_NAME = "coalesce(n.name, w.name, '')"
+
+
+@dataclass(frozen=True)
+class Search:
+    """Which nodes are meant; every field that is set has to fit.
+
+    ``text``: any part of UUID, name or profile; ``state``: a number of Identify, ``moved``, ``revoked``, ``retired`` or
+    ``unseen``; ``due``: the day (ISO 8601) by which a calibration ends; ``since``: seen at this moment or later.
+    """
+
+    text: str | None = None
+    state: str | int | None = None
+    profile: str | None = None
+    group: str | None = None
+    due: str | None = None
+    since: str | None = None
+
+
+@dataclass(frozen=True)
+class Known:
+    """What the tables say of one node; None and empty where they say nothing."""
+
+    uuid: bytes
+    node: dict[str, Any] | None
+    whitelist: dict[str, Any] | None
+    moved: dict[str, str] | None
+    revoked: dict[str, str] | None
+    rotation: str | None
+    keys: list[dict[str, Any]] = field(default_factory=list)
+    holders: list[dict[str, str]] = field(default_factory=list)
+    groups: list[str] = field(default_factory=list)
+
+
+class OverviewTables:
+    """The part of the store that looks at all tables at once; see :class:`teds_provision.store.Store`."""
+
+    _database: Database
+
+    def find(self, search: Search) -> list[bytes]:
+        """Return the UUIDs of the nodes that are meant, ascending."""
+        terms, values = _terms(search)
+        statement = f"""SELECT k.uuid FROM {_KNOWN} k LEFT JOIN nodes n ON n.uuid = k.uuid
+            LEFT JOIN whitelist w ON w.uuid = k.uuid WHERE {" AND ".join(terms) or "1"} ORDER BY k.uuid"""
+        return [bytes(uuid) for (uuid,) in self._database.execute(statement, values)]
+
+    def overview(self, uuids: Sequence[bytes]) -> Iterator[Known]:
+        """Give what is known of these nodes, in their order, a page at a time; holds no lock between pages."""
+        for first in range(0, len(uuids), _PAGE):
+            yield from self._page(uuids[first : first + _PAGE])
+
+    def is_known(self, uuid: bytes) -> bool:
+        """Say whether anything at all is known of a node."""
+        row = self._database.one(f"SELECT 1 FROM {_KNOWN} WHERE uuid = ? LIMIT 1", (uuid,))
+        return row is not None
+
+    def named(self, name: str) -> bytes | None:
+        """Return the UUID of the one node of exactly this name, None where none or several have it."""
+        statement = "SELECT uuid FROM nodes WHERE name = ? UNION SELECT uuid FROM whitelist WHERE name = ? LIMIT 2"
+        rows = self._database.execute(statement, (name, name))
+        return bytes(rows[0][0]) if len(rows) == 1 else None
+
+    def _page(self, uuids: Sequence[bytes]) -> Iterator[Known]:
+        nodes = self._rows("nodes", _NODE, uuids)
+        whitelist = self._rows("whitelist", ("fingerprint", "assurance", "name", "added"), uuids)
+        moved = self._rows("tombstones", ("to_fingerprint", "handover_id"), uuids)
+        revoked = self._rows("revocations", ("why", "created"), uuids)
+        marks = self._rows("marks", ("rotation",), uuids)
+        keys = self._lists(
+            "keys", ("key_id", "epoch", "state", "source", "created"), uuids, "state = 'active', seq DESC"
+        )
+        holders = self._lists("holders", ("fingerprint", "mode", "since"), uuids, "since, fingerprint")
+        groups = self._lists("group_members", ("name",), uuids, "name")
+        for uuid in uuids:
+            yield Known(
+                uuid,
+                nodes.get(uuid),
+                whitelist.get(uuid),
+                moved.get(uuid),
+                revoked.get(uuid),
+                (marks.get(uuid) or {}).get("rotation"),
+                keys.get(uuid, []),
+                holders.get(uuid, []),
+                [group["name"] for group in groups.get(uuid, [])],
+            )
+
+    def _rows(self, table: str, columns: Sequence[str], uuids: Sequence[bytes]) -> dict[bytes, dict[str, Any]]:
+        return {uuid: rows[0] for uuid, rows in self._lists(table, columns, uuids, "uuid").items()}
+
+    def _lists(
+        self, table: str, columns: Sequence[str], uuids: Sequence[bytes], order: str
+    ) -> dict[bytes, list[dict[str, Any]]]:
+        places = ", ".join("?" * len(uuids))
+        rows = self._database.execute(
+            f"SELECT uuid, {', '.join(columns)} FROM {table} WHERE uuid IN ({places}) ORDER BY {order}", uuids
+        )
+        found: dict[bytes, list[dict[str, Any]]] = {}
+        for uuid, *values in rows:
+            found.setdefault(uuid, []).append(dict(zip(columns, values, strict=True)))
+        return found
+
+
+_NODE = (
+    "point", "name", "profile", "state", "epoch", "sequence", "can_address", "groups", "teds_sha256", "verdict",
+    "last_seen", "channels", "due",
+)  # fmt: skip
+
+
+def _terms(search: Search) -> tuple[list[str], list[Any]]:
+    terms: list[str] = []
+    values: list[Any] = []
+
+    def add(term: str, *more: Any) -> None:
+        terms.append(term)
+        values.extend(more)
+
+    if search.text is not None:
+        part = search.text.strip()
+        digits = part.lower().removeprefix("0x")
+        named = f"instr(lower({_NAME}), lower(?)) OR instr(lower(coalesce(n.profile, '')), lower(?))"
+        if digits and len(digits) <= 2 * UUID_OCTETS and not set(digits) - set("0123456789abcdef"):
+            add(f"(instr(lower(hex(k.uuid)), ?) OR {named})", digits, part, part)
+        else:
+            add(f"({named})", part, part)
+    if search.profile is not None:
+        add("n.profile = ?", search.profile)
+    if search.group is not None:
+        members = "k.uuid IN (SELECT uuid FROM group_members WHERE name = ?)"
+        add(f"({members} OR (n.groups <> '[]' AND instr(n.groups, ?)))", search.group, json.dumps(search.group))
+    if search.due is not None:
+        add("n.due <= ?", search.due)
+    if search.since is not None:
+        add("n.last_seen >= ?", search.since)
+    if search.state is not None:
+        _add_state(search.state, add)
+    return terms, values
+
+
+def _add_state(state: str | int, add: Any) -> None:
+    tables = {"moved": "tombstones", "revoked": "revocations"}
+    seen = "(n.last_seen IS NOT NULL OR n.point IS NOT NULL)"
+    if isinstance(state, int):
+        add(f"n.state = ? AND {seen}", state)
+    elif state in tables:
+        add(f"k.uuid IN (SELECT uuid FROM {tables[state]})")
+    elif state == "retired":
+        add("(n.verdict GLOB 'decommissioned*' OR n.verdict GLOB 'replaced by*')")
+    else:
+        add(f"(n.uuid IS NULL OR NOT {seen})")
