@@ -7,6 +7,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import Literal, Protocol
 
+from teds_provision.links.hints import BleAddress, Charging
 from teds_provision.protocol.messages.identity import Identity
 
 NoticeKind = Literal[
@@ -78,12 +79,17 @@ class Link(Protocol):
 
 @dataclass(frozen=True)
 class Contact:
-    """A node that was found: its unauthenticated Identify, its link, and where it was found."""
+    """A node that was found: its unauthenticated Identify, its link, and where it was found.
+
+    ``charging`` and ``ble`` are what its initial NFC message says beside; hints, as unauthenticated as the rest.
+    """
 
     identity: Identity
     link: Link
     tag_uid: bytes | None = None
     address: int | None = None
+    charging: Charging | None = None
+    ble: BleAddress | None = None
 
 
 class Port(Protocol):

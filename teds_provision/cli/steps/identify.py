@@ -74,6 +74,8 @@ def _one(station: Any, node: Any, add: bool) -> dict[str, Any]:
         "epoch": node.identity.epoch,
         "sequence": node.identity.sequence,
         "can_address": node.identity.can_address,
+        "charging": node.contact.charging.to_json() if node.contact.charging else None,
+        "ble": node.contact.ble.text if node.contact.ble else None,
     }
 
 
@@ -85,4 +87,5 @@ def _line(found: dict[str, Any]) -> str:
     listed = "whitelisted" if found["whitelisted"] else "not whitelisted"
     name = f"  {found['name']}" if found["name"] else ""
     tag = f"  tag {found['tag_uid']}" if found["tag_uid"] else ""
-    return f"{found['uuid']}  key {found['fingerprint'][:16]}  {found['state']}  {listed}{name}{tag}"
+    charge = f"  {found['charging']['text']}" if found["charging"] else ""
+    return f"{found['uuid']}  key {found['fingerprint'][:16]}  {found['state']}  {listed}{name}{tag}{charge}"

@@ -125,7 +125,7 @@ class NfcPort:
             if not same:
                 here = seen.identity.uuid
                 link = NfcLink(self, seen, notice)
-                yield Contact(seen.identity, link, tag_uid=seen.tag.uid)
+                yield _contact(seen, link)
                 link.close()
                 seen = link.visit
             if link is not None and link.lost:  # whoever comes next is a new visit, the same node too
@@ -177,7 +177,7 @@ class NfcPort:
         self.close()
 
     def _contact(self, visit: Visit, notice: NoticeSink) -> Contact:
-        return Contact(visit.identity, NfcLink(self, visit, notice), tag_uid=visit.tag.uid)
+        return _contact(visit, NfcLink(self, visit, notice))
 
     def _look(self, notice: NoticeSink, stop: threading.Event) -> Visit | Foreign | None:
         """Poll once; None when nothing lies there or the reader is away (which is told once)."""
@@ -309,6 +309,10 @@ class NfcLink:
             self._poller.restart()
         else:
             self._poller = None
+
+
+def _contact(visit: Visit, link: NfcLink) -> Contact:
+    return Contact(visit.identity, link, visit.tag.uid, charging=visit.charging, ble=visit.ble)
 
 
 def _tell(seen: Visit | Foreign, told: str, notice: NoticeSink) -> str:

@@ -6,7 +6,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from teds_provision.errors import BadData, Garbled
-from teds_provision.links.nfc import message, tnep
+from teds_provision.links.hints import BleAddress, Charging
+from teds_provision.links.nfc import hints, message, tnep
 from teds_provision.links.nfc.message import Record
 from teds_provision.links.nfc.tag import ReaderTag
 from teds_provision.protocol.messages.identity import Identity
@@ -19,6 +20,8 @@ class Visit:
     tag: ReaderTag
     service: tnep.ServiceParameters
     identity: Identity
+    charging: Charging | None = None
+    ble: BleAddress | None = None
 
 
 @dataclass(frozen=True)
@@ -42,9 +45,10 @@ def look(tag: ReaderTag) -> Visit | Foreign:
     if payload is None:
         return Foreign(tag, _described(tag, "It offers the service but does not say who it is (no id record)."))
     try:
-        return Visit(tag, service, Identity.decode(payload))
+        identity = Identity.decode(payload)
     except BadData as error:
         return Foreign(tag, _described(tag, error.message))
+    return Visit(tag, service, identity, hints.charging(records), hints.ble_address(records))
 
 
 def _described(tag: ReaderTag, what: str) -> str:
