@@ -121,6 +121,12 @@ def test_the_link_key_alone_opens_no_recorded_session() -> None:
     assert desk.plain(security_command(Function.SEALED, recorded)).ok, "the frame was a good one"
 
 
+def test_no_key_shows_in_what_is_printed() -> None:
+    keys = SessionKeys.derive(bytes(16), UUID, b"z" * 32, b"s" * 65, b"n" * 65)
+    for secret in (keys.to_node, keys.to_station, keys.messages, keys.node_tag):
+        assert repr(secret)[2:-1] not in repr(keys)
+
+
 def test_both_sides_have_one_key_for_data_messages_and_it_is_new_with_each_open() -> None:
     desk = Desk().agree().open()
     assert desk.session is not None

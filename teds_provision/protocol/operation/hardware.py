@@ -16,7 +16,8 @@ from teds_provision.teds.sheet import Kind, channel_from
 
 _CHANNEL_CODE: Final = 3
 _MILLION: Final = 10**6
-_ONCE_A_SECOND: Final = 10**9
+_LONGEST: Final = 1e6
+"""Seconds that stand for every longer SPeriod, infinity too: no stream has such a period."""
 
 
 @dataclass(frozen=True)
@@ -134,4 +135,4 @@ def teds_fits(own: ChannelHardware, teds: bytes | None) -> bool:
 def teds_period(teds: bytes | None) -> int:
     """SPeriod of a Channel TEDS in ns, less 1 ppm (it is a Float32); 0 where it is absent, NaN or not positive."""
     period = channel_from(decode(teds)).period if teds is not None else 0.0
-    return int(period * 1e9 * (1 - 1 / _MILLION)) if period > 0 else 0
+    return int(min(period, _LONGEST) * 1e9 * (1 - 1 / _MILLION)) if period > 0 else 0

@@ -107,7 +107,7 @@ class Stream:
                 continue
             octets, valid = hardware.read(channel, tick)
             self._filling += octets
-            if not valid or hardware.testing(channel):
+            if not valid or hardware.testing(channel) or hardware.fault(channel):
                 self._flags |= NOT_VALID
         self._held += 1
         if self._held == self.asked.n:

@@ -277,6 +277,20 @@ def test_the_budget_counts_every_stream_of_the_bus_and_the_largest_gap() -> None
     assert bench.reason(subscribe(n=1, period=1 * MS, gap=250)) is None, "2 · 500000 ppm is the most"
 
 
+@pytest.mark.parametrize(
+    ("period", "shortest"),
+    [(0.02, 20 * MS), (float("nan"), 1), (0.0, 1), (-1.0, 1), (float("inf"), None), (3e38, None)],
+)
+def test_speriod_as_it_may_stand(period: float, shortest: int | None) -> None:
+    bench = Bench(teds={(1, 3): channel_teds(channels()[1], period=period)}).open().operate(1)
+    if shortest is None:
+        assert bench.reason(subscribe(period=10**12)) == Reason.OUT_OF_RANGE
+        return
+    assert bench.reason(subscribe(n=113, period=max(shortest, 1 * MS), gap=0)) is None
+    if shortest > 1:
+        assert bench.reason(subscribe(period=shortest // 1000 * 999)) == Reason.OUT_OF_RANGE
+
+
 def test_links_that_do_not_offer_all() -> None:
     bench = Bench().open("nfc").operate(1, 4, link="nfc")
     arm = Arm(bytes(16), 10, Action.MARK).command()
@@ -359,7 +373,11 @@ def test_a_node_without_hardware_answers_1() -> None:
     assert {bench.reason(command) for command in commands} == {Reason.UNKNOWN_COMMAND}
 
 
-@pytest.mark.parametrize("command", [operate(1), sample([1]), CLOCK, subscribe(), read_data_set(1), R(1, 1, 5, b"\0")])
-def test_outside_a_session_they_get_3(command: Command) -> None:
-    assert Bench().plain(command).reason == Reason.NOT_PERMITTED
-    assert Bench().plain(command, "nfc").reason == Reason.NOT_PERMITTED
+def test_outside_a_session_they_get_3() -> None:
+    numbers = [(1, n) for n in range(5, 13)] + [(g, n) for g in range(2, 8) for n in range(1, 6)]
+    numbers += [(128, n) for n in range(12, 21)]
+    bench = Bench()
+    for link in ("can:f1", "nfc"):
+        found = {number: bench.plain(R(0, *number, b"\1"), link).reason for number in numbers}
+        assert found == dict.fromkeys(numbers, Reason.NOT_PERMITTED)
+    assert bench.plain(R(0, 128, 21)).reason == Reason.UNKNOWN_COMMAND

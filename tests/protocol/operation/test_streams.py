@@ -270,6 +270,9 @@ def test_flags_speak_of_their_message_alone() -> None:
     bench.hardware.invalid = set()
     bench.until(145 * MS)
     assert [m.valid for m in consumer.messages()] == [False, True]
+    bench.hardware.faults = {1}
+    bench.until(165 * MS)
+    assert [m.valid for m in consumer.messages()] == [False], "a fault, told by the hardware apart"
 
 
 # -- trigger -----------------------------------------------------------------------------------------------------------
