@@ -171,7 +171,8 @@ def export_all(
 
 def _announced(station: Station, plan: ExportPlan, run: str) -> ExportPlan:
     """Record a bundle of several that is not sealed yet."""
-    return replace(plan, earlier=_record(station, replace(plan, run=run), ()))
+    named = replace(plan, run=run)
+    return replace(named, earlier=_record(station, named, ()))
 
 
 def outputs_of(output: Path, count: int) -> list[Path]:

@@ -8,7 +8,7 @@ import pytest
 
 from teds_provision.errors import NodeRefused, NodeSilent, NotAuthentic, NotWhitelisted, OtherKey, PolicyRefused
 from teds_provision.protocol.agreement import key_id
-from teds_provision.protocol.messages.frames import Reason, refusal
+from teds_provision.protocol.messages.frames import Command, Reason, refusal
 from teds_provision.protocol.messages.identity import NodeState
 from teds_provision.station.station import Station
 from teds_provision.steps.agree import Agreed, agree
@@ -152,7 +152,7 @@ def test_a_confirm_that_is_held_back_finds_its_key_at_the_station(station: Stati
     with talk(board) as node:
         who, real, sends = identify(station, node), node.send, list[str]()
 
-        def hold_back(command: bytes, why: str) -> bytes:
+        def hold_back(command: Command, why: str) -> bytes:
             sends.append(why)
             if len(sends) == 2:
                 raise KeyboardInterrupt  # the Confirm is on its way, and this station ends here

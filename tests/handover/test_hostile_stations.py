@@ -1,0 +1,422 @@
+"""What a trusted station, or someone on the way between two, may not do: issue 7, rows M1 to M4, L1 to L3, L13."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from dataclasses import replace
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+from uuid import uuid4
+
+import pytest
+
+from teds_provision.errors import PolicyRefused, UsageFailure
+from teds_provision.handover.deny import lift
+from teds_provision.handover.export_keys import export_all, export_keys, outputs_of, plan_exports
+from teds_provision.handover.import_keys import Imported, ImportPlan, import_keys, plan_import
+from teds_provision.handover.life import revoke
+from teds_provision.handover.pending import close, find_handover, undo
+from teds_provision.handover.selection import ExportOrder
+from teds_provision.handover.trust import plan_removal, remove
+from teds_provision.protocol.datasheet import SEQUENCE_WINDOW
+from teds_provision.protocol.handover.bundle import Bundle, BundledNode, Mode, seal_bundle
+from teds_provision.protocol.handover.jose import verify_compact
+from teds_provision.protocol.handover.receipt import TYPE, open_receipt, seal_receipt
+from teds_provision.protocol.handover.revocation import seal_revocation
+from teds_provision.protocol.keys import station_key_message
+from teds_provision.protocol.messages.frames import Command
+from teds_provision.station.station import Station
+from teds_provision.steps.agree import agree, require_session
+from teds_provision.steps.identify import identify
+from teds_provision.steps.sign import known_node_keys, sign
+from teds_provision.steps.write import write
+from teds_provision.store import NodeRecord
+from tests.workflow.bench import Board, MemoryLink, make_station, talk
+from tests.workflow.handover_desk import Pair, held, key_up, provisioned, session, trust
+
+HIGHEST = 0xFFFFFFFF
+
+
+@pytest.fixture
+def pair(tmp_path: Path) -> Iterator[Pair]:
+    made = Pair.make(tmp_path)
+    yield made
+    made.close()
+
+
+@pytest.fixture
+def west(pair: Pair, tmp_path: Path) -> Iterator[Station]:
+    """A third station; north and west trust each other."""
+    made = make_station(tmp_path / "west", "west")
+    trust(pair.north, made)
+    trust(made, pair.north)
+    yield made
+    made.close()
+
+
+def node_of(board: Board, **more: object) -> BundledNode:
+    state = board.state
+    assert state.key is not None
+    return replace(BundledNode(board.uuid, state.node_key, state.key, max(1, state.epoch)), **more)  # type: ignore[arg-type]
+
+
+def forged(
+    sender: Station, receiver: Station, *nodes: BundledNode, mode: Mode = "copy", revoked: tuple[str, ...] = ()
+) -> bytes:
+    """A bundle that a trusted station may make by hand: its own key, and whatever content it likes."""
+    now = datetime.now(UTC).replace(microsecond=0)
+    ca = sender.vault.ca()
+    assert ca is not None
+    bundle = Bundle(
+        id=str(uuid4()),
+        sender=sender.fingerprint,
+        to=(receiver.fingerprint,),
+        created=now,
+        expires=now + timedelta(days=1),
+        mode=mode,
+        ca=sender.ca,
+        nodes=nodes,
+        station_signatures={receiver.fingerprint: ca.sign(station_key_message(receiver.point))},
+        revoked=revoked,
+    )
+    return seal_bundle(bundle, sender.vault.identity(), [receiver.point])
+
+
+def taken(station: Station, octets: bytes) -> Imported:
+    plan = plan_import(station, octets)
+    return import_keys(station, plan) if isinstance(plan, ImportPlan) else plan
+
+
+# -- M1: sequence and epoch are hearsay ------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("known", [False, True])
+def test_a_bundle_cannot_ruin_a_nodes_sequence(pair: Pair, known: bool) -> None:
+    provisioned(pair.north, pair.board)
+    if known:
+        pair.take(pair.export("copy")[0])
+        session(pair.south, pair.board)
+    lie = node_of(pair.board, sequence=HIGHEST, teds_sha256="ab" * 32)
+    taken(pair.south, forged(pair.north, pair.south, lie))
+    record = pair.south.nodes.get(pair.board.uuid)
+    assert record is not None
+    assert record.sequence <= 1
+    provisioned(pair.south, pair.board)
+    record = pair.south.nodes.get(pair.board.uuid)
+    assert record is not None
+    assert record.sequence == pair.board.state.sequence <= 2
+
+
+def test_a_lie_about_the_epoch_is_corrected_in_the_first_session(pair: Pair) -> None:
+    taken(pair.south, forged(pair.north, pair.south, node_of(pair.board, epoch=HIGHEST)))
+    assert held(pair.south, pair.board) == [("pending", HIGHEST, "import")]
+    assert session(pair.south, pair.board) == 1
+    assert held(pair.south, pair.board) == [("active", 1, "import")]
+    with talk(pair.board, MemoryLink(pair.board, via="can", tapped=False)) as node:
+        assert agree(pair.south, node, identify(pair.south, node), rotate=True).epoch == 2
+
+
+def test_a_far_jump_of_the_sequence_needs_a_persons_word(pair: Pair) -> None:
+    provisioned(pair.north, pair.board)
+    image = pair.north.nodes.datasheet(pair.board.uuid)
+    assert image is not None
+    far = pair.board.state.sequence + SEQUENCE_WINDOW + 1
+    keys = known_node_keys(pair.north, pair.board.uuid, image)
+    signed = sign(pair.north, keys, image, epoch=pair.board.state.epoch, node_sequence=0, sequence=far).image
+    with talk(pair.board, MemoryLink(pair.board, via="can", tapped=False)) as node:
+        require_session(pair.north, node)
+        with pytest.raises(PolicyRefused, match="far ahead"):
+            write(pair.north, node, signed)
+        assert pair.board.state.sequence == 1
+        write(pair.north, node, signed, jump=True)
+    assert pair.board.state.sequence == far
+
+
+# -- M2: who may hand a node back ------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("mode", ["copy", "move"])
+def test_a_station_that_never_had_the_node_lifts_no_tombstone(pair: Pair, west: Station, mode: Mode) -> None:
+    before = node_of(pair.board)
+    pair.take(pair.export("move")[0])
+    with pytest.raises(PolicyRefused, match="alone can move it back"):
+        plan_import(pair.north, forged(west, pair.north, before, mode=mode))
+    with pytest.raises(PolicyRefused, match="was moved"):
+        session(pair.north, pair.board)
+
+
+def test_a_node_that_comes_back_is_rotated_and_the_plan_says_so(pair: Pair) -> None:
+    pair.take(pair.export("move")[0])
+    session(pair.south, pair.board)
+    (plan,) = plan_exports(pair.south, ExportOrder(("north",), None, "move"))
+    back = pair.folder / "back.jwe"
+    export_keys(pair.south, plan, back)
+    shown = plan_import(pair.north, back.read_bytes())
+    assert isinstance(shown, ImportPlan)
+    assert shown.nodes[0].notes == ("it comes back: its key is rotated at the first contact",)
+    import_keys(pair.north, shown)
+    assert pair.north.keys.rotation_due(pair.board.uuid) is not None
+    assert session(pair.north, pair.board) == 3
+    assert pair.north.keys.rotation_due(pair.board.uuid) is None
+
+
+# -- M3: what a move gives away, and what its receipt deletes --------------------------------------------------------
+
+
+def cut_rotation(station: Station, board: Board) -> None:
+    """A rotation whose Confirm reached the node while the station died before its reply."""
+    with talk(board) as node:
+        who, real, sends = identify(station, node), node.send, list[str]()
+
+        def cut(command: Command, why: str) -> bytes:
+            sends.append(why)
+            reply = real(command, why)
+            if len(sends) == 2:
+                raise KeyboardInterrupt
+            return reply
+
+        node.send = cut  # type: ignore[assignment, method-assign]
+        with pytest.raises(KeyboardInterrupt):
+            agree(station, node, who, rotate=True)
+
+
+def test_a_move_waits_until_a_cut_rotation_is_settled(pair: Pair) -> None:
+    cut_rotation(pair.north, pair.board)
+    assert [state for state, *_ in held(pair.north, pair.board)] == ["pending", "active"]
+    with pytest.raises(PolicyRefused, match="not settled"):
+        pair.export("move", nodes=(pair.board.uuid,))
+    session(pair.north, pair.board)
+    path, _ = pair.export("move")
+    close(pair.north, pair.take(path).receipt)
+    assert session(pair.south, pair.board) == 3
+
+
+def test_a_receipt_deletes_the_key_that_was_in_its_bundle_and_no_other(pair: Pair) -> None:
+    path, _exported = pair.export("move")
+    pair.north.keys.add_pending(pair.board.uuid, key=bytes(16), key_id=b"newer...", epoch=9)
+    close(pair.north, pair.take(path).receipt)
+    assert [record.key_id for record in pair.north.keys.of(pair.board.uuid)] == [b"newer...".hex()]
+
+
+def test_a_receipt_that_comes_after_the_nodes_return_deletes_nothing(pair: Pair) -> None:
+    """Model, LATE."""
+    path, _ = pair.export("move")
+    receipt = pair.take(path).receipt
+    session(pair.south, pair.board)
+    (plan,) = plan_exports(pair.south, ExportOrder(("north",), None, "move"))
+    export_keys(pair.south, plan, pair.folder / "back.jwe")
+    pair.take(pair.folder / "back.jwe", pair.north)
+    before = held(pair.north, pair.board)
+    close(pair.north, receipt)
+    assert held(pair.north, pair.board) == before
+    assert session(pair.north, pair.board) == 3
+
+
+def test_an_undone_move_does_not_take_an_older_pending_key_for_a_rotation(pair: Pair) -> None:
+    """Model, OLD_PENDING: only a key that was agreed on since ends a due rotation."""
+    cut_rotation(pair.north, pair.board)
+    pair.north.keys.demand_rotation(pair.board.uuid, "others may have this key")
+    with talk(pair.board, MemoryLink(pair.board, via="can", tapped=False)) as node:
+        assert require_session(pair.north, node).record.epoch == 3  # 2 was the one that was cut
+    assert pair.north.keys.rotation_due(pair.board.uuid) is None
+
+
+# -- M4: trust that is removed ---------------------------------------------------------------------------------------
+
+
+def test_trust_that_is_removed_ends_with_all_that_hung_on_it(pair: Pair) -> None:
+    provisioned(pair.north, pair.board)
+    pair.take(pair.export("copy")[0])
+    session(pair.south, pair.board)
+    revoke(pair.north, pair.board.uuid, "says north")
+    statement = pair.north.policy.revocations()[0].statement
+    taken(pair.south, forged(pair.north, pair.south, revoked=(statement,)))
+    assert pair.south.policy.revocation(pair.board.uuid) is not None
+    assert pair.north.ca in pair.south.policy.trusted_cas(pair.board.uuid)
+    (north,) = pair.south.policy.trusted("station")
+    shown = plan_removal(pair.south, north)
+    assert (shown.shared, shown.cas, shown.under) == ((pair.board.uuid,), (pair.north.ca,), 1)
+    assert shown.bans == (pair.board.uuid,)
+    assert remove(pair.south, north) == shown
+    assert pair.north.ca not in pair.south.policy.trusted_cas(pair.board.uuid)
+    assert "trusted no more" in (pair.south.keys.rotation_due(pair.board.uuid) or "")
+    assert pair.south.policy.revocation(pair.board.uuid) is None
+    trust(pair.south, pair.north)
+    assert pair.north.ca not in pair.south.policy.trusted_cas(pair.board.uuid)  # a person compared a station, not a CA
+
+
+def test_a_ca_that_two_stations_brought_stays_until_both_are_gone(pair: Pair, west: Station) -> None:
+    trust(pair.south, west)
+    pair.take(pair.export("copy")[0])
+    (north,) = (one for one in pair.south.policy.trusted("station") if one.name == "north")
+    assert plan_removal(pair.south, north).cas == (pair.north.ca,)
+    (other,) = (one for one in pair.south.policy.trusted("station") if one.name == "west")
+    assert plan_removal(pair.south, other).cas == ()
+
+
+# -- L1, L3: receipts ------------------------------------------------------------------------------------------------
+
+
+def test_a_header_added_on_the_way_does_not_keep_a_move_from_closing(pair: Pair) -> None:
+    path, _ = pair.export("move")
+    document = json.loads(path.read_bytes())
+    document["unprotected"] = {"added": "on the way"}
+    path.write_bytes(json.dumps(document, indent=1).encode())
+    done = pair.take(path)
+    assert close(pair.north, done.receipt).row.state == "closed"
+    assert held(pair.north, pair.board) == []
+    document["unprotected"] = {"added": "twice"}
+    path.write_bytes(json.dumps(document).encode())
+    assert (pair.take(path).fresh, pair.take(path).receipt) == (False, done.receipt)
+
+
+def test_one_receiver_does_not_close_a_copy_for_two(pair: Pair, west: Station) -> None:
+    path, exported = pair.export("copy", to=("south", "west"))
+    first = pair.take(path)
+    key, stations = pair.south.vault.identity(), {pair.south.fingerprint: pair.south.point}
+    assert close(pair.north, first.receipt).row.state == "open"
+    said = open_receipt(first.receipt, stations.get)
+    again = seal_receipt(replace(said, created=said.created + timedelta(hours=1)), key)
+    assert again != first.receipt
+    done = close(pair.north, again)
+    assert (done.row.state, done.fresh) == ("open", False)
+    assert close(pair.north, pair.take(path, west).receipt).row.state == "closed"
+    assert exported.plan.id == done.row.id
+    assert verify_compact(first.receipt, stations.get, typ=TYPE, max_octets=10_000).kid == pair.south.fingerprint
+
+
+# -- L2: whose word bans a node --------------------------------------------------------------------------------------
+
+
+def test_a_ban_counts_only_from_a_station_with_authority_and_for_the_key_it_names(pair: Pair, west: Station) -> None:
+    own = Board(uuid=bytes.fromhex("ee" * 10))
+    key_up(pair.south, own)
+    trust(pair.south, west)
+    trust(west, pair.south)
+    now, key = datetime.now(UTC), west.vault.identity()
+    pinned = pair.south.pins.pinned(own.uuid)
+    said = (
+        seal_revocation(key, uuid=own.uuid, node=pinned, why="no authority", created=now),
+        seal_revocation(key, uuid=bytes(10), node="ab" * 32, why="unknown node", created=now),
+    )
+    plan = plan_import(pair.south, forged(west, pair.south, revoked=tuple(one.statement for one in said)))
+    assert isinstance(plan, ImportPlan)
+    assert plan.denied == ()
+    assert ["no authority" in why or "nothing is known" in why for _, why in plan.passed_over] == [True, True]
+    import_keys(pair.south, plan)
+    assert pair.south.policy.revocations() == []
+    pair.take(pair.export("copy")[0])  # north holds this node's key, so its word counts, for this key
+    north = pair.north.vault.identity()
+    other_key = seal_revocation(north, uuid=pair.board.uuid, node="cd" * 32, why="another key", created=now)
+    real = seal_revocation(north, uuid=pair.board.uuid, node=None, why="lost", created=now)
+    plan = plan_import(pair.south, forged(pair.north, pair.south, revoked=(other_key.statement,)))
+    assert isinstance(plan, ImportPlan)
+    assert "has another" in plan.passed_over[0][1]
+    taken(pair.south, forged(pair.north, pair.south, revoked=(real.statement,)))
+    (entry,) = pair.south.policy.revocations()
+    assert entry.fingerprint == pair.south.pins.pinned(pair.board.uuid)
+
+
+def test_a_ban_can_be_lifted_and_the_same_statement_does_not_come_back(pair: Pair) -> None:
+    pair.take(pair.export("copy")[0])
+    now = datetime.now(UTC)
+    said = seal_revocation(pair.north.vault.identity(), uuid=pair.board.uuid, node=None, why="lost", created=now)
+    taken(pair.south, forged(pair.north, pair.south, revoked=(said.statement,)))
+    with pytest.raises(PolicyRefused, match="revoked: lost"):
+        pair.south.policy.require_whitelisted(pair.board.uuid)
+    assert lift(pair.south, pair.board.uuid)
+    assert not lift(pair.south, pair.board.uuid)
+    pair.south.policy.require_whitelisted(pair.board.uuid)
+    plan = plan_import(pair.south, forged(pair.north, pair.south, revoked=(said.statement,)))
+    assert isinstance(plan, ImportPlan)
+    assert plan.passed_over[0][1] == "it was lifted here"
+    assert [entry.outcome for entry in pair.south.audit_log.entries() if entry.act == "revoke"][-1] == "lifted"
+
+
+# -- L13: names ------------------------------------------------------------------------------------------------------
+
+
+def test_names_of_a_bundle_never_stand_for_two_nodes_or_for_digits(pair: Pair) -> None:
+    mine = bytes.fromhex("aa" * 10)
+    pair.south.nodes.put(NodeRecord(mine, name="gripper"))
+    boards = [Board(uuid=bytes([number]) * 10) for number in (1, 2, 3)]
+    for board in boards:
+        key_up(pair.north, board)
+    names = ("gripper", "gripper", "8d4d")
+    nodes = [node_of(board, name=name) for board, name in zip(boards, names, strict=True)]
+    plan = plan_import(pair.south, forged(pair.north, pair.south, *nodes))
+    assert isinstance(plan, ImportPlan)
+    assert [one.name for one in plan.nodes] == ["gripper-0101", "gripper-0202", "8d4d-0303"]
+    assert all("is called" in one.notes[0] for one in plan.nodes)
+    import_keys(pair.south, plan)
+    assert pair.south.nodes.resolve("gripper") == mine
+    assert pair.south.nodes.resolve("gripper-0202") == boards[1].uuid
+
+
+# -- more nodes than a bundle holds ----------------------------------------------------------------------------------
+
+
+def several(pair: Pair, mode: Mode, output: Path) -> list[str]:
+    plans = plan_exports(pair.north, ExportOrder(("south",), None, mode), most=2)
+    return [one.plan.id for one in export_all(pair.north, plans, outputs_of(output, len(plans)))]
+
+
+@pytest.mark.parametrize("mode", ["copy", "move"])
+def test_many_nodes_go_in_several_bundles_with_a_receipt_each(tmp_path: Path, mode: Mode) -> None:
+    pair = Pair.make(tmp_path, 5)
+    output = tmp_path / "all.jwe"
+    ids = several(pair, mode, output)
+    assert [path.name for path in sorted(tmp_path.glob("all.jwe*"))] == ["all.jwe", "all.jwe.2", "all.jwe.3"]
+    assert several(pair, mode, output) == ids
+    for path in outputs_of(output, 3):
+        close(pair.north, pair.take(path).receipt)
+    assert {row.state for row in pair.north.handovers.all()} == {"closed"}
+    expected = 2 if mode == "move" else 1
+    assert [session(pair.south, board) for board in pair.boards] == [expected] * 5
+    pair.close()
+
+
+@pytest.mark.parametrize("cut", [1, 2, 3])
+def test_a_move_in_several_bundles_that_was_cut_is_carried_on(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, cut: int
+) -> None:
+    pair = Pair.make(tmp_path, 5)
+    output, written = tmp_path / "all.jwe", []
+
+    def dying(path: Path, octets: bytes) -> None:
+        written.append(path)
+        if len(written) == cut:
+            raise KeyboardInterrupt
+        path.write_bytes(octets)
+
+    with monkeypatch.context() as patch:
+        patch.setattr("teds_provision.handover.export_keys.write_new", dying)
+        with pytest.raises(KeyboardInterrupt):
+            several(pair, "move", output)
+    assert len(pair.north.policy.tombstones()) == 5  # all of them rest before the first file exists
+    ids = several(pair, "move", output)
+    assert len(set(ids)) == 3
+    assert len(pair.north.handovers.all()) == 3
+    for path in outputs_of(output, 3):
+        close(pair.north, pair.take(path).receipt)
+    assert [session(pair.south, board) for board in pair.boards] == [2] * 5
+    pair.close()
+
+
+def test_a_name_that_is_taken_is_found_before_any_key_rests(tmp_path: Path) -> None:
+    pair = Pair.make(tmp_path, 3)
+    (tmp_path / "all.jwe.2").write_text("somebody's")
+    with pytest.raises(UsageFailure):
+        several(pair, "move", tmp_path / "all.jwe")
+    assert pair.north.policy.tombstones() == []
+    pair.close()
+
+
+def test_each_of_several_bundles_can_be_undone(tmp_path: Path) -> None:
+    pair = Pair.make(tmp_path, 3)
+    first, second = several(pair, "move", tmp_path / "all.jwe")
+    undo(pair.north, find_handover(pair.north, second))
+    assert len(pair.north.policy.tombstones()) == 2
+    assert find_handover(pair.north, first).state == "open"
+    pair.close()
