@@ -65,7 +65,8 @@ def _take_up(station: Station, node: Conversation, held: NodeKey) -> NodeKey:
         station.nodes.remember(uuid, epoch=record.epoch, **({} if told is None else {"sequence": told.sequence}))
         if fresh or station.keys.outdated(record):
             station.keys.promote(uuid, record.key_id)
-            if fresh and record.source == "agreement":
+            # a pending key out of a backup may have been used and shared since (model/README.md, OLD_PENDING)
+            if fresh and record.source == "agreement" and not station.keys.restored(uuid):
                 station.keys.rotated(uuid)
             station.audit("key", uuid, "active", key_id=record.key_id, epoch=record.epoch)
     return NodeKey(record, held.key)

@@ -10,8 +10,9 @@ from teds_provision.errors import NodeRefused, NodeSilent, NotAuthentic, NotWhit
 from teds_provision.protocol.agreement import key_id
 from teds_provision.protocol.messages.frames import Command, Reason, refusal
 from teds_provision.protocol.messages.identity import NodeState
+from teds_provision.station.node_keys import RESTORED
 from teds_provision.station.station import Station
-from teds_provision.steps.agree import Agreed, agree
+from teds_provision.steps.agree import Agreed, agree, open_session
 from teds_provision.steps.identify import identify
 from teds_provision.store import WhitelistEntry
 
@@ -222,3 +223,18 @@ def test_a_lost_store_is_healed_by_a_tap_where_identity_and_ca_were_kept(station
     run(station, board)
     station.keys.remove(board.uuid)
     assert run(station, board).epoch == 2
+
+
+def test_a_pending_key_out_of_a_backup_does_not_end_the_rotation_that_is_due(station: Station, board: Board) -> None:
+    whitelist(station, board)
+    run(station, board)
+    board.flash.die_after = True
+    with pytest.raises(NodeSilent):
+        run(station, board, rotate=True)
+    assert [state for state, _ in held(station, board)] == ["pending", "active"]
+    station.keys.demand_rotation(board.uuid, f"{RESTORED} of last year")
+    with talk(board) as node:
+        opened = open_session(station, node)
+    assert opened is not None
+    assert held(station, board) == [("active", 2)]
+    assert station.keys.rotation_due(board.uuid) is not None
