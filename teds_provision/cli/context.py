@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 
 import click
 
-from teds_provision.errors import TedsProvisionError, UsageFailure, WrongPassphrase
+from teds_provision.errors import PolicyRefused, TedsProvisionError, UsageFailure, WrongPassphrase
 
 if TYPE_CHECKING:
     from rich.console import Console, RenderableType
@@ -110,14 +110,20 @@ class App:
         if not self.quiet:
             print(harmless(f"Warning: {text}"), file=sys.stderr, flush=True)
 
-    def fail_line(self, error: TedsProvisionError) -> None:
-        """Tell an error that does not end the command (``--watch``): one JSON object, or a line on stderr."""
+    def fail_line(self, error: TedsProvisionError, **of: object) -> None:
+        """Tell an error that does not end the command (``--watch``): one JSON object, or a line on stderr.
+
+        ``of`` says whose it is: uuid, time, row of a sheet; what is None is left out.
+        """
         self.live_line()
+        known = {name: value for name, value in of.items() if value is not None}
         if self.json:
             told = {"code": error.code, "message": error.message, "hint": error.hint}
-            print(to_json({"error": told}), flush=True)
+            print(to_json({**known, "error": told}), flush=True)
         else:
-            told_lines = f"Error: {error.message}" + (f"\n  → {error.hint}" if error.hint else "")
+            where = ", ".join(f"row {value}" if name == "row" else str(value) for name, value in known.items())
+            at = f" ({where})" if where else ""
+            told_lines = f"Error{at}: {error.message}" + (f"\n  → {error.hint}" if error.hint else "")
             print(harmless(told_lines), file=sys.stderr, flush=True)
 
     # -- asking ----------------------------------------------------------------------------------------------------
@@ -128,15 +134,23 @@ class App:
         return not self.no_input and sys.stdin.isatty()
 
     def confirm(self, question: str, *, yes: bool) -> None:
-        """Ask before something that cannot be undone; ``yes`` is the command's --yes. Aborts on "no" (exit 130)."""
+        """Ask before something that cannot be undone; ``yes`` is the command's --yes.
+
+        Raises PolicyRefused where the answer is no, or nobody can be asked.
+        """
         if yes:
             return
-        self.live_line()
         if not self.interactive:
-            raise UsageFailure(
-                "This needs a confirmation and nobody can be asked.", hint="Add --yes, or --dry-run to see the plan."
+            raise PolicyRefused(
+                "This needs a person's word and nobody can be asked.", hint="Add --yes, or --dry-run to see the plan."
             )
-        click.confirm(question, abort=True, err=True)
+        if not self.ask(question):
+            raise PolicyRefused("You said no: nothing was changed.")
+
+    def ask(self, question: str) -> bool:
+        """Ask a person, yes or no; nothing that a node or a file brought steers the terminal."""
+        self.live_line()
+        return click.confirm(harmless(question), err=True)
 
     def ask_secret(self, prompt: str, confirm: bool = False) -> str:
         """Get a passphrase or PIN: from --passphrase-fd (one line, read once), else from the terminal."""
@@ -171,6 +185,7 @@ class App:
         from teds_provision.station.station import Station
 
         station = Station.open(self.home, ask=self.ask_secret, tell=self.warn)
+        station.notice = self.note
         self.closing(station.close)
         return station
 

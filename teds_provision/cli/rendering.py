@@ -46,11 +46,14 @@ def print_table(console: Console, table: Table) -> None:
     console.file.writelines(f"{line.rstrip()}\n" for line in captured.get().splitlines())
 
 
-def reporter_for(app: App) -> Reporter:
-    """The reporter that suits this run: silent for --json and --quiet, lines in a pipe, live on a terminal."""
+def reporter_for(app: App, *, several: bool = False) -> Reporter:
+    """The reporter that suits this run: silent for --json and --quiet, lines in a pipe, live on a terminal.
+
+    ``several`` nodes are worked on at once: their lines come between each other.
+    """
     if app.json or app.quiet:
         return Silent()
-    if not sys.stderr.isatty():
+    if several or not sys.stderr.isatty():
         return LineReporter(app)
     live = LiveReporter(app)
     app.live_line = live.close

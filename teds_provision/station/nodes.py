@@ -67,6 +67,10 @@ class Nodes:
         """UUID of the one node of exactly this name, None where none or several have it."""
         return self._store.named(name)
 
+    def all_named(self, name: str) -> list[bytes]:
+        """The UUIDs that have exactly this name, as a node or on the whitelist."""
+        return self._store.all_named(name)
+
     # -- datasheets ------------------------------------------------------------------------------------------------
 
     def datasheet(self, uuid: bytes) -> Image | None:

@@ -98,6 +98,10 @@ class Pins:
         former = self._keys.former(uuid)
         return 0 if former and pinned and former != pinned else self._keys.active_epoch(uuid)
 
+    def is_unsettled(self, uuid: bytes) -> bool:
+        """Whether the link keys that are held may belong to a board that was replaced since."""
+        return self._keys.former(uuid) is not None
+
     def settled(self, uuid: bytes) -> None:
         """A session is open: the key in use belongs to the board that lies there."""
         self._keys.set_former(uuid, None)

@@ -18,8 +18,9 @@ Opening a station reads the store only; the vault opens at the first secret.
 
 from __future__ import annotations
 
+import threading
 from collections.abc import Callable, Iterator
-from contextlib import AbstractContextManager
+from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -33,7 +34,7 @@ from teds_provision.station.nodes import Nodes
 from teds_provision.station.pins import Pins
 from teds_provision.station.policy import Policy
 from teds_provision.station.seals import Seals
-from teds_provision.store import AuditLog, Store, StoreLock
+from teds_provision.store import AuditLog, NodeTurn, Store, StoreLock
 from teds_provision.store.dump import dump
 
 if TYPE_CHECKING:
@@ -52,6 +53,9 @@ class Station:
         self._store = store
         self._ask = ask
         self._vault: Vault | None = None
+        self._turn, self._held = threading.RLock(), 0
+        self.notice: Callable[[str], object] = lambda text: None
+        """Told in one sentence whom this station waits for."""
         self.seals = Seals(store, self._opened, tell)
         self.identity = Identity(store, self._opened, self.seals)
         self.keys = NodeKeys(store, self._opened, self.identity, self.seals, self._reopened)
@@ -163,9 +167,35 @@ class Station:
 
     # -- one command at a time, all or nothing, and who did it -----------------------------------------------------
 
-    def lock(self, command: str, notice: Callable[[str], object] | None = None) -> StoreLock:
-        """One changing command at a time; waits, then says who holds the store."""
-        return StoreLock(self.home, command=command, notice=notice)
+    @contextmanager
+    def lock(self, command: str, notice: Callable[[str], object] | None = None) -> Iterator[None]:
+        """Hold the store: one command, and one thread of it, at a time; waits, then says who holds it.
+
+        May stand inside another one of the same thread.
+        """
+        with self._turn:
+            if self._held:
+                yield
+                return
+            with StoreLock(self.home, command=command, notice=notice or self.notice):
+                self._held += 1
+                try:
+                    yield
+                finally:
+                    self._held -= 1
+
+    @contextmanager
+    def durable(self, command: str) -> Iterator[None]:
+        """One durable step: the store held, and all of the block on the disk or nothing of it.
+
+        Never held while a node is talked to: a slow node would hold up every other command.
+        """
+        with self.lock(command), self.transaction():
+            yield
+
+    def turn(self, uuid: bytes) -> NodeTurn:
+        """Have one node to oneself: two commands of this station do not work on the same node at once."""
+        return NodeTurn(self.home, uuid, notice=self.notice)
 
     def transaction(self) -> AbstractContextManager[None]:
         """All of the block reaches the disk, or nothing of it; may stand inside another one."""

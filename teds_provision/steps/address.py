@@ -6,7 +6,6 @@ from teds_provision.errors import Garbled
 from teds_provision.protocol.messages.frames import Function, security_command
 from teds_provision.station.station import Station
 from teds_provision.steps.agree import open_session
-from teds_provision.steps.identify import identify
 from teds_provision.talk.conversation import Conversation, SessionLost
 
 
@@ -16,7 +15,6 @@ def set_address(station: Station, node: Conversation, address: int) -> bool:
     Its reply still leaves from the old address; the node is met at the new one from then on. Raises NodeRefused
     (3: neither tapped nor in a session), OtherKey, LinkFailure.
     """
-    identify(station, node)
     if node.identity.can_address == address:
         return False
     open_session(station, node)
@@ -28,8 +26,9 @@ def set_address(station: Station, node: Conversation, address: int) -> bool:
         node.forget()  # a link is one pair of addresses: this session ended with the old one
     elif node.sealed and _address_of(node) != address:
         raise Garbled("The node took the new CAN address and still shows the old one.")
-    station.nodes.remember(node.uuid, can_address=address)
-    station.audit("address", node.uuid, "done", address=address)
+    with station.durable("address"):
+        station.nodes.remember(node.uuid, can_address=address)
+        station.audit("address", node.uuid, "done", address=address)
     return True
 
 

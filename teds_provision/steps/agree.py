@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
-from teds_provision.errors import NodeRefused, NotAuthentic, PolicyRefused
+from teds_provision.errors import Garbled, NodeRefused, NodeSilent, NotAuthentic, PolicyRefused
 from teds_provision.protocol.agreement import StationAgreement
 from teds_provision.protocol.messages.frames import Reason
 from teds_provision.protocol.messages.identity import NodeState
@@ -13,6 +13,8 @@ from teds_provision.steps.identify import Identified
 from teds_provision.steps.read import read_identity
 from teds_provision.store import WhitelistEntry
 from teds_provision.talk.conversation import Conversation, SessionLost
+
+_BEGINNINGS = 5
 
 
 @dataclass(frozen=True)
@@ -56,7 +58,11 @@ def _take_up(station: Station, node: Conversation, held: NodeKey) -> NodeKey:
     uuid, record = node.uuid, held.record
     fresh = record.state == "pending"
     told = read_identity(node) if fresh and record.source == "import" else None
-    with station.transaction():
+    known = station.nodes.get(uuid)
+    settled = known is not None and known.epoch == record.epoch and not station.pins.is_unsettled(uuid)
+    if settled and not fresh and not station.keys.outdated(record):
+        return held
+    with station.durable("agree"):
         if told is not None and told.epoch != record.epoch:
             station.audit("key", uuid, "epoch corrected", key_id=record.key_id, said=record.epoch, epoch=told.epoch)
             record = station.keys.correct_epoch(record, told.epoch)
@@ -113,34 +119,80 @@ def unknown_key(uuid: bytes) -> PolicyRefused:
     )
 
 
-def agree(station: Station, node: Conversation, who: Identified, *, rotate: bool = False) -> Agreed:
+def agree(
+    station: Station,
+    node: Conversation,
+    who: Identified,
+    *,
+    rotate: bool = False,
+    newcomer: WhitelistEntry | None = None,
+) -> Agreed:
     """End with a session open under an agreed key: the present one, or a new one.
 
     ``rotate`` demands a new one, by a person's word: inside a session where a key is known, else by tap.
-    Raises NotWhitelisted, OtherKey, PolicyRefused, NodeRefused, NotAuthentic, LinkFailure; whatever is cut, the same
-    call carries on.
+    ``newcomer`` is the whitelist entry that is made together with the first key: a board of another owner refuses, and
+    never comes onto the list. On a link that loses messages an agreement begins anew, five times at most. Raises NotWhitelisted, OtherKey,
+    PolicyRefused, NodeRefused, NotAuthentic, LinkFailure; whatever is cut, the same call carries on.
     """
-    returning = who.state == NodeState.FACTORY and _may_return(station, node.uuid)
-    entry = station.policy.require_whitelisted(node.uuid, returning=returning)
-    held = open_session(station, node, word=rotate) if who.state != NodeState.FACTORY else None
-    rotate = rotate or (held is not None and station.keys.rotation_due(node.uuid) is not None)
+    again = 0
+    while True:
+        try:
+            return _agree(station, node, who, rotate=rotate, newcomer=newcomer, again=again > 0)
+        except (NodeSilent, Garbled):
+            again += 1
+            if again == _BEGINNINGS or not node.contact.link.capabilities.many:
+                raise
+            node.forget()
+
+
+def _agree(
+    station: Station,
+    node: Conversation,
+    who: Identified,
+    *,
+    rotate: bool,
+    newcomer: WhitelistEntry | None,
+    again: bool,
+) -> Agreed:
+    new = who.state == NodeState.FACTORY
+    returning = new and _may_return(station, node.uuid)
+    listed = newcomer is not None and station.pins.entry(node.uuid) is None
+    entry = newcomer if listed else station.policy.require_whitelisted(node.uuid, returning=returning)
+    assert entry is not None
+    # of a run that was just cut short the node may have the new key, whatever it said before
+    held = open_session(station, node, word=rotate) if not new or again else None
+    if held is not None and newcomer is not None:
+        with station.durable("agree"):
+            _enlist(station, newcomer)
+    rotate = (rotate and not again) or (held is not None and station.keys.rotation_due(node.uuid) is not None)
     if held is not None and not rotate:
-        return Agreed(held.record.epoch, held.record.key_id, fresh=False)
-    if held is None and who.state != NodeState.FACTORY and station.keys.held(node.uuid) and not rotate:
+        return Agreed(held.record.epoch, held.record.key_id, fresh=again)
+    if held is None and not new and station.keys.held(node.uuid) and not (rotate or again):
         raise unknown_key(node.uuid)
     pinned = _pin_for(entry, node, who)
-    ca = station.ca if who.state == NodeState.FACTORY else station.keys.ca_of(node.uuid)
+    ca = station.ca if new else station.keys.ca_of(node.uuid)
     try:
         return _agree_anew(station, node, pinned, ca, returning=returning)
     except NodeRefused as refusal:
         # Identify may have been answered while the node was still storing the key of a run that was cut off
-        late = refusal.reason == Reason.NOT_PERMITTED and who.state == NodeState.FACTORY and not rotate
+        late = refusal.reason == Reason.NOT_PERMITTED and new and not rotate
         held = open_session(station, node) if late else None
         if held is None:
             raise
         return Agreed(held.record.epoch, held.record.key_id, fresh=True)
     except SessionLost as lost:
         raise lost.cause from lost
+
+
+def _enlist(station: Station, entry: WhitelistEntry) -> None:
+    """Put a node onto the whitelist, unless another process did so meanwhile."""
+    present = station.pins.entry(entry.uuid)
+    if present == entry or (present is not None and entry.fingerprint is None):
+        return
+    station.pins.put(entry)
+    if present is None:
+        told = {"fingerprint": entry.fingerprint, "assurance": entry.assurance}
+        station.audit("whitelist", entry.uuid, "added", **told)
 
 
 def _may_return(station: Station, uuid: bytes) -> bool:
@@ -181,29 +233,29 @@ def _agree_anew(
     key_id = agreed.key_id.hex()
     if returning and not agreed.unsigned:
         station.policy.require_not_given_away(uuid)
-    with station.transaction():
+    with station.durable("agree"):
         if returning:
             station.policy.take_back([uuid])
             station.audit("handover", uuid, "came back after a reset")
         station.keys.add_pending(uuid, key=agreed.key, key_id=agreed.key_id, epoch=agreed.epoch)
         station.keys.set_ca_of(uuid, ca)
-        if entry != station.pins.entry(uuid):
-            station.pins.put(entry)
+        _enlist(station, entry)
         station.audit("agree", uuid, "pending", key_id=key_id, epoch=agreed.epoch, via=node.contact.link.via)
     node.send(agreed.confirm, "the key confirmation")
     node.forget()
     node.open(agreed.key)
-    with station.transaction():
+    identity = read_identity(node)
+    with station.durable("agree"):
         station.keys.promote(uuid, key_id)
-        station.nodes.remember(uuid, epoch=agreed.epoch, point=agreed.node)
+        station.nodes.remember(
+            uuid,
+            epoch=agreed.epoch,
+            point=agreed.node,
+            sequence=identity.sequence,
+            state=int(identity.state),
+            can_address=identity.can_address,
+        )
         station.keys.rotated(uuid)
         station.pins.settled(uuid)
-    identity = read_identity(node)
-    station.nodes.remember(
-        uuid,
-        sequence=identity.sequence,
-        state=int(identity.state),
-        can_address=identity.can_address,
-    )
-    station.audit("agree", uuid, "done", key_id=key_id, epoch=agreed.epoch)
+        station.audit("agree", uuid, "done", key_id=key_id, epoch=agreed.epoch)
     return Agreed(agreed.epoch, key_id, fresh=True)

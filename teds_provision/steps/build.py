@@ -1,35 +1,32 @@
-"""Step 4: the TEDS of a node from its profile and calibration, and the Security TEDS still unsigned."""
+"""Step 4: the TEDS of a node from its profile and calibration, and the Security TEDS still unsigned.
+
+What is written to a node that has a datasheet is what the user just asked for. Anything else (a trial build, a run that
+was cut, a newer profile, another datasheet than this station remembers) is shown as the changes in physical units and
+asked about; the store never silently wins over the node.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import TYPE_CHECKING
 
-from teds_provision.errors import BadData, NotFound, UsageFailure
+from teds_provision.errors import BadData, NotFound, PolicyRefused
 from teds_provision.station.station import Station
+from teds_provision.steps.order import BuildOrder, Prepared, compose, guard, merged, own_name, prepare
+from teds_provision.steps.read import Survey
 from teds_provision.steps.sign import known_image, known_node_keys, unsigned_security
+from teds_provision.steps.verify import Known, Verified, verify_image
 from teds_provision.store import Draft
+from teds_provision.teds.codec import security
+from teds_provision.teds.codec.codes import AccessCode
+from teds_provision.teds.diff.datasheets import Change, diff_blocks
 from teds_provision.teds.image import SECURITY, BlockId, Image
 
 if TYPE_CHECKING:
     from teds_provision.teds.calibration import Calibration
-    from teds_provision.teds.profile import Profile
 
-
-@dataclass(frozen=True)
-class BuildOrder:
-    """What the user asks for: profile (None: the one that the node had), calibration file, name, and overrides.
-
-    ``accept_calibration`` is the reason given for a calibration that the guard would refuse.
-    """
-
-    profile: str | None = None
-    calibration: Path | None = None
-    name: str | None = None
-    drop_calibration: bool = False
-    accept_calibration: str | None = None
+__all__ = ["BuildOrder", "Built", "NotNamed", "Proposal", "build", "propose"]
 
 
 @dataclass(frozen=True)
@@ -42,93 +39,194 @@ class Built:
     calibrations: Mapping[int, Calibration] = field(default_factory=dict)
 
 
+class NotNamed(PolicyRefused):
+    """A node's datasheet would change in what this command did not name, and nobody said yes; ``changes`` says what."""
+
+    code = "not-named"
+
+    def __init__(self, message: str, changes: tuple[Change, ...], *, hint: str = "") -> None:
+        super().__init__(message, hint=hint)
+        self.changes = changes
+
+
+Confirm = Callable[[bytes, tuple[Change, ...]], None]
+"""Asked before a datasheet changes in what was not named: UUID and changes; raises where the answer is no."""
+
+
+def nobody(uuid: bytes, changes: tuple[Change, ...]) -> None:
+    """The answer where nobody can be asked: no. Raises NotNamed with the changes."""
+    shown = " ".join(change.text for change in changes[:3])
+    more = f" And {len(changes) - 3} more." if len(changes) > 3 else ""
+    raise NotNamed(
+        f"Node {uuid.hex()} has another datasheet, and this command does not name what would change: {shown}{more}",
+        changes,
+        hint="Name it (--profile, --name, --calibration), or drop what lies ready: teds-provision draft drop UUID.",
+    )
+
+
 def build(
     station: Station,
     uuid: bytes,
     order: BuildOrder,
     *,
     has: Image | None = None,
-    keep: Mapping[BlockId, bytes] | None = None,
     edition: int = 2007,
     keep_draft: bool = True,
 ) -> Built:
-    """Build a node's datasheet.
+    """Build a node's datasheet as a draft: a trial, which only ``sign``, ``write`` or a "yes" bring onto the node.
 
-    ``has`` is what the node has now (else what it was last read to have): where the order brings no calibration, that
-    of an earlier run that never came to write is taken, else the node's is kept. ``keep`` are read-only TEDS of the
-    node, to be signed as they are. ``keep_draft`` False changes nothing in the store (dry run).
+    Where the order brings no calibration, that of an earlier run that never came to write is taken, else the one that
+    the node was last read to have (``has``: another one's). ``keep_draft`` False changes nothing (dry run).
 
     Raises NotFound (profile, file), BadData (profile or calibration with errors), PolicyRefused (a calibration that
     the guard refuses).
     """
+    prepared = prepare(station, order, uuid)
     has = has or known_image(station, uuid)
-    plan = _composed(station, uuid, order, _pending(station, uuid, has) or has, edition)
-    profile, calibrations, warnings = plan.profile, plan.calibrations, plan.warnings
-    image = Image(uuid, {**(keep or {}), **plan.blocks})
-    warnings += guard(
-        station,
-        image,
-        has,
-        order.accept_calibration,
-        calibrations=calibrations,
-        profile=profile,
-        record=keep_draft,
+    plan = compose(station, uuid, prepared, pending_image(station, uuid, has) or has, edition=edition)
+    image = Image(uuid, dict(plan.blocks))
+    warnings = plan.warnings + guard(
+        station, image, has, order.accept_calibration, plan.calibrations, plan.profile, record=keep_draft
     )
     try:
         image = image.with_block(SECURITY, unsigned_security(station, known_node_keys(station, uuid, has), image))
     except NotFound:
         warnings += ("The node's key is not known yet: the Security TEDS is added when it was identified.",)
+    built = Built(image, plan.profile.name, merged(warnings), plan.calibrations)
     if not keep_draft:
-        return Built(image, profile.name, warnings, calibrations)
-    with station.transaction():
-        station.nodes.remember(uuid, profile=plan.wanted, name=plan.name)
+        return built
+    with station.durable("build"):
+        if has is None or not has.unsigned_blocks():  # of a node with a datasheet the store keeps what is on it
+            station.nodes.remember(uuid, profile=plan.wanted, name=plan.name)
         station.nodes.keep_draft(Draft(uuid, image, "built", plan.wanted))
-        station.audit("build", uuid, "done", profile=profile.name, teds=image.digest())
-    return Built(image, profile.name, warnings, calibrations)
+        station.audit("build", uuid, "done", profile=built.profile, teds=image.digest())
+    return built
 
 
 @dataclass(frozen=True)
-class _Composed:
-    """The TEDS that profile, calibration and name give; ``wanted`` is the profile as it was asked for."""
+class Proposal:
+    """What a node is to have: TEDS without the Security TEDS, and whether all of it was asked for.
 
-    profile: Profile
-    wanted: str
-    name: str | None
-    calibrations: dict[int, Calibration]
-    blocks: Mapping[BlockId, bytes]
-    warnings: tuple[str, ...]
-
-
-def _composed(station: Station, uuid: bytes, order: BuildOrder, has: Image | None, edition: int) -> _Composed:
-    from teds_provision.teds.profile import default_folders, load_profile, passed_over
-
-    record = station.nodes.get(uuid)
-    wanted = order.profile or (record.profile if record else None)
-    if wanted is None:
-        raise UsageFailure(f"No profile is known for node {uuid.hex()}.", hint="Add --profile; see: profile list")
-    folders = default_folders(station.home)
-    profile = load_profile(wanted, folders)
-    calibrations, warnings = _calibrations(order, profile, has)
-    warnings = passed_over(wanted, folders) + warnings
-    name = order.name or (record.name if record else None)
-    try:
-        made = profile.build(uuid, calibration=calibrations, name=name, edition=edition)  # type: ignore[arg-type]
-    except UnicodeEncodeError as error:  # an argument in another encoding than the terminal's
-        raise BadData("The name of the node is not valid text.", hint="Give it in the terminal's encoding.") from error
-    return _Composed(profile, wanted, name, calibrations, made.blocks, warnings + made.warnings)
-
-
-def check_order(station: Station, uuid: bytes | None, order: BuildOrder) -> None:
-    """Try what an order names, before a node is waited for or changed; a UUID of None is any node's.
-
-    Raises UsageFailure (no profile known), NotFound, BadData, as :func:`build` would; changes nothing.
+    ``changes`` are against what it has now; ``profile`` and ``name`` what is remembered once it is written, None where
+    nothing is to be remembered anew.
     """
-    if uuid is not None or order.profile is not None:
-        _composed(station, uuid or bytes(10), order, None, 2007)
+
+    image: Image
+    changes: tuple[Change, ...]
+    named: bool
+    warnings: tuple[str, ...] = ()
+    profile: str | None = None
+    name: str | None = None
+    calibrations: Mapping[int, Calibration] = field(default_factory=dict)
+
+    def require_a_yes(self, confirm: Confirm) -> None:
+        """Ask where something changes that was not named."""
+        if self.changes and not self.named:
+            confirm(self.image.uuid, self.changes)
 
 
-def _pending(station: Station, uuid: bytes, has: Image | None) -> Image | None:
-    """What an earlier run built or signed and never wrote: it says which calibration is meant, not the node."""
+def propose(station: Station, prepared: Prepared, present: Survey, *, record: bool = True) -> Proposal:
+    """Say what a node that was just read is to have. ``record`` False: for a dry run, without a trace in the log.
+
+    Raises UsageFailure (no profile known), NotFound, BadData, PolicyRefused (a calibration that the guard refuses).
+    """
+    has, order = present.image, prepared.order
+    keep = {block: has.blocks[block] for block in present.read_only}
+    now = has.unsigned_blocks()
+    own = {block: octets for block, octets in now.items() if block not in keep}
+    if not own:
+        proposal = _composed(station, prepared, present, keep, named=True)
+    elif not _intact(station, present):
+        proposal = _composed(station, prepared, present, keep, named=order.profile is not None)
+    elif order.names_nothing:
+        proposal = _as_it_is(station, present, keep)
+    elif order.profile is not None:
+        proposal = _composed(station, prepared, present, keep, named=True, resume=False)
+    else:
+        proposal = _only_what_is_named(station, prepared, present, keep)
+    profile = prepared.profile if proposal.calibrations else None
+    warnings = guard(
+        station,
+        proposal.image,
+        has,
+        order.accept_calibration,
+        proposal.calibrations or None,
+        profile,
+        record=record,
+    )
+    changes = tuple(diff_blocks(now, proposal.image.unsigned_blocks()))
+    return Proposal(
+        proposal.image,
+        changes,
+        proposal.named,
+        merged(proposal.warnings + warnings),
+        proposal.profile,
+        proposal.name,
+        proposal.calibrations,
+    )
+
+
+def _intact(station: Station, present: Survey) -> bool:
+    """Whether the node has a datasheet that this station would call authentic: what it says may be kept."""
+    checks = verify_image(station, present.image, known=Known(present.identity))
+    return Verified(present.image.uuid, tuple(checks)).verdict == "authentic"
+
+
+def _composed(
+    station: Station,
+    prepared: Prepared,
+    present: Survey,
+    keep: Mapping[BlockId, bytes],
+    *,
+    named: bool,
+    resume: bool = True,
+) -> Proposal:
+    """Everything by profile; ``resume``: with the calibration of a run that never came to write."""
+    uuid, has = present.image.uuid, present.image
+    pending = pending_image(station, uuid, has) if resume else None
+    record = station.nodes.get(uuid)
+    name = own_name(station, pending or has, record.profile if record is not None else None)
+    plan = compose(station, uuid, prepared, pending or has, name=name)
+    image = Image(uuid, {**keep, **plan.blocks})
+    return Proposal(image, (), named, plan.warnings, plan.wanted, plan.name, plan.calibrations)
+
+
+def _as_it_is(station: Station, present: Survey, keep: Mapping[BlockId, bytes]) -> Proposal:
+    """What the node has, unless something else was built or signed for it and never written."""
+    uuid, has = present.image.uuid, present.image
+    pending = pending_image(station, uuid, has)
+    if pending is None or pending.unsigned_blocks() == has.unsigned_blocks():
+        return Proposal(Image(uuid, has.unsigned_blocks()), (), named=True)
+    draft = station.nodes.draft(uuid)
+    image = Image(uuid, {**keep, **pending.unsigned_blocks()})
+    return Proposal(image, (), named=False, profile=draft.profile if draft is not None else None)
+
+
+def _only_what_is_named(
+    station: Station, prepared: Prepared, present: Survey, keep: Mapping[BlockId, bytes]
+) -> Proposal:
+    """What the node has, with those TEDS exchanged that differ by the named values alone."""
+    uuid, has = present.image.uuid, present.image
+    record = station.nodes.get(uuid)
+    name = own_name(station, has, record.profile if record is not None else None)
+    asked = compose(station, uuid, prepared, has, name=name)
+    unasked = compose(station, uuid, Prepared(BuildOrder(), asked.profile), has, name=name)
+    blocks = dict(has.unsigned_blocks())
+    for block in {*asked.blocks, *unasked.blocks} - set(keep):
+        wanted = asked.blocks.get(block)
+        if wanted == unasked.blocks.get(block):
+            continue
+        if wanted is None:
+            blocks.pop(block, None)
+        else:
+            blocks[block] = wanted
+    if prepared.order.name is not None:  # also where the profile says the same and the node does not
+        blocks[0, AccessCode.NAME] = asked.blocks[0, AccessCode.NAME]
+    return Proposal(Image(uuid, blocks), (), True, asked.warnings, asked.wanted, asked.name, asked.calibrations)
+
+
+def pending_image(station: Station, uuid: bytes, has: Image | None) -> Image | None:
+    """What an earlier run built or signed and never wrote: it says which calibration was meant, not the node."""
     draft = station.nodes.draft(uuid)
     if draft is None:
         return None
@@ -139,58 +237,8 @@ def _pending(station: Station, uuid: bytes, has: Image | None) -> Image | None:
 
 
 def _sequence(image: Image | None) -> int:
-    from teds_provision.teds.codec import security
-
     octets = image.security if image is not None else None
     try:
         return security.decode(octets).sequence if octets is not None else -1
     except BadData:
         return -1
-
-
-def _calibrations(
-    order: BuildOrder, profile: Profile, has: Image | None
-) -> tuple[dict[int, Calibration], tuple[str, ...]]:
-    from teds_provision.teds.calibration import load_calibrations
-    from teds_provision.teds.sheet import Sheet
-
-    if order.calibration is not None:
-        if not order.calibration.is_file():
-            raise NotFound(f"There is no calibration file {order.calibration}.")
-        return load_calibrations(order.calibration, profile), ()
-    if order.drop_calibration or has is None:
-        return {}, ()
-    kept = dict(Sheet.of(has).calibrations)
-    numbers = ", ".join(map(str, kept))
-    return kept, (f"The calibration that was given before is kept (channel {numbers}).",) if kept else ()
-
-
-def guard(
-    station: Station,
-    image: Image,
-    has: Image | None,
-    accepted: str | None,
-    *,
-    calibrations: Mapping[int, Calibration] | None = None,
-    profile: Profile | None = None,
-    record: bool = True,
-) -> tuple[str, ...]:
-    """Refuse a calibration that would hurt (exit 6), unless someone said why it is right; returns warnings.
-
-    That reason goes into the audit log, unless ``record`` is False (dry run).
-    """
-    from teds_provision.errors import PolicyRefused
-    from teds_provision.teds.guard.guard import check_calibration
-
-    old = has.unsigned_blocks() if has is not None else None
-    findings = check_calibration(image.unsigned_blocks(), old, profile, calibrations=calibrations)
-    errors = [f"channel {finding.channel}: {finding.message}" for finding in findings if finding.severity == "error"]
-    if errors and accepted is None:
-        more = f" (and {len(errors) - 1} more)" if len(errors) > 1 else ""
-        raise PolicyRefused(
-            f"The calibration is refused: {errors[0]}{more}.",
-            hint='Mend it; or, if it is right, say why: --accept-calibration "why".',
-        )
-    if errors and record:
-        station.audit("accept-calibration", image.uuid, "accepted", why=accepted, findings=errors)
-    return tuple(f"channel {finding.channel}: {finding.message}" for finding in findings)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass, replace
 
@@ -52,37 +53,41 @@ def prove(node: Conversation, point: bytes) -> None:
         )
 
 
-def identify(station: Station, node: Conversation) -> Identified:
+def identify(
+    station: Station, node: Conversation, *, expect: Callable[[Identified], object] = lambda who: None
+) -> Identified:
     """Read UUID and key, demand the proof, and hold both against what this station knows.
 
     Raises OtherKey (a known UUID with another key), NotAuthentic, BadData, LinkFailure. A tap pins the key that it
     brought; over a bus, where anyone can call itself by any UUID, only a whitelisted key is kept. State, epoch and
-    address of a plain Identify are hints: they change nothing in the store, a session does.
+    address of a plain Identify are hints: they change nothing in the store, a session does. ``expect`` is asked before
+    anything is recorded, and raises where another node was meant.
     """
     who = examine(station, node)
-    pinned = who.whitelisted is not None and who.whitelisted.fingerprint is not None
-    station.nodes.remember(
-        node.uuid,
-        last_seen=utc_now(),
-        **({"point": who.point} if node.tapped or pinned else {}),
-    )
-    if node.tapped and who.whitelisted is not None and not pinned:
-        with suppress(WrongPassphrase, NoKeyring):  # nobody gives the passphrase: the first agreement will pin it
-            who = replace(who, whitelisted=_pin(station, who.whitelisted, who.fingerprint))
-    known = known_key(station, node.uuid)
-    if known != who.point:
-        station.nodes.keep_datasheet(Image(node.uuid, {SECURITY: who.security_teds}))
+    expect(who)
+    entry = who.whitelisted
+    pinned = entry is not None and entry.fingerprint is not None
+    point = {"point": who.point} if node.tapped or pinned else {}
+    pins_now = node.tapped and entry is not None and not pinned and _opened(station)
+    with station.durable("identify"):
+        station.nodes.remember(node.uuid, last_seen=utc_now(), **point)
+        if pins_now and entry is not None:
+            # an entry that was made without a fingerprint is pinned by its first tap (profile, section 2)
+            entry = replace(entry, fingerprint=who.fingerprint, assurance="tap")
+            who = replace(who, whitelisted=entry)
+            station.pins.put(entry)
+            station.audit("whitelist", node.uuid, "pinned", fingerprint=who.fingerprint, assurance="tap")
+        if known_key(station, node.uuid) != who.point:
+            station.nodes.keep_datasheet(Image(node.uuid, {SECURITY: who.security_teds}))
     return who
 
 
-def _pin(station: Station, entry: WhitelistEntry, key: str) -> WhitelistEntry:
-    """Give an entry that was made without a fingerprint the key that was just tapped and proven (section 2)."""
-    pinned = replace(entry, fingerprint=key, assurance="tap")
-    station.unlock()  # its seal: nobody is asked while the store is locked
-    with station.transaction():
-        station.pins.put(pinned)
-        station.audit("whitelist", entry.uuid, "pinned", fingerprint=key, assurance="tap")
-    return pinned
+def _opened(station: Station) -> bool:
+    """Whether the vault is open, which seals a pin; where nobody gives the passphrase, the first agreement will pin."""
+    with suppress(WrongPassphrase, NoKeyring):
+        station.unlock()
+        return True
+    return False
 
 
 def examine(station: Station, node: Conversation) -> Identified:

@@ -7,15 +7,17 @@ finds nothing to do.
 from __future__ import annotations
 
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass
 
-from teds_provision.errors import PolicyRefused
+from teds_provision.errors import PolicyRefused, StoreFailure, TedsProvisionError
 from teds_provision.protocol.datasheet import NodeKeys
 from teds_provision.protocol.messages.identity import NodeState
 from teds_provision.station.station import Station
 from teds_provision.steps.agree import Agreed, agree
-from teds_provision.steps.build import BuildOrder, Built, build, check_order
+from teds_provision.steps.build import BuildOrder, Confirm, Proposal, nobody, propose
 from teds_provision.steps.identify import Identified, identify
+from teds_provision.steps.order import Prepared, named_for, no_profile, prepare
 from teds_provision.steps.read import Survey, survey
 from teds_provision.steps.sign import Signed, sign
 from teds_provision.steps.verify import Verified
@@ -25,10 +27,13 @@ from teds_provision.store import Draft, WhitelistEntry
 from teds_provision.store.records import Assurance
 from teds_provision.talk.conversation import Conversation
 from teds_provision.talk.progress import DONE, NOTHING, Reporter, StepResult, Steps
+from teds_provision.teds.calibration.describe import sentence
 from teds_provision.teds.image import SECURITY, Image
 
+Order = BuildOrder | Prepared | Callable[["Identified"], Prepared]
+"""What a node gets: as it was asked for, read already, or by who it is (which raises where it gets nothing)."""
 Accept = Callable[[Identified], None]
-"""Asked before an unknown node is whitelisted; raises (or aborts) where the answer is no."""
+"""Asked before an unknown node is whitelisted; raises where the answer is no."""
 
 
 @dataclass(frozen=True)
@@ -43,88 +48,138 @@ class Provisioned:
 
 
 def provision(
-    station: Station, node: Conversation, order: BuildOrder, *, accept: Accept, reporter: Reporter
+    station: Station,
+    node: Conversation,
+    order: Order,
+    *,
+    accept: Accept,
+    reporter: Reporter,
+    confirm: Confirm = nobody,
 ) -> Provisioned:
-    """Bring one node from wherever it stands to a verified datasheet; raises at the first step that fails."""
-    return _Run(station, node, order, accept, reporter).run()
+    """Bring one node from wherever it stands to a verified datasheet; raises at the first step that fails.
+
+    ``accept`` is asked before an unknown node is whitelisted, ``confirm`` before a datasheet changes in what the order
+    does not name. A failure stands in the audit log with the step that it happened in.
+    """
+    run = _Run(station, node, order, accept, confirm, reporter)
+    try:
+        with station.turn(node.uuid):
+            return run.run()
+    except TedsProvisionError as error:
+        with suppress(StoreFailure):  # a full disk must not hide what happened
+            station.audit("provision", node.uuid, error.code, step=run.steps.current, why=error.message)
+        raise
 
 
 class _Run:
     def __init__(
-        self, station: Station, node: Conversation, order: BuildOrder, accept: Accept, reporter: Reporter
+        self,
+        station: Station,
+        node: Conversation,
+        order: Order,
+        accept: Accept,
+        confirm: Confirm,
+        reporter: Reporter,
     ) -> None:
         self.station, self.node, self.order = station, node, order
-        self.accept, self.reporter = accept, reporter
+        self.accept, self.confirm, self.reporter = accept, confirm, reporter
         self.steps = Steps(reporter)
 
     def run(self) -> Provisioned:
         who = self._identify()
-        check_order(self.station, who.uuid, self.order)
-        self._whitelist(who)
-        self._agree(who)
-        present = survey(self.node)
-        earlier = _signed_draft(self.station.nodes.draft(who.uuid))
-        built = self._build(present)
-        signed = self._sign(who, built, present, earlier)
-        written = self._write(signed, present)
+        prepared = self._prepared(who)
+        entry = self._whitelist(who)
+        self._agree(who, entry)
+        present = survey(self.node, initial=who.security_teds)
+        proposal = self._build(prepared, present)
+        signed = self._sign(who, proposal, present)
+        written = self._write(signed, proposal, present)
         verified = self._verify(who, written)
-        return Provisioned(who, tuple(self.steps.done), written.on_node, verified, built.warnings)
+        return Provisioned(who, tuple(self.steps.done), written.on_node, verified, proposal.warnings)
 
     def _identify(self) -> Identified:
         with self.steps.step("identify") as step:
-            who = identify(self.station, self.node)
+            who = identify(self.station, self.node, expect=self._choose)
             step.detail = f"{who.uuid.hex()}, key {who.fingerprint[:16]}"
         return who
 
-    def _whitelist(self, who: Identified) -> None:
+    def _choose(self, who: Identified) -> None:
+        if callable(self.order):
+            self.order = self.order(who)
+
+    def _prepared(self, who: Identified) -> Prepared:
+        """The order for this very node; what was read before the tap is not read again."""
+        order = self.order
+        prepared = prepare(self.station, order, who.uuid) if isinstance(order, BuildOrder) else order
+        assert isinstance(prepared, Prepared), "_choose() has asked"
+        if prepared.profile is None and prepared.order.calibration is not None:  # of the type that this node has
+            prepared = prepare(self.station, prepared.order, who.uuid)
+        known = self.station.nodes.get(who.uuid)
+        unknown = prepared.profile is None and (known is None or known.profile is None)
+        if unknown and who.state != NodeState.PROVISIONED:
+            raise no_profile(who.uuid)
+        return named_for(self.station, who.uuid, prepared)
+
+    def _whitelist(self, who: Identified) -> WhitelistEntry | None:
+        """None for a node that is whitelisted; else its entry, which the key agreement makes durable with the key."""
         with self.steps.step("whitelist") as step:
             if who.whitelisted is not None:
                 step.result = NOTHING
-                return
+                return None
+            entry = newcomer(self.station, self.node, who)
             self.accept(who)
-            add_to_whitelist(self.station, self.node, who)
+        return entry
 
-    def _agree(self, who: Identified) -> Agreed:
+    def _agree(self, who: Identified, entry: WhitelistEntry | None) -> Agreed:
         with self.steps.step("agree") as step:
-            agreed = agree(self.station, self.node, who)
+            agreed = agree(self.station, self.node, who, newcomer=entry)
             step.result = DONE if agreed.fresh else NOTHING
             step.detail = f"key epoch {agreed.epoch}, key {agreed.key_id}"
         return agreed
 
-    def _build(self, present: Survey) -> Built:
-        from teds_provision.teds.calibration import sentence
-
+    def _build(self, prepared: Prepared, present: Survey) -> Proposal:
         with self.steps.step("build") as step:
-            keep = {block: present.image.blocks[block] for block in present.read_only}
-            built = build(self.station, self.node.uuid, self.order, has=present.image, keep=keep)
-            if built.image.unsigned_blocks() == present.image.unsigned_blocks():
+            proposal = propose(self.station, prepared, present)
+            proposal.require_a_yes(self.confirm)
+            if not proposal.changes:
                 step.result = NOTHING
-            fits = "".join(f"; {sentence(calibration)}" for calibration in built.calibrations.values())
-            step.detail = f"{built.profile}, {len(built.image.blocks)} TEDS{fits}"
-        return built
+            fits = "".join(f"; {sentence(calibration)}" for calibration in proposal.calibrations.values())
+            kind = f"{proposal.profile}, " if proposal.profile else ""
+            step.detail = f"{kind}{len(proposal.image.blocks)} TEDS{fits}"
+        return proposal
 
-    def _sign(self, who: Identified, built: Built, present: Survey, earlier: bytes | None) -> Signed:
+    def _sign(self, who: Identified, proposal: Proposal, present: Survey) -> Signed:
         with self.steps.step("sign") as step:
             keys = NodeKeys(who.uuid, who.point, who.key_signature)
+            earlier = _signed_draft(self.station.nodes.draft(who.uuid))
             # a node whose TEDS are not what it was signed for takes them only under a newer sequence
-            intact = present.image.unsigned_blocks() == built.image.unsigned_blocks()
+            intact = present.image.unsigned_blocks() == proposal.image.unsigned_blocks()
             signed = sign(
                 self.station,
                 keys,
-                built.image,
+                proposal.image,
                 epoch=present.identity.epoch,
                 node_sequence=present.identity.sequence,
                 on_node=present.image.security if intact and present.identity.state == NodeState.PROVISIONED else None,
                 earlier=() if earlier is None else (earlier,),
+                keep_draft=True,
+                profile=proposal.profile,
             )
-            self.station.nodes.keep_draft(Draft(who.uuid, signed.image, "signed", built.profile))
             step.result = NOTHING if signed.reused else DONE
             step.detail = f"sequence {signed.sequence}"
         return signed
 
-    def _write(self, signed: Signed, present: Survey) -> Written:
+    def _write(self, signed: Signed, proposal: Proposal, present: Survey) -> Written:
         with self.steps.step("write") as step:
-            written = write(self.station, self.node, signed.image, has=present.image, progress=self.reporter.written)
+            facts = {"profile": proposal.profile, "name": proposal.name}
+            written = write(
+                self.station,
+                self.node,
+                signed.image,
+                present=present,
+                progress=self.reporter.written,
+                facts={fact: value for fact, value in facts.items() if value is not None},
+            )
             step.result = DONE if written.octets else NOTHING
             step.detail = f"{written.octets} octets" if written.octets else ""
         return written
@@ -136,28 +191,32 @@ class _Run:
         return verified
 
 
-def add_to_whitelist(station: Station, node: Conversation, who: Identified) -> WhitelistEntry:
-    """Whitelist a node that was just identified, pinned to its key: by tap, or by the bus of a new CAN-only node.
+def newcomer(station: Station, node: Conversation, who: Identified) -> WhitelistEntry:
+    """The whitelist entry of a node that was just identified, pinned to its key by tap, or by the bus of a new node.
 
-    A node that already has a key is not pinned over a bus, where anyone may show any UUID; its first tap does. An
-    entry that another process made meanwhile stays. Raises PolicyRefused (revoked), OtherKey.
+    A node that already has a key is not pinned over a bus, where anyone may show any UUID; its first tap does. Changes
+    nothing. Raises PolicyRefused (revoked), OtherKey.
     """
     new = who.state == NodeState.FACTORY
     assurance: Assurance = "tap" if node.tapped else "bus" if new else "uuid"
-    pinned = who.fingerprint if node.tapped or new else None
-    entry = WhitelistEntry(who.uuid, pinned, assurance=assurance)
-    with station.transaction():
-        revoked = station.policy.revocation(who.uuid)
-        if revoked is not None:
-            raise PolicyRefused(f"Node {who.uuid.hex()} was revoked: {revoked.why}.", hint="It was not whitelisted.")
-        station.pins.check(who.uuid, who.point)
+    revoked = station.policy.revocation(who.uuid)
+    if revoked is not None:
+        raise PolicyRefused(f"Node {who.uuid.hex()} was revoked: {revoked.why}.", hint="It was not whitelisted.")
+    station.pins.check(who.uuid, who.point)
+    return WhitelistEntry(who.uuid, who.fingerprint if node.tapped or new else None, assurance=assurance)
+
+
+def add_to_whitelist(station: Station, node: Conversation, who: Identified) -> WhitelistEntry:
+    """Whitelist a node as :func:`newcomer` says; an entry that another process made meanwhile stays."""
+    entry = newcomer(station, node, who)
+    with station.durable("whitelist"):
         present = station.pins.entry(who.uuid)
         if present is not None:
             return present
         station.pins.put(entry)
-        if pinned is not None:
+        if entry.fingerprint is not None:
             station.nodes.remember(who.uuid, point=who.point)
-        station.audit("whitelist", who.uuid, "added", fingerprint=pinned, assurance=assurance)
+        station.audit("whitelist", who.uuid, "added", fingerprint=entry.fingerprint, assurance=entry.assurance)
     return entry
 
 

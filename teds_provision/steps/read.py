@@ -16,7 +16,7 @@ from teds_provision.protocol.messages.frames import (
     read_teds,
     security_command,
 )
-from teds_provision.protocol.messages.identity import Identity
+from teds_provision.protocol.messages.identity import Identity, NodeState
 from teds_provision.talk.conversation import Conversation
 from teds_provision.teds.image import SECURITY, BlockId, Image
 
@@ -59,12 +59,15 @@ def list_blocks(node: Conversation) -> list[BlockId]:
     return decode_list(node.ask(security_command(Function.LIST), "to list its TEDS"))
 
 
-def read_image(node: Conversation) -> Image:
-    """Read every TEDS of a node."""
+def read_image(node: Conversation, *, initial: bytes | None = None) -> Image:
+    """Read every TEDS of a node; ``initial`` stands for its Security TEDS where that is not worth reading again."""
     blocks: dict[BlockId, bytes] = {}
     total = 0
     until = time.monotonic() + READING_SECONDS
     for block in list_blocks(node):
+        if block == SECURITY and initial is not None:
+            blocks[block] = initial
+            continue
         try:
             blocks[block] = read_block(node, block, until=until)
         except NodeRefused as refusal:
@@ -82,6 +85,8 @@ def read_identity(node: Conversation) -> Identity:
     identity = Identity.decode(node.ask(security_command(Function.IDENTIFY), "to identify itself"))
     if identity.uuid != node.uuid:
         raise Garbled(f"The node called itself {node.uuid.hex()} before and {identity.uuid.hex()} now.")
+    if node.sealed:
+        node.proven = identity
     return identity
 
 
@@ -94,10 +99,14 @@ class Survey:
     identity: Identity
 
 
-def survey(node: Conversation) -> Survey:
-    """Read all TEDS and, for those that the Security TEDS does not account for, whether they are read-only."""
-    identity = read_identity(node)
-    image = read_image(node)
+def survey(node: Conversation, *, initial: bytes | None = None) -> Survey:
+    """Read all TEDS and, for those that the Security TEDS does not account for, whether they are read-only.
+
+    ``initial`` is the Security TEDS that was read before the session: of a node that nobody wrote to since its last
+    reset it is unsigned and says nothing that the session does not, so it is not read twice.
+    """
+    identity = node.proven or read_identity(node)
+    image = read_image(node, initial=None if identity.state == NodeState.PROVISIONED else initial)
     read_only = frozenset(block for block in image.unsigned_blocks() if _is_read_only(node, block))
     return Survey(image, read_only, identity)
 

@@ -34,7 +34,7 @@ def reset_node(station: Station, node: Conversation, who: Identified) -> ResetRe
     if who.state != NodeState.FACTORY:
         require_session(station, node)
     receipt = proof_of_reset(node, who.point)
-    with station.transaction():
+    with station.durable("reset"):
         station.keys.remove(who.uuid)
         station.nodes.remember(who.uuid, state=int(NodeState.FACTORY), verdict=None)
         told = {"challenge": receipt.challenge.hex(), "proof": receipt.proof.hex()}

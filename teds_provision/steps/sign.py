@@ -18,6 +18,7 @@ from teds_provision.protocol.datasheet import (
 )
 from teds_provision.protocol.keys import fingerprint, node_key_message, verify
 from teds_provision.station.station import Station
+from teds_provision.store import Draft
 from teds_provision.teds.codec import security
 from teds_provision.teds.image import SECURITY, Image
 
@@ -90,13 +91,16 @@ def sign(
     on_node: bytes | None = None,
     earlier: Sequence[bytes] = (),
     sequence: int | None = None,
+    keep_draft: bool = False,
+    profile: str | None = None,
 ) -> Signed:
     """Sign ``image`` for key epoch ``epoch``.
 
     ``node_sequence`` is the node's, as read in a session (or last known). ``on_node`` is the node's present Security
     TEDS and ``earlier`` those that were signed but perhaps never written: where one says exactly the same by the same
-    signer, it is given back. ``sequence`` forces one (steps over more than 65536). The new sequence is durable in the
-    store before the signature is made.
+    signer, it is given back. ``sequence`` forces one (steps over more than 65536). ``keep_draft``: the signed image is
+    kept, with its ``profile``, until it is written. The new sequence is durable in the store before the signature is
+    given to anyone: one that was lost with its process was never seen, and its number may be used again.
     """
     for block, teds in image.unsigned_blocks().items():
         if not can_be_stored(block) or not passes_own_check(block, teds):
@@ -107,24 +111,29 @@ def sign(
                 number = security.decode(octets).sequence
                 if octets == on_node or number > node_sequence:
                     return Signed(image.with_block(SECURITY, octets), number, reused=True)
-    known = station.nodes.get(keys.uuid)
-    number = max(node_sequence, known.sequence if known else 0) + 1 if sequence is None else sequence
-    if number > LAST_SEQUENCE:
-        raise PolicyRefused("The sequence of this node is used up.")
-    unsigned = unsigned_datasheet(
-        keys,
-        station.point,
-        station.identity.signature_under(station.keys.ca_of(keys.uuid)),
-        digests(image.blocks),
-        ca=security.ca_hint(station.name, fingerprint(station.keys.ca_of(keys.uuid))),
-        last_modified=_now(),
-        sequence=number,
-        key_epoch=epoch,
-    )
-    station.nodes.remember(keys.uuid, sequence=number)
-    octets = sign_datasheet(unsigned, keys.uuid, station.credentials(keys.uuid))
-    station.audit("sign", keys.uuid, "done", sequence=number, epoch=epoch, teds=image.digest())
-    return Signed(image.with_block(SECURITY, octets), number, reused=False)
+    ca = station.keys.ca_of(keys.uuid)
+    signature, credentials = station.identity.signature_under(ca), station.credentials(keys.uuid)
+    with station.durable("sign"):
+        known = station.nodes.get(keys.uuid)
+        number = max(node_sequence, known.sequence if known else 0) + 1 if sequence is None else sequence
+        if number > LAST_SEQUENCE:
+            raise PolicyRefused("The sequence of this node is used up.")
+        unsigned = unsigned_datasheet(
+            keys,
+            station.point,
+            signature,
+            digests(image.blocks),
+            ca=security.ca_hint(station.name, fingerprint(ca)),
+            last_modified=_now(),
+            sequence=number,
+            key_epoch=epoch,
+        )
+        made = image.with_block(SECURITY, sign_datasheet(unsigned, keys.uuid, credentials))
+        station.nodes.remember(keys.uuid, sequence=number)
+        if keep_draft:
+            station.nodes.keep_draft(Draft(keys.uuid, made, "signed", profile))
+        station.audit("sign", keys.uuid, "done", sequence=number, epoch=epoch, teds=image.digest())
+    return Signed(made, number, reused=False)
 
 
 def _says_the_same(station: Station, keys: NodeKeys, image: Image, octets: bytes, epoch: int) -> bool:

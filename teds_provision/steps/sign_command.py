@@ -3,15 +3,22 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from pathlib import Path
 
-from teds_provision.errors import NotFound
+from teds_provision.errors import NotFound, UsageFailure
+from teds_provision.links import LinkSettings
 from teds_provision.station.station import Station
 from teds_provision.steps.agree import require_session
-from teds_provision.steps.build import guard
+from teds_provision.steps.order import guard
 from teds_provision.steps.read import survey
 from teds_provision.steps.sign import Signed, known_image, known_node_keys, sign
+from teds_provision.steps.visit import node_or_image
 from teds_provision.store import Draft
 from teds_provision.talk.conversation import Conversation
+from teds_provision.talk.meeting import meet
+from teds_provision.talk.progress import Reporter
+from teds_provision.teds.codec import security
+from teds_provision.teds.diff.datasheets import diff_blocks
 from teds_provision.teds.image import SECURITY, Image
 
 
@@ -33,23 +40,53 @@ class SignDone:
     changes: tuple[str, ...]
 
 
+def sign_at(
+    station: Station,
+    links: LinkSettings,
+    what: str,
+    reporter: Reporter,
+    *,
+    read_node: bool = False,
+    accept_calibration: str | None = None,
+    dry_run: bool = False,
+    output: Path | None = None,
+) -> SignDone:
+    """Sign the draft of the node that ``what`` names, or an image file; ``read_node``: against the node itself.
+
+    ``output`` is where the caller will write the image: an image file needs one. Raises UsageFailure, and what
+    :func:`sign_image` raises.
+    """
+    found = node_or_image(station, what)
+    image = found if isinstance(found, Image) else None
+    if image is not None and output is None and not dry_run:
+        raise UsageFailure("Signing an image file needs a place for the result.", hint="Add --output IMAGE.")
+    uuid = image.uuid if image is not None else station.nodes.resolve(what)
+    order = SignOrder(uuid, image, accept_calibration, dry_run)
+    if not dry_run:
+        station.policy.require_whitelisted(uuid)
+        station.unlock()
+    if not read_node:
+        return sign_image(station, order, None)
+    with meet(station, links, uuid, reporter) as node, station.turn(uuid):
+        return sign_image(station, order, node)
+
+
 def sign_image(station: Station, order: SignOrder, node: Conversation | None) -> SignDone:
     """Sign the draft or image of one node; with ``node`` against what it has, in a session, else as last known.
 
-    Raises NotFound (nothing built, key unknown), BadData, PolicyRefused (guard), NotWhitelisted.
+    Where nothing lies ready, what the node was last read to have is signed: nothing to do, if it still holds. Raises
+    NotFound (nothing built, key unknown), BadData, PolicyRefused (guard), NotWhitelisted.
     """
-    from teds_provision.teds.diff.datasheets import diff_blocks
-
     uuid = order.uuid
     station.policy.require_whitelisted(uuid)
     draft = station.nodes.draft(uuid)
-    image = order.image or (draft.image if draft is not None else known_image(station, uuid))
+    has = known_image(station, uuid)
+    image = order.image or (draft.image if draft is not None else has)
     if image is None or not image.unsigned_blocks():
         raise NotFound(f"Nothing is built for node {uuid.hex()}.", hint=f"Build it: teds-provision build {uuid.hex()}")
     record = station.nodes.get(uuid)
     epoch = station.keys.active_epoch(uuid) or (record.epoch if record else 0)
-    sequence = record.sequence if record else 0
-    has = known_image(station, uuid)
+    sequence = _sequence_of(has)
     if node is not None:
         if not order.dry_run:  # opening a session may settle or rotate keys
             require_session(station, node)
@@ -70,19 +107,18 @@ def sign_image(station: Station, order: SignOrder, node: Conversation | None) ->
         keys,
         image,
         epoch=epoch,
-        node_sequence=sequence if node is not None else _sequence_of(has),
+        node_sequence=sequence,
         on_node=has.security if has is not None and intact else None,
         earlier=_signed_before(image, draft),
     )
-    if draft is not None and (order.image is None or draft.image.unsigned_blocks() == image.unsigned_blocks()):
-        station.nodes.keep_draft(Draft(uuid, signed.image, "signed", draft.profile))
+    if draft is not None and draft.image.unsigned_blocks() == image.unsigned_blocks():
+        with station.durable("sign"):
+            station.nodes.keep_draft(Draft(uuid, signed.image, "signed", draft.profile))
     return SignDone(signed, told)
 
 
 def _sequence_of(has: Image | None) -> int:
     """Sequence of the datasheet that the node was last read to have."""
-    from teds_provision.teds.codec import security
-
     octets = has.blocks.get(SECURITY) if has is not None else None
     return security.decode(octets).sequence if octets is not None else 0
 

@@ -46,7 +46,7 @@ def verify_node(station: Station, node: Conversation, image: Image, point: bytes
 
     ``why`` says why there is no session although a key is held: then nothing of what was read is recorded.
     """
-    identity = read_identity(node) if node.sealed else None
+    identity = (node.proven or read_identity(node)) if node.sealed else None
     checks: list[Check] = verify_image(station, image, known=known_of(station, node.uuid, identity))
     checks.append(possession(lambda: prove(node, point)))
     checks.append(_vouched(node, point, why))
@@ -68,9 +68,11 @@ def verify_node(station: Station, node: Conversation, image: Image, point: bytes
             "sequence": identity.sequence,
             "can_address": identity.can_address,
         }
-        station.nodes.keep_datasheet(image)
-    station.nodes.remember(node.uuid, **facts)
-    station.audit("verify", node.uuid, verified.verdict)
+    with station.durable("verify"):
+        if identity is not None and station.nodes.datasheet(node.uuid) != image:
+            station.nodes.keep_datasheet(image)
+        station.nodes.remember(node.uuid, **facts)
+        station.audit("verify", node.uuid, verified.verdict)
     return verified
 
 

@@ -3,17 +3,20 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from types import MappingProxyType
 
 from teds_provision.errors import BadData, NodeRefused, NotAuthentic, PolicyRefused
 from teds_provision.protocol.datasheet import SEQUENCE_WINDOW
 from teds_provision.protocol.messages.frames import Reason, update_teds, write_teds
+from teds_provision.protocol.messages.identity import Identity, NodeState
 from teds_provision.station.station import Station
-from teds_provision.steps.read import read_block, read_identity, read_image
+from teds_provision.steps.read import Survey, read_block, read_identity, read_image
 from teds_provision.steps.sign import known_image, node_keys_of, sign
 from teds_provision.talk.conversation import Conversation, SessionLost
 from teds_provision.teds.codec import security
+from teds_provision.teds.codec.security import SecurityTeds
 from teds_provision.teds.image import SECURITY, BlockId, Image
 
 WRITE_OVERHEAD = 53
@@ -37,26 +40,59 @@ def write(
     node: Conversation,
     image: Image,
     *,
-    has: Image | None = None,
+    present: Survey | None = None,
     progress: Progress | None = None,
+    facts: Mapping[str, object] = MappingProxyType({}),
     jump: bool = False,
 ) -> Written:
     """Bring a signed image onto the node, inside the open session, and prove by reading that it is there.
 
-    ``has`` is what the node was read to hold in this session: blocks that are the same are not sent again. Raises
-    NodeRefused with the node's reason, PolicyRefused where the image is older than what the node has, or so far ahead
-    that more than one step of 65,536 would be needed and no person said so (``jump``): that uses up the sequence of
-    the node for good. NotAuthentic where the read-back differs.
+    ``present`` is what the node was read to hold in this session: blocks that are the same are not sent again.
+    ``facts`` are remembered of the node once it is written. Raises NodeRefused with the node's reason, PolicyRefused
+    where the image is older than what the node has, or so far ahead that more than one step of 65,536 would be needed
+    and no person said so (``jump``): that uses up the sequence of the node for good. NotAuthentic where the read-back
+    differs.
     """
     started = time.monotonic()
     signed = security.decode(image.blocks[SECURITY])
     if not signed.signed:
         raise BadData("The image is not signed.", hint="Sign it first: teds-provision sign UUID")
-    if read_block(node, SECURITY) == image.security:
-        present = has or read_image(node)
-        if all(present.blocks.get(block) == image.blocks[block] for block in image):
-            return Written(0, time.monotonic() - started, present)
-    identity = read_identity(node)
+    has = present.image if present is not None else None
+    if (has.security if has is not None else read_block(node, SECURITY)) == image.security:
+        has = has or read_image(node)
+        if all(has.blocks.get(block) == image.blocks[block] for block in image):
+            return Written(0, time.monotonic() - started, has)
+    identity = node.proven or read_identity(node)
+    _require_newer(signed, identity, jump=jump)
+    octets = 0
+    for step in range(identity.sequence + SEQUENCE_WINDOW, signed.sequence, SEQUENCE_WINDOW):
+        keys = node_keys_of(image.uuid, image.blocks[SECURITY])
+        between = sign(station, keys, image, epoch=identity.epoch, node_sequence=0, sequence=step).image
+        octets += _commit(station, node, between, has, progress)
+        has = between
+    octets += _commit(station, node, image, has, progress)
+    node.proven = replace(identity, sequence=signed.sequence, state=NodeState.PROVISIONED)
+    back = read_image(node)
+    differing = [block for block in image if back.blocks.get(block) != image.blocks[block]]
+    with station.durable("write"):
+        profile = facts.get("profile")
+        station.nodes.keep_datasheet(back, profile if isinstance(profile, str) else None)
+        if differing:
+            channel, access_code = differing[0]
+            station.audit("write", image.uuid, "read-back differs", block=[channel, access_code])
+        else:
+            station.nodes.remember(image.uuid, **facts)
+            _forget_draft(station, image)
+            station.audit("write", image.uuid, "done", octets=octets, sequence=signed.sequence)
+    if differing:
+        raise NotAuthentic(
+            f"The node gives back another TEDS {access_code} of channel {channel} than was written.",
+            hint="Try again; if it stays, the board's flash is broken.",
+        )
+    return Written(octets, time.monotonic() - started, back)
+
+
+def _require_newer(signed: SecurityTeds, identity: Identity, *, jump: bool) -> None:
     if signed.sequence <= identity.sequence:
         raise PolicyRefused(
             f"The image has sequence {signed.sequence}; the node is at {identity.sequence} already.",
@@ -73,26 +109,13 @@ def write(
             " lied about this node.",
             hint="Sign anew (sign UUID --read-node), or if you know why: write UUID --sequence-jump --yes",
         )
-    octets = 0
-    for step in range(identity.sequence + SEQUENCE_WINDOW, signed.sequence, SEQUENCE_WINDOW):
-        keys = node_keys_of(image.uuid, image.blocks[SECURITY])
-        between = sign(station, keys, image, epoch=identity.epoch, node_sequence=0, sequence=step).image
-        octets += _commit(station, node, between, has, progress)
-        has = between
-    octets += _commit(station, node, image, has, progress)
-    back = read_image(node)
-    station.nodes.keep_datasheet(back)
-    differing = [block for block in image if back.blocks.get(block) != image.blocks[block]]
-    if differing:
-        channel, access_code = differing[0]
-        station.audit("write", image.uuid, "read-back differs", block=[channel, access_code])
-        raise NotAuthentic(
-            f"The node gives back another TEDS {access_code} of channel {channel} than was written.",
-            hint="Try again; if it stays, the board's flash is broken.",
-        )
-    seconds = time.monotonic() - started
-    station.audit("write", image.uuid, "done", octets=octets, sequence=signed.sequence)
-    return Written(octets, seconds, back)
+
+
+def _forget_draft(station: Station, image: Image) -> None:
+    """A draft that is on the node now is none any more; a newer trial stays."""
+    draft = station.nodes.draft(image.uuid)
+    if draft is not None and draft.image.unsigned_blocks() == image.unsigned_blocks():
+        station.nodes.drop_draft(image.uuid)
 
 
 def _commit(station: Station, node: Conversation, image: Image, has: Image | None, progress: Progress | None) -> int:

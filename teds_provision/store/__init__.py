@@ -1,7 +1,7 @@
 """What a station remembers: whitelist, nodes, wrapped keys, trust and the audit log, in one SQLite file."""
 
 from teds_provision.store.audit import AuditEntry, AuditLog, AuditVerdict, Choice, is_failure
-from teds_provision.store.lock import StoreLock
+from teds_provision.store.lock import NodeTurn, StoreLock
 from teds_provision.store.records import (
     DatasheetRecord,
     Draft,
@@ -40,6 +40,7 @@ __all__ = [
     "Marks",
     "Measurement",
     "NodeRecord",
+    "NodeTurn",
     "Revocation",
     "Search",
     "Store",

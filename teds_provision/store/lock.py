@@ -1,4 +1,6 @@
-"""One command at a time changes a store: an advisory lock (flock) that names its holder.
+"""One command at a time changes a store, and one at a time works on a node: advisory locks.
+
+The store's (flock) names its holder; a node's is one octet of a file, taken by number.
 
 The kernel releases it when the holder ends, however it ends; what the file says of its holder counts only while the
 lock is held.
@@ -7,8 +9,10 @@ lock is held.
 from __future__ import annotations
 
 import fcntl
+import hashlib
 import json
 import os
+import struct
 import time
 from collections.abc import Callable
 from contextlib import suppress
@@ -20,6 +24,8 @@ from teds_provision.store.database import as_store_failure
 from teds_provision.store.records import utc_now
 
 FILE_NAME = "store.lock"
+TURNS_NAME = "store.turns"
+_FIRST_POLL_SECONDS = 0.001
 _POLL_SECONDS = 0.05
 
 
@@ -64,7 +70,7 @@ class StoreLock:
 
     def _acquire(self, descriptor: int) -> None:
         until = time.monotonic() + self._wait
-        told = False
+        told, pause = False, _FIRST_POLL_SECONDS
         while True:
             try:
                 fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
@@ -77,10 +83,11 @@ class StoreLock:
             holder = self._holder(descriptor)
             if time.monotonic() >= until:
                 raise StoreLocked(f"The store is held by {holder}.", hint="Wait until it has ended, or end it.")
-            if not told and self._notice is not None:
+            if not told and pause >= _POLL_SECONDS and self._notice is not None:
                 self._notice(f"Waiting for the store, held by {holder}.")
                 told = True
-            time.sleep(_POLL_SECONDS)
+            time.sleep(pause)
+            pause = min(2 * pause, _POLL_SECONDS)  # a durable step of another command takes milliseconds
 
     def _sign(self, descriptor: int) -> None:
         text = json.dumps({"pid": os.getpid(), "command": self._command, "since": utc_now()})
@@ -94,3 +101,61 @@ class StoreLock:
             return f"pid {int(said['pid'])} ({said['command']}) since {said['since']}"
         except (OSError, ValueError, KeyError, TypeError):
             return "another process"
+
+
+class NodeTurn:
+    """``with NodeTurn(home, uuid):`` one command works on this node of the store, the next one waits for it.
+
+    One octet of a file is locked, at a place that the UUID names (two nodes may share one: then they take turns, no
+    more). Waits up to ``wait`` seconds; raises StoreLocked after that, StoreFailure where the file cannot be made.
+    """
+
+    def __init__(
+        self, home: Path, uuid: bytes, *, wait: float = 60.0, notice: Callable[[str], object] | None = None
+    ) -> None:
+        self._path, self._uuid, self._wait, self._notice = home / TURNS_NAME, uuid, wait, notice
+        self._descriptor: int | None = None
+
+    def __enter__(self) -> NodeTurn:
+        try:
+            descriptor = os.open(self._path, os.O_CREAT | os.O_RDWR | os.O_NOFOLLOW | os.O_CLOEXEC, 0o600)
+        except OSError as error:
+            raise as_store_failure(error, self._path) from error
+        try:
+            self._acquire(descriptor)
+        except BaseException:
+            os.close(descriptor)
+            raise
+        self._descriptor = descriptor
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        if self._descriptor is not None:
+            os.close(self._descriptor)
+            self._descriptor = None
+
+    def _acquire(self, descriptor: int) -> None:
+        place = int.from_bytes(hashlib.sha256(self._uuid).digest()[:6], "big")
+        asked = struct.pack("hhqqi4x", fcntl.F_WRLCK, os.SEEK_SET, place, 1, 0)  # struct flock
+        until, told = time.monotonic() + self._wait, False
+        while True:
+            try:
+                # a lock of this open file, not of the process: threads take turns too
+                fcntl.fcntl(descriptor, fcntl.F_OFD_SETLK, asked)
+            except (BlockingIOError, PermissionError):
+                pass
+            except OSError as error:
+                raise as_store_failure(error, self._path) from error
+            else:
+                return
+            if time.monotonic() >= until:
+                raise StoreLocked(
+                    f"Another command of this station works on node {self._uuid.hex()}.",
+                    hint="Wait until it has ended, or end it.",
+                )
+            if not told and self._notice is not None:
+                self._notice(f"Waiting: another command works on node {self._uuid.hex()}.")
+                told = True
+            time.sleep(_POLL_SECONDS)

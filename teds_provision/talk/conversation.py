@@ -10,6 +10,7 @@ from teds_provision.errors import LinkFailure, NodeRefused, NotAuthentic, TedsPr
 from teds_provision.links import Contact, Notice
 from teds_provision.links.ports import NoticeSink
 from teds_provision.protocol.messages.frames import Command, Function, Reason, Reply, decode_reply, security_command
+from teds_provision.protocol.messages.identity import Identity
 from teds_provision.protocol.session import StationSession
 
 _log = logging.getLogger(__name__)
@@ -85,6 +86,8 @@ class Conversation:
         self.contact = contact
         self.identity = contact.identity
         self.uuid = contact.identity.uuid
+        self.proven: Identity | None = None
+        """What Identify said in the session that is open, None where it was not asked yet."""
         self._notice = notice
         self._key: bytes | None = None
         self._session: StationSession | None = None
@@ -140,7 +143,7 @@ class Conversation:
 
     def forget(self) -> None:
         """The node ended the session (Confirm, Reset): go on plain."""
-        self._session = self._key = None
+        self._session = self._key = self.proven = None
 
     def leave(self) -> None:
         """Close the session politely; a node that does not answer any more is left as it is."""

@@ -62,10 +62,13 @@ class Steps:
 
     reporter: Reporter
     done: list[StepResult] = field(default_factory=list)
+    current: str = ""
+    """The step that runs, or ran last."""
 
     @contextmanager
     def step(self, name: str) -> Iterator[StepResult]:
         """Run one step; what it found is put into the yielded result."""
+        self.current = name
         self.reporter.started(name)
         result, began = StepResult(name), time.monotonic()
         yield result

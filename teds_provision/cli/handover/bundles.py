@@ -14,10 +14,11 @@ from teds_provision.errors import PolicyRefused
 from teds_provision.links import LinkSettings
 
 if TYPE_CHECKING:
+    from contextlib import AbstractContextManager
+
     from teds_provision.handover.export_keys import ExportPlan
     from teds_provision.handover.import_keys import Imported, ImportPlan
     from teds_provision.station.station import Station
-    from teds_provision.store import StoreLock
 
 _LINK_OPTIONS = ("via", "nfc", "can", "ble")
 _MEANS = {
@@ -296,7 +297,7 @@ def _prove(app: App, station: Station, done: Imported, links: LinkSettings) -> l
 
     waiting = [uuid for uuid in done.uuids if not is_proven(station, uuid)]
 
-    def hold() -> StoreLock:
+    def hold() -> AbstractContextManager[None]:
         return station.lock("import-keys", app.note)
 
     outcomes = prove_nodes(station, links, waiting, reporter_for(app), hold=hold) if waiting else []

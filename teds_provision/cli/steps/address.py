@@ -30,20 +30,17 @@ def _address(_ctx: click.Context, _parameter: click.Parameter, text: str) -> int
 def address(app: App, uuid: str, address: int, yes: bool, dry_run: bool, links: LinkSettings) -> None:
     """Give a node another CAN address, 1 to 239, for good: by tap, or in a session where its key is held."""
     from teds_provision.cli.rendering import reporter_for
-    from teds_provision.steps.address import set_address
-    from teds_provision.talk.meeting import meet
+    from teds_provision.steps.at_node import set_address_at
 
     del yes  # the old address can be given back the same way
-    station = app.station()
-    octets = station.nodes.resolve(uuid)
-    if dry_run:
-        plan = f"Plan: node {octets.hex()} gets CAN address 0x{address:02x}."
-        app.emit({"uuid": octets.hex(), "plan": "address", "can_address": address}, plan)
+    done = set_address_at(app.station(), links, uuid, address, reporter_for(app), dry_run=dry_run)
+    node = done.uuid.hex()
+    if done.changed is None:
+        plan = f"Plan: node {node} gets CAN address 0x{address:02x}."
+        app.emit({"uuid": node, "plan": "address", "can_address": address}, plan)
         return
-    with meet(station, links, octets, reporter_for(app)) as node, station.lock("address", app.note):
-        changed = set_address(station, node, address)
-    told = "has" if changed else "has already"
+    told = "has" if done.changed else "has already"
     app.emit(
-        {"uuid": octets.hex(), "can_address": address, "changed": changed},
-        f"Node {octets.hex()} {told} CAN address 0x{address:02x}.",
+        {"uuid": node, "can_address": address, "changed": done.changed},
+        f"Node {node} {told} CAN address 0x{address:02x}.",
     )

@@ -25,27 +25,19 @@ def agree(app: App, uuid: str, links: LinkSettings, rotate: bool, yes: bool, dry
     The first agreement needs a tap (or the bus of a node built without NFC); a rotation goes over any link.
     """
     from teds_provision.cli.rendering import reporter_for
-    from teds_provision.steps.agree import agree as run
-    from teds_provision.steps.identify import identify
-    from teds_provision.talk.meeting import meet
+    from teds_provision.steps.at_node import agree_at
 
-    station = app.station()
-    octets = station.nodes.resolve(uuid)
-    station.policy.require_whitelisted(octets)
-    if dry_run:
-        held = [f"{record.state} key of epoch {record.epoch}" for record in station.keys.of(octets)]
-        plan = ("rotate" if rotate else "keep") if held else "agree on a first key"
-        app.emit(
-            {"uuid": octets.hex(), "plan": plan, "held": held}, f"Plan: {plan} ({', '.join(held) or 'no key held'})."
-        )
+    def confirm(question: str) -> None:
+        app.confirm(question, yes=yes)
+
+    done = agree_at(app.station(), links, uuid, reporter_for(app), rotate=rotate, dry_run=dry_run, confirm=confirm)
+    node, agreed = done.uuid.hex(), done.agreed
+    if agreed is None:
+        told = f"Plan: {done.plan} ({', '.join(done.held) or 'no key held'})."
+        app.emit({"uuid": node, "plan": done.plan, "held": list(done.held)}, told)
         return
-    if station.keys.restored(octets) and links.via != "nfc" and rotate:
-        app.confirm(f"Node {octets.hex()} is {station.keys.rotation_due(octets)}. Is it still this station's?", yes=yes)
-    meeting = meet(station, links, octets, reporter_for(app), before=station.unlock)
-    with meeting as node, station.lock("agree", app.note):
-        agreed = run(station, node, identify(station, node), rotate=rotate)
+    again = "." if agreed.fresh else " (nothing to do)."
     app.emit(
-        {"uuid": octets.hex(), "epoch": agreed.epoch, "key_id": agreed.key_id, "fresh": agreed.fresh},
-        f"Node {octets.hex()}: key {agreed.key_id}, epoch {agreed.epoch}"
-        + ("." if agreed.fresh else " (nothing to do)."),
+        {"uuid": node, "epoch": agreed.epoch, "key_id": agreed.key_id, "fresh": agreed.fresh},
+        f"Node {node}: key {agreed.key_id}, epoch {agreed.epoch}{again}",
     )

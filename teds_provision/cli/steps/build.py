@@ -25,7 +25,7 @@ def order_options(function: Function) -> Function:
 
     @wraps(function)
     def with_order(*args: Any, profile: Any, calibration: Any, no_calibration: bool, name: Any, **rest: Any) -> Any:
-        from teds_provision.steps.build import BuildOrder
+        from teds_provision.steps.order import BuildOrder
 
         accepted = rest.pop("accept_calibration")
         return function(*args, order=BuildOrder(profile, calibration, name, no_calibration, accepted), **rest)
@@ -70,8 +70,7 @@ def build(app: App, uuid: str, order: Any, output: Path | None, edition: str, ye
     del yes  # a build can always be made again
     station = app.station()
     octets = station.nodes.resolve(uuid)
-    with station.lock("build", app.note):
-        built = run(station, octets, order, edition=int(edition), keep_draft=not dry_run)
+    built = run(station, octets, order, edition=int(edition), keep_draft=not dry_run)
     if output is not None and not dry_run:
         write_file(output, built.image.to_json())
     for warning in built.warnings:

@@ -4,13 +4,16 @@ from __future__ import annotations
 
 import signal
 import threading
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import click
 
 from teds_provision.cli.context import App, pass_app
 from teds_provision.cli.options import command, link_options
 from teds_provision.links import LinkSettings
+
+if TYPE_CHECKING:
+    from teds_provision.steps.identify_at import Found
 
 
 @command(
@@ -27,55 +30,39 @@ def identify(app: App, links: LinkSettings, watch: bool, add: bool) -> None:
     Over --via can every node on the bus is asked; with --json several are listed under "nodes".
     """
     from teds_provision.cli.rendering import reporter_for
-    from teds_provision.talk.meeting import meet_everyone
-
-    station, reporter = app.station(), reporter_for(app)
-    if add:
-        station.unlock()  # before a node lies there: a pin is sealed by the vault
-    if not watch:
-        with meet_everyone(links, reporter) as nodes:
-            found = [_one(station, node, add) for node in nodes]
-        _emit(app, found[0] if len(found) == 1 else {**found[0], "nodes": found})
-        return
-    from teds_provision.talk.watching import watch_nodes
+    from teds_provision.steps.identify_at import identify_at
 
     stop = threading.Event()
-    signal.signal(signal.SIGTERM, lambda *_: stop.set())
-    for outcome in watch_nodes(station, links, lambda node: _one(station, node, add), reporter, stop):
-        if isinstance(outcome, dict):
-            _emit(app, outcome)
-        else:
-            app.fail_line(outcome)
+    if watch:
+        signal.signal(signal.SIGTERM, lambda *_: stop.set())
+    several = len(links.places) > 1
+    found: list[dict[str, Any]] = []
+    for came in identify_at(app.station(), links, reporter_for(app, several=several), add=add, watch=watch, stop=stop):
+        if came.error is not None:
+            app.fail_line(came.error, uuid=came.uuid.hex(), time=came.time)
+        elif came.result is not None:
+            found.append(_told(came.result))
+            if watch:
+                _emit(app, found.pop() | {"time": came.time})
+    if not watch:
+        _emit(app, found[0] if len(found) == 1 else {**found[0], "nodes": found})
 
 
-def _one(station: Any, node: Any, add: bool) -> dict[str, Any]:
-    from teds_provision.steps.identify import describe
-    from teds_provision.steps.identify import identify as run
-    from teds_provision.steps.provision import add_to_whitelist
-
-    who = run(station, node)
-    described = describe(node)
-    with station.lock("identify"):
-        entry = who.whitelisted
-        if entry is None and add:
-            entry = add_to_whitelist(station, node, who)
-        known = station.nodes.get(who.uuid)
-        name = (known.name if known else None) or described.name
-        station.nodes.remember(who.uuid, name=name, channels=described.channels)
-        station.audit("identify", who.uuid, "proven", fingerprint=who.fingerprint)
+def _told(found: Found) -> dict[str, Any]:
+    who, identity = found.who, found.identity
     return {
         "uuid": who.uuid.hex(),
         "fingerprint": who.fingerprint,
         "tag_uid": None if who.tag_uid is None else who.tag_uid.hex(),
         "state": who.state.name.lower(),
-        "whitelisted": entry is not None,
-        "channels": described.channels,
-        "name": name,
-        "epoch": node.identity.epoch,
-        "sequence": node.identity.sequence,
-        "can_address": node.identity.can_address,
-        "charging": node.contact.charging.to_json() if node.contact.charging else None,
-        "ble": node.contact.ble.text if node.contact.ble else None,
+        "whitelisted": found.whitelisted,
+        "channels": found.channels,
+        "name": found.name,
+        "epoch": identity.epoch,
+        "sequence": identity.sequence,
+        "can_address": identity.can_address,
+        "charging": found.charging,
+        "ble": found.ble,
     }
 
 

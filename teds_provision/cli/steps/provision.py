@@ -1,10 +1,9 @@
-"""``provision``: from tap to verified datasheet in one command."""
+"""``provision``: from tap to verified datasheet in one command, for one board, for fifty, for every node of a bus."""
 
 from __future__ import annotations
 
 import signal
-import threading
-from collections.abc import Callable
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
@@ -18,135 +17,234 @@ from teds_provision.links import LinkSettings
 if TYPE_CHECKING:
     from rich.console import Console
 
-    from teds_provision.station.station import Station
+    from teds_provision.steps.build import NotNamed
     from teds_provision.steps.identify import Identified
+    from teds_provision.steps.many.board import Board
+    from teds_provision.steps.many.boards import Boards, Plan, Questions
     from teds_provision.steps.provision import Provisioned
-    from teds_provision.talk.conversation import Conversation
-    from teds_provision.talk.progress import Reporter
+    from teds_provision.teds.diff.datasheets import Change
+
+_CHANGES_SHOWN = 20
 
 
 @command(
     "teds-provision provision --profile tactile-finger-sensor --nfc udp:localhost:54321",
     "teds-provision provision --profile magnetic-angular-position-sensor --calibration angle.csv --yes",
-    "teds-provision provision --watch --yes --profile load-cell",
+    "teds-provision provision --watch --yes --profile load-cell --name 'cell {n}'",
+    "teds-provision provision --batch boards.csv --report boards.html",
+    "teds-provision provision --all --via can --can socketcan:can0 --profile load-cell",
 )
 @click.argument("uuid", required=False)
 @order_options
 @click.option("--watch", is_flag=True, help="Tap after tap, until Ctrl-C.")
+@click.option(
+    "--batch",
+    type=click.Path(path_type=Path, dir_okay=False),
+    metavar="FILE",
+    help="A sheet says which board gets what: uuid, name, profile, calibration, fingerprint.",
+)
+@click.option(
+    "--report",
+    type=click.Path(path_type=Path, dir_okay=False),
+    metavar="FILE",
+    help="Write how the batch went, as .csv or .html.",
+)
+@click.option("--all", "everything", is_flag=True, help="Every whitelisted node of the bus, at once.")
 @yes_option
 @dry_run_option
 @link_options
 @pass_app
 def provision(
-    app: App, uuid: str | None, order: Any, watch: bool, yes: bool, dry_run: bool, links: LinkSettings
+    app: App,
+    uuid: str | None,
+    order: Any,
+    watch: bool,
+    batch: Path | None,
+    report: Path | None,
+    everything: bool,
+    yes: bool,
+    dry_run: bool,
+    links: LinkSettings,
 ) -> None:
     """Identify, whitelist, agree, build, sign, write and verify; carries on where an earlier run stopped.
 
-    --yes accepts the node that lies on the reader. A finished node is left as it is.
+    --yes accepts the node that lies on the reader. A finished node is left as it is: what it has changes only in what
+    this command names (--profile, --calibration, --name), or after a yes to the changes that are shown.
     """
     from teds_provision.cli.rendering import reporter_for
-    from teds_provision.steps.build import check_order
-    from teds_provision.talk.meeting import meet
+    from teds_provision.steps.many.boards import Boards, Request
 
-    station, reporter = app.station(), reporter_for(app)
-    wanted = station.nodes.resolve(uuid) if uuid is not None else None
-    check_order(station, wanted, order)
-    run = _runner(app, station, order, yes, reporter)
+    request = Request(uuid, order, watch, everything, batch, report)
+    several = everything or len(links.places) > 1
+    boards = Boards(app.station(), links, request, reporter_for(app, several=several))
+    for warning in boards.prepared.warnings:
+        app.warn(warning)
     if dry_run:
-        with meet(station, links, wanted, reporter) as node:
-            _plan(app, station, node)
-        return
-    if watch:
-        station.unlock()
-        _watch(app, station, links, run, reporter)
-        return
-    with meet(station, links, wanted, reporter, before=station.unlock) as node:
-        done = run(node)
-    _tell(app, done)
+        _tell_plan(app, boards.plan())
+    elif request.several:
+        _many(app, boards, _questions(app, yes, strangers=not everything), totals=everything or batch is not None)
+    else:
+        _one(app, boards, _questions(app, yes))
 
 
-def _runner(
-    app: App, station: Station, order: Any, yes: bool, reporter: Reporter
-) -> Callable[[Conversation], Provisioned]:
-    from teds_provision.steps.identify import examine
-    from teds_provision.steps.provision import provision as run
+def _one(app: App, boards: Boards, questions: Questions) -> None:
+    from teds_provision.steps.build import NotNamed
+
+    try:
+        done = boards.one(questions)
+    except NotNamed as error:
+        _tell_not_named(app, error)
+        return
+    _tell(app, done, error=_failure(done))
+
+
+def _many(app: App, boards: Boards, questions: Questions, *, totals: bool) -> None:
+    from teds_provision.cli.steps.screen import screen_for
+
+    signal.signal(signal.SIGTERM, lambda *_: boards.stop.set())
+    with screen_for(app, boards) as screen:
+        try:
+            for board in boards.many(questions):
+                _tell_board(app, board)
+                screen.ended(board)
+        finally:
+            screen.close()
+            if totals:
+                _tell_totals(app, boards)
+    error = boards.totals().error if totals else None
+    if error is not None and app.json:
+        raise click.exceptions.Exit(error.exit_code)
+    if error is not None:
+        raise error
+
+
+# -- questions ---------------------------------------------------------------------------------------------------------
+
+
+def _questions(app: App, yes: bool, *, strangers: bool = True) -> Questions:
+    """Whom to ask; ``strangers`` False: a yes on the command line does not add nodes that nobody named."""
+    import threading
+
+    from teds_provision.steps.build import nobody
+    from teds_provision.steps.many.board import Declined
+    from teds_provision.steps.many.boards import Questions
 
     accepted: set[tuple[bytes, str]] = set()
+    turn = threading.Lock()  # one question at a time, however many readers there are
 
     def accept(who: Identified) -> None:
-        if yes or (who.uuid, who.fingerprint) in accepted:
+        if (yes and strangers) or (who.uuid, who.fingerprint) in accepted:
             return
         if not app.interactive:
             raise NotWhitelisted(
                 f"Node {who.uuid.hex()} is not on the whitelist, and nobody can be asked.",
                 hint=f"Add --yes, or: teds-provision whitelist add {who.uuid.hex()} --fingerprint {who.fingerprint}",
             )
-        app.confirm(f"Whitelist node {who.uuid.hex()} with key {who.fingerprint[:16]}?", yes=False)
+        with turn:
+            if not app.ask(f"Whitelist node {who.uuid.hex()} with key {who.fingerprint[:32]}?"):
+                raise Declined(f"You said no: node {who.uuid.hex()} was not whitelisted, nothing was changed.")
         accepted.add((who.uuid, who.fingerprint))
 
-    def one(node: Conversation) -> Provisioned:
-        if app.interactive and not yes and station.pins.entry(node.uuid) is None:
-            accept(examine(station, node))  # before the store is locked: people take their time
-        with station.lock("provision", app.note):
-            done = run(station, node, order, accept=accept, reporter=reporter)
-        for warning in done.warnings:
-            app.warn(warning)
-        return done
+    def confirm(uuid: bytes, changes: tuple[Change, ...]) -> None:
+        if not app.interactive:
+            nobody(uuid, changes)
+        with turn:
+            app.note(f"Node {uuid.hex()} has another datasheet. What this command does not name would change:")
+            for change in changes[:_CHANGES_SHOWN]:
+                app.note(f"  {change.text}")
+            if len(changes) > _CHANGES_SHOWN:
+                app.note(f"  and {len(changes) - _CHANGES_SHOWN} more")
+            if not app.ask("Write it?"):
+                raise Declined(f"You said no: node {uuid.hex()} keeps its datasheet.")
 
-    return one
-
-
-def _watch(
-    app: App, station: Station, links: LinkSettings, run: Callable[[Conversation], Provisioned], reporter: Reporter
-) -> None:
-    from teds_provision.talk.watching import watch_nodes
-
-    stop = threading.Event()
-    signal.signal(signal.SIGTERM, lambda *_: stop.set())
-    for outcome in watch_nodes(station, links, run, reporter, stop):
-        if isinstance(outcome, TedsProvisionError):
-            app.fail_line(outcome)
-        else:
-            _tell(app, outcome, last=False)
+    return Questions(accept, confirm)
 
 
-def _plan(app: App, station: Station, node: Conversation) -> None:
-    from teds_provision.protocol.messages.identity import NodeState
-    from teds_provision.steps.identify import examine
-
-    who = examine(station, node)
-    steps = ["identify"]
-    steps += [] if who.whitelisted else ["whitelist"]
-    steps += ["agree"] if who.state == NodeState.FACTORY or not station.keys.held(who.uuid) else []
-    steps += ["build", "sign", "write", "verify"]
-    text = f"Plan for {who.uuid.hex()} ({who.state.name.lower()}): {', '.join(steps)}."
-    app.emit({"uuid": who.uuid.hex(), "state": who.state.name.lower(), "plan": steps}, text)
+# -- telling -----------------------------------------------------------------------------------------------------------
 
 
-def _tell(app: App, done: Provisioned, *, last: bool = True) -> None:
-    """Tell one node's end; ``last`` ends the command with the error of a datasheet that is not authentic."""
+def _tell_plan(app: App, plan: Plan) -> None:
+    changes = "".join(f"\n  {text}" for text in plan.changes) or "\n  no change of what it has"
+    text = f"Plan for {plan.uuid.hex()} ({plan.state.name.lower()}): {', '.join(plan.steps)}.{changes}"
+    for warning in plan.warnings:
+        app.warn(warning)
+    told = {
+        "uuid": plan.uuid.hex(),
+        "state": plan.state.name.lower(),
+        "plan": list(plan.steps),
+        "changes": list(plan.changes),
+        "warnings": list(plan.warnings),
+    }
+    app.emit(told, text)
+
+
+def _tell_not_named(app: App, error: NotNamed) -> None:
+    """With --json the changes stand beside the error, so that whoever asked can name them."""
+    changes = [change.text for change in error.changes]
+    app.conclude({"changes": changes}, "\n".join(f"  {text}" for text in changes), error)
+
+
+def _failure(done: Provisioned) -> TedsProvisionError | None:
+    from teds_provision.steps.many.board import Board
+
+    return Board(done.who.uuid, 0.0, done).failure
+
+
+def _tell(app: App, done: Provisioned, *, error: TedsProvisionError | None = None, **more: object) -> None:
+    """Tell one node's end; ``error`` ends the command, ``more`` stands on the line of one of many."""
     from teds_provision.station.summary import summarise
-    from teds_provision.steps.verify import require_authentic
 
-    error: TedsProvisionError | None = None
-    try:
-        require_authentic(done.verified)
-    except TedsProvisionError as failure:
-        error = failure
+    for warning in done.warnings:
+        app.warn(warning)
     summary = summarise(done.image)
-    app.conclude(
-        {
-            "uuid": done.who.uuid.hex(),
-            "fingerprint": done.who.fingerprint,
-            "name": summary.name,
-            "channels": [vars(channel) for channel in summary.channels],
-            "steps": [{"name": s.name, "result": s.result, "seconds": s.seconds} for s in done.steps],
-            "verdict": done.verified.verdict,
-            "warnings": list(done.warnings),
-        },
-        lambda console: _summary(console, done),
-        error if last else None,
-    )
+    result = {
+        "uuid": done.who.uuid.hex(),
+        "fingerprint": done.who.fingerprint,
+        "name": summary.name,
+        "channels": [vars(channel) for channel in summary.channels],
+        "steps": [{"name": s.name, "result": s.result, "seconds": s.seconds} for s in done.steps],
+        "verdict": done.verified.verdict,
+        "warnings": list(done.warnings),
+        **{name: value for name, value in more.items() if value is not None},
+    }
+    app.conclude(result, lambda console: _summary(console, done), error)
+
+
+def _tell_board(app: App, board: Board) -> None:
+    """One line of JSON, or what a person reads: UUID, time and row of the sheet on each."""
+    from teds_provision.steps.build import NotNamed
+
+    if board.done is not None:
+        _tell(app, board.done, row=board.row, time=board.time, seconds=round(board.seconds, 3))
+        if board.failure is not None and not app.json:
+            app.fail_line(board.failure, uuid=board.uuid.hex(), time=board.time, row=board.row)
+    elif board.error is not None:
+        of: dict[str, object] = {"uuid": board.uuid.hex(), "time": board.time, "row": board.row}
+        if app.json:
+            of["seconds"] = round(board.seconds, 3)
+            if isinstance(board.error, NotNamed):
+                of["changes"] = [change.text for change in board.error.changes]
+        app.fail_line(board.error, **of)
+
+
+def _tell_totals(app: App, boards: Boards) -> None:
+    totals = boards.totals()
+    told: dict[str, Any] = {
+        "passed": totals.passed,
+        "failed": totals.failed,
+        "skipped": totals.skipped,
+        "seconds": totals.seconds,
+        "first_pass": totals.first_pass,
+        "steps": totals.steps,
+    }
+    result: dict[str, Any] = {"totals": told}
+    if totals.error is not None:
+        error = totals.error
+        result["error"] = {"code": error.code, "message": error.message, "hint": error.hint}
+    share = "" if totals.first_pass is None else f", {totals.first_pass:.1%} at the first try"
+    steps = "".join(f"\n  {name:<11} {seconds:6.2f} s" for name, seconds in totals.steps.items())
+    counts = f"{totals.passed} passed, {totals.failed} failed, {totals.skipped} skipped"
+    app.emit(result, f"{counts}{share}, {totals.seconds:.1f} s in all.{steps}")
 
 
 def _summary(console: Console, done: Provisioned) -> None:

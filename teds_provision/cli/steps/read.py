@@ -23,25 +23,15 @@ def read(app: App, uuid: str, output: Path | None, links: LinkSettings) -> None:
     """Read every TEDS of a node, over a session where this station holds its key; look at it with show."""
     from teds_provision.cli.rendering import reporter_for
     from teds_provision.cli.steps.build import write_file
-    from teds_provision.steps.agree import session_if_keyed
-    from teds_provision.steps.identify import identify
-    from teds_provision.steps.read import read_image
-    from teds_provision.talk.meeting import meet
+    from teds_provision.steps.at_node import read_at
 
-    station = app.station()
-    octets = station.nodes.resolve(uuid)
-    with meet(station, links, octets, reporter_for(app), before=lambda: station.unlock(octets)) as node:
-        identify(station, node)
-        with station.lock("read", app.note):
-            session_if_keyed(station, node)
-        image = read_image(node)
-        if node.sealed:
-            station.nodes.keep_datasheet(image)
-    text = image.to_json()
+    done = read_at(app.station(), links, uuid, reporter_for(app))
+    if not done.proven:
+        app.warn("Nothing here is proven: the node opened no session under the key that is held for it.")
+    text = done.image.to_json()
     if output is not None:
         write_file(output, text)
-    total = sum(map(len, image.blocks.values()))
-    told = f"{len(image.blocks)} TEDS, {total} octets read from {octets.hex()}" + (
-        f" into {output}." if output else "."
-    )
+    total = sum(map(len, done.image.blocks.values()))
+    into = f" into {output}." if output else "."
+    told = f"{len(done.image.blocks)} TEDS, {total} octets read from {done.image.uuid.hex()}{into}"
     app.emit(json.loads(text), told if output is not None else text.rstrip("\n"))

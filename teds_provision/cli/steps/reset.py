@@ -21,9 +21,7 @@ def reset(app: App, uuid: str, yes: bool, dry_run: bool, links: LinkSettings) ->
     The node signs the statement; in factory state it signs it again, so a lost receipt can be fetched.
     """
     from teds_provision.cli.rendering import reporter_for
-    from teds_provision.steps.identify import identify
-    from teds_provision.steps.reset import reset_node
-    from teds_provision.talk.meeting import meet
+    from teds_provision.steps.at_node import reset_at
 
     station = app.station()
     octets = station.nodes.resolve(uuid)
@@ -31,9 +29,7 @@ def reset(app: App, uuid: str, yes: bool, dry_run: bool, links: LinkSettings) ->
         app.emit({"uuid": octets.hex(), "plan": "reset"}, f"Plan: reset {octets.hex()} to factory state.")
         return
     app.confirm(f"Reset node {octets.hex()}? Its key is erased and its datasheet counts as unsigned.", yes=yes)
-    meeting = meet(station, links, octets, reporter_for(app), before=lambda: station.unlock(octets))
-    with meeting as node, station.lock("reset", app.note):
-        receipt = reset_node(station, node, identify(station, node))
+    receipt = reset_at(station, links, octets, reporter_for(app))
     app.emit(
         {
             "uuid": octets.hex(),

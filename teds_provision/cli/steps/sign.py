@@ -9,7 +9,6 @@ import click
 
 from teds_provision.cli.context import App, pass_app
 from teds_provision.cli.options import command, dry_run_option, link_options, yes_option
-from teds_provision.errors import UsageFailure
 from teds_provision.links import LinkSettings
 
 
@@ -37,30 +36,22 @@ def sign(
     Unchanged content, key epoch and signer give back the existing signature.
     """
     from teds_provision.cli.rendering import reporter_for
-    from teds_provision.cli.steps.build import read_file, write_file
-    from teds_provision.steps.sign_command import SignOrder, sign_image
-    from teds_provision.talk.meeting import meet
-    from teds_provision.teds.image import Image
+    from teds_provision.cli.steps.build import write_file
+    from teds_provision.steps.sign_command import sign_at
 
     del yes  # a signature uses up a sequence number, nothing else
     station = app.station()
-    path = Path(what)
-    image: Image | None = None
-    if path.is_file():
-        if output is None and not dry_run:
-            raise UsageFailure("Signing an image file needs a place for the result.", hint="Add --output IMAGE.")
-        image = Image.from_json(read_file(path))
-    uuid = image.uuid if image is not None else station.nodes.resolve(what)
-    order = SignOrder(uuid, image, accept_calibration, dry_run)
-    if not dry_run:
-        station.policy.require_whitelisted(uuid)
-        station.unlock()
-    if read_node:
-        with meet(station, links, uuid, reporter_for(app)) as node, station.lock("sign", app.note):
-            done = sign_image(station, order, node)
-    else:
-        with station.lock("sign", app.note):
-            done = sign_image(station, order, None)
+    done = sign_at(
+        station,
+        links,
+        what,
+        reporter_for(app),
+        read_node=read_node,
+        accept_calibration=accept_calibration,
+        dry_run=dry_run,
+        output=output,
+    )
+    uuid = done.signed.image.uuid
     if dry_run:
         app.emit({"uuid": uuid.hex(), "changes": list(done.changes)}, _changes(done.changes))
         return

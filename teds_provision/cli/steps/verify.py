@@ -2,22 +2,18 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 import click
 
 from teds_provision.cli.context import App, pass_app
 from teds_provision.cli.options import command, link_options
-from teds_provision.errors import TedsProvisionError
 from teds_provision.links import LinkSettings
 
 if TYPE_CHECKING:
     from rich.console import Console
 
-    from teds_provision.station.station import Station
     from teds_provision.steps.verify import Verified
-    from teds_provision.teds.image import Image
 
 
 @command("teds-provision verify 8d4d --nfc udp:localhost:54321", "teds-provision verify signed.json")
@@ -31,56 +27,21 @@ def verify(app: App, what: str, links: LinkSettings, accept_calibration: str | N
     A file is judged alone. A node whose key is held here must open a session, else nothing is proven.
     Exits 0 for "authentic", 4 for "unsigned" and "not authentic", 5 for "unproven", 6 for a harmful calibration.
     """
-    from teds_provision.cli.steps.build import read_file
-    from teds_provision.steps.verify import Verified, verify_image
-    from teds_provision.teds.image import Image
+    from teds_provision.cli.rendering import reporter_for
+    from teds_provision.steps.at_node import verify_at
 
-    station = app.station()
-    path = Path(what)
-    if path.is_file():
-        image = Image.from_json(read_file(path))
-        verified = Verified(image.uuid, tuple(verify_image(station, image)), scope="image")
-    else:
-        image, verified = _node(app, what, links)
+    done = verify_at(app.station(), links, what, reporter_for(app), accept_calibration=accept_calibration)
+    verified = done.verified
     result = {
         "uuid": verified.uuid.hex(),
         "scope": verified.scope,
         "verdict": verified.verdict,
         "checks": [{"name": check.name, "result": check.result, "why": check.why} for check in verified.checks],
+        "warnings": list(done.warnings),
     }
-    warnings, error = _judged(station, image, verified, accept_calibration)
-    for warning in warnings:
+    for warning in done.warnings:
         app.warn(warning)
-    app.conclude(result | {"warnings": list(warnings)}, lambda console: _table(console, verified), error)
-
-
-def _judged(
-    station: Station, image: Image, verified: Verified, accepted: str | None
-) -> tuple[tuple[str, ...], TedsProvisionError | None]:
-    """Warnings, and what the verification ends with: not authentic (4), or a calibration that would hurt (6)."""
-    from teds_provision.steps.build import guard
-    from teds_provision.steps.verify import require_authentic
-
-    try:
-        require_authentic(verified)
-        return guard(station, image, None, accepted), None
-    except TedsProvisionError as error:
-        return (), error
-
-
-def _node(app: App, what: str, links: LinkSettings) -> tuple[Image, Verified]:
-    from teds_provision.cli.rendering import reporter_for
-    from teds_provision.steps.identify import identify
-    from teds_provision.steps.verify_node import look_at_node
-    from teds_provision.talk.meeting import meet
-
-    station = app.station()
-    uuid = station.nodes.resolve(what)
-    with meet(station, links, uuid, reporter_for(app), before=lambda: station.unlock(uuid)) as node:
-        who = identify(station, node)
-        with station.lock("verify", app.note):
-            looked = look_at_node(station, node, who)
-    return looked.image, looked.verified
+    app.conclude(result, lambda console: _table(console, verified), done.error)
 
 
 def _table(console: Console, verified: Verified) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from pathlib import Path
 
 import click
@@ -29,47 +30,29 @@ def write(
 ) -> None:
     """Write a signed datasheet over a session, commit it, read it back and compare."""
     from teds_provision.cli.rendering import reporter_for
-    from teds_provision.cli.steps.build import read_file
-    from teds_provision.errors import BadData, NotFound, PolicyRefused
-    from teds_provision.steps.agree import require_session
-    from teds_provision.steps.identify import identify
-    from teds_provision.steps.write import write as run
-    from teds_provision.talk.meeting import meet
-    from teds_provision.teds.image import Image
+    from teds_provision.steps.at_node import write_at
 
-    station, reporter = app.station(), reporter_for(app)
-    octets = station.nodes.resolve(uuid)
-    station.policy.require_whitelisted(octets)
-    draft = station.nodes.draft(octets)
-    if image is not None:
-        wanted = Image.from_json(read_file(image))
-    elif draft is not None:
-        wanted = draft.image
-    elif (known := station.nodes.datasheet(octets)) is not None and known.unsigned_blocks():
-        wanted = known  # written already: the same command once more
-    else:
-        raise NotFound(f"Nothing is built for node {octets.hex()}.", hint="build and sign it first, or give --image.")
-    if wanted.uuid != octets:
-        raise PolicyRefused(f"The image is for node {wanted.uuid.hex()}, not for {octets.hex()}.")
-    if wanted.security is None:
-        raise BadData("The image holds no Security TEDS.", hint=f"Sign it first: teds-provision sign {octets.hex()}")
-    total = sum(map(len, wanted.blocks.values()))
-    if dry_run:
-        plan = {"uuid": octets.hex(), "plan": "write", "blocks": len(wanted.blocks), "octets": total}
-        app.emit(plan, f"Plan: write {len(wanted.blocks)} TEDS, {total} octets, to {octets.hex()}.")
+    confirm = partial(app.confirm, yes=yes)
+    done = write_at(
+        app.station(),
+        links,
+        uuid,
+        reporter_for(app),
+        file=image,
+        dry_run=dry_run,
+        jump=confirm if sequence_jump else None,
+    )
+    node, written = done.image.uuid.hex(), done.written
+    if written is None:
+        blocks, octets = len(done.image.blocks), sum(map(len, done.image.blocks.values()))
+        plan = {"uuid": node, "plan": "write", "blocks": blocks, "octets": octets}
+        app.emit(plan, f"Plan: write {blocks} TEDS, {octets} octets, to {node}.")
         return
-    if sequence_jump:
-        app.confirm("The sequence of this node is then used up that far, for good. Write it?", yes=yes)
-    meeting = meet(station, links, octets, reporter, before=lambda: station.unlock(octets))
-    with meeting as node, station.lock("write", app.note):
-        identify(station, node)
-        require_session(station, node)
-        written = run(station, node, wanted, progress=reporter.written, jump=sequence_jump)
     result = {
-        "uuid": octets.hex(),
+        "uuid": node,
         "octets_written": written.octets,
         "verified": True,
         "seconds": round(written.seconds, 3),
     }
     told = f"{written.octets} octets written and read back" if written.octets else "nothing to do, it is there already"
-    app.emit(result, f"Node {octets.hex()}: {told} ({written.seconds:.2f} s).")
+    app.emit(result, f"Node {node}: {told} ({written.seconds:.2f} s).")

@@ -118,6 +118,10 @@ class NodeTables:
             raise UsageFailure(f"{asked!r} fits several nodes: {shown}{more}.", hint="Give more digits of the UUID.")
         return bytes(candidates[0])
 
+    def all_named(self, name: str) -> list[bytes]:
+        """Return the UUIDs of the nodes and whitelist entries that have exactly this name."""
+        return sorted(bytes(uuid) for (uuid,) in self._database.execute(*_by_name(name)))
+
 
 def _node(*row: Any) -> NodeRecord:
     values = (*row[:_GROUPS], tuple(json.loads(row[_GROUPS])), *row[_GROUPS + 1 :])

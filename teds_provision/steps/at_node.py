@@ -1,0 +1,184 @@
+"""Each command at a node as one call: resolve, unlock, meet, identify, and the step itself."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+from teds_provision.errors import BadData, NotFound, PolicyRefused, TedsProvisionError
+from teds_provision.links import LINKS, LinkSettings
+from teds_provision.station.station import Station
+from teds_provision.steps.address import set_address
+from teds_provision.steps.agree import Agreed, agree, session_if_keyed
+from teds_provision.steps.order import guard
+from teds_provision.steps.read import read_image
+from teds_provision.steps.reset import ResetReceipt, reset_node
+from teds_provision.steps.sign import known_image
+from teds_provision.steps.verify import Verified, require_authentic, verify_image
+from teds_provision.steps.verify_node import look_at_node
+from teds_provision.steps.visit import at_node, node_or_image, read_image_file
+from teds_provision.steps.write import Written, write
+from teds_provision.talk.progress import Reporter
+from teds_provision.teds.image import Image
+
+
+@dataclass(frozen=True)
+class AgreeDone:
+    """What ``agree`` did; for a dry run ``agreed`` is None, and ``plan`` says what it would do."""
+
+    uuid: bytes
+    agreed: Agreed | None
+    plan: str = ""
+    held: tuple[str, ...] = ()
+
+
+def agree_at(
+    station: Station,
+    links: LinkSettings,
+    node: str,
+    reporter: Reporter,
+    *,
+    rotate: bool = False,
+    dry_run: bool = False,
+    confirm: Callable[[str], object] = lambda question: None,
+) -> AgreeDone:
+    """Agree on a key with the node that ``node`` names (UUID, prefix, name), or rotate it; see :func:`agree`.
+
+    ``confirm`` is asked where the key came back from a backup and nobody taps the node; it raises for a no.
+    """
+    uuid = station.nodes.resolve(node)
+    station.policy.require_whitelisted(uuid)
+    if dry_run:
+        held = tuple(f"{record.state} key of epoch {record.epoch}" for record in station.keys.of(uuid))
+        return AgreeDone(uuid, None, ("rotate" if rotate else "keep") if held else "agree on a first key", held)
+    if station.keys.restored(uuid) and rotate and not LINKS[links.via].capabilities.tapped:
+        confirm(f"Node {uuid.hex()} is {station.keys.rotation_due(uuid)}. Is it still this station's?")
+    with at_node(station, links, uuid, reporter, unlock="always") as visit:
+        return AgreeDone(uuid, agree(station, visit.node, visit.who, rotate=rotate))
+
+
+@dataclass(frozen=True)
+class AddressDone:
+    """A node's CAN address; ``changed`` None for a dry run."""
+
+    uuid: bytes
+    changed: bool | None
+
+
+def set_address_at(
+    station: Station, links: LinkSettings, node: str, address: int, reporter: Reporter, *, dry_run: bool = False
+) -> AddressDone:
+    """Give the node that ``node`` names another CAN address; see :func:`set_address`."""
+    uuid = station.nodes.resolve(node)
+    if dry_run:
+        return AddressDone(uuid, None)
+    with at_node(station, links, uuid, reporter) as visit:
+        return AddressDone(uuid, set_address(station, visit.node, address))
+
+
+@dataclass(frozen=True)
+class ReadDone:
+    """Every TEDS of a node. ``proven``: read in a session, or no key is held here that could have opened one."""
+
+    image: Image
+    proven: bool
+
+
+def read_at(station: Station, links: LinkSettings, node: str, reporter: Reporter) -> ReadDone:
+    """Read every TEDS of the node that ``node`` names, in a session where this station holds its key."""
+    uuid = station.nodes.resolve(node)
+    with at_node(station, links, uuid, reporter) as visit:
+        session_if_keyed(station, visit.node)
+        image = read_image(visit.node)
+        if visit.node.sealed:
+            with station.durable("read"):
+                station.nodes.keep_datasheet(image)
+        given_away = station.policy.tombstone(uuid) is not None
+        return ReadDone(image, visit.node.sealed or given_away or not station.keys.held(uuid))
+
+
+def reset_at(station: Station, links: LinkSettings, uuid: bytes, reporter: Reporter) -> ResetReceipt:
+    """Reset a node; see :func:`reset_node`."""
+    with at_node(station, links, uuid, reporter) as visit:
+        return reset_node(station, visit.node, visit.who)
+
+
+@dataclass(frozen=True)
+class VerifyDone:
+    """All checks of a node or an image, warnings, and the error that the verification ends with, None for none."""
+
+    verified: Verified
+    warnings: tuple[str, ...]
+    error: TedsProvisionError | None
+
+
+def verify_at(
+    station: Station, links: LinkSettings, what: str, reporter: Reporter, *, accept_calibration: str | None = None
+) -> VerifyDone:
+    """Check the image file, or the node, that ``what`` names.
+
+    ``error``: NotAuthentic (4), Unproven (5), or PolicyRefused (6) for a calibration that would hurt.
+    """
+    found = node_or_image(station, what)
+    if isinstance(found, Image):
+        image, verified = found, Verified(found.uuid, tuple(verify_image(station, found)), scope="image")
+    else:
+        with at_node(station, links, found, reporter) as visit:
+            looked = look_at_node(station, visit.node, visit.who)
+        image, verified = looked.image, looked.verified
+    try:
+        require_authentic(verified)
+        return VerifyDone(verified, guard(station, image, None, accept_calibration), None)
+    except TedsProvisionError as error:
+        return VerifyDone(verified, (), error)
+
+
+@dataclass(frozen=True)
+class WriteDone:
+    """What ``write`` did; for a dry run ``written`` is None and ``image`` what would be written."""
+
+    image: Image
+    written: Written | None
+
+
+def write_at(
+    station: Station,
+    links: LinkSettings,
+    node: str,
+    reporter: Reporter,
+    *,
+    file: Path | None,
+    dry_run: bool = False,
+    jump: Callable[[str], object] | None = None,
+) -> WriteDone:
+    """Write a signed image to the node that ``node`` names: of a file, else the draft, else what it was read to have.
+
+    ``jump`` is asked before a sequence far ahead of the node's is written, and raises for a no; None: it is refused.
+    Raises NotFound (nothing built), BadData (not signed), PolicyRefused (another node's image), as ``write`` does.
+    """
+    uuid = station.nodes.resolve(node)
+    station.policy.require_whitelisted(uuid)
+    draft = station.nodes.draft(uuid)
+    facts: dict[str, object] = {}
+    if file is not None:
+        wanted: Image | None = read_image_file(file)
+    elif draft is not None:
+        wanted = draft.image
+        facts = {"profile": draft.profile} if draft.profile is not None else {}
+    else:
+        wanted = known_image(station, uuid)
+    if wanted is None:
+        raise NotFound(f"Nothing is built for node {uuid.hex()}.", hint="build and sign it first, or give --image.")
+    if wanted.uuid != uuid:
+        raise PolicyRefused(f"The image is for node {wanted.uuid.hex()}, not for {uuid.hex()}.")
+    if wanted.security is None:
+        raise BadData("The image holds no Security TEDS.", hint=f"Sign it first: teds-provision sign {uuid.hex()}")
+    if dry_run:
+        return WriteDone(wanted, None)
+    if jump is not None:
+        jump("The sequence of this node is then used up that far, for good. Write it?")
+    with at_node(station, links, uuid, reporter) as visit:
+        visit.session()
+        written = write(station, visit.node, wanted, progress=reporter.written, facts=facts, jump=jump is not None)
+        return WriteDone(wanted, written)

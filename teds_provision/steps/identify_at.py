@@ -1,0 +1,73 @@
+"""The ``identify`` command: who lies on the reader or hangs on the bus, once or as they come."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+from teds_provision.links import LinkSettings
+from teds_provision.protocol.messages.identity import Identity
+from teds_provision.station.station import Station
+from teds_provision.steps.identify import Identified, describe, identify
+from teds_provision.steps.provision import add_to_whitelist
+from teds_provision.talk.conversation import Conversation
+from teds_provision.talk.meeting import meet_everyone
+from teds_provision.talk.progress import Reporter
+from teds_provision.talk.watching import Came, watch_nodes
+
+
+@dataclass(frozen=True)
+class Found:
+    """A node that proved its key; ``identity`` is its plain Identify, a hint."""
+
+    who: Identified
+    identity: Identity
+    whitelisted: bool
+    channels: int
+    name: str | None
+    charging: dict[str, object] | None = None
+    ble: str | None = None
+
+
+def identify_at(
+    station: Station,
+    links: LinkSettings,
+    reporter: Reporter,
+    *,
+    add: bool = False,
+    watch: bool = False,
+    stop: threading.Event | None = None,
+) -> Iterator[Came[Found]]:
+    """Identify who is there, or (``watch``) whoever comes until ``stop``; ``add`` whitelists what proves its key.
+
+    Without ``watch`` an error is raised, with it it ends one node only.
+    """
+    if add:
+        station.unlock()  # before a node lies there: a pin is sealed by the vault
+    if watch:
+        yield from watch_nodes(links, lambda node: _one(station, node, add), reporter, stop or threading.Event())
+        return
+    with meet_everyone(links, reporter) as nodes:
+        for node in nodes:
+            yield Came(node.uuid, links.places[0], 0.0, _one(station, node, add))
+
+
+def _one(station: Station, node: Conversation, add: bool) -> Found:
+    who = identify(station, node)
+    described = describe(node)
+    entry = who.whitelisted
+    if entry is None and add:
+        entry = add_to_whitelist(station, node, who)
+    known = station.nodes.get(who.uuid)
+    name = (known.name if known else None) or described.name
+    facts: dict[str, object] = {}
+    if known is None or known.verdict is None:  # nothing is verified here: it stands for what is not known better
+        free = name is not None and station.nodes.all_named(name) in ([], [who.uuid])
+        facts = {"channels": described.channels} | ({"name": name} if free else {})
+    with station.durable("identify"):
+        station.nodes.remember(who.uuid, **facts)
+        station.audit("identify", who.uuid, "proven", fingerprint=who.fingerprint)
+    charging = node.contact.charging.to_json() if node.contact.charging else None
+    ble = node.contact.ble.text if node.contact.ble else None
+    return Found(who, node.identity, entry is not None, described.channels, name, charging, ble)

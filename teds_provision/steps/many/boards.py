@@ -1,0 +1,281 @@
+"""``provision`` for one node, tap after tap, by a sheet, or for every node of a bus at once."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor, as_completed
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Final
+
+from teds_provision.errors import NoNode, OtherKey, PolicyRefused, TedsProvisionError, UsageFailure
+from teds_provision.links import Contact, LinkSettings, open_port
+from teds_provision.protocol.messages.identity import NodeState
+from teds_provision.station.station import Station
+from teds_provision.steps.build import Confirm, propose
+from teds_provision.steps.identify import Identified, examine
+from teds_provision.steps.many.board import Board, Totals, worse
+from teds_provision.steps.many.progress import Progress, mean_steps
+from teds_provision.steps.many.report import check_report, write_report
+from teds_provision.steps.many.sheet import Row, read_sheet
+from teds_provision.steps.order import BuildOrder, Prepared, for_several, named_for, prepare
+from teds_provision.steps.provision import Accept, Provisioned, provision
+from teds_provision.steps.read import survey
+from teds_provision.talk.conversation import Conversation, SessionLost
+from teds_provision.talk.meeting import meet, refuse_twins
+from teds_provision.talk.progress import Reporter
+from teds_provision.talk.watching import Patience, watch_nodes
+
+WORKERS: Final = 24
+"""Nodes of one bus that are worked on at once: while most of them calculate, the bus is never idle at 500 kbit/s."""
+_TOKEN_WORKERS: Final = 1
+"""A token takes one command at a time."""
+
+
+@dataclass(frozen=True)
+class Request:
+    """What ``provision`` is asked for: one node (None: the one that is there), or many.
+
+    ``watch``: tap after tap. ``everyone``: every node of the bus that is not finished. ``sheet``: what each board gets.
+    """
+
+    node: str | None = None
+    order: BuildOrder = field(default_factory=BuildOrder)
+    watch: bool = False
+    everyone: bool = False
+    sheet: Path | None = None
+    report: Path | None = None
+
+    @property
+    def several(self) -> bool:
+        """Whether more than one node may be meant."""
+        return self.watch or self.everyone or self.sheet is not None
+
+
+@dataclass(frozen=True)
+class Questions:
+    """Who is asked: before an unknown node is whitelisted, and before what nobody named is written."""
+
+    accept: Accept
+    confirm: Confirm
+
+
+@dataclass(frozen=True)
+class Plan:
+    """What ``provision`` would do (``--dry-run``): its steps, and the changes in physical units, a sentence each."""
+
+    uuid: bytes
+    state: NodeState
+    steps: tuple[str, ...]
+    changes: tuple[str, ...]
+    warnings: tuple[str, ...]
+
+
+class Boards:
+    """One run of ``provision``. Everything that was ordered is read, fitted and guarded when this is made.
+
+    Raises UsageFailure, NotFound, BadData, PolicyRefused before any node is waited for.
+    """
+
+    def __init__(self, station: Station, links: LinkSettings, request: Request, reporter: Reporter) -> None:
+        self._station, self._links, self._request, self._reporter = station, links, request, reporter
+        _check(request, links)
+        check_report(request.report)
+        self.node = station.nodes.resolve(request.node) if request.node is not None else None
+        order = for_several(request.order) if request.several else request.order
+        self.prepared = prepare(station, order, self.node)
+        if self.prepared.order.name is not None and self.node is not None:
+            named_for(station, self.node, self.prepared)
+        sheet = read_sheet(station, request.sheet, order) if request.sheet is not None else None
+        if sheet is not None and request.everyone and any(row.by_order for row in sheet.rows):
+            raise UsageFailure("On a bus there is no order of taps.", hint="Give each row its uuid or fingerprint.")
+        self.progress = Progress(station.home, sheet) if sheet is not None else None
+        self.stop = Patience(links.timeout if sheet is not None and not request.watch else None)
+        self._turn = threading.Lock()
+        self._rows: dict[bytes, Row] = {}
+        self._boards: list[Board] = []
+        self._began = time.monotonic()
+
+    # -- one node --------------------------------------------------------------------------------------------------
+
+    def one(self, questions: Questions) -> Provisioned:
+        """Provision the one node; raises what ends it."""
+        with meet(self._station, self._links, self.node, self._reporter, before=self._station.unlock) as node:
+            return self._provision(node, questions)
+
+    def plan(self) -> Plan:
+        """Look at the one node, plainly, and say what would be done; changes nothing anywhere."""
+        with meet(self._station, self._links, self.node, self._reporter) as node:
+            who = examine(self._station, node)
+            steps = ["identify"]
+            steps += [] if who.whitelisted else ["whitelist"]
+            steps += ["agree"] if who.state == NodeState.FACTORY or not self._station.keys.held(who.uuid) else []
+            found = survey(node, initial=who.security_teds)
+            named = named_for(self._station, who.uuid, self._for(who))
+            proposal = propose(self._station, named, found, record=False)
+            changes = tuple(change.text for change in proposal.changes)
+            steps += ["build", "sign", "write", "verify"]
+            return Plan(who.uuid, who.state, tuple(steps), changes, proposal.warnings)
+
+    # -- many ------------------------------------------------------------------------------------------------------
+
+    def __len__(self) -> int:
+        """How many boards the sheet has, 0 without one."""
+        return len(self.progress.rows) if self.progress is not None else 0
+
+    @property
+    def passed(self) -> int:
+        """How many boards have passed: of the sheet over all runs, else in this one."""
+        if self.progress is not None:
+            return len(self.progress.rows) - len(self.progress.open)
+        return sum(board.result == "passed" for board in self._boards)
+
+    @property
+    def next_row(self) -> Row | None:
+        """The row that the next board may be of."""
+        rows = self.progress.untried or self.progress.open if self.progress is not None else []
+        return rows[0] if rows else None
+
+    def many(self, questions: Questions) -> Iterator[Board]:
+        """Provision board after board, or all at once; one that fails does not end it. At the end comes the report."""
+        try:
+            if self.progress is not None and not self.progress.open:
+                return
+            self._station.unlock()
+            for board in self._all_at_once(questions) if self._request.everyone else self._as_they_come(questions):
+                self._note(board)
+                yield board
+        finally:
+            if self._request.report is not None and self.progress is not None:
+                write_report(self._request.report, self.progress)
+
+    def totals(self) -> Totals:
+        """What it came to: the whole sheet over all runs, or the nodes of this run."""
+        if self.progress is not None:
+            if self.stop.ran_out and self.progress.untried:
+                missed = ", ".join(str(row.number) for row in self.progress.untried[:10])
+                error = NoNode(f"No board came within {self._links.timeout:.0f} s for row {missed}.")
+                self.progress.worst = worse(self.progress.worst, error)
+            return self.progress.totals()
+        results = [board.result for board in self._boards]
+        steps = [{step.name: step.seconds for step in board.done.steps} for board in self._boards if board.done]
+        worst: TedsProvisionError | None = None
+        for board in self._boards:
+            worst = worse(worst, board.failure)
+        passed, seconds = results.count("passed"), round(time.monotonic() - self._began, 3)
+        share = round(passed / len(results), 4) if results else None
+        skipped = results.count("skipped")
+        return Totals(passed, results.count("failed"), skipped, seconds, share, mean_steps(steps), worst)
+
+    def _as_they_come(self, questions: Questions) -> Iterator[Board]:
+        for came in watch_nodes(self._links, lambda node: self._provision(node, questions), self._reporter, self.stop):
+            row = self._rows.pop(came.uuid, None)
+            number = row.number if row is not None else None
+            board = Board(came.uuid, came.seconds, came.result, came.error, number, came.place)
+            self.stop.renew()
+            yield board
+            if self.progress is not None and not (self.progress.open if self._request.watch else self.progress.untried):
+                self.stop.set()
+
+    def _all_at_once(self, questions: Questions) -> Iterator[Board]:
+        port = open_port(self._links)
+        try:
+            if not port.capabilities.many:
+                raise UsageFailure("--all is for a bus: a reader sees one node.", hint="Use --watch, tap after tap.")
+            found = refuse_twins(port.everyone(seconds=self._links.timeout, notice=self._reporter.notice))
+            contacts = [contact for contact in found if self._is_meant(contact)]
+            token = self._station.identity.keystore.startswith("pkcs11:")
+            workers = max(1, min(_TOKEN_WORKERS if token else WORKERS, len(contacts)))
+            with ThreadPoolExecutor(workers, thread_name_prefix="node") as pool:
+                running = [pool.submit(self._board, contact, port.place, questions) for contact in contacts]
+                try:
+                    for done in as_completed(running):
+                        yield done.result()
+                        if self.stop.is_set():
+                            break
+                finally:
+                    for future in running:
+                        future.cancel()
+        finally:
+            port.close()
+
+    def _is_meant(self, contact: Contact) -> bool:
+        """On the whitelist or in the sheet, and not finished yet; said for those that are neither."""
+        uuid = contact.identity.uuid
+        listed = self._station.pins.entry(uuid) is not None
+        in_sheet = self.progress is not None and any(row.uuid == uuid or row.uuid is None for row in self.progress.open)
+        if not in_sheet and (not listed or self.progress is not None):
+            self._station.notice(f"Left alone: node {uuid.hex()} is not {'in the sheet' if listed else 'whitelisted'}.")
+            return False
+        known = self._station.nodes.get(uuid)
+        finished = contact.identity.state == NodeState.PROVISIONED and known is not None
+        return in_sheet or not (finished and known is not None and known.verdict == "authentic")
+
+    def _board(self, contact: Contact, place: str, questions: Questions) -> Board:
+        began, uuid = time.monotonic(), contact.identity.uuid
+        done: Provisioned | None = None
+        error: TedsProvisionError | None = None
+        try:
+            with Conversation(contact, notice=self._reporter.notice) as node:
+                done = self._provision(node, questions)
+        except TedsProvisionError as failure:
+            error = failure
+        except SessionLost as lost:
+            error = lost.cause
+        row = self._rows.pop(uuid, None)
+        return Board(uuid, time.monotonic() - began, done, error, row.number if row is not None else None, place)
+
+    # -- both ------------------------------------------------------------------------------------------------------
+
+    def _provision(self, node: Conversation, questions: Questions) -> Provisioned:
+        def accept(who: Identified) -> None:
+            row = self._rows.get(who.uuid)
+            if row is None or row.by_order:  # a sheet that names the board is a person's word
+                questions.accept(who)
+
+        return provision(
+            self._station,
+            node,
+            self._for,
+            accept=accept,
+            reporter=self._reporter,
+            confirm=questions.confirm,
+        )
+
+    def _for(self, who: Identified) -> Prepared:
+        """What this board gets; raises PolicyRefused for one that the sheet does not know, OtherKey."""
+        if self.progress is None:
+            return self.prepared
+        with self._turn:
+            row = self.progress.row_for(who.uuid, who.fingerprint)
+            if row is None:
+                raise PolicyRefused(f"No row of the sheet is left for board {who.uuid.hex()}.", hint="Lay it aside.")
+            if row.fingerprint is not None and not who.fingerprint.startswith(row.fingerprint):
+                raise OtherKey(
+                    f"Board {who.uuid.hex()} holds the key {who.fingerprint[:32]}; row {row.number} of the sheet "
+                    f"says {row.fingerprint[:32]}.",
+                    hint="Compare the label of this board; it may be another one under the same UUID.",
+                )
+            self._rows[who.uuid] = row
+            self.progress.take(row, who.uuid)
+        return row.prepared
+
+    def _note(self, board: Board) -> None:
+        self._boards.append(board)
+        if self.progress is not None and board.row is not None:
+            self.progress.note(self.progress.sheet.rows[board.row - 1], board)
+
+
+def _check(request: Request, links: LinkSettings) -> None:
+    if request.node is not None and request.several:
+        raise UsageFailure(
+            "A node is named, and many are asked for.", hint="Name the node, or say --watch, --batch or --all."
+        )
+    if request.everyone and request.watch:
+        raise UsageFailure("--all takes what is on the bus now, --watch what comes.", hint="Use one of them.")
+    if request.report is not None and request.sheet is None:
+        raise UsageFailure("A report is that of a sheet.", hint="Add --batch FILE.")
+    if len(links.places) > 1 and not (request.watch or request.sheet is not None):
+        raise UsageFailure("Several readers are for --watch.", hint="Add --watch, or name one reader.")

@@ -1,0 +1,132 @@
+"""How far a sheet is: kept per sheet in the station's home, so that the same command carries on after anything."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any, Final
+
+from teds_provision.errors import NotFound, TedsProvisionError
+from teds_provision.files import private_folder, read_limited, write_whole
+from teds_provision.steps.many.board import Board, Totals, worse
+from teds_provision.steps.many.sheet import Row, Sheet
+
+FOLDER: Final = "batches"
+_MAX_OCTETS: Final = 64 << 20
+
+
+@dataclass
+class Attempted:
+    """What became of one row: the board that took it, its last result, and whether the first try passed.
+
+    ``digest`` is of the row's cells: another content is another board, and begins anew.
+    """
+
+    digest: str
+    uuid: str | None = None
+    result: str = ""
+    tries: int = 0
+    first: bool = False
+    seconds: float = 0.0
+    time: str = ""
+    message: str = ""
+    steps: dict[str, float] = field(default_factory=dict)
+
+
+class Progress:
+    """The rows of one sheet with what became of them; durable after each board."""
+
+    def __init__(self, home: Path, sheet: Sheet) -> None:
+        self.sheet = sheet
+        name = hashlib.sha256(str(sheet.path.resolve()).encode()).hexdigest()[:32]
+        self._path = home / FOLDER / f"{name}.json"
+        kept = self._kept()
+        self.rows = {row.number: self._of(row, kept.get(str(row.number))) for row in sheet.rows}
+        self.worst: TedsProvisionError | None = None
+
+    def _kept(self) -> dict[str, Any]:
+        try:
+            told = json.loads(read_limited(self._path, _MAX_OCTETS, "progress of a sheet", follow=False))
+        except (NotFound, ValueError):
+            return {}
+        rows = told.get("rows") if isinstance(told, dict) else None
+        return rows if isinstance(rows, dict) else {}
+
+    @staticmethod
+    def _of(row: Row, kept: Any) -> Attempted:
+        if not isinstance(kept, dict) or kept.get("digest") != row.digest:
+            return Attempted(row.digest)
+        try:
+            return Attempted(**kept)
+        except TypeError:  # of another version of this tool
+            return Attempted(row.digest)
+
+    def save(self) -> None:
+        """Put it onto the disk; raises StoreFailure."""
+        private_folder(self._path.parent)
+        told = {"sheet": str(self.sheet.path.resolve()), "rows": {n: asdict(row) for n, row in self.rows.items()}}
+        write_whole(self._path, json.dumps(told, indent=1).encode())
+
+    @property
+    def open(self) -> list[Row]:
+        """The rows whose board has not passed."""
+        return [row for row in self.sheet.rows if self.rows[row.number].result != "passed"]
+
+    @property
+    def untried(self) -> list[Row]:
+        """The open rows that nobody tried in this run."""
+        return [row for row in self.open if row.number not in self._tried]
+
+    _tried: frozenset[int] = frozenset()
+
+    def row_for(self, uuid: bytes, fingerprint: str) -> Row | None:
+        """The row of a board: that which names it or had it before, else the next in the order of the taps."""
+        for row in self.sheet.rows:
+            if row.means(uuid, fingerprint) or (row.by_order and self.rows[row.number].uuid == uuid.hex()):
+                return row
+        return next((row for row in self.sheet.rows if row.by_order and self.rows[row.number].uuid is None), None)
+
+    def take(self, row: Row, uuid: bytes) -> None:
+        """Note that this board is the row's, before anything is done with it."""
+        attempted = self.rows[row.number]
+        if attempted.uuid != uuid.hex():
+            attempted.uuid = uuid.hex()
+            self.save()
+
+    def note(self, row: Row, board: Board) -> None:
+        """Note how a board ended."""
+        attempted = self.rows[row.number]
+        attempted.tries += 1
+        attempted.result = board.result
+        attempted.first = attempted.first or (attempted.tries == 1 and board.result == "passed")
+        attempted.seconds, attempted.time = round(board.seconds, 3), board.time
+        attempted.message = board.failure.message if board.failure is not None else ""
+        if board.done is not None:
+            attempted.steps = {step.name: step.seconds for step in board.done.steps}
+        self._tried = self._tried | {row.number}
+        self.worst = worse(self.worst, board.failure)
+        self.save()
+
+    def totals(self) -> Totals:
+        """What the whole sheet came to, over all runs; a row that was not reached is ``skipped``."""
+        rows = list(self.rows.values())
+        passed = [row for row in rows if row.result == "passed"]
+        failed = [row for row in rows if row.result == "failed"]
+        tried = [row for row in rows if row.tries and row.result != "skipped"]
+        return Totals(
+            len(passed),
+            len(failed),
+            len(rows) - len(passed) - len(failed),
+            round(sum(row.seconds for row in rows), 3),
+            round(sum(row.first for row in tried) / len(tried), 4) if tried else None,
+            mean_steps([row.steps for row in passed]),
+            self.worst,
+        )
+
+
+def mean_steps(all_steps: list[dict[str, float]]) -> dict[str, float]:
+    """Mean seconds of each step."""
+    names = list(dict.fromkeys(name for steps in all_steps for name in steps))
+    return {name: round(sum(steps.get(name, 0.0) for steps in all_steps) / len(all_steps), 4) for name in names}

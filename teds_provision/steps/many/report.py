@@ -1,0 +1,91 @@
+"""What a batch came to, as a file for people and spreadsheets: CSV or HTML by suffix."""
+
+from __future__ import annotations
+
+import csv
+import html
+import io
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Final
+
+from teds_provision.errors import UsageFailure
+from teds_provision.files import SHARED, write_whole
+from teds_provision.steps.many.board import Totals
+from teds_provision.steps.many.progress import Progress
+
+_HEAD: Final = ("row", "uuid", "name", "profile", "result", "tries", "first_pass", "seconds", "time", "message")
+_STYLE: Final = (
+    "body{font:16px sans-serif;margin:2em}table{border-collapse:collapse}td,th{border:1px solid #999;padding:.3em .6em;"
+    "text-align:left}.passed{background:#cfc}.failed{background:#fcc}.skipped{background:#eee}"
+)
+
+
+def check_report(path: Path | None) -> None:
+    """Raise UsageFailure for a report of an unknown form, or without a folder to lie in, before the first tap."""
+    if path is None:
+        return
+    if path.suffix.lower() not in (".csv", ".html", ".htm"):
+        raise UsageFailure(f"{path.name} is neither CSV nor HTML.", hint="Name it FILE.csv or FILE.html.")
+    if not path.parent.is_dir():
+        raise UsageFailure(f"There is no folder {path.parent} for the report.")
+
+
+def write_report(path: Path, progress: Progress) -> None:
+    """Write the report whole; raises UsageFailure where it cannot be written."""
+    rows, totals = _rows(progress), progress.totals()
+    text = _csv(rows, totals) if path.suffix.lower() == ".csv" else _html(progress.sheet.path.name, rows, totals)
+    write_whole(path, text.encode(), mode=SHARED, failure=UsageFailure)
+
+
+def _rows(progress: Progress) -> list[tuple[str, ...]]:
+    told = []
+    for row in progress.sheet.rows:
+        kept, order = progress.rows[row.number], row.prepared.order
+        uuid = kept.uuid or (row.uuid.hex() if row.uuid is not None else "")
+        values = (row.number, uuid, order.name or "", order.profile or "", kept.result or "not reached", kept.tries)
+        told.append((*map(str, values), str(kept.first).lower(), str(kept.seconds), kept.time, kept.message))
+    return told
+
+
+def _totals(totals: Totals) -> list[tuple[str, str]]:
+    share = "" if totals.first_pass is None else f"{totals.first_pass:.4f}"
+    told = [
+        ("passed", str(totals.passed)),
+        ("failed", str(totals.failed)),
+        ("skipped", str(totals.skipped)),
+        ("seconds", f"{totals.seconds:.3f}"),
+        ("first_pass", share),
+    ]
+    return told + [(f"seconds of {name}", f"{seconds:.4f}") for name, seconds in totals.steps.items()]
+
+
+def _csv(rows: Sequence[Sequence[str]], totals: Totals) -> str:
+    out = io.StringIO(newline="")
+    writer = csv.writer(out, lineterminator="\n")
+    writer.writerow(_HEAD)
+    writer.writerows([[_tame(cell) for cell in row] for row in rows])
+    writer.writerow([])
+    writer.writerows(_totals(totals))
+    return out.getvalue()
+
+
+def _tame(cell: str) -> str:
+    """A cell that no spreadsheet takes for a formula: names and messages come from outside."""
+    return f"'{cell}" if cell[:1] in ("=", "+", "-", "@") else cell
+
+
+def _html(name: str, rows: Sequence[Sequence[str]], totals: Totals) -> str:
+    head = "".join(f"<th>{html.escape(cell)}</th>" for cell in _HEAD)
+    body = "".join(
+        f'<tr class="{html.escape(row[4])}">' + "".join(f"<td>{html.escape(cell)}</td>" for cell in row) + "</tr>\n"
+        for row in rows
+    )
+    sums = "".join(
+        f"<tr><th>{html.escape(what)}</th><td>{html.escape(value)}</td></tr>\n" for what, value in _totals(totals)
+    )
+    return (
+        f'<!DOCTYPE html>\n<html lang="en"><head><meta charset="utf-8"><title>{html.escape(name)}</title>'
+        f"<style>{_STYLE}</style></head><body><h1>{html.escape(name)}</h1>\n<table>{sums}</table><p></p>"
+        f"<table><tr>{head}</tr>\n{body}</table></body></html>\n"
+    )

@@ -1,0 +1,315 @@
+"""What a user orders for a node: profile, calibration, name. Read, fitted and guarded before any node is waited for."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Final
+
+from teds_provision import teds
+from teds_provision.errors import BadData, NotFound, PolicyRefused, UsageFailure
+from teds_provision.harmless import printable
+from teds_provision.station.station import Station
+from teds_provision.teds.codec.codes import AccessCode
+from teds_provision.teds.image import Image
+from teds_provision.teds.profile.load import default_folders, load_profile, passed_over
+from teds_provision.teds.sheet import Sheet
+
+if TYPE_CHECKING:
+    from teds_provision.teds.calibration import Calibration
+    from teds_provision.teds.guard.guard import GuardFinding
+    from teds_provision.teds.image import BlockId
+    from teds_provision.teds.profile import BuiltDatasheet, Profile
+
+NAME_OCTETS: Final = 120
+"""The longest name of a node, as UTF-8: what wire, labels and lists have room for."""
+_UUID, _COUNT = "{uuid}", "{n}"
+_NOBODY: Final = bytes(10)
+
+
+@dataclass(frozen=True)
+class BuildOrder:
+    """What the user asks for: profile (None: the one that the node had), calibration file, name, and overrides.
+
+    ``name`` may hold ``{uuid}`` (20 hex digits) or ``{n}`` (the first free number from 1). ``accept_calibration`` is
+    the reason given for a calibration that the guard would refuse.
+    """
+
+    profile: str | None = None
+    calibration: Path | None = None
+    name: str | None = None
+    drop_calibration: bool = False
+    accept_calibration: str | None = None
+
+    @property
+    def names_nothing(self) -> bool:
+        """Whether no value of the datasheet is named."""
+        return self.profile is None and self.calibration is None and self.name is None and not self.drop_calibration
+
+    @property
+    def has_pattern(self) -> bool:
+        """Whether each node gets a name of its own."""
+        return self.name is not None and (_UUID in self.name or _COUNT in self.name)
+
+
+@dataclass(frozen=True)
+class Prepared:
+    """An order that was read and found good: its profile, and the calibrations of its file, fitted; None where unnamed.
+
+    ``warnings`` are those of the guard, and what a person should know of the order.
+    """
+
+    order: BuildOrder
+    profile: Profile | None = None
+    calibrations: Mapping[int, Calibration] | None = None
+    warnings: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class Composed:
+    """The TEDS that profile, calibration and name give; ``wanted`` is the profile as it was asked for."""
+
+    profile: Profile
+    wanted: str
+    name: str | None
+    calibrations: Mapping[int, Calibration]
+    blocks: Mapping[BlockId, bytes]
+    warnings: tuple[str, ...]
+
+
+def for_several(order: BuildOrder) -> BuildOrder:
+    """The order, if it can be meant for more than one node; raises UsageFailure where all would be made equal."""
+    if order.name is not None and not order.has_pattern:
+        raise UsageFailure(
+            f"Every node would get the name {order.name!r}.",
+            hint="Put {uuid} or {n} into --name, or say which board gets which in a sheet: --batch FILE.",
+        )
+    if order.calibration is not None:
+        raise UsageFailure(
+            f"Every node would get the calibration {order.calibration}: it belongs to one sensor.",
+            hint="Say which board gets which in a sheet: --batch FILE.",
+        )
+    return order
+
+
+def prepare(station: Station, order: BuildOrder, uuid: bytes | None = None) -> Prepared:
+    """Read, fit and guard what an order names; ``uuid`` is the node that is meant, None where any may come.
+
+    Changes nothing. Raises UsageFailure (no profile known), NotFound, BadData, PolicyRefused (the guard).
+    """
+    _check_name(order.name)
+    wanted = order.profile or (_known_profile(station, uuid) if uuid is not None else None)
+    if order.calibration is not None and not order.calibration.is_file():
+        raise NotFound(f"There is no calibration file {order.calibration}.")
+    if wanted is None:
+        if uuid is not None and not order.names_nothing:
+            raise no_profile(uuid)
+        return Prepared(order)
+    profile = _load(station, wanted)
+    calibrations = _from_file(order, profile)
+    if calibrations is None:
+        return Prepared(order, profile)
+    made = _made(profile, _NOBODY, calibrations, order.name, 2007)
+    trial = Image(_NOBODY, dict(made.blocks))
+    warnings = guard(station, trial, None, order.accept_calibration, calibrations, profile, record=False)
+    return Prepared(order, profile, calibrations, merged(warnings))
+
+
+def named_for(station: Station, uuid: bytes, prepared: Prepared) -> Prepared:
+    """The order with the name that this node gets; raises PolicyRefused where another node has it."""
+    name = prepared.order.name
+    if name is None:
+        return prepared
+    name = name.replace(_UUID, uuid.hex())
+    if _COUNT in name:
+        name = _numbered(station, uuid, name)
+    others = [other for other in station.nodes.all_named(name) if other != uuid]
+    if others:
+        raise PolicyRefused(
+            f"Node {others[0].hex()} has the name {name!r} already.",
+            hint="Give this one another name; {uuid} or {n} in --name makes each its own.",
+        )
+    _check_name(name)
+    return replace(prepared, order=replace(prepared.order, name=name))
+
+
+def _numbered(station: Station, uuid: bytes, pattern: str) -> str:
+    """The pattern with the first number that no other node has; a node that has one keeps it."""
+    record = station.nodes.get(uuid)
+    mine = record.name if record is not None else None
+    number = 1
+    while True:
+        name = pattern.replace(_COUNT, str(number))
+        owners = station.nodes.all_named(name)
+        if name == mine or not owners or owners == [uuid]:
+            break
+        number += 1
+    if mine is not None and mine != name:
+        before, _, after = pattern.partition(_COUNT)
+        digits = mine.removeprefix(before).removesuffix(after)
+        if digits.isdecimal() and mine == pattern.replace(_COUNT, digits):
+            return mine
+    return name
+
+
+def compose(
+    station: Station,
+    uuid: bytes,
+    prepared: Prepared,
+    has: Image | None,
+    *,
+    name: str | None = None,
+    edition: int = 2007,
+) -> Composed:
+    """Compose a node's TEDS; ``has`` is where calibrations come from that the order does not bring or drop.
+
+    ``name`` is the one to keep where the order names none. Raises UsageFailure (no profile known), BadData.
+    """
+    order = prepared.order
+    wanted = order.profile or _known_profile(station, uuid)
+    if wanted is None:
+        raise no_profile(uuid)
+    profile = prepared.profile or _load(station, wanted)
+    passed = passed_over(wanted, default_folders(station.home))
+    calibrations = prepared.calibrations if prepared.calibrations is not None else _from_file(order, profile)
+    warnings: tuple[str, ...] = ()
+    if calibrations is None:
+        calibrations = {} if order.drop_calibration or has is None else teds_calibrations(has)
+        if calibrations:
+            numbers = ", ".join(map(str, calibrations))
+            warnings = (f"The calibration that was given before is kept (channel {numbers}).",)
+    record = station.nodes.get(uuid)
+    kept = order.name or name or (record.name if record else None)
+    made = _made(profile, uuid, calibrations, kept, edition)
+    return Composed(profile, wanted, kept, calibrations, made.blocks, merged((*passed, *warnings, *made.warnings)))
+
+
+def teds_calibrations(image: Image) -> dict[int, Calibration]:
+    """The calibrations that an image holds, by channel."""
+    return dict(Sheet.of(image).calibrations)
+
+
+def own_name(station: Station, image: Image, before: str | None) -> str | None:
+    """The name that a node's datasheet gives it, None where it is the one that its profile ``before`` gives to all."""
+    octets = image.blocks.get((0, AccessCode.NAME))
+    found = teds.decode(octets).get("TCName") if octets is not None else None
+    if not isinstance(found, str) or not found:
+        return None
+    try:
+        common = _load(station, before).tim_name if before is not None else None
+    except (BadData, NotFound):
+        common = None
+    return None if found == common else printable(found)
+
+
+def guard(
+    station: Station,
+    image: Image,
+    has: Image | None,
+    accepted: str | None,
+    calibrations: Mapping[int, Calibration] | None = None,
+    profile: Profile | None = None,
+    *,
+    record: bool = True,
+) -> tuple[str, ...]:
+    """Refuse a calibration that would hurt (exit 6), unless someone said why it is right; returns warnings.
+
+    That reason goes into the audit log, unless ``record`` is False (dry run).
+    """
+    if not any(code == AccessCode.CALIBRATION for _, code in (*image, *(has or ()))):
+        return ()
+    from teds_provision.teds.guard.guard import check_calibration  # numpy: not for a datasheet without calibration
+
+    old = has.unsigned_blocks() if has is not None else None
+    findings = check_calibration(image.unsigned_blocks(), old, profile, calibrations=calibrations)
+    errors = [_said(finding) for finding in findings if finding.severity == "error"]
+    if errors and accepted is None:
+        more = f" (and {len(errors) - 1} more)" if len(errors) > 1 else ""
+        raise PolicyRefused(
+            f"The calibration is refused: {errors[0]}{more}.",
+            hint='Mend it; or, if it is right, say why: --accept-calibration "why".',
+        )
+    if errors and record:
+        station.audit("accept-calibration", image.uuid, "accepted", why=accepted, findings=errors)
+    return merged(tuple(map(_said, findings)))
+
+
+def merged(warnings: Sequence[str]) -> tuple[str, ...]:
+    """Warnings, those that say the same of several channels in one line: ``Channels 1 to 12: …``."""
+    order: list[tuple[str, str]] = []
+    channels: dict[tuple[str, str], list[int]] = {}
+    for text in warnings:
+        head, number, rest = _of_channel(text)
+        if (head, rest) not in channels:
+            order.append((head, rest))
+        channels.setdefault((head, rest), [])
+        if number is not None and number not in channels[head, rest]:
+            channels[head, rest].append(number)
+    return tuple(_joined(head, channels[head, rest], rest) for head, rest in order)
+
+
+def _of_channel(text: str) -> tuple[str, int | None, str]:
+    """``Channel 3 (force): x`` → ("Channel", 3, ": x"); the name of the channel counts for nothing."""
+    head, _, rest = text.partition(" ")
+    digits = len(rest) - len(rest.lstrip("0123456789"))
+    if head.lower() != "channel" or not digits:
+        return text, None, ""
+    number, rest = int(rest[:digits]), rest[digits:]
+    if rest.startswith(" (") and ")" in rest:
+        rest = rest[rest.index(")") + 1 :]
+    return head, number, rest
+
+
+def _joined(head: str, numbers: list[int], rest: str) -> str:
+    if not numbers:
+        return head
+    if len(numbers) == 1:
+        return f"{head} {numbers[0]}{rest}"
+    whole = numbers == list(range(numbers[0], numbers[-1] + 1))
+    told = f"{numbers[0]} to {numbers[-1]}" if whole else ", ".join(map(str, numbers))
+    return f"{head}s {told}{rest}"
+
+
+def _said(finding: GuardFinding) -> str:
+    return f"channel {finding.channel}: {finding.message}"
+
+
+def _check_name(name: str | None) -> None:
+    """Raise UsageFailure for a name that does not fit into a TEDS, BadData for one that is no text."""
+    if name is None:
+        return
+    try:
+        octets = len(name.encode())
+    except UnicodeEncodeError as error:  # an argument in another encoding than the terminal's
+        raise BadData("The name of the node is not valid text.", hint="Give it in the terminal's encoding.") from error
+    if not 1 <= octets <= NAME_OCTETS:
+        raise UsageFailure(f"A name has 1 to {NAME_OCTETS} octets of UTF-8, this one {octets}.")
+
+
+def _known_profile(station: Station, uuid: bytes) -> str | None:
+    record = station.nodes.get(uuid)
+    return record.profile if record is not None else None
+
+
+def no_profile(uuid: bytes) -> UsageFailure:
+    """The error for a node of which nobody said what it is."""
+    return UsageFailure(f"No profile is known for node {uuid.hex()}.", hint="Add --profile; see: profile list")
+
+
+def _load(station: Station, wanted: str) -> Profile:
+    return load_profile(wanted, default_folders(station.home))
+
+
+def _from_file(order: BuildOrder, profile: Profile) -> Mapping[int, Calibration] | None:
+    if order.calibration is None:
+        return None
+    from teds_provision.teds.calibration import load_calibrations  # numpy, for the fit
+
+    return load_calibrations(order.calibration, profile)
+
+
+def _made(
+    profile: Profile, uuid: bytes, calibrations: Mapping[int, Calibration], name: str | None, edition: int
+) -> BuiltDatasheet:
+    return profile.build(uuid, calibration=calibrations, name=name, edition=edition)  # type: ignore[arg-type]
