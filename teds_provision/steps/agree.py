@@ -131,8 +131,9 @@ def agree(
 
     ``rotate`` demands a new one, by a person's word: inside a session where a key is known, else by tap.
     ``newcomer`` is the whitelist entry that is made together with the first key: a board of another owner refuses, and
-    never comes onto the list. On a link that loses messages an agreement begins anew, five times at most. Raises NotWhitelisted, OtherKey,
-    PolicyRefused, NodeRefused, NotAuthentic, LinkFailure; whatever is cut, the same call carries on.
+    never comes onto the list. On a link that loses messages an agreement begins anew, five times at most.
+    Raises NotWhitelisted, OtherKey, PolicyRefused, NodeRefused, NotAuthentic, LinkFailure; whatever is cut, the same
+    call carries on.
     """
     again = 0
     while True:
@@ -140,7 +141,7 @@ def agree(
             return _agree(station, node, who, rotate=rotate, newcomer=newcomer, again=again > 0)
         except (NodeSilent, Garbled):
             again += 1
-            if again == _BEGINNINGS or not node.contact.link.capabilities.many:
+            if again == _BEGINNINGS or not node.lives():
                 raise
             node.forget()
 

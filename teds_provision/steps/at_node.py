@@ -91,7 +91,8 @@ def read_at(station: Station, links: LinkSettings, node: str, reporter: Reporter
     with at_node(station, links, uuid, reporter) as visit:
         session_if_keyed(station, visit.node)
         image = read_image(visit.node)
-        if visit.node.sealed:
+        verdict = Verified(uuid, tuple(verify_image(station, image))).verdict
+        if visit.node.sealed and verdict != "not authentic":
             with station.durable("read"):
                 station.nodes.keep_datasheet(image)
         given_away = station.policy.tombstone(uuid) is not None

@@ -12,6 +12,7 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
 from teds_provision.errors import BadData, NotFound, PolicyRefused
+from teds_provision.protocol import datasheet
 from teds_provision.station.station import Station
 from teds_provision.steps.order import BuildOrder, Prepared, compose, guard, merged, own_name, prepare
 from teds_provision.steps.read import Survey
@@ -137,7 +138,9 @@ def propose(station: Station, prepared: Prepared, present: Survey, *, record: bo
     if not own:
         proposal = _composed(station, prepared, present, keep, named=True)
     elif not _intact(station, present):
-        proposal = _composed(station, prepared, present, keep, named=order.profile is not None)
+        proposal = _mended(station, prepared, present) or _composed(
+            station, prepared, present, keep, named=order.profile is not None
+        )
     elif order.names_nothing:
         proposal = _as_it_is(station, present, keep)
     elif order.profile is not None:
@@ -170,6 +173,25 @@ def _intact(station: Station, present: Survey) -> bool:
     """Whether the node has a datasheet that this station would call authentic: what it says may be kept."""
     checks = verify_image(station, present.image, known=Known(present.identity))
     return Verified(present.image.uuid, tuple(checks)).verdict == "authentic"
+
+
+def _mended(station: Station, prepared: Prepared, present: Survey) -> Proposal | None:
+    """The very datasheet that the node was signed for, where it holds something else and nothing else is asked for."""
+    octets, uuid = present.image.security, present.image.uuid
+    try:
+        shown = security.decode(octets) if octets is not None else None
+    except BadData:
+        shown = None
+    if octets is None or shown is None or not shown.signed or not prepared.order.names_nothing:
+        return None
+    for record in station.nodes.history(uuid):
+        blocks = record.image.unsigned_blocks()
+        if datasheet.digests(blocks) != shown.signed_blocks:
+            continue
+        checks = verify_image(station, Image(uuid, {**blocks, SECURITY: octets}), known=Known(present.identity))
+        if Verified(uuid, tuple(checks)).verdict == "authentic":
+            return Proposal(Image(uuid, blocks), (), named=True)
+    return None
 
 
 def _composed(

@@ -111,9 +111,11 @@ def sign_image(station: Station, order: SignOrder, node: Conversation | None) ->
         on_node=has.security if has is not None and intact else None,
         earlier=_signed_before(image, draft),
     )
-    if draft is not None and draft.image.unsigned_blocks() == image.unsigned_blocks():
+    built_here = draft is not None and draft.image.unsigned_blocks() == image.unsigned_blocks()
+    if built_here or (order.image is None and not signed.reused):
+        profile = draft.profile if draft is not None else record.profile if record is not None else None
         with station.durable("sign"):
-            station.nodes.keep_draft(Draft(uuid, signed.image, "signed", draft.profile))
+            station.nodes.keep_draft(Draft(uuid, signed.image, "signed", profile))
     return SignDone(signed, told)
 
 

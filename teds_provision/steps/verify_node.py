@@ -69,7 +69,8 @@ def verify_node(station: Station, node: Conversation, image: Image, point: bytes
             "can_address": identity.can_address,
         }
     with station.durable("verify"):
-        if identity is not None and station.nodes.datasheet(node.uuid) != image:
+        worth = identity is not None and verified.verdict != "not authentic"  # else what it had stays known
+        if worth and station.nodes.datasheet(node.uuid) != image:
             station.nodes.keep_datasheet(image)
         station.nodes.remember(node.uuid, **facts)
         station.audit("verify", node.uuid, verified.verdict)

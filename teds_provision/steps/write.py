@@ -7,7 +7,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from types import MappingProxyType
 
-from teds_provision.errors import BadData, NodeRefused, NotAuthentic, PolicyRefused
+from teds_provision.errors import BadData, Garbled, NodeRefused, NodeSilent, NotAuthentic, PolicyRefused
 from teds_provision.protocol.datasheet import SEQUENCE_WINDOW
 from teds_provision.protocol.messages.frames import Reason, update_teds, write_teds
 from teds_provision.protocol.messages.identity import Identity, NodeState
@@ -21,6 +21,8 @@ from teds_provision.teds.image import SECURITY, BlockId, Image
 
 WRITE_OVERHEAD = 53
 _STARTS = 3
+_LOSSES = 20
+_SMALLEST_PIECE = 48
 
 Progress = Callable[[int, int], None]
 """``progress(octets written, octets to write)``."""
@@ -123,34 +125,57 @@ def _commit(station: Station, node: Conversation, image: Image, has: Image | Non
     has = has or known_image(station, image.uuid)
     skip = {block for block in image if has is not None and has.blocks.get(block) == image.blocks[block]}
     for attempt in range(_STARTS):
+        last = attempt == _STARTS - 1
         try:
             octets = _stage(node, image, skip - {SECURITY}, progress)
             node.send(update_teds(*SECURITY), "the commit")
             return octets
         except NodeRefused as refusal:
-            if refusal.reason != Reason.DIGEST_MISMATCH or not skip - {SECURITY} or attempt == _STARTS - 1:
+            if refusal.reason != Reason.DIGEST_MISMATCH or not skip - {SECURITY} or last:
                 raise
             skip = set()  # the node does not hold what it was last read to hold: send everything
+        except (NodeSilent, Garbled):
+            if last or not node.lives():
+                raise
+            if _is_there(node, image):
+                return 0
         except SessionLost as lost:
-            if attempt == _STARTS - 1:
+            if last:
                 raise lost.cause from lost
-            node.reopen()
-            if read_block(node, SECURITY) == image.security:  # the commit happened, its reply was lost
+            if _is_there(node, image):
                 return 0
     raise AssertionError("every attempt returns or raises")
 
 
+def _is_there(node: Conversation, image: Image) -> bool:
+    """In a new session: whether the commit happened, and only its reply was lost."""
+    node.reopen()
+    return read_block(node, SECURITY) == image.security
+
+
 def _stage(node: Conversation, image: Image, skip: set[BlockId], progress: Progress | None) -> int:
-    """Write every block but those of ``skip`` into the node's staging; returns the octets written."""
-    segment = node.identity.max_message - WRITE_OVERHEAD
+    """Write every block but those of ``skip`` into the node's staging; returns the octets written.
+
+    Where frames are lost the pieces shrink: a short one comes through where a long one never would.
+    """
+    piece = node.identity.max_message - WRITE_OVERHEAD
     blocks = [block for block in image if block not in skip]
     total = sum(len(image.blocks[block]) for block in blocks)
-    done = 0
+    done, losses = 0, 0
     for channel, access_code in blocks:
         teds = image.blocks[channel, access_code]
-        for offset in range(0, len(teds), segment):
-            part = teds[offset : offset + segment]
-            node.send(write_teds(channel, access_code, offset, part), f"TEDS {access_code} of channel {channel}")
+        offset = 0
+        while offset < len(teds):
+            part = teds[offset : offset + piece]
+            try:
+                node.send(write_teds(channel, access_code, offset, part), f"TEDS {access_code} of channel {channel}")
+            except (NodeSilent, Garbled):
+                losses += 1
+                if losses > _LOSSES or not node.lives():
+                    raise
+                piece = max(_SMALLEST_PIECE, min(piece, len(part)) // 2)
+                continue
+            offset += len(part)
             done += len(part)
             if progress is not None:
                 progress(done, total)

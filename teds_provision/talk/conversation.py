@@ -6,7 +6,7 @@ import logging
 import time
 from types import TracebackType
 
-from teds_provision.errors import LinkFailure, NodeRefused, NotAuthentic, TedsProvisionError
+from teds_provision.errors import Garbled, LinkFailure, NodeRefused, NodeSilent, NotAuthentic, TedsProvisionError
 from teds_provision.links import Contact, Notice
 from teds_provision.links.ports import NoticeSink
 from teds_provision.protocol.messages.frames import Command, Function, Reason, Reply, decode_reply, security_command
@@ -17,6 +17,8 @@ _log = logging.getLogger(__name__)
 _BUSY_PAUSE = 0.25
 _BUSY_SECONDS = 10.0
 _REOPENINGS = 2
+_REPEATS = 5
+"""How often a command that does no harm is sent again on a link that loses frames."""
 _OPENING = "to open a session"
 
 _MEANING = {
@@ -183,15 +185,32 @@ class Conversation:
 
     def ask(self, command: Command, doing: str) -> bytes:
         """Send a command that may be repeated without harm, over a new session where the old one was lost."""
-        for _ in range(_REOPENINGS):
+        reopenings = repeats = 0
+        while True:
             try:
                 return self.send(command, doing)
-            except SessionLost:
+            except SessionLost as lost:
+                reopenings += 1
+                if reopenings > _REOPENINGS:
+                    raise lost.cause from lost
                 self.reopen()
+            except (NodeSilent, Garbled):
+                repeats += 1
+                if repeats > _REPEATS or not self.lives():
+                    raise
+
+    def lives(self) -> bool:
+        """Whether a node that a message did not reach still answers: on a bus single frames are lost, nodes are not.
+
+        Never True at a reader: what is not answered there has left the field.
+        """
+        if not self.contact.link.capabilities.many:
+            return False
         try:
-            return self.send(command, doing)
-        except SessionLost as lost:
-            raise lost.cause from lost
+            self._exchange(security_command(Function.IDENTIFY))
+        except LinkFailure:
+            return False
+        return True
 
     def _exchange(self, command: Command) -> Reply:
         until = time.monotonic() + _BUSY_SECONDS

@@ -284,8 +284,9 @@ def test_a_config_that_is_no_toml_is_bad_data(home: Path) -> None:
 def test_a_question_can_be_answered_on_a_terminal(home: Path) -> None:
     call(home, "whitelist", "add", ONE)
     code, _, err = on_terminal(home, "whitelist", "remove", ONE, answers=b"n\n")
-    assert (code, "[y/N]" in err) == (130, True)
-    code, out, _ = on_terminal(home, "whitelist", "remove", ONE, answers=b"y\n", passphrase=PASSPHRASE)
+    assert (code, "[y/N]" in err, "You said no" in err) == (6, True, True)
+    code, out, _ = on_terminal(home, "whitelist", "remove", ONE, answers=b"y
+", passphrase=PASSPHRASE)
     assert (code, "is off the whitelist" in out) == (0, True)
 
 
@@ -293,7 +294,7 @@ def test_a_question_can_be_answered_on_a_terminal(home: Path) -> None:
 def test_no_input_and_json_never_ask(home: Path, words: list[str]) -> None:
     call(home, "whitelist", "add", ONE)
     code, out, err = on_terminal(home, *words, "whitelist", "remove", ONE)
-    assert code == 2
+    assert code == 6
     assert "--yes" in out + err
     code, out, err = on_terminal(home, *words, "backup", home / "b")
     assert code == 7

@@ -11,12 +11,13 @@ from rich.spinner import Spinner
 
 from teds_provision.cli.context import App
 from teds_provision.cli.rendering import LiveReporter
-from teds_provision.cli.steps.provision import _plan, _runner
+from teds_provision.cli.steps.provision import _questions
 from teds_provision.errors import NotAuthentic
 from teds_provision.links.nfc.message import Record
 from teds_provision.steps.agree import agree
 from teds_provision.steps.build import BuildOrder, build
 from teds_provision.steps.identify import identify
+from teds_provision.steps.provision import provision
 from teds_provision.steps.sign_command import SignOrder, sign_image
 from teds_provision.store import StoreLock, WhitelistEntry
 from teds_provision.talk.progress import Silent
@@ -41,14 +42,6 @@ def test_people_see_the_result_before_the_error(capsys: pytest.CaptureFixture[st
     with pytest.raises(NotAuthentic):
         App().conclude({}, "all checks", NotAuthentic("Nobody signed it."))
     assert capsys.readouterr().out == "all checks\n"
-
-
-def test_a_dry_run_of_provision_leaves_no_trace(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    station, board = make_station(tmp_path / "home"), Board()
-    _plan(App(as_json=True), station, talk(board))
-    assert json.loads(capsys.readouterr().out)["plan"][:3] == ["identify", "whitelist", "agree"]
-    assert station.nodes.all() == []
-    assert station.nodes.datasheet(board.uuid) is None
 
 
 def test_a_dry_run_of_sign_against_the_node_settles_no_key(tmp_path: Path) -> None:
@@ -76,8 +69,9 @@ def test_the_store_is_free_while_a_person_is_asked(tmp_path: Path, monkeypatch: 
 
     monkeypatch.setattr(click, "confirm", confirm)
     monkeypatch.setattr(App, "interactive", True)
+    questions = _questions(App(home=home, quiet=True), False)
     with talk(board) as node:
-        done = _runner(App(home=home, quiet=True), station, ANGLE, False, Silent())(node)
+        done = provision(station, node, ANGLE, accept=questions.accept, reporter=Silent(), confirm=questions.confirm)
     assert done.verified.verdict == "authentic"
     assert len(asked) == 1
 

@@ -143,7 +143,8 @@ def test_a_node_that_moves_away_in_the_transfer_is_5(station: Station, node: Nod
     assert outcome.code == 5
     assert 1 <= outcome.err[outcome.err.index("Error:") :].count("\n") <= 3
     assert node.flash["provisioned"] is False
-    assert station.tables()["steps"]
+    failed = [entry for entry in station.ask("log")["entries"] if entry["act"] == "provision"]
+    assert [(entry["uuid"], entry["outcome"]) for entry in failed] == [(node.uuid, "node-silent")]
 
 
 @pytest.mark.parametrize("room", [100, 2500])

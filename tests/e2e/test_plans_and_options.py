@@ -80,14 +80,14 @@ def test_nobody_is_asked_with_no_input(station: Station, node: Node) -> None:
     station.ask("whitelist", "add", node.uuid)
     for words in (["whitelist", "remove", node.uuid], ["reset", node.uuid, *links]):
         outcome = station.run("--no-input", *words)
-        assert outcome.code == 2, outcome
+        assert outcome.code == 6, outcome
         assert "--yes" in outcome.err
     assert len(station.ask("whitelist", "list")["whitelist"]) == 1
     assert station.run("--no-input", "whitelist", "remove", node.uuid, "--yes").code == 0
 
 
 def test_a_person_is_asked_on_a_terminal_and_may_say_no(station: Station, node: Node) -> None:
-    """On a real pseudo-terminal: the question names UUID and key; "n" ends with 130, node and whitelist as before."""
+    """On a real pseudo-terminal: the question names UUID and key; "n" ends with 6, node and whitelist as before."""
     node.start()
     before = node.octets
     ours, theirs = pty.openpty()
@@ -116,7 +116,7 @@ def test_a_person_is_asked_on_a_terminal_and_may_say_no(station: Station, node: 
         process.wait()
         os.close(ours)
     assert node.uuid.encode() in said
-    assert process.returncode == 130
+    assert process.returncode == 6
     assert out == b""
     assert node.octets == before
     assert station.ask("whitelist", "list")["whitelist"] == []

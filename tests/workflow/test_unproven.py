@@ -13,6 +13,7 @@ import pytest
 
 from teds_provision.errors import AddressConflict, NotAuthentic, Unproven
 from teds_provision.links import Contact
+from teds_provision.links.ports import CAN, Capabilities
 from teds_provision.protocol.messages.frames import (
     COMMON,
     Function,
@@ -45,6 +46,7 @@ class Attacker:
     state: NodeState = NodeState.FACTORY
     reason: Reason = Reason.WRONG_STATE
     via: str = "can"
+    capabilities: Capabilities = CAN
     asked: list[int] = field(default_factory=list)
 
     @property
