@@ -285,8 +285,7 @@ def test_a_question_can_be_answered_on_a_terminal(home: Path) -> None:
     call(home, "whitelist", "add", ONE)
     code, _, err = on_terminal(home, "whitelist", "remove", ONE, answers=b"n\n")
     assert (code, "[y/N]" in err, "You said no" in err) == (6, True, True)
-    code, out, _ = on_terminal(home, "whitelist", "remove", ONE, answers=b"y
-", passphrase=PASSPHRASE)
+    code, out, _ = on_terminal(home, "whitelist", "remove", ONE, answers=b"y\n", passphrase=PASSPHRASE)
     assert (code, "is off the whitelist" in out) == (0, True)
 
 
