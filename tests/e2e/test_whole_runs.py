@@ -183,7 +183,6 @@ def test_the_log_tells_every_act_and_no_secret(station: Station, node: Node) -> 
         "whitelist",
         "agree",
         "agree",
-        "build",
         "sign",
         "write",
         "verify",
