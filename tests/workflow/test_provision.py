@@ -20,9 +20,11 @@ from teds_provision.errors import (
 from teds_provision.protocol.messages.frames import Reason
 from teds_provision.protocol.messages.identity import NodeState
 from teds_provision.station.station import Station
+from teds_provision.steps.agree import require_session
 from teds_provision.steps.build import BuildOrder
 from teds_provision.steps.identify import Identified
 from teds_provision.steps.provision import Provisioned, provision
+from teds_provision.steps.write import write
 from teds_provision.talk.progress import Silent
 from teds_provision.teds.codec import security
 from teds_provision.teds.codec.frame import frame
@@ -171,11 +173,18 @@ def test_read_only_teds_are_signed_as_they_are(station: Station, board: Board) -
     assert (0, 13) in security.decode(board.state.blocks[SECURITY]).signed_blocks
 
 
-def test_a_sequence_far_behind_is_caught_up_in_steps(station: Station, board: Board) -> None:
+def test_a_sequence_far_behind_is_caught_up_in_steps_once_a_person_says_so(station: Station, board: Board) -> None:
     run(station, board)
     station.nodes.remember(board.uuid, sequence=200_000)
-    assert run(station, board, order=replace(ANGLE, name="far ahead")).verified.verdict == "authentic"
+    with pytest.raises(PolicyRefused, match="far ahead"):
+        run(station, board, order=replace(ANGLE, name="far ahead"))
+    draft = station.nodes.draft(board.uuid)
+    assert draft is not None
+    with talk(board) as node:
+        require_session(station, node)
+        write(station, node, draft.image, jump=True)
     assert board.state.sequence == 200_001
+    assert station.nodes.draft(board.uuid) is None
 
 
 def test_a_node_reset_by_hand_is_provisioned_again(station: Station, board: Board) -> None:
