@@ -22,9 +22,10 @@ from teds_provision.errors import (
 )
 from teds_provision.links.can.port import CanPort
 from teds_provision.links.ports import Contact, Notice
-from teds_provision.measure.blocks import NodeReport, State
+from teds_provision.measure.blocks import Command, NodeReport, State
 from teds_provision.measure.clock import AT_FIRST, ClockMap, Monotone, Wall
 from teds_provision.measure.facts import facts_of
+from teds_provision.measure.hands import Hands
 from teds_provision.measure.hearing import HeardStream, Hearing
 from teds_provision.measure.interpreter import StreamInterpreter
 from teds_provision.measure.orders import BusShare, Events, StreamTotals, Wish
@@ -79,6 +80,7 @@ class NodeKeeper:
         self._anew = threading.Event()
         self._address: int | None = None
         self._halved = 0
+        self._hands: Hands | None = None
         self._told = ""
         self._thread = threading.Thread(target=self._run, name=f"node {uuid.hex()[:8]}", daemon=True)
 
@@ -90,6 +92,12 @@ class NodeKeeper:
         """Ask it to end in order: Stop, Idle, Close."""
         self._stop.set()
         self._anew.set()
+
+    def command(self, command: Command) -> None:
+        """A set point for one of its actuators; dropped while it is not there."""
+        hands = self._hands
+        if hands is not None:
+            hands.take(command)
 
     def join(self, seconds: float) -> None:
         """Wait for its end."""
@@ -169,13 +177,19 @@ class NodeKeeper:
             self.clock = ClockMap()
         for _ in range(AT_FIRST):
             self._tell_time(trusted)
-        channels = sensors_of(trusted.sheet.channels, wish.channels, wish.kind)
-        if len(channels) == sum(1 for one in trusted.sheet.channels if not one.actuator):
+        actuators = self._actuators(trusted)
+        numbers = {one.number for one in actuators}
+        asked = [number for number in wish.channels if number not in numbers]
+        only_acts = actuators and (
+            not any(not one.actuator for one in trusted.sheet.channels) or (wish.channels and not asked)
+        )
+        channels = [] if only_acts else sensors_of(trusted.sheet.channels, asked, wish.kind)
+        if channels and len(channels) == sum(1 for one in trusted.sheet.channels if not one.actuator):
             claim(trusted, 0, lease=wish.lease)
         else:
             for one in channels:
                 claim(trusted, one.number, lease=wish.lease)
-        plans = self._subscribe(trusted, channels, address)
+        plans = self._subscribe(trusted, channels, address) if channels else Plans((), 0.0)
         periods = {number: p.subscribe.period / 1e9 for p in plans.streams for number in p.layout.channels}
         self._events.facts(
             [
@@ -184,17 +198,41 @@ class NodeKeeper:
                     one,
                     name=trusted.name,
                     fingerprint=trusted.fingerprint,
-                    period=None if _is_event(one) else periods[one.number],
+                    period=None if _is_event(one) else periods.get(one.number),
                 )
-                for one in channels
+                for one in (*channels, *actuators)
             ]
         )
+        if actuators:
+            self._hands = Hands(
+                trusted,
+                self._port,
+                address,
+                tuple(sorted(numbers)),
+                dead_man=wish.dead_man,
+                clock=self.clock,
+                turn=self.turn,
+                mapping=self._mapping,
+                echo=self._events.block,
+                tell=lambda why: self._say(self.state, why=why),
+            )
         notes = [plans.slowed] if plans.slowed else []
         notes += [problem for heard in self.running.values() for problem in heard.interpreter.problems.values()]
         self.ever_ran, self.error = True, None
         self._say("running", why="; ".join(notes))
         self.ready.set()
         return channels
+
+    def _actuators(self, trusted: Trusted) -> list[Channel]:
+        """Actuators that set points may come for: of a node on the whitelist, with a way from values to raw."""
+        if not self._wish.actuators or self._station.pins.entry(self.uuid) is None:
+            return []
+        wanted = self._wish.channels
+        return [
+            one
+            for one in trusted.sheet.channels
+            if one.actuator and not one.value_problem and (not wanted or one.number in wanted)
+        ]
 
     def _subscribe(self, trusted: Trusted, channels: list[Channel], address: int) -> Plans:
         while True:
@@ -293,6 +331,9 @@ class NodeKeeper:
     def _end(self, trusted: Trusted, address: int) -> None:
         """Let go in order, as far as the node still answers."""
         alive = self._stop.is_set()
+        if self._hands is not None:
+            self._hands.close()
+            self._hands = None
         self._hearing.on_announce(address, None)
         self._stop_streams(trusted if alive else None, address)
         with self._bus.lock:

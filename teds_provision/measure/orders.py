@@ -12,6 +12,7 @@ from teds_provision.measure.planning import BusTime
 from teds_provision.protocol.operation.stream_commands import Kind
 
 LEASE = 10  # seconds
+DEAD_MAN = 1000  # milliseconds
 
 
 @dataclass(frozen=True)
@@ -25,6 +26,8 @@ class Wish:
     test_pattern: bool = False
     lease: int = LEASE
     timeout: float = 60.0
+    actuators: bool = False  # whether set points may come for actuators of nodes on the whitelist
+    dead_man: int = DEAD_MAN
 
 
 @dataclass

@@ -16,7 +16,7 @@ from typing import Any
 from teds_provision.errors import NoNode, TedsProvisionError
 from teds_provision.links.can.bus import Frame
 from teds_provision.links.can.port import CanPort
-from teds_provision.measure.blocks import Block, ChannelFacts, NodeReport, StationFacts
+from teds_provision.measure.blocks import Block, ChannelFacts, Command, NodeReport, StationFacts
 from teds_provision.measure.clock import Wall
 from teds_provision.measure.grid import Grid
 from teds_provision.measure.hearing import Hearing
@@ -71,6 +71,7 @@ class Measurement:
     sinks: Sequence[Sink]
     facts: StationFacts
     watcher: Watcher = field(default_factory=Watcher)
+    keepers: list[NodeKeeper] = field(default_factory=list, init=False)
 
     def run(self, stop: threading.Event, duration: float | None = None) -> Ended:
         """Measure until ``stop``, for ``duration`` seconds of data, or until no node is left.
@@ -147,6 +148,12 @@ class Measurement:
             for sink in self.sinks:
                 sink.write_group(rows)
 
+    def command(self, command: Command) -> None:
+        """A set point that came by a sink."""
+        for keeper in self.keepers:
+            if keeper.uuid.hex() == command.uuid:
+                keeper.command(command)
+
     # -- from the threads of nodes and bus ---------------------------------------------------------------------------
 
     def _block(self, block: Block) -> None:
@@ -165,7 +172,8 @@ class Measurement:
                 spans = [heard.receiver.plan.span for one in self.keepers for heard in list(one.running.values())]
                 patience = max(spans, default=0) / 1e9 + 2 * BEAT
                 group = self.facts.group or "all"
-                self._grid = Grid(group, [self._known[key] for key in sorted(self._known)], patience=patience)
+                sensors = [one for _, one in sorted(self._known.items()) if one.kind != "actuator"]
+                self._grid = Grid(group, sensors, patience=patience)
         for sink in self.sinks:
             sink.describe(facts)
         self.watcher.facts(facts)

@@ -27,10 +27,11 @@ CALIBRATIONS = {
 class Bench:
     """A station that has provisioned an angle sensor and a gripper, both on one bus and running."""
 
-    def __init__(self, desk: Desk) -> None:
+    def __init__(self, desk: Desk, only: str = "") -> None:
         self.desk, self.station = desk, desk.station()
         self.can = ["--can", f"{desk.links.can}&fd=1"]
-        self.angle, self.gripper = (self.node(name, type_) for name, type_ in (("a", ANGLE), ("g", "gripper")))
+        self.gripper = self.node("g", "gripper")
+        self.angle = self.gripper if only else self.node("a", ANGLE)
 
     def node(self, name: str, type_: str) -> Node:
         folder = self.desk.folder / name
@@ -41,6 +42,7 @@ class Bench:
         calibration = self.desk.folder / f"{name}.csv"
         calibration.write_text(CALIBRATIONS[type_])
         words = ["--profile", type_, "--calibration", calibration, "--name", name, "--via", "can", *self.can]
+        words[-1] = f"{words[-1]}&node=0x{node.flash['can_address']:02X}"
         done = self.station.ask("provision", *words, "--yes")
         assert done["uuid"] == node.uuid
         assert done["verdict"] == "authentic"

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -18,6 +18,7 @@ from teds_provision.errors import PolicyRefused, UsageFailure
 from teds_provision.links import LinkSettings
 
 if TYPE_CHECKING:
+    from teds_provision.measure.blocks import Command
     from teds_provision.measure.runner import Ended
     from teds_provision.station.station import Station
 
@@ -42,6 +43,9 @@ KINDS = ("periodic", "event", "free")
 @click.option("--ros1", is_flag=True, help="Publish to ROS 1 (ROS_MASTER_URI).")
 @click.option("--ros2", is_flag=True, help="Publish to ROS 2 (ROS_DOMAIN_ID), on this machine.")
 @click.option("--mqtt", metavar="URL", help="Publish to a broker: mqtt://HOST, with Home Assistant discovery.")
+@click.option("--actuators/--no-actuators", default=True, show_default=True, help="Take set points from ROS topics.")
+@click.option("--dead-man", type=click.IntRange(20, 10_000), default=1000, show_default=True, metavar="MS",
+              help="An actuator without set points for so long is safe.")  # fmt: skip
 @click.option("--require", type=click.Path(path_type=Path, dir_okay=False), metavar="FILE", help="What the task needs.")
 @click.option("--scalar-rate", type=click.FloatRange(0, 1000), default=10.0, show_default=True, metavar="HZ",
               help="Rate of topics of one value.")  # fmt: skip
@@ -74,7 +78,10 @@ def measure(
     if links.via != "can":
         raise UsageFailure("Streams need a bus.", hint="Name it with --can; over NFC: teds-provision sample UUID")
     specs = [*files, *(name for name in ("ros1", "ros2") if wished[name])]
-    sinks = [open_sink(spec) for spec in [*specs, *([mqtt] if mqtt else [])]]
+    orders = Orders()
+    sinks = [
+        open_sink(spec, orders.take if wished["actuators"] else None) for spec in [*specs, *([mqtt] if mqtt else [])]
+    ]
     wish = Wish(
         channels=tuple(dict.fromkeys(wished["channels"])),
         rate=wished["rate"],
@@ -82,6 +89,8 @@ def measure(
         trigger=wished["trigger"],
         test_pattern=wished["test_pattern"],
         timeout=links.timeout,
+        actuators=wished["actuators"] and (wished["ros1"] or wished["ros2"]),
+        dead_man=wished["dead_man"],
     )
     station = app.station()
     group, uuids = _who(station, what)
@@ -92,8 +101,19 @@ def measure(
             station.unlock(uuid)
         if require is not None:
             _require(app, station, uuids, require)
-        ended = _run(app, station, links, uuids, group, wish, sinks, duration, scalar_rate)
+        ended = _run(app, station, links, uuids, wish, sinks, duration, orders, group=group, scalar_rate=scalar_rate)
     _tell_end(app, ended)
+
+
+class Orders:
+    """Passes set points on to the measurement, which is made after the sinks that they come from."""
+
+    def __init__(self) -> None:
+        self.to: Callable[[Command], None] = lambda _command: None
+
+    def take(self, command: Command) -> None:
+        """A set point."""
+        self.to(command)
 
 
 def _who(station: Station, what: Sequence[str]) -> tuple[str, list[bytes]]:
@@ -110,10 +130,12 @@ def _run(
     station: Station,
     links: LinkSettings,
     uuids: Sequence[bytes],
-    group: str,
     wish: Any,
     sinks: Sequence[Any],
     duration: float | None,
+    orders: Orders,
+    *,
+    group: str,
     scalar_rate: float,
 ) -> Ended:
     from teds_provision.cli.measure.showing import watcher_for
@@ -132,6 +154,7 @@ def _run(
         with watcher_for(app, station, sinks, stop) as watcher, ending(stop):
             station.audit("measure", None, "begun", nodes=[uuid.hex() for uuid in uuids], group=group)
             measurement = Measurement(station, port, uuids, wish, sinks, facts, watcher)
+            orders.to = measurement.command
             ended = measurement.run(stop, duration)
     finally:
         port.close()

@@ -1,0 +1,192 @@
+"""Actuators of a node in a measurement: set points that come by topics, applied in the node's session.
+
+An actuator is claimed when its first set point comes, not before (operation.md section 7), and the dead-man is fed by
+set points alone: when they stop, the node goes to its safe state by itself, and the next one claims it anew. A set
+point beyond the limits of the datasheet, or older than the dead-man, is refused and told; it is never changed. More
+than DRIVE_ABOVE set points a second to one actuator go as Drive messages, which need no reply.
+"""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections import deque
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from teds_provision.errors import LinkFailure, NodeRefused, TedsProvisionError
+from teds_provision.links.can.bus import Frame
+from teds_provision.links.can.port import CanPort
+from teds_provision.measure.acting import LEASE
+from teds_provision.measure.blocks import Block, Command
+from teds_provision.measure.clock import ClockMap
+from teds_provision.measure.trusting import Trusted, claim
+from teds_provision.protocol.operation.can_frames import DriveAddress, cut
+from teds_provision.protocol.operation.commands import write_data_set
+from teds_provision.protocol.operation.datagram import Layout
+from teds_provision.protocol.operation.driving import Driver
+from teds_provision.protocol.operation.stream_commands import Driven, drive
+from teds_provision.talk.conversation import SessionLost
+from teds_provision.teds.calibration.interpreter import ChannelInterpreter
+
+DRIVE_ABOVE = 50  # set points a second
+WATCHED = 10  # set points over which their rate is taken
+ECHO = 255  # number of the "stream" in which applied set points are echoed; nodes have 0 to 3
+
+
+@dataclass
+class _Hand:
+    interpreter: ChannelInterpreter
+    claimed_until: float = 0.0
+    count: int = 0
+    came: deque[float] = field(default_factory=lambda: deque(maxlen=WATCHED))
+    driver: Driver | None = None
+
+    @property
+    def fast(self) -> bool:
+        """Whether set points come so fast that a reply to each would hold them up."""
+        full = len(self.came) == WATCHED
+        return full and self.came[-1] - self.came[0] < (WATCHED - 1) / DRIVE_ABOVE
+
+
+class Hands:
+    """The actuators of one node in one session. ``take`` returns at once; the newest set point of each counts."""
+
+    def __init__(
+        self,
+        trusted: Trusted,
+        port: CanPort,
+        address: int,
+        numbers: tuple[int, ...],
+        *,
+        dead_man: int,
+        clock: ClockMap,
+        turn: threading.Lock,
+        mapping: threading.Lock,
+        echo: Callable[[Block], None],
+        tell: Callable[[str], None],
+    ) -> None:
+        self._trusted, self._port, self._address = trusted, port, address
+        self._dead_man, self._clock, self._turn, self._mapping = dead_man, clock, turn, mapping
+        self._echo, self._tell = echo, tell
+        self._hands = {number: _Hand(ChannelInterpreter(trusted.sheet, number)) for number in numbers}
+        self._newest: dict[int, Command] = {}
+        self._news = threading.Condition()
+        self._stop = False
+        self.refused = 0
+        self._thread = threading.Thread(target=self._run, name=f"hands {trusted.uuid[:8]}", daemon=True)
+        self._thread.start()
+
+    def take(self, command: Command) -> None:
+        """A set point in the SI unit of the datasheet."""
+        with self._news:
+            if command.channel in self._hands and not self._stop:
+                self._newest[command.channel] = command
+                self._news.notify_all()
+
+    def close(self) -> None:
+        """Take no more; what is claimed is let go by the node's own end."""
+        with self._news:
+            self._stop = True
+            self._news.notify_all()
+        self._thread.join(2.0)
+
+    def _run(self) -> None:
+        while True:
+            with self._news:
+                while not self._newest and not self._stop:
+                    self._news.wait()
+                if self._stop:
+                    return
+                commands, self._newest = list(self._newest.values()), {}
+            for command in commands:
+                try:
+                    self._apply(command)
+                except SessionLost as lost:
+                    self._refuse(f"channel {command.channel}: the session was lost: {lost.cause.message}")
+                except TedsProvisionError as error:
+                    self._refuse(f"channel {command.channel}: {error.message}")
+
+    def _refuse(self, why: str) -> None:
+        self.refused += 1
+        self._tell(f"set point refused, {why.rstrip('.')}")
+
+    def _apply(self, command: Command) -> None:
+        hand = self._hands[command.channel]
+        one = hand.interpreter
+        age = time.monotonic() - command.received
+        if age > self._dead_man / 1000:
+            raise LinkFailure(f"It is {age:.2f} s old; the dead-man is {self._dead_man} ms.")
+        value = one.unit.from_si(command.value)
+        beyond = one.beyond(value)
+        if beyond:
+            self._refuse(f"{beyond}")
+            return
+        octets = one.encode(value)
+        hand.came.append(command.received)
+        with self._turn:
+            self._send(command.channel, hand, octets)
+        self._say(command.channel, hand, octets)
+
+    def _send(self, number: int, hand: _Hand, octets: bytes) -> None:
+        now = time.monotonic()
+        if now >= hand.claimed_until:
+            self._claim(number, hand)
+        alone = sum(1 for one in self._hands.values() if one.claimed_until > now) <= 1
+        if hand.fast and alone:
+            self._drive(number, hand, octets)
+        else:
+            hand.driver = None
+            try:
+                self._trusted.node.send(write_data_set(number, octets), "to set the actuator")
+            except NodeRefused as refusal:
+                hand.claimed_until = 0.0
+                if refusal.reason != 2:
+                    raise
+                # Its dead-man has run out meanwhile, by the node's clock: the way back is a new Operate.
+                self._claim(number, hand)
+                self._trusted.node.send(write_data_set(number, octets), "to set the actuator")
+        hand.claimed_until = time.monotonic() + self._dead_man / 1000
+
+    def _claim(self, number: int, hand: _Hand) -> None:
+        hand.driver = None
+        try:
+            claim(self._trusted, number, lease=LEASE, dead_man=self._dead_man)
+        except NodeRefused as refusal:
+            if refusal.reason != 2:  # it is claimed by this session still
+                raise
+
+    def _drive(self, number: int, hand: _Hand, octets: bytes) -> None:
+        if hand.driver is None:
+            layout = Layout((number,), (len(octets),))
+            reply = Driven.decode(self._trusted.node.send(drive([number]), "to be driven"))
+            hand.driver = Driver(layout, reply, self._trusted.node.message_key, dead_man=self._dead_man)
+        with self._mapping:
+            now = self._clock.ticks_at(time.monotonic_ns())
+        message = hand.driver.seal((octets,), now)
+        identifier = DriveAddress(self._address, self._port.spec.source).identifier
+        for piece in cut(message, fd=self._port.spec.fd, drive=True):
+            self._port.send(Frame(identifier, piece.data, self._port.spec.fd))
+
+    def _say(self, number: int, hand: _Hand, octets: bytes) -> None:
+        """Echo what was applied, as a sample of the actuator's channel."""
+        one = hand.interpreter
+        raw = one.reader.raw(octets)
+        found = one.values(raw)
+        value = np.asarray(one.unit.to_si(found.value), dtype=np.float64)  # type: ignore[arg-type]
+        self._echo(
+            Block(
+                uuid=self._trusted.uuid,
+                stream=ECHO,
+                channels=(number,),
+                index=hand.count,
+                time=np.array([time.time()]),
+                tick=np.array([0], dtype=np.uint64),
+                raw=raw.reshape(1, 1),
+                value=value.reshape(1, 1),
+                valid=np.isfinite(value).reshape(1, 1),
+            )
+        )
+        hand.count += 1
