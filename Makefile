@@ -5,7 +5,7 @@ PYTHON ?= python3
 VENV ?= .venv
 BIN := $(VENV)/bin
 
-.PHONY: demo test lint types unit bench bench-teds bench-handover fuzz faults model clean
+.PHONY: demo test lint types unit bench bench-teds bench-handover bench-scale fuzz faults model clean
 
 demo: $(VENV)/.run
 	@$(BIN)/teds-provision demo
@@ -32,6 +32,9 @@ bench-teds: $(VENV)/.dev
 
 bench-handover: $(VENV)/.dev
 	$(BIN)/python -m benchmarks.handover
+
+bench-scale: $(VENV)/.dev
+	$(BIN)/python -m benchmarks.scale
 
 # Coverage-guided fuzzing of every parser of octets: RUNS inputs each (a million take about an hour and a half on one
 # core), or one of them: make fuzz TARGET=nfc RUNS=100000. atheris gets an environment of its own.

@@ -4,10 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
+from typing import TYPE_CHECKING
 
+from teds_provision.lazy import late
 from teds_provision.station.seals import Seals
 from teds_provision.store import DatasheetRecord, Draft, Known, NodeRecord, Search, Store
 from teds_provision.teds.image import Image
+
+if TYPE_CHECKING:
+    from teds_provision.teds import sheet
+else:  # TEDS: a list decodes none
+    sheet = late("teds_provision.teds.sheet")
 
 
 class Nodes:
@@ -88,7 +95,9 @@ class Nodes:
             if draft is not None and draft.image == image:
                 profile = profile or draft.profile
                 self._store.drop_draft(image.uuid)
-            self._store.put_datasheet(image, profile)
+            if self._store.put_datasheet(image, profile):
+                ends = [channel.due for channel in sheet.Sheet.of(image).channels if channel.due is not None]
+                self._store.set_due(image.uuid, min(ends).strftime("%Y-%m-%d") if ends else None)
 
     def history(self, uuid: bytes) -> list[DatasheetRecord]:
         """The datasheets that a node had, newest first: the present one and at most ten older ones.

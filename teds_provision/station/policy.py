@@ -4,15 +4,21 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Iterable
+from typing import TYPE_CHECKING
 
 from teds_provision.errors import NotWhitelisted, PolicyRefused
-from teds_provision.protocol.keys import fingerprint
+from teds_provision.lazy import late
 from teds_provision.station.identity import Identity
 from teds_provision.station.node_keys import NodeKeys
 from teds_provision.station.pins import Pins
 from teds_provision.station.seals import Seals
 from teds_provision.store import Revocation, Store, Tombstone, TrustRecord, WhitelistEntry
 from teds_provision.store.records import TrustRole
+
+if TYPE_CHECKING:
+    from teds_provision.protocol import keys
+else:  # cryptography: not for commands that only list
+    keys = late("teds_provision.protocol.keys")
 
 
 class Policy:
@@ -53,21 +59,21 @@ class Policy:
         The last one counts no more once trust in those who brought it has ended (:meth:`end_ca`).
         """
         cas = [self._identity.ca, *(record.point for record in self.trusted("ca"))]
-        if uuid is None or (kept := self._keys.ca_of(uuid)) in cas or fingerprint(kept) in self._store.ended_cas():
+        if uuid is None or (kept := self._keys.ca_of(uuid)) in cas or keys.fingerprint(kept) in self._store.ended_cas():
             return cas
         return [*cas, kept]
 
     def counts(self, ca: bytes) -> bool:
         """Whether trust in a CA has not been ended."""
-        return fingerprint(ca) not in self._store.ended_cas()
+        return keys.fingerprint(ca) not in self._store.ended_cas()
 
     def end_ca(self, ca: bytes) -> None:
         """Have a CA that came in a bundle count no more for the nodes that keep it."""
-        self._store.end_ca(fingerprint(ca))
+        self._store.end_ca(keys.fingerprint(ca))
 
     def renew_ca(self, ca: bytes) -> None:
         """Have a CA count again for the nodes that keep it: a person took in a bundle that names it."""
-        self._store.renew_ca(fingerprint(ca))
+        self._store.renew_ca(keys.fingerprint(ca))
 
     def trusted_stations(self) -> list[bytes]:
         """Station keys that count here: its own, and those added."""

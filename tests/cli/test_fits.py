@@ -8,7 +8,6 @@ from pathlib import Path
 import pytest
 
 from teds_provision.errors import PolicyRefused
-from teds_provision.station.nodes import Nodes
 from teds_provision.steps.fits import NodeFit, require
 from teds_provision.store import NodeRecord, Store
 from teds_provision.teds.calibration import fit
@@ -35,7 +34,7 @@ def known(home: Path) -> Path:
         for uuid in (GOOD, COARSE, UNSEEN):
             store.put_node(NodeRecord(uuid))
         for uuid, uncertainty in ((GOOD, 0.5), (COARSE, 5.0)):
-            Nodes(store).keep_datasheet(image(uuid, uncertainty))
+            store.put_datasheet(image(uuid, uncertainty))
     return home
 
 

@@ -88,6 +88,10 @@ class NodeTables:
                 f"INSERT OR REPLACE INTO nodes({_NODE_COLUMNS}) VALUES({marks})", tuple(values.values())
             )
 
+    def set_due(self, uuid: bytes, due: str | None) -> None:
+        """Note the day (ISO 8601) on which the first calibration of a node ends, None where none does."""
+        self._database.execute("UPDATE nodes SET due = ? WHERE uuid = ? AND due IS NOT ?", (due, uuid, due))
+
     def unpin_node(self, uuid: bytes) -> None:
         """Forget the identity key of a node on its owner's explicit order; epoch and sequence stay."""
         self._database.execute("UPDATE nodes SET point = NULL, point_mac = NULL WHERE uuid = ?", (uuid,))

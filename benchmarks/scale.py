@@ -1,0 +1,188 @@
+"""What grows with the number of nodes: commands on stores of 10 to 100,000 nodes, wall time, memory and exponents.
+
+Run: ``python -m benchmarks.scale [SIZE …]`` (default 10 1000 10000 100000). Each command is the shipped one, a process of
+its own, the median of three runs (one at 100,000). ``exponent``: 0 is flat, 1 grows as the nodes do, between the two
+largest sizes, less the time of a command that does nothing (``--version``). Aims: issue 13 row 8, issue 9 "At scale".
+"""
+
+from __future__ import annotations
+
+import hashlib
+import math
+import os
+import statistics
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+from teds_provision.protocol.keys import SoftwareKey, fingerprint
+from teds_provision.station.station import Station, initialise
+from teds_provision.store import Batch, KeyRecord, NodeRecord, WhitelistEntry, utc_now
+from teds_provision.teds.image import Image
+from teds_provision.teds.profile import load_profile
+from teds_provision.vault import forget_vaults, node_key_context, passphrase
+
+PASSPHRASE = "correct horse battery"
+SIZES = (10, 1000, 10_000, 100_000)
+_PAGE = 2000
+
+
+@dataclass(frozen=True)
+class Row:
+    """One command: its words, and what it may take at 100,000 nodes (seconds, MB; None for no aim)."""
+
+    name: str
+    words: tuple[str, ...]
+    seconds: float | None = None
+    megabytes: float | None = 100.0
+
+
+@dataclass(frozen=True)
+class Taken:
+    """Seconds and megabytes of one command."""
+
+    seconds: float
+    megabytes: float
+
+
+def fill(home: Path, count: int) -> None:
+    """A station with so many provisioned nodes: pin, key, datasheet, and an entry of the audit log each."""
+    forget_vaults()
+    costs = passphrase.THROWAWAY
+    station, _ = initialise(home, name="n", keystore="file", ask=lambda p, c: PASSPHRASE, costs=costs)
+    points = [SoftwareKey(number).point for number in range(1, 98)]
+    octets = load_profile("temperature-sensor").build(bytes(10)).blocks
+    for first in range(0, count, _PAGE):
+        numbers = range(first, min(count, first + _PAGE))
+        entries = [WhitelistEntry(_uuid(n), fingerprint(points[n % 97]), name=f"node-{n}") for n in numbers]
+        with station.transaction():
+            station.handovers.take_in(
+                Batch(
+                    nodes=[_node(number, points) for number in numbers],
+                    whitelist=[
+                        WhitelistEntry(_uuid(n), fingerprint(points[n % 97]), name=f"node-{n}") for n in numbers
+                    ],
+                    keys=[_key(station, number) for number in numbers],
+                )
+            )
+            for number in numbers:
+                signed = {**octets, (0, 128): os.urandom(900)}
+                station._store.put_datasheet(Image(_uuid(number), signed), "temperature-sensor")
+                station.audit("verify", _uuid(number), "authentic")
+    station.close()
+    forget_vaults()
+
+
+def _uuid(number: int) -> bytes:
+    return hashlib.sha256(number.to_bytes(4, "big")).digest()[:10]
+
+
+def _node(number: int, points: list[bytes]) -> NodeRecord:
+    return NodeRecord(
+        _uuid(number),
+        points[number % 97],
+        f"node-{number}",
+        "temperature-sensor",
+        2,
+        1,
+        3,
+        verdict="authentic",
+        last_seen=utc_now(),
+        channels=1,
+        teds_sha256="ab" * 32,
+    )
+
+
+def _key(station: Station, number: int) -> KeyRecord:
+    uuid, key = _uuid(number), hashlib.sha256(b"k" + number.to_bytes(4, "big")).digest()
+    sealed = station.vault.wrap(key[:16], context=node_key_context(station.id, uuid, 1, 1))
+    return KeyRecord(uuid, 1, key[:8].hex(), "active", 1, sealed)
+
+
+def commands(folder: Path, count: int) -> Iterator[Row]:
+    """What is timed on a store of ``count`` nodes."""
+    last = _uuid(count - 1).hex()
+    listed = str(folder / f"whitelist{count}.csv")
+    yield Row("--version", ("--version",))
+    yield Row("nodes UUID", ("nodes", last), 0.15)
+    yield Row("nodes NAME", ("nodes", f"node-{count - 1}"), 0.15)
+    yield Row("log --last 20", ("log", "--last", "20"), 0.15)
+    yield Row("nodes --json", ("--json", "nodes"))
+    yield Row("nodes (table)", ("nodes",))
+    yield Row("nodes TEXT", ("nodes", last[:7]))
+    yield Row("log", ("log",))
+    yield Row("whitelist list", ("whitelist", "list"))
+    yield Row("whitelist add", ("whitelist", "add", "ee" * 10))
+    yield Row("whitelist export", ("whitelist", "export", listed))
+    yield Row("whitelist import", ("whitelist", "import", listed))
+    yield Row("doctor", ("doctor",), 3.0, None)
+
+
+def run(home: Path, words: tuple[str, ...]) -> Taken:
+    """Run the program once, output thrown away; the passphrase comes through a pipe."""
+    read, write = os.pipe()
+    os.write(write, PASSPHRASE.encode() + b"\n")
+    os.close(write)
+    command = [sys.executable, "-m", "teds_provision", "--home", str(home), "--passphrase-fd", str(read), *words]
+    begun = time.perf_counter()
+    process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, pass_fds=(read,))
+    os.close(read)
+    _, _, usage = os.wait4(process.pid, 0)
+    process.returncode = 0
+    return Taken(time.perf_counter() - begun, usage.ru_maxrss / 1024)
+
+
+def main(sizes: tuple[int, ...]) -> None:
+    """Fill a store of each size, time every command on it, and print the table."""
+    taken: dict[str, dict[int, Taken]] = {}
+    rows: dict[str, Row] = {}
+    with tempfile.TemporaryDirectory() as name:
+        for size in sizes:
+            home = Path(name, str(size))
+            fill(home, size)
+            octets = (home / "store.sqlite3").stat().st_size
+            print(f"{size} nodes: {octets / size / 1000:.2f} kB a node", file=sys.stderr, flush=True)
+            for row in commands(Path(name), size):
+                rows[row.name] = row
+                runs = [run(home, row.words) for _ in range(1 if size >= 100_000 else 3)]
+                median = statistics.median(one.seconds for one in runs)
+                taken.setdefault(row.name, {})[size] = Taken(median, max(one.megabytes for one in runs))
+    print_table(sizes, rows, taken)
+
+
+def print_table(sizes: tuple[int, ...], rows: dict[str, Row], taken: dict[str, dict[int, Taken]]) -> None:
+    """One line a command: seconds at each size, memory at the largest, the exponent, and the verdict on its aim."""
+    print("command".ljust(18) + "".join(f"{size:>10}" for size in sizes) + "        MB  exponent  aim")
+    nothing = taken["--version"]
+    for name, each in taken.items():
+        cells = "".join(f"{each[size].seconds:>8.2f} s" for size in sizes)
+        most, least = each[sizes[-1]], nothing[sizes[-1]]
+        exponent, aim = _exponent(sizes, each, nothing), _aim(rows[name], most, least)
+        print(f"{name:<18}{cells}{most.megabytes:>10.0f}{exponent:>10}  {aim}")
+    table, listed = taken["nodes (table)"][sizes[-1]], taken["nodes --json"][sizes[-1]]
+    print(f"table / JSON: {table.seconds / listed.seconds:.2f} (aim 2)")
+
+
+def _exponent(sizes: tuple[int, ...], each: dict[int, Taken], nothing: dict[int, Taken]) -> str:
+    if len(sizes) < 2:
+        return "-"
+    small, large = (max(0.005, each[size].seconds - nothing[size].seconds) for size in sizes[-2:])
+    return f"{math.log(large / small) / math.log(sizes[-1] / sizes[-2]):.2f}"
+
+
+def _aim(row: Row, at_most: Taken, nothing: Taken) -> str:
+    told = []
+    if row.seconds is not None:
+        own = at_most.seconds - (nothing.seconds if row.seconds < 1 else 0)
+        told.append(f"{'met' if own <= row.seconds else 'MISSED'}: {own:.2f} of {row.seconds} s")
+    if row.megabytes is not None and at_most.megabytes > row.megabytes:
+        told.append(f"MISSED: {at_most.megabytes:.0f} of {row.megabytes:.0f} MB")
+    return ", ".join(told)
+
+
+if __name__ == "__main__":
+    main(tuple(map(int, sys.argv[1:])) or SIZES)
