@@ -1,7 +1,7 @@
 """What grows with the number of nodes: commands on stores of 10 to 100,000 nodes, wall time, memory and exponents.
 
-Run: ``python -m benchmarks.scale [SIZE …]`` (default 10 1000 10000 100000). Each command is the shipped one, a process of
-its own, the median of three runs (one at 100,000). ``exponent``: 0 is flat, 1 grows as the nodes do, between the two
+Run: ``python -m benchmarks.scale [SIZE …]`` (default 10 1000 10000 100000). Each command is the shipped one, a process
+of its own, the median of three runs (one at 100,000). ``exponent``: 0 is flat, 1 grows as the nodes do, between the two
 largest sizes, less the time of a command that does nothing (``--version``). Aims: issue 13 row 8, issue 9 "At scale".
 """
 
@@ -63,9 +63,7 @@ def fill(home: Path, count: int) -> None:
             station.handovers.take_in(
                 Batch(
                     nodes=[_node(number, points) for number in numbers],
-                    whitelist=[
-                        WhitelistEntry(_uuid(n), fingerprint(points[n % 97]), name=f"node-{n}") for n in numbers
-                    ],
+                    whitelist=entries,
                     keys=[_key(station, number) for number in numbers],
                 )
             )
