@@ -41,6 +41,7 @@ class Sealer:
 
     def __init__(self, key: bytes) -> None:
         self._cipher = AESCCM(key, tag_length=TAG_OCTETS)
+        self._decrypt = self._cipher.decrypt
 
     def seal(self, counter: int, plain: bytes) -> bytes:
         """One message; a counter is used once, which is the caller's to see to."""
@@ -50,7 +51,7 @@ class Sealer:
     def open(self, message: bytes) -> bytes | None:
         """The plain octets, None for a bad tag (or too few octets to hold one)."""
         try:
-            return self._cipher.decrypt(_NONCE_HEAD + message[:COUNTER_OCTETS], message[COUNTER_OCTETS:], None)
+            return self._decrypt(_NONCE_HEAD + message[:COUNTER_OCTETS], message[COUNTER_OCTETS:], None)
         except (InvalidTag, ValueError):
             return None
 

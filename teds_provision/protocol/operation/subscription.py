@@ -7,7 +7,7 @@ counts each cause apart. No clock of its own: the caller hands in the bounds of 
 from __future__ import annotations
 
 from collections import deque
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Final, NamedTuple
 
 from teds_provision.errors import NotAuthentic
@@ -97,15 +97,15 @@ def most_instants(kind: Kind, octets: int, most: int = MOST_OCTETS) -> int:
     return max(0, min(255, room // octets, 1 if kind == Kind.EVENT else 255)) if octets else 0
 
 
-@dataclass(frozen=True, slots=True)
-class Message:
+class Message(NamedTuple):
     """One good data message: ``index`` of its first sample, ``tick`` of that (ns), n instants one after another.
 
     Sample i of it was taken at ``tick`` + i · period (kinds periodic and free). For events ``index`` counts events.
     """
 
+    # A NamedTuple, since one is made for every message; it hides tuple.index, which nobody asks of a message.
     counter: int
-    index: int
+    index: int  # type: ignore[assignment]
     tick: int
     flags: int
     data: bytes
@@ -165,7 +165,8 @@ class Receiver:
         self._sealer = Sealer(stream_key(message_key, reply.run))
         self._before = previous._sealer if previous is not None else None
         self._oldest = 2 * plan.span + LATE_AFTER if oldest is None else oldest
-        self._length = plan.length
+        self._length, self._n, self._period = plan.length, plan.subscribe.n, plan.subscribe.period
+        self._last_instant = plan.span - plan.subscribe.period
         self._timed = plan.subscribe.kind != Kind.PERIODIC
         self._pattern = TEST_PATTERN if plan.subscribe.test_pattern else 0
         self._held: deque[tuple[Message, TickBounds]] = deque()
@@ -202,7 +203,7 @@ class Receiver:
         """The first instant of a stream that waited is known (mark + 10 ms): gives the messages held, where fresh."""
         self.start = start
         held, self._held = self._held, deque()
-        dated = [(replace(message, tick=start + message.tick), now) for message, now in held]
+        dated = [(message._replace(tick=start + message.tick), now) for message, now in held]
         return [message for message, now in dated if self._fresh(message, now)]
 
     def finish(self, counter: int) -> None:
@@ -221,18 +222,16 @@ class Receiver:
         return b"".join(rows)
 
     def _read(self, counter: int, plain: bytes) -> Message:
-        index = counter * self.plan.subscribe.n
+        index = counter * self._n
         if self._timed:
             return Message(counter, index, int.from_bytes(plain[1 : 1 + _TICK], "big"), plain[0], plain[1 + _TICK :])
-        since = index * self.plan.subscribe.period
-        return Message(counter, index, since + (self.start or 0), plain[0], plain[1:])
+        return Message(counter, index, index * self._period + (self.start or 0), plain[0], plain[1:])
 
     def _fresh(self, message: Message, now: TickBounds) -> bool:
         if message.tick > now.high:
             self.counts.future += 1
             return False
-        last = message.tick + (self.plan.span - self.plan.subscribe.period)
-        if last < now.low - self._oldest:
+        if message.tick + self._last_instant < now.low - self._oldest:
             self.counts.stale += 1
             return False
         self.counts.good += 1
