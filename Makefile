@@ -5,7 +5,7 @@ PYTHON ?= python3
 VENV ?= .venv
 BIN := $(VENV)/bin
 
-.PHONY: demo test lint types unit bench bench-teds bench-handover bench-scale fuzz faults model clean
+.PHONY: demo test lint types unit bench bench-teds bench-handover bench-scale fuzz faults model house sbom clean
 
 demo: $(VENV)/.run
 	@$(BIN)/teds-provision demo
@@ -49,6 +49,10 @@ fuzz: .venv-fuzz/.ready
 faults: $(VENV)/.dev
 	$(BIN)/python -m tests.faults.bench $(if $(FULL),--full,--minutes 60)
 
+# The figures of the house: circles, late imports, complexity, drawers, lines.
+house: $(VENV)/.dev
+	$(BIN)/python scripts/house.py
+
 # The model of a key's life, by SPIN: the rules hold, each broken one is found.
 model: $(VENV)/.made
 	$(BIN)/python model/check.py
@@ -77,5 +81,16 @@ $(VENV)/.dev: $(VENV)/.made pyproject.toml
 	.venv-fuzz/bin/python -m pip install --quiet --editable '.[fuzz]'
 	@touch $@
 
+# What is in an installation, as a CycloneDX bill of materials.
+sbom: .venv-sbom/.ready
+	@mkdir -p build
+	.venv-sbom/bin/cyclonedx-py environment $(VENV)/bin/python --output-format JSON --output-file build/sbom.json
+	@echo "build/sbom.json"
+
+.venv-sbom/.ready: $(VENV)/.run
+	$(PYTHON) -m venv .venv-sbom
+	.venv-sbom/bin/python -m pip install --quiet 'cyclonedx-bom>=4'
+	@touch $@
+
 clean:
-	rm -rf $(VENV) .venv-fuzz .mypy_cache .ruff_cache .pytest_cache
+	rm -rf $(VENV) .venv-fuzz .venv-sbom .mypy_cache .ruff_cache .pytest_cache

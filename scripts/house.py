@@ -1,0 +1,143 @@
+"""The figures of the house: circles, arrows that run back, imports inside functions, complexity, drawers, lines.
+
+Usage: python scripts/house.py. Prints a table; `make house` runs it, and tests/test_house.py holds the figures that
+cannot flake against their aims.
+"""
+
+from __future__ import annotations
+
+import ast
+from collections import Counter
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+PACKAGE = Path(__file__).resolve().parent.parent / "teds_provision"
+NAME = "teds_provision"
+
+
+@dataclass(frozen=True)
+class Module:
+    """One file: its dotted name, its tree, and the dotted names of ours that it imports, anywhere in it."""
+
+    name: str
+    path: Path
+    tree: ast.Module
+    imports: frozenset[str]
+
+
+def modules() -> dict[str, Module]:
+    """Every module of the package by its dotted name."""
+    found: dict[str, tuple[Path, ast.Module]] = {}
+    for path in sorted(PACKAGE.rglob("*.py")):
+        parts = path.relative_to(PACKAGE.parent).with_suffix("").parts
+        name = ".".join(parts[:-1] if parts[-1] == "__init__" else parts)
+        found[name] = path, ast.parse(path.read_text(encoding="utf-8"))
+    return {
+        name: Module(name, path, tree, frozenset(_targets(tree, set(found)) - {name}))
+        for name, (path, tree) in found.items()
+    }
+
+
+def _targets(tree: ast.AST, known: set[str]) -> set[str]:
+    result: set[str] = set()
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Import):
+            result |= {alias.name for alias in node.names if alias.name in known}
+        elif isinstance(node, ast.ImportFrom) and node.module in known:
+            whole = {f"{node.module}.{alias.name}" for alias in node.names}
+            result |= (whole & known) or {node.module}
+    return result
+
+
+def circles(found: dict[str, Module]) -> list[list[str]]:
+    """Groups of files that import each other (Tarjan's strongly connected components of more than one)."""
+    number: dict[str, int] = {}
+    low: dict[str, int] = {}
+    stack: list[str] = []
+    result: list[list[str]] = []
+
+    def visit(name: str) -> None:
+        number[name] = low[name] = len(number)
+        stack.append(name)
+        for target in found[name].imports:
+            if target not in number:
+                visit(target)
+                low[name] = min(low[name], low[target])
+            elif target in stack:
+                low[name] = min(low[name], number[target])
+        if low[name] == number[name]:
+            group = []
+            while not group or group[-1] != name:
+                group.append(stack.pop())
+            if len(group) > 1:
+                result.append(sorted(group))
+
+    for name in found:
+        if name not in number:
+            visit(name)
+    return result
+
+
+def late_imports(found: dict[str, Module]) -> list[str]:
+    """Imports of our own modules inside functions: ``file:line``."""
+    result = []
+    for module in found.values():
+        for function in ast.walk(module.tree):
+            if isinstance(function, ast.FunctionDef | ast.AsyncFunctionDef):
+                for node in ast.walk(function):
+                    ours = isinstance(node, ast.ImportFrom) and (node.module or "").split(".")[0] == NAME
+                    if ours or (isinstance(node, ast.Import) and any(a.name.startswith(NAME) for a in node.names)):
+                        result.append(f"{module.path.relative_to(PACKAGE)}:{node.lineno}")
+    return sorted(set(result))
+
+
+def complex_functions(found: dict[str, Module]) -> list[str]:
+    """Functions of cyclomatic complexity C or worse (11 and more, as radon counts)."""
+    from radon.complexity import cc_visit  # noqa: PLC0415  only this figure needs it
+
+    result = []
+    for module in found.values():
+        for block in cc_visit(module.path.read_text(encoding="utf-8")):
+            for one in [block, *getattr(block, "methods", [])]:
+                if type(one).__name__ == "Function" and one.complexity > 10:
+                    result.append(f"{one.complexity:3} {module.path.relative_to(PACKAGE)}:{one.lineno} {one.name}")
+    return sorted(set(result), reverse=True)
+
+
+def drawers() -> list[tuple[int, str]]:
+    """Files side by side in each folder, the fullest first (``__init__`` not counted)."""
+    count = Counter(
+        str(path.parent.relative_to(PACKAGE.parent)) for path in PACKAGE.rglob("*.py") if path.stem[0] != "_"
+    )
+    return sorted(((number, folder) for folder, number in count.items()), reverse=True)
+
+
+def lines(found: dict[str, Module]) -> list[tuple[int, str]]:
+    """Lines of each room, the longest first."""
+    count: Counter[str] = Counter()
+    for module in found.values():
+        parts = module.path.relative_to(PACKAGE).parts
+        count[parts[0] if len(parts) > 1 else "(top)"] += len(module.path.read_text(encoding="utf-8").splitlines())
+    return sorted(((number, room) for room, number in count.items()), reverse=True)
+
+
+def report() -> Iterator[str]:
+    """The table, line by line."""
+    found = modules()
+    rings, late, knots = circles(found), late_imports(found), complex_functions(found)
+    yield f"circles of files                        {len(rings):6}   aim 0"
+    yield from (f"    {' ~ '.join(ring)}" for ring in rings)
+    yield f"imports of our own inside functions     {len(late):6}   aim 10 at most"
+    yield from (f"    {place}" for place in late[:12])
+    yield f"functions of complexity C or worse      {len(knots):6}   aim 10 at most"
+    yield from (f"    {knot}" for knot in knots[:25])
+    yield f"files in the fullest folder             {drawers()[0][0]:6}   aim 15 at most"
+    yield from (f"    {number:3} {folder}" for number, folder in drawers() if number > 15)
+    yield f"lines                                   {sum(number for number, _ in lines(found)):6}"
+    yield from (f"    {number:6} {room}" for number, room in lines(found))
+
+
+if __name__ == "__main__":
+    for line in report():
+        print(line)
