@@ -317,3 +317,20 @@ def test_after_a_restart_the_node_is_silent() -> None:
     assert safe(bench)
     assert not bench.open().operation().measuring
     assert bench.reason(drive([4])) == Reason.WRONG_STATE
+
+
+@pytest.mark.parametrize("end", ["close", "lost", "by hand", "replaced"])
+def test_nothing_of_a_session_stays_in_ram(end: str) -> None:
+    bench = acting()
+    match end:
+        case "close":
+            bench.send(security_command(Function.CLOSE))
+        case "lost":
+            bench.tim.link_lost("can:f1")
+        case "by hand":
+            bench.tim.reset_by_hand()
+        case _:
+            bench.open().send(IDENTIFY)
+    role = bench.tim._role
+    assert role is not None
+    assert (role._ports, role.streams._sessions, role.claims._leases) == ({}, {}, {})
