@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import lru_cache
 
 from teds_provision.errors import BadData
 from teds_provision.protocol.agreement import Credentials
@@ -76,7 +77,13 @@ def station_signature_good(teds: SecurityTeds, ca: bytes, verify: Verify = verif
     """Whether 104 is the CA's signature over 103, and 103 a point."""
     if teds.station_key is None or teds.station_key_signature is None or not is_point(teds.station_key):
         return False
-    return verify(ca, station_key_message(teds.station_key), teds.station_key_signature)
+    return _certified(ca, teds.station_key, teds.station_key_signature)
+
+
+@lru_cache(maxsize=256)
+def _certified(ca: bytes, station: bytes, signature: bytes) -> bool:
+    """The same for every node of a station, and asked twice for each: remembered, since it never changes."""
+    return verify(ca, station_key_message(station), signature)
 
 
 def signature_good(teds: SecurityTeds, octets: bytes, uuid: bytes, verify: Verify = verify) -> bool:

@@ -11,6 +11,7 @@ from teds_provision.protocol import datasheet
 from teds_provision.protocol.keys import fingerprint, is_point, node_key_message, verify
 from teds_provision.protocol.messages.identity import Identity
 from teds_provision.station.station import Station
+from teds_provision.steps.judging import Judging
 from teds_provision.steps.sign import known_image
 from teds_provision.teds.codec import security
 from teds_provision.teds.codec.codes import AccessCode
@@ -84,7 +85,7 @@ def known_of(station: Station, uuid: bytes, identity: Identity | None) -> Known:
     return Known(identity, shown.sequence, shown.key_epoch) if trusted else Known(identity)
 
 
-def verify_image(station: Station, image: Image, *, known: Known | None = None) -> list[Check]:
+def verify_image(station: Judging, image: Image, *, known: Known | None = None) -> list[Check]:
     """Check an image as far as octets and this station's trust go; ``known`` is None for a file judged alone.
 
     Never raises on any octets.
@@ -170,7 +171,7 @@ def _algorithms(shown: SecurityTeds) -> Check:
     return _check("algorithms", not wrong, why, "ECDSA P-256, SHA-256, AES-128")
 
 
-def _node_key(station: Station, uuid: bytes, shown: SecurityTeds) -> Check:
+def _node_key(station: Judging, uuid: bytes, shown: SecurityTeds) -> Check:
     name = "node key"
     signed = is_point(shown.node_key) and verify(
         shown.node_key, node_key_message(uuid, shown.node_key), shown.node_key_signature
@@ -212,12 +213,12 @@ def _sequence(shown: SecurityTeds, known: Known | None) -> Check:
     return _check(name, shown.sequence >= known.sequence, why, str(shown.sequence))
 
 
-def _not_revoked(station: Station, uuid: bytes) -> Check:
+def _not_revoked(station: Judging, uuid: bytes) -> Check:
     revoked = station.policy.revocation(uuid)
     return _check("not revoked", revoked is None, f"revoked: {revoked.why}" if revoked else "")
 
 
-def _station(station: Station, uuid: bytes, shown: SecurityTeds) -> Check:
+def _station(station: Judging, uuid: bytes, shown: SecurityTeds) -> Check:
     key = shown.station_key or b""
     certified = any(datasheet.station_signature_good(shown, ca) for ca in station.policy.trusted_cas(uuid))
     return _check(
@@ -228,7 +229,7 @@ def _station(station: Station, uuid: bytes, shown: SecurityTeds) -> Check:
     )
 
 
-def _certificate(station: Station, uuid: bytes, shown: SecurityTeds) -> Check:
+def _certificate(station: Judging, uuid: bytes, shown: SecurityTeds) -> Check:
     name = "station certificate"
     for ca in station.policy.trusted_cas(uuid):
         if datasheet.station_signature_good(shown, ca):

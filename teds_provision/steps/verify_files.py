@@ -1,0 +1,153 @@
+"""Many images at once: each judged as ``verify IMAGE`` judges one, on every core (cli.md, ``verify FILES…|DIR``)."""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Final
+
+from teds_provision.errors import BadData, NotFound, PolicyRefused, TedsProvisionError
+from teds_provision.files import read_limited
+from teds_provision.limits import LIMITS
+from teds_provision.station.station import Station
+from teds_provision.steps.judging import Judging, remember
+from teds_provision.steps.verify import Check, Verified, require_authentic, verify_image
+from teds_provision.teds.guard.guard import check_calibration
+from teds_provision.teds.image import Image
+
+ENDING: Final = "*.json"
+_FEW: Final = 50
+"""So many are judged sooner than another process is ready."""
+_CHUNK: Final = 64
+
+
+@dataclass(frozen=True)
+class FileVerdict:
+    """What became of one file: its checks, or why it could not be read; ``exit_code`` as the command would end."""
+
+    path: Path
+    uuid: str | None = None
+    verdict: str | None = None
+    checks: tuple[Check, ...] = ()
+    warnings: tuple[str, ...] = ()
+    exit_code: int = 0
+    code: str = ""
+    error: str = ""
+
+    def to_json(self) -> dict[str, object]:
+        """One line of the result."""
+        out: dict[str, object] = {"file": str(self.path), "uuid": self.uuid, "scope": "image", "verdict": self.verdict}
+        out["checks"] = [{"name": check.name, "result": check.result, "why": check.why} for check in self.checks]
+        out["warnings"] = list(self.warnings)
+        if self.error:
+            out["error"] = {"code": self.code, "message": self.error}
+        return out
+
+
+@dataclass
+class Totals:
+    """How many files came to which verdict; ``exit_code`` is that of the worst."""
+
+    files: int = 0
+    verdicts: dict[str, int] = field(default_factory=dict)
+    exit_code: int = 0
+
+    def add(self, verdict: FileVerdict) -> None:
+        """Count one in."""
+        self.files += 1
+        word = verdict.verdict or "unreadable"
+        self.verdicts[word] = self.verdicts.get(word, 0) + 1
+        if _WORST.index(verdict.exit_code) > _WORST.index(self.exit_code):
+            self.exit_code = verdict.exit_code
+
+    def to_json(self) -> dict[str, object]:
+        """The last line."""
+        return {"totals": {"files": self.files, **dict(sorted(self.verdicts.items()))}}
+
+
+# From good to bad: a harmful calibration, a file that is not there or holds no image, one that is not authentic.
+_WORST: Final = (0, 6, 7, 3, 8, 1, 4)
+
+
+def image_files(paths: Sequence[Path]) -> list[Path]:
+    """Files that are named, and every ``*.json`` below folders that are named, by name.
+
+    Raises NotFound for a folder without one; a file that is not there is told with the others' verdicts.
+    """
+    found: list[Path] = []
+    for path in paths:
+        if path.is_dir():
+            inside = sorted(file for file in path.rglob(ENDING) if file.is_file())
+            if not inside:
+                raise NotFound(f"There is no image ({ENDING}) in the folder {path}.")
+            found += inside
+        else:
+            found.append(path)
+    return list(dict.fromkeys(found))
+
+
+def verify_files(station: Station, files: Sequence[Path], *, processes: int | None = None) -> Iterator[FileVerdict]:
+    """Judge every file, in order; a fault of one is its verdict and stops no other.
+
+    More than a few files are shared among ``processes`` (as many as there are cores).
+    """
+    workers = min(processes or len(os.sched_getaffinity(0)), (len(files) + _CHUNK - 1) // _CHUNK)
+    judging = remember(station)
+    if len(files) <= _FEW or workers <= 1:
+        yield from (_judged(judging, path) for path in files)
+        return
+    context = multiprocessing.get_context("fork")  # what is remembered is simply there
+    with context.Pool(workers, initializer=_begin, initargs=(judging,)) as pool:
+        yield from pool.imap(_judge, files, chunksize=min(_CHUNK, max(1, len(files) // (4 * workers))))
+
+
+_judging: Judging | None = None
+
+
+def _begin(judging: Judging) -> None:
+    global _judging  # noqa: PLW0603 - set once, in a process of its own
+    _judging = judging
+
+
+def _judge(path: Path) -> FileVerdict:
+    assert _judging is not None
+    return _judged(_judging, path)
+
+
+def _judged(judging: Judging, path: Path) -> FileVerdict:
+    try:
+        image = Image.from_json(read_limited(path, LIMITS.teds_file, "image", failure=BadData))
+    except TedsProvisionError as error:
+        return FileVerdict(path, exit_code=error.exit_code, code=error.code, error=error.message)
+    verified = Verified(image.uuid, tuple(verify_image(judging, image)), scope="image")
+    result = FileVerdict(path, image.uuid.hex(), verified.verdict, verified.checks)
+    try:
+        require_authentic(verified)
+        return _with_warnings(result, image)
+    except TedsProvisionError as error:
+        return _ended(result, error)
+
+
+def _with_warnings(result: FileVerdict, image: Image) -> FileVerdict:
+    """Look at the calibrations, as every command does before it trusts a datasheet."""
+    findings = check_calibration(image.unsigned_blocks())
+    texts = tuple(f"channel {finding.channel}: {finding.message}" for finding in findings)
+    harmful = [text for text, finding in zip(texts, findings, strict=True) if finding.severity == "error"]
+    whole = FileVerdict(result.path, result.uuid, result.verdict, result.checks, texts)
+    return _ended(whole, PolicyRefused(f"The calibration is refused: {harmful[0]}.")) if harmful else whole
+
+
+def _ended(result: FileVerdict, error: TedsProvisionError) -> FileVerdict:
+    return FileVerdict(
+        result.path,
+        result.uuid,
+        result.verdict,
+        result.checks,
+        result.warnings,
+        error.exit_code,
+        error.code,
+        error.message,
+    )
