@@ -12,7 +12,7 @@ from dataclasses import dataclass, field, fields, replace
 from typing import Final
 
 from teds_provision.errors import BadData
-from teds_provision.teds.codec.frame import frame, raw_tuple, tuples, unframe
+from teds_provision.teds.codec.frame import frame, raw_tuple, unframe
 from teds_provision.teds.image import BlockId
 
 TEDSID_TUPLE: Final = bytes.fromhex("030400800101")
@@ -26,6 +26,7 @@ OLDER_SUITE = 1
 OUR_VALUES: Final = {1: 4, 2: 2, 3: 0, 4: 1, 105: 1, 109: 2, 110: 1}
 _U8 = (1, 2, 3, 4, 105, 109, 110)
 _BASE64 = {100: 64, 101: 65, 102: 64, 103: 65, 104: 64}
+_OCTETS = dict.fromkeys(_U8, 1) | dict.fromkeys(_BASE64, 88) | {6: 8, 106: 4, 107: 4}
 _KNOWN = {1, 2, 3, 4, 5, 6, *range(100, 111)}
 INITIAL_FIELDS: Final = frozenset({1, 2, 3, 4, 5, 6, 101, 102, 105, 106, 107, 109, 110})
 SIGNED_FIELDS: Final = INITIAL_FIELDS | {100, 103, 104}
@@ -109,15 +110,12 @@ def decode(teds: bytes) -> SecurityTeds:
     """Read a framed Security TEDS in canonical form; raises NotCanonical with the rule that it breaks."""
     try:
         block = unframe(teds)
-        parts = [(part.type, part.value) for part in tuples(block)]
+        parts = _places(block)
     except BadData as error:
         raise NotCanonical(error.message) from error
     if block[:6] != TEDSID_TUPLE:
         raise NotCanonical("The first tuple of the Security TEDS is not exactly 03 04 00 80 01 01.")
-    values = _ascending(parts[1:])
-    for number, value in values.items():
-        _check_length(number, value)
-    blocks = _signed_blocks([value for number, value in parts[1:] if number == SIGNED_BLOCK])
+    values, blocks = _ascending(block, parts[1:])
     missing = INITIAL_FIELDS - values.keys()
     if missing:
         raise NotCanonical(f"The Security TEDS lacks field {min(missing)}.")
@@ -132,7 +130,7 @@ def decode(teds: bytes) -> SecurityTeds:
         signature=raw.get(SIGNATURE),
         station_key=raw.get(STATION_KEY),
         station_key_signature=raw.get(STATION_KEY_SIGNATURE),
-        signed_blocks=blocks,
+        signed_blocks=_signed_blocks(blocks),
         values={number: values[number][0] for number in _U8},
         extra={number: value for number, value in values.items() if number >= 111},
     )
@@ -141,41 +139,66 @@ def decode(teds: bytes) -> SecurityTeds:
 def tbs(uuid: bytes, teds: bytes) -> bytes:
     """What field 100 signs: label ‖ UUID ‖ the data block without the tuple of type 100, cut from the octets."""
     block = unframe(teds)
-    kept = bytearray()
-    for part in tuples(block):
-        if part.type != SIGNATURE:
-            kept += raw_tuple(part.type, part.value)
-    return b"TEDS1 datasheet\0" + uuid + bytes(kept)
+    kept, done = [b"TEDS1 datasheet\0", uuid], 0
+    for number, start, end in _places(block):
+        if number == SIGNATURE:
+            kept.append(block[done : start - 2])
+            done = end
+    return b"".join([*kept, block[done:]])
 
 
 def has_profile_version(teds: bytes) -> bool:
     """Say whether the tuples close and field 105 is there: such a TEDS is canonical or refused."""
     try:
-        return any(part.type == PROFILE_VERSION for part in tuples(unframe(teds)))
+        return any(number == PROFILE_VERSION for number, _, _ in _places(unframe(teds)))
     except BadData:
         return False
 
 
-def _ascending(parts: list[tuple[int, bytes]]) -> dict[int, bytes]:
+def _places(block: bytes) -> list[tuple[int, int, int]]:
+    """Type, start and end of the value of every tuple (one length octet each); raises BadData where one runs out.
+
+    Walked three times for each datasheet (is it ours, what does it say, what is signed), so this loop does no more.
+    """
+    places, at, size = [], 0, len(block)
+    try:
+        while at < size:
+            start = at + 2
+            end = start + block[at + 1]
+            places.append((block[at], start, end))
+            at = end
+    except IndexError:
+        at = size + 1
+    if at > size:
+        number = places[-1][0] if places else block[0]
+        raise BadData(f"The tuple of type {number} runs past the end of the data block.")
+    return places
+
+
+def _ascending(block: bytes, parts: list[tuple[int, int, int]]) -> tuple[dict[int, bytes], list[bytes]]:
+    """Values by field, and those of every SignedBlock; raises NotCanonical for an order, field or length of its own."""
     values: dict[int, bytes] = {}
+    blocks: list[bytes] = []
     last = 0
-    for number, value in parts:
-        if number not in _KNOWN and number < 111:
-            raise NotCanonical(f"The Security TEDS holds a field {number} that the profile does not know.")
-        if number < last or (number == last and number != SIGNED_BLOCK):
+    for number, start, end in parts:
+        if number == SIGNED_BLOCK:
+            if number < last:
+                raise NotCanonical(f"Field {number} of the Security TEDS stands out of ascending order or twice.")
+            blocks.append(block[start:end])
+        elif number <= last:
             raise NotCanonical(f"Field {number} of the Security TEDS stands out of ascending order or twice.")
+        else:
+            values[number] = block[start:end]
+            wanted = _OCTETS.get(number)
+            if wanted is not None and end - start != wanted:
+                raise NotCanonical(f"Field {number} of the Security TEDS has {end - start} octets, not {wanted}.")
         last = number
-        if number != SIGNED_BLOCK:
-            values[number] = value
-    return values
-
-
-def _check_length(number: int, value: bytes) -> None:
-    wanted = 1 if number in _U8 else 88 if number in _BASE64 else {6: 8, 106: 4, 107: 4}.get(number)
-    if wanted is not None and len(value) != wanted:
-        raise NotCanonical(f"Field {number} of the Security TEDS has {len(value)} octets, not {wanted}.")
-    if number == 5 and len(value) > CA_OCTETS:
-        raise NotCanonical(f"Field 5 (CA) has {len(value)} octets; {CA_OCTETS} is the most.")
+    unknown = values.keys() - _KNOWN
+    if unknown and min(unknown) < 111:
+        raise NotCanonical(f"The Security TEDS holds a field {min(unknown)} that the profile does not know.")
+    if len(values.get(5, b"")) > CA_OCTETS:
+        raise NotCanonical(f"Field 5 (CA) has {len(values[5])} octets; {CA_OCTETS} is the most.")
+    return values, blocks
 
 
 def _signed_blocks(values: list[bytes]) -> dict[BlockId, bytes]:
@@ -195,10 +218,10 @@ def _signed_blocks(values: list[bytes]) -> dict[BlockId, bytes]:
 
 def _base64(number: int, value: bytes) -> bytes:
     try:
-        raw = base64.b64decode(value, validate=True)
-    except (binascii.Error, ValueError) as error:
+        raw = binascii.a2b_base64(value, strict_mode=True)
+    except binascii.Error as error:
         raise NotCanonical(f"Field {number} of the Security TEDS is not base64.") from error
-    if len(raw) != _BASE64[number] or base64.b64encode(raw) != value:
+    if len(raw) != _BASE64[number] or binascii.b2a_base64(raw, newline=False) != value:
         raise NotCanonical(f"Field {number} of the Security TEDS is not canonical base64 of {_BASE64[number]} octets.")
     return raw
 
