@@ -22,8 +22,6 @@ from teds_provision.teds.codec.values import READERS, is_packed_units, units_of
 
 SUB_SUM: Final = 12
 
-_new = Field.__new__
-
 
 def decode(octets: bytes, *, strict: bool = False) -> Decoded:
     """Decode a framed TEDS or a bare data block, 2007 or 2024 edition (told by the length of the TEDSID).
@@ -43,13 +41,6 @@ def decode(octets: bytes, *, strict: bool = False) -> Decoded:
                 where = "" if finding.offset is None else f" (octet {finding.offset})"
                 raise BadData(f"{finding.message}{where}", hint=f"The verdict of this TEDS is {decoded.verdict}.")
     return decoded
-
-
-def _field(kind: int, name: str, value: Value, raw: bytes, offset: int, children: tuple[Field, ...] = ()) -> Field:
-    # A frozen dataclass sets each attribute through object.__setattr__; filling the dictionary takes half the time.
-    made = _new(Field)
-    made.__dict__.update(type=kind, name=name, value=value, raw=raw, offset=offset, children=children)
-    return made
 
 
 class _Walk(Head):
@@ -97,17 +88,17 @@ class _Walk(Head):
             self.left -= 1
             raw = octets[body:stop]
             if is_tedsid:
-                fields.append(_field(kind, "TEDSID", tuple(raw), raw, at))
+                fields.append(Field(kind, "TEDSID", tuple(raw), raw, at))
             else:
                 spec = spec_of.get(kind)
                 if kind <= last:
                     self.order(kind, last, spec, at, seen)
                 last = kind
                 seen.add(kind)
-                if spec is None or spec.children or len(raw) not in spec.octets:
+                if spec is None or spec.children or not (spec.any_length or len(raw) in spec.octets):
                     fields.append(self.special(kind, spec, raw, at, body))
                 else:
-                    fields.append(_field(kind, spec.name, READERS[spec.kind](raw), raw, at))
+                    fields.append(Field(kind, spec.name, READERS[spec.kind](raw), raw, at))
             at = stop
             if text_based and kind == SUB_SUM:
                 self.text_area(fields, at, end)
@@ -157,8 +148,8 @@ class _Walk(Head):
         if spec.kind == "units":
             return self.units(spec, raw, at, body)
         if spec.children:
-            return _field(kind, spec.name, None, raw, at, self.nested(spec, body, body + len(raw)))
-        return _field(kind, spec.name, self.value(spec, raw, body), raw, at)
+            return Field(kind, spec.name, None, raw, at, self.nested(spec, body, body + len(raw)))
+        return Field(kind, spec.name, self.value(spec, raw, body), raw, at)
 
     def value(self, spec: FieldSpec, raw: bytes, body: int) -> Value:
         """Value of a leaf whose length needs looking at."""
@@ -188,16 +179,16 @@ class _Walk(Head):
         """A type that the table of this class does not have at top level."""
         known = self.table
         if known is None or not known.by_type:
-            return _field(kind, "", None, raw, at)
+            return Field(kind, "", None, raw, at)
         if kind == TEDSID:
             message = f"The type 3 occurs again with {len(raw)} octets (clash with the TEDSID)."
             self.find("error", "tedsid-again", message, at, "TEDSID", "once", "again")
-            return _field(kind, "", None, raw, at)
+            return Field(kind, "", None, raw, at)
         alias = known.aliases.get(kind)
         if alias is not None:
             message = f"{alias.name} has the number {kind} of the clause's text, not that of its table."
             self.find("warning", "numbering", message, at, alias.name, "4 or 5", kind)
-            return _field(kind, alias.name, self.value(alias, raw, body), raw, at)
+            return Field(kind, alias.name, self.value(alias, raw, body), raw, at)
         inner = known.inner.get(kind)
         if inner is not None:
             parent = known.parents[kind]
@@ -207,7 +198,7 @@ class _Walk(Head):
             self.find("error", "top-level", message, at, inner.name, f"inside {parent.name}", "at top level")
             return self.special(kind, inner, raw, at, body)
         self.unknown(kind, at)
-        return _field(kind, "", None, raw, at)
+        return Field(kind, "", None, raw, at)
 
     def unknown(self, kind: int, at: int) -> None:
         known = self.table
@@ -223,7 +214,7 @@ class _Walk(Head):
     def units(self, spec: FieldSpec, raw: bytes, at: int, body: int) -> Field:
         """Physical units in any of three spellings."""
         if is_packed_units(raw):
-            return _field(spec.type, spec.name, units_of(raw), raw, at)
+            return Field(spec.type, spec.name, units_of(raw), raw, at)
         packed = bytearray([0, *[128] * 9, 0])
         children = self.nested(spec, body, body + len(raw))
         for child in children:
@@ -233,7 +224,7 @@ class _Walk(Head):
             self.find(
                 "warning", "units", f"{spec.name} does not say its interpretation.", body, spec.name, "UnitType", ""
             )
-        return _field(spec.type, spec.name, units_of(bytes(packed)), raw, at, children)
+        return Field(spec.type, spec.name, units_of(bytes(packed)), raw, at, children)
 
     def nested(self, parent: FieldSpec, start: int, end: int) -> tuple[Field, ...]:
         """Tuples inside a structure, only those of its own table."""
@@ -254,7 +245,7 @@ class _Walk(Head):
             raw = octets[body:stop]
             spec = by_type.get(kind)
             if spec is not None and len(raw) in spec.octets and kind not in seen:
-                fields.append(_field(kind, spec.name, READERS[spec.kind](raw), raw, at))
+                fields.append(Field(kind, spec.name, READERS[spec.kind](raw), raw, at))
             else:
                 fields.append(self.nested_special(parent, kind, spec, raw, at, body, kind in seen))
             seen.add(kind)
@@ -280,10 +271,10 @@ class _Walk(Head):
             message = f"{other.name} ({kind}) does not belong inside {parent.name}."
             self.find("error", "misplaced", message, at, other.name, "elsewhere", f"inside {parent.name}")
             if not other.children:
-                return _field(kind, other.name, self.value(other, raw, body), raw, at)
-            return _field(kind, other.name, None, raw, at)
+                return Field(kind, other.name, self.value(other, raw, body), raw, at)
+            return Field(kind, other.name, None, raw, at)
         self.unknown(kind, at)
-        return _field(kind, "", None, raw, at)
+        return Field(kind, "", None, raw, at)
 
     def text_area(self, fields: list[Field], at: int, end: int) -> None:
         """What stands behind the directory of a text-based TEDS."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from enum import StrEnum
 from fractions import Fraction
-from typing import Final, Literal
+from typing import Final, Literal, NamedTuple
 
 Edition = Literal[2007, 2024]
 Severity = Literal["error", "warning", "note"]
@@ -87,8 +87,7 @@ class TimeInstance:
 Value = int | float | str | bytes | Units | TimeInstance | tuple[int, ...] | tuple[float, ...] | None
 
 
-@dataclass(frozen=True)
-class Field:
+class Field(NamedTuple):
     """One tuple: its type, name ('' when unknown), decoded value (None when nested or unknown), raw value octets.
 
     ``offset`` is that of the Type octet; ``children`` are the tuples of a nested structure.

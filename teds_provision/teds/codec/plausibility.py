@@ -9,7 +9,6 @@ from typing import Final
 
 from teds_provision.teds.codec import security
 from teds_provision.teds.codec.codes import AccessCode
-from teds_provision.teds.codec.frame import frame
 from teds_provision.teds.codec.model import Field, TimeInstance, Units
 from teds_provision.teds.codec.tables import FieldSpec, Table
 from teds_provision.teds.codec.tables.phy_text_security import LEVELS
@@ -190,6 +189,6 @@ def _security(fields: tuple[Field, ...], find: Find, octets: bytes, framed: bool
         return
 
     try:
-        security.decode(frame(octets[4:-2] if framed else octets))
+        security.decode_block(octets[4:-2] if framed else octets)
     except security.NotCanonical as error:
         find("error", "not-canonical", error.message, None, "", "the canonical form", "")

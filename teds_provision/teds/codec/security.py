@@ -110,6 +110,14 @@ def decode(teds: bytes) -> SecurityTeds:
     """Read a framed Security TEDS in canonical form; raises NotCanonical with the rule that it breaks."""
     try:
         block = unframe(teds)
+    except BadData as error:
+        raise NotCanonical(error.message) from error
+    return decode_block(block)
+
+
+def decode_block(block: bytes) -> SecurityTeds:
+    """Read the data block of a Security TEDS; raises NotCanonical."""
+    try:
         parts = _places(block)
     except BadData as error:
         raise NotCanonical(error.message) from error

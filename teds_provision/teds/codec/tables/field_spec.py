@@ -46,6 +46,10 @@ OCTETS: Final[Mapping[str, tuple[int, ...]]] = {
 }
 
 
+ANY_LENGTH: Final = frozenset({"text", "key", "octets"})
+"""Kinds of value of which every number of octets can be read."""
+
+
 @dataclass(frozen=True)
 class FieldSpec:
     """One row of a field table.
@@ -71,6 +75,7 @@ class FieldSpec:
     by_type: Mapping[int, FieldSpec] = field(init=False, repr=False, compare=False)
     by_name: Mapping[str, FieldSpec] = field(init=False, repr=False, compare=False)
     octets: tuple[int, ...] = field(init=False, repr=False, compare=False)
+    any_length: bool = field(init=False, repr=False, compare=False)
     required: frozenset[int] = field(init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:
@@ -79,6 +84,7 @@ class FieldSpec:
         object.__setattr__(self, "by_type", {child.type: child for child in self.children})
         object.__setattr__(self, "by_name", {child.name: child for child in self.children})
         object.__setattr__(self, "octets", OCTETS.get(self.kind, ()))
+        object.__setattr__(self, "any_length", self.kind in ANY_LENGTH)
 
 
 @dataclass(frozen=True)
