@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from teds_provision.protocol.messages.tables import REASONS
-
 from teds_provision.protocol.messages.frames import Reason
+from teds_provision.protocol.messages.tables import REASONS
 from teds_provision.talk.conversation import refused
 
 
