@@ -19,8 +19,6 @@ from teds_provision.protocol.messages.identity import Identity
 from teds_provision.protocol.repetition import Repetition
 
 _MOST_WAITING: Final = 4
-_FIRST_KINDS: Final = (0, 1)
-"""N_PDU types of a single and of a first frame: a new request begins."""
 
 
 BUS: Final = "can"
@@ -144,10 +142,3 @@ class Seat:
         for line in lines.values():
             line.gone = True
             line.turns.put(line.begin_anew)
-
-    @staticmethod
-    def take(pair: Pair, frame: Frame) -> None:
-        """Give a frame to its pair. A new request ends an answer for which no flow control came."""
-        if pair.sending and frame.data and frame.data[0] >> 4 in _FIRST_KINDS:
-            pair.stop_sending()
-        pair.take(frame)

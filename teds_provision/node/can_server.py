@@ -230,8 +230,10 @@ class CanServer:
             self._flow_control_of_old_address(station, own, frame)
 
     def _request(self, seat: Seat, line: Line, pair: Pair, frame: Frame) -> None:
-        seat.take(pair, frame)
+        pair.take(frame)
         while (body := pair.received()) is not None:
+            if pair.waits_for_flow:
+                pair.stop_sending()  # whoever asks again has not taken that answer up
             received = seat.measuring.tick() if seat.measuring is not None else 0
             line.put(functools.partial(self._run_request, line, pair, Request(body, frame.fd, received)))
         self._note(seat, pair)

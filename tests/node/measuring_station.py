@@ -11,9 +11,10 @@ from teds_provision.errors import NodeRefused
 from teds_provision.links.can.bus import Frame
 from teds_provision.links.can.port import CanPort
 from teds_provision.links.can.shared import Ear
+from teds_provision.links.ports import Link
 from teds_provision.node import described
 from teds_provision.node.flash_file import FlashFile
-from teds_provision.protocol.messages.frames import Command, Reply, decode_reply
+from teds_provision.protocol.messages.frames import Command, Function, Reply, decode_reply, security_command
 from teds_provision.protocol.operation.can_frames import Assembly, cut, data_address, trigger_identifier
 from teds_provision.protocol.operation.commands import Operate, Operation
 from teds_provision.protocol.operation.stream_commands import CLOCK, Clock, Subscribed
@@ -32,22 +33,15 @@ def keyed_node(folder: Path, **order: object) -> FlashFile:
     return made
 
 
-class MeasuringStation:
-    """One session with the node at an address; ``fd`` as in ``--can``."""
+class SealedLine:
+    """One session over any link (an object with ``exchange``)."""
 
-    def __init__(self, spec: str, uuid: bytes, address: int) -> None:
-        self.port = CanPort(spec)
-        self.address, self.fd = address, "fd=1" in spec
-        self.link = self.port.link(address)
+    def __init__(self, link: Link, uuid: bytes) -> None:
+        self.link = link
         self.session = StationSession(KEY, uuid)
-        self.ear: Ear = self.port.listen(lambda frame: data_address(frame.identifier) is not None)
         counter = self._plain(self.session.ask()).payload
         self.session.accept(self._plain(self.session.open(counter)).payload)
         self.digest = hashlib.sha256(self.teds()).digest()[:16]
-        self.clock = self.read_clock()
-
-    def close(self) -> None:
-        self.port.close()
 
     def _plain(self, command: Command) -> Reply:
         return decode_reply(self.link.exchange(command.encode()))
@@ -63,6 +57,26 @@ class MeasuringStation:
         """The Security TEDS, which is short enough for one Read."""
         return self._plain(Command(0, 1, 2, b"\x80" + bytes(4))).payload[4:]
 
+    def operate(self, channel: int = 0, *, lease: int = 10, dead_man: int | None = None) -> None:
+        self.send(Operate(channel, self.digest, lease, dead_man).command())
+
+    def states(self) -> Operation:
+        return Operation.decode(self.send(security_command(Function.OPERATION)))
+
+
+class MeasuringStation(SealedLine):
+    """A session with the node at an address of a CAN bus; ``fd`` as in ``--can``."""
+
+    def __init__(self, spec: str, uuid: bytes, address: int) -> None:
+        self.port = CanPort(spec)
+        self.address, self.fd = address, "fd=1" in spec
+        self.ear: Ear = self.port.listen(lambda frame: data_address(frame.identifier) is not None)
+        super().__init__(self.port.link(address), uuid)
+        self.clock = self.read_clock()
+
+    def close(self) -> None:
+        self.port.close()
+
     def read_clock(self) -> ClockSample:
         left = time.monotonic_ns()
         reply = Clock.decode(self.send(CLOCK))
@@ -71,14 +85,6 @@ class MeasuringStation:
 
     def now(self) -> TickBounds:
         return self.clock.tick(time.monotonic_ns())
-
-    def operate(self, channel: int = 0, *, lease: int = 10, dead_man: int | None = None) -> None:
-        self.send(Operate(channel, self.digest, lease, dead_man).command())
-
-    def states(self) -> Operation:
-        from teds_provision.protocol.messages.frames import Function, security_command
-
-        return Operation.decode(self.send(security_command(Function.OPERATION)))
 
     def subscribe(self, plan: Plan) -> tuple[Receiver, Subscribed]:
         reply = plan.accept(self.send(plan.command()), self.now())

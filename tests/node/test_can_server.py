@@ -303,3 +303,22 @@ def test_comes_back_from_a_lost_bus_silent_and_announces_again(node: EchoNode) -
     finally:
         server.stop()
         again.close()
+
+
+def test_a_repetition_that_meets_the_reply_costs_neither(station: Stranger, server: CanServer) -> None:
+    """The first frame of the reply and that of the repeated request cross on the bus."""
+    request = b"\x05\x00\x00\x01\x03\x00\x1e" + bytes(30)
+    pair = Pair(0xF1, 0x21, station.bus.send)
+    pair.send(request)
+    messages: list[bytes] = []
+    until = time.monotonic() + 5
+    while time.monotonic() < until and not messages:
+        frame = station.bus.receive(0.05)
+        if frame is None or frame.identifier != 0x18DAF121:
+            continue
+        if frame.data[0] >> 4 == 1:
+            station.bus.send(Frame(0x18DA21F1, bytes([0x10, len(request)]) + request[:6]))
+        pair.take(frame)
+        if (message := pair.received()) is not None:
+            messages.append(message)
+    assert messages == [b"\x05" + bytes(30)]

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import json
+import os
 import signal
 import sys
+import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
@@ -14,11 +16,12 @@ from typing import Any
 import pytest
 
 from teds_provision.errors import NodeRefused
+from teds_provision.links.nfc.reader import NfcPort
 from teds_provision.node.converter import Converter
 from teds_provision.node.sources import make_source
 from teds_provision.node.sources.base import Reading
-from teds_provision.protocol.messages.frames import Function, security_command
-from teds_provision.protocol.operation.commands import ChannelState, Power, Sampled, idle, sample, set_values
+from teds_provision.protocol.messages.frames import Function, decode_reply, security_command
+from teds_provision.protocol.operation.commands import ChannelState, Power, PowerFlag, Sampled, idle, sample, set_values
 from teds_provision.protocol.operation.datagram import Layout
 from teds_provision.protocol.operation.driving import Driver
 from teds_provision.protocol.operation.stream_commands import WAITS, Action, Driven, decode_stopped, drive, stop
@@ -30,7 +33,7 @@ from teds_provision.teds.profile import load_profile
 from teds_provision.teds.sheet import Sheet
 from tests.e2e.desk import Links, Running
 from tests.links.can.hub import Hub
-from tests.node.measuring_station import MeasuringStation, keyed_node
+from tests.node.measuring_station import MeasuringStation, SealedLine, keyed_node
 
 pytestmark = pytest.mark.link
 ANGLE = "magnetic-angular-position-sensor"
@@ -240,8 +243,6 @@ def test_a_simulation_brings_its_own_time_and_its_end_is_survived(scene: Scene, 
     assert second.tick - first.tick == (second.counter - first.counter) * 40 * MS
     assert first.valid
     pid = next(iter(_children(process.process.pid)))
-    import os
-
     os.kill(pid, signal.SIGTERM)
     process.wait_for("no value is valid")
     assert not Sampled.decode(station.send(sample([1])), 2).valid
@@ -259,6 +260,68 @@ def test_a_battery_tells_its_level_and_too_low_does_not_measure(scene: Scene) ->
     with pytest.raises(NodeRefused) as refused:
         station.operate()
     assert refused.value.reason == 23
+
+
+def test_values_on_demand_over_nfc_and_a_battery_that_the_field_charges(scene: Scene) -> None:
+    keyed_node(scene.folder / "angle", profile=ANGLE)
+    path = Links().nfc
+    process = Running("--json", "node", "run", scene.folder / "angle", "--nfc", path, "--battery", "50")
+    port = NfcPort(path)
+    try:
+        process.wait_for_lines(1)
+        contact = port.find(lambda identity: True, seconds=20, notice=lambda told: None)
+        line = SealedLine(contact.link, contact.identity.uuid)
+        line.operate()
+        assert Sampled.decode(line.send(sample([1])), 2).valid
+        power = Power.decode(line.send(security_command(Function.POWER)))
+        assert power.flags & PowerFlag.CHARGING
+        assert power.current is not None
+        assert power.current > 0
+        with pytest.raises(NodeRefused) as refused:
+            line.send(Plan.of(0, ((1, 2),), n=1, period=50 * MS).command())
+        assert refused.value.reason == 21
+        assert line.states().channels[1][1] == 1
+    finally:
+        port.close()
+        process.close()
+
+
+def test_no_slow_chip_holds_up_a_dead_man(scene: Scene) -> None:
+    process = scene.run("gripper", "--crypto-delay", "1500", profile="gripper")
+    station, sheet = scene.station("gripper"), scene.sheet("gripper")
+    converter = Converter(sheet, sheet.channels[0])
+    station.operate(1, dead_man=200)
+    station.send(set_values([(1, converter.octets(Reading(value=converter.high)))]))
+    done = threading.Event()
+
+    def prove() -> None:
+        station.send(security_command(Function.PROVE, bytes(32)))
+        done.set()
+
+    threading.Thread(target=prove, daemon=True).start()
+    assert wait_for(lambda: [line["safe"] for line in actuator_lines(process)] == [True, False, True], 5)
+    assert not done.is_set(), "the safe state came while the chip was still at work"
+    assert done.wait(10)
+
+
+def test_a_slow_chip_answers_no_stranger_while_an_actuator_is_claimed(scene: Scene) -> None:
+    scene.run("gripper", "--crypto-delay", "50", profile="gripper")
+    station = scene.station("gripper")
+    station.operate(1, dead_man=10_000)
+    reply = decode_reply(station.link.exchange(security_command(Function.PROVE, bytes(32)).encode()))
+    assert (reply.ok, reply.payload) == (False, b"\x11")
+
+
+def test_an_actuator_is_safe_when_its_node_is_ended(scene: Scene) -> None:
+    process = scene.run("gripper", profile="gripper")
+    station = scene.station("gripper")
+    station.operate(1, dead_man=10_000)
+    station.send(set_values([(1, b"\x01\x00")]))
+    assert wait_for(lambda: len(actuator_lines(process)) == 2)
+    process.signal(signal.SIGTERM)
+    ended = process.end()
+    assert ended.code == 0
+    assert json.loads(ended.out.splitlines()[-1])["safe"]
 
 
 def test_hardware_stays_what_the_node_was_made_with(tmp_path: Path) -> None:

@@ -104,8 +104,6 @@ class Pair:
         if kind == _CONSECUTIVE and data == self._last:
             return True  # the same frame twice: an error in its last bit doubles a frame on CAN
         self._last = data if kind == _CONSECUTIVE else b""
-        if kind in (_SINGLE, _FIRST) and self.waits_for_flow:
-            self.stop_sending()  # who asks anew has given up what we were about to send
         if kind != _FLOW:
             self.speak(fd=frame.fd)
         self._waiting.append(

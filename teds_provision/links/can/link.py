@@ -130,6 +130,7 @@ class _Exchange:
             reply = self._reply(self._seconds * share)
             if reply is not None:
                 return reply
+            self._line.partial = None  # given up: when the same reply begins anew it is no doubled frame
             self.losses += 1
             if time.monotonic() - began >= REPEAT_SECONDS:
                 break
