@@ -43,7 +43,7 @@ ARROWS = {
 }
 # Too slow to load before they are needed: --help, --version and a pure decode must not wait for them.
 HEAVY = {"nfc", "ndef", "can", "isotp", "keyring", "rich", "cryptography", "pint", "numpy", "matplotlib", "pkcs11"}
-HEAVY |= {"mcap", "zstandard", "cyclonedds", "paho"}
+HEAVY |= {"smartcard", "mcap", "zstandard", "cyclonedds", "paho"}
 PURE = ("protocol", "teds")
 IO = {"socket", "sqlite3", "subprocess", "threading", "time", "click", "serial"}
 

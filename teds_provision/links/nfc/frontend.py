@@ -11,6 +11,7 @@ from typing import Any
 from teds_provision.errors import NoReader, UsageFailure
 from teds_provision.links.nfc.exchange import Frontend
 from teds_provision.links.nfc.library import nfc
+from teds_provision.links.nfc.pcsc import PREFIX, PcscReader, names_if_any
 from teds_provision.links.nfc.tag import FieldLost, ReaderLost, ReaderTag, activate, translated
 from teds_provision.links.nfc.udp import ReaderDevice, address_of, frontend
 
@@ -52,21 +53,24 @@ class Reader:
             self._clf.device = None
 
 
-def open_reader(path: str) -> Reader:
-    """Open the reader that ``path`` names: ``udp[:host][:port]`` or any path of nfcpy (``usb``, ``tty:USB0:pn532``).
+def open_reader(path: str) -> Reader | PcscReader:
+    """Open the reader that ``path`` names: ``udp[:host][:port]``, ``pcsc[:READER]`` or any path of nfcpy.
 
-    ``auto`` is the one USB reader that is there. Raises NoReader with the cause and its cure, UsageFailure for a path
+    Those are ``usb``, ``usb:072f:2200``, ``tty:USB0:pn532``. ``auto`` is the one USB reader that is there, else the one
+    PC/SC reader. Raises NoReader with the cause and its cure, UsageFailure for a path
     that is none, and where ``auto`` finds several.
     """
     if path == AUTO:
         path = _the_only_one()
+    if path.partition(":")[0] == PREFIX:
+        return PcscReader(path)
     if path.startswith("udp"):
         device = ReaderDevice(*address_of(path))
         return Reader(frontend(device, path), again=path, simulated=True)
     if not _PATH.fullmatch(path):
         raise UsageFailure(
             f"{path!r} is not the path of a reader.",
-            hint="Write auto, usb, usb:072f:2200, tty:USB0:pn532 or udp:localhost:54321.",
+            hint="Write auto, usb, usb:072f:2200, tty:USB0:pn532, pcsc or udp:localhost:54321.",
         )
     if path.startswith("usb"):
         return _open_usb(path)
@@ -102,10 +106,14 @@ def _usb_readers(path: str) -> list[tuple[int, int, int, int]]:
 
 def _the_only_one() -> str:
     """The path of the only reader that is there; ``usb`` where there is none, so that it says what is missing."""
-    found = [f"usb:{int(bus):03}:{int(number):03}" for _, _, bus, number in _usb_readers("usb")]
+    try:
+        found = [f"usb:{int(bus):03}:{int(number):03}" for _, _, bus, number in _usb_readers("usb")]
+    except NoReader:  # no libusb: a PC/SC reader needs none
+        found = []
+    found = found or [f"{PREFIX}:{name}" for name in names_if_any()]
     if len(found) > 1:
         raise UsageFailure(
-            f"{len(found)} readers are plugged in: {', '.join(found)}.", hint=f"Name one, e.g. --nfc {found[0]}."
+            f"{len(found)} readers are plugged in: {', '.join(found)}.", hint=f"Name one, e.g. --nfc '{found[0]}'."
         )
     return found[0] if found else "usb"
 
@@ -127,7 +135,7 @@ def _explained(path: str, error: Exception, vendor: int = 0, product: int = 0) -
             f"The reader {path} is held by {driver or 'another program'}.",
             hint=f"sudo modprobe -r {driver}; echo blacklist {driver} | sudo tee /etc/modprobe.d/nfc-blacklist.conf"
             if driver
-            else "Stop it (pcscd claims many readers: sudo systemctl stop pcscd.socket pcscd).",
+            else "pcscd claims many readers: use it (--nfc pcsc), or stop it: sudo systemctl stop pcscd.socket pcscd.",
         )
     if code == errno.EACCES:
         return NoReader(

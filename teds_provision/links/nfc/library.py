@@ -33,7 +33,7 @@ def _load() -> Any:
 nfc: Any = _load()
 UdpDevice: Any = nfc.clf.udp.Device
 Type2Tag: Any = nfc.tag.tt2.Type2Tag
-Type2Ndef: Any = nfc.tag.tt2.Type2Tag.NDEF
+NfcpyType2Ndef: Any = nfc.tag.tt2.Type2Tag.NDEF
 Type2TagCommandError: Any = nfc.tag.tt2.Type2TagCommandError
 Type4ATag: Any = nfc.tag.tt4.Type4ATag
-Type4Ndef: Any = nfc.tag.tt4.Type4Tag.NDEF
+NfcpyType4Ndef: Any = nfc.tag.tt4.Type4Tag.NDEF

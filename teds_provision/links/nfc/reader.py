@@ -12,6 +12,7 @@ from collections.abc import Callable, Iterator
 
 from teds_provision.errors import Garbled, LinkFailure, NodeSilent, NoNode, NoReader
 from teds_provision.links.nfc.frontend import AUTO, Reader, open_reader
+from teds_provision.links.nfc.pcsc import PcscReader
 from teds_provision.links.nfc.poller import Poller
 from teds_provision.links.nfc.tag import FieldLost, ReaderLost
 from teds_provision.links.nfc.visit import Foreign, Visit, look
@@ -44,7 +45,7 @@ class NfcPort:
     """
 
     def __init__(self, path: str) -> None:
-        self._reader: Reader | None = open_reader(path)
+        self._reader: Reader | PcscReader | None = open_reader(path)
         self._again = self._reader.again
         self._named = f" ({self._reader.name} at {self._again})" if path == AUTO else ""
         self.place = f"nfc:{self._again}"

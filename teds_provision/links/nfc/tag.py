@@ -12,11 +12,11 @@ from typing import Any
 
 from teds_provision.errors import Garbled, NodeSilent, NoReader
 from teds_provision.links.nfc.library import (
-    Type2Ndef,
+    NfcpyType2Ndef,
+    NfcpyType4Ndef,
     Type2Tag,
     Type2TagCommandError,
     Type4ATag,
-    Type4Ndef,
     nfc,
 )
 
@@ -54,7 +54,7 @@ def translated() -> Iterator[None]:
         raise FieldLost from error
 
 
-class _Type4Ndef(Type4Ndef):  # type: ignore[misc]
+class Type4Ndef(NfcpyType4Ndef):  # type: ignore[misc]
     """NDEF on Type 4: lengths that a short APDU can say, and the file selected once, not before every read."""
 
     _chosen: bytes | None = None
@@ -81,7 +81,7 @@ class _Type4Ndef(Type4Ndef):  # type: ignore[misc]
 class _Type4Tag(Type4ATag):  # type: ignore[misc]
     """Type 4A, its answer to select read as ISO/IEC 14443-4 clause 5.2 lays it out (nfcpy takes fixed positions)."""
 
-    NDEF = _Type4Ndef
+    NDEF = Type4Ndef
 
     def __init__(self, clf: Any, target: Any) -> None:
         super(Type4ATag, self).__init__(clf, target)
@@ -100,7 +100,7 @@ class _Type4Tag(Type4ATag):  # type: ignore[misc]
         return True
 
 
-class _Type2Ndef(Type2Ndef):  # type: ignore[misc]
+class _Type2Ndef(NfcpyType2Ndef):  # type: ignore[misc]
     """NDEF on Type 2: once nfcpy has found where the message lies, one READ says whether there is one.
 
     nfcpy reads the capability container and every TLV anew each time, and before each write. Where lock or reserved
@@ -154,7 +154,7 @@ class _Type2Ndef(Type2Ndef):  # type: ignore[misc]
         self._tag.write(page, pages[0])
 
 
-class _Type2Tag(Type2Tag):  # type: ignore[misc]
+class Type2(Type2Tag):  # type: ignore[misc]
     """Type 2, asked once whether it is still there (nfcpy asks three times)."""
 
     NDEF = _Type2Ndef
@@ -251,7 +251,7 @@ def activate(clf: Any, target: Any) -> ReaderTag | None:
                 return ReaderTag(_Type4Tag(clf, target), "Type 4")
             if target.brty == "106A" and target.sel_res and not target.sel_res[0] & 0x60:
                 plain = target.sel_res[0] == 0
-                return ReaderTag(_Type2Tag(clf, target), "Type 2" if plain else f"SAK {target.sel_res[0]:02X}h")
+                return ReaderTag(Type2(clf, target), "Type 2" if plain else f"SAK {target.sel_res[0]:02X}h")
             tag = nfc.tag.activate(clf, target)
             return None if tag is None else ReaderTag(tag, str(tag.type).replace("Tag", "").replace("Type", "Type "))
     except FieldLost:

@@ -1,0 +1,239 @@
+"""A PC/SC reader (``--nfc pcsc[:READER]``) in place of one of nfcpy's: its firmware does ISO-DEP, pcscd the USB.
+
+Tags are nfcpy's classes with the exchange put in: Type 4 gets APDUs as they are, Type 2 by the pseudo-APDUs of PC/SC
+part 3 (FF B0 reads 16 octets, FF D6 writes a page). The reader is held alone (SCARD_SHARE_EXCLUSIVE). Errors of the
+service are named; the library (pyscard, extra ``pcsc``) is loaded when the first such reader is opened.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, Final
+
+from teds_provision.errors import NoReader, UsageFailure
+from teds_provision.links.nfc.library import Type2TagCommandError, Type4ATag, nfc
+from teds_provision.links.nfc.tag import FieldLost, ReaderLost, ReaderTag, Type2, Type4Ndef
+
+PREFIX: Final = "pcsc"
+_STORAGE_CARD: Final = bytes.fromhex("A000000306")
+"""Application identifier of PC/SC in the ATR of a card without a processor (PC/SC part 3, section 3.1.3.2.3)."""
+_UID: Final = bytes.fromhex("FFCA000000")
+_OK: Final = b"\x90\x00"
+_PRESENCE: Final = bytes.fromhex("00B0000002")
+
+
+def _scard() -> Any:
+    try:
+        import smartcard.scard
+    except ImportError as error:
+        raise NoReader(
+            "PC/SC readers need the package pyscard, which is not installed.",
+            hint="pip install 'teds-provision[pcsc]'; where it must be built: sudo apt install swig libpcsclite-dev.",
+        ) from error
+    return smartcard.scard
+
+
+def _context(scard: Any) -> Any:
+    result, context = scard.SCardEstablishContext(scard.SCARD_SCOPE_USER)
+    if result != scard.SCARD_S_SUCCESS:
+        raise NoReader(
+            f"The PC/SC service does not answer: {_said(scard, result)}.",
+            hint="sudo apt install pcscd; sudo systemctl start pcscd.socket. Over ssh polkit may refuse; run as root.",
+        )
+    return context
+
+
+def names() -> list[str]:
+    """Names of all PC/SC readers; raises NoReader where the service or the library is missing."""
+    scard = _scard()
+    context = _context(scard)
+    try:
+        result, found = scard.SCardListReaders(context, [])
+    finally:
+        scard.SCardReleaseContext(context)
+    return list(found) if result == scard.SCARD_S_SUCCESS else []
+
+
+def names_if_any() -> list[str]:
+    """As :func:`names`, empty where there is no PC/SC here."""
+    try:
+        return contactless(names())
+    except NoReader:
+        return []
+
+
+def contactless(found: list[str]) -> list[str]:
+    """Without the slots for security modules that many readers have beside their antenna."""
+    return [name for name in found if " SAM " not in f" {name} "]
+
+
+class PcscReader:
+    """An opened PC/SC reader, as ``links.nfc.frontend.Reader``; ``path`` is ``pcsc``, or ``pcsc:PART OF A NAME``."""
+
+    def __init__(self, path: str) -> None:
+        self._scard = _scard()
+        self.name = _chosen(path.partition(":")[2])
+        self.again = f"{PREFIX}:{self.name}"
+        self._context = _context(self._scard)
+        self._card: _Card | None = None
+
+    def sense(self) -> ReaderTag | None:
+        """Connect to what lies on the reader, field off and on before; None for nothing. Raises ReaderLost."""
+        self._disconnect()
+        scard = self._scard
+        result, handle, protocol = scard.SCardConnect(
+            self._context,
+            self.name,
+            scard.SCARD_SHARE_EXCLUSIVE,
+            scard.SCARD_PROTOCOL_T0 | scard.SCARD_PROTOCOL_T1,
+        )
+        if result in _gone(scard):
+            raise ReaderLost(_said(scard, result))
+        if result == scard.SCARD_E_SHARING_VIOLATION:
+            raise ReaderLost("another program holds it")
+        if result != scard.SCARD_S_SUCCESS:
+            return None
+        self._card = card = _Card(scard, handle, protocol)
+        try:
+            return _tag(card)
+        except FieldLost:
+            return None
+
+    def close(self) -> None:
+        """Let the card and the service go; never raises."""
+        self._disconnect()
+        if self._context is not None:
+            self._scard.SCardReleaseContext(self._context)
+            self._context = None
+
+    def _disconnect(self) -> None:
+        if self._card is not None:
+            self._scard.SCardDisconnect(self._card.handle, self._scard.SCARD_UNPOWER_CARD)
+            self._card.target = None
+            self._card = None
+
+
+def _chosen(wanted: str) -> str:
+    found = names() if wanted else contactless(names())
+    fitting = [name for name in found if wanted == name] or [name for name in found if wanted.lower() in name.lower()]
+    if len(fitting) == 1:
+        return fitting[0]
+    listed = ", ".join(fitting or found)
+    if fitting:
+        raise UsageFailure(
+            f"{len(fitting)} PC/SC readers fit: {listed}.", hint="Name one: --nfc 'pcsc:PART OF ITS NAME'."
+        )
+    raise NoReader(
+        f"No PC/SC reader {wanted!r} is there; there are: {listed}." if found else "No PC/SC reader is plugged in.",
+        hint="Plug it in; pcsc_scan of the package pcsc-tools lists what pcscd sees.",
+    )
+
+
+def _gone(scard: Any) -> set[int]:
+    return {
+        scard.SCARD_E_READER_UNAVAILABLE,
+        scard.SCARD_E_UNKNOWN_READER,
+        scard.SCARD_E_NO_SERVICE,
+        scard.SCARD_E_SERVICE_STOPPED,
+        scard.SCARD_E_INVALID_HANDLE,
+        scard.SCARD_F_COMM_ERROR,
+    }
+
+
+def _said(scard: Any, result: int) -> str:
+    return str(scard.SCardGetErrorMessage(result)).strip().rstrip(".")
+
+
+@dataclass
+class _Target:
+    """What nfcpy's tags want to know of an activation."""
+
+    uid: bytes
+
+    @property
+    def sdd_res(self) -> bytes:
+        """The UID."""
+        return self.uid
+
+
+class _Card:
+    """A connected card; stands where nfcpy's tags have their front end."""
+
+    def __init__(self, scard: Any, handle: Any, protocol: int) -> None:
+        self._scard = scard
+        self.handle, self._protocol = handle, protocol
+        self.target: _Target | None = None
+
+    @property
+    def atr(self) -> bytes:
+        """Answer to reset, which the reader makes up for a card without contacts."""
+        result, _, _, _, atr = self._scard.SCardStatus(self.handle)
+        if result != self._scard.SCARD_S_SUCCESS:
+            raise FieldLost
+        return bytes(atr)
+
+    def transmit(self, apdu: bytes) -> bytes:
+        """Exchange one APDU, status word last; raises FieldLost, ReaderLost."""
+        result, answer = self._scard.SCardTransmit(self.handle, self._protocol, list(apdu))
+        if result in _gone(self._scard):
+            raise ReaderLost(_said(self._scard, result))
+        if result != self._scard.SCARD_S_SUCCESS or len(answer) < 2:
+            raise FieldLost
+        return bytes(answer)
+
+
+def _tag(card: _Card) -> ReaderTag:
+    storage = _STORAGE_CARD in card.atr
+    answer = card.transmit(_UID)
+    card.target = _Target(answer[:-2] if answer[-2:] == _OK else b"")
+    if storage:
+        return ReaderTag(_PcscType2(card, card.target), "Type 2")
+    return ReaderTag(_PcscType4(card, card.target), "Type 4")
+
+
+class _Apdus:
+    """Stands where nfcpy has its ISO-DEP."""
+
+    def __init__(self, card: _Card) -> None:
+        self._card = card
+
+    def exchange(self, command: bytes | None, timeout: float | None = None) -> bytearray:
+        """Exchange one APDU; the time-out is the reader's. None asks whether the card is still there."""
+        del timeout
+        return bytearray(self._card.transmit(_PRESENCE if command is None else bytes(command)))
+
+
+class _PcscType4(Type4ATag):  # type: ignore[misc]
+    """Type 4 behind a PC/SC reader."""
+
+    NDEF = Type4Ndef
+
+    def __init__(self, card: _Card, target: _Target) -> None:
+        super(Type4ATag, self).__init__(card, target)
+        self._nfcid = bytearray(target.uid)
+        self._dep = _Apdus(card)
+        self._extended_length_support = False
+
+    def _is_present(self) -> bool:
+        self._dep.exchange(None)  # raises FieldLost where it is not
+        return True
+
+
+class _PcscType2(Type2):
+    """Type 2 behind a PC/SC reader: READ and WRITE as pseudo-APDUs; no second sector."""
+
+    def transceive(self, data: bytes, timeout: float = 0.1, retries: int = 2) -> bytearray:
+        """Send one command of the tag and return its answer."""
+        del timeout, retries
+        card: _Card = self.clf
+        if data[0] == 0x30:
+            answer = card.transmit(bytes((0xFF, 0xB0, 0, data[1], 16)))
+            if answer[-2:] == _OK and len(answer) == 18:
+                return bytearray(answer[:16])
+        elif data[0] == 0xA2:
+            answer = card.transmit(bytes((0xFF, 0xD6, 0, data[1], 4)) + bytes(data[2:6]))
+            if answer[-2:] == _OK:
+                return bytearray(b"\x0a")
+        else:
+            return bytearray(b"\x00")
+        raise Type2TagCommandError(nfc.tag.RECEIVE_ERROR)

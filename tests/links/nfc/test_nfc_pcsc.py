@@ -1,0 +1,169 @@
+"""PC/SC readers: real pcscd and pyscard on a virtual reader, and what is said where there is no service."""
+
+from __future__ import annotations
+
+import importlib.util
+import json
+import os
+import shutil
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from teds_provision.errors import NoReader, UsageFailure
+from teds_provision.links.nfc import pcsc
+from teds_provision.links.nfc.frontend import open_reader
+from tests.cli.shell import clean_environment
+from tests.workflow.bench import PASSPHRASE, make_station
+
+from .conftest import ROOT
+from .pcsc_scene import DRIVER
+
+READER = "pcsc:Virtual PCD 00 00"
+
+
+def why_not() -> str:
+    """Why the scene cannot be run here, "" where it can."""
+    if importlib.util.find_spec("smartcard") is None:
+        return "pyscard is not installed (pip install 'teds-provision[pcsc]')"
+    if not Path(DRIVER).exists() or not Path("/usr/sbin/pcscd").exists():
+        return "pcscd or vsmartcard-vpcd is not installed (scripts/install-test-packages)"
+    if os.geteuid() != 0 or shutil.which("unshare") is None:
+        return "namespaces of its own need root and unshare"
+    if subprocess.run(["unshare", "-n", "-m", "true"], capture_output=True, check=False).returncode:
+        return "namespaces cannot be made here"
+    return ""
+
+
+class Scene:
+    """The scene's process: commands in, outcomes out."""
+
+    def __init__(self, folder: Path, tag: str) -> None:
+        self.home = folder / "home"
+        make_station(self.home).close()
+        (folder / "pass").write_text(PASSPHRASE + "\n")
+        self._process = subprocess.Popen(
+            ["unshare", "-n", "-m", sys.executable, "-m", "tests.links.nfc.pcsc_scene", folder, tag],
+            cwd=ROOT,
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            text=True,
+            env=clean_environment(),
+        )
+        self.uuid = self._line()["uuid"]
+
+    def _line(self) -> Any:
+        assert self._process.stdout
+        return json.loads(self._process.stdout.readline())
+
+    def do(self, *words: str) -> Any:
+        assert self._process.stdin
+        self._process.stdin.write(json.dumps(words) + "\n")
+        self._process.stdin.flush()
+        return self._line()
+
+    def run(self, *words: str) -> Any:
+        """Run the program with --json; its object, with the exit code under ``code``."""
+        done = self.do("--home", str(self.home), "--json", *words)
+        return {**json.loads(done["out"]), "code": done["code"]}
+
+    def close(self) -> None:
+        assert self._process.stdin
+        assert self._process.stdout
+        self._process.stdin.close()
+        self._process.wait(20)
+        self._process.stdout.close()
+
+
+@pytest.fixture
+def scene(tmp_path: Path, request: pytest.FixtureRequest) -> Iterator[Scene]:
+    reason = why_not()
+    if reason:
+        pytest.skip(reason)
+    scene = Scene(tmp_path, request.param)
+    yield scene
+    scene.close()
+
+
+@pytest.mark.system
+@pytest.mark.link
+@pytest.mark.parametrize("scene", ["4", "2"], indirect=True)
+def test_a_node_is_identified_over_a_pc_sc_reader(scene: Scene) -> None:
+    none = scene.run("identify", "--nfc", READER, "--timeout", "1")
+    assert (none["code"], none["error"]["code"]) == (5, "no-node")
+    scene.do("put")
+    found = scene.run("identify", "--nfc", READER, "--timeout", "10")
+    assert (found.get("uuid"), found["tag_uid"], found["state"]) == (scene.uuid, "04112233445566", "factory"), found
+    several = scene.run("identify", "--timeout", "10")  # auto, and vpcd has two slots
+    assert several["code"] == 2
+    assert READER in several["error"]["message"]
+    scene.do("lift")
+    gone = scene.run("identify", "--nfc", READER, "--timeout", "1")
+    assert (gone["code"], gone["error"]["code"]) == (5, "no-node")
+    wrong = scene.run("identify", "--nfc", "pcsc:Omnikey", "--timeout", "1")
+    assert wrong["code"] == 5
+    assert "Virtual PCD" in wrong["error"]["message"]
+
+
+@pytest.mark.system
+@pytest.mark.link
+@pytest.mark.parametrize("scene", ["4", "2"], indirect=True)
+def test_a_node_is_provisioned_over_a_pc_sc_reader(scene: Scene) -> None:
+    scene.do("put")
+    words = ["provision", "--yes", "--profile", "temperature-sensor", "--nfc", READER, "--timeout", "10"]
+    done = scene.run(*words)
+    assert (done.get("uuid"), done.get("verdict")) == (scene.uuid, "authentic"), done
+
+
+class Scard:
+    """A stand-in for pyscard's functions where no service can be had in the state that a test wants."""
+
+    SCARD_SCOPE_USER = SCARD_S_SUCCESS = 0
+
+    def __init__(self, readers: list[str] | None) -> None:
+        self._readers = readers
+
+    def SCardEstablishContext(self, scope: int) -> tuple[int, int]:
+        return (0, 1) if self._readers is not None else (0x8010001D, 0)
+
+    def SCardListReaders(self, context: int, groups: list[str]) -> tuple[int, list[str]]:
+        return 0, self._readers or []
+
+    def SCardReleaseContext(self, context: int) -> int:
+        return 0
+
+    def SCardGetErrorMessage(self, code: int) -> str:
+        return "Service not available."
+
+
+@pytest.mark.parametrize(
+    ("readers", "path", "error", "says"),
+    [
+        (None, "pcsc", NoReader, "does not answer: Service not available"),
+        ([], "pcsc", NoReader, "No PC/SC reader is plugged in"),
+        (["ACS ACR1252 PICC 00", "HID Omnikey 5022 00"], "pcsc", UsageFailure, "2 PC/SC readers fit"),
+        (["ACS ACR1252 PICC 00", "HID Omnikey 5022 00"], "pcsc:identiv", NoReader, "Omnikey"),
+    ],
+)
+def test_what_is_wrong_with_pc_sc_is_named(
+    monkeypatch: pytest.MonkeyPatch, readers: list[str] | None, path: str, error: type[Exception], says: str
+) -> None:
+    monkeypatch.setattr(pcsc, "_scard", lambda: Scard(readers))
+    with pytest.raises(error, match=says):
+        open_reader(path)
+
+
+def test_the_slot_of_a_security_module_is_no_reader_for_nodes(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(pcsc, "_scard", lambda: Scard(["ACS ACR1252 SAM Reader 01", "ACS ACR1252 PICC Reader 00"]))
+    assert open_reader("pcsc").name == "ACS ACR1252 PICC Reader 00"
+
+
+def test_without_pyscard_the_extra_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "smartcard", None)
+    with pytest.raises(NoReader) as caught:
+        open_reader("pcsc")
+    assert "teds-provision[pcsc]" in caught.value.hint
