@@ -8,6 +8,7 @@ import click
 
 from teds_provision.cli.context import App, pass_app
 from teds_provision.cli.options import command, link_options
+from teds_provision.errors import UsageFailure
 from teds_provision.links import LinkSettings
 
 if TYPE_CHECKING:
@@ -16,21 +17,33 @@ if TYPE_CHECKING:
     from teds_provision.steps.verify import Verified
 
 
-@command("teds-provision verify 8d4d --nfc udp:localhost:54321", "teds-provision verify signed.json")
-@click.argument("what", metavar="UUID|IMAGE")
+@command(
+    "teds-provision verify 8d4d --nfc udp:localhost:54321",
+    "teds-provision verify signed.json",
+    "teds-provision --json verify datasheets/",
+)
+@click.argument("what", metavar="UUID|IMAGE…|DIR", nargs=-1, required=True)
 @click.option("--accept-calibration", metavar='"WHY"', help="Take a calibration that the guard refuses; logged.")
 @link_options
 @pass_app
-def verify(app: App, what: str, links: LinkSettings, accept_calibration: str | None) -> None:
+def verify(app: App, what: tuple[str, ...], links: LinkSettings, accept_calibration: str | None) -> None:
     """Read a node (or an image file) and check its datasheet; a node must also sign a fresh challenge.
 
     A file is judged alone. A node whose key is held here must open a session, else nothing is proven.
-    Exits 0 for "authentic", 4 for "unsigned" and "not authentic", 5 for "unproven", 6 for a harmful calibration.
+    Several files, or a folder, give a line each and at last the totals; on every core.
+    Exits 0 for "authentic", 4 for "unsigned" and "not authentic", 5 for "unproven", 6 for a harmful calibration;
+    of several the worst.
     """
     from teds_provision.cli.rendering import reporter_for
+    from teds_provision.cli.steps.verify_files import are_files, verify_many
     from teds_provision.steps.at_node import verify_at
 
-    done = verify_at(app.station(), links, what, reporter_for(app), accept_calibration=accept_calibration)
+    if are_files(what):
+        if accept_calibration is not None:
+            raise UsageFailure("--accept-calibration is for one image.", hint="Verify that one by itself.")
+        verify_many(app, what)
+        return
+    done = verify_at(app.station(), links, what[0], reporter_for(app), accept_calibration=accept_calibration)
     verified = done.verified
     result = {
         "uuid": verified.uuid.hex(),

@@ -1,0 +1,140 @@
+"""Many images at once: each as if it were alone, in order, with totals and the worst one's exit code."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+
+from teds_provision.errors import NotFound
+from teds_provision.protocol import datasheet
+from teds_provision.protocol.keys import SoftwareKey, node_key_message, station_key_message, to_pem
+from teds_provision.steps import verify_files as many
+from teds_provision.steps.verify_files import FileVerdict, Totals, image_files
+from teds_provision.teds.calibration import Calibration, CalibrationInput
+from teds_provision.teds.codec import security
+from teds_provision.teds.image import Image
+from teds_provision.teds.profile import load_profile
+from tests.cli.shell import call, spawn
+
+CA, STATION = (SoftwareKey.from_secret(number.to_bytes(32, "big")) for number in (5, 6))
+PASSPHRASE = "a passphrase of the tests"
+
+
+def signed(number: int, calibration: Calibration | None = None, *, ca: SoftwareKey = CA) -> Image:
+    """A signed datasheet of node ``number``, the station certified by ``ca``."""
+    uuid, node = number.to_bytes(10, "big"), SoftwareKey.from_secret((1000 + number).to_bytes(32, "big"))
+    profile = load_profile("magnetic-angular-position-sensor")
+    blocks = dict(profile.build(uuid, calibration={1: calibration} if calibration else {}).blocks)
+    keys = datasheet.NodeKeys(uuid, node.point, node.sign(node_key_message(uuid, node.point)))
+    teds = datasheet.unsigned_datasheet(
+        keys,
+        STATION.point,
+        ca.sign(station_key_message(STATION.point)),
+        datasheet.digests(blocks),
+        ca="plant:0",
+        last_modified=bytes(8),
+        sequence=1,
+        key_epoch=1,
+    )
+    signature = STATION.sign(security.tbs(uuid, teds.encode()))
+    return Image(uuid, blocks).with_block((0, 128), teds.with_signature(signature).encode())
+
+
+@pytest.fixture
+def home(tmp_path: Path) -> Path:
+    folder = tmp_path / "home"
+    assert spawn("--home", folder, "init", "--keystore", "file", passphrase=f"{PASSPHRASE}\n{PASSPHRASE}").code == 0
+    (tmp_path / "ca.pem").write_text(to_pem(CA.point))
+    words = ("--home", folder, "trust", "add", "--role", "ca", "plant", tmp_path / "ca.pem", "--yes")
+    done = spawn(*words, passphrase=PASSPHRASE)
+    assert done.code == 0, done.err
+    return folder
+
+
+def write(folder: Path, name: str, image: Image | str) -> Path:
+    folder.mkdir(exist_ok=True, parents=True)
+    path = folder / name
+    path.write_text(image if isinstance(image, str) else image.to_json())
+    return path
+
+
+def lines(out: str) -> list[dict[str, object]]:
+    return [json.loads(line) for line in out.splitlines()]
+
+
+def test_a_folder_gives_a_line_for_each_image_and_totals(home: Path, tmp_path: Path) -> None:
+    folder = tmp_path / "images"
+    for number in range(3):
+        write(folder / "good", f"{number}.json", signed(number))
+    done = call(home, "--json", "verify", folder)
+    assert done.code == 0, done.err
+    *each, last = lines(done.out)
+    assert [entry["verdict"] for entry in each] == ["authentic"] * 3
+    assert [entry["uuid"] for entry in each] == [bytes([0] * 9 + [number]).hex() for number in range(3)]
+    assert {entry["scope"] for entry in each} == {"image"}
+    assert last == {"totals": {"files": 3, "authentic": 3}}
+
+
+def test_each_fault_is_told_in_its_line_and_the_worst_one_ends_the_command(home: Path, tmp_path: Path) -> None:
+    folder = tmp_path / "images"
+    harmful = Calibration(1, "linear", (CalibrationInput(1, 1, (0.0, 65535.0), (0.0,)),), (0.0, 0.0))
+    changed = signed(3)
+    faults = {
+        "a-good.json": signed(1),
+        "b-harmful.json": signed(2, harmful),
+        "c-changed.json": Image(bytes(10), changed.blocks),
+        "d-broken.json": "{",
+        "e-foreign.json": signed(4, ca=SoftwareKey.from_secret(bytes(31) + b"\7")),
+        "f-unsigned.json": Image(bytes(10), signed(5).unsigned_blocks()),
+    }
+    for name, image in faults.items():
+        write(folder, name, image)
+    done = call(home, "--json", "verify", folder)
+    *each, last = lines(done.out)
+    assert [Path(str(entry["file"])).name for entry in each] == list(faults)
+    codes = [entry.get("error", {}).get("code") for entry in each]  # type: ignore[union-attr, attr-defined]
+    assert codes == [None, "refused", "not-authentic", "bad-data", "not-authentic", "not-authentic"]
+    assert last["totals"] == {"files": 6, "authentic": 2, "not authentic": 2, "unreadable": 1, "unsigned": 1}
+    assert done.code == 4
+    assert call(home, "verify", folder / "a-good.json", folder / "b-harmful.json").code == 6
+    assert call(home, "verify", folder / "a-good.json", folder / "gone.json").code == 3
+    assert call(home, "verify", folder / "a-good.json", folder / "d-broken.json").code == 8
+
+
+def test_people_see_a_line_each_and_a_sum(home: Path, tmp_path: Path) -> None:
+    one, other = (write(tmp_path / "images", f"{number}.json", signed(number)) for number in (1, 2))
+    done = call(home, "verify", one, other)
+    assert done.code == 0
+    assert done.out.splitlines()[-1] == "2 images: 2 authentic."
+    assert str(one) in done.out
+
+
+def test_the_same_verdicts_come_from_one_process_and_from_several(
+    home: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder = tmp_path / "images"
+    for number in range(6):
+        write(folder, f"{number}.json", signed(number) if number % 2 else Image(bytes(10), signed(number).blocks))
+    alone = call(home, "--json", "verify", folder).out
+    monkeypatch.setattr(many, "_FEW", 1)
+    monkeypatch.setattr(many, "_CHUNK", 2)
+    together = call(home, "--json", "verify", folder).out
+    assert together == alone
+    assert call(home, "--json", "verify", folder / "1.json").json["checks"] == lines(alone)[1]["checks"]
+
+
+def test_a_folder_without_images_is_said_and_doubles_count_once(tmp_path: Path) -> None:
+    with pytest.raises(NotFound, match="no image"):
+        image_files([tmp_path])
+    one = write(tmp_path, "1.json", signed(1))
+    assert image_files([one, tmp_path, one]) == [one]
+
+
+def test_the_worst_exit_code_wins_whatever_the_order() -> None:
+    for codes in ((0, 6, 4), (4, 0, 8), (4,)):
+        totals = Totals()
+        for code in codes:
+            totals.add(FileVerdict(Path("x"), exit_code=code))
+        assert totals.exit_code == 4
