@@ -71,6 +71,7 @@ class TopicSink(ThreadedSink):
         self._scalars: dict[tuple[str, int, tuple[int, ...]], _Scalars] = {}
         self._reports: dict[str, NodeReport] = {}
         self._arrays: dict[tuple[tuple[str, int], ...], float] = {}  # time of the last row that went out
+        self._labels: dict[tuple[tuple[str, int], ...], list[str]] = {}
         self._sent = 0
         self._second = 0.0
         self.refused_commands = 0
@@ -108,6 +109,12 @@ class TopicSink(ThreadedSink):
     def _begin(self) -> None:
         self._announce(tuple(self._facts.values()))
 
+    def write(self, block: Block) -> None:
+        """Samples of one stream; what comes before its topics are due is left out here, not queued."""
+        scalars = self._scalars.get((block.uuid, block.stream, block.channels))
+        if scalars is None or time.monotonic() >= scalars.due:
+            super().write(block)
+
     def _take(self, item: Item) -> None:
         if isinstance(item, Block):
             self._block(item)
@@ -124,13 +131,17 @@ class TopicSink(ThreadedSink):
         changed = [one for one in item if self._facts.get(one.key) != one]
         self._facts.update((one.key, one) for one in changed)
         self._topics.learn(changed)
+        self._labels.clear()
         self._scalars.clear()
         return changed
 
     def _announce(self, facts: Sequence[ChannelFacts]) -> None:
         """Metadata, parameters and command topics of channels; again when a way to the consumers opened anew."""
-        for uuid in dict.fromkeys(one.uuid for one in facts):
-            channels = [one for one in self._facts.values() if one.uuid == uuid]
+        by_node: dict[str, list[ChannelFacts]] = {one.uuid: [] for one in facts}
+        for one in self._facts.values():
+            if one.uuid in by_node:
+                by_node[one.uuid].append(one)
+        for uuid, channels in by_node.items():
             words = {
                 "uuid": uuid,
                 "station": self._station.name,
@@ -178,7 +189,11 @@ class TopicSink(ThreadedSink):
         if rows.test_pattern:
             return
         topic = self._topics.of_group(rows.group)
-        names = [self._topics.channel(*key).removeprefix(f"/{self._topics.station}/") for key in rows.channels]
+        names = self._labels.get(rows.channels)
+        if names is None:
+            prefix = f"/{self._topics.station}/"
+            names = [self._topics.channel(*key).removeprefix(prefix) for key in rows.channels]
+            self._labels = {rows.channels: names}
         last = self._arrays.get(rows.channels, -math.inf)
         for k, stamp in enumerate(rows.time.tolist()):
             if stamp - last < 1 / ROWS - 1e-6:

@@ -44,30 +44,33 @@ class Topics:
                     hint="Use letters, digits and single _, beginning with a letter; / between parts.",
                 )
         self._facts: dict[tuple[str, int], ChannelFacts] = {}
+        self._nodes: dict[str, str] = {}
+        self._channels: dict[tuple[str, int], str] = {}
 
     def learn(self, facts: Iterable[ChannelFacts]) -> None:
         """Facts of channels; names of those that were known stay unless a namesake came."""
         self._facts.update((one.key, one) for one in facts)
+        slugs = {one.uuid: slug(one.node) for one in self._facts.values()}
+        namesakes, alike = Counter(slugs.values()), Counter(uuid[:8] for uuid in slugs)
+        self._nodes = {}
+        for uuid, own in slugs.items():
+            short = uuid[:8] if alike[uuid[:8]] == 1 else uuid
+            self._nodes[uuid] = f"n{short}" if not own else own if namesakes[own] == 1 else f"{own}_{short}"
+        self._channels = {key: slug(one.name) or f"ch{one.number}" for key, one in self._facts.items()}
+        taken = Counter((uuid, own) for (uuid, _), own in self._channels.items())
+        for (uuid, number), own in list(self._channels.items()):
+            if taken[uuid, own] > 1:
+                self._channels[uuid, number] = f"{own}_{number}"
 
     def node(self, uuid: str) -> str:
         """Part of the node: ``arm``, ``n8d4d9da6``."""
-        if (uuid, 0) in self._chosen:
-            return self._chosen[uuid, 0]
-        slugs = {one.uuid: slug(one.node) for one in self._facts.values()}
-        own = slugs.get(uuid, "")
-        if not own:
-            return f"n{uuid[:8]}" if Counter(other[:8] for other in slugs)[uuid[:8]] < 2 else f"n{uuid}"
-        return own if Counter(slugs.values())[own] == 1 else f"{own}_{uuid[:8]}"
+        return self._chosen.get((uuid, 0)) or self._nodes.get(uuid) or f"n{uuid[:8]}"
 
     def channel(self, uuid: str, number: int) -> str:
         """Whole topic of a channel: ``/bench/arm/angle``."""
         if (uuid, number) in self._chosen:
             return f"/{self._chosen[uuid, number]}"
-        slugs = {one.number: slug(one.name) or f"ch{one.number}" for one in self._facts.values() if one.uuid == uuid}
-        own = slugs.get(number, f"ch{number}")
-        if Counter(slugs.values())[own] > 1:
-            own = f"{own}_{number}"
-        return f"/{self.station}/{self.node(uuid)}/{own}"
+        return f"/{self.station}/{self.node(uuid)}/{self._channels.get((uuid, number), f'ch{number}')}"
 
     def of_node(self, uuid: str, what: str) -> str:
         """A topic beside the channels of a node: ``/bench/arm/teds``."""

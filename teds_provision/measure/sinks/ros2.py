@@ -59,6 +59,7 @@ class Ros2Sink(TopicSink):
         self._ending = threading.Event()
         self._listener: threading.Thread | None = None
         self._types: Any = None
+        self._unshown = False  # endpoints that the graph has not been told of
 
     def _prepare(self, facts: tuple[ChannelFacts, ...], station: StationFacts) -> None:
         super()._prepare(facts, station)
@@ -115,11 +116,12 @@ class Ros2Sink(TopicSink):
     def _writer(self, topic: str, kind: str, *, latched: bool = False) -> Any:
         if topic not in self._writers:
             self._writers[topic] = self._new_writer(kind, f"rt{topic}", latched=latched)
-            self._show_node()
+            self._unshown = True
         return self._writers[topic]
 
     def _show_node(self) -> None:
-        """Tell the graph which endpoints are this node's."""
+        """Tell the graph which endpoints are this node's: all of them, so once for all that are new."""
+        self._unshown = False
         humble = self._distribution == "humble"
         types = self._types
         gid, info = (types.HumbleGid, types.HumbleNodeEntitiesInfo) if humble else (types.Gid, types.NodeEntitiesInfo)
@@ -135,6 +137,11 @@ class Ros2Sink(TopicSink):
             writer_gid_seq=[of(writer) for writer in self._writers.values()],
         )
         self._write(self._graph, whole(gid=of(self._participant), node_entities_info_seq=[node]), 0)
+
+    def _idle(self, now: float) -> None:
+        super()._idle(now)
+        if self._unshown:
+            self._show_node()
 
     def _write(self, writer: Any, message: Any, values: int) -> None:
         """A reader that takes nothing costs at most BLOCKING_MS, and the values of this message."""
@@ -172,7 +179,7 @@ class Ros2Sink(TopicSink):
         kind = "std_msgs/Float64"
         reader = DataReader(self._participant, self._topic(kind, f"rt{topic}"), qos=self._qos(kind, latched=False))
         self._readers[topic] = (reader, uuid, channel)
-        self._show_node()
+        self._unshown = True
         if self._listener is None:
             self._listener = threading.Thread(target=self._hear, name="ROS 2 commands", daemon=True)
             self._listener.start()
