@@ -137,3 +137,12 @@ def test_both_sides_have_one_key_for_data_messages_and_it_is_new_with_each_open(
     assert line.half_open.message_key == first
     desk.open()
     assert desk.session.message_key != first
+
+
+def test_the_station_ends_a_session_whose_counters_are_used_up() -> None:
+    desk = Desk().agree().open()
+    assert desk.session is not None
+    desk.session._counter = 0xFFFFFFFE
+    assert desk.sealed(IDENTIFY).ok, "the last one"
+    with pytest.raises(Garbled, match="used up its counters"):
+        desk.session.seal(IDENTIFY)
