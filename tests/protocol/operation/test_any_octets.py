@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from unittest.mock import patch
+
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from teds_provision.protocol.messages.frames import Command, Function
-from teds_provision.protocol.operation.stream_commands import CLOCK
+from teds_provision.protocol.operation.datagram import Sealer
+from teds_provision.protocol.operation.stream_commands import CLOCK, Kind, Subscribe, stop
 
 from .bench import DIGEST, MS, SAFE_VALUE, Bench
 
@@ -39,3 +42,55 @@ def test_no_inner_command_makes_the_node_raise(said: list[tuple[tuple, int]], ju
     sent = len(bench.frames)
     bench.later(100 * MS)
     assert len(bench.frames) == sent
+
+
+class Recording(Sealer):
+    """A sealer that notes each key and counter, of every sealer there is."""
+
+    used: list[tuple[bytes, int]]
+
+    def __init__(self, key: bytes) -> None:
+        super().__init__(key)
+        self._key = key
+
+    def seal(self, counter: int, plain: bytes) -> bytes:
+        self.used.append((self._key, counter))
+        return super().seal(counter, plain)
+
+
+subscriptions = st.builds(
+    lambda stream, kind, n, period, start: Subscribe(
+        stream, kind, 1 if kind == Kind.EVENT else n, 0, period, start, (5,) if kind == Kind.EVENT else (1,)
+    ),
+    st.integers(0, 3),
+    st.sampled_from(Kind),
+    st.integers(1, 5),
+    st.sampled_from([MS, 7 * MS]),
+    st.sampled_from([0, (1 << 64) - 1]),
+)
+acts = st.one_of(
+    subscriptions.map(lambda asked: asked.command()),
+    st.integers(0, 3).map(stop),
+    st.sampled_from(["idle", "open", "restart"]),
+)
+
+
+@settings(max_examples=60, deadline=None)
+@given(st.lists(st.tuples(acts, st.integers(0, 60 * MS)), min_size=3, max_size=20))
+def test_no_key_and_nonce_come_twice_whatever_a_station_asks(said: list[tuple[Command | str, int]]) -> None:
+    Recording.used = []
+    with patch("teds_provision.protocol.operation.streams.Sealer", Recording):
+        bench = Bench().open().operate(0)
+        for act, pause in said:
+            if isinstance(act, Command):
+                bench.send(act)
+            elif act == "idle":
+                bench.idle()
+                bench.operate(0)
+            else:
+                if act == "restart":
+                    bench.restart()
+                bench.open().operate(0)
+            bench.later(pause)
+            bench.tim.event(5, bench.hardware.tick, b"\1")
+    assert len(Recording.used) == len(set(Recording.used))
