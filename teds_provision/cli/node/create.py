@@ -95,6 +95,7 @@ def create(
             "channel": channel.number,
             "name": channel.name,
             "kind": channel.kind.word if channel.kind is not None else None,
+            "unit": channel.unit.text,
         }
         for channel in Sheet.of_blocks(made.hardware).channels
     ]
