@@ -22,6 +22,7 @@ from teds_provision.protocol.handover.receipt import Receipt, RefusedNode, seal_
 from teds_provision.protocol.handover.revocation import Revocation as Statement
 from teds_provision.protocol.keys import fingerprint, station_key_message, verify
 from teds_provision.protocol.messages.identity import NodeState
+from teds_provision.station.node_keys import MAX_PENDING
 from teds_provision.station.station import Station
 from teds_provision.store import Batch, Handover, Holder, KeyRecord, NodeRecord, WhitelistEntry, utc_now
 
@@ -212,6 +213,8 @@ class _Judge:
         held = self.held.get(node.uuid, {})
         if key_id(node.key).hex() in held:
             return ""
+        if sum(state == "pending" for state, _ in held.values()) >= MAX_PENDING:
+            return f"{MAX_PENDING} keys of it wait here for their proof"
         active = max((epoch for state, epoch in held.values() if state == "active"), default=0)
         hearsay = max((epoch for _, epoch in held.values()), default=0)
         latest = max(active, hearsay, known.epoch if known is not None else 0)

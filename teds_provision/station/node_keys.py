@@ -17,6 +17,9 @@ from teds_provision.vault.base import node_key_context
 if TYPE_CHECKING:
     from teds_provision.vault import Vault
 
+MAX_PENDING = 8
+"""So many keys of one node may wait for their proof at a time (issue 7 L4)."""
+
 _FEW = 20
 """So many nodes are looked up one by one; for more the table of marks is read once."""
 
@@ -93,8 +96,15 @@ class NodeKeys:
         return self._store.slots()
 
     def add_pending(self, uuid: bytes, *, key: bytes, key_id: bytes, epoch: int, imported: bool = False) -> None:
-        """Store a new key durably as pending; nothing else is touched."""
+        """Store a new key durably as pending; of the others only the oldest pending one goes, beyond eight.
+
+        The newest are tried first, and a node knows one key at most that was never proven: whoever makes a station
+        agree again and again fills no disk.
+        """
         with self._store.transaction():
+            pending = [record for record in self._store.keys(uuid) if record.state == "pending"]
+            for record in pending[MAX_PENDING - 1 :]:
+                self._store.remove_key(uuid, record.key_id)
             slot = self._store.next_slot(uuid)
             source: KeySource = "import" if imported else "agreement"
             self._store.add_key(

@@ -128,8 +128,9 @@ class Seals:
         if facts is None:
             return
         if facts.seal_key is None:
-            self._take_over(facts, vault)
-            return
+            if self._store.frozen is None:
+                self._take_over(facts, vault)
+            return  # a store of version 0.1 on a disk that takes nothing: it is read as that version read it
         self._key = vault.unwrap(facts.seal_key, context=self._context())
         if not self._holds(facts.mac, "station", *_facts(facts)):
             raise changed(["the station's own key or CA"], "Restore a backup: teds-provision restore FILE")

@@ -18,6 +18,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from teds_provision.errors import BadData, StoreFailure, StoreLocked
+from teds_provision.store.frozen import open_copy
 from teds_provision.store.migration import carry
 from teds_provision.store.schema import APPLICATION_ID, SCHEMA_VERSION, STEPS_TO
 
@@ -77,6 +78,8 @@ class Database:
         self._connection = connection
         self._lock = threading.RLock()
         self._depth = 0
+        self._frozen: StoreFailure | None = None
+        """Why nothing can be written; what is read then comes from a private copy."""
 
     @classmethod
     def open(cls, home: Path, *, create: bool) -> Database:
@@ -91,6 +94,15 @@ class Database:
         except OSError as error:
             raise as_store_failure(error, path) from error
         try:
+            return cls._opened(path, create=create)
+        except StoreFailure as failure:
+            if create or not _is_no_place_to_write(failure):
+                raise
+            return cls._read_only(path, failure)
+
+    @classmethod
+    def _opened(cls, path: Path, *, create: bool) -> Database:
+        try:
             connection = sqlite3.connect(path, timeout=BUSY_SECONDS, isolation_level=None, check_same_thread=False)
         except sqlite3.Error as error:
             raise as_store_failure(error, path) from error
@@ -101,6 +113,28 @@ class Database:
             connection.close()
             raise
         return database
+
+    @classmethod
+    def _read_only(cls, path: Path, failure: StoreFailure) -> Database:
+        """Open a private copy to be read; whatever would change it raises why the store itself cannot be written."""
+        try:
+            connection = open_copy(path)
+        except (OSError, sqlite3.Error):
+            raise failure from None
+        database = cls(path, connection)
+        try:
+            database._bring_in_order(create=False)
+            database.execute("PRAGMA query_only=ON")
+        except BaseException:
+            connection.close()
+            raise
+        database._frozen = failure
+        return database
+
+    @property
+    def frozen(self) -> StoreFailure | None:
+        """Why nothing can be written (the disk is full or read-only), None where it can."""
+        return self._frozen
 
     def close(self) -> None:
         """Close the connection; a second call does nothing."""
@@ -161,6 +195,8 @@ class Database:
     def transaction(self) -> Iterator[None]:
         """All or nothing: BEGIN IMMEDIATE, COMMIT, or ROLLBACK when anything is raised; inside another, a savepoint."""
         with self._lock:
+            if self._frozen is not None:
+                raise self._frozen
             level = self._depth
             begin, commit, rollback = (
                 ("BEGIN IMMEDIATE", "COMMIT", ("ROLLBACK",))
@@ -189,6 +225,8 @@ class Database:
         try:
             yield
         except (sqlite3.Error, OSError) as error:
+            if self._frozen is not None and getattr(error, "sqlite_errorcode", 0) & 0xFF == sqlite3.SQLITE_READONLY:
+                raise self._frozen from error
             raise as_store_failure(error, self.path) from error
         except UnicodeDecodeError as error:  # SQLite quotes what it found in a damaged file
             raise self._damaged() from error
@@ -196,12 +234,20 @@ class Database:
             raise BadData("A name or text is not valid UTF-8.", hint="Give it in UTF-8.") from error
 
     def _set_up(self, *, create: bool) -> None:
-        for pragma in ("trusted_schema=OFF", "foreign_keys=ON", "secure_delete=ON", "synchronous=FULL"):
-            self.execute(f"PRAGMA {pragma}")
+        self._check_version(create=create)
+        self._write_ahead()
+        self._bring_in_order(create=create)
+
+    def _check_version(self, *, create: bool) -> int:
         version = self._version()
         if version == 0 and not create:
             raise StoreFailure(f"The store {self.path} is empty.", hint="Run teds-provision init.")
-        self._write_ahead()
+        return version
+
+    def _bring_in_order(self, *, create: bool) -> None:
+        for pragma in ("trusted_schema=OFF", "foreign_keys=ON", "secure_delete=ON", "synchronous=FULL"):
+            self.execute(f"PRAGMA {pragma}")
+        version = self._check_version(create=create)
         if version < SCHEMA_VERSION:
             try:
                 self._bring_forward()
@@ -245,6 +291,15 @@ class Database:
         return int(version)
 
 
+def _is_no_place_to_write(failure: StoreFailure) -> bool:
+    """Whether a store could not be opened because nothing can be written where it lies."""
+    cause = failure.__cause__
+    if isinstance(cause, OSError):
+        return cause.errno in _OS_CAUSES
+    refused = (sqlite3.SQLITE_READONLY, sqlite3.SQLITE_CANTOPEN, sqlite3.SQLITE_IOERR, sqlite3.SQLITE_FULL)
+    return isinstance(cause, sqlite3.Error) and getattr(cause, "sqlite_errorcode", 0) & 0xFF in refused
+
+
 def _prepare_home(home: Path, *, create: bool) -> None:
     """Make the directory with mode 0700; refuse one in which others may write."""
     if create:
@@ -258,8 +313,10 @@ def _prepare_home(home: Path, *, create: bool) -> None:
         raise StoreFailure(f"There is no store in {home}.", hint="Run teds-provision init.") from None
     if not stat.S_ISDIR(status.st_mode):
         raise StoreFailure(f"{home} is not a directory.", hint="Choose another --home.")
+    if status.st_uid != os.geteuid():
+        raise StoreFailure(f"{home} belongs to another user.", hint="Run this as its owner, or choose another --home.")
     private = not status.st_mode & 0o077
-    if create and not private and status.st_uid == os.geteuid() and not any(home.iterdir()):
+    if create and not private and not any(home.iterdir()):
         home.chmod(0o700)
     elif status.st_mode & 0o022:
         raise StoreFailure(f"Others may write in {home}.", hint=f"Run: chmod 700 {home}, or choose another --home.")
@@ -270,7 +327,21 @@ def _prepare_file(path: Path, *, create: bool) -> None:
     if create:
         with suppress(FileExistsError):
             os.close(os.open(path, os.O_CREAT | os.O_EXCL | os.O_RDWR | os.O_NOFOLLOW, 0o600))
-    elif not path.exists():
+    for file in (path, path.with_name(path.name + "-wal"), path.with_name(path.name + "-shm")):
+        _require_own(file)
+    if not path.exists():
         raise StoreFailure(f"There is no store in {path.parent}.", hint="Run teds-provision init.")
     if path.stat().st_mode & 0o077:
-        path.chmod(0o600)
+        with suppress(OSError):  # a disk that is read-only: what is read stays as open as it was
+            path.chmod(0o600)
+
+
+def _require_own(file: Path) -> None:
+    """Refuse a link, or another user's file, in the place of the store: somebody put it there."""
+    try:
+        status = file.lstat()
+    except FileNotFoundError:
+        return
+    if not stat.S_ISREG(status.st_mode) or status.st_uid != os.geteuid():
+        what = "a link" if stat.S_ISLNK(status.st_mode) else "not this user's own file"
+        raise StoreFailure(f"{file} is {what}.", hint="Somebody put it there: look at it, and move it away.")

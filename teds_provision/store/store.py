@@ -58,6 +58,11 @@ class Store(
         """The directory that the store lies in."""
         return self._database.path.parent
 
+    @property
+    def frozen(self) -> StoreFailure | None:
+        """Why nothing can be written (the disk is full or read-only), None where it can."""
+        return self._database.frozen
+
     def close(self) -> None:
         """Close the file; a second call does nothing."""
         self._database.close()
