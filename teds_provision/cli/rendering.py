@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import json
 import sys
 import time
+from collections.abc import Iterable
 from datetime import datetime
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from teds_provision.cli.context import harmless
 from teds_provision.talk.progress import NOTHING, Reporter, Silent, StepResult
@@ -33,6 +35,18 @@ def local_time(text: str) -> str:
         return datetime.fromisoformat(text).astimezone().isoformat(sep=" ", timespec="seconds")
     except ValueError:
         return text
+
+
+def print_json_list(name: str, entries: Iterable[dict[str, Any]]) -> None:
+    """One JSON object with one list, written to stdout as it is made: a long list takes no memory."""
+    out = sys.stdout
+    wide = (out.encoding or "utf-8").lower().replace("-", "") == "utf8"
+    encode = json.JSONEncoder(ensure_ascii=not wide).encode
+    out.write(f'{{"{name}": [')
+    for number, entry in enumerate(entries):
+        out.write(f", {encode(entry)}" if number else encode(entry))
+    out.write("]}\n")
+    out.flush()
 
 
 def print_table(console: Console, table: Table) -> None:

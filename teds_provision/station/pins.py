@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from typing import TYPE_CHECKING
 
 from teds_provision.lazy import late
@@ -63,6 +64,14 @@ class Pins:
         for entry in entries:
             self._seals.check_entry(entry)
         return entries
+
+    def each(self) -> Iterator[WhitelistEntry]:
+        """All entries, by UUID, a page at a time, for lists."""
+        return map(self._checked, self._store.each_whitelisted())
+
+    def _checked(self, entry: WhitelistEntry) -> WhitelistEntry:
+        self._seals.check_entry(entry)
+        return entry
 
     def entry(self, uuid: bytes) -> WhitelistEntry | None:
         """The whitelist entry of a node, None where it is not on it."""

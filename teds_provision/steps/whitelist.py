@@ -13,7 +13,6 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
-from xml.sax.saxutils import quoteattr
 
 from teds_provision.errors import OtherKey, PolicyRefused, UsageFailure
 from teds_provision.station.station import Station
@@ -173,9 +172,16 @@ def render(entries: Iterable[WhitelistEntry], form: str) -> str:
     lines = ['<?xml version="1.0" encoding="UTF-8"?>', "<whitelist>"]
     for row in rows:
         attributes = {**row, "uuid": f"0x{row['uuid']}"}
-        shown = " ".join(f"{key}={quoteattr(_legal(value))}" for key, value in attributes.items() if value is not None)
+        shown = " ".join(f"{key}={_quoted(_legal(value))}" for key, value in attributes.items() if value is not None)
         lines.append(f"  <transducer {shown}/>")
     return "\n".join([*lines, "</whitelist>", ""])
+
+
+def _quoted(text: str) -> str:
+    """An attribute's value with its quotes (XML 1.0 section 2.3)."""
+    for character, entity in (("&", "&amp;"), ("<", "&lt;"), (">", "&gt;"), ('"', "&quot;")):
+        text = text.replace(character, entity)
+    return f'"{text}"'
 
 
 def _legal(text: str) -> str:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import csv
-import json
 import shutil
 import sys
 from collections.abc import Callable, Iterable, Iterator
@@ -16,7 +15,7 @@ import click
 from teds_provision.cli.context import App, pass_app
 from teds_provision.cli.moments import moment
 from teds_provision.cli.options import command
-from teds_provision.cli.rendering import local_time, shown
+from teds_provision.cli.rendering import local_time, print_json_list, shown
 from teds_provision.cli.station.fits import show_fits
 from teds_provision.station.inventory import STATES, inventory, search
 
@@ -67,7 +66,7 @@ def nodes(
         return
     described = inventory(station, found)
     if app.json or form == "json":
-        _json(described)
+        print_json_list("nodes", described)
     elif form == "csv":
         _csv(described)
     elif not found:
@@ -76,19 +75,6 @@ def nodes(
         _one(next(described))
     else:
         _table(described)
-
-
-def _json(described: Iterable[dict[str, Any]]) -> None:
-    """One JSON object, written as it is made."""
-    out, first = sys.stdout, True
-    wide = (out.encoding or "utf-8").lower().replace("-", "") == "utf8"
-    encode = json.JSONEncoder(ensure_ascii=not wide).encode
-    out.write('{"nodes": [')
-    for node in described:
-        out.write(encode(node) if first else f", {encode(node)}")
-        first = False
-    out.write("]}\n")
-    out.flush()
 
 
 _FIELDS = (

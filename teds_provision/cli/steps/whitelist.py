@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import re
+import sys
+from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -10,10 +12,9 @@ import click
 
 from teds_provision.cli.context import App, pass_app
 from teds_provision.cli.options import COMMAND_SETTINGS, dry_run_option, examples, yes_option
+from teds_provision.cli.rendering import print_json_list, shown
 
 if TYPE_CHECKING:
-    from rich.console import Console
-
     from teds_provision.station.station import Station
     from teds_provision.steps.whitelist import Plan
 
@@ -114,27 +115,23 @@ def list_entries(app: App) -> None:
 
     UUID, the pinned key, how well it was proven, when the entry was added, and the node's name.
     """
-    station = app.station()
-    entries = station.pins.whitelist()
-
-    def human(console: Console) -> None:
-        from rich.table import Table
-        from rich.text import Text
-
-        from teds_provision.cli.rendering import print_table, shown
-
-        if not entries:
-            console.print("The whitelist is empty.")
-            return
-        table = Table("UUID", "key", "assurance", "added", "name", box=None, pad_edge=False)
-        for entry in entries:
-            key = entry.fingerprint[:16] if entry.fingerprint else "not pinned yet"
-            table.add_row(entry.uuid.hex(), key, entry.assurance, entry.added, Text(shown(entry.name)))
-        print_table(console, table)
-
     from teds_provision.steps.whitelist import as_dict
 
-    app.emit({"whitelist": [as_dict(entry) for entry in entries]}, human)
+    station = app.station()
+    entries = station.pins.each()
+    if app.json:
+        print_json_list("whitelist", map(as_dict, entries))
+        return
+    first = next(entries, None)
+    if first is None:
+        print("The whitelist is empty.")
+        return
+    print(f"{'UUID':<20}  {'key':<16}  {'assurance':<9}  {'added':<20}  name")
+    for entry in chain([first], entries):
+        key = entry.fingerprint[:16] if entry.fingerprint else "not pinned yet"
+        line = f"{entry.uuid.hex()}  {key:<16}  {entry.assurance:<9}  {entry.added:<20}  {shown(entry.name)}"
+        sys.stdout.write(f"{line.rstrip()}\n")
+    sys.stdout.flush()
 
 
 @whitelist.command(

@@ -81,10 +81,6 @@ class KeyTables:
             self._database.execute("DELETE FROM keys WHERE uuid = ? AND key_id <> ?", (uuid, key_id))
             self._database.execute("UPDATE keys SET state = 'active' WHERE uuid = ? AND state <> 'active'", (uuid,))
 
-    def remove_key(self, uuid: bytes, key_id: str) -> bool:
-        """Delete one key of a node; False if there is none."""
-        return self._database.change("DELETE FROM keys WHERE uuid = ? AND key_id = ?", (uuid, key_id)) > 0
-
     def remove_keys(self, uuid: bytes) -> int:
         """Delete every key of a node (decommission); returns how many there were."""
         return self._database.change("DELETE FROM keys WHERE uuid = ?", (uuid,))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import fields
 from typing import Any
 
@@ -14,6 +14,7 @@ from teds_provision.store.records import UUID_OCTETS, NodeRecord, WhitelistEntry
 
 _UUID_DIGITS = 2 * UUID_OCTETS
 _MIN_PREFIX = 4
+_PAGE = 500
 _SHOWN_CANDIDATES = 5
 _GROUPS = next(place for place, column in enumerate(fields(NodeRecord)) if column.name == "groups")
 _NODE_COLUMNS = ", ".join(column.name for column in fields(NodeRecord))
@@ -27,6 +28,15 @@ class NodeTables:
     def whitelist(self) -> list[WhitelistEntry]:
         """Return all entries, by UUID."""
         return self._database.read(WhitelistEntry, "SELECT * FROM whitelist ORDER BY uuid")
+
+    def each_whitelisted(self) -> Iterator[WhitelistEntry]:
+        """Give all entries, by UUID, a page at a time; holds no lock between pages."""
+        after = b""
+        while page := self._database.read(
+            WhitelistEntry, "SELECT * FROM whitelist WHERE uuid > ? ORDER BY uuid LIMIT ?", (after, _PAGE)
+        ):
+            yield from page
+            after = page[-1].uuid
 
     def whitelisted(self, uuid: bytes) -> WhitelistEntry | None:
         """Return the entry of this node, None if it is not whitelisted."""
