@@ -14,6 +14,8 @@ def main() -> None:
 
         print(f"teds-provision {__version__}")
         return
+    if sys.stdout is None:  # closed by the caller: the exit code still tells
+        sys.stdout = open(os.devnull, "w", encoding="utf-8")  # noqa: SIM115 - until the process ends
     if isinstance(sys.stdout, TextIOWrapper):  # a name in another encoding is no reason to fail after the work is done
         sys.stdout.reconfigure(errors="backslashreplace")
     try:
@@ -25,12 +27,12 @@ def main() -> None:
 
 
 def _told(code: int) -> int:
-    """The exit code, once stdout is written out; 1 where its reader went away (``| head``), without a word."""
+    """The exit code, once stdout is written out; 141 where its reader went away (``| head``), without a word."""
     try:
         sys.stdout.flush()
-    except BrokenPipeError:
+    except OSError as error:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # Python flushes once more when it ends
-        return code or 1
+        return 141 if isinstance(error, BrokenPipeError) and not code else code
     return code
 
 

@@ -6,12 +6,13 @@ import json
 import os
 import sys
 from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar, TextIO
 
 import click
 
-from teds_provision.errors import PolicyRefused, TedsProvisionError, UsageFailure, WrongPassphrase
+from teds_provision.errors import PolicyRefused, StoreFailure, TedsProvisionError, UsageFailure, WrongPassphrase
 
 if TYPE_CHECKING:
     from rich.console import Console, RenderableType
@@ -64,16 +65,29 @@ class App:
         ``human`` is a rich renderable (or a str), or a function that is given the console.
         """
         self.live_line()
-        if self.json:
-            print(to_json(result), flush=True)
-        elif human is not None:
-            console = self.console()
-            if callable(human):
-                human(console)
-            elif isinstance(human, str):
-                console.print(harmless(human), markup=False)
-            else:
-                console.print(human)
+        try:
+            if self.json:
+                print(to_json(result), flush=True)
+            elif human is not None:
+                self._print(human)
+                sys.stdout.flush()
+        except BrokenPipeError:
+            raise
+        except OSError as error:  # the work is done and safe; a script that gets no answer must hear of it
+            nowhere(sys.stdout)
+            told = f"The result cannot be written to stdout: {error.strerror}."
+            if self.json:
+                raise StoreFailure(told, hint="Free some space; the work itself is done.") from error
+            self.note(told)
+
+    def _print(self, human: Callable[[Console], None] | RenderableType) -> None:
+        console = self.console()
+        if callable(human):
+            human(console)
+        elif isinstance(human, str):
+            console.print(harmless(human), markup=False)
+        else:
+            console.print(human)
 
     def conclude(
         self,
@@ -198,6 +212,14 @@ class App:
         self.live_line()
         while self._closers:
             self._closers.pop()()
+
+
+def nowhere(stream: TextIO) -> None:
+    """Send what is still buffered nowhere: the interpreter would fail on it once more at its end."""
+    with suppress(OSError, ValueError):
+        null = os.open(os.devnull, os.O_WRONLY)
+        os.dup2(null, stream.fileno())
+        os.close(null)
 
 
 def to_json(value: object, *, indent: int | None = None) -> str:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import errno
 import importlib
 import json
 import os
@@ -13,12 +14,14 @@ from typing import Any, Final
 import click
 
 from teds_provision import __version__
-from teds_provision.cli.context import App, harmless
+from teds_provision.cli.context import App, harmless, nowhere
+from teds_provision.cli.globals import in_front
 from teds_provision.cli.table import COMMANDS, GROUPS, SECTIONS
-from teds_provision.errors import BadData, TedsProvisionError
+from teds_provision.errors import BadData, StoreFailure, TedsProvisionError
 
 ENVIRONMENT_PREFIX = "TEDS_PROVISION"
-INTERRUPTED = 130
+INTERRUPTED, BROKEN_PIPE = 130, 141
+_FULL: Final = frozenset({errno.ENOSPC, errno.EDQUOT, errno.EIO, errno.EBADF})
 _COMPLETE = "_TEDS_PROVISION_COMPLETE"
 
 
@@ -166,6 +169,7 @@ def run(arguments: list[str]) -> int:
     if asked:
         return _complete(asked)
     try:
+        arguments = in_front(arguments, _command_of)
         with cli.make_context("teds-provision", list(arguments)) as ctx:
             cli.invoke(ctx)
         return 0
@@ -180,17 +184,34 @@ def run(arguments: list[str]) -> int:
     except TedsProvisionError as error:
         _traceback(arguments)
         return _fail(arguments, error.exit_code, error.code, error.message, error.hint)
-    except BrokenPipeError:
-        sys.stderr.close()
-        return 1
+    except BrokenPipeError:  # whoever read has gone; the work was done before it was told
+        nowhere(sys.stdout)
+        return BROKEN_PIPE
+    except OSError as error:
+        if error.errno not in _FULL:
+            return _bug(arguments, error)
+        nowhere(sys.stdout)  # a table that was being printed; what reads a store or a file has errors of its own
+        told = f"The result cannot be written to stdout: {error.strerror}."
+        if _wants(arguments, "--json"):
+            return _fail(arguments, StoreFailure.exit_code, StoreFailure.code, told, "")
+        _say(told)
+        return 0
     except Exception as error:  # noqa: BLE001 - the last line of defence: a foreign exception is a bug of ours
-        _traceback(arguments)
-        hint = "This is a bug: please report it with what --debug prints."
-        return _fail(arguments, 1, "bug", f"Unexpected {type(error).__name__}.", hint)
+        return _bug(arguments, error)
     finally:
         app = App.current
         if app is not None:
             app.close()
+
+
+def _bug(arguments: list[str], error: Exception) -> int:
+    _traceback(arguments)
+    hint = "This is a bug: please report it with what --debug prints."
+    return _fail(arguments, 1, "bug", f"Unexpected {type(error).__name__}.", hint)
+
+
+def _command_of(name: str) -> click.Command | None:
+    return cli.get_command(click.Context(cli), name)
 
 
 def _complete(instruction: str) -> int:
@@ -245,7 +266,7 @@ def _settle() -> None:
 def _fail(arguments: list[str], exit_code: int, code: str, message: str, hint: str) -> int:
     _settle()
     if _wants(arguments, "--json"):
-        with contextlib.suppress(BrokenPipeError):
+        with contextlib.suppress(OSError):
             print(json.dumps({"error": {"code": code, "message": message, "hint": hint}}), flush=True)
     else:
         _say(message if exit_code == INTERRUPTED else f"Error: {message}")

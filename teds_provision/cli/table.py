@@ -35,6 +35,8 @@ SECTIONS: Final[dict[str, dict[str, Entry]]] = {
         "build": Entry("steps.build", "build", "Build a node's datasheet from its profile and calibration."),
         "sign": Entry("steps.sign", "sign", "Sign a built datasheet; say what changes on the node."),
         "write": Entry("steps.write", "write", "Write a signed datasheet to the node's flash, commit, read back."),
+        "draft": Entry("steps.history", "draft", "What was built and not written: list, drop."),
+        "history": Entry("steps.history", "history", "The datasheets that a node had; write --from brings one back."),
         "verify": Entry("steps.verify", "verify", "Check a node or an image against everything the profile demands."),
         "read": Entry("steps.read", "read", "Read every TEDS of a node."),
         "reset": Entry("steps.reset", "reset", "Take a node back to factory state, with its signed receipt."),
@@ -70,5 +72,5 @@ SECTIONS: Final[dict[str, dict[str, Entry]]] = {
 }
 
 COMMANDS: Final = {name: entry for section in SECTIONS.values() for name, entry in section.items()}
-GROUPS: Final = frozenset({"vault", "group", "trust", "profile", "whitelist", "handover", "node"})
+GROUPS: Final = frozenset({"draft", "vault", "group", "trust", "profile", "whitelist", "handover", "node"})
 """The commands that have commands of their own."""

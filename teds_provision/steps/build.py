@@ -221,7 +221,8 @@ def _as_it_is(station: Station, present: Survey, keep: Mapping[BlockId, bytes]) 
         return Proposal(Image(uuid, has.unsigned_blocks()), (), named=True)
     draft = station.nodes.draft(uuid)
     image = Image(uuid, {**keep, **pending.unsigned_blocks()})
-    return Proposal(image, (), named=False, profile=draft.profile if draft is not None else None)
+    profile = draft.profile if draft is not None else None
+    return Proposal(image, (), named=False, profile=profile, name=own_name(station, image, profile))
 
 
 def _only_what_is_named(

@@ -116,8 +116,20 @@ def prepare(station: Station, order: BuildOrder, uuid: bytes | None = None) -> P
     return Prepared(order, profile, calibrations, merged(warnings))
 
 
-def named_for(station: Station, uuid: bytes, prepared: Prepared) -> Prepared:
-    """The order with the name that this node gets; raises PolicyRefused where another node has it."""
+def named_for(station: Station, uuid: bytes, prepared: Prepared, *, keep: bool = False) -> Prepared:
+    """The order with the name that this node gets; raises PolicyRefused where another node has it.
+
+    ``keep``: a numbered name is kept for this node at once, as others may ask for theirs at the same time.
+    """
+    if prepared.order.name is None or _COUNT not in prepared.order.name or not keep:
+        return _named_for(station, uuid, prepared)
+    with station.durable("name"):
+        named = _named_for(station, uuid, prepared)
+        station.nodes.remember(uuid, name=named.order.name)
+    return named
+
+
+def _named_for(station: Station, uuid: bytes, prepared: Prepared) -> Prepared:
     name = prepared.order.name
     if name is None:
         return prepared

@@ -118,7 +118,7 @@ class _Run:
         unknown = prepared.profile is None and (known is None or known.profile is None)
         if unknown and who.state != NodeState.PROVISIONED:
             raise no_profile(who.uuid)
-        return named_for(self.station, who.uuid, prepared)
+        return named_for(self.station, who.uuid, prepared, keep=True)
 
     def _whitelist(self, who: Identified) -> WhitelistEntry | None:
         """None for a node that is whitelisted; else its entry, which the key agreement makes durable with the key."""

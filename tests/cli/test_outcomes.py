@@ -18,7 +18,7 @@ from teds_provision.steps.agree import agree
 from teds_provision.steps.build import BuildOrder, build
 from teds_provision.steps.identify import identify
 from teds_provision.steps.provision import provision
-from teds_provision.steps.sign_command import SignOrder, sign_image
+from teds_provision.steps.visits.sign_command import SignOrder, sign_image
 from teds_provision.store import StoreLock, WhitelistEntry
 from teds_provision.talk.progress import Silent
 

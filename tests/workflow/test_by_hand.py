@@ -14,7 +14,7 @@ from teds_provision.steps.agree import agree, require_session
 from teds_provision.steps.build import BuildOrder, build
 from teds_provision.steps.identify import identify
 from teds_provision.steps.read import Survey
-from teds_provision.steps.sign_command import SignOrder, sign_image
+from teds_provision.steps.visits.sign_command import SignOrder, sign_image
 from teds_provision.steps.write import write
 from teds_provision.store import WhitelistEntry
 from teds_provision.talk.meeting import the_one

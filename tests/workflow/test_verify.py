@@ -191,7 +191,7 @@ def test_a_datasheet_of_a_later_epoch_is_caught(station: Station, board: Board, 
 
 
 def test_what_is_not_whitelisted_cannot_be_signed(station: Station, board: Board, image: Image) -> None:
-    from teds_provision.steps.sign_command import SignOrder, sign_image
+    from teds_provision.steps.visits.sign_command import SignOrder, sign_image
 
     station.pins.remove(board.uuid)
     with pytest.raises(NotWhitelisted):
@@ -201,7 +201,7 @@ def test_what_is_not_whitelisted_cannot_be_signed(station: Station, board: Board
 def test_the_same_build_signed_as_draft_and_as_file_has_one_signature(station: Station, board: Board) -> None:
     from teds_provision.steps.agree import agree
     from teds_provision.steps.build import build
-    from teds_provision.steps.sign_command import SignOrder, sign_image
+    from teds_provision.steps.visits.sign_command import SignOrder, sign_image
 
     from .test_agree import whitelist
     from .test_provision import ANGLE

@@ -30,7 +30,7 @@ def _address(_ctx: click.Context, _parameter: click.Parameter, text: str) -> int
 def address(app: App, uuid: str, address: int, yes: bool, dry_run: bool, links: LinkSettings) -> None:
     """Give a node another CAN address, 1 to 239, for good: by tap, or in a session where its key is held."""
     from teds_provision.cli.rendering import reporter_for
-    from teds_provision.steps.at_node import set_address_at
+    from teds_provision.steps.visits.at_node import set_address_at
 
     del yes  # the old address can be given back the same way
     done = set_address_at(app.station(), links, uuid, address, reporter_for(app), dry_run=dry_run)

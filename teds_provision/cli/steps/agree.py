@@ -25,7 +25,7 @@ def agree(app: App, uuid: str, links: LinkSettings, rotate: bool, yes: bool, dry
     The first agreement needs a tap (or the bus of a node built without NFC); a rotation goes over any link.
     """
     from teds_provision.cli.rendering import reporter_for
-    from teds_provision.steps.at_node import agree_at
+    from teds_provision.steps.visits.at_node import agree_at
 
     def confirm(question: str) -> None:
         app.confirm(question, yes=yes)

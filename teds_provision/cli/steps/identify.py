@@ -13,7 +13,7 @@ from teds_provision.cli.options import command, link_options
 from teds_provision.links import LinkSettings
 
 if TYPE_CHECKING:
-    from teds_provision.steps.identify_at import Found
+    from teds_provision.steps.visits.identify_at import Found
 
 
 @command(
@@ -30,7 +30,7 @@ def identify(app: App, links: LinkSettings, watch: bool, add: bool) -> None:
     Over --via can every node on the bus is asked; with --json several are listed under "nodes".
     """
     from teds_provision.cli.rendering import reporter_for
-    from teds_provision.steps.identify_at import identify_at
+    from teds_provision.steps.visits.identify_at import identify_at
 
     stop = threading.Event()
     if watch:

@@ -23,7 +23,7 @@ def read(app: App, uuid: str, output: Path | None, links: LinkSettings) -> None:
     """Read every TEDS of a node, over a session where this station holds its key; look at it with show."""
     from teds_provision.cli.rendering import reporter_for
     from teds_provision.cli.steps.build import write_file
-    from teds_provision.steps.at_node import read_at
+    from teds_provision.steps.visits.at_node import read_at
 
     done = read_at(app.station(), links, uuid, reporter_for(app))
     if not done.proven:

@@ -21,7 +21,7 @@ def reset(app: App, uuid: str, yes: bool, dry_run: bool, links: LinkSettings) ->
     The node signs the statement; in factory state it signs it again, so a lost receipt can be fetched.
     """
     from teds_provision.cli.rendering import reporter_for
-    from teds_provision.steps.at_node import reset_at
+    from teds_provision.steps.visits.at_node import reset_at
 
     station = app.station()
     octets = station.nodes.resolve(uuid)

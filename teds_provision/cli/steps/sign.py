@@ -37,7 +37,7 @@ def sign(
     """
     from teds_provision.cli.rendering import reporter_for
     from teds_provision.cli.steps.build import write_file
-    from teds_provision.steps.sign_command import sign_at
+    from teds_provision.steps.visits.sign_command import sign_at
 
     del yes  # a signature uses up a sequence number, nothing else
     station = app.station()

@@ -36,7 +36,7 @@ def verify(app: App, what: tuple[str, ...], links: LinkSettings, accept_calibrat
     """
     from teds_provision.cli.rendering import reporter_for
     from teds_provision.cli.steps.verify_files import are_files, verify_many
-    from teds_provision.steps.at_node import verify_at
+    from teds_provision.steps.visits.at_node import verify_at
 
     if are_files(what):
         if accept_calibration is not None:

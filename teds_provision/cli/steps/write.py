@@ -4,21 +4,34 @@ from __future__ import annotations
 
 from functools import partial
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import click
 
 from teds_provision.cli.context import App, pass_app
 from teds_provision.cli.options import command, dry_run_option, link_options, yes_option
+from teds_provision.errors import UsageFailure
 from teds_provision.links import LinkSettings
+
+if TYPE_CHECKING:
+    from teds_provision.steps.write import Written
 
 
 @command(
     "teds-provision write 8d4d --nfc udp:localhost:54321",
     "teds-provision write 8d4d --image signed.json --via can --can udp_multicast:239.74.163.2",
+    "teds-provision write 8d4d --from 3 --nfc udp:localhost:54321",
 )
 @click.argument("uuid")
 @click.option(
     "--image", type=click.Path(path_type=Path, dir_okay=False), metavar="IMAGE", help="Write this file's image."
+)
+@click.option(
+    "--from",
+    "sequence",
+    type=click.IntRange(0, 2**32 - 1),
+    metavar="SEQUENCE",
+    help="Bring back what it had; see history.",
 )
 @click.option("--sequence-jump", is_flag=True, help="Write although its sequence is far ahead of the node's.")
 @yes_option
@@ -26,12 +39,27 @@ from teds_provision.links import LinkSettings
 @link_options
 @pass_app
 def write(
-    app: App, uuid: str, image: Path | None, sequence_jump: bool, yes: bool, dry_run: bool, links: LinkSettings
+    app: App,
+    uuid: str,
+    image: Path | None,
+    sequence: int | None,
+    sequence_jump: bool,
+    yes: bool,
+    dry_run: bool,
+    links: LinkSettings,
 ) -> None:
-    """Write a signed datasheet over a session, commit it, read it back and compare."""
-    from teds_provision.cli.rendering import reporter_for
-    from teds_provision.steps.at_node import write_at
+    """Write a signed datasheet over a session, commit it, read it back and compare.
 
+    --from brings an older datasheet of the node back, signed anew.
+    """
+    from teds_provision.cli.rendering import reporter_for
+    from teds_provision.steps.visits.at_node import write_at
+
+    if sequence is not None:
+        if image is not None:
+            raise UsageFailure("--from and --image name two datasheets.", hint="Give one of them.")
+        _bring_back(app, uuid, sequence, links, dry_run=dry_run)
+        return
     confirm = partial(app.confirm, yes=yes)
     done = write_at(
         app.station(),
@@ -48,11 +76,34 @@ def write(
         plan = {"uuid": node, "plan": "write", "blocks": blocks, "octets": octets}
         app.emit(plan, f"Plan: write {blocks} TEDS, {octets} octets, to {node}.")
         return
-    result = {
+    app.emit(_told(node, written), f"Node {node}: {_said(written)}.")
+
+
+def _bring_back(app: App, uuid: str, sequence: int, links: LinkSettings, *, dry_run: bool) -> None:
+    from teds_provision.cli.rendering import reporter_for
+    from teds_provision.steps.visits.history import bring_back
+
+    done = bring_back(app.station(), links, uuid, sequence, reporter_for(app), dry_run=dry_run)
+    node, changes = done.uuid.hex(), [change.text for change in done.changes]
+    lines = "".join(f"\n  {text}" for text in changes) or "\n  no change of what it has"
+    if done.written is None:
+        plan = {"uuid": node, "plan": "write", "from": sequence, "changes": changes}
+        app.emit(plan, f"Plan: bring the datasheet of sequence {sequence} back to {node}.{lines}")
+        return
+    result = _told(node, done.written) | {"from": sequence, "sequence": done.sequence, "changes": changes}
+    told = f"the datasheet of sequence {sequence} is back, as sequence {done.sequence}"
+    app.emit(result, f"Node {node}: {told}; {_said(done.written)}.{lines}")
+
+
+def _told(node: str, written: Written) -> dict[str, Any]:
+    return {
         "uuid": node,
         "octets_written": written.octets,
         "verified": True,
         "seconds": round(written.seconds, 3),
     }
+
+
+def _said(written: Written) -> str:
     told = f"{written.octets} octets written and read back" if written.octets else "nothing to do, it is there already"
-    app.emit(result, f"Node {node}: {told} ({written.seconds:.2f} s).")
+    return f"{told} ({written.seconds:.2f} s)"

@@ -252,13 +252,13 @@ class Boards:
             row = self.progress.row_for(who.uuid, who.fingerprint)
             if row is None:
                 raise PolicyRefused(f"No row of the sheet is left for board {who.uuid.hex()}.", hint="Lay it aside.")
+            self._rows[who.uuid] = row
             if row.fingerprint is not None and not who.fingerprint.startswith(row.fingerprint):
                 raise OtherKey(
                     f"Board {who.uuid.hex()} holds the key {who.fingerprint[:32]}; row {row.number} of the sheet "
                     f"says {row.fingerprint[:32]}.",
                     hint="Compare the label of this board; it may be another one under the same UUID.",
                 )
-            self._rows[who.uuid] = row
             self.progress.take(row, who.uuid)
         return row.prepared
 

@@ -11,13 +11,13 @@ from teds_provision.links import LINKS, LinkSettings
 from teds_provision.station.station import Station
 from teds_provision.steps.address import set_address
 from teds_provision.steps.agree import Agreed, agree, session_if_keyed
-from teds_provision.steps.order import guard
+from teds_provision.steps.order import guard, own_name
 from teds_provision.steps.read import read_image
 from teds_provision.steps.reset import ResetReceipt, reset_node
 from teds_provision.steps.sign import known_image
 from teds_provision.steps.verify import Verified, require_authentic, verify_image
 from teds_provision.steps.verify_node import look_at_node
-from teds_provision.steps.visit import at_node, node_or_image, read_image_file
+from teds_provision.steps.visits.visit import at_node, node_or_image, read_image_file
 from teds_provision.steps.write import Written, write
 from teds_provision.talk.progress import Reporter
 from teds_provision.teds.image import Image
@@ -169,6 +169,9 @@ def write_at(
         facts = {"profile": draft.profile} if draft.profile is not None else {}
     else:
         wanted = known_image(station, uuid)
+    name = own_name(station, wanted, draft.profile if draft is not None else None) if wanted is not None else None
+    if name is not None:
+        facts["name"] = name
     if wanted is None:
         raise NotFound(f"Nothing is built for node {uuid.hex()}.", hint="build and sign it first, or give --image.")
     if wanted.uuid != uuid:

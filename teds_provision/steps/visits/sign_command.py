@@ -12,7 +12,7 @@ from teds_provision.steps.agree import require_session
 from teds_provision.steps.order import guard
 from teds_provision.steps.read import survey
 from teds_provision.steps.sign import Signed, known_image, known_node_keys, sign
-from teds_provision.steps.visit import node_or_image
+from teds_provision.steps.visits.visit import node_or_image
 from teds_provision.store import Draft
 from teds_provision.talk.conversation import Conversation
 from teds_provision.talk.meeting import meet

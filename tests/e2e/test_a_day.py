@@ -1,0 +1,293 @@
+"""A day at the bench: sheets, names, what nobody named, "no", an undo; and every node of a bus at once."""
+
+from __future__ import annotations
+
+import csv
+import json
+import os
+import pty
+import signal
+import subprocess
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from tests.cli.shell import Outcome, clean_environment
+
+from .desk import ANGLE, FINGER, PROGRAM, Desk, Node, Station, results
+
+pytestmark = pytest.mark.link
+
+CALIBRATION = "raw,value [degree]\n0,0\n32768,{middle}\n65535,359.9\n"
+
+
+def sheet(path: Path, *rows: dict[str, str]) -> Path:
+    """A sheet of boards."""
+    with path.open("w", newline="") as file:
+        writer = csv.DictWriter(file, ["uuid", "name", "profile", "calibration", "fingerprint"])
+        writer.writeheader()
+        writer.writerows(rows)
+    return path
+
+
+def lines_of(outcome: Outcome) -> list[Any]:
+    return [json.loads(line) for line in outcome.out.splitlines()]
+
+
+def on_a_terminal(station: Station, *words: object, answers: list[bytes]) -> tuple[int, str]:
+    """Run a command on a pseudo-terminal, answer its questions in turn; exit code and all that was shown."""
+    ours, theirs = pty.openpty()
+    read, write = os.pipe()
+    os.write(write, (station.passphrase or "").encode() + b"\n")
+    os.close(write)
+    process = subprocess.Popen(
+        [*PROGRAM, "--home", str(station.home), "--passphrase-fd", str(read), *map(str, words)],
+        stdin=theirs,
+        stdout=theirs,
+        stderr=theirs,
+        pass_fds=(read,),
+        env=clean_environment(TERM="xterm"),
+    )
+    os.close(theirs)
+    os.close(read)
+    said = b""
+    waiting = list(answers)
+    try:
+        while True:
+            try:
+                octets = os.read(ours, 4096)
+            except OSError:  # the other end is closed
+                break
+            if not octets:
+                break
+            said += octets
+            if waiting and said.count(b"[y/N]") > len(answers) - len(waiting):
+                os.write(ours, waiting.pop(0))
+        process.wait(30)
+    finally:
+        process.kill()
+        process.wait()
+        os.close(ours)
+    return process.returncode, said.decode(errors="replace")
+
+
+# -- what is written is what was asked for -----------------------------------------------------------------------------
+
+
+def test_a_trial_build_is_not_written_by_the_next_plain_provision(station: Station, node: Node) -> None:
+    node.start()
+    links = station.desk.links.over("nfc")
+    station.provision("nfc", "--profile", ANGLE, "--name", "first")
+    station.ask("build", node.uuid, "--profile", ANGLE, "--name", "only a trial")
+    assert [draft["stage"] for draft in station.ask("draft", "list")["drafts"]] == ["built"]
+    before = node.octets
+    told = station.provision("nfc", code=6)
+    assert told["error"]["code"] == "not-named"
+    assert any("only a trial" in change for change in told["changes"]), told
+    assert node.octets == before
+    code, said = on_a_terminal(station, "provision", *links, answers=[b"n\n"])
+    assert code == 6
+    assert "only a trial" in said
+    assert "Interrupted" not in said
+    assert node.octets == before
+    station.ask("draft", "drop", node.uuid)
+    assert set(results(station.provision("nfc")).values()) == {"done", "nothing to do"}
+    assert node.octets == before
+    station.ask("build", node.uuid, "--profile", ANGLE, "--name", "wanted after all")
+    code, said = on_a_terminal(station, "provision", *links, answers=[b"y\n"])
+    assert code == 0, said
+    assert station.ask("identify", *links)["name"] == "wanted after all"
+
+
+def test_what_was_put_onto_the_node_by_hand_stays_until_something_else_is_named(
+    station: Station, node: Node, tmp_path: Path
+) -> None:
+    node.start()
+    links = station.desk.links.over("nfc")
+    station.provision("nfc", "--profile", ANGLE, "--name", "old name")
+    station.ask("build", node.uuid, "--profile", FINGER, "--output", tmp_path / "finger.json")
+    station.ask("sign", tmp_path / "finger.json", "--output", tmp_path / "signed.json")
+    station.ask("write", node.uuid, "--image", tmp_path / "signed.json", *links)
+    station.ask("draft", "drop", node.uuid)
+    written = node.octets
+    assert station.provision("nfc")["verdict"] == "authentic"
+    assert node.octets == written
+    plan = station.ask("provision", "--name", "new name", "--dry-run", *links)
+    assert any("new name" in change for change in plan["changes"]), plan
+    assert node.octets == written
+
+
+def test_an_older_datasheet_is_brought_back_signed_anew(station: Station, node: Node) -> None:
+    node.start()
+    links = station.desk.links.over("nfc")
+    for name in ("one", "two"):
+        station.provision("nfc", "--profile", ANGLE, "--name", name)
+    history = station.ask("history", node.uuid)["history"]
+    assert [(entry["sequence"], entry["profile"]) for entry in history] == [(2, ANGLE), (1, ANGLE)]
+    assert station.refuses("write", node.uuid, "--from", "7", *links, code=3)["hint"] == "Known are: 2, 1."
+    assert station.ask("write", node.uuid, "--from", "1", "--dry-run", *links)["changes"]
+    done = station.ask("write", node.uuid, "--from", "1", *links)
+    assert (done["sequence"], done["verified"]) == (3, True)
+    assert station.ask("identify", *links)["name"] == "one" or station.ask("verify", node.uuid, *links)
+    assert station.ask("verify", node.uuid, *links)["verdict"] == "authentic"
+
+
+# -- names -------------------------------------------------------------------------------------------------------------
+
+
+def test_one_name_or_calibration_is_not_given_to_every_board(station: Station, node: Node, tmp_path: Path) -> None:
+    node.start()
+    links, file = station.desk.links.over("nfc"), tmp_path / "angle.csv"
+    file.write_text(CALIBRATION.format(middle=180))
+    for words in (["--name", "same"], ["--calibration", file]):
+        said = station.refuses("provision", "--watch", "-p", ANGLE, "--yes", *words, *links, code=2)
+        assert "--batch" in said["hint"]
+    bus = station.desk.links.over("can")
+    assert "--batch" in station.refuses("provision", "--all", "-p", ANGLE, "--name", "same", *bus, code=2)["hint"]
+    station.refuses("provision", "-p", ANGLE, "--yes", "--name", "x" * 121, *links, code=2)
+    assert node.flash["key"] is None
+
+
+def test_names_by_pattern_and_a_name_that_is_taken(desk: Desk, station: Station) -> None:
+    nodes = [desk.node(f"node{number}") for number in range(3)]
+    names = []
+    for node in (nodes[0], nodes[1], nodes[0]):
+        node.start()
+        names.append(station.provision("nfc", "-p", ANGLE, "--name", "cell {n}")["name"])
+        node.stop()
+    assert names == ["cell 1", "cell 2", "cell 1"]
+    nodes[2].start()
+    said = station.provision("nfc", "-p", ANGLE, "--name", "cell 2", code=6)["error"]
+    assert nodes[1].uuid in said["message"]
+    assert nodes[2].flash["key"] is None
+    assert station.provision("nfc", "-p", ANGLE, "--name", "node-{uuid}")["name"] == f"node-{nodes[2].uuid}"
+
+
+def test_a_board_of_another_owner_is_not_whitelisted(desk: Desk, station: Station, node: Node) -> None:
+    node.start()
+    assert desk.station("rival").provision("nfc", "-p", ANGLE)["verdict"] == "authentic"
+    said = station.provision("nfc", "-p", ANGLE, code=6)["error"]
+    assert "another owner" in said["message"]
+    assert station.ask("whitelist", "list")["whitelist"] == []
+    (entry,) = [entry for entry in station.ask("log")["entries"] if entry["act"] == "provision"]
+    assert (entry["uuid"], entry["outcome"]) == (node.uuid, "node-refused")
+
+
+# -- sheets ------------------------------------------------------------------------------------------------------------
+
+
+def test_a_sheet_with_errors_is_8_with_every_line_before_the_first_tap(station: Station, tmp_path: Path) -> None:
+    rows = [
+        {"uuid": "12", "profile": ANGLE},
+        {"profile": "no-such-type"},
+        {"profile": ANGLE, "calibration": "none.csv"},
+        {"profile": ANGLE, "name": "twice"},
+        {"profile": ANGLE, "name": "twice", "fingerprint": "abc"},
+        {"profile": ANGLE, "name": "x" * 121},
+    ]
+    file = sheet(tmp_path / "boards.csv", *rows)
+    said = station.refuses("provision", "--batch", file, "--yes", "--nfc", "tty:nowhere:pn532", code=8)
+    for line in range(2, 8):
+        if line != 5:
+            assert f"boards.csv:{line}:" in said["message"], line
+    file.write_text("uuid,nome\n,x\n")
+    assert "nome" in station.refuses("provision", "--batch", file, "--nfc", "tty:nowhere:pn532", code=8)["message"]
+    station.refuses("provision", "--batch", tmp_path / "none.csv", "--nfc", "tty:nowhere:pn532", code=3)
+
+
+def test_a_sheet_gives_each_board_its_own_and_carries_on(desk: Desk, station: Station, tmp_path: Path) -> None:
+    """By order of taps, by UUID, by the key of a label; killed in between; the report at the end."""
+    nodes = [desk.node(f"node{number}") for number in range(3)]
+    for number, middle in enumerate((175, 180)):
+        (tmp_path / f"{number}.csv").write_text(CALIBRATION.format(middle=middle))
+    key = nodes[2].start() and station.ask("identify", *desk.links.over("nfc"))["fingerprint"]
+    nodes[2].stop()
+    file = sheet(
+        tmp_path / "boards.csv",
+        {"name": "first", "profile": ANGLE, "calibration": "0.csv"},
+        {"uuid": f"0x{nodes[1].uuid.upper()}", "name": "second", "profile": ANGLE, "calibration": "1.csv"},
+        {"fingerprint": key[:32], "name": "third", "profile": FINGER},
+    )
+    report = tmp_path / "report.html"
+    words = ["--json", "provision", "--batch", file, "--yes", "--timeout", "20", "--report", report]
+    batch = station.start(*words, *desk.links.over("nfc"))
+    nodes[0].start()
+    (line,) = batch.wait_for_lines(1)
+    assert (line["uuid"], line["row"], line["name"], line["verdict"]) == (nodes[0].uuid, 1, "first", "authentic")
+    assert line["seconds"] > 0
+    nodes[0].stop()
+    batch.signal(signal.SIGKILL)
+    batch.end()
+    batch = station.start(*words, *desk.links.over("nfc"))
+    nodes[2].start()
+    assert [line["row"] for line in batch.wait_for_lines(1)] == [3]
+    nodes[2].stop()
+    nodes[1].start()
+    outcome = batch.end(40)
+    assert outcome.code == 0, outcome
+    third, second, last = lines_of(outcome)
+    assert (third["name"], second["row"], second["name"], second["uuid"]) == ("third", 2, "second", nodes[1].uuid)
+    totals = last["totals"]
+    assert (totals["passed"], totals["failed"], totals["skipped"], totals["first_pass"]) == (3, 0, 0, 1.0)
+    assert set(totals["steps"]) >= {"identify", "agree", "write", "verify"}
+    assert all(uuid in report.read_text() for uuid in (nodes[0].uuid, nodes[1].uuid, nodes[2].uuid))
+    again = station.run(*words, *desk.links.over("nfc"))
+    assert (again.code, list(again.json)) == (0, ["totals"])
+
+
+def test_a_label_pins_the_key_before_the_tap(station: Station, node: Node, tmp_path: Path) -> None:
+    node.start()
+    file = sheet(tmp_path / "boards.csv", {"uuid": node.uuid, "profile": ANGLE, "fingerprint": "ab" * 32})
+    outcome = station.run("--json", "provision", "--batch", file, "--timeout", "5", *station.desk.links.over("nfc"))
+    line, last = lines_of(outcome)
+    assert (line["row"], line["uuid"], line["error"]["code"]) == (1, node.uuid, "other-key")
+    assert (outcome.code, last["totals"]["failed"]) == (6, 1)
+    assert node.flash["key"] is None
+    (listed,) = [entry for entry in station.ask("nodes")["nodes"] if entry["uuid"] == node.uuid] or [None]
+    assert listed is None or listed["fingerprint"] is None
+
+
+def test_no_at_the_question_skips_the_board(station: Station, node: Node, tmp_path: Path) -> None:
+    node.start()
+    file = sheet(tmp_path / "boards.csv", {"profile": ANGLE, "name": "a"})
+    words = ["provision", "--batch", file, "--timeout", "10", *station.desk.links.over("nfc")]
+    code, said = on_a_terminal(station, *words, answers=[b"n\n"])
+    assert code == 6
+    assert "1 skipped" in said
+    assert "\a" in said
+    assert node.flash["key"] is None
+    code, said = on_a_terminal(station, *words, answers=[b"y\n"])
+    assert code == 0, said
+    assert "1 passed" in said
+
+
+# -- a whole bus -------------------------------------------------------------------------------------------------------
+
+
+def test_every_whitelisted_node_of_a_bus_is_brought_up_at_once(desk: Desk, station: Station) -> None:
+    nodes = [desk.node(f"node{number}").start("--crypto-delay", "20", nfc=False, can=True) for number in range(4)]
+    words = ["--json", "provision", "--all", "--yes", "-p", ANGLE, "--name", "axis {n}", *desk.links.over("can")]
+    outcome = station.run(*words)
+    assert (outcome.code, outcome.json["totals"]["passed"]) == (0, 0), "a yes adds no strangers"
+    for node in nodes[:3]:
+        station.ask("whitelist", "add", node.uuid)
+    outcome = station.run(*words)
+    assert outcome.code == 0, outcome
+    *lines, last = lines_of(outcome)
+    assert sorted(line["uuid"] for line in lines) == sorted(node.uuid for node in nodes[:3])
+    assert sorted(line["name"] for line in lines) == ["axis 1", "axis 2", "axis 3"]
+    assert last["totals"]["passed"] == 3
+    assert nodes[3].flash["key"] is None
+    assert station.log_is_whole()
+    assert list(station.run(*words).json) == ["totals"], "the finished ones are left alone"
+
+
+# -- global options and a look at a plan -------------------------------------------------------------------------------
+
+
+def test_global_options_stand_anywhere(station: Station) -> None:
+    assert station.desk.start("nodes", "--json", "--home", station.home).end().json == {"nodes": []}
+    assert station.desk.start("whitelist", "list", f"--home={station.home}", "--json", "-q").end().json
+    said = station.desk.start("nodes", "--home").end()
+    assert (said.code, "--home" in said.err) == (2, True)
