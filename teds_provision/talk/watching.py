@@ -38,8 +38,12 @@ class Patience(threading.Event):
 
     def __init__(self, seconds: float | None) -> None:
         super().__init__()
-        self._seconds = seconds
+        self._seconds, self._asked = seconds, False
         self.renew()
+
+    def ask(self) -> None:
+        """Say stop from a signal handler: takes no lock, which the interrupted thread may hold; seen within 0.2 s."""
+        self._asked = True
 
     def renew(self) -> None:
         """Something happened: wait the whole time again."""
@@ -48,18 +52,24 @@ class Patience(threading.Event):
     @property
     def ran_out(self) -> bool:
         """Whether the time is over, and not somebody said stop."""
-        return self._until is not None and time.monotonic() >= self._until and not super().is_set()
+        return self._is_over() and not self._asked and not super().is_set()
+
+    def _is_over(self) -> bool:
+        return self._until is not None and time.monotonic() >= self._until
 
     def is_set(self) -> bool:
         """Whether somebody said stop, or the time is over."""
-        return super().is_set() or (self._until is not None and time.monotonic() >= self._until)
+        return self._asked or super().is_set() or self._is_over()
 
     def wait(self, timeout: float | None = None) -> bool:
         """Wait for either."""
-        if self._until is not None:
-            left = max(0.0, self._until - time.monotonic())
-            timeout = left if timeout is None else min(timeout, left)
-        return super().wait(timeout) or self.is_set()
+        end = None if timeout is None else time.monotonic() + timeout
+        while not self.is_set():
+            left = _LOOK_SECONDS if end is None else min(_LOOK_SECONDS, end - time.monotonic())
+            if left <= 0:
+                return False
+            super().wait(left)
+        return True
 
 
 def watch_nodes(

@@ -168,10 +168,10 @@ def test_debug_alone_shows_a_traceback(home: Path) -> None:
 
 
 def test_a_bug_is_told_as_one_without_a_traceback(home: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def broken(*_: object) -> None:
+    def broken(*_: object, **__: object) -> None:
         raise ZeroDivisionError("secret detail")
 
-    monkeypatch.setattr("teds_provision.station.inventory.inventory", broken)
+    monkeypatch.setattr("teds_provision.station.station.Station.open", broken)
     told = call(home, "--json", "nodes")
     assert (told.code, told.json["error"]["code"]) == (1, "bug")
     assert "secret detail" not in told.out + told.err

@@ -48,7 +48,7 @@ draft.add_command(list_, "list")
 draft.add_command(drop, "drop")
 
 
-@command("teds-provision history 8d4d", "teds-provision write 8d4d --from 3 --nfc udp:localhost:54321")
+@command("teds-provision history 8d4d")
 @click.argument("uuid")
 @pass_app
 def history(app: App, uuid: str) -> None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import signal
-import threading
 from typing import TYPE_CHECKING, Any
 
 import click
@@ -31,10 +30,11 @@ def identify(app: App, links: LinkSettings, watch: bool, add: bool) -> None:
     """
     from teds_provision.cli.rendering import reporter_for
     from teds_provision.steps.visits.identify_at import identify_at
+    from teds_provision.talk.watching import Patience
 
-    stop = threading.Event()
+    stop = Patience(None)
     if watch:
-        signal.signal(signal.SIGTERM, lambda *_: stop.set())
+        signal.signal(signal.SIGTERM, lambda *_: stop.ask())
     several = len(links.places) > 1
     found: list[dict[str, Any]] = []
     for came in identify_at(app.station(), links, reporter_for(app, several=several), add=add, watch=watch, stop=stop):

@@ -101,7 +101,7 @@ def _one(app: App, boards: Boards, questions: Questions) -> None:
 def _many(app: App, boards: Boards, questions: Questions, *, totals: bool) -> None:
     from teds_provision.cli.steps.screen import screen_for
 
-    signal.signal(signal.SIGTERM, lambda *_: boards.stop.set())
+    signal.signal(signal.SIGTERM, lambda *_: boards.stop.ask())
     with screen_for(app, boards) as screen:
         try:
             for board in boards.many(questions):
