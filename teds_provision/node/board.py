@@ -70,9 +70,8 @@ class Board:
         self._facts = kinds
         self.channels: Mapping[int, ChannelHardware] = {n: _facts(channel) for n, channel in kinds.items()}
         self.converters = {number: Converter(sheet, channel) for number, channel in kinds.items()}
-        self._test_seconds = min(max(sheet.meta.self_test_time, 0.0), _LONGEST_SELF_TEST)
-        if not math.isfinite(self._test_seconds):
-            self._test_seconds = _SELF_TEST
+        stated = sheet.meta.self_test_time
+        self._test_seconds = min(max(stated, _SELF_TEST), _LONGEST_SELF_TEST) if math.isfinite(stated) else _SELF_TEST
         self._seen: dict[int, Reading | None] = {
             n: None for n, facts in self.channels.items() if facts.kind is Kind.EVENT_SENSOR
         }
@@ -198,7 +197,7 @@ class Board:
     # -- self-test, faults, power ----------------------------------------------------------------------------------
 
     def self_test(self, channels: Sequence[int]) -> None:
-        """It takes TestTime of the Meta-TEDS, 0.1 s where that says nothing, 10 s at most; it always passes."""
+        """It takes TestTime of the Meta-TEDS, 0.1 s at least and 10 s at most; it always passes."""
         end = self.now() + round(self._test_seconds * NANOSECONDS)
         self._testing.update(dict.fromkeys(channels, end))
 

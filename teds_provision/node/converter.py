@@ -41,7 +41,7 @@ class Converter:
         self._octets = self.form.octets
         width = 8 * self._octets
         bits = self.form.bits if 0 < self.form.bits < width else width
-        self._most = (1 << bits) - 1 if self.form.integer else None
+        self._most = (1 << bits) - 1 if self.form.integer or self.form.model == DataModel.BITS else None
         self._packing = _PACKING.get(DataModel(self.form.model))
         self._table = self._tabulated()
 

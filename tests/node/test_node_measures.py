@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 import os
 import signal
@@ -24,7 +25,7 @@ from teds_provision.protocol.messages.frames import Function, decode_reply, secu
 from teds_provision.protocol.operation.commands import ChannelState, Power, PowerFlag, Sampled, idle, sample, set_values
 from teds_provision.protocol.operation.datagram import Layout
 from teds_provision.protocol.operation.driving import Driver
-from teds_provision.protocol.operation.stream_commands import WAITS, Action, Driven, decode_stopped, drive, stop
+from teds_provision.protocol.operation.stream_commands import WAITS, Action, Driven, Kind, decode_stopped, drive, stop
 from teds_provision.protocol.operation.subscription import Plan
 from teds_provision.protocol.operation.timing import Token, mark_is_honest
 from teds_provision.teds.calibration import load_calibrations
@@ -127,6 +128,17 @@ def test_a_classic_bus_takes_a_kilohertz_of_two_streams_and_loses_nothing(scene:
         station.send(idle())
     finally:
         hub.close()
+
+
+def test_a_switch_tells_its_events_with_their_times(scene: Scene) -> None:
+    scene.run("switch", "--source", "sine:0.4", profile="limit-switch")
+    station = scene.station("switch")
+    station.operate()
+    receiver, _ = station.subscribe(Plan.of(2, ((1, 1),), n=1, period=1 * MS, gap=100, kind=Kind.EVENT))
+    events = station.hear(receiver, 4)
+    assert [event.data for event in events] in ([b"\0", b"\1"] * 2, [b"\1", b"\0"] * 2)
+    gaps = [after.tick - before.tick for before, after in itertools.pairwise(events)]
+    assert all(100 * MS < gap < 300 * MS for gap in gaps), gaps
 
 
 def test_without_a_sign_of_life_the_lease_silences_the_node(scene: Scene) -> None:
