@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Callable
+from functools import lru_cache
 from typing import Protocol
 
 from cryptography.exceptions import InvalidSignature, UnsupportedAlgorithm
@@ -88,6 +89,7 @@ def normalise_signature(raw: bytes) -> bytes:
     return raw[:32] + min(s, GROUP_ORDER - s).to_bytes(32, "big")
 
 
+@lru_cache(maxsize=256)  # stations, CAs and the node at hand are asked for again and again, and a check costs 25 µs
 def public_key(point: bytes) -> ec.EllipticCurvePublicKey:
     """Read a 65-octet point strictly: uncompressed, on the curve, not infinity. Raises BadData."""
     if len(point) != POINT_OCTETS or point[0] != 0x04:

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 from teds_provision.errors import BadData
 from teds_provision.files import read_limited
 from teds_provision.limits import LIMITS
-from teds_provision.protocol.handover.bundle import peek_bundle
+from teds_provision.protocol import handover
 from teds_provision.protocol.messages.message import Message, decode_message, looks_like_message
 from teds_provision.teds import convert, decode
 from teds_provision.teds.codec.codes import AccessCode
@@ -70,7 +70,7 @@ def load(name: str, edition: Edition | None = None) -> ShownFile:
     try:
         kind = detect(octets)
         if kind == "bundle":
-            return ShownFile(name, kind, bundle=peek_bundle(octets))
+            return ShownFile(name, kind, bundle=handover.bundle.peek_bundle(octets))
         path = Path(name) if name != STDIN else None
         blocks = read_blocks(octets, kind, path=path)
     except BadData as error:

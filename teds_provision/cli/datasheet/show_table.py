@@ -6,10 +6,8 @@ import re
 from collections.abc import Iterable, Iterator
 from typing import TYPE_CHECKING
 
-from rich import markup
-from rich.table import Table
-
 from teds_provision.cli.datasheet.show_files import ShownFile
+from teds_provision.lazy import late
 from teds_provision.protocol.messages.message import Argument, Message
 from teds_provision.teds.codec.model import Finding, TimeInstance, Verdict
 from teds_provision.teds.formats import with_class
@@ -18,9 +16,13 @@ from teds_provision.teds.show import Shown, ShownField, describe
 from teds_provision.teds.show.values import hexadecimal, instant
 
 if TYPE_CHECKING:
+    from rich import markup
+    from rich import table as rich_table
     from rich.console import Console
 
     from teds_provision.protocol.handover.bundle import BundleHeader
+else:
+    markup, rich_table = late("rich.markup"), late("rich.table")
 
 _COLOURS = {"error": "bold red", "warning": "yellow", "note": "dim"}
 _PIPE_WIDTH = 200
@@ -66,7 +68,9 @@ def print_teds(console: Console, shown: Shown) -> None:
     console.print(f"{head} · [{colour}]{decoded.verdict}[/]")
     for label, text in shown.summary:
         console.print(f"  [cyan]{label}[/]: {escape(text)}")
-    table = Table("offset", "type", "field", "value", "meaning", box=None, pad_edge=False, header_style="dim")
+    table = rich_table.Table(
+        "offset", "type", "field", "value", "meaning", box=None, pad_edge=False, header_style="dim"
+    )
     table.columns[0].justify = table.columns[1].justify = "right"
     for row in _rows(shown.fields, 0):
         table.add_row(*row)
@@ -99,7 +103,7 @@ def _print_message(console: Console, message: Message) -> None:
     school = " · tagged arguments" if message.school == "tagged" else ""
     failed = " · [red]failed[/]" if message.ok is False else ""
     console.print(f"[bold]{escape(group + name)}[/] · {message.kind}, {message.edition} edition{where}{school}{failed}")
-    table = Table("offset", "argument", "value", "meaning", box=None, pad_edge=False, header_style="dim")
+    table = rich_table.Table("offset", "argument", "value", "meaning", box=None, pad_edge=False, header_style="dim")
     for argument in message.arguments:
         table.add_row(str(argument.offset), argument.name, escape(_value(argument)), escape(argument.meaning))
     if message.arguments:

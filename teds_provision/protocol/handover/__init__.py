@@ -1,1 +1,15 @@
-"""What travels between base stations: bundles, receipts, revocations, and the JOSE forms around them."""
+"""Bundles, receipts and revocations of a handover: what they say and how they are signed and sealed.
+
+The modules are loaded at their first use: whoever shows a file need not load the cryptography of a bundle.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from teds_provision.lazy import lazy
+
+if TYPE_CHECKING:
+    from teds_provision.protocol.handover import bundle as bundle
+
+__getattr__ = lazy(__name__, {"bundle": ""})
