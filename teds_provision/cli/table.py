@@ -42,6 +42,7 @@ SECTIONS: Final[dict[str, dict[str, Entry]]] = {
         "reset": Entry("steps.reset", "reset", "Take a node back to factory state, with its signed receipt."),
         "address": Entry("steps.address", "address", "Give a node another CAN address."),
         "nodes": Entry("station.nodes", "nodes", "What this station knows of its nodes."),
+        "label": Entry("station.label", "label", "A label for a board: QR code and text of UUID and fingerprint."),
         "log": Entry("station.log", "log", "The audit log, and whether its hash chain holds."),
         "show": Entry("datasheet.show", "show", "Decode TEDS, images, profiles, bundles and messages."),
     },

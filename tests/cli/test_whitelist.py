@@ -32,7 +32,7 @@ def test_adding_again_is_nothing_to_do_and_another_key_is_refused(home: Path) ->
 
 def test_removing_asks_and_then_another_key_may_come(home: Path) -> None:
     call(home, "whitelist", "add", ONE, "--fingerprint", KEY)
-    assert call(home, "whitelist", "remove", ONE).code == 2
+    assert call(home, "whitelist", "remove", ONE).code == 6
     plan = call(home, "--json", "whitelist", "remove", ONE, "--dry-run")
     assert [entry["uuid"] for entry in plan.json["whitelist"]] == [ONE]
     removed = call(home, "--json", "whitelist", "remove", "8d4d", "--yes")

@@ -13,6 +13,7 @@ import click
 from teds_provision.cli.context import App, pass_app
 from teds_provision.cli.options import COMMAND_SETTINGS, dry_run_option, examples, yes_option
 from teds_provision.cli.rendering import print_json_list, shown
+from teds_provision.station.label import read_label
 
 if TYPE_CHECKING:
     from teds_provision.station.station import Station
@@ -48,7 +49,7 @@ def _fingerprint(_ctx: click.Context, _parameter: click.Parameter, text: str | N
     short_help="Whitelist one node.",
     epilog=examples("teds-provision whitelist add 8d4d9da65281f7000000 --name finger-1"),
 )
-@click.argument("uuid")
+@click.argument("uuid", metavar="UUID|LABEL")
 @click.option(
     "--fingerprint", "-f", callback=_fingerprint, metavar="F", help="Fingerprint of the node's key, 64 hex digits."
 )
@@ -56,13 +57,21 @@ def _fingerprint(_ctx: click.Context, _parameter: click.Parameter, text: str | N
 @dry_run_option
 @pass_app
 def add(app: App, uuid: str, fingerprint: str | None, name: str | None, dry_run: bool) -> None:
-    """Whitelist one node; a key that is pinned already is never replaced (exit 6)."""
+    """Whitelist one node; a key that is pinned already is never replaced (exit 6).
+
+    What a scanner reads of a label (see: label) is taken in place of the UUID, and pins the key.
+    """
     from teds_provision.steps.whitelist import add as run
     from teds_provision.steps.whitelist import plan_addition
     from teds_provision.steps.whitelist_files import Listed, require_name
 
     station = app.station()
-    octets = station.nodes.resolve(uuid)
+    scanned = read_label(uuid)
+    octets = station.nodes.resolve(uuid) if scanned is None else scanned[0]
+    if scanned is not None:
+        if fingerprint not in (None, scanned[1]):
+            raise click.BadParameter("the label names another key.", param_hint="--fingerprint")
+        fingerprint = scanned[1]
     require_name(name)
     wanted = Listed(0, octets, fingerprint, name)
     plan = plan_addition(station, [wanted])

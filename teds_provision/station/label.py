@@ -1,0 +1,133 @@
+"""The label on a board: ``TEDS1:UUID:FINGERPRINT`` as QR code and text, and what a scanner types of it.
+
+A scanner that types as a keyboard knows nothing of the layout that the computer has. The separators come out as
+something else, and on a French layout so do the digits and A. Lengths are fixed, so separators are skipped by position.
+"""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+from html import escape
+from io import BytesIO
+from pathlib import Path
+from typing import TYPE_CHECKING, Final
+
+from teds_provision import files
+from teds_provision.errors import NotFound, UsageFailure
+
+if TYPE_CHECKING:
+    from teds_provision.station.station import Station
+
+PREFIX: Final = "TEDS1"
+_UUID_DIGITS, _FINGERPRINT_DIGITS = 20, 64
+_LENGTH = len(PREFIX) + 1 + _UUID_DIGITS + 1 + _FINGERPRINT_DIGITS
+_FRENCH: Final = str.maketrans({**dict(zip("à&é\"'(-è_ç", "0123456789", strict=True)), "Q": "A", "q": "a"})
+"""What a French layout makes of the digits and of A when a scanner presses the keys of a US keyboard."""
+_MODULE, _QUIET = 8, 4
+_INSTALL: Final = "Install it: pip install 'teds-provision[label]'"
+
+
+@dataclass(frozen=True)
+class Label:
+    """What stands on a label: the node's UUID, the whole fingerprint of its key (64 hex digits), and its name."""
+
+    uuid: bytes
+    fingerprint: str
+    name: str | None = None
+
+    @property
+    def text(self) -> str:
+        """The content of the QR code; upper case, so that it is coded as alphanumeric and stays small."""
+        return f"{PREFIX}:{self.uuid.hex()}:{self.fingerprint}".upper()
+
+    @property
+    def lines(self) -> list[str]:
+        """What people read beside the code."""
+        first = [self.name] if self.name else []
+        digits = self.fingerprint
+        return [*first, self.uuid.hex(), *(digits[start : start + 16] for start in range(0, len(digits), 16))]
+
+
+def label_of(station: Station, uuid: bytes) -> Label:
+    """The label of a node whose key is pinned; raises NotFound where it is not."""
+    pinned = station.pins.pinned(uuid)
+    if pinned is None or len(pinned) != _FINGERPRINT_DIGITS:
+        raise NotFound(
+            f"The key of node {uuid.hex()} is not known here.", hint="Tap it once: teds-provision identify --add"
+        )
+    entry, node = station.pins.entry(uuid), station.nodes.get(uuid)
+    name = (node.name if node is not None else None) or (entry.name if entry is not None else None)
+    return Label(uuid, pinned, name)
+
+
+def read_label(text: str) -> tuple[bytes, str] | None:
+    """UUID and fingerprint of what a scanner typed, whatever became of the separators; None for anything else."""
+    text = text.strip()
+    if len(text) != _LENGTH or text[: len(PREFIX)].upper().translate(_FRENCH)[:4] != PREFIX[:4]:
+        return None
+    first = len(PREFIX) + 1
+    second = first + _UUID_DIGITS + 1
+    uuid, digits = text[first : second - 1], text[second:]
+    for read in (uuid + digits, (uuid + digits).translate(_FRENCH)):
+        if re.fullmatch("[0-9A-Fa-f]+", read):
+            return bytes.fromhex(read[:_UUID_DIGITS]), read[_UUID_DIGITS:].lower()
+    return None
+
+
+def write_label(label: Label, path: Path) -> None:
+    """Write the label as SVG or PNG, by the suffix; raises UsageFailure (another one; no segno, no Pillow)."""
+    suffix = path.suffix.lower()
+    if suffix not in (".svg", ".png"):
+        raise UsageFailure(f"A label is written as .svg or .png, not {path.name}.", hint="Name it LABEL.svg.")
+    rows = _modules(label.text)
+    octets = _svg(label, rows).encode() if suffix == ".svg" else _png(label, rows)
+    files.write_whole(path, octets, mode=0o644, failure=UsageFailure)
+
+
+def _modules(text: str) -> list[list[bool]]:
+    try:
+        import segno
+    except ImportError as error:
+        raise UsageFailure("Labels need segno, which is not installed.", hint=_INSTALL) from error
+    code = segno.make(text, micro=False, error="m", boost_error=True)
+    return [[bool(module) for module in row] for row in code.matrix]
+
+
+def _svg(label: Label, rows: list[list[bool]]) -> str:
+    size = len(rows) + 2 * _QUIET
+    dark = "".join(
+        f"M{x + _QUIET} {y + _QUIET}h1v1h-1z" for y, row in enumerate(rows) for x, module in enumerate(row) if module
+    )
+    lines = "".join(
+        f'<text x="{size}" y="{_QUIET + 4 + 5 * number}">{escape(line)}</text>'
+        for number, line in enumerate(label.lines)
+    )
+    width = size + 2 + max(len(line) for line in label.lines) * 2.5
+    return (
+        f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {width:g} {size}" width="{width * 0.4:g}mm" '
+        f'height="{size * 0.4:g}mm"><rect width="100%" height="100%" fill="#fff"/><path d="{dark}"/>'
+        f'<g font-family="monospace" font-size="4">{lines}</g></svg>\n'
+    )
+
+
+def _png(label: Label, rows: list[list[bool]]) -> bytes:
+    try:
+        from PIL import Image, ImageDraw, ImageFont
+    except ImportError as error:
+        raise UsageFailure("A PNG needs Pillow, which is not installed.", hint=_INSTALL) from error
+    side = (len(rows) + 2 * _QUIET) * _MODULE
+    font = ImageFont.load_default(4 * _MODULE)
+    width = side + _QUIET * _MODULE + int(max(font.getlength(line) for line in label.lines))
+    picture = Image.new("1", (width, side), 1)
+    draw = ImageDraw.Draw(picture)
+    for y, row in enumerate(rows):
+        for x, module in enumerate(row):
+            if module:
+                left, top = (x + _QUIET) * _MODULE, (y + _QUIET) * _MODULE
+                draw.rectangle((left, top, left + _MODULE - 1, top + _MODULE - 1), fill=0)
+    for number, line in enumerate(label.lines):
+        draw.text((side, (_QUIET + 5 * number) * _MODULE), line, font=font, fill=0)
+    octets = BytesIO()
+    picture.save(octets, "PNG", dpi=(508, 508))
+    return octets.getvalue()
