@@ -11,12 +11,13 @@ from typing import Final
 from teds_provision.errors import BadData
 from teds_provision.files import read_limited
 from teds_provision.limits import LIMITS
+from teds_provision.node.board import Board
 from teds_provision.node.flash_file import FILE, FlashFile
 from teds_provision.protocol.datasheet import can_be_stored, passes_own_check
 from teds_provision.teds.codec.codes import AccessCode
 from teds_provision.teds.codec.frame import frame, raw_tuple, tuples, unframe
 from teds_provision.teds.formats import detect, read_blocks
-from teds_provision.teds.image import SECURITY, BlockId
+from teds_provision.teds.image import SECURITY, BlockId, Image
 from teds_provision.teds.profile import load_profile
 from teds_provision.teds.sheet import Sheet
 
@@ -101,7 +102,10 @@ def create(
         wanted = FlashFile(folder).load().uuid if (folder / FILE).exists() else secrets.token_bytes(UUID_OCTETS)
     if profile is not None:
         described = from_profile(profile, folders, wanted, name)
-    blocks = described.of(wanted).blocks if described is not None else None
+    blocks = None
+    if described is not None:
+        blocks = described.of(wanted).blocks
+        Board(Sheet.of(Image(wanted, blocks)))  # what it could not imitate is told now, not when it runs
     return FlashFile.create(folder, uuid=wanted, name=name, max_message=max_message, blocks=blocks)
 
 

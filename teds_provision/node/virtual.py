@@ -261,7 +261,7 @@ class VirtualNode:
         what Tim.poll returns.
         """
         real = board.clock.tick()
-        at = max(self._sampled, real - _MOST_BEHIND)
+        at = max(self._sampled, real - _MOST_BEHIND) if board.clock.runs_by_itself else self._sampled
         while True:
             board.sampling = at
             try:

@@ -9,6 +9,7 @@ import pytest
 from teds_provision.errors import BadData, NotFound, UsageFailure
 from teds_provision.node import described
 from teds_provision.node.flash_file import FlashFile
+from teds_provision.teds import compose
 from teds_provision.teds.codec.codes import AccessCode
 from teds_provision.teds.formats import Block, write_blocks
 from teds_provision.teds.image import SECURITY, Image
@@ -86,6 +87,10 @@ def test_what_no_node_can_be_made_of_is_told(tmp_path: Path, image: Image) -> No
         path.write_text(Image(UUID, blocks).to_json())
         with pytest.raises(BadData, match=match):
             described.create(tmp_path / "node", teds=path)
+    silent = compose(AccessCode.CHANNEL, {"ChanType": 0, "LowLimit": 0.0, "HiLimit": 1.0})
+    path.write_text(Image(UUID, {(1, AccessCode.CHANNEL): silent}).to_json())
+    with pytest.raises(BadData, match="how a sample of channel 1 is coded"):
+        described.create(tmp_path / "node", teds=path)
     path.write_text("junk")
     with pytest.raises(BadData, match=r"node\.json"):
         described.create(tmp_path / "node", teds=path)

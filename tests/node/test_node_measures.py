@@ -11,6 +11,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -347,3 +348,32 @@ def test_hardware_stays_what_the_node_was_made_with(tmp_path: Path) -> None:
     made = keyed_node(tmp_path / "node", teds=file)
     sheet = Sheet.of(Image(uuid, made.hardware))
     assert Converter(sheet, sheet.channels[0]).octets(Reading(value=180.0)) == round(16383 / 2).to_bytes(2, "big")
+
+
+SLOW_SIMULATION = """
+import json, sys, time
+for line in range(1, 40):
+    print(json.dumps({"t": line * 1.0, "raw": {"angle": line}}), flush=True)
+    time.sleep(0.15)
+"""
+
+
+def test_between_two_lines_of_a_simulation_every_sample_is_taken_with_the_value_before(
+    scene: Scene, tmp_path: Path
+) -> None:
+    program = tmp_path / "simulation.py"
+    program.write_text(SLOW_SIMULATION)
+    scene.run("angle", "--source", f"exec:{sys.executable} {program}")
+    station = scene.station("angle")
+    station.operate(lease=60)
+    plan = Plan.of(0, ((1, 2),), n=5, period=100 * MS, gap=100)
+    receiver, _ = station.subscribe(plan)
+    receiver._oldest = 10**12  # a simulation at seven times real time: the age of its messages says nothing
+    station.clock = replace(station.clock, reply=replace(station.clock.reply, step=0xFFFFFFFF))
+    messages = station.hear(receiver, 8)
+    assert [message.counter for message in messages] == list(range(8))
+    for message in messages:
+        for instant in range(5):
+            tick = message.tick + instant * 100 * MS
+            value = int.from_bytes(message.data[2 * instant : 2 * instant + 2], "big")
+            assert value == tick // 1_000_000_000, (tick, value)
