@@ -166,6 +166,11 @@ class App:
         self.live_line()
         return click.confirm(harmless(question), err=True)
 
+    @property
+    def has_passphrase(self) -> bool:
+        """Whether a passphrase was given by --passphrase-fd, so that nobody has to be asked."""
+        return self._passphrase_fd is not None
+
     def ask_secret(self, prompt: str, confirm: bool = False) -> str:
         """Get a passphrase or PIN: from --passphrase-fd (one line, read once), else from the terminal."""
         if self._passphrase_fd is not None:

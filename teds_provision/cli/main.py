@@ -79,6 +79,9 @@ def _read_by_name(command: click.Command) -> None:
         _read_by_name(inner)
 
 
+_BROKEN: Final = "teds_provision.config_error"
+
+
 class Defaults(dict[str, Any]):
     """Values of config.toml: what stands outside of a table serves every command, a table the command of its name.
 
@@ -119,12 +122,13 @@ def _read_config(ctx: click.Context, _parameter: click.Parameter, home: Path | N
     if path.is_file():
         import tomllib
 
+        values = {}
         try:
             values = tomllib.loads(path.read_text(encoding="utf-8"))
         except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-            raise BadData(f"{path} is not valid TOML: {error}.", hint="Mend or remove the file.") from error
+            ctx.meta[_BROKEN] = BadData(f"{path} is not valid TOML: {error}.", hint="Mend or remove the file.")
         except OSError as error:
-            raise BadData(f"{path} cannot be read: {error.strerror}.", hint="Check its owner and mode.") from error
+            ctx.meta[_BROKEN] = BadData(f"{path} cannot be read: {error.strerror}.", hint="Check its owner and mode.")
         ctx.default_map = Defaults(_as_parameters(values))
     return home
 
@@ -160,6 +164,9 @@ def cli(ctx: click.Context, /, as_json: bool, **options: Any) -> None:
     Identify, key, sign and write the IEEE 1451.0 TEDS of smart transducers over NFC and CAN.
     """
     ctx.obj = App(as_json=as_json, **options)
+    broken = ctx.meta.get(_BROKEN)
+    if broken is not None and ctx.invoked_subcommand != "doctor":  # which tells it, and looks at all the rest
+        raise broken
 
 
 def run(arguments: list[str]) -> int:

@@ -40,6 +40,10 @@ class Place:
     workspace: Path = field(default_factory=Path.cwd)
     system: Path = Path("/")
     environment: Mapping[str, str] = field(default_factory=lambda: os.environ)
+    settings: Mapping[str, frozenset[str]] | None = None
+    """Names that config.toml may have, by table ("" outside of one); None where nobody knows them."""
+    ask: Callable[[str, bool], str] | None = None
+    """Gives the passphrase without asking anybody, None where nobody gave one."""
 
     def at(self, path: str) -> Path:
         """A path of the system, below the root that is looked at."""
@@ -48,7 +52,7 @@ class Place:
 
 Look = Callable[[Place], Iterator[Finding]]
 CHECKS: Final[dict[str, tuple[Room, Look]]] = {}
-_MODULES: Final = ("machine", "links", "station")
+_MODULES: Final = ("machine", "links", "station", "fleet")
 
 
 def check(name: str, room: Room) -> Callable[[Look], Look]:

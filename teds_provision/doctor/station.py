@@ -14,7 +14,7 @@ from typing import Final
 
 from teds_provision.doctor.doctor import Finding, Place, check
 from teds_provision.errors import NoKeyring, StoreFailure, VaultFailure
-from teds_provision.store import Store
+from teds_provision.store import Choice, Store
 
 _STORE: Final = "store.sqlite3"
 _LOCK: Final = "store.lock"
@@ -78,8 +78,8 @@ def store(place: Place) -> Iterator[Finding]:
         if facts is None or facts.point is None:
             yield Finding("store", "warning", "An init was begun here and not finished.", _INIT)
             return
-        count = len(opened.nodes())
-        yield Finding("store", "ok", f"Whole; {count} nodes, {len(opened.whitelist())} whitelisted.")
+        count = opened.count("nodes")
+        yield Finding("store", "ok", f"Whole; {count} nodes, {opened.count('whitelist')} whitelisted.")
         yield from _audit(opened)
         yield from _backups(opened, count)
     yield from _lock(place)
@@ -95,7 +95,7 @@ def _audit(opened: Store) -> Iterator[Finding]:
 
 
 def _backups(opened: Store, nodes: int) -> Iterator[Finding]:
-    taken = [entry.at for entry in opened.audit.entries() if entry.act == "backup"]
+    taken = [entry.at for entry in opened.audit.chosen(Choice(act="backup"))]
     fix = "teds-provision backup FILE"
     if not taken:
         why = "There is no backup: if this machine is lost, every node has to come back to the bench."

@@ -6,6 +6,7 @@ import secrets
 from contextlib import AbstractContextManager
 from pathlib import Path
 from types import TracebackType
+from typing import Literal
 
 from teds_provision.errors import StoreFailure
 from teds_provision.store.audit import AuditLog
@@ -82,6 +83,11 @@ class Store(
     def version(self) -> int:
         """Return a number that changes when another connection has changed the file."""
         return int(self._database.execute("PRAGMA data_version")[0][0])
+
+    def count(self, table: Literal["nodes", "whitelist", "keys", "trust"]) -> int:
+        """Return how many rows a table has."""
+        row = self._database.one(f"SELECT count(*) FROM {table}")
+        return int(row[0]) if row is not None else 0
 
     def damage(self) -> str | None:
         """Return what SQLite's quick check finds wrong with the file, None if nothing (for doctor)."""

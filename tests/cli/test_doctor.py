@@ -47,3 +47,15 @@ def test_it_works_before_there_is_a_station_and_makes_nothing(tmp_path: Path) ->
     assert told.code == 0
     assert "teds-provision init" in told.out
     assert not (tmp_path / "none").exists()
+
+
+def test_a_broken_config_stops_every_command_but_doctor(home: Path) -> None:
+    (home / "config.toml").write_text("via = [")
+    assert call(home, "nodes").code == 8
+    checks = {one["name"]: one for one in call(home, "--json", "doctor").json["checks"]}
+    assert checks["config"]["result"] == "failed"
+    assert checks["store"]["result"] == "ok"
+    (home / "config.toml").write_text("via = 'nfc'\nno_input = true\n[provision]\nprofile = 'load-cell'\nprofle = 1\n")
+    config = {one["name"]: one for one in call(home, "--json", "doctor").json["checks"]}["config"]
+    assert "provision.profle" in config["why"]
+    assert "no_input" not in config["why"]

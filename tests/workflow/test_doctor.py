@@ -9,6 +9,7 @@ import time
 import tomllib
 from collections.abc import Iterator
 from contextlib import closing
+from dataclasses import replace
 from importlib import metadata
 from pathlib import Path
 
@@ -20,10 +21,11 @@ from teds_provision.doctor.doctor import CHECKS, Finding, Place, examine, exit_c
 from teds_provision.doctor.links import READERS
 from teds_provision.doctor.station import holds_private_key
 from teds_provision.protocol.keys import SoftwareKey, to_pem
-from teds_provision.store import Facts, NodeRecord, Store, StoreLock
+from teds_provision.store import Draft, Facts, KeyRecord, Marks, NodeRecord, Store, StoreLock, WhitelistEntry
+from teds_provision.teds.image import Image
 from teds_provision.vault import forget_vaults
 
-from .bench import make_station
+from .bench import PASSPHRASE, make_station
 
 
 @pytest.fixture
@@ -374,3 +376,58 @@ def test_the_keys_folder_of_this_project_holds_no_private_key() -> None:
     folder = Path(__file__).parents[2] / "keys"
     assert folder.is_dir()
     assert [path for path in folder.rglob("*") if path.is_file() and holds_private_key(path)] == []
+
+
+# -- the fleet ---------------------------------------------------------------------------------------------------------
+
+
+def test_a_broken_config_is_told_and_the_rest_is_still_looked_at(stationed: Place) -> None:
+    (stationed.home / "config.toml").write_text("home = [")
+    found = by_name(stationed)
+    assert (found["config"].result, found["store"].result) == ("failed", "ok")
+    assert "not valid TOML" in found["config"].why
+
+
+def test_keys_that_no_command_knows_are_named(stationed: Place) -> None:
+    known = {"": frozenset({"via", "no-input"}), "provision": frozenset({"profile", "yes"})}
+    place = replace(stationed, settings=known)
+    (stationed.home / "config.toml").write_text("via = 'nfc'\nno_input = true\n[provision]\nprofile = 'x'\n")
+    assert by_name(place)["config"].result == "ok"
+    (stationed.home / "config.toml").write_text("vai = 'nfc'\n[provision]\nprofle = 'x'\n[provisoin]\n")
+    config = by_name(place)["config"]
+    assert (config.result, all(word in config.why for word in ("vai", "provision.profle", "[provisoin]"))) == (
+        "failed",
+        True,
+    )
+
+
+def test_a_store_that_is_gone_beside_its_vault_is_a_failure(stationed: Place) -> None:
+    (stationed.home / "store.sqlite3").unlink()
+    found = by_name(stationed)["store file"]
+    assert (found.result, "restore" in found.fix) == ("failed", True)
+
+
+def test_what_waits_for_somebody_is_told(stationed: Place) -> None:
+    assert look(stationed, "nodes")[0].result == "ok"
+    with Store.open(stationed.home) as store:
+        for number in range(3):
+            store.put_node(NodeRecord(bytes([number]) * 10, name="same" if number else "other", due="2020-01-01"))
+        store.put_draft(Draft(bytes(10), Image(bytes(10), {(0, 1): b"x"})))
+        store.add_key(KeyRecord(bytes(10), 1, "ab" * 8, "active", 1, b"wrapped"))
+        store.put_marks({b"\1" * 10: Marks(rotation="restored")})
+    said = [finding.why for finding in look(stationed, "nodes")]
+    counts = [why.split()[0] for why in said]
+    assert counts == ["3", "2", "1", "1", "1"]
+    for why, word in zip(said, ("ended", "name", "not written", "never verified", "rotated"), strict=True):
+        assert word in why
+
+
+def test_seals_are_checked_where_the_passphrase_is_given(stationed: Place) -> None:
+    assert look(stationed, "seals")[0].result == "skipped"
+    forget_vaults()
+    place = replace(stationed, ask=lambda prompt, confirm: PASSPHRASE)
+    assert look(place, "seals")[0].result == "ok"
+    with Store.open(stationed.home) as store:
+        store.put_whitelist(WhitelistEntry(bytes(10), "ab" * 32))
+    found = look(place, "seals")[0]
+    assert (found.result, bytes(10).hex() in found.why) == ("failed", True)

@@ -8,6 +8,7 @@ import click
 
 from teds_provision.cli.context import App, pass_app
 from teds_provision.cli.options import command
+from teds_provision.cli.settings import known_settings
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -24,12 +25,16 @@ _STYLES = {"ok": "green", "warning": "yellow", "failed": "bold red", "skipped": 
 def doctor(app: App, nfc: str | None, can: str | None) -> None:
     """Look at Python, libraries, readers, buses, clock, keyring, vault and store; name cause and cure of each trouble.
 
-    Opens no reader and no bus unless it is named, and asks for no passphrase. Exits 0 unless something failed
+    Opens no reader and no bus unless it is named, and asks for no passphrase; with --passphrase-fd the seals
+    of pins and trust are checked too. Exits 0 unless something failed
     (warnings are no failure): 7 for the store, the keyring or the vault, 5 for a named reader or bus, 1 for the rest.
     """
     from teds_provision.doctor.doctor import Place, examine, exit_code
 
-    found = list(examine(Place(app.home, nfc, can)))
+    group = click.get_current_context().find_root().command
+    settings = known_settings(group) if isinstance(group, click.Group) else None
+    ask = app.ask_secret if app.has_passphrase else None
+    found = list(examine(Place(app.home, nfc, can, settings=settings, ask=ask)))
     findings = [finding for _, finding in found]
     checks = [{"name": one.name, "result": one.result, "why": one.why, "fix": one.fix} for one in findings]
     code = exit_code(found)

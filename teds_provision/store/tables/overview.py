@@ -50,6 +50,17 @@ class Known:
     groups: list[str] = field(default_factory=list)
 
 
+@dataclass(frozen=True)
+class Tally:
+    """Nodes that wait for somebody, by UUID."""
+
+    overdue: tuple[bytes, ...]
+    twice: tuple[bytes, ...]
+    drafts: tuple[bytes, ...]
+    unverified: tuple[bytes, ...]
+    rotations: tuple[bytes, ...]
+
+
 class OverviewTables:
     """The part of the store that looks at all tables at once; see :class:`teds_provision.store.Store`."""
 
@@ -66,6 +77,27 @@ class OverviewTables:
         """Give what is known of these nodes, in their order, a page at a time; holds no lock between pages."""
         for first in range(0, len(uuids), _PAGE):
             yield from self._page(uuids[first : first + _PAGE])
+
+    def tally(self, today: str) -> Tally:
+        """Return the nodes that wait for somebody; ``today`` is a day, ISO 8601."""
+
+        def some(statement: str, *values: Any) -> tuple[bytes, ...]:
+            return tuple(bytes(uuid) for (uuid,) in self._database.execute(statement, values))
+
+        gone = "(SELECT uuid FROM tombstones UNION SELECT uuid FROM revocations)"
+        return Tally(
+            some("SELECT uuid FROM nodes WHERE due < ? ORDER BY due, uuid", today),
+            some(
+                "SELECT uuid FROM nodes WHERE name IN"
+                " (SELECT name FROM nodes WHERE name IS NOT NULL GROUP BY name HAVING count(*) > 1) ORDER BY name, uuid"
+            ),
+            some("SELECT uuid FROM drafts ORDER BY uuid"),
+            some(
+                "SELECT DISTINCT k.uuid FROM keys k LEFT JOIN nodes n ON n.uuid = k.uuid WHERE k.state = 'active'"
+                f" AND n.verdict IS NULL AND k.uuid NOT IN {gone} ORDER BY k.uuid"
+            ),
+            some("SELECT uuid FROM marks WHERE rotation IS NOT NULL ORDER BY uuid"),
+        )
 
     def is_known(self, uuid: bytes) -> bool:
         """Say whether anything at all is known of a node."""

@@ -1,0 +1,118 @@
+"""What the doctor looks at among the nodes: what is due, what was left half done, what another program changed."""
+
+from __future__ import annotations
+
+import tomllib
+from collections.abc import Iterator
+from datetime import UTC, datetime
+from typing import Any, Final
+
+from teds_provision.doctor.doctor import Finding, Place, check
+from teds_provision.errors import StoreChanged, StoreFailure, VaultFailure
+from teds_provision.station.station import Station
+from teds_provision.store import Store
+
+_STORE: Final = "store.sqlite3"
+_SHOWN: Final = 5
+
+
+@check("config", "machine")
+def config(place: Place) -> Iterator[Finding]:
+    """Is config.toml what it should be: TOML, with keys that some command knows."""
+    path = place.home / "config.toml"
+    if not path.exists():
+        yield Finding("config", "skipped", "There is no config.toml.")
+        return
+    try:
+        values = tomllib.loads(path.read_text(encoding="utf-8"))
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        yield Finding("config", "failed", f"{path} is not valid TOML: {error}.", "Mend or remove the file.")
+        return
+    except OSError as error:
+        yield Finding("config", "failed", f"{path} cannot be read: {error.strerror}.", "Check its owner and mode.")
+        return
+    unknown = list(_unknown(values, place))
+    if unknown:
+        names = ", ".join(unknown[:_SHOWN])
+        yield Finding(
+            "config", "failed", f"{path} has keys that no command knows: {names}.", f"Take them out of {path}."
+        )
+    else:
+        yield Finding("config", "ok", f"{path} holds {len(values)} settings.")
+
+
+def _unknown(values: dict[str, Any], place: Place) -> Iterator[str]:
+    if place.settings is None:
+        return
+    known = {table: {name.replace("-", "_") for name in names} for table, names in place.settings.items()}
+    for key, value in values.items():
+        name = key.replace("-", "_")
+        if not isinstance(value, dict):
+            if name not in known[""]:
+                yield key
+        elif key.replace("_", "-") not in place.settings:
+            yield f"[{key}]"
+        else:
+            allowed = known[key.replace("_", "-")]
+            yield from (f"{key}.{inner}" for inner in value if inner.replace("-", "_") not in allowed)
+
+
+@check("store file", "store")
+def store_file(place: Place) -> Iterator[Finding]:
+    """Is the store there where the vault is: one without the other is a loss."""
+    if (place.home / "vault.json").exists() and not (place.home / _STORE).exists():
+        why = f"The vault is in {place.home}, and its store is gone: names, pins and wrapped keys of every node."
+        yield Finding("store file", "failed", why, "teds-provision restore FILE (a backup)")
+
+
+@check("nodes", "store")
+def nodes(place: Place) -> Iterator[Finding]:
+    """What waits for somebody: calibrations that have ended, names twice, drafts, nodes never verified, rotations."""
+    if not (place.home / _STORE).exists():
+        return
+    with Store.open(place.home) as opened:
+        if opened.damage() is not None:  # the check of the store says so
+            return
+        tally = opened.tally(datetime.now(UTC).strftime("%Y-%m-%d"))
+    told = [
+        (tally.overdue, "with a calibration that has ended", "teds-provision nodes --due 0"),
+        (tally.twice, "under a name that another one has", "Name them apart: build UUID --name, sign, write"),
+        (tally.drafts, "with a datasheet that was built and not written", "teds-provision draft list"),
+        (tally.unverified, "keyed and never verified", "teds-provision verify UUID"),
+        (tally.rotations, "whose key has to be rotated", "Use it once: teds-provision verify UUID"),
+    ]
+    for uuids, what, fix in told:
+        if uuids:
+            some = ", ".join(uuid.hex() for uuid in uuids[:_SHOWN]) + (" …" if len(uuids) > _SHOWN else "")
+            yield Finding("nodes", "warning", f"{len(uuids)} {what}: {some}.", fix)
+    if not any(uuids for uuids, _, _ in told):
+        yield Finding("nodes", "ok", "Nothing waits for anybody.")
+
+
+@check("seals", "store")
+def seals(place: Place) -> Iterator[Finding]:
+    """Do the rows that decide whom the station believes carry its seal; only where the passphrase is given."""
+    if not (place.home / _STORE).exists():
+        return
+    if place.ask is None:
+        why = "Pins and trust are checked where the vault opens; no passphrase was given."
+        yield Finding("seals", "skipped", why, "teds-provision --passphrase-fd 3 doctor 3<FILE")
+        return
+    station = Station.open(place.home, ask=place.ask)
+    try:
+        station.unlock()
+        broken = list(station.seals.all_broken())
+    except StoreChanged as error:
+        yield Finding("seals", "failed", error.message, error.hint)
+        return
+    except (VaultFailure, StoreFailure) as error:
+        yield Finding("seals", "skipped", error.message, error.hint)
+        return
+    finally:
+        station.close()
+    if broken:
+        some = ", ".join(broken[:_SHOWN]) + (" …" if len(broken) > _SHOWN else "")
+        fix = "Take them away (whitelist remove, trust remove), find out who wrote the file, and add them anew."
+        yield Finding("seals", "failed", f"Changed by another program, and not believed: {some}.", fix)
+    else:
+        yield Finding("seals", "ok", "Pins, trust and the station's own CA are as this station wrote them.")
