@@ -6,6 +6,7 @@ import itertools
 import json
 import os
 import signal
+import subprocess
 import sys
 import threading
 import time
@@ -33,7 +34,8 @@ from teds_provision.teds.calibration import load_calibrations
 from teds_provision.teds.image import Image
 from teds_provision.teds.profile import load_profile
 from teds_provision.teds.sheet import Sheet
-from tests.e2e.desk import Links, Running
+from tests.cli.shell import clean_environment
+from tests.e2e.desk import ROOT, Links, Running
 from tests.links.can.hub import Hub
 from tests.node.measuring_station import MeasuringStation, SealedLine, keyed_node
 
@@ -335,6 +337,27 @@ def test_an_actuator_is_safe_when_its_node_is_ended(scene: Scene) -> None:
     ended = process.end()
     assert ended.code == 0
     assert json.loads(ended.out.splitlines()[-1])["safe"]
+
+
+def test_a_closed_standard_output_does_not_stop_a_node(scene: Scene) -> None:
+    keyed_node(scene.folder / "gripper", profile="gripper")
+    words = ["--json", "node", "run", str(scene.folder / "gripper"), "--can", scene.can]
+    with subprocess.Popen(
+        [sys.executable, "-m", "teds_provision", *words], stdout=subprocess.PIPE, cwd=ROOT, env=clean_environment()
+    ) as process:
+        try:
+            assert process.stdout is not None
+            assert b"ready" in process.stdout.readline()
+            process.stdout.close()
+            station = scene.station("gripper")
+            station.operate(1, dead_man=1000)
+            for raw in (b"\1\0", b"\2\0"):
+                station.send(set_values([(1, raw)]))
+                time.sleep(0.1)
+            assert station.states().channels[1][0] & ChannelState.CLAIMED_HERE
+            assert process.poll() is None
+        finally:
+            process.terminate()
 
 
 def test_hardware_stays_what_the_node_was_made_with(tmp_path: Path) -> None:

@@ -62,7 +62,11 @@ class ActuatorLines:
         for (uuid, channel), state in news.items():
             if self._told.get((uuid, channel)) != state:
                 self._told[uuid, channel] = state
-                self._tell(uuid, state)
+                try:
+                    self._tell(uuid, state)
+                except OSError:  # nobody reads, or the disk is full: the node runs on
+                    self._stop.set()
+                    return
 
     def _tell(self, uuid: str, state: Shown) -> None:
         name = state.name or f"channel {state.channel}"

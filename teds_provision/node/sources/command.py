@@ -29,7 +29,12 @@ class Command(Lines):
     def start(self, drive: Drive) -> None:
         """Start the program; raises NotFound where there is none. Its errors go to our standard error."""
         try:
-            self._process = subprocess.Popen(self._words, stdin=subprocess.PIPE, stdout=subprocess.PIPE)
+            self._process = subprocess.Popen(
+                self._words,
+                stdin=subprocess.PIPE,
+                stdout=subprocess.PIPE,
+                start_new_session=True,  # Ctrl-C is for the node, which then ends its program
+            )
         except OSError as error:
             raise NotFound(f"The program {self._words[0]} cannot be started: {error.strerror}.") from error
         assert self._process.stdin is not None
