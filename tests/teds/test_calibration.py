@@ -476,3 +476,9 @@ def test_a_calibration_kept_from_a_node_gives_the_same_octets(magnetic: Profile)
     assert (
         magnetic.build(bytes(10), calibration=dict(Sheet.of_blocks(built.blocks).calibrations)).blocks == built.blocks
     )
+
+
+def test_a_column_that_is_named_twice_is_refused(tactile: Profile) -> None:
+    text = "channel;from;to;from;to;offset;c0;c1\n1;0;512;0;0,5;0,001\n"
+    with pytest.raises(BadData, match='c.csv:1: the column "from" is there twice'):
+        read_calibrations(text, "c.csv", tactile)

@@ -171,6 +171,9 @@ def _segment_columns(table: CsvTable, number: int, names: list[str], channel: in
     wanted = (*SEGMENT, *(f"c{power}" for power in range(degree)))
     extra = [name for at, name in enumerate(names) if name not in wanted and at != channel]
     missing = [name for name in (*SEGMENT, "c0") if name not in names]
+    twice = [name for name in wanted if names.count(name) > 1]
+    if twice:
+        raise BadData(f'{table.file}:{number}: the column "{twice[0]}" is there twice.')
     if extra or missing:
         what = f'"{extra[0]}" is no column' if extra else f'the column "{missing[0]}" is missing'
         raise BadData(f"{table.file}:{number}: {what}: a table of segments has from, to, offset, c0, c1 and so on.")
