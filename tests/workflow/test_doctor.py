@@ -86,7 +86,7 @@ def test_the_registry_holds_every_check(place: Place) -> None:
     list(examine(place))
     machine = ["python", "libraries", "argon2id", "libusb", "clock"]
     links = ["nfc readers", "serial ports", "nfc loopback", "nfc", "can interfaces", "can loopback", "can"]
-    station = ["home", "disk", "store", "keyring", "vault", "keys folder"]
+    station = ["home", "disk", "store", "keyring", "vault", "keys folder", "store file", "nodes", "seals", "config"]
     assert sorted(CHECKS) == sorted(machine + links + station)
 
 
