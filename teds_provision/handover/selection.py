@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from teds_provision.errors import NotFound, PolicyRefused
 from teds_provision.handover.pending import OPEN, Notes
 from teds_provision.protocol.handover.bundle import Mode
+from teds_provision.protocol.keys import fingerprint
 from teds_provision.station.station import Station
 from teds_provision.store import KeyRecord, NodeRecord
 
@@ -34,6 +35,7 @@ class Selection:
 
     def __init__(self, station: Station, order: ExportOrder, receivers: set[str]) -> None:
         self.station, self.order, self.receivers = station, order, receivers
+        self.pins = station.pins.all()
         self.nodes = {node.uuid: node for node in station.nodes.all()}
         held = list(station.keys.all())
         self.keys = {key.uuid: key for key in held if key.state == "active"}
@@ -86,6 +88,8 @@ class Selection:
             return "it is out of service"
         if node is None or node.point is None:
             return "its public key is not known"
+        if self.pins.get(uuid) != fingerprint(node.point):
+            return "the key that it showed last is not the one that it is pinned to"
         return ""
 
     def _is_cut(self, uuid: bytes) -> bool:

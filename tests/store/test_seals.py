@@ -10,7 +10,9 @@ from pathlib import Path
 
 import pytest
 
-from teds_provision.errors import StoreChanged, WrongPassphrase
+from teds_provision.errors import PolicyRefused, StoreChanged, WrongPassphrase
+from teds_provision.handover.export_keys import plan_export
+from teds_provision.handover.selection import ExportOrder
 from teds_provision.protocol.keys import SoftwareKey, fingerprint
 from teds_provision.station.rewrap import rewrap
 from teds_provision.station.station import Station, initialise
@@ -226,3 +228,15 @@ def test_a_store_of_version_1_is_taken_over_once_and_listed(tmp_path: Path) -> N
     with pytest.raises(StoreChanged):  # a row without a seal is taken over once, not a second time
         station.pins.whitelist()
     station.close()
+
+
+def test_a_changed_identity_key_is_not_handed_over(home: Path, opened: Open) -> None:
+    """What goes into a bundle is what another station will pin."""
+    behind_its_back(home, f"UPDATE nodes SET point = x'{OTHER.hex()}', point_mac = NULL")
+    station = opened()
+    station.keys.add_pending(NODE, key=bytes(16), key_id=bytes(8), epoch=1)
+    station.keys.promote(NODE, bytes(8).hex())
+    peer = SoftwareKey.generate().point
+    station.policy.trust(TrustRecord("east", "station", peer, fingerprint(peer)))
+    with pytest.raises(PolicyRefused, match="pinned"):
+        plan_export(station, ExportOrder(("east",), (NODE,), "copy"))
