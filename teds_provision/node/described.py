@@ -50,6 +50,21 @@ def from_file(path: Path) -> Described:
 
     Raises NotFound, and BadData that names the TEDS which no node holds.
     """
+    placed = _placed(path)
+    for (channel, code), teds in placed.items():
+        if not can_be_stored((channel, code)) or not passes_own_check((channel, code), teds):
+            raise BadData(
+                f"{path}: no node can hold the TEDS of access code {code} of channel {channel}, or it is damaged.",
+                hint=f"See what is wrong: show {path}",
+            )
+    if not placed:
+        raise BadData(f"{path} holds no TEDS.")
+    stated = Sheet.of_blocks(placed).meta.uuid
+    return Described(placed, stated if stated and len(stated) == UUID_OCTETS and any(stated) else None)
+
+
+def _placed(path: Path) -> dict[BlockId, bytes]:
+    """TEDS of a file by place, without Security TEDS."""
     octets = read_limited(path, LIMITS.teds_file, "file of TEDS")
     try:
         blocks = read_blocks(octets, detect(octets), path=path)
@@ -63,17 +78,7 @@ def from_file(path: Path) -> Described:
         if key in placed:
             raise BadData(f"{path} holds two TEDS of access code {code} for channel {key[0]}.")
         placed[key] = teds
-    placed = {key: teds for key, teds in placed.items() if key[1] != AccessCode.SECURITY}
-    for (channel, code), teds in placed.items():
-        if not can_be_stored((channel, code)) or not passes_own_check((channel, code), teds):
-            raise BadData(
-                f"{path}: no node can hold the TEDS of access code {code} of channel {channel}, or it is damaged.",
-                hint=f"See what is wrong: show {path}",
-            )
-    if not placed:
-        raise BadData(f"{path} holds no TEDS.")
-    stated = Sheet.of_blocks(placed).meta.uuid
-    return Described(placed, stated if stated and len(stated) == UUID_OCTETS and any(stated) else None)
+    return {key: teds for key, teds in placed.items() if key[1] != AccessCode.SECURITY}
 
 
 def from_profile(profile: str, folders: tuple[Path, ...] | None, uuid: bytes, name: str = "") -> Described:

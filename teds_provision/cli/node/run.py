@@ -83,16 +83,9 @@ def run(
     """
     from teds_provision.cli.node.actuators import ActuatorLines
     from teds_provision.node.pulse import Pulse
-    from teds_provision.node.sources import ONE_NODE_ONLY, kind_of
     from teds_provision.node.virtual import Delays, VirtualNode
 
-    if not links["nfc"] and not links["can"]:
-        raise UsageFailure(
-            "A node needs a link.", hint="Add --nfc udp:localhost:54321, --can udp_multicast:239.74.163.2, or both."
-        )
-    if len(folders) > 1 and (links["nfc"] or kind_of(source) in ONE_NODE_ONLY):
-        what = "--nfc" if links["nfc"] else f"--source {source}"
-        raise UsageFailure(f"{what} is for one node.", hint="Run the others in processes of their own.")
+    _check(len(folders), source, **links)
     delays = Delays(crypto_delay / 1000, flash_delay / 1000)
     lines, pulse = ActuatorLines(app), Pulse()
     make = _boards(app, lines, source, battery)
@@ -116,6 +109,19 @@ def run(
     finally:
         for part in reversed(running):
             part.stop()
+
+
+def _check(count: int, source: str, *, nfc: str | None, can: str | None, **_: Any) -> None:
+    """Raise UsageFailure where the options do not go together."""
+    from teds_provision.node.sources import ONE_NODE_ONLY, kind_of
+
+    if not nfc and not can:
+        raise UsageFailure(
+            "A node needs a link.", hint="Add --nfc udp:localhost:54321, --can udp_multicast:239.74.163.2, or both."
+        )
+    if count > 1 and (nfc or kind_of(source) in ONE_NODE_ONLY):
+        what = "--nfc" if nfc else f"--source {source}"
+        raise UsageFailure(f"{what} is for one node.", hint="Run the others in processes of their own.")
 
 
 def _boards(app: App, lines: ActuatorLines, source: str, percent: float | None) -> Callable[[FlashFile], Board | None]:

@@ -19,7 +19,7 @@ from teds_provision.files import read_limited
 from teds_provision.node.sources.base import Generated, Place, Reading, Tell
 
 MOST_OCTETS: Final = 256 << 20
-_TIME: Final = ("t", "time")
+_TIME_NAMES: Final = ("t", "time")
 _RAW: Final = "raw:"
 
 
@@ -57,6 +57,24 @@ def make(argument: str, places: Sequence[Place], tell: Tell) -> Recorded:
 
 def read(path: Path, places: Sequence[Place], tell: Tell) -> Recorded:
     """Read a file of at most 256 MiB whole."""
+    lines = _lines(path)
+    fields = list(csv.reader(line for _, line in lines))
+    header = [name.strip() for name in fields[0]]
+    columns = _columns(path, header, {place.name: place.number for place in places if place.name})
+    at = next(index for index, name in enumerate(header) if name.lower() in _TIME_NAMES)
+    times: list[float] = []
+    readings: dict[int, list[Reading | None]] = {number: [] for number, _, _ in columns}
+    for (line, _), row in zip(lines[1:], fields[1:], strict=True):
+        if len(row) != len(header):
+            raise BadData(f"{path}, line {line}: {len(row)} fields, the first line names {len(header)}.")
+        times.append(_time(path, line, row[at], times))
+        for number, index, raw in columns:
+            readings[number].append(_reading(_number(path, line, row[index]), raw=raw))
+    return Recorded(places, [time - times[0] for time in times], readings, tell)
+
+
+def _lines(path: Path) -> list[tuple[int, str]]:
+    """Numbered lines without comments and empty ones: the first line and at least one row."""
     try:
         text = read_limited(path, MOST_OCTETS, "file of values").decode("utf-8-sig")
     except UnicodeDecodeError as error:
@@ -64,30 +82,26 @@ def read(path: Path, places: Sequence[Place], tell: Tell) -> Recorded:
     lines = [(number, line) for number, line in enumerate(text.splitlines(), 1) if line.strip() and line[0] != "#"]
     if len(lines) < 2:
         raise BadData(f"{path} holds no row of values.", hint="First line: t,NAME,NAME …; then a row for each instant.")
-    fields = list(csv.reader(line for _, line in lines))
-    header = [name.strip() for name in fields[0]]
-    columns = _columns(path, header, {place.name: place.number for place in places if place.name})
-    at = next(index for index, name in enumerate(header) if name.lower() in _TIME)
-    times: list[float] = []
-    readings: dict[int, list[Reading | None]] = {number: [] for number, _, _ in columns}
-    for (line, _), row in zip(lines[1:], fields[1:], strict=True):
-        if len(row) != len(header):
-            raise BadData(f"{path}, line {line}: {len(row)} fields, the first line names {len(header)}.")
-        time = _number(path, line, row[at])
-        if time is None or (times and time - times[0] < times[-1] - times[0]):
-            raise BadData(f"{path}, line {line}: times must be numbers that ascend.")
-        times.append(time)
-        for number, index, raw in columns:
-            value = _number(path, line, row[index])
-            reading = None if value is None else Reading(raw=value) if raw else Reading(value=value)
-            readings[number].append(reading)
-    return Recorded(places, [time - times[0] for time in times], readings, tell)
+    return lines
+
+
+def _time(path: Path, line: int, text: str, before: list[float]) -> float:
+    time = _number(path, line, text)
+    if time is None or (before and time < before[-1]):
+        raise BadData(f"{path}, line {line}: times must be numbers that ascend.")
+    return time
+
+
+def _reading(number: float | None, *, raw: bool) -> Reading | None:
+    if number is None:
+        return None
+    return Reading(raw=number) if raw else Reading(value=number)
 
 
 def _columns(path: Path, header: list[str], numbers: dict[str, int]) -> list[tuple[int, int, bool]]:
     """(channel, column, raw) of each column that names a channel."""
     found: list[tuple[int, int, bool]] = []
-    if not any(name.lower() in _TIME for name in header):
+    if not any(name.lower() in _TIME_NAMES for name in header):
         raise BadData(f"{path}: no column is named t.", hint="First line: t,NAME,NAME …")
     for index, name in enumerate(header):
         raw = name.startswith(_RAW)
@@ -96,7 +110,7 @@ def _columns(path: Path, header: list[str], numbers: dict[str, int]) -> list[tup
             if any(number == other for other, _, _ in found):
                 raise BadData(f"{path}: two columns are for the channel {name.removeprefix(_RAW)}.")
             found.append((number, index, raw))
-        elif name.lower() not in _TIME:
+        elif name.lower() not in _TIME_NAMES:
             raise BadData(f"{path}: the node has no sensor named {name!r}.", hint=f"It has: {', '.join(numbers)}.")
     return found
 
