@@ -197,20 +197,38 @@ def _straight(calibration: Calibration) -> bool:
 def _axis(
     boundaries: tuple[float, ...], source: Channel | None, count: int, actuator: bool, unit: WrittenUnit
 ) -> NDArray[np.float64]:
-    """Samples of one input: every integer where there are few, else evenly spread; and both sides of each boundary."""
+    """Samples of one input: every integer where there are few, else evenly spread; and both sides of each boundary.
+
+    Two samples at least, whatever a foreign datasheet says of its limits.
+    """
+    low, high, whole = _ends(boundaries, source, actuator, unit)
+    if whole and high - low < SAMPLES and count == SAMPLES:
+        samples = np.arange(math.ceil(low), math.floor(high) + 1, dtype=np.float64)
+    else:
+        samples = _spread(boundaries, low, high, count, whole)
+    return samples if len(samples) > 1 else np.array([low, high])
+
+
+def _ends(
+    boundaries: tuple[float, ...], source: Channel | None, actuator: bool, unit: WrittenUnit
+) -> tuple[float, float, bool]:
+    """Lowest and highest input, and whether it takes whole numbers alone."""
     ends = source.raw if source else None
     whole = source is not None and source.integer
-    if actuator and source is not None and math.isfinite(source.low) and math.isfinite(source.high):
+    if actuator and source is not None:
         ends, whole = (unit.from_si(source.low), unit.from_si(source.high)), False
-    low, high = ends or (boundaries[0], boundaries[-1])
-    if whole and high - low < SAMPLES and count == SAMPLES:
-        return np.arange(math.ceil(low), math.floor(high) + 1, dtype=np.float64)
+    if ends is None or not all(map(math.isfinite, ends)) or ends[0] == ends[1]:
+        ends = boundaries[0], boundaries[-1]
+    return min(ends), max(ends), whole
+
+
+def _spread(boundaries: tuple[float, ...], low: float, high: float, count: int, whole: bool) -> NDArray[np.float64]:
     spread = np.linspace(low, high, count)
-    if whole:
-        spread = np.rint(spread)
     edges = np.asarray(boundaries)
-    below = np.ceil(edges) - 1 if whole else np.nextafter(edges, -np.inf)
-    at = np.ceil(edges) if whole else edges
+    if whole:
+        spread, below, at = np.rint(spread), np.ceil(edges) - 1, np.ceil(edges)
+    else:
+        below, at = np.nextafter(edges, -np.inf), edges
     if 2 < count < SAMPLES and len(edges) > count:
         below, at = below[:: len(edges) // count + 1], at[:: len(edges) // count + 1]
     samples = np.concatenate([spread, below, at])
