@@ -2,7 +2,30 @@
 
 from __future__ import annotations
 
+import json
+
 
 def printable(text: str) -> str:
-    """A name as a node gives it, without the characters that steer a terminal."""
+    """A name as a node gives it, without the characters that steer a terminal or turn the direction of writing."""
+    if text.isprintable():
+        return text
     return "".join(character if character.isprintable() else "\N{REPLACEMENT CHARACTER}" for character in text)
+
+
+def harmless(text: str) -> str:
+    """Lines for a terminal: nothing in them that a node, a tag or a file brought can steer it; breaks and tabs stay."""
+    if text.isprintable():
+        return text
+    return "".join(character if character.isprintable() or character in "\n\t" else "?" for character in text)
+
+
+def harmless_json(text: str) -> str:
+    """JSON with every character that is not printable escaped: it says the same, and steers no terminal.
+
+    JSON itself escapes only what lies below U+0020; a terminal also obeys U+009B, and U+202E turns what people read.
+    """
+    if text.isprintable():
+        return text
+    return "".join(
+        character if character.isprintable() or character == "\n" else json.dumps(character)[1:-1] for character in text
+    )

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, TextIO
 import click
 
 from teds_provision.errors import PolicyRefused, StoreFailure, TedsProvisionError, UsageFailure, WrongPassphrase
+from teds_provision.harmless import harmless, harmless_json
 
 if TYPE_CHECKING:
     from rich.console import Console, RenderableType
@@ -107,10 +108,10 @@ class App:
 
     def console(self, *, stderr: bool = False) -> Console:
         """Return a rich console; colour yields to NO_COLOR and to a pipe, long lines are not broken in a pipe."""
-        from rich.console import Console
+        from teds_provision.cli.console import CleanConsole
 
         stream = sys.stderr if stderr else sys.stdout
-        return Console(stderr=stderr, highlight=False, soft_wrap=not stream.isatty())
+        return CleanConsole(stderr=stderr, highlight=False, soft_wrap=not stream.isatty())
 
     def note(self, text: str, *, level: int = 0) -> None:
         """Say something on stderr, unless --quiet (or fewer ``-v`` than ``level``); not with --json."""
@@ -173,6 +174,9 @@ class App:
 
     def ask_secret(self, prompt: str, confirm: bool = False) -> str:
         """Get a passphrase or PIN: from --passphrase-fd (one line, read once), else from the terminal."""
+        from teds_provision.vault.hardening import harden  # with the vault comes cryptography, which lists do without
+
+        harden()
         if self._passphrase_fd is not None:
             if self._passphrase is None:
                 self._passphrase = read_line(self._passphrase_fd)
@@ -183,7 +187,7 @@ class App:
                 hint="Give it through a file descriptor: --passphrase-fd 3 3<FILE.",
             )
         self.live_line()
-        answer: str = click.prompt(prompt, hide_input=True, confirmation_prompt=confirm, err=True)
+        answer: str = click.prompt(harmless(prompt), hide_input=True, confirmation_prompt=confirm, err=True)
         return answer
 
     def ask_new(self, prompt: str) -> str:
@@ -194,7 +198,7 @@ class App:
                 hint="Give it through a file descriptor: --new-passphrase-fd 4 4<FILE.",
             )
         self.live_line()
-        answer: str = click.prompt(prompt, hide_input=True, confirmation_prompt=True, err=True)
+        answer: str = click.prompt(harmless(prompt), hide_input=True, confirmation_prompt=True, err=True)
         return answer
 
     # -- the station -----------------------------------------------------------------------------------------------
@@ -230,12 +234,7 @@ def nowhere(stream: TextIO) -> None:
 def to_json(value: object, *, indent: int | None = None) -> str:
     """JSON for stdout: characters as they are where it takes UTF-8, escaped where it does not."""
     wide = (sys.stdout.encoding or "utf-8").lower().replace("-", "") == "utf8"
-    return json.dumps(value, ensure_ascii=not wide, indent=indent)
-
-
-def harmless(text: str) -> str:
-    """Text for a terminal: nothing in it that a node, a tag or a file brought can steer the terminal."""
-    return "".join(character if character.isprintable() or character in "\n\t" else "?" for character in text)
+    return harmless_json(json.dumps(value, ensure_ascii=not wide, indent=indent))
 
 
 def read_line(descriptor: int) -> str:

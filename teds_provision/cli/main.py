@@ -14,10 +14,11 @@ from typing import Any, Final
 import click
 
 from teds_provision import __version__
-from teds_provision.cli.context import App, harmless, nowhere
+from teds_provision.cli.context import App, nowhere
 from teds_provision.cli.globals import in_front
 from teds_provision.cli.table import COMMANDS, GROUPS, SECTIONS
 from teds_provision.errors import BadData, StoreFailure, TedsProvisionError
+from teds_provision.harmless import harmless
 
 ENVIRONMENT_PREFIX = "TEDS_PROVISION"
 INTERRUPTED, BROKEN_PIPE = 130, 141
@@ -249,6 +250,11 @@ def _usage_hint(error: click.ClickException) -> str:
     return ""
 
 
+def wants_json(arguments: list[str]) -> bool:
+    """Whether a run of these arguments tells its result as JSON."""
+    return _wants(arguments, "--json")
+
+
 def _wants(arguments: list[str], option: str) -> bool:
     name = option.strip("-")
     if App.current is not None and getattr(App.current, name):
@@ -283,4 +289,5 @@ def _fail(arguments: list[str], exit_code: int, code: str, message: str, hint: s
 
 
 def _say(text: str) -> None:
-    print(harmless(text), file=sys.stderr, flush=True)
+    with contextlib.suppress(OSError):
+        print(harmless(text), file=sys.stderr, flush=True)

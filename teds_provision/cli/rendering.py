@@ -9,7 +9,7 @@ from collections.abc import Iterable
 from datetime import datetime
 from typing import TYPE_CHECKING, Any
 
-from teds_provision.cli.context import harmless
+from teds_provision.harmless import harmless
 from teds_provision.talk.progress import NOTHING, Reporter, Silent, StepResult
 
 if TYPE_CHECKING:

@@ -6,6 +6,7 @@ from pathlib import Path
 
 from teds_provision.errors import UsageFailure, VaultFailure
 from teds_provision.vault.base import Ask, Vault
+from teds_provision.vault.hardening import harden
 from teds_provision.vault.passphrase import PRODUCT, Costs
 
 _opened: dict[tuple[Path, str, str], Vault] = {}
@@ -27,6 +28,7 @@ def create_vault(
     set, a read back and a delete), else a passphrase file. ``costs`` are those of a new passphrase file, ``restored``
     the secret material of a backup; ``with_ca`` False makes no CA key. Raises VaultFailure (leaves too), UsageFailure.
     """
+    harden()
     vault, why = _create(home, store_id, keystore, ask, costs, restored, with_ca=with_ca)
     if not with_ca and restored is None:
         vault.drop_ca()  # one that was made a moment ago and never used
@@ -39,6 +41,7 @@ def open_vault(home: Path, store_id: str, keystore: str, ask: Ask) -> Vault:
 
     Raises VaultFailure and its leaves: locked, missing, damaged, wrong passphrase.
     """
+    harden()
     place = (home.resolve(), store_id, keystore)
     vault = _opened.get(place)
     if vault is None or vault.replaced():

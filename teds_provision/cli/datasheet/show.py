@@ -17,6 +17,7 @@ from teds_provision.cli.datasheet.show_json import to_json
 from teds_provision.cli.datasheet.show_table import print_files
 from teds_provision.cli.options import command
 from teds_provision.errors import BadData, UsageFailure
+from teds_provision.harmless import harmless
 from teds_provision.teds.diff.datasheets import diff_blocks
 from teds_provision.teds.formats import lost, write_blocks
 from teds_provision.teds.guard.guard import check_calibration
@@ -105,6 +106,8 @@ def _convert(app: App, files: Sequence[ShownFile], form: Format) -> None:
         raise UsageFailure("Octets are not for a terminal.", hint="Send them to a file: … --format binary > FILE")
     for sentence in lost(blocks, form):
         app.warn(f"{form} cannot hold {sentence}")
+    if isinstance(written, str) and sys.stdout.isatty():
+        written = harmless(written)
     octets = written if isinstance(written, bytes) else written.encode()
     sys.stdout.buffer.write(octets)
     sys.stdout.flush()

@@ -117,7 +117,7 @@ def _table(described: Iterator[dict[str, Any]]) -> None:
         [_GAP.join(title.ljust(width) for title, _, width in columns)],
         (_GAP.join(cell(node).ljust(width) for _, cell, width in columns) for node in chain(head, described)),
     )
-    sys.stdout.writelines(f"{_cut(line.rstrip(), limit)}\n" for line in lines)
+    sys.stdout.writelines(f"{_cut(shown(line.rstrip()), limit)}\n" for line in lines)
     sys.stdout.flush()
 
 

@@ -1,0 +1,110 @@
+"""stdout as it may be: closed, full, or a pipe whose reader went away. None of them may undo or hide what was done.
+
+A closed descriptor is taken by /dev/null before a file could get its number, and be written into. What a full disk
+does not take is dropped and remembered: the command goes on to its own end. A broken pipe raises, so that a command
+that would tell for hours ends at once.
+"""
+
+from __future__ import annotations
+
+import io
+import os
+import re
+import sys
+from contextlib import suppress
+from typing import TYPE_CHECKING, Final
+
+if TYPE_CHECKING:
+    from _typeshed import ReadableBuffer as Buffer
+
+BROKEN_PIPE: Final = 141
+_NOT_TOLD: Final = 7
+# Control characters but line breaks, tabs and ESC; zero-width and direction marks; halves of surrogate pairs.
+_STEERING: Final = re.compile(
+    "[\x00-\x08\x0b\x0c\x0e-\x1a\x1c-\x1f\x7f-\x9f\u200b-\u200f\u202a-\u202e\u2060-\u2064\u2066-\u206f\ufeff\ud800-\udfff]"
+)
+
+
+class GuardedOutput(io.FileIO):
+    """Descriptor 1; ``failure`` is why something could not be told, "" as long as all was."""
+
+    failure = ""
+
+    def write(self, octets: Buffer, /) -> int:
+        """Write, or note why not; raises BrokenPipeError where nobody reads."""
+        try:
+            return super().write(octets)
+        except BrokenPipeError:
+            raise
+        except OSError as error:
+            self.failure = error.strerror or "it failed"
+            return memoryview(octets).nbytes
+
+
+class CleanText(io.TextIOWrapper):
+    """Text for stdout, with escapes in the place of what would steer a terminal or turn what people read.
+
+    In JSON such an escape says the same. ESC itself stays, as colours need it: whoever prints names takes it out
+    (:mod:`teds_provision.harmless`), and JSON never holds it.
+    """
+
+    def write(self, text: str, /) -> int:
+        """Write a text; returns its length as it was given."""
+        if not text.isprintable():
+            super().write(_STEERING.sub(lambda found: f"\\u{ord(found[0]):04x}", text))
+        else:
+            super().write(text)
+        return len(text)
+
+
+def guard() -> GuardedOutput | None:
+    """Put guarded output in the place of ``sys.stdout``; None where it is not a plain descriptor (a test's own)."""
+    for _ in range(3):  # the lowest free number is given first: 0, 1, 2, as far as they are closed
+        descriptor = os.open(os.devnull, os.O_RDWR)
+        if descriptor > 2:
+            os.close(descriptor)
+            break
+    for number, name in ((0, "stdin"), (1, "stdout"), (2, "stderr")):
+        if getattr(sys, name) is None:
+            plain = io.FileIO(number, "r" if number == 0 else "w", closefd=False)
+            buffer = io.BufferedReader(plain) if number == 0 else io.BufferedWriter(plain)
+            setattr(sys, name, io.TextIOWrapper(buffer, encoding="utf-8"))
+    if not isinstance(sys.stdout, io.TextIOWrapper):
+        return None
+    output = GuardedOutput(1, "w", closefd=False)
+    encoding = sys.stdout.encoding
+    with suppress(OSError):
+        sys.stdout.flush()
+    # A name in another encoding is no reason to fail after the work is done.
+    sys.stdout = CleanText(
+        io.BufferedWriter(output), encoding=encoding, errors="backslashreplace", line_buffering=output.isatty()
+    )
+    return output
+
+
+def ended(code: int, output: GuardedOutput | None, *, as_json: bool) -> int:
+    """Write out what is left and return the exit code: ``code``, or 141 for a broken pipe.
+
+    Where the one JSON object could not be told, and all else went well, 7: whoever reads it must not take silence for
+    a result.
+    """
+    try:
+        sys.stdout.flush()
+    except BrokenPipeError:
+        silence()
+        return BROKEN_PIPE
+    except (OSError, ValueError):
+        silence()
+    if output is None or not output.failure:
+        return code
+    with suppress(OSError):
+        print(f"Error: What was done could not be told on stdout: {output.failure}.", file=sys.stderr, flush=True)
+    return _NOT_TOLD if as_json and code == 0 else code
+
+
+def silence() -> None:
+    """Send what Python would still write to stdout when it ends to /dev/null."""
+    with suppress(OSError, ValueError):
+        devnull = os.open(os.devnull, os.O_WRONLY)
+        os.dup2(devnull, 1)
+        os.close(devnull)

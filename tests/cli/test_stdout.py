@@ -1,0 +1,150 @@
+"""stdout that is closed, full, or a pipe whose reader went away; text from outside on a terminal; memory of secrets."""
+
+from __future__ import annotations
+
+import json
+import os
+import pty
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from teds_provision.harmless import harmless, harmless_json, printable
+from teds_provision.store import NodeRecord, Store
+from tests.cli.shell import call, clean_environment
+from tests.workflow.bench import PASSPHRASE
+
+UUID = bytes.fromhex("8d4d9da65281f7000000")
+
+
+@pytest.fixture
+def run(home: Path, tmp_path: Path) -> str:
+    """The start of a command line in a shell, with the passphrase on descriptor 9."""
+    (tmp_path / "words").write_text(PASSPHRASE + "\n")
+    return f"9<{tmp_path / 'words'} {sys.executable} -m teds_provision --passphrase-fd 9 --home {home}"
+
+
+def shell(command: str) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(
+        ["bash", "-c", command], capture_output=True, text=True, timeout=60, check=False, env=clean_environment()
+    )
+
+
+def listed(home: Path) -> list[str]:
+    return [entry["uuid"] for entry in call(home, "--json", "whitelist", "list").json["whitelist"]]
+
+
+@pytest.mark.parametrize(
+    ("sink", "code"),
+    [(">&-", 0), (">/dev/full", 0), (">&- 2>&-", 0), ("<&- >&- 2>&-", 0)],
+)
+def test_the_work_keeps_its_own_exit_code(home: Path, run: str, sink: str, code: int) -> None:
+    done = shell(f"{run} whitelist add {UUID.hex()} {sink}")
+    assert done.returncode == code, done.stderr
+    assert "bug" not in done.stderr
+    assert listed(home) == [UUID.hex()]
+    assert shell(f"{run} nodes 1234 {sink}").returncode == 3
+    with Store.open(home) as store:
+        assert store.damage() is None
+
+
+def test_json_that_a_full_disk_does_not_take_is_7_after_the_work(home: Path, run: str) -> None:
+    done = shell(f"{run} --json whitelist add {UUID.hex()} >/dev/full")
+    assert done.returncode == 7
+    assert "could not be told" in done.stderr
+    assert "No space left" in done.stderr
+    assert listed(home) == [UUID.hex()]
+    assert shell(f"{run} --json nodes 1234 >/dev/full").returncode == 3
+
+
+@pytest.mark.parametrize("option", ["", "--json"])
+def test_a_broken_pipe_ends_quietly_with_141_after_the_work(home: Path, run: str, option: str) -> None:
+    done = shell(f"set -o pipefail; (sleep 0.2; {run} {option} whitelist add {UUID.hex()}; echo $? >&2) | :")
+    assert done.stderr == "141\n"
+    assert listed(home) == [UUID.hex()]
+
+
+def test_a_long_list_into_head(home: Path, run: str) -> None:
+    with Store.open(home) as store, store.transaction():
+        for number in range(2000):
+            store.put_node(NodeRecord(number.to_bytes(10, "big"), name=f"node {number} " + "x" * 80))
+    for option in ("", "--json"):
+        done = shell(f"set -o pipefail; ({run} {option} nodes; echo $? >&2) | head -c 100 >/dev/null")
+        assert done.stderr == "141\n"
+
+
+# -- text from outside -------------------------------------------------------------------------------------------------
+
+STEERING = "\x1b[31mred\x9b2J\u202etxt\x07"
+
+
+def test_cleaned_text_steers_nothing_and_json_still_says_the_same() -> None:
+    for clean in (printable(STEERING), harmless(STEERING)):
+        assert clean.isprintable()
+    told = harmless_json(json.dumps({"name": STEERING}, ensure_ascii=False))
+    assert told.isprintable()
+    assert json.loads(told) == {"name": STEERING}
+    assert harmless_json('{"ä": "ö"}') == '{"ä": "ö"}'
+    assert harmless("two\n\tlines") == "two\n\tlines"
+
+
+@pytest.mark.parametrize(
+    "words", [("nodes",), ("--json", "nodes"), ("nodes", UUID.hex()), ("--json", "nodes", UUID.hex())]
+)
+def test_a_name_that_steers_terminals_is_cleaned_on_one(home: Path, words: tuple[str, ...]) -> None:
+    with Store.open(home) as store:
+        store.put_node(NodeRecord(UUID, name=STEERING, profile=STEERING, verdict=STEERING))
+    main, side = pty.openpty()
+    command = [sys.executable, "-m", "teds_provision", "--home", str(home), *words]
+    environment = clean_environment(TERM="xterm", NO_COLOR="1", COLUMNS="200")
+    done = subprocess.Popen(command, stdout=side, stderr=side, stdin=subprocess.DEVNULL, env=environment)
+    os.close(side)
+    octets = b""
+    while True:
+        try:
+            part = os.read(main, 65536)
+        except OSError:
+            break
+        if not part:
+            break
+        octets += part
+    assert done.wait(timeout=60) == 0
+    os.close(main)
+    text = octets.decode()
+    assert "red" in text
+    for character in ("\x9b", "\u202e", "\x07", "\x1b[31m"):
+        assert character not in text
+
+
+# -- memory ------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("option", ["", "--debug"])
+def test_a_process_that_holds_secrets_dumps_no_core_and_is_not_traced(home: Path, tmp_path: Path, option: str) -> None:
+    (tmp_path / "words").write_text(PASSPHRASE + "\n")
+    code = f"""
+import ctypes, os, resource, signal, sys
+from teds_provision.cli.main import run
+most = resource.getrlimit(resource.RLIMIT_CORE)[1]
+resource.setrlimit(resource.RLIMIT_CORE, (most, most))
+options = [{option!r}] if {option!r} else []
+assert ctypes.CDLL(None).prctl(3, 0, 0, 0, 0) == 1
+assert run(["--home", {str(home)!r}, "--passphrase-fd", "3", *options, "vault", "rewrap"]) == 0
+print(ctypes.CDLL(None).prctl(3, 0, 0, 0, 0), resource.getrlimit(resource.RLIMIT_CORE), flush=True)
+os.abort()
+"""
+    with (tmp_path / "words").open("rb") as words:
+        done = subprocess.run(
+            ["bash", "-c", f'exec "$0" -c "$1" 3<&{words.fileno()}', sys.executable, code],
+            pass_fds=(words.fileno(),),
+            capture_output=True,
+            text=True,
+            timeout=60,
+            check=False,
+            cwd=tmp_path,
+            env=clean_environment(PYTHONPATH=str(Path(__file__).parents[2])),
+        )
+    assert done.stdout.endswith("0 (0, 0)\n"), done
+    assert [path.name for path in tmp_path.glob("core*")] == []
