@@ -53,7 +53,7 @@ def test_backup_and_restore_into_an_empty_home(home: Path, sealed: Path, tmp_pat
 
 def test_an_existing_file_is_replaced_only_when_told(home: Path, sealed: Path) -> None:
     before = sealed.read_bytes()
-    assert spawn("--home", home, "backup", sealed, passphrase=PASSPHRASE).code == 2
+    assert spawn("--home", home, "backup", sealed, passphrase=PASSPHRASE).code == 6
     assert sealed.read_bytes() == before
     plan = spawn("--home", home, "--json", "backup", sealed, "--dry-run")
     assert (plan.code, plan.json["replaces"]) == (0, True)
@@ -76,7 +76,7 @@ def test_an_endless_file_is_not_read_to_its_end(tmp_path: Path) -> None:
 def test_a_merge_shows_its_plan_and_asks(home: Path, sealed: Path) -> None:
     call(home, "whitelist", "remove", ONE.hex(), "--yes")
     refused = spawn("--home", home, "restore", sealed, passphrase=PASSPHRASE)
-    assert refused.code == 2
+    assert refused.code == 6
     assert "comes back: whitelist: 1" in refused.err
     assert "an older state" in refused.err
     assert call(home, "--json", "whitelist", "list").json == {"whitelist": []}
@@ -137,7 +137,7 @@ def test_a_recovery_key_that_openssl_made(home: Path, tmp_path: Path) -> None:
     assert restore(new, path)[0] == 2
     assert restore(new, path, "--recovery-key", str(private))[0] == 7
     code, _ = restore(new, path, "--recovery-key", str(private), passphrase="words of the key")
-    assert code == 2  # whose backup it is, only the fingerprint tells
+    assert code == 6  # whose backup it is, only the fingerprint tells
     code, told = restore(new, path, "--recovery-key", str(private), "--yes", passphrase="words of the key")
     assert (code, told["action"]) == (0, "rebuilt")
 

@@ -179,10 +179,10 @@ def test_a_move_tells_who_else_holds_a_copy(homes: Homes) -> None:
 
 def test_it_asks_and_nobody_answers(homes: Homes) -> None:
     output = homes.folder / "keys.jwe"
-    homes.refused(2, "export-keys", "--to", "south", "--all", "--output", output, home=homes.north)
+    homes.refused(6, "export-keys", "--to", "south", "--all", "--output", output, home=homes.north)
     assert not output.exists()
     homes.export("--all")
-    homes.refused(2, "import-keys", output)
+    homes.refused(6, "import-keys", output)
 
 
 def test_undo_by_the_first_digits_of_the_id(homes: Homes) -> None:

@@ -112,7 +112,7 @@ def test_a_spare_in_the_place_of_a_node(yard: Yard) -> None:
 
 def test_revoked_for_good(yard: Yard) -> None:
     node = yard.provisioned()
-    assert yard.run("north", "revoke", node.uuid, "--why", "stolen").code == 2
+    assert yard.run("north", "revoke", node.uuid, "--why", "stolen").code == 6
     assert yard.done("north", "revoke", node.uuid, "--why", "stolen", "--dry-run")["keys"] == 1
     done = yard.done("north", "revoke", node.uuid, "--why", "stolen", "--yes")
     assert (done["why"], done["fresh"], len(done["fingerprint"])) == ("stolen", True, 64)

@@ -31,7 +31,7 @@ def unlocked(home: Path, *words: object) -> Outcome:
 
 
 def test_add_list_remove(home: Path, pem: Path) -> None:
-    assert call(home, "--json", "trust", "add", "lab", pem).code == 2
+    assert call(home, "--json", "trust", "add", "lab", pem).code == 6
     plan = call(home, "--json", "trust", "add", "lab", pem, "--dry-run")
     assert (plan.json["plan"], plan.json["added"]) == (True, 1)
     assert call(home, "--json", "trust", "list").json["trusted"] == []
@@ -43,7 +43,7 @@ def test_add_list_remove(home: Path, pem: Path) -> None:
     assert call(home, "--json", "trust", "add", "lab", pem, "--yes").json["added"] == 0
     (listed,) = call(home, "--json", "trust", "list").json["trusted"]
     assert (listed["name"], listed["role"], listed["fingerprint"]) == ("lab", "station", DIGITS)
-    assert call(home, "--json", "trust", "remove", "lab").code == 2
+    assert call(home, "--json", "trust", "remove", "lab").code == 6
     assert spawn("--home", home, "--json", "trust", "remove", "lab", "--yes").code == 7
     removed = unlocked(home, "trust", "remove", DIGITS[:32], "--yes").json
     assert removed["removed"]["name"] == "lab"
@@ -77,13 +77,13 @@ def test_a_station_without_a_ca_of_its_own(home: Path, tmp_path: Path) -> None:
         made = unlocked(east, "init", "--name", "east", "--keystore", "file", "--request", asked)
         assert (made.code, made.json["ca"]) == (0, None), made
     assert "init --certificate" in unlocked(east, "nodes").json["error"]["hint"]
-    assert unlocked(home, "trust", "ca", "sign", asked, "--output", cert).code == 2
+    assert unlocked(home, "trust", "ca", "sign", asked, "--output", cert).code == 6
     assert unlocked(home, "trust", "ca", "sign", asked, "--output", cert, "--dry-run").json["plan"] is True
     assert not cert.exists()
     for fresh in (True, False):
         signed = unlocked(home, "trust", "ca", "sign", asked, "--output", cert, "--yes").json
         assert (signed["name"], signed["fingerprint"], signed["fresh"]) == ("east", made.json["fingerprint"], fresh)
-    assert unlocked(east, "init", "--certificate", cert).code == 2
+    assert unlocked(east, "init", "--certificate", cert).code == 6
     for _ in range(2):
         done = unlocked(east, "init", "--certificate", cert, "--yes")
         assert done.code == 0, done
@@ -101,7 +101,7 @@ def test_the_ca_key_away_and_back(home: Path, tmp_path: Path) -> None:
     assert path.stat().st_mode & 0o777 == 0o600
     assert b"ENCRYPTED" in path.read_bytes()
     assert unlocked(home, "trust", "ca", "export", path).code == 7
-    assert unlocked(home, "trust", "ca", "drop").code == 2
+    assert unlocked(home, "trust", "ca", "drop").code == 6
     assert [unlocked(home, "trust", "ca", "drop", "--yes").json["dropped"] for _ in range(2)] == [True, False]
     assert unlocked(home, "trust", "ca", "create").code == 6
     assert unlocked(home, "trust", "ca", "import", path).json["fingerprint"] == shown

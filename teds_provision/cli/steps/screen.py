@@ -8,7 +8,8 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Final, Protocol
 
-from teds_provision.cli.context import App, harmless
+from teds_provision.cli.context import App
+from teds_provision.harmless import harmless
 
 if TYPE_CHECKING:
     from rich.console import Console
