@@ -11,9 +11,9 @@ import sys
 import tempfile
 from pathlib import Path
 
-from teds_provision.node.can_server import CanServer
+from teds_provision.node.can.server import CanServer
 from teds_provision.node.flash_file import FlashFile
-from teds_provision.node.nfc_server import NfcServer
+from teds_provision.node.nfc.server import NfcServer
 from teds_provision.node.virtual import VirtualNode
 
 

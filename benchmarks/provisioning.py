@@ -23,7 +23,7 @@ from pathlib import Path
 
 from teds_provision.links import Capabilities, Contact, LinkSettings, Notice, open_port
 from teds_provision.links.can.pacing import classic_bits
-from teds_provision.node.nfc_air import answer_seconds, command_seconds
+from teds_provision.node.nfc.air import answer_seconds, command_seconds
 from teds_provision.station.station import Station, initialise
 from teds_provision.steps.build import BuildOrder
 from teds_provision.steps.provision import provision

@@ -11,8 +11,8 @@ from typing import Final
 from teds_provision.errors import BadData
 from teds_provision.files import read_limited
 from teds_provision.limits import LIMITS
-from teds_provision.node.board import Board
 from teds_provision.node.flash_file import FILE, FlashFile
+from teds_provision.node.hardware.board import Board
 from teds_provision.protocol.datasheet import can_be_stored, passes_own_check
 from teds_provision.teds.codec.codes import AccessCode
 from teds_provision.teds.codec.frame import frame, raw_tuple, tuples, unframe

@@ -10,10 +10,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Final, Protocol
 
-from teds_provision.node.board import Board
-from teds_provision.node.can_seat import BUS
-from teds_provision.node.clock import NANOSECONDS
+from teds_provision.node.can.seat import BUS
 from teds_provision.node.flash_file import FlashFile
+from teds_provision.node.hardware.board import Board
+from teds_provision.node.hardware.clock import NANOSECONDS
 from teds_provision.node.pulse import Pulse
 from teds_provision.protocol.flash import Flash
 from teds_provision.protocol.keys import PrivateKey, SoftwareKey, verify

@@ -10,7 +10,7 @@ import sys
 from pathlib import Path
 
 from teds_provision.node.flash_file import FlashFile
-from teds_provision.node.nfc_server import NfcServer
+from teds_provision.node.nfc.server import NfcServer
 from teds_provision.node.virtual import VirtualNode
 
 

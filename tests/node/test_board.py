@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import pytest
 
-from teds_provision.node.battery import Battery
-from teds_provision.node.board import Board, Shown
-from teds_provision.node.clock import NodeClock
+from teds_provision.node.hardware.battery import Battery
+from teds_provision.node.hardware.board import Board, Shown
+from teds_provision.node.hardware.clock import NodeClock
 from teds_provision.protocol.operation.commands import PowerFlag
 from teds_provision.teds.image import Image
 from teds_provision.teds.profile import list_profiles, load_profile

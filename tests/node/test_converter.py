@@ -9,8 +9,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from teds_provision.node.clock import NodeClock
-from teds_provision.node.converter import Converter
+from teds_provision.node.hardware.clock import NodeClock
+from teds_provision.node.hardware.converter import Converter
 from teds_provision.node.sources.base import Reading
 from teds_provision.teds.calibration import load_calibrations
 from teds_provision.teds.calibration.interpreter import ChannelInterpreter

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from teds_provision.node.board import Board
+from teds_provision.node.hardware.board import Board
 from teds_provision.teds.image import Image
 from teds_provision.teds.profile import load_profile
 from teds_provision.teds.sheet import Sheet

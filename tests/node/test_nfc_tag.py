@@ -14,11 +14,11 @@ from teds_provision.errors import Garbled, NodeSilent, UsageFailure
 from teds_provision.links.nfc import message, tnep
 from teds_provision.links.nfc.pieces import Piece
 from teds_provision.links.nfc.poller import Poller
-from teds_provision.node import charging
-from teds_provision.node.nfc_air import ETU, Air, answer_seconds, command_seconds
-from teds_provision.node.nfc_tnep import TnepTag
-from teds_provision.node.nfc_type2 import Type2Memory
-from teds_provision.node.nfc_type4 import IsoDepTag, NdefApplication, Type4Memory
+from teds_provision.node.nfc import charging
+from teds_provision.node.nfc.air import ETU, Air, answer_seconds, command_seconds
+from teds_provision.node.nfc.tnep import TnepTag
+from teds_provision.node.nfc.type2 import Type2Memory
+from teds_provision.node.nfc.type4 import IsoDepTag, NdefApplication, Type4Memory
 from teds_provision.protocol.operation.commands import Power, PowerFlag
 
 SELECT_APPLICATION = bytes.fromhex("00A4040007D276000085010100")
@@ -439,7 +439,7 @@ def test_a_paced_exchange_lasts_as_long_as_on_air() -> None:
 
 
 def test_a_tag_that_cannot_be_is_refused() -> None:
-    from teds_provision.node.nfc_server import NfcServer
+    from teds_provision.node.nfc.server import NfcServer
 
     with pytest.raises(UsageFailure):
         NfcServer("udp:localhost:5000", Handler(), tag="2", uid=bytes(4))

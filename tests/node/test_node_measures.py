@@ -20,7 +20,7 @@ import pytest
 
 from teds_provision.errors import NodeRefused
 from teds_provision.links.nfc.reader import NfcPort
-from teds_provision.node.converter import Converter
+from teds_provision.node.hardware.converter import Converter
 from teds_provision.node.sources import make_source
 from teds_provision.node.sources.base import Reading
 from teds_provision.protocol.messages.frames import Function, decode_reply, security_command

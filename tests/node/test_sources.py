@@ -235,6 +235,7 @@ def test_simulations_come_and_go_at_a_unix_socket(tmp_path: Path) -> None:
         assert path.stat().st_mode & 0o777 == 0o600
         with pytest.raises(NoReader, match=r"hand\.sock"):
             make_source(f"unix:{path}", PLACES, print).start(Clock())
+        assert clock.ended.wait(10)  # the second node knocked, and went away
         for value in (1.0, 2.0):
             clock.ended.clear()
             with socket.socket(socket.AF_UNIX) as simulation:

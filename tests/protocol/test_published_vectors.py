@@ -257,7 +257,7 @@ def test_the_node_gives_the_published_reason_at_the_commit() -> None:
 @cases("nfc_pieces")
 def test_nfc_messages_as_published(document: Entry, entry: Entry) -> None:
     mailbox = Mailbox(entry["max_ndef"])
-    from teds_provision.node.nfc_tnep import TnepTag
+    from teds_provision.node.nfc.tnep import TnepTag
 
     tag = TnepTag(mailbox, TagHandler(node(entry["name"], entry["state"])), wt_int=20, n_wait=15)
     tag.start()
@@ -392,7 +392,7 @@ def check_gathering(entry: Entry) -> None:
 def test_a_node_on_a_bus_answers_the_published_functional_identify() -> None:
     import can
 
-    from teds_provision.node.can_server import CanServer
+    from teds_provision.node.can.server import CanServer
 
     entry = vn.load("can_frames")["entries"][0]
     server = CanServer("virtual:published-vectors", TagHandler(node(entry["name"])))

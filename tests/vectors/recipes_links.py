@@ -13,7 +13,7 @@ from teds_provision.links.can.gathering import Gathering
 from teds_provision.links.can.isotp import FUNCTIONAL, Pair, single
 from teds_provision.links.nfc import message, tnep
 from teds_provision.links.nfc.pieces import Piece, Requester, room
-from teds_provision.node.nfc_tnep import TnepTag
+from teds_provision.node.nfc.tnep import TnepTag
 from teds_provision.protocol.agreement import StationAgreement
 from teds_provision.protocol.messages.frames import Command, Function, read_teds, security_command
 from teds_provision.protocol.tim import Tim

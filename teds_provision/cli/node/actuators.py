@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 from teds_provision.cli.context import App
 
 if TYPE_CHECKING:
-    from teds_provision.node.board import Shown
+    from teds_provision.node.hardware.board import Shown
 
 _EVERY_SECONDS = 0.05
 

@@ -17,10 +17,10 @@ from teds_provision.errors import UsageFailure
 
 if TYPE_CHECKING:
     from teds_provision.cli.node.actuators import ActuatorLines
-    from teds_provision.node.board import Board
-    from teds_provision.node.can_server import CanServer
-    from teds_provision.node.charging import Extras
+    from teds_provision.node.can.server import CanServer
     from teds_provision.node.flash_file import FlashFile
+    from teds_provision.node.hardware.board import Board
+    from teds_provision.node.nfc.charging import Extras
     from teds_provision.node.virtual import LinkServer, VirtualNode
     from teds_provision.protocol.operation.streams import DataFrame
 
@@ -125,8 +125,8 @@ def _check(count: int, source: str, *, nfc: str | None, can: str | None, **_: An
 
 
 def _boards(app: App, lines: ActuatorLines, source: str, percent: float | None) -> Callable[[FlashFile], Board | None]:
-    from teds_provision.node.battery import Battery
-    from teds_provision.node.board import Board
+    from teds_provision.node.hardware.battery import Battery
+    from teds_provision.node.hardware.board import Board
     from teds_provision.teds.image import Image
     from teds_provision.teds.sheet import Sheet
 
@@ -167,13 +167,13 @@ def _servers(
 ) -> list[LinkServer]:
     servers: list[LinkServer] = []
     if nfc:
-        from teds_provision.node.nfc_server import NfcServer
+        from teds_provision.node.nfc.server import NfcServer
 
         servers.append(
             NfcServer(nfc, nodes[0], tag=tag, pace=pace, wt_int=wait_time // 4 * 4, extras=_extras(nodes[0]))
         )
     if can:
-        from teds_provision.node.can_server import CanServer
+        from teds_provision.node.can.server import CanServer
 
         bus = CanServer(can, tell=app.warn)
         for node in nodes:
@@ -190,7 +190,7 @@ def _send(bus: CanServer, node: VirtualNode, frame: DataFrame) -> None:
 
 def _extras(node: VirtualNode) -> Extras:
     """What a node with a battery says in its initial message, and how a field charges it."""
-    from teds_provision.node.charging import NO_EXTRAS, Extras, charge_records
+    from teds_provision.node.nfc.charging import NO_EXTRAS, Extras, charge_records
 
     battery = node.board.battery if node.board is not None else None
     if battery is None:

@@ -11,7 +11,7 @@ import sys
 import threading
 import time
 
-from teds_provision.node.can_server import CanServer
+from teds_provision.node.can.server import CanServer
 from teds_provision.protocol.messages.identity import Identity, NodeState
 
 

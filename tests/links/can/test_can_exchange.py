@@ -15,7 +15,7 @@ from teds_provision.errors import AddressConflict, LinkFailure, NodeSilent, NoNo
 from teds_provision.links.can import link as link_module
 from teds_provision.links.can.port import CanPort
 from teds_provision.links.ports import Contact, Notice
-from teds_provision.node.can_server import CanServer
+from teds_provision.node.can.server import CanServer
 from teds_provision.protocol.messages.identity import Identity, NodeState
 from tests.links.can.echo_node import EchoNode
 from tests.links.can.hub import Hub

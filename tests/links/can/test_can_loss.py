@@ -127,7 +127,7 @@ def test_what_began_and_did_not_end_is_named(hub: Hub, nodes: Start) -> None:
 
 
 def test_one_uuid_at_two_addresses_is_named(hub: Hub) -> None:
-    from teds_provision.node.can_server import CanServer
+    from teds_provision.node.can.server import CanServer
     from tests.links.can.echo_node import EchoNode
 
     servers = [CanServer(hub.spec, EchoNode(address, uuid=b"U" * 10)) for address in (0x21, 0x22)]

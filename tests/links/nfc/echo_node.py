@@ -14,7 +14,7 @@ import threading
 import time
 from typing import Any
 
-from teds_provision.node.nfc_server import NfcServer
+from teds_provision.node.nfc.server import NfcServer
 from teds_provision.protocol.messages.identity import Identity, NodeState
 
 

@@ -12,9 +12,9 @@ import pytest
 from teds_provision.errors import NoNode, NoReader
 from teds_provision.links import LinkSettings, Notice, open_port
 from teds_provision.links.nfc.reader import NfcPort
-from teds_provision.node.nfc_tnep import TnepTag
-from teds_provision.node.nfc_type2 import Type2Memory
-from teds_provision.node.nfc_type4 import ATS, IsoDepTag, NdefApplication, Type4Memory
+from teds_provision.node.nfc.tnep import TnepTag
+from teds_provision.node.nfc.type2 import Type2Memory
+from teds_provision.node.nfc.type4 import ATS, IsoDepTag, NdefApplication, Type4Memory
 
 from .conftest import UUID
 from .echo_node import Echo

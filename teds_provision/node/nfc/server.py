@@ -11,11 +11,12 @@ from typing import Any, Literal
 from teds_provision.errors import NoReader, UsageFailure
 from teds_provision.links.nfc.library import nfc
 from teds_provision.links.nfc.udp import NodeDevice, address_of, frontend
-from teds_provision.node import nfc_type2, nfc_type4
-from teds_provision.node.charging import NO_EXTRAS, Extras
 from teds_provision.node.handler import NodeHandler
-from teds_provision.node.nfc_air import Air
-from teds_provision.node.nfc_tnep import TnepTag
+from teds_provision.node.nfc import type2 as nfc_type2
+from teds_provision.node.nfc import type4 as nfc_type4
+from teds_provision.node.nfc.air import Air
+from teds_provision.node.nfc.charging import NO_EXTRAS, Extras
+from teds_provision.node.nfc.tnep import TnepTag
 
 _LISTEN = 0.25  # seconds after which the server looks around: stop, renewal of the initial message
 _QUEUE = 0.2  # seconds between two tries to lie down on a reader on which another node lies

@@ -15,8 +15,8 @@ from typing import Protocol
 from teds_provision.errors import Garbled
 from teds_provision.links.nfc import message, tnep
 from teds_provision.links.nfc.pieces import Piece, Responder, room
-from teds_provision.node.charging import NO_EXTRAS, Extras, is_poller_information
 from teds_provision.node.handler import NodeHandler
+from teds_provision.node.nfc.charging import NO_EXTRAS, Extras, is_poller_information
 from teds_provision.protocol.repetition import Repetition
 
 LINE = "nfc"

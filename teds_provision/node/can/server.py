@@ -16,9 +16,9 @@ from teds_provision.errors import LinkFailure, NoReader, TedsProvisionError
 from teds_provision.links.can.bus import Bus, Frame
 from teds_provision.links.can.isotp import FUNCTIONAL, Pair, addresses, read_single
 from teds_provision.links.can.spec import FIRST_STATION, LAST_NODE, LAST_STATION, parse_spec
-from teds_provision.node.can_seat import Line, Request, Seat, link_name
+from teds_provision.node.can.seat import Line, Request, Seat, link_name
+from teds_provision.node.can.workers import Crew
 from teds_provision.node.handler import Measuring, NodeHandler
-from teds_provision.node.workers import Crew
 from teds_provision.protocol.announce import Announce, is_announce
 from teds_provision.protocol.messages.frames import Function, Reply, security_command
 from teds_provision.protocol.operation.can_frames import drive_address, trigger_station

@@ -14,9 +14,9 @@ from typing import Final
 
 from teds_provision.errors import BadData
 from teds_provision.node import sources
-from teds_provision.node.battery import Battery
-from teds_provision.node.clock import NANOSECONDS, NodeClock
-from teds_provision.node.converter import Converter
+from teds_provision.node.hardware.battery import Battery
+from teds_provision.node.hardware.clock import NANOSECONDS, NodeClock
+from teds_provision.node.hardware.converter import Converter
 from teds_provision.node.sources.base import Place, Tell
 from teds_provision.node.sources.base import Reading as Given
 from teds_provision.protocol.operation.commands import Power

@@ -1,0 +1,1 @@
+"""What a virtual transducer measures and acts with: channels, clock, battery."""
