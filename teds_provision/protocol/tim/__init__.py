@@ -4,7 +4,8 @@ Pure code, no I/O: a link server gives whole command frames and gets whole reply
 the hardware are injected. One :class:`Tim` serves all links of a node.
 
 ==============  ======================================================================================================
-``node``        :class:`Tim`: routing, the table of states and permissions (section 4), Prove, Reset, List
+``node``        :class:`Tim`: routing, Identify, Prove, Reset, List
+``permission``  the table of states and permissions (section 4), and what claims forbid
 ``lines``       Open, Sealed, the lives of sessions
 ``agreeing``    Request and Confirm (section 3)
 ``teds_access`` Query, Read, Write, Update (section 5); the commit is ``protocol.commit``

@@ -1,4 +1,4 @@
-"""One node: routing of commands, the table of states and permissions, and what needs no state (profile section 4)."""
+"""One node: routing of commands, and those that need little (profile section 4)."""
 
 from __future__ import annotations
 
@@ -26,17 +26,15 @@ from teds_provision.protocol.operation.can_frames import TOKEN_OCTETS
 from teds_provision.protocol.operation.hardware import Hardware, Port, port_of
 from teds_provision.protocol.operation.role import Inner, OperationRole
 from teds_provision.protocol.operation.streams import DataFrame
-from teds_provision.protocol.session import LAST_COUNTER, OPEN_OCTETS, NodeSession, OneTime
+from teds_provision.protocol.session import LAST_COUNTER, NodeSession, OneTime
 from teds_provision.protocol.tim.agreeing import Agreeing
 from teds_provision.protocol.tim.lines import Lines
 from teds_provision.protocol.tim.origin import Origin
+from teds_provision.protocol.tim.permission import Permission
 from teds_provision.protocol.tim.teds_access import TedsAccess
 
 CHALLENGE_OCTETS: Final = 32
 LAST_CAN_ADDRESS: Final = 239
-_SESSION_ONLY = {Function.CLOSE, *range(Function.SAMPLE, Function.DRIVE + 1)}
-_STRANGER_SECONDS: Final = 1.0
-"""While a stream runs, plain Read and List are answered once in so many seconds."""
 
 
 @dataclass
@@ -77,7 +75,6 @@ class Tim:
             claims=lambda session: self._role is not None and bool(self._role.claims.of(session)),
             ended=self._session_ended,
         )
-        self._stranger_at: float | None = None
         self._role: OperationRole | None = None
         if self.hardware is not None:
             self._role = OperationRole(
@@ -88,6 +85,25 @@ class Tim:
                 max_message=self.max_message,
                 streams=self.streams,
             )
+        self._permission = Permission(
+            lambda: self._flash.state == NodeState.FACTORY,
+            self._lines.any_on,
+            self.clock,
+            self._role,
+            self.quick_points,
+        )
+        self._security: dict[int, Callable[[bytes, Origin], bytes]] = {
+            Function.REQUEST: self._request,
+            Function.CONFIRM: self._confirm,
+            Function.OPEN: self._open,
+            Function.SEALED: self._sealed,
+            Function.CLOSE: self._close,
+            Function.IDENTIFY: self._identify,
+            Function.PROVE: self._prove,
+            Function.RESET: self._reset,
+            Function.SET_CAN_ADDRESS: self._set_can_address,
+            Function.LIST: self._list,
+        }
 
     # -- what links call -------------------------------------------------------------------------------------------
 
@@ -204,124 +220,69 @@ class Tim:
                 raise Refused(Reason.BAD_FORM)
             length = int.from_bytes(frame[4:6], "big")
             command = Command(int.from_bytes(frame[:2], "big"), frame[2], frame[3], frame[COMMAND_HEADER:])
-            self._permit(command, origin)
+            self._permission.check(command, origin)
             if length != len(command.payload):
                 raise Refused(Reason.BAD_FORM)
-            if self._measures(command) and self._role is not None and origin.session is not None:
-                return self._role.run(Inner(command, origin.session, origin.port, origin.received))
-            if command.command_class == COMMON:
-                return self._common(command, origin)
-            return self._security(Function(command.function), command.payload, origin)
+            return self._known(command, origin)
         except Refused as refused:
             return refusal(refused.reason)
         except FlashFailure:
             return refusal(Reason.FLASH_FAILURE)
 
-    def _measures(self, command: Command) -> bool:
-        return self._role is not None and self._role.knows(command)
-
-    def _permit(self, command: Command, origin: Origin) -> None:
-        """State and permission: the table of section 4."""
-        inside = origin.session is not None
-        if command.command_class == SECURITY:
-            if command.channel != 0 or command.function not in set(Function):
-                raise Refused(Reason.UNKNOWN_COMMAND)
-            self._permit_security(Function(command.function), command.payload, origin)
-        elif command.command_class == COMMON and command.function in set(TedsFunction):
-            if command.function not in (TedsFunction.QUERY, TedsFunction.READ) and not inside:
-                raise Refused(Reason.NOT_PERMITTED)
-            if command.function == TedsFunction.READ and not inside:
-                self._hold_strangers_back()
-        elif not inside:
-            raise Refused(Reason.NOT_PERMITTED)
-        elif not self._measures(command):
+    def _known(self, command: Command, origin: Origin) -> Reply:
+        """Run a command that is permitted and whose length is right."""
+        if command.command_class == COMMON and command.function in set(TedsFunction):
+            return self._common(command, origin)
+        security = self._security.get(command.function) if command.command_class == SECURITY else None
+        if security is not None:
+            return Reply(True, security(command.payload, origin))
+        if self._role is None or origin.session is None or not self._role.knows(command):
             raise Refused(Reason.UNKNOWN_COMMAND)
-        self._permit_change(command, origin)
+        return self._role.run(Inner(command, origin.session, origin.port, origin.received))
 
-    def _permit_security(self, function: Function, payload: bytes, origin: Origin) -> None:
-        factory = self._flash.state == NodeState.FACTORY
-        if origin.session is not None:
-            if function in (Function.OPEN, Function.SEALED):
-                raise Refused(Reason.NOT_PERMITTED)
-            return
-        if function in (Function.REQUEST, Function.CONFIRM, Function.SET_CAN_ADDRESS):
-            if not origin.tapped:
-                raise Refused(Reason.NOT_PERMITTED)
-        elif function in _SESSION_ONLY or (function == Function.RESET and not factory):
-            raise Refused(Reason.NOT_PERMITTED)
-        elif (function == Function.OPEN and factory) or (
-            function == Function.SEALED and not self._lines.any_on(origin.link)
-        ):
-            raise Refused(Reason.WRONG_STATE)
-        elif function == Function.PROVE or (function == Function.OPEN and len(payload) == OPEN_OCTETS):
-            if self.actuator_claimed() and not self.quick_points:
-                raise Refused(Reason.BUSY)
-        elif function == Function.LIST:
-            self._hold_strangers_back()
+    # -- class 128: each gives the payload of its reply ------------------------------------------------------------
 
-    def _permit_change(self, command: Command, origin: Origin) -> None:
-        """The datasheet and the address do not change under a claim (operation.md section 1)."""
-        pair = (command.command_class, command.function)
-        changes = ((COMMON, TedsFunction.WRITE), (COMMON, TedsFunction.UPDATE), (SECURITY, Function.SET_CAN_ADDRESS))
-        if self._role is not None and pair in changes:
-            over_nfc = origin.port.kind == "nfc" and pair == (COMMON, TedsFunction.WRITE)
-            self._role.demand_configuration(origin.session, writes_over_nfc=over_nfc)
+    def _request(self, payload: bytes, origin: Origin) -> bytes:
+        return self._agreeing.request(payload, origin, self._flash)
 
-    def _hold_strangers_back(self) -> None:
-        """While a stream runs, plain Read and List beyond one a second get 17, together and over all links."""
-        if self._role is None or not self._role.streams.running:
-            return
-        now = self.clock()
-        if self._stranger_at is not None and now - self._stranger_at < _STRANGER_SECONDS:
-            raise Refused(Reason.BUSY)
-        self._stranger_at = now
+    def _confirm(self, payload: bytes, origin: Origin) -> bytes:
+        self._commit(self._agreeing.confirm(payload, origin, self._flash), safe=True)
+        self._agreeing.forget()
+        self._ending.append(self._end_everything)
+        return b""
 
-    def _security(self, function: Function, payload: bytes, origin: Origin) -> Reply:
-        flash = self._flash
-        match function:
-            case Function.REQUEST:
-                return Reply(True, self._agreeing.request(payload, origin, flash))
-            case Function.CONFIRM:
-                self._commit(self._agreeing.confirm(payload, origin, flash), safe=True)
-                self._agreeing.forget()
-                self._ending.append(self._end_everything)
-                return Reply(True)
-            case Function.OPEN:
-                return Reply(True, self._lines.open(payload, origin.link, flash))
-            case Function.SEALED:
-                return self._sealed(payload, origin)
-            case Function.CLOSE:
-                _length(payload, 0)
-                self._end_with_reply(origin)
-                return Reply(True)
-            case Function.IDENTIFY:
-                _length(payload, 0)
-                return Reply(True, self.identity().encode())
-            case Function.PROVE:
-                _length(payload, CHALLENGE_OCTETS)
-                return Reply(True, self.key.sign(prove_message(flash.uuid, payload)))
-            case Function.RESET:
-                return self._reset(payload)
-            case Function.SET_CAN_ADDRESS:
-                return self._set_can_address(payload)
-            case Function.LIST:
-                _length(payload, 0)
-                entries = [channel.to_bytes(2, "big") + bytes([code]) for channel, code in flash.present()]
-                return Reply(True, b"".join(entries))
-            case _:
-                raise Refused(Reason.UNKNOWN_COMMAND)
+    def _open(self, payload: bytes, origin: Origin) -> bytes:
+        return self._lines.open(payload, origin.link, self._flash)
+
+    def _close(self, payload: bytes, origin: Origin) -> bytes:
+        _length(payload, 0)
+        self._end_with_reply(origin)
+        return b""
+
+    def _identify(self, payload: bytes, origin: Origin) -> bytes:
+        _length(payload, 0)
+        return self.identity().encode()
+
+    def _prove(self, payload: bytes, origin: Origin) -> bytes:
+        _length(payload, CHALLENGE_OCTETS)
+        return self.key.sign(prove_message(self._flash.uuid, payload))
+
+    def _list(self, payload: bytes, origin: Origin) -> bytes:
+        _length(payload, 0)
+        entries = [channel.to_bytes(2, "big") + bytes([code]) for channel, code in self._flash.present()]
+        return b"".join(entries)
 
     # -- sessions --------------------------------------------------------------------------------------------------
 
-    def _sealed(self, payload: bytes, origin: Origin) -> Reply:
+    def _sealed(self, payload: bytes, origin: Origin) -> bytes:
         self.poll()  # a lease that ran out before this frame came is over: the frame does not revive it
         taken = self._lines.take(payload, origin.link)
         if not taken.room:
-            return Reply(True, taken.session.seal(taken.counter, refusal(Reason.NO_ROOM).encode()))
+            return taken.session.seal(taken.counter, refusal(Reason.NO_ROOM).encode())
         sealed_from = replace(origin, session=taken.session)
         if taken.counter == LAST_COUNTER:
             self._end_with_reply(sealed_from)
-        return Reply(True, taken.session.seal(taken.counter, self._run(taken.inner, sealed_from).encode()))
+        return taken.session.seal(taken.counter, self._run(taken.inner, sealed_from).encode())
 
     def _end_with_reply(self, origin: Origin) -> None:
         session = origin.session
@@ -359,22 +320,22 @@ class Tim:
                     session.staging.clear()
                 return reply
 
-    def _reset(self, payload: bytes) -> Reply:
+    def _reset(self, payload: bytes, origin: Origin) -> bytes:
         _length(payload, CHALLENGE_OCTETS)
         flash = self._flash
         proof = self.key.sign(reset_message(flash.uuid, flash.epoch, payload))
         if flash.state != NodeState.FACTORY:
             self._commit(_factory(flash), safe=True)
             self._ending.append(self._end_everything)
-        return Reply(True, proof)
+        return proof
 
-    def _set_can_address(self, payload: bytes) -> Reply:
+    def _set_can_address(self, payload: bytes, origin: Origin) -> bytes:
         _length(payload, 1)
         if not 1 <= payload[0] <= LAST_CAN_ADDRESS:
             raise Refused(Reason.BAD_FORM)
         self._commit(replace(self._flash, can_address=payload[0]))
         self._taken_address = None
-        return Reply(True)
+        return b""
 
     def _commit(self, state: Flash, *, safe: bool = False) -> None:
         """Put the new state; ``safe``: every actuator goes to its safe state before that."""

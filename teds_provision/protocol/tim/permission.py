@@ -1,0 +1,126 @@
+"""State and permission of every command: the table of profile section 4, and what claims forbid (operation.md 1, 2).
+
+The first question that a node asks of a command; lengths and everything else come after it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Final
+
+from teds_provision.protocol.messages.frames import (
+    COMMON,
+    SECURITY,
+    Command,
+    Function,
+    Reason,
+    Refused,
+    TedsFunction,
+)
+from teds_provision.protocol.operation.role import OperationRole
+from teds_provision.protocol.session import OPEN_OCTETS
+from teds_provision.protocol.tim.origin import Origin
+
+_TAPPED: Final = frozenset({Function.REQUEST, Function.CONFIRM, Function.SET_CAN_ADDRESS})
+_MEASURING: Final = frozenset(range(Function.SAMPLE, Function.DRIVE + 1))
+_PLAIN_ALONE: Final = frozenset({Function.OPEN, Function.SEALED})
+_CHANGES: Final = frozenset(
+    {(COMMON, TedsFunction.WRITE), (COMMON, TedsFunction.UPDATE), (SECURITY, Function.SET_CAN_ADDRESS)}
+)
+_STRANGER_SECONDS: Final = 1.0
+"""While a stream runs, plain Read and List are answered once in so many seconds."""
+
+
+@dataclass
+class Permission:
+    """Says no where the table does. ``in_factory`` and ``open_on`` (a link) tell the node's state.
+
+    ``quick_points``: the node's point arithmetic holds no Sealed frame up by more than 5 ms.
+    """
+
+    in_factory: Callable[[], bool]
+    open_on: Callable[[str], bool]
+    clock: Callable[[], float]
+    role: OperationRole | None
+    quick_points: bool
+    _stranger_at: float | None = None
+
+    def check(self, command: Command, origin: Origin) -> None:
+        """Raise Refused where the command may not be run now, or is not known."""
+        if command.command_class == SECURITY:
+            self._known_security(command)
+            if origin.session is None:
+                self._plain_security(Function(command.function), command.payload, origin)
+            else:
+                self._offered(command)
+        elif origin.session is None:
+            self._plain(command)
+        elif not self._measures(command) and not _of_teds(command):
+            raise Refused(Reason.UNKNOWN_COMMAND)
+        self._change(command, origin)
+
+    def _known_security(self, command: Command) -> None:
+        """Class 128 goes to channel 0; a function that nobody knows gets 1 in every state."""
+        if command.channel != 0 or command.function not in set(Function):
+            raise Refused(Reason.UNKNOWN_COMMAND)
+
+    def _offered(self, command: Command) -> None:
+        """Inside a session a node answers 1 to what it does not measure."""
+        if command.function in _PLAIN_ALONE:
+            raise Refused(Reason.NOT_PERMITTED)
+        if command.function in _MEASURING and not self._measures(command):
+            raise Refused(Reason.UNKNOWN_COMMAND)
+
+    def _plain_security(self, function: Function, payload: bytes, origin: Origin) -> None:
+        """The columns "factory" and "keyed or provisioned"."""
+        if function in _TAPPED and not origin.tapped:
+            raise Refused(Reason.NOT_PERMITTED)
+        if function == Function.CLOSE or function in _MEASURING:
+            raise Refused(Reason.NOT_PERMITTED)
+        if function == Function.RESET and not self.in_factory():
+            raise Refused(Reason.NOT_PERMITTED)
+        if function == Function.OPEN and self.in_factory():
+            raise Refused(Reason.WRONG_STATE)
+        if function == Function.SEALED and not self.open_on(origin.link):
+            raise Refused(Reason.WRONG_STATE)
+        if function == Function.PROVE or (function == Function.OPEN and len(payload) == OPEN_OCTETS):
+            self._spare_actuators()
+        if function == Function.LIST:
+            self._hold_strangers_back()
+
+    def _plain(self, command: Command) -> None:
+        """Other classes outside a session: Query and Read alone."""
+        if not _of_teds(command) or command.function not in (TedsFunction.QUERY, TedsFunction.READ):
+            raise Refused(Reason.NOT_PERMITTED)
+        if command.function == TedsFunction.READ:
+            self._hold_strangers_back()
+
+    def _measures(self, command: Command) -> bool:
+        return self.role is not None and self.role.knows(command)
+
+    def _change(self, command: Command, origin: Origin) -> None:
+        """The datasheet and the address do not change under a claim."""
+        if self.role is None or (command.command_class, command.function) not in _CHANGES:
+            return
+        writes = (command.command_class, command.function) == (COMMON, TedsFunction.WRITE)
+        self.role.demand_configuration(origin.session, writes_over_nfc=writes and origin.port.kind == "nfc")
+
+    def _spare_actuators(self) -> None:
+        """No stranger's point arithmetic may hold up the values of a claimed actuator."""
+        if self.role is not None and self.role.claims.actuators and not self.quick_points:
+            raise Refused(Reason.BUSY)
+
+    def _hold_strangers_back(self) -> None:
+        """While a stream runs, plain Read and List beyond one a second get 17, together and over all links."""
+        if self.role is None or not self.role.streams.running:
+            return
+        now = self.clock()
+        if self._stranger_at is not None and now - self._stranger_at < _STRANGER_SECONDS:
+            raise Refused(Reason.BUSY)
+        self._stranger_at = now
+
+
+def _of_teds(command: Command) -> bool:
+    """Whether it is Query, Read, Write or Update."""
+    return command.command_class == COMMON and command.function in set(TedsFunction)
