@@ -33,6 +33,20 @@ class _Several(click.Option):
         return super().type_cast_value(ctx, (value,) if isinstance(value, str) else value)
 
 
+class Seconds(click.FloatRange):
+    """A time in seconds; says so where it is none."""
+
+    name = "seconds"
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
+        """Read a number of seconds; raises BadParameter."""
+        try:
+            float(value)
+        except (TypeError, ValueError):
+            self.fail(f"{value!r} is no number of seconds, e.g. 30 or 2.5.", param, ctx)
+        return super().convert(value, param, ctx)
+
+
 def link_options(function: Function) -> Function:
     """Add --via, --nfc (several with --watch), --can, --ble, --timeout; the command gets ``links: LinkSettings``."""
     from functools import wraps
@@ -59,7 +73,7 @@ def link_options(function: Function) -> Function:
         click.option("--ble", metavar="ADAPTER", help="Not in this version."),
         click.option(
             "--timeout",
-            type=click.FloatRange(min=0.1),
+            type=Seconds(min=0.1),
             default=60.0,
             show_default=True,
             metavar="SECONDS",

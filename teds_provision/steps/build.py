@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 from teds_provision.errors import BadData, NotFound, PolicyRefused
 from teds_provision.protocol import datasheet
 from teds_provision.station.station import Station
-from teds_provision.steps.order import BuildOrder, Prepared, compose, guard, merged, own_name, prepare
+from teds_provision.steps.order import BuildOrder, Prepared, compose, guard, merged, named_for, own_name, prepare
 from teds_provision.steps.read import Survey
 from teds_provision.steps.sign import known_image, known_node_keys, unsigned_security
 from teds_provision.steps.verify import Known, Verified, verify_image
@@ -82,7 +82,7 @@ def build(
     Raises NotFound (profile, file), BadData (profile or calibration with errors), PolicyRefused (a calibration that
     the guard refuses).
     """
-    prepared = prepare(station, order, uuid)
+    prepared = named_for(station, uuid, prepare(station, order, uuid))
     has = has or known_image(station, uuid)
     plan = compose(station, uuid, prepared, pending_image(station, uuid, has) or has, edition=edition)
     image = Image(uuid, dict(plan.blocks))
@@ -97,8 +97,10 @@ def build(
     if not keep_draft:
         return built
     with station.durable("build"):
+        facts = {} if plan.name is None else {"name": plan.name}
         if has is None or not has.unsigned_blocks():  # of a node with a datasheet the store keeps what is on it
-            station.nodes.remember(uuid, profile=plan.wanted, name=plan.name)
+            facts["profile"] = plan.wanted
+        station.nodes.remember(uuid, **facts)
         station.nodes.keep_draft(Draft(uuid, image, "built", plan.wanted))
         station.audit("build", uuid, "done", profile=built.profile, teds=image.digest())
     return built
@@ -208,7 +210,7 @@ def _composed(
     pending = pending_image(station, uuid, has) if resume else None
     record = station.nodes.get(uuid)
     name = own_name(station, pending or has, record.profile if record is not None else None)
-    plan = compose(station, uuid, prepared, pending or has, name=name)
+    plan = compose(station, uuid, prepared, pending or has, name=name, as_known=resume)
     image = Image(uuid, {**keep, **plan.blocks})
     return Proposal(image, (), named, plan.warnings, plan.wanted, plan.name, plan.calibrations)
 
@@ -232,8 +234,8 @@ def _only_what_is_named(
     uuid, has = present.image.uuid, present.image
     record = station.nodes.get(uuid)
     name = own_name(station, has, record.profile if record is not None else None)
-    asked = compose(station, uuid, prepared, has, name=name)
-    unasked = compose(station, uuid, Prepared(BuildOrder(), asked.profile), has, name=name)
+    asked = compose(station, uuid, prepared, has, name=name, as_known=False)
+    unasked = compose(station, uuid, Prepared(BuildOrder(), asked.profile), has, name=name, as_known=False)
     blocks = dict(has.unsigned_blocks())
     for block in {*asked.blocks, *unasked.blocks} - set(keep):
         wanted = asked.blocks.get(block)

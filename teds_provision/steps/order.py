@@ -172,11 +172,13 @@ def compose(
     has: Image | None,
     *,
     name: str | None = None,
+    as_known: bool = True,
     edition: int = 2007,
 ) -> Composed:
     """Compose a node's TEDS; ``has`` is where calibrations come from that the order does not bring or drop.
 
-    ``name`` is the one to keep where the order names none. Raises UsageFailure (no profile known), BadData.
+    ``name`` is the one to keep where the order names none; ``as_known``: else the one that this station knows.
+    Raises UsageFailure (no profile known), BadData.
     """
     order = prepared.order
     wanted = order.profile or _known_profile(station, uuid)
@@ -192,7 +194,7 @@ def compose(
             numbers = ", ".join(map(str, calibrations))
             warnings = (f"The calibration that was given before is kept (channel {numbers}).",)
     record = station.nodes.get(uuid)
-    kept = order.name or name or (record.name if record else None)
+    kept = order.name or name or (record.name if record and as_known else None)
     made = _made(profile, uuid, calibrations, kept, edition)
     return Composed(profile, wanted, kept, calibrations, made.blocks, merged((*passed, *warnings, *made.warnings)))
 

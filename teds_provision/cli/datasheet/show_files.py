@@ -67,6 +67,7 @@ def read_file(name: str) -> bytes:
 def load(name: str, edition: Edition | None = None) -> ShownFile:
     """Read one file and put it into words, converted to ``edition`` where one is asked."""
     octets = read_file(name)
+    kind: Kind | None = None
     try:
         kind = detect(octets)
         if kind == "bundle":
@@ -74,6 +75,12 @@ def load(name: str, edition: Edition | None = None) -> ShownFile:
         path = Path(name) if name != STDIN else None
         blocks = read_blocks(octets, kind, path=path)
     except BadData as error:
+        if kind == "hex" and "Line 1 holds" in error.message:
+            raise BadData(
+                f"{name} holds no TEDS: it is neither binary nor hex (read as hex: {error.message[:1].lower()}"
+                f"{error.message[1:].rstrip('.')}).",
+                hint="TEDS come as binary, hex, Intel HEX, JSON, XML, an image, a profile or a bundle.",
+            ) from error
         named = error.message.startswith(f"{name}:") or error.message.startswith(f"{name} ")
         raise BadData(error.message if named else f"{name}: {error.message}", hint=error.hint) from error
     if not blocks:

@@ -10,7 +10,7 @@ import click
 
 from teds_provision.cli.context import App, pass_app
 from teds_provision.cli.options import command, dry_run_option, link_options, yes_option
-from teds_provision.errors import PolicyRefused
+from teds_provision.errors import BadData, PolicyRefused
 from teds_provision.links import LinkSettings
 
 if TYPE_CHECKING:
@@ -193,6 +193,8 @@ def import_keys(
     station = app.station()
     receipt = receipt or file.with_name(file.name + ".receipt")
     octets = read_limited(file, MAX_BUNDLE_OCTETS, "bundle")
+    if octets.lstrip()[:1] != b"{" or b'"ciphertext"' not in octets:
+        raise BadData(f"{file} is no handover bundle.", hint="Give the file that export-keys wrote.")
     station.unlock()
     shown = plan_import(station, octets)
     state = station.version()

@@ -178,7 +178,8 @@ def replace(
             "profile": taken.profile,
             "calibration_copied": bool(plan.calibration),
         }
-        text = f"{spare.hex()} takes over from {octets.hex()}: name {taken.name}, profile {taken.profile}"
+        given = [f"{what} {value}" for what, value in (("name", taken.name), ("profile", taken.profile)) if value]
+        text = f"{spare.hex()} takes over from {octets.hex()}: {', '.join(given) or 'without name and profile'}"
         if dry_run:
             app.emit({**told, "plan": True}, f"Plan: {text}.")
             return
@@ -186,8 +187,8 @@ def replace(
             app.emit({**told, "fresh": False}, "Nothing to do: it has taken over before.")
             return
         app.confirm(f"{text}?", yes=yes)
-        given = any(ctx.get_parameter_source(name) != click.core.ParameterSource.DEFAULT for name in _LINK_OPTIONS)
-        receipt = _reset(app, station, octets, links, force=True) if given else None
+        linked = any(ctx.get_parameter_source(name) != click.core.ParameterSource.DEFAULT for name in _LINK_OPTIONS)
+        receipt = _reset(app, station, octets, links, force=True) if linked else None
         warnings = take_over(station, plan, receipt)
     for warning in warnings:
         app.warn(warning)

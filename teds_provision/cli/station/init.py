@@ -3,11 +3,16 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import click
 
 from teds_provision.cli.context import App, pass_app
 from teds_provision.cli.options import command, yes_option
+from teds_provision.errors import UsageFailure
+
+if TYPE_CHECKING:
+    from teds_provision.station.station import Station
 
 _FILE = click.Path(path_type=Path, dir_okay=False)
 
@@ -49,6 +54,7 @@ def init(
     else:
         station, why = initialise(app.home, name=name, keystore=keystore, ask=app.ask_secret)
         app.closing(station.close)
+        _require_same(station, name, keystore)
     ca = fingerprint(station.ca)
     app.emit(
         {
@@ -62,6 +68,16 @@ def init(
         f"Station  {station.name}\n  key      {station.fingerprint[:16]}\n  CA key   {ca[:16]}\n"
         f"  keystore {station.identity.keystore} ({why})\n  home     {app.home}\n\n{to_pem(station.point)}",
     )
+
+
+def _require_same(station: Station, name: str | None, keystore: str | None) -> None:
+    """Raise UsageFailure where there is a station already, and the command line asks for another one."""
+    for what, asked, has in (("name", name, station.name), ("keystore", keystore, station.identity.keystore)):
+        if asked is not None and asked != has:
+            raise UsageFailure(
+                f"There is a station in {station.home} already, its {what} is {has!r}: nothing was changed.",
+                hint=f"Leave --{what} out to see it, or choose another --home.",
+            )
 
 
 def _request(app: App, name: str | None, keystore: str | None, path: Path) -> None:

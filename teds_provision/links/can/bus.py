@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import errno
 import logging
 import select
 import socket
@@ -174,6 +175,15 @@ def _open(spec: CanSpec) -> can.BusABC:
             hint=f"python-can knows {', '.join(sorted(can.VALID_INTERFACES))}.",
         ) from error
     except Exception as error:  # back ends raise what their driver, serial port or library raises
+        if spec.interface == "socketcan" and _number(error) == errno.EAFNOSUPPORT:
+            raise NoReader(
+                "This kernel has no CAN.",
+                hint="Load it (sudo modprobe can_raw), or go over the network: socketcand:can0?host=….",
+            ) from error
+        if spec.interface == "socketcan" and _number(error) == errno.ENODEV:
+            raise NoReader(
+                f"There is no CAN interface {spec.channel}.", hint="See which are there: ip -brief link show type can."
+            ) from error
         raise NoReader(f"The CAN bus {spec.text} does not open: {_reason(error)}.", hint=_cure(spec)) from error
     if spec.interface == "udp_multicast":
         _this_group_alone(bus)
@@ -246,6 +256,13 @@ def _cure(spec: CanSpec) -> str:
     if spec.interface == "socketcand":
         return "Start socketcand there, or name it: socketcand:can0?host=127.0.0.1&port=29536."
     return "Check the channel's name, that the adapter is plugged in, and that its driver is installed."
+
+
+def _number(error: BaseException) -> int | None:
+    """The system's number of the innermost cause, None where it is none of the system's."""
+    while error.__cause__ is not None:
+        error = error.__cause__
+    return error.errno if isinstance(error, OSError) else None
 
 
 def _reason(error: BaseException) -> str:

@@ -141,6 +141,11 @@ def _explained(path: str, error: Exception, vendor: int = 0, product: int = 0) -
         return NoReader(
             f"This user may not open {path}.", hint="Serial ports: sudo adduser $USER dialout, log in again."
         )
+    if code in (errno.ENODEV, errno.ENOENT) and path.startswith("tty"):
+        return NoReader(
+            f"No NFC reader answers on the serial line {path}.",
+            hint="Look which line is there (ls /dev/ttyUSB* /dev/ttyACM*), and write it like tty:USB0:pn532.",
+        )
     if code in (errno.ENODEV, errno.ENOENT):
         return NoReader(f"No NFC reader was found on {path}.", hint=_candidates())
     return NoReader(f"The reader {path} cannot be opened: {error}.", hint="Unplug it, plug it in again.")

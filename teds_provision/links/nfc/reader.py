@@ -74,6 +74,7 @@ class NfcPort:
         """
         until, told, never = time.monotonic() + seconds, "", threading.Event()
         waiting = False
+        seen: Visit | Foreign | None = None
         while (left := until - time.monotonic()) > 0:
             seen = self._look(notice, never)
             if isinstance(seen, Visit) and wanted(seen.identity):
@@ -88,6 +89,11 @@ class NfcPort:
             time.sleep(_PAUSE)
         if self._reader is None:
             raise NoReader("The reader was unplugged and did not come back.", hint="Plug it in again.")
+        if isinstance(seen, Visit):
+            raise NoNode(
+                f"Node {seen.identity.uuid.hex()} lies on the reader, and it is not the one that is meant.",
+                hint="Put the node there that you named, or name the one that lies there.",
+            )
         raise NoNode(
             f"The node was not held to the reader within {seconds:.0f} s.",
             hint="Hold the node's NFC antenna flat on the reader, or give it more time with --timeout.",

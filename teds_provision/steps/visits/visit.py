@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Final, Literal
 
-from teds_provision.errors import NotFound
+from teds_provision.errors import BadData, NotFound
 from teds_provision.files import read_limited
 from teds_provision.links import LinkSettings
 from teds_provision.station.station import Station
@@ -70,4 +70,9 @@ def node_or_image(station: Station, text: str) -> bytes | Image:
 
 def read_image_file(path: Path) -> Image:
     """Read an image file; raises NotFound, BadData."""
-    return Image.from_json(read_limited(path, MAX_IMAGE_OCTETS, "image"))
+    try:
+        return Image.from_json(read_limited(path, MAX_IMAGE_OCTETS, "image"))
+    except BadData as error:
+        raise BadData(
+            f"{path} is no TEDS image: {error.message}", hint=error.hint or "Images come from build, sign and read."
+        ) from error

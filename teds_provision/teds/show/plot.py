@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
-from teds_provision.errors import BadData, UsageFailure
+from teds_provision.errors import BadData, TedsProvisionError, UsageFailure
 from teds_provision.files import SHARED, write_whole
 from teds_provision.lazy import late
 from teds_provision.teds.calibration.decoded import is_finite
@@ -104,8 +104,9 @@ def _picture(panels: list[_Panel], kind: str) -> bytes:
         import matplotlib as mpl
         from matplotlib.figure import Figure
     except ImportError as error:
-        raise UsageFailure(
-            "Pictures need matplotlib, which is not installed.", hint="Install it: pip install 'teds-provision[plot]'"
+        raise TedsProvisionError(
+            "Pictures need matplotlib, which is not installed.",
+            hint="Install it into the environment of this tool: pip install matplotlib.",
         ) from error
     columns = min(COLUMNS, len(panels))
     rows = math.ceil(len(panels) / columns)
