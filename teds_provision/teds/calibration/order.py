@@ -101,17 +101,11 @@ def _misfit(curve: Calibration) -> float | None:
 
 
 def _curve(order: Order, channel: ChannelProfile) -> Calibration:
-    actuator, method, degree = channel.type == 1, _method(order), _degree(order)
+    method, degree = _method(order), _degree(order)
     sources = [key for key in ("points", "segments", "inputs", "slope", "coefficients") if order.get(key) is not None]
     match sources:
         case ["points"]:
-            points = _points(order)
-            chosen = method or _asked(channel) or ("linear" if len(points) == 2 else "table")
-            wanted = degree if degree is not None else channel.calibration.degree
-            tolerance = order.number("tolerance")
-            return fit(
-                points, chosen, channel=channel.number, degree=wanted, actuator=actuator, tolerance=tolerance or 0.0
-            )
+            return _fitted(order, channel, method, degree)
         case ["segments"]:
             return _segments(order, channel, method)
         case ["inputs", "coefficients"]:
@@ -119,13 +113,25 @@ def _curve(order: Order, channel: ChannelProfile) -> Calibration:
         case ["slope"]:
             pair = (order.number("intercept") or 0.0, order.number("slope") or 0.0)
             part = CalibrationInput(channel.number, 1, _ends(order, channel), (0.0,))
-            return Calibration(channel.number, method or "linear", (part,), pair, actuator=actuator)
+            return Calibration(channel.number, method or "linear", (part,), pair, actuator=channel.type == 1)
         case ["coefficients"]:
             return _ready(order, channel, method, degree)
         case []:
             raise order.wrong("", "there is nothing to calibrate with: points, coefficients, or slope and intercept.")
         case _:
             raise order.wrong(sources[0], f"only one of {', '.join(sources)} can be the calibration.")
+
+
+def _fitted(order: Order, channel: ChannelProfile, method: Method | None, degree: int | None) -> Calibration:
+    points = _points(order)
+    return fit(
+        points,
+        method or _asked(channel) or ("linear" if len(points) == 2 else "table"),
+        channel=channel.number,
+        degree=channel.calibration.degree if degree is None else degree,
+        actuator=channel.type == 1,
+        tolerance=order.number("tolerance") or 0.0,
+    )
 
 
 def _asked(channel: ChannelProfile) -> Method | None:
@@ -180,27 +186,28 @@ def _multinomial(order: Order, channel: ChannelProfile, method: Method | None) -
     value = order.get("inputs")
     if not isinstance(value, tuple) or not all(isinstance(part, Table) for part in value):
         raise order.wrong("inputs", "tables [[inputs]] with channel, degree, boundaries and offsets are expected.")
-    parts = []
-    for table in value:
-        inner = Order(order.file, table.where.line)
-        for key, entry in table.entries.items():
-            if isinstance(entry, Table) or key not in ("channel", "key", "degree", "boundaries", "offsets"):
-                raise BadData(f"{entry.where}: inputs.{key}: there is no such key.")
-            inner.values[key] = (entry.value, entry.where.line)
-        number = inner.number("channel")
-        degree = _degree(inner)
-        part = CalibrationInput(
-            channel.number if number is None else int(number),
-            1 if degree is None else degree,
-            inner.numbers("boundaries") or (),
-            inner.numbers("offsets") or (),
-            int(inner.number("key") or 0),
-        )
-        _ascending(inner, "boundaries", part)
-        parts.append(part)
+    parts = tuple(_input(order, table, channel) for table in value)
     coefficients = order.numbers("coefficients") or ()
-    actuator = channel.type == 1
-    return Calibration(channel.number, method or "polynomial", tuple(parts), coefficients, actuator=actuator)
+    return Calibration(channel.number, method or "polynomial", parts, coefficients, actuator=channel.type == 1)
+
+
+def _input(order: Order, table: Table, channel: ChannelProfile) -> CalibrationInput:
+    """One ``[[inputs]]`` table."""
+    inner = Order(order.file, table.where.line)
+    for key, entry in table.entries.items():
+        if isinstance(entry, Table) or key not in ("channel", "key", "degree", "boundaries", "offsets"):
+            raise BadData(f"{entry.where}: inputs.{key}: there is no such key.")
+        inner.values[key] = (entry.value, entry.where.line)
+    number, degree = inner.number("channel"), _degree(inner)
+    part = CalibrationInput(
+        channel.number if number is None else int(number),
+        1 if degree is None else degree,
+        inner.numbers("boundaries") or (),
+        inner.numbers("offsets") or (),
+        int(inner.number("key") or 0),
+    )
+    _ascending(inner, "boundaries", part)
+    return part
 
 
 def _ascending(order: Order, key: str, part: CalibrationInput) -> None:

@@ -90,14 +90,11 @@ class Head:
         at = start if self.octets[start] == TEDSID else self.search_tedsid(start, end)
         self.tedsid_at = at
         if at != start:
-            found = "no TEDSID" if at is None else f"the TEDSID at octet {at}"
-            first = self.octets[start]
-            self.find(
-                "error", "tedsid-first", "The TEDSID tuple is not first.", start, "TEDSID", "type 3", f"type {first}"
-            )
-            if at is None:
-                self.find("note", "no-class", f"There is {found}: nothing says what the fields mean.", start)
-                return
+            first = f"type {self.octets[start]}"
+            self.find("error", "tedsid-first", "The TEDSID tuple is not first.", start, "TEDSID", "type 3", first)
+        if at is None:
+            self.find("note", "no-class", "There is no TEDSID: nothing says what the fields mean.", start)
+            return
         size = self.octets[at + 1] if at + 1 < end else 0
         if size not in (4, 5) or at + 2 + size > end:
             if at + 2 + size <= end:
@@ -106,26 +103,32 @@ class Head:
             return
         value = self.octets[at + 2 : at + 2 + size]
         self.edition = 2007 if size == 4 else 2024
-        family, self.access_code, version, width = value[0], value[-3], value[-2], value[-1]
+        self.access_code = value[-3]
         self.table = table(self.access_code)
-        if size == 4 and self.access_code in ONLY_2024:
-            self.find("note", "class", f"The 2007 edition has no {self.table.name}.", at + 3, "TEDSID")
-        elif self.access_code == 0 or AccessCode.TIME_SYNC < self.access_code < MANUFACTURER:
-            self.find("note", "class", f"The class {self.access_code} is reserved.", at, "TEDSID", "", self.access_code)
+        self.width = self.width_of(value[-1], at + 1 + size) if at == start else 1
+        self.check_class(self.table, value, at)
+
+    def width_of(self, width: int, place: int) -> int:
+        """Octets of the length part of all later tuples, 1 where the TEDSID asks for something impossible."""
         if 1 <= width <= 4:
-            self.width = width if at == start else 1
-        else:
-            message = f"The TEDSID asks for tuples of {width} length octets."
-            self.find("error", "tuple-width", message, at + 1 + size, "TEDSID", "1 to 4", width)
-        if family != self.table.family:
-            self.find(
-                "note", "family", f"The TEDSID names family {family}.", at + 2, "TEDSID", self.table.family, family
-            )
-        if version != (1 if size == 4 else 2):
+            return width
+        message = f"The TEDSID asks for tuples of {width} length octets."
+        self.find("error", "tuple-width", message, place, "TEDSID", "1 to 4", width)
+        return 1
+
+    def check_class(self, known: Table, value: bytes, at: int) -> None:
+        """Note what is unusual about the class, family and version that a TEDSID names."""
+        size, code, family, version = len(value), value[-3], value[0], value[-2]
+        if size == 4 and code in ONLY_2024:
+            self.find("note", "class", f"The 2007 edition has no {known.name}.", at + 3, "TEDSID")
+        elif code == 0 or AccessCode.TIME_SYNC < code < MANUFACTURER:
+            self.find("note", "class", f"The class {code} is reserved.", at, "TEDSID", "", code)
+        if family != known.family:
+            self.find("note", "family", f"The TEDSID names family {family}.", at + 2, "TEDSID", known.family, family)
+        usual = 1 if size == 4 else 2
+        if version != usual:
             what = "0 (prototype)" if version == 0 else str(version)
-            self.find(
-                "note", "version", f"The TEDSID names version {what}.", at + size, "TEDSID", 1 if size == 4 else 2, what
-            )
+            self.find("note", "version", f"The TEDSID names version {what}.", at + size, "TEDSID", usual, what)
 
     def search_tedsid(self, start: int, end: int) -> int | None:
         """Offset of the first tuple of type 3 with 4 or 5 octets, tuples having one length octet."""

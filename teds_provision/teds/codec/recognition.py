@@ -31,17 +31,30 @@ def shape_of(octets: bytes) -> Shape:
 
 
 def _is_message(octets: bytes) -> bool:
-    size = len(octets)
-    if size >= 5 and octets[:1] <= b"\x09" and octets[0] and 1 <= octets[2] <= 5:
-        length = int.from_bytes(octets[3:5], "big")
-        if length == size - 5 and not (octets[:2] in _TEDSIDS and octets[3]):
-            return True
-    if octets[:2] in _TEDSIDS:
-        return False
-    commanded = size >= 6 and octets[3] and (1 <= octets[2] <= 7 or octets[2] >= 128)
-    if commanded and int.from_bytes(octets[4:6], "big") == size - 6:
+    tedsid = octets[:2] in _TEDSIDS
+    if _is_service(octets) and not (tedsid and octets[3]):
         return True
-    return size >= 3 and octets[0] <= 1 and int.from_bytes(octets[1:3], "big") == size - 3
+    return not tedsid and (_is_command(octets) or _is_reply(octets))
+
+
+def _counts(octets: bytes, at: int) -> bool:
+    """Whether the u16 at ``at`` counts what follows it to the octet."""
+    return len(octets) >= at + 2 and int.from_bytes(octets[at : at + 2], "big") == len(octets) - at - 2
+
+
+def _is_service(octets: bytes) -> bool:
+    """A network service of 2024: type 1 to 9, id, message type 1 to 5, length."""
+    return _counts(octets, 3) and 1 <= octets[0] <= 9 and 1 <= octets[2] <= 5
+
+
+def _is_command(octets: bytes) -> bool:
+    """A command of 2007: channel u16, class 1 to 7 or a maker's, function, length."""
+    return _counts(octets, 4) and octets[3] != 0 and (1 <= octets[2] <= 7 or octets[2] >= 128)
+
+
+def _is_reply(octets: bytes) -> bool:
+    """A reply of 2007: flag 0 or 1, length."""
+    return _counts(octets, 1) and octets[0] <= 1
 
 
 def verdict_of(framed: bool, findings: Iterable[Finding]) -> Verdict:

@@ -52,10 +52,7 @@ def _text(value: object) -> tuple[str, bytes, int]:
 
 def split_text(fields: list[Field], area: bytes, at: int, find: Callable[..., None]) -> tuple[bytes, ...]:
     """Texts behind the directory, without their checksums; deviations go to ``find``."""
-    lengths = [
-        child.value for field in fields if field.name == "DirBlock" for child in field.children if child.type == 22
-    ]
-    known = [length for length in lengths if isinstance(length, int)]
+    known = _lengths(fields)
     if known and sum(known) == len(area) and min(known) >= 2:
         return _cut(area, known, at, find)
     if known and sum(known) + 2 * len(known) == len(area):
@@ -63,20 +60,19 @@ def split_text(fields: list[Field], area: bytes, at: int, find: Callable[..., No
         return _cut(area, [length + 2 for length in known], at, find)
     tagged = _tagged(area)
     if tagged is not None:
-        find(
-            "warning",
-            "text-tagged",
-            "The text stands in a tuple of type 128; it should stand bare.",
-            at,
-            "",
-            "bare",
-            "128",
-        )
+        message = "The text stands in a tuple of type 128; it should stand bare."
+        find("warning", "text-tagged", message, at, "", "bare", "128")
         return tagged
     if area:
         message = f"The directory counts {sum(known)} octets of text, {len(area)} are there."
         find("warning", "text-length", message, at, "Length", len(area), sum(known))
     return (area,) if area else ()
+
+
+def _lengths(fields: list[Field]) -> list[int]:
+    """Octets of each text, as the directory counts them."""
+    entries = (child for field in fields if field.name == "DirBlock" for child in field.children)
+    return [child.value for child in entries if child.type == 22 and isinstance(child.value, int)]
 
 
 def _cut(area: bytes, lengths: list[int], at: int, find: Callable[..., None]) -> tuple[bytes, ...]:

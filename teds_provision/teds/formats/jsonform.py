@@ -136,26 +136,31 @@ def _entry(data: object, where: str, depth: int) -> Entry:
 
 
 def _value(kind: object, value: object, where: str) -> tuple[Kind, EntryValue]:
-    if kind == "octets":
-        return "octets", _hex(value, f"octets of {where}")
-    if kind == "units" and isinstance(value, Mapping):
-        return "units", units_from_parts(value)
-    if kind == "time" and isinstance(value, Mapping):
-        parts = [
-            _number(value.get(part, 0), (1 << 48) - 1, f"{part} of {where}") for part in ("seconds", "nanoseconds")
-        ]
-        return "time", TimeInstance(parts[0] or 0, parts[1] or 0, value.get("negative") is True)
-    if isinstance(value, list) and kind in {"integers", "numbers"}:
-        numbers = tuple(_float(part, where) for part in value) if kind == "numbers" else tuple(value)
-        if all(type(part) in {int, float} for part in numbers):
-            return ("numbers" if kind == "numbers" else "integers"), numbers
-    if kind == "number":
-        return "number", _float(value, where)
-    if type(value) is int and kind in {"integer", None}:
-        return "integer", value
-    if isinstance(value, str) and kind in {"text", None}:
-        return "text", value
-    raise BadData(f"The value of {where} is no {kind or 'value'}: {value!r}.")
+    match kind, value:
+        case "octets", _:
+            return "octets", _hex(value, f"octets of {where}")
+        case "units", Mapping():
+            return "units", units_from_parts(value)
+        case "time", Mapping():
+            return "time", _time(value, where)
+        case "integers", list() if all(type(part) is int for part in value):
+            return "integers", tuple(value)
+        case "numbers", list():
+            return "numbers", tuple(_float(part, where) for part in value)
+        case "number", _:
+            return "number", _float(value, where)
+        case "integer" | None, int() if type(value) is int:
+            return "integer", value
+        case "text" | None, str():
+            return "text", value
+    raise BadData(f"The value of {where} is no {str(kind or 'value')[:40]}: {str(value)[:60]!r}.")
+
+
+def _time(value: Mapping[str, object], where: str) -> TimeInstance:
+    seconds, nanoseconds = (
+        _number(value.get(part, 0), (1 << 48) - 1, f"{part} of {where}") or 0 for part in ("seconds", "nanoseconds")
+    )
+    return TimeInstance(seconds, nanoseconds, value.get("negative") is True)
 
 
 def _float(value: object, where: str) -> float:

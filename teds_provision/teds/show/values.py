@@ -56,23 +56,31 @@ def meaning_of(field: Field, spec: FieldSpec | None) -> tuple[str, bool]:
 
 def text_of(field: Field, context: Context, spec: FieldSpec | None) -> str:
     """Value of a field for people; hex digits where nothing better is known."""
-    value = field.value
-    if isinstance(value, Units):
-        return name_of_units(value)
-    if isinstance(value, TimeInstance):
-        return span(value) if spec is not None and spec.kind == "duration" else instant(value)
-    if isinstance(value, float):
-        return _number(field, value, context, spec)
-    if isinstance(value, tuple):
-        shown = ", ".join(f"{part:.7g}" if isinstance(part, float) else str(part) for part in value[:SHOWN_NUMBERS])
-        return f"{shown}, … ({len(value)})" if len(value) > SHOWN_NUMBERS else shown
-    if spec is not None and spec.kind == "key":
-        return key(field)
-    if spec is not None and spec.kind == "block id" and len(field.raw) == 35:
-        return signed_block(field.raw, context.beside)
-    if isinstance(value, str):
-        return value
-    return hexadecimal(field.raw) if value is None or isinstance(value, bytes) else _integer(value, spec)
+    kind = spec.kind if spec is not None else ""
+    match field.value:
+        case Units() as units:
+            return name_of_units(units)
+        case TimeInstance() as moment:
+            return span(moment) if kind == "duration" else instant(moment)
+        case float(number):
+            return _number(field, number, context, spec)
+        case tuple(numbers):
+            return _list(numbers)
+        case _ if kind == "key":
+            return key(field)
+        case _ if kind == "block id" and len(field.raw) == 35:
+            return signed_block(field.raw, context.beside)
+        case str(text):
+            return text
+        case int(number):
+            return _integer(number, spec)
+        case _:
+            return hexadecimal(field.raw)
+
+
+def _list(numbers: tuple[int, ...] | tuple[float, ...]) -> str:
+    shown = ", ".join(f"{part:.7g}" if isinstance(part, float) else str(part) for part in numbers[:SHOWN_NUMBERS])
+    return f"{shown}, … ({len(numbers)})" if len(numbers) > SHOWN_NUMBERS else shown
 
 
 def _integer(value: int, spec: FieldSpec | None) -> str:
