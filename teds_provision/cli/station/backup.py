@@ -77,7 +77,7 @@ def backup(
         "to": done.sealed_to,
         "warnings": list(done.warnings),
     }
-    app.emit(result, f"Sealed {done.nodes} nodes and {done.keys} keys to {to}: {file} ({done.octets} octets).")
+    app.emit(result, f"Sealed nodes: {done.nodes}, keys: {done.keys}, to {to}: {file} ({done.octets} octets).")
 
 
 @command(
@@ -133,8 +133,8 @@ def restore(
         app.warn(f"The damaged store is kept as {done.set_aside}.")
     if done.rotations_due:
         app.warn(
-            f"{done.rotations_due} nodes need a new key before anything else: the keys in a backup may have been given"
-            " away since. Tap each, or: teds-provision agree UUID --rotate"
+            f"Nodes that need a new key before anything else: {done.rotations_due}; the keys in a backup may have been"
+            " given away since. Tap each, or: teds-provision agree UUID --rotate"
         )
     _emit(app, content, done, f"The station is back in {app.home}, its keys in the keystore {done.keystore}.")
 
