@@ -99,15 +99,9 @@ class MeasuringStation(SealedLine):
             assert left > 0, (heard, receiver.counts)
             frame = self.ear.get(left)
             address = data_address(frame.identifier) if frame is not None else None
-            if (
-                frame is None
-                or address is None
-                or (address.node, address.stream)
-                != (
-                    self.address,
-                    receiver.plan.subscribe.stream,
-                )
-            ):
+            if frame is None or address is None:
+                continue
+            if address[:2] != (self.port.spec.source, receiver.plan.subscribe.stream) or address.node != self.address:
                 continue
             octets = assembly.take(address.segment, frame.data)
             message = receiver.take(octets, self.now()) if octets is not None else None

@@ -339,6 +339,36 @@ def test_an_actuator_is_safe_when_its_node_is_ended(scene: Scene) -> None:
     assert json.loads(ended.out.splitlines()[-1])["safe"]
 
 
+def test_a_lost_bus_brings_actuators_to_their_safe_state_at_once(scene: Scene) -> None:
+    hub = Hub()
+    process = scene.run("gripper", profile="gripper", can=hub.spec)
+    station = scene.station("gripper", hub.spec)
+    station.operate(1, dead_man=10_000)
+    station.send(set_values([(1, b"\x01\x00")]))
+    assert wait_for(lambda: [line["safe"] for line in actuator_lines(process)] == [True, False])
+    hub.close()
+    assert wait_for(lambda: [line["safe"] for line in actuator_lines(process)] == [True, False, True], 5)
+
+
+def test_two_stations_share_sensors_and_not_an_actuator(scene: Scene) -> None:
+    scene.run("gripper", profile="gripper")
+    first, second = scene.station("gripper"), scene.station("gripper", f"{scene.can}&source=0xF2")
+    for station in (first, second):
+        station.operate()
+    first.operate(1, dead_man=10_000)
+    with pytest.raises(NodeRefused) as refused:
+        second.operate(1, dead_man=10_000)
+    assert refused.value.reason == 17
+    plan = Plan.of(0, ((2, 2),), n=2, period=20 * MS, gap=100)
+    receivers = [station.subscribe(plan)[0] for station in (first, second)]
+    for station, receiver in zip((first, second), receivers, strict=True):
+        assert len(station.hear(receiver, 5)) == 5
+        assert (receiver.counts.bad, receiver.counts.junk) == (0, 0)
+    assert first.states().channels[2][1] == 0xF2
+    first.send(idle())
+    second.operate(1, dead_man=10_000)
+
+
 def test_a_closed_standard_output_does_not_stop_a_node(scene: Scene) -> None:
     keyed_node(scene.folder / "gripper", profile="gripper")
     words = ["--json", "node", "run", str(scene.folder / "gripper"), "--can", scene.can]
