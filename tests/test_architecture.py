@@ -192,3 +192,25 @@ def test_numbers_without_a_calibration_need_no_numpy(module: str) -> None:
     ask = f"import sys, teds_provision.{module}; print(*sys.modules)"
     done = subprocess.run([sys.executable, "-c", ask], capture_output=True, text=True, timeout=60, check=True)
     assert not {"numpy", "pint", "matplotlib"}.intersection(done.stdout.split())
+
+
+# Acts of a module beyond one for each of its commands: write --from brings back, verify takes files, lists are planned.
+_MORE_ACTS = {"write": 1, "verify_files": 2, "whitelist": 9}
+_ROOMS_THAT_ACT = ("steps", "talk", "links", "handover", "backup")
+
+
+def test_a_command_at_a_node_is_one_call_of_one_step() -> None:
+    """The modules of ``cli/steps`` take one function for each command; meetings, sessions and locks are not theirs."""
+    for path in sorted((PACKAGE / "cli" / "steps").glob("*.py")):
+        tree = parsed(path)
+        commands = sum(
+            isinstance(node, ast.FunctionDef) and any("command(" in ast.unparse(part) for part in node.decorator_list)
+            for node in ast.walk(tree)
+        )
+        acts = {
+            (module, name)
+            for module, _, name in (full.removeprefix("teds_provision.").rpartition(".") for full, _ in imports(tree))
+            if module.split(".")[0] in _ROOMS_THAT_ACT and name[0].islower()
+        }
+        assert len(acts) <= commands + _MORE_ACTS.get(path.stem, 0), f"{path.name}: {sorted(acts)}"
+        assert not {module for module, _ in acts if module.split(".")[0] in ("talk", "links")}, path.name

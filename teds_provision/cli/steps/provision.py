@@ -125,7 +125,6 @@ def _questions(app: App, yes: bool, *, strangers: bool = True) -> Questions:
     """Whom to ask; ``strangers`` False: a yes on the command line does not add nodes that nobody named."""
     import threading
 
-    from teds_provision.steps.build import nobody
     from teds_provision.steps.many.board import Declined
     from teds_provision.steps.many.boards import Questions
 
@@ -146,8 +145,6 @@ def _questions(app: App, yes: bool, *, strangers: bool = True) -> Questions:
         accepted.add((who.uuid, who.fingerprint))
 
     def confirm(uuid: bytes, changes: tuple[Change, ...]) -> None:
-        if not app.interactive:
-            nobody(uuid, changes)
         with turn:
             app.note(f"Node {uuid.hex()} has another datasheet. What this command does not name would change:")
             for change in changes[:_CHANGES_SHOWN]:
@@ -157,7 +154,7 @@ def _questions(app: App, yes: bool, *, strangers: bool = True) -> Questions:
             if not app.ask("Write it?"):
                 raise Declined(f"You said no: node {uuid.hex()} keeps its datasheet.")
 
-    return Questions(accept, confirm)
+    return Questions(accept, confirm if app.interactive else None)
 
 
 # -- telling -----------------------------------------------------------------------------------------------------------

@@ -14,7 +14,7 @@ from teds_provision.errors import NoNode, OtherKey, PolicyRefused, TedsProvision
 from teds_provision.links import Contact, LinkSettings, open_port
 from teds_provision.protocol.messages.identity import NodeState
 from teds_provision.station.station import Station
-from teds_provision.steps.build import Confirm, propose
+from teds_provision.steps.build import Confirm, nobody, propose
 from teds_provision.steps.identify import Identified, examine
 from teds_provision.steps.many.board import Board, Totals, worse
 from teds_provision.steps.many.progress import Progress, mean_steps
@@ -56,10 +56,10 @@ class Request:
 
 @dataclass(frozen=True)
 class Questions:
-    """Who is asked: before an unknown node is whitelisted, and before what nobody named is written."""
+    """Who is asked: before an unknown node is whitelisted, and before what nobody named is written (None: nobody)."""
 
     accept: Accept
-    confirm: Confirm
+    confirm: Confirm | None
 
 
 @dataclass(frozen=True)
@@ -241,7 +241,7 @@ class Boards:
             self._for,
             accept=accept,
             reporter=self._reporter,
-            confirm=questions.confirm,
+            confirm=questions.confirm or nobody,
         )
 
     def _for(self, who: Identified) -> Prepared:
