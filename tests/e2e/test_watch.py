@@ -6,7 +6,7 @@ import signal
 
 import pytest
 
-from .desk import ANGLE, Desk, Node, Station, results
+from .desk import ANGLE, Desk, Links, Node, Station, free_port, results
 
 pytestmark = pytest.mark.link
 
@@ -98,3 +98,21 @@ def test_a_person_reads_one_line_for_each_node(station: Station, node: Node) -> 
     outcome = watch.end()
     assert outcome.code == 0
     assert outcome.out.count("\n") == 1
+
+
+def test_several_readers_serve_several_taps_and_a_slow_board_holds_nobody_up(desk: Desk, station: Station) -> None:
+    """Two readers; the board on one takes its time over each point operation, the other one passes meanwhile."""
+    slow, quick = desk.node("slow"), desk.node("quick")
+    ports = [desk.links.nfc, f"udp:localhost:{free_port()}"]
+    words = ["--json", "provision", "--watch", "--yes", "-p", ANGLE, "--nfc", ports[0], "--nfc", ports[1]]
+    watch = station.start(*words)
+    slow.start("--crypto-delay", "700")
+    desk.links = Links(nfc=ports[1], can=desk.links.can)
+    quick.start()
+    lines = watch.wait_for_lines(2, 40)
+    assert [line["uuid"] for line in lines] == [quick.uuid, slow.uuid]
+    assert {line["verdict"] for line in lines} == {"authentic"}
+    assert all(line["time"] for line in lines)
+    watch.signal(signal.SIGTERM)
+    assert watch.end().code == 0
+    assert station.log_is_whole()
