@@ -59,13 +59,6 @@ class Link(Protocol):
     def capabilities(self) -> Capabilities:
         """What this link can do."""
 
-    @property
-    def comfortable(self) -> int | None:
-        """Octets of a whole frame that come through well, None without a limit; falls as parts are lost.
-
-        Who cuts data into pieces (Read, Write) keeps to it, so that what is lost and repeated is small.
-        """
-
     def exchange(self, frame: bytes) -> bytes:
         """Send one whole command frame and return the whole reply frame that belongs to it.
 

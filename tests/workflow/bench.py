@@ -95,10 +95,6 @@ class MemoryLink:
     def capabilities(self) -> Capabilities:
         return LINKS[self.via].capabilities
 
-    @property
-    def comfortable(self) -> int | None:
-        return None
-
     def close(self) -> None:
         self.board.tim.link_lost(self.via)
 

@@ -19,13 +19,13 @@ REPEAT_SECONDS: Final = 15.0
 TRIES: Final = 3
 """A reply is awaited 5 s; a request is repeated at most twice, within 15 s (profile: wire)."""
 _SHARES: Final = (0.3, 0.7, 1.0)
-"""Parts of the 5 s after which a request goes out again: a lost one costs 1.5 s, a slow node still has its 5 s."""
+_LOSSY_SHARES: Final = (0.06, 0.24, 1.0)
+"""Parts of the 5 s after which a request goes out again, on a bus that loses nothing and on one that lost a frame in
+the last minute: a lost request costs 1.5 s or 0.3 s, and a slow node still has its 5 s."""
 _FLOW_SECONDS: Final = (0.25, 0.5, 1.0)
 """The wait for a flow control, try after try, at most N_Bs of ISO 15765-2: a lost one ends it early."""
 _GAP_SECONDS: Final = 0.5
 """The wait for the next consecutive frame (N_Cr, at most 1 s)."""
-_LARGEST, _SMALLEST = 256, 64
-"""Octets of a message after the first loss, and at least: 10 frames, which at 1 % all come through 9 times in 10."""
 _LONGEST_TRY: Final = 120.0
 """Seconds: 4095 octets at the longest gap (127 ms) that a node may ask for take 75 s."""
 
@@ -61,18 +61,12 @@ class CanLink:
     ) -> None:
         self._bus, self._number = bus, number
         self.address = address
-        self._comfortable: int | None = None
         self._reply_seconds = REPLY_SECONDS if reply_seconds is None else reply_seconds
 
     @property
     def capabilities(self) -> Capabilities:
         """What a node on a bus can do."""
         return CAN
-
-    @property
-    def comfortable(self) -> int | None:
-        """Octets of a message that come through well here, see ``Link.comfortable``: fewer after every loss."""
-        return self._comfortable
 
     def exchange(self, frame: bytes) -> bytes:
         """Send one command frame and return its reply; see ``Link.exchange``."""
@@ -86,12 +80,7 @@ class CanLink:
         bus, transaction = self._bus(), self._number()
         try:
             with bus.line(self.address).exchange(transaction) as line:
-                exchange = _Exchange(bus, line, bytes([transaction]) + frame, tries, seconds)
-                try:
-                    reply = exchange.run()
-                finally:
-                    if exchange.losses:
-                        self._comfortable = max(_SMALLEST, (self._comfortable or 2 * _LARGEST) // 2)
+                reply = _Exchange(bus, line, bytes([transaction]) + frame, tries, seconds).run()
         except LinkFailure as failure:
             if bus.rivals.seen() and not bus.failed:
                 raise type(failure)(f"{failure.message} {bus.rivals.text}", hint=bus.rivals.hint) from failure
@@ -110,7 +99,6 @@ class _Exchange:
         self._fd = bus.spec.fd
         self._torn = False
         self._clash = False
-        self.losses = 0
 
     def run(self) -> bytes:
         """Return the whole reply, transaction first; raises NodeSilent, Garbled, AddressConflict, LinkFailure."""
@@ -121,17 +109,18 @@ class _Exchange:
                 self._send(_FLOW_SECONDS[min(refused, len(_FLOW_SECONDS) - 1)])
             except _NoFlow as lost:
                 refused += 1
-                self.losses += 1
+                if lost.begun:
+                    self._bus.note_loss()
                 if not self._worth_another(began, refused, begun=lost.begun):
                     break
                 continue
-            share = _SHARES[max(0, len(_SHARES) - self._tries + whole)] if self._tries > 1 else 1.0
+            shares = _LOSSY_SHARES if self._bus.lossy else _SHARES
+            share = shares[max(0, len(shares) - self._tries + whole)] if self._tries > 1 else 1.0
             whole += 1
             reply = self._reply(self._seconds * share)
             if reply is not None:
                 return reply
             self._line.partial = None  # given up: when the same reply begins anew it is no doubled frame
-            self.losses += 1
             if time.monotonic() - began >= REPEAT_SECONDS:
                 break
         raise self._failed()
@@ -212,6 +201,7 @@ class _Exchange:
                     self._clash = True
                 case "torn":
                     self._torn = True
+                    self._bus.note_loss()
                     return None
                 case _:
                     self._bus.check()

