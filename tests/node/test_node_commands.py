@@ -48,6 +48,15 @@ def test_a_reader_on_which_another_node_lies_is_told(tmp_path: Path) -> None:
     assert links.nfc in json.loads(done.out)["error"]["message"]
 
 
+def test_a_source_that_is_unknown_or_of_no_use_is_told(tmp_path: Path) -> None:
+    run("node", "create", tmp_path / "plain")
+    links = Links()
+    assert run("node", "run", tmp_path / "plain", "--can", links.can, "--source", "sinus:2").code == 2
+    with running(tmp_path / "plain", "--can", links.can, "--source", "sine:2") as process:
+        process.wait_for("has no channels")
+        assert process.wait_for_lines(1)[0]["ready"]
+
+
 def test_what_is_for_one_node_is_refused_for_two(tmp_path: Path) -> None:
     for name in ("a", "b"):
         run("node", "create", tmp_path / name)

@@ -133,6 +133,22 @@ def test_a_classic_bus_takes_a_kilohertz_of_two_streams_and_loses_nothing(scene:
         hub.close()
 
 
+def test_nothing_of_a_stream_comes_after_the_reply_to_stop(scene: Scene) -> None:
+    scene.run("angle")
+    station = scene.station("angle")
+    station.operate()
+    for _ in range(8):
+        receiver, _ = station.subscribe(Plan.of(0, ((1, 2),), n=5, period=1 * MS, gap=200))
+        station.hear(receiver, 3)
+        station.send(stop(0))
+        replied = time.monotonic()
+        time.sleep(0.05)
+        late = []
+        while (frame := station.ear.get(0)) is not None:
+            late += [frame.at - replied] if frame.at > replied else []
+        assert late == []
+
+
 def test_a_switch_tells_its_events_with_their_times(scene: Scene) -> None:
     scene.run("switch", "--source", "sine:0.4", profile="limit-switch")
     station = scene.station("switch")

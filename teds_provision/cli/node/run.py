@@ -24,6 +24,8 @@ if TYPE_CHECKING:
     from teds_provision.node.virtual import LinkServer, VirtualNode
     from teds_provision.protocol.operation.streams import DataFrame
 
+_DEFAULT_SOURCE = "noise"
+
 
 @command(
     "teds-provision node run bench/finger --nfc udp:localhost:54321",
@@ -40,7 +42,7 @@ if TYPE_CHECKING:
 )
 @click.option(
     "--source",
-    default="noise",
+    default=_DEFAULT_SOURCE,
     show_default=True,
     metavar="SOURCE",
     help="Where values come from: noise, sine:PERIOD, ramp:PERIOD, file:CSV, -, unix:PATH, exec:COMMAND.",
@@ -119,7 +121,8 @@ def _check(count: int, source: str, *, nfc: str | None, can: str | None, **_: An
         raise UsageFailure(
             "A node needs a link.", hint="Add --nfc udp:localhost:54321, --can udp_multicast:239.74.163.2, or both."
         )
-    if count > 1 and (nfc or kind_of(source) in ONE_NODE_ONLY):
+    kind = kind_of(source)
+    if count > 1 and (nfc or kind in ONE_NODE_ONLY):
         what = "--nfc" if nfc else f"--source {source}"
         raise UsageFailure(f"{what} is for one node.", hint="Run the others in processes of their own.")
 
@@ -132,6 +135,10 @@ def _boards(app: App, lines: ActuatorLines, source: str, percent: float | None) 
 
     def make(file: FlashFile) -> Board | None:
         uuid, hardware = file.load().uuid, file.hardware
+        if not hardware and source != _DEFAULT_SOURCE:
+            app.warn(
+                f"Node {uuid.hex()} has no channels, so --source is of no use: create it with --teds or --profile."
+            )
         if not hardware and percent is None:
             return None
         return Board(
