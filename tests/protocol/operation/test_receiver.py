@@ -179,6 +179,8 @@ def test_how_many_instants_fit() -> None:
     assert plan(n=113).fits
     assert not plan(n=114).fits
     assert plan(n=113).length == MOST_OCTETS - 1
+    exactly = Plan.of(0, ((1, 1),), n=227, period=MS)
+    assert (exactly.length, exactly.fits) == (MOST_OCTETS, True)
 
 
 # -- clock -------------------------------------------------------------------------------------------------------------
