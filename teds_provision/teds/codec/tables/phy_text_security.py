@@ -109,7 +109,12 @@ SECURITY: Final = (
     _security(107, "KeyEpoch", "u32", "the node's key epoch at signing", "M"),
     _security(108, "SignedBlock", "block id", "channel, access code and SHA-256 of a signed TEDS", "M", repeats=True),
     _security(
-        109, "SessionSuite", "u8", "session suite", "M", enumeration={1: "AES-128-CCM", 2: "one-time ECDH, AES-128-CCM"}
+        109,
+        "SessionSuite",
+        "u8",
+        "session suite",
+        "M",
+        enumeration={1: "AES-128-CCM alone (older)", 2: "one-time ECDH, AES-128-CCM"},
     ),
     _security(110, "KeyAgreement", "u8", "key agreement", "M", enumeration={1: "C(1e, 2s, ECC CDH)"}),
 )
