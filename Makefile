@@ -5,7 +5,7 @@ PYTHON ?= python3
 VENV ?= .venv
 BIN := $(VENV)/bin
 
-.PHONY: demo test lint types unit bench bench-teds bench-handover bench-scale fuzz faults model house sbom clean
+.PHONY: demo test lint types unit bench bench-teds bench-handover bench-scale fuzz faults model house man sbom clean
 
 demo: $(VENV)/.run
 	@$(BIN)/teds-provision demo
@@ -48,6 +48,10 @@ fuzz: .venv-fuzz/.ready
 # Cuts at every durable write and message of every changing command, failing disks, power loss; an hour, or all (FULL=1).
 faults: $(VENV)/.dev
 	$(BIN)/python -m tests.faults.bench $(if $(FULL),--full,--minutes 60)
+
+# What follows from the command line's own definitions: option names, docs/configuration.md, the man page.
+man: $(VENV)/.dev
+	$(BIN)/python scripts/options.py
 
 # The figures of the house: circles, late imports, complexity, drawers, lines.
 house: $(VENV)/.dev

@@ -8,15 +8,17 @@ import importlib
 import json
 import os
 import sys
+from collections.abc import Callable
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, ClassVar, Final
 
 import click
 
 from teds_provision import __version__
+from teds_provision.cli.configuration import PARAMETERS, Defaults, as_parameters, config_path, read_config
 from teds_provision.cli.context import App, nowhere
 from teds_provision.cli.globals import in_front
-from teds_provision.cli.table import COMMANDS, GROUPS, SECTIONS
+from teds_provision.cli.table import COMMANDS, SECTIONS
 from teds_provision.errors import BadData, StoreFailure, TedsProvisionError
 from teds_provision.harmless import harmless
 
@@ -27,7 +29,12 @@ _COMPLETE = "_TEDS_PROVISION_COMPLETE"
 
 
 class LazyGroup(click.Group):
-    """The top group: commands are imported when they are called, help comes from the table."""
+    """The top group: commands are imported when they are called, help comes from the table.
+
+    ``teach`` gets each command that is loaded; it does something where a shell completes a command line.
+    """
+
+    teach: ClassVar[Callable[[click.Command], None]] = staticmethod(lambda _command: None)
 
     def list_commands(self, ctx: click.Context) -> list[str]:
         """Names in the order of the table."""
@@ -42,6 +49,7 @@ class LazyGroup(click.Group):
         command = getattr(module, entry.attribute)
         assert isinstance(command, click.Command)
         _read_by_name(command)
+        self.teach(command)
         return command
 
     def resolve_command(
@@ -66,13 +74,9 @@ class LazyGroup(click.Group):
                 formatter.write_dl([(name.ljust(width), entry.help) for name, entry in entries.items()])
 
 
-_PARAMETERS: Final = {"json": "as_json", "format": "form", "to": "receivers", "all": "everything"}
-"""Options that the code calls otherwise than the command line does."""
-
-
 def _read_by_name(command: click.Command) -> None:
     """Have such options read TEDS_PROVISION_<NAME>, where the name is the command line's."""
-    names = {parameter: name for name, parameter in _PARAMETERS.items()}
+    names = {parameter: name for name, parameter in PARAMETERS.items()}
     for option in command.params:
         if option.name in names and isinstance(option, click.Option):
             option.envvar = f"{ENVIRONMENT_PREFIX}_{names[option.name].upper()}"
@@ -83,54 +87,14 @@ def _read_by_name(command: click.Command) -> None:
 _BROKEN: Final = "teds_provision.config_error"
 
 
-class Defaults(dict[str, Any]):
-    """Values of config.toml: what stands outside of a table serves every command, a table the command of its name.
-
-    The same word may be an option and a command (``profile``), so a command is given plain values, never tables.
-    """
-
-    def get(self, key: str, default: Any = None) -> Any:
-        """Return the defaults of command ``key``, or the value of global option ``key``."""
-        if key not in COMMANDS:
-            return super().get(key, default)
-        return _of_command(self, key, GroupDefaults if key in GROUPS else dict)
-
-
-class GroupDefaults(dict[str, Any]):
-    """The values of a command that has commands of its own, which are all that it is asked for."""
-
-    def get(self, key: str, default: Any = None) -> Any:
-        """Return the defaults of command ``key``."""
-        return _of_command(self, key, dict)
-
-
-def _of_command(values: dict[str, Any], name: str, make: type[dict[str, Any]]) -> dict[str, Any]:
-    own = dict.get(values, name.replace("-", "_"))
-    common = {key: value for key, value in values.items() if not isinstance(value, dict)}
-    return make({**common, **(own if isinstance(own, dict) else {})})
-
-
-def _as_parameters(values: dict[str, Any]) -> dict[str, Any]:
-    """Spell the keys as click names parameters, in every table."""
-    return {
-        _PARAMETERS.get(name, name.replace("-", "_")): _as_parameters(value) if isinstance(value, dict) else value
-        for name, value in values.items()
-    }
-
-
 def _read_config(ctx: click.Context, _parameter: click.Parameter, home: Path | None) -> Path | None:
-    path = App.home_of(home) / "config.toml"
-    if path.is_file():
-        import tomllib
-
-        values = {}
-        try:
-            values = tomllib.loads(path.read_text(encoding="utf-8"))
-        except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-            ctx.meta[_BROKEN] = BadData(f"{path} is not valid TOML: {error}.", hint="Mend or remove the file.")
-        except OSError as error:
-            ctx.meta[_BROKEN] = BadData(f"{path} cannot be read: {error.strerror}.", hint="Check its owner and mode.")
-        ctx.default_map = Defaults(_as_parameters(values))
+    try:
+        values = read_config(config_path(home))
+    except BadData as error:
+        ctx.meta[_BROKEN] = error
+        return home
+    if values is not None:
+        ctx.default_map = Defaults(as_parameters(values))
     return home
 
 
@@ -226,6 +190,9 @@ def _complete(instruction: str) -> int:
     """Answer a shell that completes a command line (``bash_source``, ``bash_complete``, zsh, fish alike)."""
     from click.shell_completion import shell_complete
 
+    from teds_provision.cli.completing import teach
+
+    LazyGroup.teach = staticmethod(teach)
     return shell_complete(cli, {}, "teds-provision", _COMPLETE, instruction)
 
 

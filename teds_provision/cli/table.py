@@ -21,6 +21,8 @@ SECTIONS: Final[dict[str, dict[str, Entry]]] = {
         "init": Entry("station.init", "init", "Make this base station's identity and CA key, or show them."),
         "trust": Entry("handover.trust", "trust", "Public keys of other stations and CAs that count here."),
         "profile": Entry("datasheet.profile", "profile", "Datasheets by transducer type: list, show, check, new."),
+        "config": Entry("station.config", "config", "What is set in config.toml and the environment: show, path."),
+        "completion": Entry("station.config", "completion", "What a shell needs to complete command lines."),
         "doctor": Entry("station.doctor", "doctor", "Look at reader, CAN, keyring, clock and store: cause and fix."),
     },
     "Nodes": {
@@ -73,5 +75,5 @@ SECTIONS: Final[dict[str, dict[str, Entry]]] = {
 }
 
 COMMANDS: Final = {name: entry for section in SECTIONS.values() for name, entry in section.items()}
-GROUPS: Final = frozenset({"draft", "vault", "group", "trust", "profile", "whitelist", "handover", "node"})
+GROUPS: Final = frozenset({"draft", "vault", "group", "trust", "config", "profile", "whitelist", "handover", "node"})
 """The commands that have commands of their own."""

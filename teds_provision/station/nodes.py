@@ -58,6 +58,10 @@ class Nodes:
         """The UUID that ``text`` (a UUID, a prefix of it, or a name) means; raises NotFound, UsageFailure."""
         return self._store.resolve(text)
 
+    def beginning_with(self, text: str, most: int) -> list[tuple[str, str]]:
+        """Names and UUIDs that begin with ``text``, each with what it is; for completing a command line."""
+        return self._store.beginning_with(text, most)
+
     def find(self, search: Search) -> list[bytes]:
         """UUIDs of the nodes that are meant, ascending; of all that is known, imported and merely listed ones too."""
         return self._store.find(search)

@@ -241,7 +241,7 @@ def test_config_toml_stands_for_options_and_the_command_line_goes_before_it(home
 
 def test_a_table_of_config_toml_serves_its_command_alone(home: Path) -> None:
     (home / "config.toml").write_text(
-        "[whitelist.add]\ndry-run = true\n[profile]\njson = false\n[identify]\nadd = true\n"
+        '[whitelist.add]\ndry-run = true\n[profile.new]\nextends = "smart-sensor"\n[identify]\nadd = true\n'
     )
     assert "Plan" in call(home, "whitelist", "add", ONE).out
     assert "1 new" in call(home, "whitelist", "add", ONE, "--name", "x").out

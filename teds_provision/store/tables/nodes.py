@@ -132,6 +132,24 @@ class NodeTables:
             raise UsageFailure(f"{asked!r} fits several nodes: {shown}{more}.", hint="Give more digits of the UUID.")
         return bytes(candidates[0])
 
+    def beginning_with(self, text: str, most: int) -> list[tuple[str, str]]:
+        """Return at most so many words that begin with ``text``, each with what it is: names, and UUIDs (20 digits)."""
+        found: dict[str, str] = {}
+        upper = text + "\U0010ffff"
+        digits = text.removeprefix("0x").lower()
+        for table in ("nodes", "whitelist"):
+            named = f"SELECT name, lower(hex(uuid)) FROM {table} WHERE name >= ? AND name < ? ORDER BY name LIMIT ?"
+            found.update((name, uuid) for name, uuid in self._database.execute(named, (text, upper, most)))
+            if re.fullmatch("[0-9a-f]{0,20}", digits):
+                low, high = (
+                    bytes.fromhex(digits.ljust(_UUID_DIGITS, "0")),
+                    bytes.fromhex(digits.ljust(_UUID_DIGITS, "f")),
+                )
+                within = f"SELECT lower(hex(uuid)), name FROM {table} WHERE uuid BETWEEN ? AND ? LIMIT ?"
+                rows = self._database.execute(within, (low, high, most))
+                found.update((uuid, name or found.get(uuid, "")) for uuid, name in rows)
+        return sorted(found.items())[:most]
+
     def all_named(self, name: str) -> list[bytes]:
         """Return the UUIDs of the nodes and whitelist entries that have exactly this name."""
         return sorted(bytes(uuid) for (uuid,) in self._database.execute(*_by_name(name)))

@@ -1,0 +1,146 @@
+"""Write what follows from the command line's own definitions: its option names, docs/configuration.md, the man page.
+
+Usage: python scripts/options.py [--check]. With --check it writes nothing and exits 1 where a file is out of date.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import click
+
+from teds_provision.cli.main import ENVIRONMENT_PREFIX, cli
+
+ROOT = Path(__file__).resolve().parent.parent
+
+
+def commands(group: click.Group = cli, path: str = "") -> Iterator[tuple[str, click.Command]]:
+    """Every command with its path (``whitelist add``); the program itself under ""."""
+    yield path, group
+    context = click.Context(group)
+    for name in group.list_commands(context):
+        command = group.get_command(context, name)
+        assert command is not None
+        inner = f"{path} {name}".strip()
+        if isinstance(command, click.Group):
+            yield from commands(command, inner)
+        else:
+            yield inner, command
+
+
+def options_of(command: click.Command) -> list[click.Option]:
+    """The options of a command that have a long name."""
+    found = [parameter for parameter in command.params if isinstance(parameter, click.Option) and not parameter.hidden]
+    return [option for option in found if _long(option)]
+
+
+def _long(option: click.Option) -> str:
+    return next((name[2:] for name in option.opts if name.startswith("--")), "")
+
+
+def option_names() -> str:
+    """The module that knows every option by name, so that config.toml is checked without loading any command."""
+    rows = []
+    for path, command in commands():
+        names = ", ".join(f'"{_long(option)}"' for option in options_of(command))
+        if names:
+            rows.append(f'    "{path}": frozenset({{{names}}}),')
+    return (
+        '"""The options of every command, by its path ("" for the program). Written by scripts/options.py."""\n\n'
+        "from __future__ import annotations\n\nfrom typing import Final\n\n# fmt: off\n"
+        "OPTIONS: Final[dict[str, frozenset[str]]] = {\n" + "\n".join(rows) + "\n}\n"
+    ).replace("# fmt: off\n", "# fmt: off\n# ruff: noqa: E501\n")
+
+
+def configuration() -> str:
+    """docs/configuration.md: every option, variable and key on one page."""
+    lines = [
+        "# Configuration",
+        "",
+        "Every option can stand on the command line, in an environment variable, or in `config.toml` in the home",
+        "(`teds-provision config path` says where). The command line goes before the variable, the variable before the",
+        "file.",
+        "No option and no variable holds a secret: passphrases come from a prompt, the keyring, or `--passphrase-fd`.",
+        "",
+        "```toml",
+        "# config.toml",
+        'can = "socketcan:can0?bitrate=500000"   # for every command that has --can',
+        "",
+        "[provision]                             # for provision alone",
+        'via = "can"',
+        "",
+        "[whitelist.add]                         # for a command of a group",
+        "dry-run = true",
+        "```",
+        "",
+        "A key that no command knows is an error that names its line. `teds-provision config show` lists what is set,",
+        "and where. Flags are `true` or `false` in the file, `1` or `0` in a variable. `make man` writes this page.",
+        "",
+    ]
+    for path, command in commands():
+        options = options_of(command)
+        if not options:
+            continue
+        lines += [f"## {path or 'Global options'}", "", "| option | variable | says |", "|---|---|---|"]
+        for option in options:
+            name = _long(option)
+            variable = f"`{ENVIRONMENT_PREFIX}_{name.replace('-', '_').upper()}`"
+            help_text = (option.help or "").replace("|", "\\|")
+            lines.append(f"| `--{name}` | {variable} | {help_text} |")
+        lines.append("")
+    return "\n".join(lines)
+
+
+def _roff(text: str) -> str:
+    return "\n".join(
+        ("\\&" + line if line.startswith((".", "'")) else line) for line in text.replace("\\", "\\e").splitlines()
+    ).replace("-", "\\-")
+
+
+def man_page() -> str:
+    """One page with every command, in the form of man(7)."""
+    out = ['.TH TEDS\\-PROVISION 1 "" "teds\\-provision" "User Commands"', ".SH NAME"]
+    out += ["teds\\-provision \\- identify, key, sign and write the datasheets of smart transducers"]
+    for path, command in commands():
+        title = f"teds-provision {path}".strip()
+        context = click.Context(command, info_name=title)
+        usage = " ".join(command.collect_usage_pieces(context))
+        out += [".SH " + ("SYNOPSIS" if not path else _roff(path.upper())), f".B {_roff(title)}", _roff(usage), ".PP"]
+        out.append(_roff((command.help or "").replace("\b", "").strip()))
+        for option in options_of(command):
+            names = ", ".join([*option.opts, *option.secondary_opts])
+            out += [".TP", f".B {_roff(names)}", _roff(option.help or "")]
+        if command.epilog:
+            out += [".PP", ".nf", _roff(command.epilog.replace("\b", "").strip()), ".fi"]
+    return "\n".join(out) + "\n"
+
+
+FILES = {
+    "teds_provision/cli/option_names.py": option_names,
+    "docs/configuration.md": configuration,
+    "man/teds-provision.1": man_page,
+}
+
+
+def main(arguments: list[str]) -> int:
+    """Write or check the files; return the exit code."""
+    stale = []
+    for name, make in FILES.items():
+        path, text = ROOT / name, make()
+        if path.exists() and path.read_text(encoding="utf-8") == text:
+            continue
+        stale.append(name)
+        if "--check" not in arguments:
+            path.parent.mkdir(exist_ok=True)
+            path.write_text(text, encoding="utf-8")
+    print(
+        "\n".join(f"{name} {'is out of date' if '--check' in arguments else 'written'}" for name in stale)
+        or "all up to date"
+    )
+    return 1 if stale and "--check" in arguments else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))

@@ -1,0 +1,130 @@
+"""``config.toml`` in the home: defaults for options, checked by name before anything runs.
+
+What stands outside of a table serves every command that has such an option; a table serves the command of its name, a
+table in it a command of that group. The names are those of the command line, with ``-`` or ``_``.
+"""
+
+from __future__ import annotations
+
+import re
+import tomllib
+from collections.abc import Iterator
+from difflib import get_close_matches
+from pathlib import Path
+from typing import Any, Final
+
+from teds_provision.cli.context import App
+from teds_provision.cli.option_names import OPTIONS
+from teds_provision.cli.table import COMMANDS, GROUPS
+from teds_provision.errors import BadData
+
+PARAMETERS: Final = {"json": "as_json", "format": "form", "to": "receivers", "all": "everything"}
+"""Options that the code calls otherwise than the command line does."""
+NEVER_IN_FILE: Final = frozenset({"home", "help", "version", "passphrase-fd"})
+_MOST_OCTETS: Final = 1 << 20
+
+
+class Defaults(dict[str, Any]):
+    """Values of config.toml: what stands outside of a table serves every command, a table the command of its name.
+
+    The same word may be an option and a command (``profile``), so a command is given plain values, never tables.
+    """
+
+    def get(self, key: str, default: Any = None) -> Any:
+        """Return the defaults of command ``key``, or the value of global option ``key``."""
+        if key not in COMMANDS:
+            return super().get(key, default)
+        return _of_command(self, key, GroupDefaults if key in GROUPS else dict)
+
+
+class GroupDefaults(dict[str, Any]):
+    """The values of a command that has commands of its own, which are all that it is asked for."""
+
+    def get(self, key: str, default: Any = None) -> Any:
+        """Return the defaults of command ``key``."""
+        return _of_command(self, key, dict)
+
+
+def _of_command(values: dict[str, Any], name: str, make: type[dict[str, Any]]) -> dict[str, Any]:
+    own = dict.get(values, name.replace("-", "_"))
+    common = {key: value for key, value in values.items() if not isinstance(value, dict)}
+    return make({**common, **(own if isinstance(own, dict) else {})})
+
+
+def as_parameters(values: dict[str, Any]) -> dict[str, Any]:
+    """Spell the keys as click names parameters, in every table."""
+    return {
+        PARAMETERS.get(name, name.replace("-", "_")): as_parameters(value) if isinstance(value, dict) else value
+        for name, value in values.items()
+    }
+
+
+def config_path(home: Path | None) -> Path:
+    """Where the file of a home lies."""
+    return App.home_of(home) / "config.toml"
+
+
+def read_config(path: Path) -> dict[str, Any] | None:
+    """Return what the file says, None where there is none; raises BadData with the line of what is wrong."""
+    try:
+        with path.open("rb") as file:
+            octets = file.read(_MOST_OCTETS + 1)
+    except FileNotFoundError:
+        return None
+    except OSError as error:
+        raise BadData(f"{path} cannot be read: {error.strerror}.", hint="Check its owner and mode.") from error
+    if len(octets) > _MOST_OCTETS:
+        raise BadData(f"{path} has more than 1 MiB.", hint="Mend or remove the file.")
+    try:
+        text = octets.decode()
+        values = tomllib.loads(text)
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError, RecursionError) as error:
+        raise BadData(f"{path} is not valid TOML: {error}.", hint="Mend or remove the file.") from error
+    for problem in problems(values, text):
+        raise BadData(f"{path}, {problem}", hint="teds-provision config show lists what there is.")
+    return values
+
+
+def problems(values: dict[str, Any], text: str) -> Iterator[str]:
+    """What is wrong with the names of a file, each with its line."""
+    anywhere = {option for options in OPTIONS.values() for option in options} - NEVER_IN_FILE
+    for name, value in values.items():
+        plain = name.replace("_", "-")
+        if isinstance(value, dict):
+            if plain in COMMANDS:
+                yield from _problems_of_command(plain, value, text)
+            else:
+                yield f"{_line(text, name)}: there is no command {name!r}.{_near(plain, COMMANDS)}"
+        elif plain not in anywhere:
+            yield f"{_line(text, name)}: no command has an option --{plain}.{_near(plain, anywhere)}"
+
+
+def _problems_of_command(command: str, values: dict[str, Any], text: str) -> Iterator[str]:
+    for name, value in values.items():
+        plain = name.replace("_", "-")
+        if isinstance(value, dict):
+            inner = f"{command} {plain}"
+            if inner in OPTIONS:
+                yield from _problems_of_command(inner, value, text)
+            else:
+                yield f"{_line(text, name)}: there is no command {inner!r}."
+        elif plain in NEVER_IN_FILE or plain not in _options_below(command):
+            yield f"{_line(text, name)}: {command} has no option --{plain}.{_near(plain, _options_below(command))}"
+
+
+def _options_below(command: str) -> set[str]:
+    below = (options for name, options in OPTIONS.items() if name == command or name.startswith(f"{command} "))
+    return {option for options in below for option in options}
+
+
+def _near(name: str, known: Any) -> str:
+    near = get_close_matches(name, list(known), n=1)
+    return f" Did you mean {near[0]!r}?" if near else ""
+
+
+def _line(text: str, name: str) -> str:
+    """The line on which a name first stands as a key or a table."""
+    for number, line in enumerate(text.splitlines(), 1):
+        if re.match(rf"\s*(\[[^\]]*)?['\"]?{re.escape(name)}['\"]?\s*(=|\]|\.)", line):
+            return f"line {number}"
+    return "line 1"

@@ -1,0 +1,57 @@
+"""The options of every command, by its path ("" for the program). Written by scripts/options.py."""
+
+from __future__ import annotations
+
+from typing import Final
+
+# fmt: off
+# ruff: noqa: E501
+OPTIONS: Final[dict[str, frozenset[str]]] = {
+    "": frozenset({"home", "json", "verbose", "quiet", "debug", "no-input", "passphrase-fd", "version"}),
+    "init": frozenset({"name", "keystore", "request", "certificate", "yes"}),
+    "trust add": frozenset({"from", "role", "yes", "dry-run"}),
+    "trust ca drop": frozenset({"yes"}),
+    "trust ca sign": frozenset({"output", "yes", "dry-run"}),
+    "trust remove": frozenset({"yes", "dry-run"}),
+    "profile new": frozenset({"extends", "output", "dry-run"}),
+    "doctor": frozenset({"nfc", "can"}),
+    "provision": frozenset({"profile", "calibration", "no-calibration", "name", "accept-calibration", "watch", "batch", "report", "all", "yes", "dry-run", "via", "nfc", "can", "ble", "timeout"}),
+    "identify": frozenset({"watch", "add", "via", "nfc", "can", "ble", "timeout"}),
+    "whitelist add": frozenset({"fingerprint", "name", "dry-run"}),
+    "whitelist export": frozenset({"format", "dry-run"}),
+    "whitelist import": frozenset({"format", "dry-run"}),
+    "whitelist remove": frozenset({"yes", "dry-run"}),
+    "agree": frozenset({"rotate", "yes", "dry-run", "via", "nfc", "can", "ble", "timeout"}),
+    "build": frozenset({"profile", "calibration", "no-calibration", "name", "accept-calibration", "output", "edition", "yes", "dry-run"}),
+    "sign": frozenset({"output", "read-node", "accept-calibration", "yes", "dry-run", "via", "nfc", "can", "ble", "timeout"}),
+    "write": frozenset({"image", "from", "sequence-jump", "yes", "dry-run", "via", "nfc", "can", "ble", "timeout"}),
+    "draft drop": frozenset({"yes", "dry-run"}),
+    "verify": frozenset({"accept-calibration", "via", "nfc", "can", "ble", "timeout"}),
+    "read": frozenset({"output", "via", "nfc", "can", "ble", "timeout"}),
+    "reset": frozenset({"yes", "dry-run", "via", "nfc", "can", "ble", "timeout"}),
+    "address": frozenset({"yes", "dry-run", "via", "nfc", "can", "ble", "timeout"}),
+    "nodes": frozenset({"state", "profile", "group", "due", "since", "fits", "format"}),
+    "label": frozenset({"output"}),
+    "log": frozenset({"follow", "last", "today", "since", "act", "failed"}),
+    "show": frozenset({"format", "edition", "diff", "plot", "strict"}),
+    "measure": frozenset({"rate", "duration", "channel", "kind", "trigger", "test-pattern", "to", "ros1", "ros2", "mqtt", "actuators", "dead-man", "require", "scalar-rate", "via", "nfc", "can", "ble", "timeout"}),
+    "sample": frozenset({"via", "nfc", "can", "ble", "timeout"}),
+    "set": frozenset({"unit", "hold", "dead-man", "via", "nfc", "can", "ble", "timeout"}),
+    "mode": frozenset({"via", "nfc", "can", "ble", "timeout"}),
+    "group add": frozenset({"dry-run"}),
+    "group create": frozenset({"dry-run"}),
+    "group delete": frozenset({"dry-run"}),
+    "group remove": frozenset({"dry-run"}),
+    "export-keys": frozenset({"to", "all", "mode", "output", "expires", "ca", "yes", "dry-run"}),
+    "import-keys": frozenset({"prove", "receipt", "yes", "dry-run", "via", "nfc", "can", "ble", "timeout"}),
+    "handover undo": frozenset({"yes", "dry-run"}),
+    "revoke": frozenset({"why", "lift", "yes", "dry-run"}),
+    "decommission": frozenset({"force", "yes", "dry-run", "via", "nfc", "can", "ble", "timeout"}),
+    "replace": frozenset({"copy-calibration", "yes", "dry-run", "via", "nfc", "can", "ble", "timeout"}),
+    "backup": frozenset({"to", "backup-passphrase-fd", "yes", "dry-run"}),
+    "vault passphrase": frozenset({"new-passphrase-fd", "dry-run"}),
+    "vault rewrap": frozenset({"yes", "dry-run"}),
+    "restore": frozenset({"recovery-key", "keystore", "backup-passphrase-fd", "yes", "dry-run"}),
+    "node create": frozenset({"uuid", "name", "teds", "profile", "max-message"}),
+    "node run": frozenset({"nfc", "tag", "can", "source", "crypto-delay", "flash-delay", "wait-time", "battery", "pace"}),
+}

@@ -1,0 +1,97 @@
+"""``config.toml``, ``config``, ``completion``: names and values are checked, sources told, words completed."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from .shell import call, clean_environment
+
+ROOT = Path(__file__).resolve().parents[2]
+UUID = "8d4d9da65281f7000000"
+
+
+def test_what_follows_from_the_command_line_is_up_to_date() -> None:
+    script = ROOT / "scripts" / "options.py"
+    if not script.exists():
+        pytest.skip("the scripts are not part of this installation")
+    environment = os.environ | {"PYTHONPATH": str(ROOT)}
+    done = subprocess.run(
+        [sys.executable, str(script), "--check"], env=environment, capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 0, f"{done.stdout}{done.stderr}Write them: make man"
+
+
+@pytest.mark.parametrize(
+    ("text", "told"),
+    [
+        ('cann = "x"', "line 1: no command has an option --cann. Did you mean 'can'?"),
+        ("[provisoin]\nyes = true", "line 1: there is no command 'provisoin'. Did you mean 'provision'?"),
+        ("[verify]\n\nprofile = 'x'", "line 3: verify has no option --profile."),
+        ("[whitelist.ad]\nname = 'x'", "there is no command 'whitelist ad'."),
+        ("passphrase-fd = 3", "line 1: no command has an option --passphrase-fd."),
+        ("can = ", "is not valid TOML"),
+    ],
+)
+def test_a_name_that_nothing_knows_is_an_error_with_its_line(home: Path, text: str, told: str) -> None:
+    (home / "config.toml").write_text(text)
+    done = call(home, "--json", "nodes")
+    assert done.code == 8
+    assert told in done.json["error"]["message"]
+
+
+def test_config_show_names_values_and_where_they_come_from(home: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (home / "config.toml").write_text('can = "socketcan:can9"\n[provision]\ntimeout = 5\n')
+    monkeypatch.setenv("TEDS_PROVISION_VIA", "can")
+    told = call(home, "--json", "config", "show").json["settings"]
+    assert {(row["name"], str(row["value"])) for row in told[1:]} == {
+        ("via", "can"),
+        ("can", "socketcan:can9"),
+        ("provision.timeout", "5"),
+    }
+    assert [row["source"] for row in told if row["name"] == "via"] == ["environment (TEDS_PROVISION_VIA)"]
+    assert call(home, "--json", "config", "path").json == {"path": str(home / "config.toml"), "exists": True}
+
+
+def test_a_bad_value_is_named_before_it_hurts(home: Path) -> None:
+    (home / "config.toml").write_text('[provision]\ntimeout = "soon"\n')
+    done = call(home, "--json", "config", "show")
+    assert (done.code, "provision.timeout = 'soon'" in done.json["error"]["message"]) == (8, True)
+
+
+@pytest.mark.parametrize("shell", ["bash", "zsh", "fish"])
+def test_each_shell_gets_its_lines(home: Path, shell: str) -> None:
+    assert "_TEDS_PROVISION_COMPLETE" in call(home, "completion", shell).out
+
+
+@pytest.mark.parametrize(
+    ("words", "offered"),
+    [
+        ("verify 8d", UUID),
+        ("verify fin", "finger"),
+        ("provision --profile accel", "accelerometer"),
+        ("white", "whitelist"),
+        ("agree --rot", "--rotate"),
+    ],
+)
+def test_a_shell_is_offered_what_fits(home: Path, words: str, offered: str) -> None:
+    assert call(home, "whitelist", "add", UUID, "--name", "finger").code == 0
+    line = f"teds-provision {words}"
+    asked = {
+        "_TEDS_PROVISION_COMPLETE": "bash_complete",
+        "COMP_WORDS": line,
+        "COMP_CWORD": str(len(line.split()) - 1),
+        "TEDS_PROVISION_HOME": str(home),
+    }
+    done = subprocess.run(
+        [sys.executable, "-m", "teds_provision"],
+        env=clean_environment() | asked,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert offered in [row.partition(",")[2] for row in done.stdout.splitlines()], done.stdout + done.stderr
