@@ -31,10 +31,10 @@ _COMPLETE = "_TEDS_PROVISION_COMPLETE"
 class LazyGroup(click.Group):
     """The top group: commands are imported when they are called, help comes from the table.
 
-    ``teach`` gets each command that is loaded; it does something where a shell completes a command line.
+    ``teachers`` get each command that is loaded: there is one where a shell completes a command line.
     """
 
-    teach: ClassVar[Callable[[click.Command], None]] = staticmethod(lambda _command: None)
+    teachers: ClassVar[list[Callable[[click.Command], None]]] = []
 
     def list_commands(self, ctx: click.Context) -> list[str]:
         """Names in the order of the table."""
@@ -49,7 +49,8 @@ class LazyGroup(click.Group):
         command = getattr(module, entry.attribute)
         assert isinstance(command, click.Command)
         _read_by_name(command)
-        self.teach(command)
+        for teach in self.teachers:
+            teach(command)
         return command
 
     def resolve_command(
@@ -192,7 +193,7 @@ def _complete(instruction: str) -> int:
 
     from teds_provision.cli.completing import teach
 
-    LazyGroup.teach = staticmethod(teach)
+    LazyGroup.teachers.append(teach)
     return shell_complete(cli, {}, "teds-provision", _COMPLETE, instruction)
 
 
