@@ -105,7 +105,8 @@ def _many(app: App, boards: Boards, questions: Questions, *, totals: bool) -> No
     with screen_for(app, boards) as screen:
         try:
             for board in boards.many(questions):
-                _tell_board(app, board)
+                if not screen.tells:
+                    _tell_board(app, board)
                 screen.ended(board)
         finally:
             screen.close()

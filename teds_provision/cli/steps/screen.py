@@ -53,7 +53,9 @@ def big(text: str) -> list[str]:
 
 
 class Screen(Protocol):
-    """Where the end of each board is shown."""
+    """Where the end of each board is shown; ``tells``: so that nothing else needs to be printed of it."""
+
+    tells: bool
 
     def ended(self, board: Board) -> None:
         """Show how it ended."""
@@ -64,6 +66,8 @@ class Screen(Protocol):
 
 class _Plain:
     """No screen: a pipe, --json, --quiet, or no sheet. The bell is for people alone."""
+
+    tells = False
 
     def ended(self, board: Board) -> None:
         """Lines were told already."""
@@ -76,6 +80,7 @@ class OperatorScreen:
     """Drawn anew after each board, on stderr."""
 
     def __init__(self, console: Console, boards: Boards) -> None:
+        self.tells = sys.stdout.isatty()  # a file or a pipe gets its lines all the same
         self._console, self._boards = console, boards
         self._last: deque[Board] = deque(maxlen=_LAST)
         self.draw(None)
