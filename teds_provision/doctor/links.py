@@ -11,6 +11,7 @@ import os
 import socket
 import stat
 import subprocess
+import time
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, Final
@@ -33,6 +34,7 @@ _ACR122U: Final = (0x072F, 0x2200)
 _ARPHRD_CAN: Final = 280  # linux/if_arp.h
 _IFF_UP: Final = 1
 _SENSES: Final = 8
+_LISTEN_SECONDS: Final = 0.5
 
 
 @check("nfc readers", "link")
@@ -91,10 +93,32 @@ def _pcscd(place: Place, found: bool) -> Iterator[Finding]:
             yield Finding(
                 "pcscd",
                 "warning" if found else "ok",
-                "pcscd is running; it takes the ACR122U and other readers for itself.",
-                "sudo systemctl stop pcscd.socket pcscd" if found else "",
+                "pcscd is running; it takes the ACR122U and other readers for itself: --nfc pcsc uses them through it.",
+                "sudo systemctl stop pcscd.socket pcscd, or use --nfc pcsc" if found else "",
             )
             return
+
+
+@check("pc/sc", "link")
+def pcsc(place: Place) -> Iterator[Finding]:
+    """Which PC/SC readers pcscd offers; a failure only where one was asked for."""
+    asked = (place.nfc or "").partition(":")[0] == "pcsc"
+    if place.system != Path("/"):
+        yield Finding("pc/sc", "skipped", "Another machine's folders are looked at.")
+        return
+    from teds_provision.links.nfc.pcsc import contactless, names
+
+    try:
+        found = contactless(names())
+    except NoReader as failure:
+        yield Finding("pc/sc", "failed" if asked else "skipped", failure.message, failure.hint if asked else "")
+        return
+    if found:
+        paths = ", ".join(f"--nfc 'pcsc:{name}'" for name in found)
+        yield Finding("pc/sc", "ok", f"Readers: {paths}.")
+    else:
+        fix = "Plug it in; pcsc_scan of the package pcsc-tools lists what pcscd sees" if asked else ""
+        yield Finding("pc/sc", "failed" if asked else "skipped", "pcscd sees no reader.", fix)
 
 
 @check("serial ports", "machine")
@@ -181,7 +205,17 @@ def can_interfaces(place: Place) -> Iterator[Finding]:
         else:
             yield Finding(name, "ok", f"{interface.name} is up{at}: --can socketcan:{interface.name}.")
     if not found:
-        yield Finding("can interfaces", "skipped", "The kernel has no CAN interface; other kinds of --can can be used.")
+        told = "no CAN interface" if _kernel_can() else "no CAN (modprobe can can_raw, where its modules are there)"
+        yield Finding("can interfaces", "skipped", f"The kernel has {told}; other kinds of --can can be used.")
+
+
+def _kernel_can() -> bool:
+    """Whether the kernel makes CAN sockets."""
+    try:
+        socket.socket(socket.AF_CAN, socket.SOCK_RAW, socket.CAN_RAW).close()
+    except (OSError, AttributeError):
+        return False
+    return True
 
 
 def _bitrate(place: Place, name: str) -> tuple[int, str]:
@@ -227,11 +261,12 @@ def _self_test(spec: str) -> tuple[bool, str, str]:
 
 @check("can", "link")
 def can(place: Place) -> Iterator[Finding]:
-    """Open the bus that was asked for, and listen for errors for a moment."""
+    """Open the bus that was asked for; listen a moment for errors, and for another station of our address."""
     if place.can is None:
         yield Finding("can", "skipped", "No bus was named, so none was opened.", "")
         return
     from teds_provision.links.can.bus import Bus
+    from teds_provision.links.can.rivals import Rivals
     from teds_provision.links.can.spec import parse_spec
 
     try:
@@ -239,14 +274,22 @@ def can(place: Place) -> Iterator[Finding]:
     except (LinkFailure, UsageFailure) as failure:
         yield Finding("can", "failed", failure.message, failure.hint)
         return
+    rivals = Rivals(bus.spec.source)
+    until = time.monotonic() + _LISTEN_SECONDS
     try:
-        bus.receive(0.2)
+        while (left := until - time.monotonic()) > 0:
+            frame = bus.receive(left)
+            if frame is not None:
+                rivals.heard(frame)
     except LinkFailure as failure:
         yield Finding("can", "failed", failure.message, failure.hint)
         return
     finally:
         bus.close()
-    yield Finding("can", "ok", f"{bus.spec.text} opens.")
+    if rivals.seen():
+        yield Finding("can", "warning", rivals.text, rivals.hint)
+    else:
+        yield Finding("can", "ok", f"{bus.spec.text} opens.")
 
 
 def _ids(device: Path) -> tuple[int, int]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import socket
 import sqlite3
 import time
@@ -15,6 +16,7 @@ from pathlib import Path
 
 import pytest
 
+import teds_provision.links
 from teds_provision.doctor import doctor
 from teds_provision.doctor import machine as doctor_machine
 from teds_provision.doctor.doctor import CHECKS, Finding, Place, examine, exit_code
@@ -85,7 +87,7 @@ def test_a_machine_without_anything_has_no_failure(place: Place, monkeypatch: py
 def test_the_registry_holds_every_check(place: Place) -> None:
     list(examine(place))
     machine = ["python", "libraries", "argon2id", "libusb", "clock"]
-    links = ["nfc readers", "serial ports", "nfc loopback", "nfc", "can interfaces", "can loopback", "can"]
+    links = ["nfc readers", "pc/sc", "serial ports", "nfc loopback", "nfc", "can interfaces", "can loopback", "can"]
     station = ["home", "disk", "store", "keyring", "vault", "keys folder", "store file", "nodes", "seals", "config"]
     assert sorted(CHECKS) == sorted(machine + links + station)
 
@@ -97,6 +99,12 @@ def test_the_known_readers_are_those_of_nfcpy() -> None:
     from teds_provision.links.nfc.library import nfc
 
     assert set(READERS) == set(nfc.clf.device.usb_device_map)
+
+
+def test_the_shipped_udev_rules_have_a_line_for_each_of_them() -> None:
+    rules = (Path(teds_provision.links.__file__).parent / "nfc" / "70-teds-provision-nfc.rules").read_text()
+    found = re.findall(r'^ATTR\{idVendor\}=="(....)", ATTR\{idProduct\}=="(....)", TAG', rules, re.MULTILINE)
+    assert {(int(vendor, 16), int(product, 16)) for vendor, product in found} == set(READERS)
 
 
 def test_a_free_reader_is_named_with_its_path(place: Place) -> None:

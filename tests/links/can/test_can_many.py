@@ -6,9 +6,12 @@ import os
 import threading
 import time
 from collections.abc import Callable
+from pathlib import Path
 
 import pytest
 
+from teds_provision.doctor import links as doctor
+from teds_provision.doctor.doctor import Place
 from teds_provision.errors import LinkFailure, UsageFailure
 from teds_provision.links import LINKS, LinkSettings, Notice, open_place, open_port
 from teds_provision.links.can.bus import Bus, Frame
@@ -170,3 +173,22 @@ def test_the_registry_opens_a_place_and_names_what_it_does_not_know(hub: Hub) ->
     with pytest.raises(UsageFailure, match="2 readers"):
         open_port(LinkSettings(nfc=("udp:localhost:7", "udp:localhost:8")))
     assert LinkSettings(nfc=("usb", "udp:localhost:8")).places == ("nfc:usb", "nfc:udp:localhost:8")
+
+
+def test_the_doctor_names_another_station_of_our_address_with_its_cure(hub: Hub, tmp_path: Path) -> None:
+    stop = threading.Event()
+
+    def talk() -> None:
+        while not stop.wait(0.02):
+            hub.send(0x18DA21F1, b"\x02\x01\x02\xcc\xcc\xcc\xcc\xcc")
+
+    thread = threading.Thread(target=talk)
+    thread.start()
+    try:
+        (found,) = list(doctor.can(Place(tmp_path, can=hub.spec)))
+        (other,) = list(doctor.can(Place(tmp_path, can=hub.spec + "&source=0xF2")))
+    finally:
+        stop.set()
+        thread.join()
+    assert (found.result, "source=0xF2" in found.fix) == ("warning", True)
+    assert other.result == "ok"
