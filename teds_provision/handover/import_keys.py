@@ -284,6 +284,7 @@ class _Arrivals:
 
     def take_in(self) -> None:
         """Write all of them."""
+        self.station.keys.refresh()
         taken, now = self.plan.taken, self.now
         back = [one.node.uuid for one in taken if one.node.uuid in self.resting]
         self.station.policy.take_back(back)

@@ -102,6 +102,7 @@ class NodeKeys:
         agree again and again fills no disk.
         """
         with self._store.transaction():
+            self.refresh()
             pending = [record for record in self._store.keys(uuid) if record.state == "pending"]
             for record in pending[MAX_PENDING - 1 :]:
                 self._store.remove_key(uuid, record.key_id)
@@ -111,15 +112,23 @@ class NodeKeys:
                 self.wrapped(uuid, key=key, key_id=key_id, epoch=epoch, slot=slot, source=source, created=utc_now())
             )
 
+    def refresh(self) -> None:
+        """Open the vault again where another process has changed the master key (vault rewrap).
+
+        To be called inside a transaction, before keys are wrapped in it: then no such change comes in between.
+        """
+        if self._identity.master not in self._vault().masters():
+            self._reopened()
+
     def wrapped(
         self, uuid: bytes, *, key: bytes, key_id: bytes, epoch: int, slot: int, source: KeySource, created: str
     ) -> KeyRecord:
-        """Return the record of a new pending key in a slot that the node never had; call it inside the transaction."""
+        """Return the record of a new pending key in a slot that the node never had.
+
+        To be called inside the transaction that keeps it, after :meth:`refresh`.
+        """
         context = node_key_context(self._store.id, uuid, epoch, slot)
-        vault = self._vault()
-        if self._identity.master not in vault.masters():  # another process has changed it (vault rewrap)
-            vault = self._reopened()
-        sealed = vault.wrap(key, context=context)
+        sealed = self._vault().wrap(key, context=context)
         return KeyRecord(uuid, epoch, key_id.hex(), "pending", slot, sealed, source, created)
 
     def unwrap(self, record: KeyRecord) -> bytes:
