@@ -220,7 +220,6 @@ def _between(uuid: bytes, meta: Meta, channels: list[Channel]) -> Iterator[Sheet
     if meta.channels is not None and meta.channels != len(described):
         message = f"The Meta-TEDS counts {meta.channels} channels; {len(described)} are described."
         yield SheetFinding(0, AccessCode.META, "warning", "channels", message)
-    names: dict[str, int] = {}
     for channel in channels:
         if channel.calibration_problem:
             yield SheetFinding(
@@ -229,11 +228,17 @@ def _between(uuid: bytes, meta: Meta, channels: list[Channel]) -> Iterator[Sheet
         if not channel.described:
             message = "There is a calibration, and nothing that describes the channel."
             yield SheetFinding(channel.number, AccessCode.CALIBRATION, "warning", "undescribed", message)
-        elif channel.name:
-            first = names.setdefault(channel.name, channel.number)
-            if first != channel.number:
-                message = f'Channels {first} and {channel.number} have the same name, "{channel.name}".'
-                yield SheetFinding(channel.number, AccessCode.NAME, "warning", "same-name", message)
+    yield from _same_names(described)
+
+
+def _same_names(channels: list[Channel]) -> Iterator[SheetFinding]:
+    """Channels that cannot be told apart by name."""
+    names: dict[str, int] = {}
+    for channel in channels:
+        first = names.setdefault(channel.name, channel.number) if channel.name else channel.number
+        if first != channel.number:
+            message = f'Channels {first} and {channel.number} have the same name, "{channel.name}".'
+            yield SheetFinding(channel.number, AccessCode.NAME, "warning", "same-name", message)
 
 
 def computable(calibration: Calibration) -> str:

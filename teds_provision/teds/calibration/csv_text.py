@@ -62,6 +62,21 @@ class _Columns:
 def read_csv(text: str, file: str, keys: Sequence[str]) -> CsvTable:
     """Read a calibration CSV; raises BadData naming file, line and field."""
     table = CsvTable(file)
+    data = _data_lines(table, text, keys)
+    delimiter = _delimiter(data[0][1])
+    lines = [(number, _cells(line, delimiter)) for number, line in data]
+    columns = _header(table, *lines[0])
+    lines = lines if columns is None else lines[1:]
+    known = columns or _unnamed(table, *lines[0])
+    table.rows = [_row(table, number, cells, known, delimiter != ",") for number, cells in lines]
+    if not table.rows:
+        raise BadData(f"{file}:{data[0][0]}: the file holds a header and no points.")
+    return table
+
+
+def _data_lines(table: CsvTable, text: str, keys: Sequence[str]) -> list[tuple[int, str]]:
+    """Lines that are neither empty nor comments, with their numbers; what comments say goes into the table."""
+    file = table.file
     check_size(len(text), LIMITS.text_file, file)
     data: list[tuple[int, str]] = []
     for number, line in enumerate(text.splitlines(), 1):
@@ -79,23 +94,17 @@ def read_csv(text: str, file: str, keys: Sequence[str]) -> CsvTable:
         raise BadData(f"{file}:{long}: the line has more than {_LINE} characters.")
     if len(data) > MAXIMUM_ROWS:
         raise BadData(f"{file}:{data[MAXIMUM_ROWS][0]}: more than {MAXIMUM_ROWS} lines.")
-    delimiter = _delimiter(data[0][1])
-    lines = [(number, _cells(line, delimiter)) for number, line in data]
-    columns = _header(table, *lines[0])
-    if columns is None:
-        columns = _Columns(("raw", "value"), (0, 1))
-        if len(lines[0][1]) != 2:
-            raise BadData(
-                f"{file}:{lines[0][0]}: {len(lines[0][1])} columns and no header.",
-                hint='Name them in the first line: "raw, value" or "channel, raw, value".',
-            )
-    else:
-        lines = lines[1:]
-    decimal_comma = delimiter != ","
-    table.rows = [_row(table, number, cells, columns, decimal_comma) for number, cells in lines]
-    if not table.rows:
-        raise BadData(f"{file}:{data[0][0]}: the file holds a header and no points.")
-    return table
+    return data
+
+
+def _unnamed(table: CsvTable, number: int, cells: list[str]) -> _Columns:
+    """Two columns without a header: raw value and value."""
+    if len(cells) != 2:
+        raise BadData(
+            f"{table.file}:{number}: {len(cells)} columns and no header.",
+            hint='Name them in the first line: "raw, value" or "channel, raw, value".',
+        )
+    return _Columns(("raw", "value"), (0, 1))
 
 
 def _metadata(table: CsvTable, line: str, number: int, keys: Sequence[str]) -> None:
@@ -139,11 +148,7 @@ def _number(text: str, *, decimal_comma: bool) -> float:
 
 def _header(table: CsvTable, number: int, cells: list[str]) -> _Columns | None:
     """Columns that a header names; None where the first line is data."""
-    try:
-        [_number(cell, decimal_comma=True) for cell in cells]
-    except (ValueError, OverflowError):
-        pass
-    else:
+    if all(map(_is_number, cells)):
         return None
     parts = [_UNIT.match(cell) for cell in cells]
     names = [match[1].lower() if match else "" for match in parts]
@@ -162,6 +167,14 @@ def _header(table: CsvTable, number: int, cells: list[str]) -> _Columns | None:
     if units[value]:
         table.unit = (units[value], number)
     return _Columns(("raw", "value"), (raw, value), channel)
+
+
+def _is_number(cell: str) -> bool:
+    try:
+        _number(cell, decimal_comma=True)
+    except (ValueError, OverflowError):
+        return False
+    return True
 
 
 def _segment_columns(table: CsvTable, number: int, names: list[str], channel: int | None) -> _Columns:

@@ -162,16 +162,16 @@ class ChannelInterpreter:
         assert curve is not None, "a channel without calibration is not inverted"
         parts = curve.calibration.inputs
         main = next((n for n, part in enumerate(parts) if part.channel == self.channel.number), 0)
-        own = curve.calibration
-        if self.channel.actuator:
-            low, high = (self._own_value(limit) for limit in self.limits)
-            known = math.isfinite(low) and math.isfinite(high)
-            ends = (min(low, high), max(low, high)) if known else None
-        else:
-            ends = own.raw_range or self.reader.form.raw_range
-        low, high = ends or (parts[main].boundaries[0], parts[main].boundaries[-1])
+        low, high = self._ends(curve) or (parts[main].boundaries[0], parts[main].boundaries[-1])
         step = 0.25 if self.reader.form.integer and not self.channel.actuator else 0.0
         return PreparedInverse(curve, low, high, main=main, step=step)
+
+    def _ends(self, curve: PreparedCurve) -> Range | None:
+        """Between which inputs of the curve its inverse is looked for; None where the datasheet sets no ends."""
+        if not self.channel.actuator:
+            return curve.calibration.raw_range or self.reader.form.raw_range
+        ends = [self._own_value(limit) for limit in self.limits]
+        return (min(ends), max(ends)) if all(map(math.isfinite, ends)) else None
 
     @cached_property
     def _way_back(self) -> PreparedInverse | None:
@@ -226,13 +226,13 @@ class ChannelInterpreter:
     def _limits(self) -> Range:
         """The narrower of the channel's limits (SI) and those of its calibration, in :attr:`unit`."""
         channel, own = self.channel, self.channel.calibration
-        lows, highs = [self.unit.from_si(channel.low)], [self.unit.from_si(channel.high)]
+        lows, highs = [channel.low], [channel.high]
         if own is not None:
-            given = [None if limit is None else own.unit.to_si(limit) for limit in (own.low_limit, own.high_limit)]
-            lows += [self.unit.from_si(limit) for limit in given[:1] if limit is not None]
-            highs += [self.unit.from_si(limit) for limit in given[1:] if limit is not None]
-        known_lows, known_highs = ([n for n in ends if math.isfinite(n)] for ends in (lows, highs))
-        return max(known_lows, default=-math.inf), min(known_highs, default=math.inf)
+            lows += [own.unit.to_si(own.low_limit)] if own.low_limit is not None else []
+            highs += [own.unit.to_si(own.high_limit)] if own.high_limit is not None else []
+        low = max(filter(math.isfinite, lows), default=-math.inf)
+        high = min(filter(math.isfinite, highs), default=math.inf)
+        return self.unit.from_si(low), self.unit.from_si(high)
 
     def _uncertainty(self) -> float | None:
         stated = self.channel.stated_uncertainty

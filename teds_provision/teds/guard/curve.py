@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Final
 
 from teds_provision.lazy import late
 from teds_provision.teds.calibration.formula import evaluate
-from teds_provision.teds.calibration.model import Calibration
+from teds_provision.teds.calibration.model import Calibration, CalibrationInput
 from teds_provision.teds.codec.model import Units
 from teds_provision.teds.image import BlockId
 from teds_provision.teds.sheet import described
@@ -175,19 +175,28 @@ def curve_of(
     unless ``dense``.
     """
     main = next((n for n, part in enumerate(calibration.inputs) if part.channel == channel.number), 0)
-    count = len(calibration.inputs)
-    terms = math.prod(part.degree + 1 for part in calibration.inputs)
-    each = SAMPLES if count == 1 else max(3, int(min(GRID, TERMS / terms) ** (1 / count)))
-    if count == 1 and not dense and _straight(calibration) and (also is None or _straight(also)):
-        each = 2
+    straight = not dense and _straight(calibration) and (also is None or _straight(also))
+    each = 2 if straight else _samples(calibration)
     axes = []
     for number, part in enumerate(calibration.inputs):
         source = channel if number == main else channels.get(part.channel)
-        edges = part.boundaries
-        if also is not None and len(also.inputs) == count:
-            edges = tuple(sorted({*edges, *also.inputs[number].boundaries}))
+        edges = _edges(part, also, number, len(calibration.inputs))
         axes.append(_axis(edges, source, each, channel.actuator and number == main, calibration.unit))
     return Curve(calibration, channel, tuple(axes), main)
+
+
+def _samples(calibration: Calibration) -> int:
+    """Samples of each input: many of one, of several so few that the whole grid stays affordable."""
+    count = len(calibration.inputs)
+    terms = math.prod(part.degree + 1 for part in calibration.inputs)
+    return SAMPLES if count == 1 else max(3, int(min(GRID, TERMS / terms) ** (1 / count)))
+
+
+def _edges(part: CalibrationInput, also: Calibration | None, number: int, count: int) -> tuple[float, ...]:
+    """Boundaries of an input, with those of the calibration that it is compared with."""
+    if also is None or len(also.inputs) != count:
+        return part.boundaries
+    return tuple(sorted({*part.boundaries, *also.inputs[number].boundaries}))
 
 
 def _straight(calibration: Calibration) -> bool:

@@ -118,14 +118,7 @@ class _Judge:
 
     def _damage(self, calibration: Calibration) -> Iterator[GuardFinding]:
         """Words that were erased, or boundaries without which nothing can be computed."""
-        each = math.prod(part.degree + 1 for part in calibration.inputs)
-        lists = [("coefficient", calibration.coefficients, each)]
-        for part in calibration.inputs:
-            lists += [("boundary", part.boundaries, 1), ("offset", part.offsets, 1)]
-        limits = [calibration.low_limit, calibration.high_limit, calibration.uncertainty]
-        lists.append(("limit", tuple(value for value in limits if value is not None and not math.isnan(value)), 1))
-        lists.append(("zero offset", (calibration.zero_offset,), 1))
-        for name, values, per_cell in lists:
+        for name, values, per_cell in _words(calibration):
             bad = next((n for n, value in enumerate(values) if _looks_erased(value)), None)
             if bad is not None:
                 where = f" (segment {bad // per_cell + 1})" if len(values) > per_cell else ""
@@ -169,6 +162,17 @@ class _Judge:
         except BadData:
             return None
         return None if any(True for _ in self._damage(calibration)) else calibration
+
+
+def _words(calibration: Calibration) -> Iterator[tuple[str, tuple[float, ...], int]]:
+    """Every Float32 of a calibration: what it is, the words, how many belong to one segment."""
+    yield "coefficient", calibration.coefficients, math.prod(part.degree + 1 for part in calibration.inputs)
+    for part in calibration.inputs:
+        yield "boundary", part.boundaries, 1
+        yield "offset", part.offsets, 1
+    limits = (calibration.low_limit, calibration.high_limit, calibration.uncertainty)
+    yield "limit", tuple(value for value in limits if value is not None and not math.isnan(value)), 1
+    yield "zero offset", (calibration.zero_offset,), 1
 
 
 def _looks_erased(value: float) -> bool:
