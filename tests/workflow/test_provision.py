@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -17,7 +18,7 @@ from teds_provision.errors import (
     PolicyRefused,
     TedsProvisionError,
 )
-from teds_provision.protocol.messages.frames import Reason
+from teds_provision.protocol.messages.frames import Command, Function, Reason, Reply, TedsFunction
 from teds_provision.protocol.messages.identity import NodeState
 from teds_provision.station.station import Station
 from teds_provision.steps.agree import require_session
@@ -252,3 +253,49 @@ def test_a_wrong_order_changes_nothing(station: Station, board: Board, tmp_path:
     assert wrong.value.exit_code in (2, 3, 8)
     assert board.state.state == NodeState.FACTORY
     assert station.pins.entry(board.uuid) is None
+
+
+def test_a_run_writes_as_little_as_its_promises_need(station: Station, board: Board) -> None:
+    """At most 8 durable commits for a whole provisioning; an idle one writes at most 4 rows and commits twice."""
+    said: list[str] = []
+    changes, rows = ("INSERT", "UPDATE", "DELETE", "REPLACE"), set[str]()
+
+    def told(statement: str) -> None:  # the trace repeats a statement that returns rows
+        if not (said and said[-1] == statement):
+            said.append(statement)
+
+    def commits() -> int:
+        made, dirty = 0, False
+        for statement in said:
+            dirty = dirty or statement.startswith(changes)
+            if statement.startswith("COMMIT"):
+                made, dirty = made + dirty, False
+        return made
+
+    station._store._database._connection.set_trace_callback(told)
+    run(station, board)
+    assert 0 < commits() <= 8
+    said.clear()
+    run(station, board, order=BuildOrder())
+    rows = {statement for statement in said if statement.startswith(changes)}
+    assert commits() <= 2
+    assert 0 < len(rows) <= 4, rows
+
+
+def test_nothing_is_read_twice_that_says_nothing_new(station: Station, board: Board) -> None:
+    """Identify is asked once in the session; the Security TEDS is read once before it and once after the commit."""
+    asked: list[tuple[int, int, bytes]] = []
+    handle = board.tim._known
+
+    def counted(command: Command, origin: Any) -> Reply:
+        asked.append((command.command_class, command.function, command.payload[:1]))
+        return handle(command, origin)
+
+    board.tim._known = counted  # type: ignore[method-assign]
+    assert run(station, board).verified.verdict == "authentic"
+    assert asked.count((128, Function.IDENTIFY, b"")) == 1, asked
+    assert asked.count((1, TedsFunction.READ, bytes([128]))) == 2, asked
+    asked.clear()
+    run(station, board, order=BuildOrder())
+    assert asked.count((128, Function.IDENTIFY, b"")) == 1, asked
+    assert asked.count((1, TedsFunction.READ, bytes([128]))) == 2, asked
