@@ -5,7 +5,7 @@ PYTHON ?= python3
 VENV ?= .venv
 BIN := $(VENV)/bin
 
-.PHONY: demo test lint types unit bench bench-teds bench-handover bench-scale fuzz faults model house man sbom clean
+.PHONY: demo test lint types unit bench bench-teds bench-handover bench-measure bench-scale fuzz faults model house man sbom clean
 
 demo: $(VENV)/.run
 	@$(BIN)/teds-provision demo
@@ -29,6 +29,10 @@ bench: $(VENV)/.dev
 
 bench-teds: $(VENV)/.dev
 	$(BIN)/python -m benchmarks.teds_codec
+
+bench-measure: $(VENV)/.dev
+	$(BIN)/python -m benchmarks.measure
+	$(BIN)/python -m benchmarks.sinks
 
 bench-handover: $(VENV)/.dev
 	$(BIN)/python -m benchmarks.handover

@@ -16,6 +16,7 @@ from teds_provision.measure.clock import ClockMap, Monotone, Wall
 from teds_provision.protocol.operation.stream_commands import Kind
 from teds_provision.protocol.operation.subscription import Message, Plan
 from teds_provision.teds.calibration.interpreter import ChannelInterpreter
+from teds_provision.teds.calibration.together import Together
 from teds_provision.teds.sheet import Sheet
 
 
@@ -40,6 +41,9 @@ class StreamInterpreter:
         self._since = 0.0
         present = set(plan.layout.channels)
         self.problems = {one.channel.number: _why_raw(one, present) for one in self._channels if _why_raw(one, present)}
+
+        usable = [one.channel.number not in self.problems for one in self._channels]
+        self._together = Together.of(self._channels, usable)
 
     @property
     def waiting_since(self) -> float:
@@ -90,6 +94,11 @@ class StreamInterpreter:
         )
 
     def _values(self, rows: np.ndarray, good: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        if self._together is not None:
+            raws = self._together.raw(rows)
+            value, valid = self._together.values(raws)
+            valid &= good[:, None]
+            return raws, np.where(valid, value, np.nan), valid
         columns = [one.reader.raw(rows[:, place]) for one, place in zip(self._channels, self._places, strict=True)]
         by_number = dict(zip(self._plan.layout.channels, columns, strict=True))
         value = np.full((len(rows), len(columns)), np.nan)

@@ -151,6 +151,16 @@ class ChannelInterpreter:
         text = f"{low:.6g} to {high:.6g} {self.unit.text}".strip()
         return f"{value:g} {self.unit.text} is beyond the limits of channel {self.channel.number}, {text}."
 
+    @property
+    def accepted(self) -> Range:
+        """Values in :attr:`unit` that are taken: the limits, widened by uncertainty and rounding."""
+        return self._floor, self._ceiling
+
+    @property
+    def shown_as_computed(self) -> bool:
+        """Whether the curve gives values in :attr:`unit` as they are."""
+        return self._same
+
     @cached_property
     def _curve(self) -> PreparedCurve | None:
         own = self.channel.calibration
