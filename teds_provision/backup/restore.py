@@ -189,6 +189,21 @@ def _opens_all(vault: Vault, content: Content) -> bool:
     return True
 
 
+def merge_sealed(store: Store, content: Content, vault: Vault, ask: Ask) -> Restored:
+    """Merge, and seal what a backup of version 0.1 brought without seals: that one is signed by this very station.
+
+    A store in which another program changed something gets no seal for anything that came. Raises as :func:`merge`.
+    """
+    station = Station(store, ask)
+    with store.transaction():
+        station.adopt(vault)
+        whole = not any(station.seals.all_broken())
+        done = merge(store, content, dry_run=False)
+        if whole:
+            station.seals.seal_what_has_none()
+    return done
+
+
 def merge(store: Store, content: Content, *, dry_run: bool) -> Restored:
     """Bring back into a living store what it lacks, in one transaction; ``dry_run`` tries it out and changes nothing.
 

@@ -132,7 +132,10 @@ class Seals:
             return  # a store of version 0.1 on a disk that takes nothing: it is read as that version read it
         self._key = vault.unwrap(facts.seal_key, context=self._context())
         if not self._holds(facts.mac, "station", *_facts(facts)):
-            raise changed(["the station's own key or CA"], "Restore a backup: teds-provision restore FILE")
+            raise changed(
+                ["the station's own key or CA"],
+                "Move store.sqlite3 away, then restore a backup: teds-provision restore FILE",
+            )
         self.broken_trust = tuple(
             record.name for record in self._store.trusted() if not self._holds(record.mac, "trust", *_trust(record))
         )

@@ -23,7 +23,7 @@ from teds_provision.backup import sealed_file as backup_file
 from teds_provision.backup.backup import BackedUp, backup
 from teds_provision.backup.chunks import CHUNK_OCTETS, ChunkReader, ChunkWriter
 from teds_provision.backup.content import Content, Head
-from teds_provision.backup.restore import Restored, complete_vault, merge, open_present, rebuild
+from teds_provision.backup.restore import Restored, complete_vault, merge, merge_sealed, open_present, rebuild
 from teds_provision.backup.sealed_file import SealedFile, Sealer
 from teds_provision.errors import (
     BadData,
@@ -631,6 +631,27 @@ def test_backups_of_version_1_still_open(tmp_path: Path) -> None:
         assert len(content.copy.nodes()) == 2
     with pytest.raises(WrongPassphrase):
         SealedFile(FIXTURES / "version-1.backup").open_with_passphrase("other words here")
+
+
+def test_what_a_backup_of_version_1_brings_into_a_sealed_store_is_sealed(tmp_path: Path) -> None:
+    with SealedFile(FIXTURES / "version-1.backup").open_with_passphrase(SEALED) as content:
+        rebuild(tmp_path / "home", content, ask, costs=THROWAWAY)
+        forget_vaults()
+        station = Station.open(tmp_path / "home", ask=ask)
+        station.unlock()  # takes it over
+        lost = station.pins.whitelist()[0].uuid
+        station.pins.remove(lost)
+    with SealedFile(FIXTURES / "version-1.backup").open_with_passphrase(SEALED) as content:
+        done = merge_sealed(station._store, content, station.vault, ask)
+    assert done.back["whitelist"] == 1
+    assert list(station.seals.all_broken()) == []
+    assert station.pins.entry(lost) is not None
+    station._store.put_whitelist(WhitelistEntry(b"\xee" * 10))  # by another program
+    station.pins.remove(lost)
+    with SealedFile(FIXTURES / "version-1.backup").open_with_passphrase(SEALED) as content:
+        merge_sealed(station._store, content, station.vault, ask)
+    assert f"the whitelist entry of {'ee' * 10}" in list(station.seals.all_broken())
+    station.close()
 
 
 class Octets:

@@ -168,7 +168,7 @@ def _require_place(home: Path, file: Path) -> None:
 
 
 def _merge(app: App, store: Store, content: Content, keystore: str | None, *, yes: bool, dry_run: bool) -> None:
-    from teds_provision.backup.restore import complete_vault, merge
+    from teds_provision.backup.restore import complete_vault, merge, merge_sealed
     from teds_provision.store import StoreLock
 
     plan = merge(store, content, dry_run=True)
@@ -182,8 +182,8 @@ def _merge(app: App, store: Store, content: Content, keystore: str | None, *, ye
     if plan.back:
         app.confirm("Bring this back?", yes=yes)
     with StoreLock(app.home, command="restore", notice=app.note):
-        complete_vault(store, content, app.ask_secret, keystore=keystore)
-        done = merge(store, content, dry_run=False)
+        vault = complete_vault(store, content, app.ask_secret, keystore=keystore)
+        done = merge_sealed(store, content, vault, app.ask_secret)
     _emit(app, content, done, "Brought back." if done.back else "The store lacks nothing of it (nothing to do).")
 
 
