@@ -133,8 +133,8 @@ def _last_entry(place: Place) -> datetime | None:
         return None
     try:
         with Store.open(place.home) as store:
-            stamps = [entry.at for entry in store.audit.entries()]
-        return datetime.strptime(max(stamps), "%Y-%m-%dT%H:%M:%SZ").replace(tzinfo=UTC) if stamps else None
+            latest = store.audit.latest()
+        return datetime.strptime(latest, "%Y-%m-%dT%H:%M:%SZ").replace(tzinfo=UTC) if latest is not None else None
     except (StoreFailure, ValueError):  # the checks of the store say so
         return None
 

@@ -101,6 +101,11 @@ class AuditLog:
         statement = f"SELECT * FROM audit WHERE seq > ?{terms} ORDER BY seq LIMIT ?"
         return self._database.stream(_entry, statement, after)
 
+    def latest(self) -> str | None:
+        """Return the latest moment that an entry names, None for an empty log."""
+        row = self._database.one("SELECT max(at) FROM audit")
+        return str(row[0]) if row is not None and row[0] is not None else None
+
     def before(self, choice: Choice, *, since: str | None = None, last: int | None = None) -> int:
         """Return the number of the entry before the first that is meant: seen ``since``, among the ``last`` of them.
 
