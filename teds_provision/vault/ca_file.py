@@ -17,6 +17,8 @@ from teds_provision.files import read_limited, write_new
 from teds_provision.vault.passphrase import check_new
 
 ROUNDS: Final = 600_000
+MAX_ROUNDS: Final = 10_000_000
+"""Some seconds: the number stands in a file that nobody has vouched for yet."""
 _MAX_OCTETS: Final = 16 * 1024
 _LABEL: Final = "ENCRYPTED PRIVATE KEY"
 # DER of the object identifiers, tag and length included (RFC 8018 appendix C, RFC 3565).
@@ -51,6 +53,7 @@ def read_ca(path: Path, passphrase: str) -> bytes:
     pem = read_limited(path, _MAX_OCTETS, "CA key", failure=VaultFailure)
     if _LABEL.encode() not in pem:
         raise VaultFailure(f"{path} holds no encrypted private key in PEM.", hint="Give the file of the CA's export.")
+    _check_costs(path, pem)
     try:
         key = load_pem_private_key(pem, passphrase.encode("utf-8", "surrogateescape"))
     except (ValueError, TypeError):  # a wrong passphrase and a damaged file look alike
@@ -60,6 +63,36 @@ def read_ca(path: Path, passphrase: str) -> bytes:
     if not isinstance(key, ec.EllipticCurvePrivateKey) or not isinstance(key.curve, ec.SECP256R1):
         raise VaultFailure(f"{path} holds no P-256 key.", hint="Give the file of the CA's export.")
     return key.private_numbers().private_value.to_bytes(32, "big")
+
+
+def _check_costs(path: Path, pem: bytes) -> None:
+    """Refuse what would take minutes before the passphrase is even tried: only PBES2 with PBKDF2, with bounded rounds."""
+    text = b"".join(line for line in pem.split(b"\n") if not line.startswith(b"-----")).strip()
+    try:
+        der = base64.b64decode(text, validate=False)
+    except ValueError:
+        der = b""
+    place = der.find(_PBKDF2)
+    rounds = _rounds(der[place + len(_PBKDF2) :]) if _PBES2 in der and place >= 0 else 0
+    if not 0 < rounds <= MAX_ROUNDS:
+        raise VaultFailure(
+            f"{path} is sealed in a way that this tool does not open.",
+            hint=f"Seal it with PBES2 and PBKDF2 of at most {MAX_ROUNDS:,} rounds: openssl pkcs8 -topk8 -v2 aes256",
+        )
+
+
+def _rounds(parameters: bytes) -> int:
+    """The iteration count of PBKDF2-params (RFC 8018 appendix A.2); 0 where it is none."""
+    try:
+        salt = 2 if parameters[1] < 0x80 else 2 + (parameters[1] & 0x7F)
+        if parameters[0] != _SEQUENCE or parameters[salt] != _OCTETS or parameters[salt + 1] >= 0x80:
+            return 0
+        number = salt + 2 + parameters[salt + 1]
+        if parameters[number] != _INTEGER or parameters[number + 1] > 8:
+            return 0
+        return int.from_bytes(parameters[number + 2 : number + 2 + parameters[number + 1]], "big")
+    except IndexError:
+        return 0
 
 
 def _plain_der(secret: bytes) -> bytes:
