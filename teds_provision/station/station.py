@@ -56,6 +56,7 @@ class Station:
         self._turn, self._held = threading.RLock(), 0
         self.notice: Callable[[str], object] = lambda text: None
         """Told in one sentence whom this station waits for."""
+        store.when_waiting(lambda text: self.notice(text))  # noqa: PLW0108 - it is replaced later
         self.seals = Seals(store, self._opened, tell)
         self.identity = Identity(store, self._opened, self.seals)
         self.keys = NodeKeys(store, self._opened, self.identity, self.seals, self._reopened)

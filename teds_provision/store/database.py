@@ -24,6 +24,7 @@ from teds_provision.store.schema import APPLICATION_ID, SCHEMA_VERSION, STEPS_TO
 
 FILE_NAME = "store.sqlite3"
 BUSY_SECONDS = 10.0
+_QUIET_MILLISECONDS = 300
 _PAGE = 500
 _RESTORE = "Restore a backup (teds-provision restore), or move the file away and run teds-provision init."
 
@@ -78,6 +79,8 @@ class Database:
         self._connection = connection
         self._lock = threading.RLock()
         self._depth = 0
+        self.notice: Callable[[str], object] | None = None
+        """Told, in a sentence, what a change of the store waits for."""
         self._frozen: StoreFailure | None = None
         """Why nothing can be written; what is read then comes from a private copy."""
 
@@ -203,7 +206,7 @@ class Database:
                 if level == 0
                 else (f"SAVEPOINT s{level}", f"RELEASE s{level}", (f"ROLLBACK TO s{level}", f"RELEASE s{level}"))
             )
-            self.execute(begin)
+            self._begin(begin)
             self._depth += 1
             try:
                 yield
@@ -215,6 +218,21 @@ class Database:
                 raise
             finally:
                 self._depth -= 1
+
+    def _begin(self, statement: str) -> None:
+        """Begin; where another process is writing and does not end soon, say what is waited for and until when."""
+        if self._depth or self.notice is None:
+            self.execute(statement)
+            return
+        self.execute(f"PRAGMA busy_timeout={_QUIET_MILLISECONDS}")
+        try:
+            self.execute(statement)
+            return
+        except StoreLocked:
+            self.notice(f"Waiting up to {BUSY_SECONDS:.0f} s for another process that is writing to the store.")
+        finally:
+            self.execute(f"PRAGMA busy_timeout={BUSY_SECONDS * 1000:.0f}")
+        self.execute(statement)
 
     def _damaged(self) -> StoreFailure:
         cause, cure = _CAUSES[sqlite3.SQLITE_CORRUPT]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import secrets
+from collections.abc import Callable
 from contextlib import AbstractContextManager
 from pathlib import Path
 from types import TracebackType
@@ -79,6 +80,10 @@ class Store(
     def transaction(self) -> AbstractContextManager[None]:
         """All of the block or nothing of it; may stand inside another one."""
         return self._database.transaction()
+
+    def when_waiting(self, notice: Callable[[str], object]) -> None:
+        """Have ``notice`` told, in a sentence, when a change has to wait for another process."""
+        self._database.notice = notice
 
     def version(self) -> int:
         """Return a number that changes when another connection has changed the file."""

@@ -66,7 +66,7 @@ def read_ca(path: Path, passphrase: str) -> bytes:
 
 
 def _check_costs(path: Path, pem: bytes) -> None:
-    """Refuse what would take minutes before the passphrase is even tried: only PBES2 with PBKDF2, with bounded rounds."""
+    """Refuse what would take minutes before the passphrase is tried: only PBES2 with PBKDF2 and bounded rounds."""
     text = b"".join(line for line in pem.split(b"\n") if not line.startswith(b"-----")).strip()
     try:
         der = base64.b64decode(text, validate=False)

@@ -776,3 +776,20 @@ def test_the_age_of_a_backup() -> None:
     made = Head("id", POINT, "n", "2026-01-01T00:00:00Z", "file", "")
     assert made.age_days(datetime(2026, 1, 13, 12, tzinfo=UTC)) == 12
     assert replace(made, created="yesterday").age_days() == 0
+
+
+def test_a_backup_beside_a_writer_of_the_file_itself_says_what_it_waits_for(
+    station: Station, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Not one of our commands: a program that holds SQLite's own lock."""
+    told: list[str] = []
+    station.notice = told.append
+    monkeypatch.setattr("teds_provision.store.database.BUSY_SECONDS", 0.5)
+    with closing(sqlite3.connect(station.home / "store.sqlite3", isolation_level=None)) as other:
+        other.execute("BEGIN IMMEDIATE")
+        with pytest.raises(StoreLocked):
+            back_up(station, tmp_path / "b")
+        assert told == ["Waiting up to 0 s for another process that is writing to the store."]
+        assert not (tmp_path / "b").exists()
+        other.execute("ROLLBACK")
+    assert back_up(station, tmp_path / "b").nodes == 2
