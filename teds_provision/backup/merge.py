@@ -118,7 +118,9 @@ class Merge:
                 self.kept["keys of revoked or moved nodes left out"] += 1
             elif newest is None or record.epoch > newest:
                 # Beside a key that is held it comes as pending: an Open under it decides, and drops the other.
-                self.live.add_key(replace(record, state="pending") if record.uuid in self.held else record)
+                self.live.add_key(
+                    replace(record, state="pending", source="import") if record.uuid in self.held else record
+                )
                 self.back["keys"] += 1
             else:
                 self.kept["older keys left out"] += 1

@@ -99,7 +99,7 @@ def _shown(found: list[Candidate]) -> str:
         if one.certificate is not None:
             from teds_provision.protocol.keys import fingerprint
 
-            lines.append(f"  certified by the CA {fingerprint(one.certificate.ca)[:16]}")
+            lines.append(f"  certified by the CA {fingerprint(one.certificate.ca)[:32]}")
     return "\n".join(lines)
 
 
