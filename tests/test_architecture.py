@@ -214,3 +214,17 @@ def test_a_command_at_a_node_is_one_call_of_one_step() -> None:
         }
         assert len(acts) <= commands + _MORE_ACTS.get(path.stem, 0), f"{path.name}: {sorted(acts)}"
         assert not {module for module, _ in acts if module.split(".")[0] in ("talk", "links")}, path.name
+
+
+def test_nothing_outside_the_station_reaches_past_it_into_the_store() -> None:
+    """Its parts (identity, keys, pins, policy, nodes, groups, handovers) are the doors."""
+    wrong = [
+        f"{name_of(path)}:{node.lineno}"
+        for path in MODULES
+        if room_of(path) != "station"
+        for node in ast.walk(parsed(path))
+        if isinstance(node, ast.Attribute)
+        and (node.attr == "_store" or (node.attr == "store" and getattr(node.value, "id", "") == "station"))
+        and getattr(node.value, "id", "") != "self"
+    ]
+    assert not wrong

@@ -8,9 +8,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from teds_provision.store import Draft, Store
+from teds_provision.store import Draft, NodeRecord, Store
 from teds_provision.store.packing import packed, unpacked
 from teds_provision.teds.image import Image
+from teds_provision.teds.profile import load_profile
 
 NODE = bytes.fromhex("0102030405060708090a")
 BLOCKS = st.dictionaries(st.tuples(st.integers(0, 0xFFFF), st.integers(0, 255)), st.binary(max_size=300), max_size=12)
@@ -67,3 +68,24 @@ def test_drafts_of_all_nodes_are_listed_and_dropped_one_by_one(store: Store) -> 
     assert store.drop_draft(NODE)
     assert not store.drop_draft(NODE)
     assert [draft.uuid for draft in store.drafts()] == [other]
+
+
+def test_a_node_costs_little_in_the_file(store: Store) -> None:
+    """Issue 13 row 12: 5 kB with one datasheet, 2 kB for each older one; signatures and digests do not deflate."""
+    blocks = load_profile("tactile-finger-sensor").build(NODE).blocks
+    nodes = 40
+
+    def pages() -> int:
+        return int(store._database.execute("PRAGMA page_count")[0][0]) * 4096
+
+    def keep(version: int) -> int:
+        before = pages()
+        with store.transaction():
+            for number in range(nodes):
+                image = Image(bytes([number]) * 10, {**blocks, (0, 128): os.urandom(1200), (0, 12): bytes([version])})
+                store.put_node(NodeRecord(image.uuid, name=f"node {number}"))
+                store.put_datasheet(image, "tactile-finger-sensor")
+        return (pages() - before) // nodes
+
+    assert keep(0) <= 5000
+    assert max(keep(version) for version in range(1, 4)) <= 2000
