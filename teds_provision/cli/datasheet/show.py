@@ -12,21 +12,26 @@ import click
 
 from teds_provision.cli.context import App, pass_app
 from teds_provision.cli.context import to_json as dumps
-from teds_provision.cli.datasheet.show_files import guard_to_json, load, placed
-from teds_provision.cli.datasheet.show_json import to_json
-from teds_provision.cli.datasheet.show_table import print_files
 from teds_provision.cli.options import command
 from teds_provision.errors import BadData, UsageFailure
 from teds_provision.harmless import harmless
-from teds_provision.teds.diff.datasheets import diff_blocks
-from teds_provision.teds.formats import lost, write_blocks
-from teds_provision.teds.guard.guard import check_calibration
-from teds_provision.teds.show.plot import plot_blocks
+from teds_provision.lazy import late
 
 if TYPE_CHECKING:
+    from teds_provision.cli.datasheet import show_files, show_json, show_table
     from teds_provision.cli.datasheet.show_files import ShownFile
+    from teds_provision.teds import formats
     from teds_provision.teds.codec.model import Edition
+    from teds_provision.teds.diff import datasheets
     from teds_provision.teds.formats import Format
+    from teds_provision.teds.guard import guard
+    from teds_provision.teds.show import plot as plots
+else:  # the help of this command needs none of them
+    show_files, show_json, show_table = (
+        late(f"teds_provision.cli.datasheet.{name}") for name in ("show_files", "show_json", "show_table")
+    )
+    formats, datasheets = late("teds_provision.teds.formats"), late("teds_provision.teds.diff.datasheets")
+    guard, plots = late("teds_provision.teds.guard.guard"), late("teds_provision.teds.show.plot")
 
 CHOICES = ["table", "json", "xml", "hex", "ihex", "toml", "binary", "image"]
 _BAD_DATA = BadData.exit_code
@@ -72,7 +77,7 @@ def show(
     if app.json and form not in {"table", "json"}:
         raise UsageFailure("--json and --format ask for different outputs.", hint="Leave one of them out.")
     wanted = cast("Edition", int(edition)) if edition else None
-    shown = [load(name, wanted) for name in files]
+    shown = [show_files.load(name, wanted) for name in files]
     if plot is not None:
         _plot(app, shown, plot)
     _tell(app, shown, form)
@@ -84,10 +89,10 @@ def _tell(app: App, files: Sequence[ShownFile], form: str) -> None:
         for note in file.notes:
             app.note(f"{file.name}: {note}")
     if app.json or form == "json":
-        result = to_json(files)
+        result = show_json.to_json(files)
         print(dumps(result, indent=None if app.json else 1), flush=True)
     elif form == "table":
-        print_files(app.console(), files)
+        show_table.print_files(app.console(), files)
     else:
         _convert(app, files, cast("Format", form))
 
@@ -101,10 +106,10 @@ def _convert(app: App, files: Sequence[ShownFile], form: Format) -> None:
                 if finding.severity == "error":
                     app.warn(f"{file.name}: {finding.message}")
     blocks = [block for file in files for block in file.blocks]
-    written = write_blocks(blocks, form)
+    written = formats.write_blocks(blocks, form)
     if isinstance(written, bytes) and sys.stdout.isatty():
         raise UsageFailure("Octets are not for a terminal.", hint="Send them to a file: … --format binary > FILE")
-    for sentence in lost(blocks, form):
+    for sentence in formats.lost(blocks, form):
         app.warn(f"{form} cannot hold {sentence}")
     if isinstance(written, str) and sys.stdout.isatty():
         written = harmless(written)
@@ -124,23 +129,23 @@ def _judge(files: Sequence[ShownFile], strict: bool) -> None:
 
 
 def _diff(app: App, before: str, after: str, *, as_json: bool) -> None:
-    old, new = (placed(load(name).blocks) for name in (before, after))
-    changes = diff_blocks(old, new)
-    guard = check_calibration(new, old)
+    old, new = (show_files.placed(show_files.load(name).blocks) for name in (before, after))
+    changes = datasheets.diff_blocks(old, new)
+    judged = guard.check_calibration(new, old)
     result = {
         "changes": [asdict(change) for change in changes],
-        "guard": [guard_to_json(finding) for finding in guard],
+        "guard": [show_files.guard_to_json(finding) for finding in judged],
     }
     if as_json and not app.json:
         print(dumps(result, indent=1), flush=True)
         return
     lines = [change.text for change in changes] or ["no difference"]
-    lines += [f"{finding.severity}: guard, channel {finding.channel}: {finding.message}" for finding in guard]
+    lines += [f"{finding.severity}: guard, channel {finding.channel}: {finding.message}" for finding in judged]
     app.emit(result, lambda console: console.print("\n".join(lines), markup=False))
 
 
 def _plot(app: App, files: Sequence[ShownFile], path: Path) -> None:
     if len(files) != 1:
         raise UsageFailure("A plot shows the calibrations of one file.", hint="Call show once for each.")
-    channels = plot_blocks(placed(files[0].blocks), path)
+    channels = plots.plot_blocks(show_files.placed(files[0].blocks), path)
     app.note(f"Drawn in {path}: channel {', '.join(map(str, channels))}.")
