@@ -112,7 +112,8 @@ def check_sheet(data: bytes) -> None:
         channel.show(channel.low)
         with suppress(TedsProvisionError):
             interpreter = ChannelInterpreter(sheet, channel.number)
-            other = {n: bytes(3 * s.octets) for n in interpreter.others if (s := sheet.channel(n).sample)}  # type: ignore[union-attr]
+            known = {channel.number: channel.sample for channel in sheet.channels}
+            other = {n: bytes(3 * form.octets) for n in interpreter.others if (form := known.get(n))}
             values = interpreter.decode(b"\x7f" * (3 * interpreter.octets), other)
             assert len(values.value) == 3
             interpreter.encode(1.0)
