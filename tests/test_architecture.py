@@ -37,7 +37,7 @@ ARROWS = {
     "measure": _BELOW_TALK | {"talk", "steps", "handover"},
     "backup": {"station", "vault", "store", "protocol", "teds"},
     "doctor": {"station", "links", "vault", "store", "protocol", "teds"},
-    "demo": _BELOW_TALK | {"talk", "steps", "handover"},
+    "demo": _BELOW_TALK | {"talk", "steps", "handover", "measure"},
     "cli": _BELOW_TALK | {"talk", "steps", "handover", "backup", "doctor", "demo", "node", "measure"},
     "__main__": {"cli"},
 }

@@ -19,6 +19,14 @@ from pathlib import Path
 
 from teds_provision.demo.desk import Demo
 from teds_provision.demo.handover import hand_over
+from teds_provision.demo.measuring import (
+    GRIPPER,
+    calibrate_sensor,
+    calibrations,
+    measure_group,
+    move_gripper,
+    provision_gripper,
+)
 from teds_provision.errors import LinkFailure
 from teds_provision.station.station import Station, initialise
 from teds_provision.steps.build import BuildOrder
@@ -56,7 +64,7 @@ def _run(demo: Demo) -> DemoDone:
     demo.say("Two base stations, each with its own keys, and a sensor on a reader (a process of its own).")
     first, second = _station(demo, "bench"), _station(demo, "crane")
     with demo.steps.step("start node") as step:
-        demo.uuid = demo.stack.enter_context(_node(demo.folder / "node", demo.nfc, demo.can))
+        demo.uuid = demo.stack.enter_context(_node(demo, "node", PROFILE, "--nfc", demo.nfc))
         step.detail = f"{demo.uuid.hex()} on {demo.nfc} and {demo.can}"
     demo.say("Tap: station bench provisions the sensor over NFC.")
     done = _provision(demo, first)
@@ -64,7 +72,22 @@ def _run(demo: Demo) -> DemoDone:
     _over_can(demo, first)
     demo.say("Hand over: crane gets a copy of the key, then bench gives the sensor away for good.")
     hand_over(demo, first, second)
+    demo.say(
+        "Measure: crane calibrates the sensor, takes up a gripper on the same bus, records both, moves the gripper."
+    )
+    _measure(demo, second)
     return DemoDone(tuple(demo.steps.done), done.verified.verdict, demo.uuid)
+
+
+def _measure(demo: Demo, station: Station) -> None:
+    files = calibrations(demo.folder)
+    with demo.steps.step("start node") as step:
+        gripper = demo.stack.enter_context(_node(demo, "gripper", GRIPPER))
+        step.detail = f"{gripper.hex()}, a gripper on {demo.can}"
+    provision_gripper(demo, station, gripper, files[GRIPPER])
+    calibrate_sensor(demo, station, files["angle"])
+    measure_group(demo, station, (demo.uuid, gripper))
+    move_gripper(demo, station, gripper)
 
 
 def _station(demo: Demo, name: str) -> Station:
@@ -103,14 +126,19 @@ def _over_can(demo: Demo, station: Station) -> None:
 
 
 @contextmanager
-def _node(folder: Path, nfc: str, can: str) -> Iterator[bytes]:
+def _node(demo: Demo, name: str, profile: str, *links: str) -> Iterator[bytes]:
     """A virtual transducer in a process of its own, while the context lasts; gives its UUID."""
+    folder = demo.folder / f"{name}-flash"
     command = [sys.executable, "-m", "teds_provision", "--json", "node"]
-    made = subprocess.run([*command, "create", str(folder)], capture_output=True, text=True, check=False)
+    made = subprocess.run(
+        [*command, "create", str(folder), "--profile", profile], capture_output=True, text=True, check=False
+    )
     if made.returncode:
         raise _failure("The virtual node could not be made", made.stdout)
     process = subprocess.Popen(
-        [*command, "run", str(folder), "--nfc", nfc, "--can", can], stdout=subprocess.PIPE, text=True
+        [*command, "run", str(folder), *links, "--can", demo.can, "--source", "sine:4"],
+        stdout=subprocess.PIPE,
+        text=True,
     )
     try:
         yield _ready(process)

@@ -24,7 +24,7 @@ def test_an_ended_demo_takes_its_node_and_its_folder_away(tmp_path: Path, number
     )
     try:
         until = time.monotonic() + 30
-        while not list(tmp_path.glob("*/node/lock")):  # the node runs
+        while not list(tmp_path.glob("*/node-flash/lock")):  # the node runs
             assert time.monotonic() < until
             assert process.poll() is None
             time.sleep(0.02)
