@@ -224,15 +224,20 @@ class Database:
         if self._depth or self.notice is None:
             self.execute(statement)
             return
-        self.execute(f"PRAGMA busy_timeout={_QUIET_MILLISECONDS}")
         try:
+            self.execute(f"PRAGMA busy_timeout={_QUIET_MILLISECONDS}")
+            try:
+                self.execute(statement)
+                return
+            except StoreLocked:
+                self.notice(f"Waiting up to {BUSY_SECONDS:.0f} s for another process that is writing to the store.")
+            finally:
+                self.execute(f"PRAGMA busy_timeout={BUSY_SECONDS * 1000:.0f}")
             self.execute(statement)
-            return
-        except StoreLocked:
-            self.notice(f"Waiting up to {BUSY_SECONDS:.0f} s for another process that is writing to the store.")
-        finally:
-            self.execute(f"PRAGMA busy_timeout={BUSY_SECONDS * 1000:.0f}")
-        self.execute(statement)
+        except BaseException:  # interrupted between BEGIN and the block that would roll it back
+            if self._connection.in_transaction:
+                self._connection.execute("ROLLBACK")
+            raise
 
     def _damaged(self) -> StoreFailure:
         cause, cure = _CAUSES[sqlite3.SQLITE_CORRUPT]

@@ -751,7 +751,7 @@ def test_a_backup_beside_a_stuck_writer_says_so_and_leaves_no_file(
     told: list[str] = []
     held = station.lock("provision")
     monkeypatch.setattr(
-        Station, "lock", lambda self, command, notice: StoreLock(self.home, command=command, wait=0.1, notice=notice)
+        Station, "lock", lambda self, command, notice: StoreLock(self.home, command=command, wait=1.0, notice=notice)
     )
     before = station.audit_log.check().count
     with held, pytest.raises(StoreLocked):
