@@ -69,7 +69,7 @@ def read_config(path: Path) -> dict[str, Any] | None:
     try:
         with path.open("rb") as file:
             octets = file.read(_MOST_OCTETS + 1)
-    except FileNotFoundError:
+    except (FileNotFoundError, NotADirectoryError):  # a home that cannot be one: whoever opens it says so
         return None
     except OSError as error:
         raise BadData(f"{path} cannot be read: {error.strerror}.", hint="Check its owner and mode.") from error
