@@ -10,6 +10,9 @@ Node side (:class:`NodeDevice`)
     * an answer is not sent when a newer command already waits;
     * a SENS_REQ while activated ends the activation and is then served: the reader before was killed.
 
+Both sides
+    * a port that has a name in /etc/services can be used.
+
 Reader side (:class:`ReaderDevice`)
     * answers that came after their time-out are dropped before the next command;
     * time-outs below 0.05 s are 0.1 s (the other side is a process on a busy machine);
@@ -61,6 +64,12 @@ def frontend(device: Any, path: str) -> Any:
     return clf
 
 
+def _at(device: Any, host: str, port: int) -> None:
+    """What nfcpy's constructor does; it turns a port that has a name in /etc/services (10000 is webmin) into that."""
+    device.addr, device._path, device.socket = (host, port), f"{host}:{port}", None
+    device._create_socket()
+
+
 def _received(receive: Callable[..., _Frame], timeout: float | None, brty_list: tuple[str, ...]) -> _Frame:
     """Receive one frame; a datagram that is none (not hexadecimal, not ASCII, empty) is a transmission error."""
     try:
@@ -81,7 +90,7 @@ class NodeDevice(UdpDevice):  # type: ignore[misc]
         self.bound = False
         self.air: Callable[[bytes, bool], None] | None = None
         self._pushed_back: _Frame | None = None
-        super().__init__(host, port)
+        _at(self, host, port)
 
     def mute(self) -> None:
         """Leave the field; a bound socket is kept."""
@@ -194,6 +203,9 @@ class ReaderDevice(UdpDevice):  # type: ignore[misc]
 
     socket: Any
     _sensing = False
+
+    def __init__(self, host: str, port: int) -> None:
+        _at(self, host, port)
 
     def send_cmd_recv_rsp(self, target: Any, data: bytes, timeout: float | None) -> bytearray:
         """Send a command and return its answer; what came too late for an earlier one is dropped first."""

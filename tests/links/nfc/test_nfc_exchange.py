@@ -284,3 +284,12 @@ def test_no_serial_reader_says_so() -> None:
     with pytest.raises(NoReader) as caught:
         open_port(LinkSettings(nfc="tty:NOSUCH9:pn532"))
     assert caught.value.hint
+
+
+def test_a_port_with_a_name_of_its_own_is_a_port(monkeypatch: pytest.MonkeyPatch) -> None:
+    """10000 stands as webmin in /etc/services; nfcpy took the name for the number."""
+    import socket as sockets
+
+    monkeypatch.setattr(sockets, "getnameinfo", lambda address, flags: ("127.0.0.1", "webmin"))
+    port = open_port(LinkSettings(nfc="udp:localhost:10000"))
+    port.close()
