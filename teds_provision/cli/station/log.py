@@ -16,11 +16,14 @@ from teds_provision.cli.moments import moment
 from teds_provision.cli.options import command
 from teds_provision.cli.rendering import local_time, shown
 from teds_provision.errors import StoreFailure, UsageFailure
-from teds_provision.store import Choice, is_failure
+from teds_provision.lazy import late
 
 if TYPE_CHECKING:
+    from teds_provision import store
     from teds_provision.station.station import Station
-    from teds_provision.store import AuditEntry, AuditVerdict
+    from teds_provision.store import AuditEntry, AuditVerdict, Choice
+else:  # SQLite is not loaded for the help
+    store = late("teds_provision.store")
 
 _POLL_SECONDS = 0.3
 
@@ -53,7 +56,7 @@ def log(
         raise UsageFailure("--today and --since are the same thing said twice.", hint="Give one of them.")
     station = app.station()
     audit_log = station.audit_log
-    choice = Choice(station.nodes.resolve(uuid) if uuid else None, act, failed)
+    choice = store.Choice(station.nodes.resolve(uuid) if uuid else None, act, failed)
     wanted = "today" if today else since
     moment_of = moment(wanted) if wanted is not None else None
     after = audit_log.before(choice, since=moment_of, last=last)
@@ -68,7 +71,7 @@ def log(
         out.write('{"entries": [')
     for number, entry in enumerate(audit_log.chosen(choice, after)):
         totals["entries"] += 1
-        totals["failed"] += is_failure(entry.outcome)
+        totals["failed"] += store.is_failure(entry.outcome)
         acts[entry.act] += 1
         out.write((", " if number else "") + json.dumps(_as_dict(entry)) if app.json else _line(entry) + "\n")
     told = {"entries": totals["entries"], "failed": totals["failed"], "acts": dict(acts)}
@@ -88,7 +91,7 @@ def log(
         raise click.exceptions.Exit(7)
     _require_intact(verdict)
     by_act = ", ".join(f"{count} {name}" for name, count in acts.most_common())
-    if choice != Choice() or moment_of is not None:
+    if choice != store.Choice() or moment_of is not None:
         app.note(f"{told['entries']} entries, {told['failed']} failed{': ' if by_act else '.'}{by_act}")
     part = f" from entry {after + 1} on" if after else ""
     app.note(f"{verdict.count} entries, chain intact{part}, head {verdict.head[:16]}.")
