@@ -9,8 +9,9 @@ from collections.abc import Callable, Iterator
 
 import pytest
 
-from teds_provision.errors import NoNode, NoReader
+from teds_provision.errors import NoNode, NoReader, UsageFailure
 from teds_provision.links import LinkSettings, Notice, open_port
+from teds_provision.links.nfc import frontend
 from teds_provision.links.nfc.reader import NfcPort
 from teds_provision.node.nfc.tnep import TnepTag
 from teds_provision.node.nfc.type2 import Type2Memory
@@ -199,3 +200,21 @@ def test_without_libusb_its_package_is_named(chip: Chip, monkeypatch: pytest.Mon
     with pytest.raises(NoReader) as caught:
         NfcPort("usb")
     assert "libusb-1.0-0" in caught.value.hint
+
+
+def test_auto_takes_the_only_reader_and_names_it(make_node: Callable[[str], Node], chip: Chip) -> None:
+    make_node("4")
+    port = open_port(LinkSettings())
+    told: list[Notice] = []
+    with pytest.raises(NoNode):
+        port.find(lambda identity: True, seconds=0.3, notice=told.append)
+    assert "usb:04e6:5591" in told[0].text
+    assert port.place == "nfc:usb:04e6:5591"
+    port.close()
+
+
+def test_auto_lists_several_readers(chip: Chip, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(frontend, "_usb_readers", lambda path: [(0x04E6, 0x5591, 1, 5), (0x054C, 0x06C3, 1, 6)])
+    with pytest.raises(UsageFailure, match=r"2 readers are plugged in: usb:001:005, usb:001:006") as caught:
+        open_port(LinkSettings(nfc="auto"))
+    assert caught.value.exit_code == 2
