@@ -126,6 +126,7 @@ def take_over(station: Station, plan: TakeOver, receipt: ResetReceipt | None) ->
     warnings: tuple[str, ...] = ()
     with station.transaction():
         if not plan.done:
+            retire(station, old.uuid, receipt, as_=f"{REPLACED} {new.hex()}")  # before the spare takes its name
             entry, former = station.pins.entry(new), station.pins.entry(old.uuid)
             if entry is not None and former is not None and former.name is not None:
                 station.pins.put(replace(entry, name=former.name))
@@ -135,5 +136,6 @@ def take_over(station: Station, plan: TakeOver, receipt: ResetReceipt | None) ->
                 order = BuildOrder(old.profile, name=old.name)
                 warnings = build(station, new, order, has=Image(new, plan.calibration)).warnings
             station.audit("replace", new, "done", old=old.uuid.hex(), calibration=bool(plan.calibration))
-        retire(station, old.uuid, receipt, as_=f"{REPLACED} {new.hex()}")
+        else:
+            retire(station, old.uuid, receipt, as_=f"{REPLACED} {new.hex()}")
     return warnings

@@ -8,19 +8,25 @@ from __future__ import annotations
 
 import errno
 import os
-import sqlite3
 import stat
 import threading
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager, nullcontext, suppress
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 from teds_provision.errors import BadData, StoreFailure, StoreLocked
+from teds_provision.lazy import late
 from teds_provision.store.frozen import open_copy
 from teds_provision.store.migration import carry
 from teds_provision.store.schema import APPLICATION_ID, SCHEMA_VERSION, STEPS_TO
+
+if TYPE_CHECKING:
+    import sqlite3
+else:  # loaded with the first store: --help does not wait for it
+    sqlite3 = late("sqlite3")
+
 
 FILE_NAME = "store.sqlite3"
 BUSY_SECONDS = 10.0
@@ -33,18 +39,21 @@ _READ_ONLY = (
     "it cannot be written",
     "Check the owner and mode of the home directory and whether the disk is read-only.",
 )
+# SQLite's primary result codes; written out, so that sqlite3 is not loaded for --help (sqlite.org, rescode).
+_SQLITE_FULL, _SQLITE_READONLY, _SQLITE_PERM, _SQLITE_CANTOPEN = 13, 8, 3, 14
+_SQLITE_IOERR, _SQLITE_CORRUPT, _SQLITE_NOTADB, _SQLITE_CONSTRAINT = 10, 11, 26, 19
 _CAUSES: dict[int, tuple[str, str]] = {
-    sqlite3.SQLITE_FULL: _FULL,
-    sqlite3.SQLITE_READONLY: _READ_ONLY,
-    sqlite3.SQLITE_PERM: _READ_ONLY,
-    sqlite3.SQLITE_CANTOPEN: ("it cannot be opened", _READ_ONLY[1]),
-    sqlite3.SQLITE_IOERR: (
+    _SQLITE_FULL: _FULL,
+    _SQLITE_READONLY: _READ_ONLY,
+    _SQLITE_PERM: _READ_ONLY,
+    _SQLITE_CANTOPEN: ("it cannot be opened", _READ_ONLY[1]),
+    _SQLITE_IOERR: (
         "the disk failed or is full",
         "Check the disk (space, quota, kernel log), then run the same command again.",
     ),
-    sqlite3.SQLITE_CORRUPT: ("it is damaged", _RESTORE),
-    sqlite3.SQLITE_NOTADB: ("it is damaged or no store of this tool", _RESTORE),
-    sqlite3.SQLITE_CONSTRAINT: ("the entry breaks a rule of the store", "Nothing was changed; please report this."),
+    _SQLITE_CORRUPT: ("it is damaged", _RESTORE),
+    _SQLITE_NOTADB: ("it is damaged or no store of this tool", _RESTORE),
+    _SQLITE_CONSTRAINT: ("the entry breaks a rule of the store", "Nothing was changed; please report this."),
 }
 _Record = TypeVar("_Record")
 _OS_CAUSES: dict[int, tuple[str, str]] = {

@@ -9,18 +9,24 @@ from __future__ import annotations
 
 import json
 import re
-import sqlite3
 import struct
 from collections.abc import Iterator
 from contextlib import suppress
 from pathlib import Path
-from typing import Any, Final, Protocol
+from typing import TYPE_CHECKING, Any, Final, Protocol
 
 from teds_provision.errors import BadData, StoreFailure
+from teds_provision.lazy import late
 from teds_provision.store.audit import AuditLog
 from teds_provision.store.database import FILE_NAME, Database
 from teds_provision.store.schema import APPLICATION_ID, SCHEMA_VERSION, STEPS_TO
 from teds_provision.store.store import Store
+
+if TYPE_CHECKING:
+    import sqlite3
+else:  # loaded with the first store: --help does not wait for it
+    sqlite3 = late("sqlite3")
+
 
 MAX_RECORD_OCTETS: Final = 128 << 20
 _MAX_HEAD_OCTETS: Final = 64 * 1024

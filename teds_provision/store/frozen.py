@@ -9,11 +9,19 @@ from __future__ import annotations
 
 import os
 import shutil
-import sqlite3
 import tempfile
 from collections.abc import Iterator
 from contextlib import suppress
 from pathlib import Path
+from typing import TYPE_CHECKING
+
+from teds_provision.lazy import late
+
+if TYPE_CHECKING:
+    import sqlite3
+else:  # loaded with the first store: --help does not wait for it
+    sqlite3 = late("sqlite3")
+
 
 _LOG = "-wal"
 

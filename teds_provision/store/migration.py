@@ -6,15 +6,21 @@ yet: the station takes them over, once and listed, when its vault opens (``teds_
 
 from __future__ import annotations
 
-import sqlite3
 from collections.abc import Iterator
 from contextlib import contextmanager
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from teds_provision.errors import BadData
+from teds_provision.lazy import late
 from teds_provision.store.packing import datasheet_row, packed
 from teds_provision.store.records import utc_now
 from teds_provision.teds.image import Image
+
+if TYPE_CHECKING:
+    import sqlite3
+else:  # loaded with the first store: --help does not wait for it
+    sqlite3 = late("sqlite3")
+
 
 _FACTS = ("station_name", "keystore", "keystore_why", "requested_point", "station_point", "ca_point")
 _PAGE = 200

@@ -2,18 +2,24 @@
 
 from __future__ import annotations
 
-import sqlite3
 import time
 from contextlib import closing, suppress
 from enum import Enum
 from pathlib import Path
-from typing import Final
+from typing import TYPE_CHECKING, Final
 
 from teds_provision.errors import BadData, StoreFailure
 from teds_provision.files import whole_draft
+from teds_provision.lazy import late
 from teds_provision.store.audit import AuditLog
 from teds_provision.store.database import FILE_NAME, Database, as_store_failure
 from teds_provision.store.store import Store
+
+if TYPE_CHECKING:
+    import sqlite3
+else:  # loaded with the first store: --help does not wait for it
+    sqlite3 = late("sqlite3")
+
 
 _MAGIC: Final = b"SQLite format 3\0"
 _FORMAT_VERSIONS: Final = slice(18, 20)  # of the file header: 1 for a rollback journal, 2 for a write-ahead log

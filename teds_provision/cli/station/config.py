@@ -38,7 +38,11 @@ def path_(app: App) -> None:
     app.emit({"path": str(place), "exists": place.is_file()}, str(place))
 
 
-@config.command(context_settings=COMMAND_SETTINGS, epilog=examples("teds-provision config show"))
+@config.command(
+    context_settings=COMMAND_SETTINGS,
+    short_help="Show what is set, and where.",
+    epilog=examples("teds-provision config show"),
+)
 @click.pass_context
 @pass_app
 def show(app: App, ctx: click.Context) -> None:
@@ -109,11 +113,14 @@ def _table(console: Console, settings: list[dict[str, Any]]) -> None:
         console.print(f"{setting['name']:{width}}  {setting['value']}  [{setting['source']}]", markup=False)
 
 
-@command('eval "$(teds-provision completion bash)"', "teds-provision completion fish | source")
+@command("teds-provision completion bash", "teds-provision completion fish")
 @click.argument("shell", type=click.Choice(["bash", "zsh", "fish"]))
 @pass_app
 def completion(app: App, shell: str) -> None:
-    """Print what a shell needs to complete commands, options, names, UUIDs, profiles and files."""
+    """Print what a shell needs to complete commands, options, names, UUIDs, profiles and files.
+
+    In bash: eval "$(teds-provision completion bash)"
+    """
     kind = get_completion_class(shell)
     assert kind is not None
     root = click.get_current_context().find_root().command
