@@ -35,10 +35,11 @@ ARROWS = {
     "steps": _BELOW_TALK | {"talk"},
     "handover": _BELOW_TALK | {"talk", "steps"},
     "measure": _BELOW_TALK | {"talk", "steps", "handover"},
+    "check": _BELOW_TALK | {"talk", "steps"},
     "backup": {"station", "vault", "store", "protocol", "teds"},
     "doctor": {"station", "links", "vault", "store", "protocol", "teds"},
     "demo": _BELOW_TALK | {"talk", "steps", "handover", "measure"},
-    "cli": _BELOW_TALK | {"talk", "steps", "handover", "backup", "doctor", "demo", "node", "measure"},
+    "cli": _BELOW_TALK | {"talk", "steps", "handover", "backup", "doctor", "demo", "node", "measure", "check"},
     "__main__": {"cli"},
 }
 # Too slow to load before they are needed: --help, --version and a pure decode must not wait for them.

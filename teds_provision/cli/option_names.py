@@ -52,6 +52,7 @@ OPTIONS: Final[dict[str, frozenset[str]]] = {
     "vault passphrase": frozenset({"new-passphrase-fd", "dry-run"}),
     "vault rewrap": frozenset({"yes", "dry-run"}),
     "restore": frozenset({"recovery-key", "keystore", "backup-passphrase-fd", "yes", "dry-run"}),
+    "node check": frozenset({"factory", "yes", "dry-run", "via", "nfc", "can", "ble", "timeout"}),
     "node create": frozenset({"uuid", "name", "teds", "profile", "max-message"}),
     "node run": frozenset({"nfc", "tag", "can", "source", "crypto-delay", "flash-delay", "wait-time", "battery", "pace"}),
 }

@@ -130,12 +130,12 @@ class StationSession:
         assert self._keys is not None, "message_key before a good accept()"
         return self._keys.messages
 
-    def seal(self, command: Command) -> Command:
-        """Seal one inner command under the next counter."""
+    def seal(self, command: Command, *, counter: int | None = None) -> Command:
+        """Seal one inner command under the next counter; another ``counter`` (u32) is for trying a node out."""
         assert self._keys is not None, "seal() before a good accept()"
-        if self._counter >= LAST_COUNTER:
+        if counter is None and self._counter >= LAST_COUNTER:
             raise Garbled("This session has used up its counters; open a new one.")
-        self._counter += 1
+        self._counter = self._counter + 1 if counter is None else counter
         return security_command(Function.SEALED, _seal(self._keys.to_node, self._counter, command.encode()))
 
     def unseal(self, payload: bytes) -> Reply:

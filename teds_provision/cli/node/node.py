@@ -7,6 +7,7 @@ from pathlib import Path
 import click
 
 from teds_provision.cli.context import App, pass_app
+from teds_provision.cli.node.check import check
 from teds_provision.cli.node.create import create
 from teds_provision.cli.node.run import run
 from teds_provision.cli.options import COMMAND_SETTINGS, examples
@@ -23,6 +24,7 @@ def node() -> None:
     """A virtual transducer: the whole node half of the profile, its flash in a file."""
 
 
+node.add_command(check)
 node.add_command(create)
 node.add_command(run)
 

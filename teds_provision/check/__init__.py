@@ -1,0 +1,12 @@
+"""The rules of docs/profile.md, run against somebody's board over its link: passed, failed or skipped, with the clause.
+
+==============  =======================================================================================
+``rule``        what a rule is, when it can be run, the register; ``outcome`` how one ends
+``probe``       the board as the rules see it: frames out, replies in, a record of both
+``plain``       rules for any state; ``teds_rules`` those about its TEDS
+``owning``      rules of factory state, of a node with a key, and of the key agreement
+``sessions``    Open, Sealed, Close
+``writing``     Write, Update, the commit, Reset
+``run``         which rules are run when, and what is made durable
+==============  =======================================================================================
+"""

@@ -1,0 +1,171 @@
+"""Which rules are run when, and what is made durable: a run that is cut leaves no node whose key is lost."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from teds_provision.check import owning, plain, sessions, teds_rules, writing
+from teds_provision.check.outcome import Checked, NotApplicable, RuleBroken
+from teds_provision.check.probe import Probe
+from teds_provision.check.rule import RULES, Rule, Stage
+from teds_provision.errors import BadData, Garbled, NodeRefused, NotAuthentic, PolicyRefused
+from teds_provision.links import LinkSettings
+from teds_provision.protocol.messages.identity import NodeState
+from teds_provision.station.station import Station
+from teds_provision.steps.agree import open_session
+from teds_provision.steps.identify import examine
+from teds_provision.steps.reset import reset_node
+from teds_provision.talk.conversation import Conversation
+from teds_provision.talk.meeting import meet
+from teds_provision.talk.progress import Reporter
+
+_REGISTERS = (plain, teds_rules, owning, sessions, writing)
+"""The modules whose rules are registered by being imported."""
+_ONLY_FACTORY = "The node has a key. Ask with --factory to have it reset first."
+_NEEDS_FACTORY = "Changes the node's key. Ask with --factory."
+_NEEDS_KEY = "The node has no key. Ask with --factory to give it one."
+
+
+@dataclass(frozen=True)
+class Report:
+    """Every rule, in order, and how often each result came."""
+
+    uuid: bytes
+    checks: tuple[Checked, ...]
+
+    def count(self, result: str) -> int:
+        """How many rules ended so."""
+        return sum(check.result == result for check in self.checks)
+
+
+def check_at(station: Station, links: LinkSettings, reporter: Reporter, *, factory: bool) -> Report:
+    """Run the rules against the node that is met first; see :func:`check_node`. Raises NoNode, NoReader as well."""
+    with meet(station, links, None, reporter, before=station.unlock) as node:
+        return check_node(station, node, factory=factory)
+
+
+def check_node(station: Station, node: Conversation, *, factory: bool = False) -> Report:
+    """Run the rules against a node, most of which change nothing.
+
+    Without ``factory`` no key changes: a factory node is tried in factory state, one of ours in sessions too. With it a
+    node of ours is reset, then keyed, written and reset again, so that it ends in factory state.
+    Raises PolicyRefused for a node with another owner, before anything but Identify was asked; LinkFailure.
+    """
+    return _Run(station, node, factory).all()
+
+
+class _Run:
+    def __init__(self, station: Station, node: Conversation, factory: bool) -> None:
+        self._station, self._node, self._factory = station, node, factory
+        self._probe = Probe(node.contact)
+        self._checks: dict[str, Checked] = {}
+
+    def all(self) -> Report:
+        state = self._probe.identity().state
+        ours = state != NodeState.FACTORY
+        if ours:
+            self._take_up()
+        elif self._factory:
+            self._station.policy.require_not_given_away(self._node.uuid)
+        self._stage(Stage.PLAIN)
+        if ours:
+            self._stage(Stage.KEYED)
+            self._stage(Stage.SESSION)
+            if self._factory:
+                self._reset()
+        if ours and not self._factory:
+            self._skip(Stage.FACTORY, _ONLY_FACTORY)
+        else:
+            self._stage(Stage.FACTORY)
+        if self._factory:
+            self._key_and_back(sessions_too=not ours)
+        for stage in Stage:
+            held = stage in (Stage.KEYED, Stage.SESSION) and not self._factory
+            self._skip(stage, _NEEDS_KEY if held else _NEEDS_FACTORY)
+        checks = tuple(self._checks[each.name] for each in _ordered())
+        return Report(self._node.uuid, checks)
+
+    # -- stages ----------------------------------------------------------------------------------------------------
+
+    def _stage(self, stage: Stage) -> None:
+        for each in RULES:
+            if each.stage == stage:
+                self._checks[each.name] = self._try(each)
+
+    def _skip(self, stage: Stage, why: str) -> None:
+        for each in RULES:
+            if each.stage == stage and each.name not in self._checks:
+                self._checks[each.name] = Checked(each.name, each.clause, "skipped", why)
+
+    def _try(self, each: Rule) -> Checked:
+        try:
+            return Checked(each.name, each.clause, "passed", each.run(self._probe))
+        except NotApplicable as skip:
+            return Checked(each.name, each.clause, "skipped", str(skip))
+        except RuleBroken as broken:
+            detail = str(broken)
+        except Garbled as torn:  # of the link, after its own repetitions: not the node's fault for certain
+            return Checked(each.name, each.clause, "skipped", f"The link failed: {torn.message}")
+        except (BadData, NotAuthentic, PolicyRefused) as wrong:
+            detail = wrong.message
+        self._probe.session = None
+        return Checked(each.name, each.clause, "failed", detail)
+
+    # -- keys ------------------------------------------------------------------------------------------------------
+
+    def _take_up(self) -> None:
+        """The link key of a node of ours; raises PolicyRefused where another owner, or nobody here, has it."""
+        held = open_session(self._station, self._node) if self._station.keys.held(self._node.uuid) else None
+        if held is None:
+            raise PolicyRefused(
+                f"Node {self._node.uuid.hex()} has a key that this station does not hold: nothing was tried.",
+                hint="Check it from its owner's station, or reset it by hand (button held 5 s).",
+            )
+        self._probe.key = held.key
+        self._node.leave()
+
+    def _reset(self) -> None:
+        """Reset a node of ours as the command ``reset`` does: its keys go here when the proof was good."""
+        reset_node(self._station, self._node, examine(self._station, self._node))
+        self._probe.key = self._probe.session = None
+
+    def _key_and_back(self, *, sessions_too: bool) -> None:
+        self._probe.credentials = self._station.credentials()
+        self._stage(Stage.AGREEMENT)
+        why = self._agree()
+        if why:
+            for stage in (Stage.KEYED, Stage.SESSION, Stage.COMMIT, Stage.RESET):
+                self._skip(stage, why)
+            return
+        if sessions_too:
+            self._stage(Stage.KEYED)
+            self._stage(Stage.SESSION)
+        self._stage(Stage.COMMIT)
+        self._stage(Stage.RESET)
+        if self._checks["reset"].result == "passed":
+            with self._station.durable("node check"):
+                self._station.keys.remove(self._node.uuid)
+                self._station.audit("reset", self._node.uuid, "done", by="node check")
+
+    def _agree(self) -> str:
+        """Give the node a key that is durable here before its Confirm leaves; why not, "" where it has one."""
+        uuid, station, probe = self._node.uuid, self._station, self._probe
+        try:
+            agreed = owning.agree(probe, station.credentials(), epoch=0)
+            with station.durable("node check"):
+                station.keys.add_pending(uuid, key=agreed.key, key_id=agreed.key_id, epoch=agreed.epoch)
+                station.keys.set_ca_of(uuid, station.identity.ca)
+                station.audit("agree", uuid, "pending", key_id=agreed.key_id.hex(), by="node check")
+            probe.good(agreed.confirm)
+        except (RuleBroken, NotApplicable) as no:
+            return f"No key was agreed. {no}"
+        except (BadData, NotAuthentic, PolicyRefused, NodeRefused) as no:
+            return f"No key was agreed. {no.message}"
+        probe.key = agreed.key
+        return ""
+
+
+def _ordered() -> list[Rule]:
+    """Every rule in the order of the stages."""
+    stages = list(Stage)
+    return sorted(RULES, key=lambda each: stages.index(each.stage))

@@ -1,0 +1,113 @@
+"""Rules of Open, Sealed and Close. They need a link key, and change nothing that lasts."""
+
+from __future__ import annotations
+
+import os
+
+from teds_provision.check.probe import Probe, demand, holds
+from teds_provision.check.rule import Stage, rule
+from teds_provision.protocol.agreement import key_id
+from teds_provision.protocol.keys import SoftwareKey
+from teds_provision.protocol.messages.frames import COMMON, SECURITY, Command, Function, Reason, security_command
+from teds_provision.protocol.session import OPEN_OCTETS, StationSession, open_mac
+
+_IDENTIFY = security_command(Function.IDENTIFY)
+
+
+def _ask(probe: Probe) -> bytes:
+    counter = probe.good(security_command(Function.OPEN))
+    holds(len(counter) == 8, f"Open (128.3) without payload: c has {len(counter)} octets, 8 are due.")
+    return counter
+
+
+def _open(payload: bytes) -> Command:
+    return security_command(Function.OPEN, payload)
+
+
+@rule("open-checks", "Sessions", Stage.SESSION)
+def open_checks(probe: Probe) -> str:
+    """Length, keyId, mac: 4, 16, 12, in this order, and none of them uses c up."""
+    key, before = probe.link_key, _ask(probe)
+    point = SoftwareKey.generate().point
+    probe.refused(_open(bytes(OPEN_OCTETS - 1)), Reason.BAD_FORM)
+    probe.refused(_open(bytes(OPEN_OCTETS)), Reason.UNKNOWN_KEY, "a keyId of zeros")
+    wrong = key_id(key) + point + os.urandom(16)
+    probe.refused(_open(wrong), Reason.BAD_TAG, "a wrong mac")
+    seen = probe.refused(_open(key_id(key) + bytes(65) + bytes(16)), Reason.BAD_TAG, "a wrong mac over a wrong point")
+    holds(_ask(probe) == before, "A refused Open changed c.")
+    return seen
+
+
+@rule("open-once", "Sessions", Stage.SESSION)
+def open_once(probe: Probe) -> str:
+    """A mac is good once: c grows by 1, and the same Open again gets 12."""
+    counter = _ask(probe)
+    command = StationSession(probe.link_key, probe.uuid).open(counter)
+    probe.good(command)
+    grown = (int.from_bytes(counter, "big") + 1) % (1 << 64)
+    holds(_ask(probe) == grown.to_bytes(8, "big"), "c did not grow by 1 with a good mac.")
+    return demand(probe.plain(command), Reason.BAD_TAG, "Open (128.3) a second time")
+
+
+@rule("open-point", "Sessions", Stage.SESSION)
+def open_point(probe: Probe) -> str:
+    """A good mac over a point off the curve gets 15."""
+    point = b"\x04" + bytes(64)
+    mac = open_mac(probe.link_key, probe.uuid, _ask(probe), point)
+    return probe.refused(_open(key_id(probe.link_key) + point + mac), Reason.BAD_POINT, "Es off the curve")
+
+
+@rule("open-tag", "Sessions", Stage.SESSION)
+def open_tag(probe: Probe) -> str:
+    """En is a point, the tag shows that the node holds the key, and a sealed command gets a sealed reply."""
+    probe.open()
+    inside, outside = probe.sealed_good(_IDENTIFY), probe.good(_IDENTIFY)
+    holds(inside == outside, "Identify says another thing in the session than outside it.")
+    return "a good tag; Identify the same inside and outside"
+
+
+@rule("sealed-counter", "Sessions", Stage.SESSION)
+def sealed_counter(probe: Probe) -> str:
+    """Gaps are fine; a counter that was used, a lower one and 0 get 13; the session goes on."""
+    session = probe.open()
+    last = session.seal(_IDENTIFY, counter=9)
+    session.unseal(probe.good(last).ljust(36, b"\0"))
+    demand(probe.plain(last), Reason.REPLAY, "Sealed (128.4), the same frame a second time")
+    for counter in (8, 0):
+        demand(
+            probe.plain(session.seal(_IDENTIFY, counter=counter)), Reason.REPLAY, f"Sealed (128.4), counter {counter}"
+        )
+    demand(probe.plain(session.seal(security_command(Function.LIST), counter=9)), Reason.REPLAY, "Sealed, 9 again")
+    probe.sealed_good(_IDENTIFY)
+    return "13 for the same frame, for 8, 0, and for another command under 9"
+
+
+@rule("sealed-tag", "Sessions", Stage.SESSION)
+def sealed_tag(probe: Probe) -> str:
+    """Too short gets 4, a wrong tag 12; a bad frame ends nothing."""
+    session = probe.open()
+    probe.sealed_good(_IDENTIFY)
+    probe.refused(security_command(Function.SEALED, bytes(35)), Reason.BAD_FORM)
+    good = session.seal(_IDENTIFY)
+    bad = good.payload[:-1] + bytes([good.payload[-1] ^ 1])
+    seen = probe.refused(security_command(Function.SEALED, bad), Reason.BAD_TAG, "one bit of the tag wrong")
+    session.unseal(probe.good(good))
+    return seen
+
+
+@rule("sealed-only-sealed", "Which command when", Stage.SESSION)
+def sealed_only_sealed(probe: Probe) -> str:
+    """Open and Sealed inside a session get 3; unknown functions 1."""
+    for function in (Function.OPEN, Function.SEALED):
+        probe.sealed_refused(security_command(function), Reason.NOT_PERMITTED)
+    probe.sealed_refused(Command(0, SECURITY, 99), Reason.UNKNOWN_COMMAND)
+    return probe.sealed_refused(Command(0, COMMON, 99), Reason.UNKNOWN_COMMAND)
+
+
+@rule("close", "Sessions", Stage.SESSION)
+def close(probe: Probe) -> str:
+    """Close ends the session: what was sealed in it gets 2 afterwards."""
+    session = probe.open()
+    probe.sealed_good(security_command(Function.CLOSE))
+    probe.session = None
+    return demand(probe.plain(session.seal(_IDENTIFY)), Reason.WRONG_STATE, "Sealed (128.4) after Close")

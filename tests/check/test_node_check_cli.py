@@ -1,0 +1,62 @@
+"""``node check`` by subprocess, against a virtual node in another process on a CAN bus of datagrams."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from teds_provision.check.rule import RULES
+from tests.cli.shell import Outcome, spawn
+from tests.e2e.desk import Desk
+from tests.workflow.bench import PASSPHRASE, make_station
+
+pytestmark = pytest.mark.link
+
+
+@pytest.fixture
+def desk(tmp_path: Path) -> Iterator[Desk]:
+    for name in ("bench", "rival"):
+        make_station(tmp_path / name, name).close()
+    made = Desk(tmp_path, tmp_path)
+    yield made
+    made.clear()
+
+
+def check(desk: Desk, name: str, *words: object) -> Outcome:
+    where = ("--via", "can", "--can", desk.links.can)
+    return spawn("--home", desk.folder / name, "--json", "node", *words, *where, passphrase=PASSPHRASE)
+
+
+def test_a_virtual_node_on_a_bus_keeps_every_rule(desk: Desk) -> None:
+    node = desk.node().start(nfc=False, can=True)
+    outcome = check(desk, "bench", "check", "--factory", "--yes")
+    assert outcome.code == 0, outcome
+    told = outcome.json
+    assert told["uuid"] == node.uuid
+    assert (told["passed"], told["failed"], told["skipped"]) == (len(RULES) - 1, 0, 1)
+    assert set(told["checks"][0]) == {"rule", "clause", "result", "detail"}
+
+
+def test_without_a_word_nothing_is_keyed(desk: Desk) -> None:
+    desk.node().start(nfc=False, can=True)
+    assert check(desk, "bench", "check", "--factory").code == 6
+    planned = check(desk, "bench", "check", "--factory", "--dry-run")
+    assert (planned.code, "plan" in planned.json) == (0, True)
+    outcome = check(desk, "bench", "check")
+    assert (outcome.code, outcome.json["failed"]) == (0, 0)
+    assert all(c["result"] == "skipped" for c in outcome.json["checks"] if c["rule"] in ("commit", "reset", "open-tag"))
+
+
+def test_exit_codes_of_no_node_and_of_another_owner(desk: Desk) -> None:
+    assert check(desk, "bench", "check", "--timeout", "1").code == 5
+    desk.node().start(nfc=False, can=True)
+    where = ("--via", "can", "--can", desk.links.can)
+    words = ("provision", "--profile", "temperature-sensor", "--yes", *where)
+    done = spawn("--home", desk.folder / "rival", "--json", *words, passphrase=PASSPHRASE)
+    assert done.code == 0, done
+    outcome = check(desk, "bench", "check", "--factory", "--yes")
+    assert (outcome.code, outcome.json["error"]["code"]) == (6, "refused")
+    own = check(desk, "rival", "check")
+    assert (own.code, own.json["failed"]) == (0, 0), own
