@@ -29,7 +29,7 @@ from teds_provision.measure.hands import Hands
 from teds_provision.measure.hearing import HeardStream, Hearing
 from teds_provision.measure.interpreter import StreamInterpreter
 from teds_provision.measure.orders import BusShare, Events, StreamTotals, Wish
-from teds_provision.measure.planning import Plans, plan_node, sensors_of
+from teds_provision.measure.planning import BusTime, Plans, plan_node, sensors_of
 from teds_provision.measure.trusting import Trusted, claim, exchange_clock, open_trusted
 from teds_provision.protocol.messages.frames import Reason
 from teds_provision.protocol.operation.can_frames import Assembly
@@ -132,6 +132,7 @@ class NodeKeeper:
                 pause = min(2 * pause, LAST_PAUSE)
             self._say("ended")
         finally:
+            self._bus.gone(self.uuid)
             self.done.set()
             self.ready.set()
 
@@ -237,16 +238,10 @@ class NodeKeeper:
     def _subscribe(self, trusted: Trusted, channels: list[Channel], address: int) -> Plans:
         while True:
             rate = self._wish.rate
+            if rate is None:
+                self._bus.want(self.uuid, self._plan(channels, self._bus.time).load)
             with self._bus.lock:
-                plans = plan_node(
-                    channels,
-                    self._bus.others(self.uuid),
-                    rate=rate,
-                    kind=self._wish.kind,
-                    test_pattern=self._wish.test_pattern,
-                    start=WAITS if self._wish.trigger else SOON,
-                    slower=2**self._halved,
-                )
+                plans = self._plan(channels, self._bus.others(self.uuid, sharing=rate is None))
                 self._bus.taken[self.uuid] = plans.load
             try:
                 for plan in plans.streams:
@@ -258,6 +253,17 @@ class NodeKeeper:
                 self._stop_streams(trusted, address)
                 continue
             return plans
+
+    def _plan(self, channels: list[Channel], bus: BusTime) -> Plans:
+        return plan_node(
+            channels,
+            bus,
+            rate=self._wish.rate,
+            kind=self._wish.kind,
+            test_pattern=self._wish.test_pattern,
+            start=WAITS if self._wish.trigger else SOON,
+            slower=2**self._halved,
+        )
 
     def _stream(self, trusted: Trusted, plan: Plan, address: int) -> None:
         number = plan.subscribe.stream

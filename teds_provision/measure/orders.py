@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import threading
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
@@ -9,10 +10,12 @@ from dataclasses import dataclass, field
 from teds_provision.measure.blocks import Block, ChannelFacts, NodeReport
 from teds_provision.measure.hearing import HeardStream
 from teds_provision.measure.planning import BusTime
+from teds_provision.protocol.operation.budget import MOST_LOAD
 from teds_provision.protocol.operation.stream_commands import Kind
 
 LEASE = 10  # seconds
 DEAD_MAN = 1000  # milliseconds
+SAYING = 1.0  # seconds that a node waits for the others to say what they want of the bus
 
 
 @dataclass(frozen=True)
@@ -67,13 +70,45 @@ class Events:
 
 @dataclass
 class BusShare:
-    """How much of a bus this station's streams take; nodes ask for their share one after another."""
+    """How much of a bus this station's streams take; nodes ask for their share one after another.
+
+    ``expected`` are the nodes of the measurement. What those that do not stream yet want (``wanted``; a full part where
+    it is not known) is kept free for them, so that the first node does not take the room of the second.
+    """
 
     time: BusTime
+    expected: set[bytes] = field(default_factory=set)
     taken: dict[bytes, float] = field(default_factory=dict)
-    lock: threading.Lock = field(default_factory=threading.Lock)
+    wanted: dict[bytes, float] = field(default_factory=dict)
+    lock: threading.Condition = field(default_factory=threading.Condition)
 
-    def others(self, uuid: bytes) -> BusTime:
-        """The bus as one node sees it."""
+    def others(self, uuid: bytes, *, sharing: bool = False) -> BusTime:
+        """The bus as one node sees it; ``sharing`` leaves the nodes that are still to come their fair part."""
         used = sum(load for key, load in self.taken.items() if key != uuid)
+        if sharing:
+            used += self._kept(uuid, MOST_LOAD - used)
         return BusTime(self.time.bitrate, self.time.data_bitrate, used)
+
+    def want(self, uuid: bytes, load: float) -> None:
+        """Say what a node would take of an empty bus, then wait (:data:`SAYING` at most) for the others to say it."""
+        with self.lock:
+            self.wanted[uuid] = load
+            self.lock.notify_all()
+            self.lock.wait_for(lambda: self.expected <= self.wanted.keys(), SAYING)
+
+    def gone(self, uuid: bytes) -> None:
+        """A node that ended for good wants nothing any more."""
+        with self.lock:
+            self.expected.discard(uuid)
+            self.lock.notify_all()
+
+    def _kept(self, uuid: bytes, room: float) -> float:
+        """What is kept for others of ``room``: whoever wants less than an equal part gets it, the rest share evenly."""
+        coming = [self.wanted.get(key, MOST_LOAD) for key in self.expected - {uuid} - self.taken.keys()]
+        left, level, kept = room, math.inf, len(coming) + 1
+        for want in sorted([*coming, self.wanted.get(uuid, MOST_LOAD)]):
+            if want > left / kept:
+                level = left / kept
+                break
+            left, kept = left - want, kept - 1
+        return sum(min(want, level) for want in coming)

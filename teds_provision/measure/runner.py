@@ -93,7 +93,7 @@ class Measurement:
                 sink.close()
             raise
         hearing = Hearing(self.port)
-        share = BusShare(_bus_time(self.port))
+        share = BusShare(_bus_time(self.port), set(self.uuids))
         events = Events(self._block, self._describe, self._report)
         self.keepers = [
             NodeKeeper(self.station, self.port, hearing, share, uuid, self.wish, self._wall, events)
