@@ -27,7 +27,8 @@ class Hub:
         self._socket.close()
         with self._lock:
             for client in self._clients:
-                client.shutdown(socket.SHUT_RDWR)
+                with contextlib.suppress(OSError):  # gone already
+                    client.shutdown(socket.SHUT_RDWR)
                 client.close()
             self._clients.clear()
 
