@@ -4,11 +4,21 @@ from __future__ import annotations
 
 import os
 
-from teds_provision.check.probe import Probe, demand, holds
+from teds_provision.check.outcome import NotApplicable
+from teds_provision.check.probe import Probe, demand, holds, told
 from teds_provision.check.rule import Stage, rule
+from teds_provision.links.ports import Repeats
 from teds_provision.protocol.agreement import key_id
 from teds_provision.protocol.keys import SoftwareKey
-from teds_provision.protocol.messages.frames import COMMON, SECURITY, Command, Function, Reason, security_command
+from teds_provision.protocol.messages.frames import (
+    COMMON,
+    SECURITY,
+    Command,
+    Function,
+    Reason,
+    decode_reply,
+    security_command,
+)
 from teds_provision.protocol.session import OPEN_OCTETS, StationSession, open_mac
 
 _IDENTIFY = security_command(Function.IDENTIFY)
@@ -102,6 +112,20 @@ def sealed_only_sealed(probe: Probe) -> str:
         probe.sealed_refused(security_command(function), Reason.NOT_PERMITTED)
     probe.sealed_refused(Command(0, SECURITY, 99), Reason.UNKNOWN_COMMAND)
     return probe.sealed_refused(Command(0, COMMON, 99), Reason.UNKNOWN_COMMAND)
+
+
+@rule("repetition", "Repetition", Stage.SESSION)
+def repetition(probe: Probe) -> str:
+    """A request that is equal octet for octet, transaction and body, gets the stored reply and is not run again."""
+    link = probe.contact.link
+    if not isinstance(link, Repeats):
+        raise NotApplicable("This link cannot send a request again.")
+    frame = probe.open().seal(_IDENTIFY).encode()
+    first = link.exchange(frame)
+    for _ in range(2):
+        second = link.again(frame)
+        holds(second == first, f"Sealed (128.4) repeated: the stored reply is due, {told(decode_reply(second))} came.")
+    return f"the stored {len(first)} octets, twice"
 
 
 @rule("close", "Sessions", Stage.SESSION)

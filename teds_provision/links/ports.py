@@ -5,7 +5,7 @@ from __future__ import annotations
 import threading
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from typing import Literal, Protocol
+from typing import Literal, Protocol, runtime_checkable
 
 from teds_provision.links.hints import BleAddress, Charging
 from teds_provision.protocol.messages.identity import Identity
@@ -68,6 +68,17 @@ class Link(Protocol):
 
     def close(self) -> None:
         """Leave the node in peace (NFC: deselect the service); never raises."""
+
+
+@runtime_checkable
+class Repeats(Protocol):
+    """A link on which a request can be sent again on purpose, to see what the node makes of it."""
+
+    def again(self, frame: bytes) -> bytes:
+        """Send the last frame of ``exchange`` once more, under its transaction, as after a lost reply.
+
+        Returns and raises as ``exchange`` does (profile.md, "Repetition").
+        """
 
 
 @dataclass(frozen=True)

@@ -12,7 +12,6 @@ from teds_provision.protocol.messages.frames import (
     COMMON,
     SECURITY,
     Attribute,
-    Command,
     Function,
     Reason,
     Reply,
@@ -38,6 +37,8 @@ class FaultyLink(MemoryLink):
 
     fault: Fault | None = None
     tapped_when_keyed: bool = False
+    runs_again: bool = False
+    """Whether the node runs a repeated request instead of giving the stored reply."""
 
     def exchange(self, frame: bytes) -> bytes:
         def reference(octets: bytes) -> bytes:
@@ -46,11 +47,18 @@ class FaultyLink(MemoryLink):
             return self.board.tim.handle(octets, link=self.via, tapped=tapped)
 
         self.frames.append(frame)
-        return reference(frame) if self.fault is None else self.fault(self.board, frame, reference)
+        self.count += 1
+        return self.answer(frame, reference)
 
+    def again(self, frame: bytes) -> bytes:
+        self.count += self.runs_again
+        return self.answer(frame, lambda octets: self.board.tim.handle(octets, link=self.via, tapped=self.via == "nfc"))
 
-def _command(octets: bytes) -> Command:
-    return Command(int.from_bytes(octets[:2], "big"), octets[2], octets[3], octets[6:])
+    def answer(self, frame: bytes, reference: Next) -> bytes:
+        def run(octets: bytes) -> bytes:
+            return reference(octets) if self.fault is None else self.fault(self.board, octets, reference)
+
+        return self.board.repetition.answer(self.count, frame, run, now=self.board.seconds)
 
 
 def _is(octets: bytes, function: int, command_class: int = SECURITY) -> bool:

@@ -161,6 +161,10 @@ def test_a_request_without_a_tap_is_found(station: Station) -> None:
     assert names(checked(station, Board(), via="can", tapped_when_keyed=True), "failed") == {"keyed-untapped"}
 
 
+def test_a_repetition_that_is_run_again_is_found(station: Station) -> None:
+    assert names(checked(station, Board(), runs_again=True), "failed") == {"repetition"}
+
+
 def test_a_commit_that_takes_an_old_sequence_is_found(station: Station, monkeypatch: pytest.MonkeyPatch) -> None:
     def forgetful(flash, staged, verify):  # type: ignore[no-untyped-def]
         return verified_commit(replace(flash, sequence=flash.sequence - 1), staged, verify)

@@ -61,6 +61,7 @@ class CanLink:
     ) -> None:
         self._bus, self._number = bus, number
         self.address = address
+        self._last = 0
         self._reply_seconds = REPLY_SECONDS if reply_seconds is None else reply_seconds
 
     @property
@@ -72,12 +73,20 @@ class CanLink:
         """Send one command frame and return its reply; see ``Link.exchange``."""
         return self.ask(frame, tries=TRIES, seconds=self._reply_seconds)
 
+    def again(self, frame: bytes) -> bytes:
+        """Send the last frame once more under its transaction; see ``Repeats.again``."""
+        return self._ask(frame, self._last, tries=TRIES, seconds=self._reply_seconds)
+
     def close(self) -> None:
         """Nothing to leave behind on CAN."""
 
     def ask(self, frame: bytes, *, tries: int, seconds: float) -> bytes:
         """As ``exchange``, at most ``tries`` times, each with ``seconds`` of silence allowed."""
-        bus, transaction = self._bus(), self._number()
+        self._last = self._number()
+        return self._ask(frame, self._last, tries=tries, seconds=seconds)
+
+    def _ask(self, frame: bytes, transaction: int, *, tries: int, seconds: float) -> bytes:
+        bus = self._bus()
         try:
             with bus.line(self.address).exchange(transaction) as line:
                 reply = _Exchange(bus, line, bytes([transaction]) + frame, tries, seconds).run()

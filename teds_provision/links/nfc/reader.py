@@ -238,6 +238,7 @@ class NfcLink:
         self._notice = notice
         self._poller: Poller | None = Poller(visit.tag, visit.service)
         self.visit = visit
+        self._last = 0
         self.lost = False
         """Whether the node left in the middle of an exchange and did not come back in time."""
 
@@ -259,10 +260,16 @@ class NfcLink:
         that failed is opened again once. Raises NodeSilent, Garbled or NoReader.
         """
         with self._port.turn:
-            return self._exchange(frame)
+            self._last = self._port.next_transaction()
+            return self._exchange(frame, self._last)
 
-    def _exchange(self, frame: bytes) -> bytes:
-        transaction, started = self._port.next_transaction(), time.monotonic()
+    def again(self, frame: bytes) -> bytes:
+        """Send the last frame once more under its transaction; see ``Repeats.again``."""
+        with self._port.turn:
+            return self._exchange(frame, self._last)
+
+    def _exchange(self, frame: bytes, transaction: int) -> bytes:
+        started = time.monotonic()
         reopened = False
         attempt = 0
         while True:
