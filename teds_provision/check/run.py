@@ -21,7 +21,7 @@ from teds_provision.talk.progress import Reporter
 
 _REGISTERS = (plain, teds_rules, owning, sessions, writing)
 """The modules whose rules are registered by being imported."""
-_ONLY_FACTORY = "The node has a key. Ask with --factory to have it reset first."
+_ONLY_FACTORY = "The node has a key. Ask with --factory to have it reset and keyed anew."
 _NEEDS_FACTORY = "Changes the node's key. Ask with --factory."
 _NEEDS_KEY = "The node has no key. Ask with --factory to give it one."
 
@@ -71,13 +71,13 @@ class _Run:
         if ours:
             self._stage(Stage.KEYED)
             self._stage(Stage.SESSION)
-            if self._factory:
-                self._reset()
-        if ours and not self._factory:
-            self._skip(Stage.FACTORY, _ONLY_FACTORY)
+        why = (self._reset() if self._factory else _ONLY_FACTORY) if ours else ""
+        if why:
+            for stage in Stage:
+                self._skip(stage, why)
         else:
             self._stage(Stage.FACTORY)
-        if self._factory:
+        if self._factory and not why:
             self._key_and_back(sessions_too=not ours)
         for stage in Stage:
             held = stage in (Stage.KEYED, Stage.SESSION) and not self._factory
@@ -124,10 +124,14 @@ class _Run:
         self._probe.key = held.key
         self._node.leave()
 
-    def _reset(self) -> None:
-        """Reset a node of ours as the command ``reset`` does: its keys go here when the proof was good."""
-        reset_node(self._station, self._node, examine(self._station, self._node))
+    def _reset(self) -> str:
+        """Reset a node of ours as ``reset`` does: its keys go here when the proof was good. Why not, "" where it is."""
+        try:
+            reset_node(self._station, self._node, examine(self._station, self._node))
+        except (BadData, NotAuthentic, PolicyRefused) as no:
+            return f"The node could not be reset. {no.message}"
         self._probe.key = self._probe.session = None
+        return ""
 
     def _key_and_back(self, *, sessions_too: bool) -> None:
         self._probe.credentials = self._station.credentials()

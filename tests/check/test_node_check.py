@@ -101,6 +101,17 @@ def test_a_node_of_ours_can_be_reset_after_a_cut(station: Station) -> None:
     assert board.state.state == NodeState.FACTORY
 
 
+def test_a_node_of_ours_that_cannot_be_reset_loses_no_report(station: Station) -> None:
+    board = Board()
+    agreed(station, board)
+    board.flash.state = replace(board.state, node_key_signature=board.key.sign(b"for another UUID"))
+    board.power_on()
+    report = checked(station, board)
+    assert names(report, "failed") == {"node-key"}
+    assert {"factory-open", "commit", "reset"} <= names(report, "skipped")
+    assert station.keys.held(board.uuid)
+
+
 @pytest.mark.parametrize("factory", [False, True])
 def test_a_node_of_another_owner_is_left_alone(station: Station, tmp_path: Path, factory: bool) -> None:
     rival, board = make_station(tmp_path / "rival", "rival"), Board()
