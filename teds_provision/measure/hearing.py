@@ -22,6 +22,7 @@ from teds_provision.protocol.operation.subscription import Message, Receiver
 
 SLICE = 0.01  # seconds between looks at what waits
 GATHER = 0.02  # seconds that messages wait to be calibrated together
+HEARD_OUT = 0.25  # seconds for what was received before Stop's reply to be looked at
 MOST_HELD = 50_000  # frames: some seconds of a full bus
 _DATA, _MASK = 0x1CFF0000, 0x1FFF0000
 
@@ -82,6 +83,12 @@ class HeardStream:
     def finish(self) -> None:
         """Hand on what is left."""
         self._deliver(self._interpret(self.interpreter.flush))
+
+    def hear_out(self, counter: int) -> None:
+        """Wait for the hearing thread: frames that came before Stop's reply may still lie in its queue."""
+        until = time.monotonic() + HEARD_OUT
+        while self.receiver.last < counter - 1 and time.monotonic() < until:
+            time.sleep(0.002)
 
     def _interpret(self, step: Callable[[], Block | None]) -> Block | None:
         with self.mapping:

@@ -46,8 +46,6 @@ SLOWER = 10  # halvings of the rate while the firmware says that its shortest pe
 _CURED_BY_TIME = frozenset({Reason.WRONG_STATE, Reason.BUSY, Reason.BAD_TAG, 21, 22, 23})
 _FINAL = (NotAuthentic, PolicyRefused, BadData, StoreFailure)
 
-HEARD_OUT = 0.25  # seconds for what was received before Stop's reply to be looked at
-
 
 class NodeKeeper:
     """Keeps one node measuring until :meth:`stop`; ``error`` is what it ended with, None where all is well."""
@@ -331,7 +329,7 @@ class NodeKeeper:
             if trusted is not None:
                 with suppress(TedsProvisionError, SessionLost):
                     counter = decode_stopped(trusted.node.send(stop(number), "to stop a stream"))
-                    _hear_out(heard, counter)
+                    heard.hear_out(counter)
                     heard.receiver.finish(counter)
             self._hearing.forget(address, number)
             self.totals[number].add(heard)
@@ -392,10 +390,3 @@ def _is_event(channel: Channel) -> bool:
 
 def _nothing(_notice: Notice) -> None:
     """Looking for a node is told once, as its state."""
-
-
-def _hear_out(heard: HeardStream, counter: int) -> None:
-    """Wait for the hearing thread: frames that came before Stop's reply may still lie in its queue."""
-    until = time.monotonic() + HEARD_OUT
-    while heard.receiver.last < counter - 1 and time.monotonic() < until:
-        time.sleep(0.002)
