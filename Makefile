@@ -12,6 +12,8 @@ demo: $(VENV)/.run
 
 test: $(VENV)/.dev
 	@sh scripts/install-test-packages || { test -z "$$CI" && echo "Going on without them: the tests marked system are skipped."; }
+	@$(BIN)/python -c 'import smartcard' 2>/dev/null || $(BIN)/python -m pip install --quiet 'pyscard>=2.0.5' || \
+	  { test -z "$$CI" && echo "Going on without pyscard: the tests of PC/SC readers are skipped."; }
 	@$(MAKE) --no-print-directory lint types unit
 
 lint: $(VENV)/.dev

@@ -68,7 +68,12 @@ class Desk:
         return result
 
     def run(
-        self, *words: str, home: str = "home", fault: dict[str, str] | None = None, seconds: float = 60
+        self,
+        *words: str,
+        home: str = "home",
+        fault: dict[str, str] | None = None,
+        seconds: float = 60,
+        module: str = "teds_provision",
     ) -> subprocess.CompletedProcess[str]:
         """Run one command of a station of this desk to its end."""
         read, write = os.pipe()
@@ -78,7 +83,7 @@ class Desk:
         os.write(write, PASSPHRASE.encode() + b"\n")
         os.close(write)
         words = tuple(word.replace("{FD}", str(second)) for word in words)
-        command = [sys.executable, "-m", "teds_provision", "--home", str(self.folder / home), "--json"]
+        command = [sys.executable, "-m", module, "--home", str(self.folder / home), "--json"]
         try:
             return subprocess.run(
                 [*command, "--passphrase-fd", str(read), *self.words(words)],
@@ -428,6 +433,61 @@ def crowd(bench: Bench, processes: int = 8) -> str:
     return "; ".join(failed + missing + ([] if log["intact"] else ["the audit log does not hold"]))
 
 
+NOISE = (
+    {"loss": 0.01},
+    {"loss": 0.03},
+    {"double": 0.05, "swap": 0.02},
+    {"delay": 0.02, "corrupt": 0.02},
+    {"loss": 0.1, "double": 0.02, "swap": 0.02, "delay": 0.02, "corrupt": 0.02},
+)
+TRIES = 3
+
+
+def noise(bench: Bench, shares: dict[str, float], seed: int) -> tuple[int, str]:
+    """Provision a node over a bus whose frames meet with faults: tries that it took (at most three), the complaint.
+
+    Up to 3 % loss three tries must do; beyond that nothing may be lost, and the same command without noise finishes.
+    """
+    act = next(act for act in ACTS if act.name == "provision")
+    with bench.desk(act) as desk:
+        node = Running("--json", "node", "run", desk.folder / "flash", "--can", desk.links.can)
+        try:
+            node.wait_for('"ready": true')
+            place = desk.links.can.replace("udp_multicast:", "lossy:") + "&under=udp_multicast"
+            place += "".join(f"&{kind}={share}" for kind, share in shares.items()) + f"&seed={seed}"
+            words = ("provision", "--profile", ANGLE, "--yes", "--via", "can", "--timeout", "20")
+            for number in range(1, TRIES + 1):
+                try:
+                    done = desk.run(*words, "--can", place, module="tests.links.can.lossy", seconds=240)
+                except subprocess.TimeoutExpired:
+                    return number, f"{shares}: the command hangs"
+                if "Traceback" in done.stderr or done.returncode not in (0, 5):
+                    return number, f"{shares}: {done.returncode} {done.stdout[-300:]}{done.stderr[-300:]}"
+                if done.returncode == 0:
+                    break
+            tries = number if done.returncode == 0 else TRIES + 1
+            done = desk.run(*words, "LINK")
+            verified = desk.run("verify", UUID, "LINK")
+            if done.returncode or verified.returncode:
+                return tries, f"{shares}: without noise {done.returncode}, verify {verified.returncode}"
+            return tries, ""
+        finally:
+            node.process.kill()
+            node.process.wait()
+
+
+def noisy(bench: Bench, seeds: int) -> int:
+    """Every kind of noise with some seeds; prints how many tries each took; how many ended in a loss."""
+    lost = 0
+    for shares in NOISE:
+        results = [noise(bench, shares, seed) for seed in range(seeds)]
+        lost += sum(bool(complaint) for _, complaint in results)
+        tries = ", ".join(str(tries) if tries <= TRIES else f"more than {TRIES}" for tries, _ in results)
+        told = " ".join(f"{kind} {share:.0%}" for kind, share in shares.items())
+        print(f"frames on CAN, {told}: tries {tries}", *(f"LOST {said}" for _, said in results if said), flush=True)
+    return lost
+
+
 @dataclass(frozen=True)
 class Trial:
     """One fault in one command, in the station or in the node."""
@@ -485,6 +545,8 @@ def main(arguments: list[str]) -> int:
         complaint = crowd(bench)
         print(f"8 processes on one store: {complaint or 'all done, nothing lost'}")
         lost += bool(complaint)
+        if not chosen.quick:
+            lost += noisy(bench, seeds=4 if chosen.full else 2)
         unseen = control(bench) == 0
     if unseen:
         print("CONTROL FAILED: a disk that ignores fsync lost nothing, so this bench sees nothing")

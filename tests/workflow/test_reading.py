@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import pytest
 
-from teds_provision.errors import BadData
+from teds_provision.errors import BadData, Garbled
 from teds_provision.protocol.messages.frames import Reply
 from teds_provision.steps.read import LARGEST_SECURITY, read_block
+from teds_provision.teds.codec.frame import frame
 from teds_provision.teds.image import SECURITY
 
 from .bench import Board, MemoryLink, talk
@@ -24,10 +25,27 @@ def test_a_teds_that_claims_to_be_endless_is_not_read(board: Board, block: tuple
 
 
 def test_the_largest_security_teds_is_read_octet_by_octet(board: Board) -> None:
-    teds = (LARGEST_SECURITY - 4).to_bytes(4, "big") + bytes(LARGEST_SECURITY - 4)
+    teds = frame(bytes(LARGEST_SECURITY - 6))
 
     def drip(count: int, _reply: bytes) -> bytes:
         at = count - 1
         return Reply(True, at.to_bytes(4, "big") + teds[at : at + 1]).encode()
 
     assert read_block(talk(board, MemoryLink(board, tamper=drip)), SECURITY) == teds
+
+
+def test_noise_on_a_plain_read_is_read_again_and_a_teds_that_is_bad_stays_bad(board: Board) -> None:
+    def noise(count: int, reply: bytes) -> bytes:
+        return reply[:-1] + bytes([reply[-1] ^ 1]) if count == 1 else reply
+
+    good = read_block(talk(board, MemoryLink(board)), SECURITY)
+    noisy = MemoryLink(board, tamper=noise)
+    assert read_block(talk(board, noisy), SECURITY) == good
+    assert noisy.count > MemoryLink(board).count + 1
+
+    bad = MemoryLink(board, tamper=lambda _count, reply: reply[:-1] + bytes([reply[-1] ^ 1]))
+    assert read_block(talk(board, bad), SECURITY) == good[:-1] + bytes([good[-1] ^ 1])
+
+    restless = MemoryLink(board, tamper=lambda count, reply: reply[:-1] + bytes([count]))
+    with pytest.raises(Garbled, match="noisy"):
+        read_block(talk(board, restless), SECURITY)
