@@ -106,7 +106,7 @@ class NodeKeeper:
     # -- the thread --------------------------------------------------------------------------------------------------
 
     def _run(self) -> None:
-        pause = FIRST_PAUSE
+        pause, first = FIRST_PAUSE, time.monotonic()
         try:
             while not self._stop.is_set():
                 self._anew.clear()
@@ -122,7 +122,8 @@ class NodeKeeper:
                     break
                 self.error = error
                 # Before the first value a refusal ends it; later anyone could have sent it, so it is tried again.
-                if isinstance(error, _FINAL) and not self.ever_ran and not self._passing(error):
+                final = isinstance(error, _FINAL) and not self._passing(error)
+                if not self.ever_ran and (final or time.monotonic() - first > self._wish.timeout):
                     self._say("refused", error)
                     return
                 if time.monotonic() - began > LAST_PAUSE:

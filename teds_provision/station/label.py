@@ -82,7 +82,7 @@ def write_label(label: Label, path: Path) -> None:
         raise UsageFailure(f"A label is written as .svg or .png, not {path.name}.", hint="Name it LABEL.svg.")
     rows = _modules(label.text)
     octets = _svg(label, rows).encode() if suffix == ".svg" else _png(label, rows)
-    files.write_whole(path, octets, mode=0o644, failure=UsageFailure)
+    files.write_whole(path, octets, mode=0o644)
 
 
 def _modules(text: str) -> list[list[bool]]:

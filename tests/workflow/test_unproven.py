@@ -6,13 +6,14 @@ sections 1 and 4).
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 
 import pytest
 
-from teds_provision.errors import AddressConflict, NotAuthentic, Unproven
-from teds_provision.links import Contact
+from teds_provision.errors import AddressConflict, NodeRefused, NotAuthentic, Unproven
+from teds_provision.links import Contact, LinkSettings
 from teds_provision.links.ports import CAN, Capabilities
 from teds_provision.protocol.messages.frames import (
     COMMON,
@@ -27,12 +28,13 @@ from teds_provision.steps.identify import identify
 from teds_provision.steps.reset import proof_of_reset
 from teds_provision.steps.verify import Verified, require_authentic
 from teds_provision.steps.verify_node import look_at_node
-from teds_provision.talk.conversation import Conversation
+from teds_provision.steps.visits.at_node import verify_at
+from teds_provision.talk.conversation import Conversation, refused
 from teds_provision.talk.meeting import refuse_twins
 from teds_provision.teds.image import SECURITY, Image
 
 from .bench import Board, MemoryLink, contact, make_station, talk
-from .test_provision import ANGLE, run
+from .test_provision import ANGLE, Silent, run
 
 FORGED_ADDRESS = 99
 
@@ -169,3 +171,21 @@ def test_a_stranger_without_the_key_judges_by_signatures(station: Station, board
     stranger = make_station(tmp_path / "stranger")
     verified = looked_at(stranger, Attacker(board, recorded, NodeState.PROVISIONED))
     assert verified.verdict == "not authentic"
+
+
+def test_a_refused_challenge_where_a_key_is_held_is_unproven_not_an_error(
+    station: Station, board: Board, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    run(station, board)
+
+    def refuses(*_: object, **__: object) -> Iterator[None]:
+        raise refused(Reason.BUSY, "to prove its key")
+        yield
+
+    monkeypatch.setattr("teds_provision.steps.visits.at_node.at_node", contextmanager(refuses))
+    done = verify_at(station, LinkSettings(), board.uuid.hex(), Silent())
+    assert (done.verified.verdict, type(done.error)) == ("unproven", Unproven)
+
+    stranger = bytes(9) + b"\1"
+    with pytest.raises(NodeRefused):
+        verify_at(station, LinkSettings(), stranger.hex(), Silent())

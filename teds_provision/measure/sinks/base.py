@@ -14,7 +14,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import Protocol
 
-from teds_provision.errors import TedsProvisionError
+from teds_provision.errors import StoreFailure, TedsProvisionError
 from teds_provision.measure.blocks import Block, ChannelFacts, Command, GroupRows, NodeReport, SinkStats, StationFacts
 
 Item = Block | GroupRows | NodeReport | tuple[ChannelFacts, ...]
@@ -267,4 +267,4 @@ def as_sink_failure(error: OSError, name: str) -> TedsProvisionError:
         errno.ENOENT: ("its folder is not there", "Make the folder first."),
     }
     cause, cure = cures.get(error.errno or 0, (error.strerror or type(error).__name__, "Check the path."))
-    return TedsProvisionError(f"{name} cannot be written: {cause}.", hint=cure)
+    return StoreFailure(f"{name} cannot be written: {cause}.", hint=cure)

@@ -6,7 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
-from teds_provision.errors import BadData, NotFound, PolicyRefused, TedsProvisionError
+from teds_provision.errors import BadData, NodeRefused, NotFound, PolicyRefused, TedsProvisionError
 from teds_provision.links import LINKS, LinkSettings
 from teds_provision.station.station import Station
 from teds_provision.steps.address import set_address
@@ -15,7 +15,7 @@ from teds_provision.steps.order import guard, own_name
 from teds_provision.steps.read import read_image
 from teds_provision.steps.reset import ResetReceipt, reset_node
 from teds_provision.steps.sign import known_image
-from teds_provision.steps.verify import Verified, require_authentic, verify_image
+from teds_provision.steps.verify import Verified, require_authentic, session, verify_image
 from teds_provision.steps.verify_node import look_at_node
 from teds_provision.steps.visits.visit import at_node, node_or_image, read_image_file
 from teds_provision.steps.write import Written, write
@@ -125,9 +125,19 @@ def verify_at(
     if isinstance(found, Image):
         image, verified = found, Verified(found.uuid, tuple(verify_image(station, found)), scope="image")
     else:
-        with at_node(station, links, found, reporter) as visit:
-            looked = look_at_node(station, visit.node, visit.who)
-        image, verified = looked.image, looked.verified
+        in_session = False
+        try:
+            with at_node(station, links, found, reporter) as visit:
+                try:
+                    looked = look_at_node(station, visit.node, visit.who)
+                finally:
+                    in_session = visit.node.sealed
+            image, verified = looked.image, looked.verified
+        except NodeRefused as refusal:  # outside a session anyone may have sent it: it decides nothing
+            if in_session or not station.keys.held(found) or station.policy.tombstone(found) is not None:
+                raise
+            station.audit("verify", found, "unproven", why=refusal.message)
+            image, verified = Image(found, {}), Verified(found, (session("", refusal.message.rstrip(".")),))
     try:
         require_authentic(verified)
         return VerifyDone(verified, guard(station, image, None, accept_calibration), None)
