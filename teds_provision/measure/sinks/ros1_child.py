@@ -36,8 +36,10 @@ _OUT = threading.Lock()
 
 def wait_for_master(rosgraph: Any) -> None:
     """Until there is a master: init_node without one would block for ever, and say nothing that we could pass on."""
-    told = False
+    told, parent = False, os.getppid()
     while not rosgraph.is_master_online():
+        if os.getppid() != parent:
+            os._exit(0)  # a parent that was killed closes our stdin, which nobody reads yet
         if not told:
             say(event="waiting", master=os.environ.get("ROS_MASTER_URI", "http://localhost:11311"))
             told = True

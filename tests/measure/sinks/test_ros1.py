@@ -7,6 +7,7 @@ import queue
 import signal
 import socket
 import subprocess
+import sys
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import replace
@@ -16,7 +17,7 @@ import numpy as np
 import pytest
 
 from teds_provision.measure.blocks import Command, GroupRows, NodeReport
-from teds_provision.measure.sinks import open_sink
+from teds_provision.measure.sinks import open_sink, ros1_child
 from teds_provision.measure.sinks.ros1 import Ros1Sink
 from teds_provision.teds.units.units import parse_units
 from tests.measure.sinks.parts import ANGLE, ARM, FORCE, HAND, STATION, block
@@ -202,3 +203,23 @@ def test_nothing_of_the_child_outlives_the_sink(master: Master) -> None:
     assert child is not None
     sink.close()
     assert child.poll() is not None
+
+
+def test_a_child_that_waits_for_a_master_ends_when_its_parent_was_killed() -> None:
+    child = Path(ros1_child.__file__)
+    code = (
+        "import subprocess, sys, time;"
+        f"p = subprocess.Popen(['/usr/bin/python3', '-s', {str(child)!r}, 'orphan'], stdin=subprocess.PIPE,"
+        " stdout=subprocess.PIPE, env={'ROS_MASTER_URI': 'http://127.0.0.1:9', 'PATH': '/usr/bin', 'HOME': '/tmp'});"
+        "p.stdout.readline(); print(p.pid, flush=True); time.sleep(60)"
+    )
+    parent = subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, text=True)
+    assert parent.stdout is not None
+    orphan = int(parent.stdout.readline())
+    parent.kill()
+    parent.wait()
+    parent.stdout.close()
+    until = time.monotonic() + 15
+    while Path(f"/proc/{orphan}").exists():
+        assert time.monotonic() < until, "the child outlives its parent"
+        time.sleep(0.05)
