@@ -15,7 +15,7 @@ _WORDS: dict[Kind, KindWord] = {Kind.SENSOR: "sensor", Kind.ACTUATOR: "actuator"
 def facts_of(sheet: Sheet, channel: Channel, *, name: str, fingerprint: str, period: float | None) -> ChannelFacts:
     """Facts of one channel; ``name`` of the node, ``fingerprint`` of its Security TEDS (64 hex digits).
 
-    Values, limits and uncertainty are in the SI unit of the datasheet.
+    Values, limits and uncertainty are in the SI unit of the datasheet; ``period`` in seconds, which events do not have.
     """
     calibrated, due = channel.calibrated_at, channel.due
     return ChannelFacts(
@@ -35,7 +35,7 @@ def facts_of(sheet: Sheet, channel: Channel, *, name: str, fingerprint: str, per
         overdue=channel.overdue(datetime.now(UTC)),
         fingerprint=fingerprint,
         sample_form=channel.sample.name if channel.sample else "",
-        period=period,
+        period=None if channel.kind == Kind.EVENT_SENSOR else period,
     )
 
 

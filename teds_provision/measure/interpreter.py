@@ -121,14 +121,17 @@ def _why_raw(one: ChannelInterpreter, present: set[int]) -> str:
     return ""
 
 
+def _exact_as_float(column: np.ndarray) -> bool:
+    return bool(column.dtype.kind == "f" or column.max() < 2**53)
+
+
 def _together(columns: Sequence[np.ndarray]) -> np.ndarray:
     """Columns as one array of a dtype that holds each raw value exactly."""
     kinds = {column.dtype for column in columns}
-    objects = any(kind.kind == "O" for kind in kinds)
-    if len(kinds) == 1 and not objects:
+    numbers = all(kind.kind != "O" for kind in kinds)
+    if numbers and len(kinds) == 1:
         return np.column_stack(columns)
-    small = not objects and all(column.dtype.kind == "f" or column.max() < 2**53 for column in columns)
-    if small:
+    if numbers and all(map(_exact_as_float, columns)):
         return np.column_stack([column.astype(np.float64) for column in columns])
     mixed = np.empty((len(columns[0]), len(columns)), dtype=object)
     for k, column in enumerate(columns):

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import threading
 import time
+from collections.abc import Sequence
 from contextlib import suppress
 
 from teds_provision.errors import (
@@ -24,7 +25,6 @@ from teds_provision.links.can.port import CanPort
 from teds_provision.links.ports import Contact, Notice
 from teds_provision.measure.blocks import Command, NodeReport, State
 from teds_provision.measure.clock import AT_FIRST, ClockMap, Monotone, Wall
-from teds_provision.measure.facts import facts_of
 from teds_provision.measure.hands import Hands
 from teds_provision.measure.hearing import HeardStream, Hearing
 from teds_provision.measure.interpreter import StreamInterpreter
@@ -111,19 +111,11 @@ class NodeKeeper:
             while not self._stop.is_set():
                 self._anew.clear()
                 began = time.monotonic()
-                try:
-                    self._once()
-                    break
-                except SessionLost as lost:
-                    error: TedsProvisionError = lost.cause
-                except TedsProvisionError as caught:
-                    error = caught
-                if self._stop.is_set():
+                error = self._failure()
+                if error is None or self._stop.is_set():
                     break
                 self.error = error
-                # Before the first value a refusal ends it; later anyone could have sent it, so it is tried again.
-                final = isinstance(error, _FINAL) and not self._passing(error)
-                if not self.ever_ran and (final or time.monotonic() - first > self._wish.timeout):
+                if self._gives_up(error, first):
                     self._say("refused", error)
                     return
                 if time.monotonic() - began > LAST_PAUSE:
@@ -136,6 +128,23 @@ class NodeKeeper:
             self._bus.gone(self.uuid)
             self.done.set()
             self.ready.set()
+
+    def _failure(self) -> TedsProvisionError | None:
+        """Measure until the end or an error: what ended it, None for the end in order."""
+        try:
+            self._once()
+        except SessionLost as lost:
+            return lost.cause
+        except TedsProvisionError as error:
+            return error
+        return None
+
+    def _gives_up(self, error: TedsProvisionError, first: float) -> bool:
+        """Before the first value a refusal ends it; later anyone could have sent it, so it is tried again."""
+        if self.ever_ran:
+            return False
+        final = isinstance(error, _FINAL) and not self._passing(error)
+        return final or time.monotonic() - first > self._wish.timeout
 
     def _passing(self, error: TedsProvisionError) -> bool:
         """A refusal that time cures: another claim, no room, a node that is busy or starts anew."""
@@ -174,50 +183,18 @@ class NodeKeeper:
 
     def _measure(self, trusted: Trusted, address: int) -> list[Channel]:
         """Clock, Operate, Subscribe; every stream is heard from then on."""
-        wish = self._wish
         with self._mapping:
             self.clock = ClockMap()
         for _ in range(AT_FIRST):
             self._tell_time(trusted)
         actuators = self._actuators(trusted)
-        numbers = {one.number for one in actuators}
-        asked = [number for number in wish.channels if number not in numbers]
-        only_acts = actuators and (
-            not any(not one.actuator for one in trusted.sheet.channels) or (wish.channels and not asked)
-        )
-        channels = [] if only_acts else sensors_of(trusted.sheet.channels, asked, wish.kind)
-        if channels and len(channels) == sum(1 for one in trusted.sheet.channels if not one.actuator):
-            claim(trusted, 0, lease=wish.lease)
-        else:
-            for one in channels:
-                claim(trusted, one.number, lease=wish.lease)
+        channels = self._sensors(trusted.sheet.channels, actuators)
+        self._claim(trusted, channels)
         plans = self._subscribe(trusted, channels, address) if channels else Plans((), 0.0)
         periods = {number: p.subscribe.period / 1e9 for p in plans.streams for number in p.layout.channels}
-        self._events.facts(
-            [
-                facts_of(
-                    trusted.sheet,
-                    one,
-                    name=trusted.name,
-                    fingerprint=trusted.fingerprint,
-                    period=None if _is_event(one) else periods.get(one.number),
-                )
-                for one in (*channels, *actuators)
-            ]
-        )
+        self._events.facts([trusted.facts(one, periods.get(one.number)) for one in (*channels, *actuators)])
         if actuators:
-            self._hands = Hands(
-                trusted,
-                self._port,
-                address,
-                tuple(sorted(numbers)),
-                dead_man=wish.dead_man,
-                clock=self.clock,
-                turn=self.turn,
-                mapping=self._mapping,
-                echo=self._events.block,
-                tell=lambda why: self._say(self.state, why=why),
-            )
+            self._hands = self._hands_for(trusted, actuators, address)
         notes = [plans.slowed] if plans.slowed else []
         notes += [problem for heard in self.running.values() for problem in heard.interpreter.problems.values()]
         self.ever_ran, self.error = True, None
@@ -235,6 +212,36 @@ class NodeKeeper:
             for one in trusted.sheet.channels
             if one.actuator and not one.value_problem and (not wanted or one.number in wanted)
         ]
+
+    def _sensors(self, every: Sequence[Channel], actuators: list[Channel]) -> list[Channel]:
+        """Sensors to measure; none where only actuators were asked for, or the node has nothing else."""
+        moved = {one.number for one in actuators}
+        asked = [number for number in self._wish.channels if number not in moved]
+        nothing_else = all(one.actuator for one in every) or (self._wish.channels and not asked)
+        if actuators and nothing_else:
+            return []
+        return sensors_of(every, asked, self._wish.kind)
+
+    def _claim(self, trusted: Trusted, channels: list[Channel]) -> None:
+        """Claim the sensors one by one, or the whole node at once where every sensor is measured."""
+        sensors = [one for one in trusted.sheet.channels if not one.actuator]
+        whole = bool(channels) and len(channels) == len(sensors)
+        for number in [0] if whole else [one.number for one in channels]:
+            claim(trusted, number, lease=self._wish.lease)
+
+    def _hands_for(self, trusted: Trusted, actuators: list[Channel], address: int) -> Hands:
+        return Hands(
+            trusted,
+            self._port,
+            address,
+            tuple(sorted(one.number for one in actuators)),
+            dead_man=self._wish.dead_man,
+            clock=self.clock,
+            turn=self.turn,
+            mapping=self._mapping,
+            echo=self._events.block,
+            tell=lambda why: self._say(self.state, why=why),
+        )
 
     def _subscribe(self, trusted: Trusted, channels: list[Channel], address: int) -> Plans:
         while True:
@@ -357,14 +364,7 @@ class NodeKeeper:
 
     def report(self) -> NodeReport:
         """How the node does now."""
-        sums = [StreamTotals(one.channels, one.period) for one in self.totals.values()]
-        for mine, (number, past) in zip(sums, self.totals.items(), strict=True):
-            for name in ("messages", "samples", "lost", "late", "bad", "invalid"):
-                setattr(mine, name, getattr(past, name))
-            mine.clock_error = past.clock_error
-            heard = self.running.get(number)
-            if heard is not None:
-                mine.add(heard)
+        sums = [past.with_run(self.running.get(number)) for number, past in self.totals.items()]
         errors = [one.clock_error for one in sums if one.clock_error is not None]
         return NodeReport(
             uuid=self.uuid.hex(),
@@ -383,10 +383,6 @@ class NodeKeeper:
         self.state = state
         self._told = why or (error.message.rstrip(".") + more if error is not None else "")
         self._events.report(self.report())
-
-
-def _is_event(channel: Channel) -> bool:
-    return channel.kind is not None and channel.kind.name == "EVENT_SENSOR"
 
 
 def _nothing(_notice: Notice) -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import threading
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 from teds_provision.measure.blocks import Block, ChannelFacts, NodeReport
 from teds_provision.measure.hearing import HeardStream
@@ -57,6 +57,13 @@ class StreamTotals:
         self.bad += counts.bad + counts.junk + counts.future + counts.unasked + heard.wrong_pattern
         self.invalid += heard.invalid
         self.clock_error = heard.bound if heard.bound is not None else self.clock_error
+
+    def with_run(self, heard: HeardStream | None) -> StreamTotals:
+        """These totals with those of the run that still goes on; themselves stay as they are."""
+        sums = replace(self)
+        if heard is not None:
+            sums.add(heard)
+        return sums
 
 
 @dataclass

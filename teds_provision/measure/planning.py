@@ -60,7 +60,6 @@ def plan_node(
 ) -> Plans:
     """Streams over these channels of one node; ``rate`` in Hz for all of them, ``slower`` multiplies every period."""
     groups = _groups(channels, rate, kind)
-    asked = min(period for period, _, _ in groups)
     factor = slower
     for _ in range(200):
         paced = [(round(period * factor), how, members) for period, how, members in groups]
@@ -72,60 +71,63 @@ def plan_node(
         factor *= max(1.02, load / MOST_LOAD)
     else:
         raise PolicyRefused("The bus has no room for another node's data.", hint="Measure fewer nodes, or more slowly.")
-    fastest = min(period for period, _, _ in paced)
-    if fastest > asked * 1.000001:
-        text = f"{1e9 / fastest:.6g} Hz"
-        if rate is not None:
-            raise PolicyRefused(
-                f"{rate:g} Hz does not fit the bus ({MOST_LOAD:.0%} of it for data).",
-                hint=f"The fastest is --rate {text[:-3]}",
-            )
-        why = "more does not fit the bus" if factor > slower else "the node takes no shorter period"
-        slowed = f"slowed from {1e9 / asked:.6g} Hz to {text}: {why}"
-    else:
-        slowed = ""
+    slowed = _slowed(_fastest(groups), _fastest(paced), rate, by_bus=factor > slower)
     streams = tuple(replace(plan, subscribe=replace(plan.subscribe, gap=gap)) for plan in plans)
     return Plans(streams, load - bus.taken, slowed)
 
 
+def _fastest(groups: Sequence[_Group]) -> int:
+    return min(period for period, _, _ in groups)
+
+
+def _slowed(asked: int, fastest: int, rate: float | None, *, by_bus: bool) -> str:
+    """What to say where the shortest period (ns) became longer than the asked one; a ``--rate`` is refused instead."""
+    if fastest <= asked * 1.000001:
+        return ""
+    possible = f"{1e9 / fastest:.6g}"
+    if rate is not None:
+        raise PolicyRefused(
+            f"{rate:g} Hz does not fit the bus ({MOST_LOAD:.0%} of it for data).",
+            hint=f"The fastest is --rate {possible}",
+        )
+    why = "more does not fit the bus" if by_bus else "the node takes no shorter period"
+    return f"slowed from {1e9 / asked:.6g} Hz to {possible} Hz: {why}"
+
+
 def sensors_of(channels: Sequence[Channel], wanted: Sequence[int], kind: Kind | None) -> list[Channel]:
     """The sensors to measure: those that were asked for, or all; raises BadData where one cannot be."""
-    fitting = [one for one in channels if one.kind in (ChannelKind.SENSOR, ChannelKind.EVENT_SENSOR) and one.sample]
-    if kind == Kind.EVENT:
-        fitting = [one for one in fitting if one.kind == ChannelKind.EVENT_SENSOR]
-    elif kind is not None:
-        fitting = [one for one in fitting if one.kind == ChannelKind.SENSOR]
-    if not wanted:
-        if not fitting:
-            raise BadData("The datasheet describes no sensor that can be measured so.")
-        return fitting
-    numbers = {one.number: one for one in fitting}
-    strangers = [number for number in wanted if number not in numbers]
-    if strangers:
-        raise BadData(
-            f"Channel {strangers[0]} is no sensor of this datasheet that can be measured so.",
-            hint=f"It has {', '.join(map(str, numbers)) or 'none'}.",
-        )
-    return [numbers[number] for number in dict.fromkeys(wanted)]
+    fitting = {one.number: one for one in channels if one.sample and one.kind in _SENSORS_OF[kind]}
+    for number in wanted:
+        if number not in fitting:
+            raise BadData(
+                f"Channel {number} is no sensor of this datasheet that can be measured so.",
+                hint=f"It has {', '.join(map(str, fitting)) or 'none'}.",
+            )
+    if not fitting:
+        raise BadData("The datasheet describes no sensor that can be measured so.")
+    return [fitting[number] for number in dict.fromkeys(wanted or fitting)]
 
 
+_SENSORS_OF: dict[Kind | None, frozenset[ChannelKind]] = {
+    None: frozenset({ChannelKind.SENSOR, ChannelKind.EVENT_SENSOR}),
+    Kind.EVENT: frozenset({ChannelKind.EVENT_SENSOR}),
+    Kind.PERIODIC: frozenset({ChannelKind.SENSOR}),
+    Kind.FREE: frozenset({ChannelKind.SENSOR}),
+}
+_Paced = dict[tuple[int, Kind], list[Channel]]  # channels by period (ns) and kind of stream
 _Group = tuple[int, Kind, list[Channel]]
 
 
 def _groups(channels: Sequence[Channel], rate: float | None, kind: Kind | None) -> list[_Group]:
     """Channels by period and kind, at most 16 each; all at the slowest period where that makes too many streams."""
-    by: dict[tuple[int, Kind], list[Channel]] = {}
+    paced: _Paced = {}
     for one in channels:
         event = one.kind == ChannelKind.EVENT_SENSOR
         how = Kind.EVENT if event else Kind.FREE if kind == Kind.FREE else Kind.PERIODIC
-        by.setdefault((period_of(one, rate), how), []).append(one)
-    groups = _cut(by)
+        paced.setdefault((period_of(one, rate), how), []).append(one)
+    groups = _cut(paced)
     if len(groups) > LAST_STREAM + 1:
-        slowest = max(period for (period, how) in by if how != Kind.EVENT) if any(h != Kind.EVENT for _, h in by) else 0
-        together: dict[tuple[int, Kind], list[Channel]] = {}
-        for (period, how), members in by.items():
-            together.setdefault((period if how == Kind.EVENT else slowest, how), []).extend(members)
-        groups = _cut(together)
+        groups = _cut(_at_the_slowest(paced))
     if len(groups) > LAST_STREAM + 1:
         raise PolicyRefused(
             f"{len(channels)} channels need {len(groups)} streams; a node has {LAST_STREAM + 1}.",
@@ -134,9 +136,18 @@ def _groups(channels: Sequence[Channel], rate: float | None, kind: Kind | None) 
     return groups
 
 
-def _cut(by: dict[tuple[int, Kind], list[Channel]]) -> list[_Group]:
+def _at_the_slowest(paced: _Paced) -> _Paced:
+    """Every channel at the longest period of all; events, which have none, stay as they are."""
+    slowest = max((period for period, how in paced if how != Kind.EVENT), default=0)
+    together: _Paced = {}
+    for (period, how), members in paced.items():
+        together.setdefault((period if how == Kind.EVENT else slowest, how), []).extend(members)
+    return together
+
+
+def _cut(paced: _Paced) -> list[_Group]:
     groups: list[_Group] = []
-    for (period, how), members in by.items():
+    for (period, how), members in paced.items():
         step = 1 if how == Kind.EVENT else MOST_STREAM_CHANNELS
         # As even as can be: 25 channels as 13 and 12 make shorter messages than 16 and 9.
         parts = math.ceil(len(members) / step)

@@ -6,11 +6,12 @@ the rows of the group, reports once a second, and looks whether somebody has end
 
 from __future__ import annotations
 
+import math
 import threading
 import time
 from collections.abc import Callable, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from typing import Any
 
 from teds_provision.errors import NoNode, TedsProvisionError
@@ -24,7 +25,7 @@ from teds_provision.measure.keeper import NodeKeeper
 from teds_provision.measure.orders import BusShare, Events, Wish
 from teds_provision.measure.planning import BusTime
 from teds_provision.measure.sinks import Sink
-from teds_provision.measure.trusting import exchange_clock
+from teds_provision.measure.trusting import Trusted, exchange_clock
 from teds_provision.protocol.operation.can_frames import trigger_identifier
 from teds_provision.protocol.operation.stream_commands import Action
 from teds_provision.protocol.operation.subscription import TickBounds
@@ -108,19 +109,19 @@ class Measurement:
         return self._ended()
 
     def _loop(self, stop: threading.Event, duration: float | None) -> None:
-        until: float | None = None
+        until = math.inf
         reported = 0.0
         triggered = not self.wish.trigger
         while not stop.wait(BEAT):
             now = time.monotonic()
-            if all(keeper.done.is_set() for keeper in self.keepers):
+            if self._all_done():
                 return
             if not triggered and all(keeper.ready.is_set() for keeper in self.keepers):
                 triggered = True
                 self._trigger()
-            if duration is not None and until is None and any(keeper.ever_ran for keeper in self.keepers):
-                until = now + duration
-            if until is not None and now >= until:
+            if until == math.inf:
+                until = self._until(now, duration)
+            if now >= until:
                 return
             self._rows()
             if now - reported >= REPORTING:
@@ -128,6 +129,15 @@ class Measurement:
                 self._look()
                 if self._gave_up():
                     return
+
+    def _until(self, now: float, duration: float | None) -> float:
+        """When ``duration`` seconds of data are over: they count from the first node's first value."""
+        if duration is None or not any(keeper.ever_ran for keeper in self.keepers):
+            return math.inf
+        return now + duration
+
+    def _all_done(self) -> bool:
+        return all(keeper.done.is_set() for keeper in self.keepers)
 
     def _gave_up(self) -> bool:
         """Whether no node ever ran and each has had its time."""
@@ -169,14 +179,16 @@ class Measurement:
             before = dict(self._known)
             self._known.update((one.key, one) for one in facts)
             if self._known != before and any(sink.wants_rows for sink in self.sinks):
-                spans = [heard.receiver.plan.span for one in self.keepers for heard in list(one.running.values())]
-                patience = max(spans, default=0) / 1e9 + 2 * BEAT
-                group = self.facts.group or "all"
-                sensors = [one for _, one in sorted(self._known.items()) if one.kind != "actuator"]
-                self._grid = Grid(group, sensors, patience=patience)
+                self._grid = self._new_grid()
         for sink in self.sinks:
             sink.describe(facts)
         self.watcher.facts(facts)
+
+    def _new_grid(self) -> Grid:
+        spans = [heard.receiver.plan.span for one in self.keepers for heard in list(one.running.values())]
+        patience = max(spans, default=0) / 1e9 + 2 * BEAT
+        sensors = [one for _, one in sorted(self._known.items()) if one.kind != "actuator"]
+        return Grid(self.facts.group or "all", sensors, patience=patience)
 
     def _report(self, report: NodeReport) -> None:
         for sink in self.sinks:
@@ -188,6 +200,22 @@ class Measurement:
     def _trigger(self) -> None:
         """Arm every node, send one frame, read each node's mark: it must meet the time at which the frame went out."""
         token = Token.draw()
+        armed = self._arm(token)
+        before = time.monotonic_ns()
+        self.port.send(Frame(trigger_identifier(self.port.spec.source), token.octets))
+        after = time.monotonic_ns() + 5_000_000  # a controller may hold a frame back while others win arbitration
+        marks = []
+        for keeper, trusted in armed:
+            mark = self._mark(keeper, trusted, before, after)
+            if mark is None:
+                continue
+            marks.append(keeper.clock.host_of(mark))
+            for heard in list(keeper.running.values()):
+                heard.begin(mark + START_AFTER_MARK)
+        self._apart = max(marks) - min(marks) if marks else 0.0
+
+    def _arm(self, token: Token) -> list[tuple[NodeKeeper, Trusted]]:
+        """The nodes that wait for the trigger now."""
         armed = []
         for keeper in self.keepers:
             trusted = keeper.trusted
@@ -199,26 +227,25 @@ class Measurement:
                 armed.append((keeper, trusted))
             except (TedsProvisionError, SessionLost) as error:
                 self.watcher.note(f"Node {keeper.uuid.hex()} does not take the trigger: {error}")
-        before = time.monotonic_ns()
-        self.port.send(Frame(trigger_identifier(self.port.spec.source), token.octets))
-        after = time.monotonic_ns() + 5_000_000  # a controller may hold a frame back while others win arbitration
-        marks = []
-        for keeper, trusted in armed:
-            try:
-                with keeper.turn:
-                    mark = exchange_clock(trusted.node, keeper.clock).mark
-            except (TedsProvisionError, SessionLost) as error:
-                self.watcher.note(f"Node {keeper.uuid.hex()} did not say when it saw the trigger: {error}")
-                continue
-            low, high = keeper.clock.ticks_at(before).low, keeper.clock.ticks_at(after).high
-            if not mark or not mark_is_honest(mark, TickBounds(low, high)):
-                self.watcher.note(f"Node {keeper.uuid.hex()} names another moment for the trigger: it is not begun.")
-                keeper.stop()
-                continue
-            marks.append(keeper.clock.host_of(mark))
-            for heard in list(keeper.running.values()):
-                heard.begin(mark + START_AFTER_MARK)
-        self._apart = max(marks) - min(marks) if marks else 0.0
+        return armed
+
+    def _mark(self, keeper: NodeKeeper, trusted: Trusted, before: int, after: int) -> int | None:
+        """The tick at which the node saw the trigger, which went out between two times (monotonic ns).
+
+        None where it does not say, or names a moment at which the frame was not on the bus; such a node is stopped.
+        """
+        try:
+            with keeper.turn:
+                mark = exchange_clock(trusted.node, keeper.clock).mark
+        except (TedsProvisionError, SessionLost) as error:
+            self.watcher.note(f"Node {keeper.uuid.hex()} did not say when it saw the trigger: {error}")
+            return None
+        low, high = keeper.clock.ticks_at(before).low, keeper.clock.ticks_at(after).high
+        if not mark or not mark_is_honest(mark, TickBounds(low, high)):
+            self.watcher.note(f"Node {keeper.uuid.hex()} names another moment for the trigger: it is not begun.")
+            keeper.stop()
+            return None
+        return mark
 
     # -- the end -------------------------------------------------------------------------------------------------------
 
@@ -236,31 +263,21 @@ class Measurement:
         self._look()
 
     def _ended(self) -> Ended:
-        nodes = []
-        for keeper in self.keepers:
-            streams = [
-                {
-                    "channels": list(one.channels),
-                    "period": one.period,
-                    "messages": one.messages,
-                    "samples": one.samples,
-                    "lost": one.lost,
-                    "late": one.late,
-                    "bad": one.bad,
-                    "invalid": one.invalid,
-                    "clock_error": one.clock_error,
-                }
-                for _, one in sorted(keeper.totals.items())
-            ]
-            node: dict[str, Any] = {"uuid": keeper.uuid.hex(), "streams": streams}
-            if keeper.error is not None:
-                node["error"] = {"code": keeper.error.code, "message": keeper.error.message}
-            nodes.append(node)
+        nodes = [_summary(keeper) for keeper in self.keepers]
         errors = [keeper.error for keeper in self.keepers if keeper.error is not None]
         errors += [TedsProvisionError(s.stats.error, hint=s.stats.hint) for s in self.sinks if s.stats.error]
         worst = min(errors, key=_rank) if errors else None
         files = [name for sink in self.sinks for name in sink.files]
         return Ended(nodes, files, worst, self._apart)
+
+
+def _summary(keeper: NodeKeeper) -> dict[str, Any]:
+    """A node of the ``end`` event (cli.md, `measure`)."""
+    streams = [asdict(one) | {"channels": list(one.channels)} for _, one in sorted(keeper.totals.items())]
+    node: dict[str, Any] = {"uuid": keeper.uuid.hex(), "streams": streams}
+    if keeper.error is not None:
+        node["error"] = {"code": keeper.error.code, "message": keeper.error.message}
+    return node
 
 
 def _rank(error: TedsProvisionError) -> int:

@@ -16,6 +16,7 @@ from teds_provision.measure.sinks.lines import plain
 from teds_provision.measure.trusting import Trusted, claim, exchange_clock
 from teds_provision.protocol.operation.commands import MOST_SAMPLE_CHANNELS, Sampled, idle, sample
 from teds_provision.teds.calibration.interpreter import ChannelInterpreter
+from teds_provision.teds.sheet import Sheet
 
 LEASE = 5
 ROOM = 180  # octets of data sets in one reply, so that it fits any node's maxMessage
@@ -44,11 +45,7 @@ class Sample:
 def take_samples(trusted: Trusted, numbers: Sequence[int]) -> list[Sample]:
     """Fresh values of these channels (none: every sensor), taken together as far as one reply holds them."""
     channels = sensors_of(trusted.sheet.channels, numbers, None)
-    interpreters = {one.number: ChannelInterpreter(trusted.sheet, one.number) for one in channels}
-    more = {other for one in interpreters.values() for other in one.others}
-    known = {one.number for one in trusted.sheet.channels}
-    for other in sorted((more & known) - set(interpreters)):  # what the calibration of an asked one takes
-        interpreters[other] = ChannelInterpreter(trusted.sheet, other)
+    interpreters = _interpreters(trusted.sheet, [one.number for one in channels])
     clock, wall = ClockMap(), Wall.now()
     for _ in range(3):
         exchange_clock(trusted.node, clock)
@@ -70,6 +67,14 @@ def take_samples(trusted: Trusted, numbers: Sequence[int]) -> list[Sample]:
     return [_sample(interpreters[one.number], raws, good, times[one.number]) for one in channels]
 
 
+def _interpreters(sheet: Sheet, asked: Sequence[int]) -> dict[int, ChannelInterpreter]:
+    """Of the asked channels, then of those that their calibration takes as well."""
+    found = {number: ChannelInterpreter(sheet, number) for number in asked}
+    more = {other for one in found.values() for other in one.others}
+    known = {one.number for one in sheet.channels}
+    return found | {other: ChannelInterpreter(sheet, other) for other in sorted((more & known) - set(found))}
+
+
 def _parts(interpreters: dict[int, ChannelInterpreter]) -> list[list[int]]:
     parts: list[list[int]] = [[]]
     size = 0
@@ -82,10 +87,14 @@ def _parts(interpreters: dict[int, ChannelInterpreter]) -> list[list[int]]:
     return parts
 
 
+def _missing(one: ChannelInterpreter, raws: dict[int, np.ndarray]) -> str:
+    missing = [other for other in one.others if other not in raws]
+    return f"channel {missing[0]}, which compensates it, is not there" if missing else ""
+
+
 def _sample(one: ChannelInterpreter, raws: dict[int, np.ndarray], good: dict[int, bool], stamp: float) -> Sample:
     channel = one.channel
-    missing = [other for other in one.others if other not in raws]
-    why = one.problem or (f"channel {missing[0]}, which compensates it, is not there" if missing else "")
+    why = one.problem or _missing(one, raws)
     value, valid = math.nan, False
     if not why:
         found = one.values(raws[channel.number], {other: raws[other] for other in one.others})

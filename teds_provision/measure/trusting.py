@@ -12,7 +12,9 @@ import time
 from dataclasses import dataclass
 
 from teds_provision.errors import BadData, PolicyRefused
+from teds_provision.measure.blocks import ChannelFacts
 from teds_provision.measure.clock import ClockMap, Exchange
+from teds_provision.measure.facts import facts_of
 from teds_provision.protocol.operation import commands
 from teds_provision.protocol.operation.commands import Operate, Operation
 from teds_provision.protocol.operation.stream_commands import CLOCK, Clock
@@ -46,6 +48,10 @@ class Trusted:
     def digest(self) -> bytes:
         """First 16 octets of the fingerprint."""
         return bytes.fromhex(self.fingerprint)[: commands.DIGEST_OCTETS]
+
+    def facts(self, channel: Channel, period: float | None) -> ChannelFacts:
+        """What goes with every value of a channel that gives one every ``period`` seconds."""
+        return facts_of(self.sheet, channel, name=self.name, fingerprint=self.fingerprint, period=period)
 
     def channel(self, number: int) -> Channel:
         """A channel of the datasheet; raises BadData where there is none."""
