@@ -1,8 +1,15 @@
-"""Packages whose names are loaded at their first use (PEP 562), so that imports stand on top and start-up stays quick.
+"""Rooms whose modules and names are loaded at their first use (PEP 562), so that imports stand on top and cost nothing.
 
-A package says where its names are: ``__getattr__ = lazy(__name__, {"fit": "fitting"})`` gives ``package.fit`` from
-``package.fitting`` when somebody first asks for it. Users write ``from … import package`` on top and ``package.fit(…)``
-where they need it; ``from … import package.fit`` loads at once.
+A room's ``__init__`` names its modules for type checkers and has them loaded late for everybody else::
+
+    if TYPE_CHECKING:
+        from teds_provision.handover import life, trust
+    else:
+        __getattr__ = lazy(__name__)
+
+Users write ``from teds_provision import handover`` on top and ``handover.trust.spoken(…)`` where they need it; that
+call loads the module. ``from teds_provision.handover.trust import spoken`` on top loads it at once, which is right for
+what every use of a module needs.
 
 This module stands below every room and imports nothing of ours.
 """
@@ -12,22 +19,28 @@ from __future__ import annotations
 import sys
 from collections.abc import Callable, Mapping
 from importlib import import_module
+from importlib.util import find_spec
+from types import MappingProxyType
+from typing import Final
+
+_NOTHING: Final[Mapping[str, str]] = MappingProxyType({})
 
 
-def lazy(package: str, where: Mapping[str, str]) -> Callable[[str], object]:
-    """Return the ``__getattr__`` of a package: ``where`` says in which of its modules each name stands.
+def lazy(package: str, where: Mapping[str, str] = _NOTHING) -> Callable[[str], object]:
+    """Return the ``__getattr__`` of a package: it gives the package's modules, and the names of ``where``.
 
-    A module that is named after nothing ("" for the value) is given itself: ``{"curve": ""}`` is ``package.curve``.
+    ``where`` says in which of its modules a name stands: ``{"fit": "fitting"}`` is ``package.fit`` of
+    ``package.fitting``. No such name may be a module's too: Python would put the module in its place.
     """
 
     def load(name: str) -> object:
-        if name not in where:
+        if name in where:
+            value: object = getattr(import_module(f"{package}.{where[name]}"), name)
+            setattr(sys.modules[package], name, value)
+            return value
+        if name.startswith("_") or find_spec(f"{package}.{name}") is None:
             raise AttributeError(f"module {package!r} has no attribute {name!r}")
-        if not where[name]:
-            return import_module(f"{package}.{name}")
-        value: object = getattr(import_module(f"{package}.{where[name]}"), name)
-        setattr(sys.modules[package], name, value)
-        return value
+        return import_module(f"{package}.{name}")
 
     return load
 

@@ -10,3 +10,12 @@
 ``run``         which rules are run when, and what is made durable
 ==============  =======================================================================================
 """
+
+from typing import TYPE_CHECKING
+
+from teds_provision.lazy import lazy
+
+if TYPE_CHECKING:
+    from teds_provision.check import outcome, owning, plain, probe, rule, run, sessions, teds_rules, writing
+else:
+    __getattr__ = lazy(__name__)

@@ -1,1 +1,10 @@
 """The whole story on one machine."""
+
+from typing import TYPE_CHECKING
+
+from teds_provision.lazy import lazy
+
+if TYPE_CHECKING:
+    from teds_provision.demo import demo, desk, handover, measuring
+else:
+    __getattr__ = lazy(__name__)

@@ -1,1 +1,10 @@
 """Keys from one base station to another, and whom this one trusts."""
+
+from typing import TYPE_CHECKING
+
+from teds_provision.lazy import lazy
+
+if TYPE_CHECKING:
+    from teds_provision.handover import certify, deny, export_keys, import_keys, life, pending, prove, selection, trust
+else:
+    __getattr__ = lazy(__name__)

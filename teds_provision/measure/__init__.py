@@ -1,1 +1,26 @@
 """From datasheet to measurement: sessions, streams, clocks, groups, and the sinks that take calibrated values."""
+
+from typing import TYPE_CHECKING
+
+from teds_provision.lazy import lazy
+
+if TYPE_CHECKING:
+    from teds_provision.measure import (
+        acting,
+        blocks,
+        clock,
+        facts,
+        grid,
+        hands,
+        hearing,
+        interpreter,
+        keeper,
+        orders,
+        planning,
+        runner,
+        sampling,
+        sinks,
+        trusting,
+    )
+else:
+    __getattr__ = lazy(__name__)

@@ -1,1 +1,10 @@
 """The virtual transducer: flash in a file, TIM server, both links."""
+
+from typing import TYPE_CHECKING
+
+from teds_provision.lazy import lazy
+
+if TYPE_CHECKING:
+    from teds_provision.node import can, described, flash_file, handler, hardware, nfc, pulse, sources, virtual
+else:
+    __getattr__ = lazy(__name__)

@@ -1,1 +1,23 @@
 """Command frames, key agreement, sessions, bundles: pure state machines of both roles, no I/O."""
+
+from typing import TYPE_CHECKING
+
+from teds_provision.lazy import lazy
+
+if TYPE_CHECKING:
+    from teds_provision.protocol import (
+        agreement,
+        announce,
+        commit,
+        datasheet,
+        flash,
+        handover,
+        keys,
+        messages,
+        operation,
+        repetition,
+        session,
+        tim,
+    )
+else:
+    __getattr__ = lazy(__name__)

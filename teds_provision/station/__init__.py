@@ -1,1 +1,24 @@
 """The base station over store and vault: identity, node keys, pins, policy."""
+
+from typing import TYPE_CHECKING
+
+from teds_provision.lazy import lazy
+
+if TYPE_CHECKING:
+    from teds_provision.station import (
+        groups,
+        handovers,
+        identity,
+        inventory,
+        label,
+        node_keys,
+        nodes,
+        pins,
+        policy,
+        rewrap,
+        seals,
+        station,
+        summary,
+    )
+else:
+    __getattr__ = lazy(__name__)

@@ -1,1 +1,30 @@
 """Each step of provisioning: identify, whitelist, agree, build, sign, write, verify, provision, reset, address."""
+
+from typing import TYPE_CHECKING
+
+from teds_provision.lazy import lazy
+
+if TYPE_CHECKING:
+    from teds_provision.steps import (
+        address,
+        agree,
+        build,
+        fits,
+        identify,
+        judging,
+        many,
+        order,
+        provision,
+        read,
+        reset,
+        sign,
+        verify,
+        verify_files,
+        verify_node,
+        visits,
+        whitelist,
+        whitelist_files,
+        write,
+    )
+else:
+    __getattr__ = lazy(__name__)

@@ -6,10 +6,12 @@
 
 from __future__ import annotations
 
-from importlib import import_module
 from typing import TYPE_CHECKING, Final
 
+from teds_provision.lazy import lazy
+
 if TYPE_CHECKING:
+    from teds_provision.teds import calibration, codec, diff, fits, formats, guard, image, profile, sheet, show, units
     from teds_provision.teds.codec.codes import AccessCode
     from teds_provision.teds.codec.composer import compose, encode, recompose
     from teds_provision.teds.codec.decode import decode
@@ -78,11 +80,5 @@ _LAZY: Final = {
     "unpack_uuid": "codec.uuid",
 }
 
-
-def __getattr__(name: str) -> object:
-    """Load what not everybody needs at its first use."""
-    if name not in _LAZY:
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    value: object = getattr(import_module(f"{__name__}.{_LAZY[name]}"), name)
-    globals()[name] = value
-    return value
+if not TYPE_CHECKING:
+    __getattr__ = lazy(__name__, _LAZY)

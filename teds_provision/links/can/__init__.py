@@ -1,1 +1,25 @@
 """CAN: ISO-TP with normal fixed addressing, through python-can and can-isotp."""
+
+from typing import TYPE_CHECKING
+
+from teds_provision.lazy import lazy
+
+if TYPE_CHECKING:
+    from teds_provision.links.can import (
+        arrivals,
+        bus,
+        echoes,
+        finding,
+        frame,
+        gathering,
+        isotp,
+        link,
+        pacing,
+        port,
+        rivals,
+        shared,
+        spec,
+        transfer,
+    )
+else:
+    __getattr__ = lazy(__name__)

@@ -1,1 +1,24 @@
 """NFC: TNEP over NDEF on Type 4 and Type 2 tags, through nfcpy."""
+
+from typing import TYPE_CHECKING
+
+from teds_provision.lazy import lazy
+
+if TYPE_CHECKING:
+    from teds_provision.links.nfc import (
+        exchange,
+        frontend,
+        hints,
+        library,
+        message,
+        pcsc,
+        pieces,
+        poller,
+        reader,
+        tag,
+        tnep,
+        udp,
+        visit,
+    )
+else:
+    __getattr__ = lazy(__name__)

@@ -1,1 +1,10 @@
 """The node's end of a CAN bus."""
+
+from typing import TYPE_CHECKING
+
+from teds_provision.lazy import lazy
+
+if TYPE_CHECKING:
+    from teds_provision.node.can import seat, server, workers
+else:
+    __getattr__ = lazy(__name__)

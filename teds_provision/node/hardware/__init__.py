@@ -1,1 +1,10 @@
 """What a virtual transducer measures and acts with: channels, clock, battery."""
+
+from typing import TYPE_CHECKING
+
+from teds_provision.lazy import lazy
+
+if TYPE_CHECKING:
+    from teds_provision.node.hardware import battery, board, clock, converter
+else:
+    __getattr__ = lazy(__name__)

@@ -3,13 +3,11 @@
 The modules are loaded at their first use: whoever shows a file need not load the cryptography of a bundle.
 """
 
-from __future__ import annotations
-
 from typing import TYPE_CHECKING
 
 from teds_provision.lazy import lazy
 
 if TYPE_CHECKING:
-    from teds_provision.protocol.handover import bundle as bundle
-
-__getattr__ = lazy(__name__, {"bundle": ""})
+    from teds_provision.protocol.handover import bundle, jose, jwk, payload, receipt, revocation, strict_json
+else:
+    __getattr__ = lazy(__name__)

@@ -15,7 +15,8 @@ from fractions import Fraction
 from typing import Final, Literal
 
 from teds_provision.errors import BadData
-from teds_provision.teds import compose, decode
+from teds_provision.teds.codec.composer import compose
+from teds_provision.teds.codec.decode import decode
 from teds_provision.teds.codec.model import UNIT_PARTS, Decoded, Edition, Field, TimeInstance, Units
 from teds_provision.teds.codec.tables import TEXT_BASED, FieldSpec, name_of, table
 from teds_provision.teds.formats.block import Block
