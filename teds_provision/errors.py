@@ -108,6 +108,12 @@ class OtherKey(PolicyRefused):
     code = "other-key"
 
 
+class Frozen(PolicyRefused):
+    """Something is being measured and stays as it is until that ends."""
+
+    code = "frozen"
+
+
 class NodeRefused(PolicyRefused):
     """The node refused a command; ``reason`` is the u8 of security-teds.md section 4."""
 
@@ -135,6 +141,12 @@ class StoreLocked(StoreFailure):
     """Another process holds the store."""
 
     code = "store-locked"
+
+
+class NodeBusy(StoreLocked):
+    """Another command or request of this station works on the node."""
+
+    code = "node-busy"
 
 
 class VaultFailure(StoreFailure):

@@ -35,16 +35,19 @@ ARROWS = {
     "steps": _BELOW_TALK | {"talk"},
     "handover": _BELOW_TALK | {"talk", "steps"},
     "measure": _BELOW_TALK | {"talk", "steps", "handover"},
+    "client": set(),
+    "ncap": _BELOW_TALK | {"talk", "steps", "handover", "measure", "node", "client"},
     "check": _BELOW_TALK | {"talk", "steps"},
     "backup": {"station", "vault", "store", "protocol", "teds"},
     "doctor": {"station", "links", "vault", "store", "protocol", "teds"},
     "demo": _BELOW_TALK | {"talk", "steps", "handover", "measure"},
-    "cli": _BELOW_TALK | {"talk", "steps", "handover", "backup", "doctor", "demo", "node", "measure", "check"},
+    "cli": _BELOW_TALK
+    | {"talk", "steps", "handover", "backup", "doctor", "demo", "node", "measure", "check", "ncap", "client"},
     "__main__": {"cli"},
 }
 # Too slow to load before they are needed: --help, --version and a pure decode must not wait for them.
 HEAVY = {"nfc", "ndef", "can", "isotp", "keyring", "rich", "cryptography", "pint", "numpy", "matplotlib", "pkcs11"}
-HEAVY |= {"smartcard", "mcap", "zstandard", "cyclonedds", "paho"}
+HEAVY |= {"smartcard", "mcap", "zstandard", "cyclonedds", "paho", "starlette", "uvicorn", "websockets"}
 PURE = ("protocol", "teds")
 IO = {"socket", "sqlite3", "subprocess", "threading", "time", "click", "serial"}
 

@@ -53,6 +53,7 @@ SECTIONS: Final[dict[str, dict[str, Entry]]] = {
         "sample": Entry("measure.values", "sample", "One reading now, verified and calibrated."),
         "set": Entry("measure.values", "set_value", "Operate an actuator within its limits; let go: safe state."),
         "mode": Entry("measure.values", "mode", "What a node claims and does."),
+        "ncap": Entry("ncap.group", "ncap", "The base station as a service, with a page: run, status, open, token."),
         "group": Entry("measure.group", "group", "Measurement groups: create, add, remove, delete, list."),
     },
     "A key's life": {
@@ -75,5 +76,7 @@ SECTIONS: Final[dict[str, dict[str, Entry]]] = {
 }
 
 COMMANDS: Final = {name: entry for section in SECTIONS.values() for name, entry in section.items()}
-GROUPS: Final = frozenset({"draft", "vault", "group", "trust", "config", "profile", "whitelist", "handover", "node"})
+GROUPS: Final = frozenset(
+    {"draft", "vault", "group", "trust", "config", "profile", "whitelist", "handover", "node", "ncap"}
+)
 """The commands that have commands of their own."""

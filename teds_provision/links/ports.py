@@ -19,12 +19,14 @@ NoticeKind = Literal[
 class Notice:
     """Something a person should see while a port works: what is waited for, or what came by that is not a node.
 
-    Units: ``seconds`` is how long this wait may still last, None for as long as it takes.
+    Units: ``seconds`` is how long this wait may still last, None for as long as it takes. ``uuid`` is the node that is
+    spoken of, where there is one.
     """
 
     kind: NoticeKind
     text: str
     seconds: float | None = None
+    uuid: bytes | None = None
 
 
 NoticeSink = Callable[[Notice], None]

@@ -9,7 +9,7 @@ from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 
-from teds_provision.errors import NotFound, PolicyRefused, UsageFailure
+from teds_provision.errors import Frozen, NotFound, UsageFailure
 from teds_provision.store import Store
 from teds_provision.store.records import Group
 
@@ -56,34 +56,34 @@ class Groups:
         return self.get(name)
 
     def add(self, name: str, uuids: Iterable[bytes]) -> Group:
-        """Add nodes; raises NotFound, PolicyRefused while it is measured."""
+        """Add nodes; raises NotFound, Frozen while it is measured."""
         self.get(name)
         with self.frozen(name):
             self._store.add_to_group(name, uuids)
         return self.get(name)
 
     def remove(self, name: str, uuids: Iterable[bytes]) -> Group:
-        """Take nodes out; raises NotFound, PolicyRefused while it is measured."""
+        """Take nodes out; raises NotFound, Frozen while it is measured."""
         self.get(name)
         with self.frozen(name):
             self._store.remove_from_group(name, uuids)
         return self.get(name)
 
     def delete(self, name: str) -> bool:
-        """Delete a group; False where there is none. Raises PolicyRefused while it is measured."""
+        """Delete a group; False where there is none. Raises Frozen while it is measured."""
         with self.frozen(name):
             return self._store.remove_group(name)
 
     @contextmanager
     def frozen(self, name: str) -> Iterator[None]:
-        """Hold a group as it is; raises PolicyRefused where another process does."""
+        """Hold a group as it is; raises Frozen where another process does."""
         place = self._home / f"measuring-{name.encode().hex()}.lock"
         descriptor = os.open(place, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
         try:
             try:
                 fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
             except BlockingIOError:
-                raise PolicyRefused(
+                raise Frozen(
                     f"Group {name!r} is being measured: it stays as it is.", hint="End that measurement first."
                 ) from None
             yield

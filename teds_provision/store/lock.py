@@ -19,7 +19,7 @@ from contextlib import suppress
 from pathlib import Path
 from types import TracebackType
 
-from teds_provision.errors import StoreLocked
+from teds_provision.errors import NodeBusy, StoreLocked
 from teds_provision.store.database import as_store_failure
 from teds_provision.store.records import utc_now
 
@@ -107,7 +107,7 @@ class NodeTurn:
     """``with NodeTurn(home, uuid):`` one command works on this node of the store, the next one waits for it.
 
     One octet of a file is locked, at a place that the UUID names (two nodes may share one: then they take turns, no
-    more). Waits up to ``wait`` seconds; raises StoreLocked after that, StoreFailure where the file cannot be made.
+    more). Waits up to ``wait`` seconds; raises NodeBusy after that, StoreFailure where the file cannot be made.
     """
 
     def __init__(
@@ -151,7 +151,7 @@ class NodeTurn:
             else:
                 return
             if time.monotonic() >= until:
-                raise StoreLocked(
+                raise NodeBusy(
                     f"Another command of this station works on node {self._uuid.hex()}.",
                     hint="Wait until it has ended, or end it.",
                 )

@@ -118,7 +118,7 @@ class NfcPort:
             seen = self._look(notice, stop)
             same = isinstance(seen, Visit) and seen.identity.uuid == here
             if here is not None and not same and (seen is not None or time.monotonic() - gone_at > _DEBOUNCE):
-                notice(Notice("node-left", f"Node {here.hex().upper()} was taken off the reader."))
+                notice(_left(here))
                 notice(waiting)
                 here = None
             if seen is None:
@@ -136,7 +136,7 @@ class NfcPort:
                 link.close()
                 seen = link.visit
             if link is not None and link.lost:  # whoever comes next is a new visit, the same node too
-                notice(Notice("node-left", f"Node {seen.identity.uuid.hex().upper()} was taken off the reader."))
+                notice(_left(seen.identity.uuid))
                 notice(waiting)
                 here, link = None, None
             else:
@@ -335,3 +335,7 @@ def _tell(seen: Visit | Foreign, told: str, notice: NoticeSink) -> str:
         if text != told:
             notice(Notice("waiting", text))
     return text
+
+
+def _left(uuid: bytes) -> Notice:
+    return Notice("node-left", f"Node {uuid.hex().upper()} was taken off the reader.", uuid=uuid)

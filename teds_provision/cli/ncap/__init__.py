@@ -1,0 +1,1 @@
+"""``ncap …``: the base station as a service."""

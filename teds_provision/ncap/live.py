@@ -1,0 +1,234 @@
+"""What happens now, to many clients: values thinned to what a page can draw, and events.
+
+Blocks come from the hearing threads and are only put aside. Every BEAT they become one message, which is encoded once
+for all clients. A client has one slot for values: the newest wins, what it missed is counted and told to it. Events are
+never thinned; a client that leaves too many unread is told to ask anew (``resync``).
+"""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import math
+import threading
+import time
+from collections import deque
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, field
+from itertools import pairwise
+from typing import TYPE_CHECKING, Any, Final
+
+from teds_provision.lazy import late
+
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
+    from teds_provision.measure.blocks import Block
+else:
+    np = late("numpy")
+
+BEAT: Final = 0.05  # seconds between two messages of values
+POINTS: Final = 100.0  # a second and channel, at most
+_CREDIT: Final = 20.0  # points that a channel may be behind: samples come in bursts
+_WAITING: Final = 512  # blocks between two beats; beyond that the oldest go
+_EVENTS: Final = 256  # events that a client may leave unread
+_TOLD: Final = 1.0  # seconds between two signs of life
+
+Key = tuple[str, int]
+
+
+@dataclass(frozen=True)
+class Last:
+    """The newest value of a channel: SI unit of the datasheet, None where it is not valid; unix seconds."""
+
+    value: float | None
+    raw: Any
+    time: float
+
+
+class Listener:
+    """One client. ``wait`` gives the next messages for it, each a JSON text."""
+
+    def __init__(self) -> None:
+        self._values: str | None = None
+        self._events: deque[str] = deque()
+        self._dropped = 0
+        self._news = asyncio.Event()
+        self.dropped = 0
+
+    def values(self, text: str) -> None:
+        """Newest wins."""
+        if self._values is not None:
+            self._dropped += 1
+            self.dropped += 1
+        self._values = text
+        self._news.set()
+
+    def event(self, text: str) -> None:
+        """Kept in order; of too many none is kept, and the client is told to ask anew."""
+        if len(self._events) >= _EVENTS:
+            self._events.clear()
+            text = json.dumps({"type": "resync"})
+        self._events.append(text)
+        self._news.set()
+
+    async def wait(self) -> list[str]:
+        """The messages that are due, at least one."""
+        await self._news.wait()
+        self._news.clear()
+        found = list(self._events)
+        self._events.clear()
+        if self._dropped:
+            found.append(json.dumps({"type": "dropped", "messages": self._dropped}))
+            self._dropped = 0
+        if self._values is not None:
+            found.append(self._values)
+            self._values = None
+        return found
+
+
+@dataclass
+class _Channel:
+    credit: float = _CREDIT
+    times: list[NDArray[Any]] = field(default_factory=list)
+    values: list[NDArray[Any]] = field(default_factory=list)
+
+
+class Live:
+    """The fan-out. ``block`` and ``event`` may be called from any thread and return at once."""
+
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
+        self._waiting: deque[Block] = deque()
+        self._channels: dict[Key, _Channel] = {}
+        self._last: dict[Key, Last] = {}
+        self._listeners: set[Listener] = set()
+        self._loop: asyncio.AbstractEventLoop | None = None
+        self.overrun = 0
+        self.values = 0
+        self.told: Callable[[dict[str, Any]], None] = lambda _event: None
+        """Gets every event as well: the daemon's lines."""
+
+    # -- from any thread ---------------------------------------------------------------------------------------------
+
+    def block(self, block: Block) -> None:
+        """Samples of a stream."""
+        with self._lock:
+            if len(self._waiting) >= _WAITING:
+                self._waiting.popleft()
+                self.overrun += 1
+            self._waiting.append(block)
+
+    def event(self, event: str, **facts: Any) -> None:
+        """Something happened: a node, a measurement, a link, a step; told to every client in order."""
+        line = {"event": event, "time": time.time(), **facts}
+        self.told(line)
+        text = json.dumps({"type": "event", **line})
+        loop = self._loop
+        if loop is not None and not loop.is_closed():
+            loop.call_soon_threadsafe(self._tell, text)
+
+    def last(self, uuid: str, channel: int) -> Last | None:
+        """The newest value of a channel."""
+        return self._last.get((uuid, channel))
+
+    # -- in the loop -------------------------------------------------------------------------------------------------
+
+    def join(self) -> Listener:
+        """A new client."""
+        listener = Listener()
+        self._listeners.add(listener)
+        return listener
+
+    def leave(self, listener: Listener) -> None:
+        """A client that has gone."""
+        self._listeners.discard(listener)
+
+    @property
+    def listeners(self) -> int:
+        """How many clients listen."""
+        return len(self._listeners)
+
+    async def run(self) -> None:
+        """Give out what came, every BEAT, until cancelled."""
+        self._loop = asyncio.get_running_loop()
+        told = before = time.monotonic()
+        while True:
+            await asyncio.sleep(BEAT)
+            now = time.monotonic()
+            changed = self._gather(now - before)
+            before = now
+            if changed:
+                text = json.dumps({"type": "values", "time": time.time(), "channels": changed})
+                for listener in self._listeners:
+                    listener.values(text)
+            if now - told >= _TOLD:
+                told = now
+                self._tell(json.dumps({"type": "beat", "time": time.time()}))
+
+    def _tell(self, text: str) -> None:
+        for listener in self._listeners:
+            listener.event(text)
+
+    def _gather(self, seconds: float) -> dict[str, list[list[float | None]]]:
+        """What came since the last beat, by ``uuid/channel``: times and values."""
+        with self._lock:
+            blocks, self._waiting = self._waiting, deque()
+        if not blocks and not self._channels:
+            return {}
+        touched = self._put_aside(blocks)
+        out: dict[str, list[list[float | None]]] = {}
+        for key, one in self._channels.items():
+            one.credit = min(_CREDIT, one.credit + POINTS * seconds)
+            if key not in touched or not self._listeners:
+                one.times, one.values = [], []
+                continue
+            times, values = np.concatenate(one.times), np.concatenate(one.values)
+            one.times, one.values = [], []
+            times, values = thinned(times, values, int(one.credit))
+            one.credit -= len(times)
+            self.values += len(times)
+            if len(times):
+                out[f"{key[0]}/{key[1]}"] = [np.round(times, 4).tolist(), _numbers(values)]
+        return out
+
+    def _put_aside(self, blocks: Iterable[Block]) -> set[Key]:
+        touched: set[Key] = set()
+        for block in blocks:
+            if block.test_pattern or not len(block.time):
+                continue
+            for column, number in enumerate(block.channels):
+                key = block.uuid, number
+                one = self._channels.setdefault(key, _Channel())
+                one.times.append(block.time)
+                one.values.append(np.where(block.valid[:, column], block.value[:, column], np.nan))
+                touched.add(key)
+                value = float(block.value[-1, column]) if block.valid[-1, column] else None
+                self._last[key] = Last(value, block.raw[-1, column].item(), float(block.time[-1]))
+        return touched
+
+
+def thinned(times: NDArray[Any], values: NDArray[Any], most: int) -> tuple[NDArray[Any], NDArray[Any]]:
+    """At most ``most`` of these points, among them the least and the greatest of each of ``most // 2`` parts.
+
+    Points stay in order and are points that were measured; of a part without a value its first is kept, as a gap.
+    """
+    if len(times) <= most:
+        return times, values
+    parts = most // 2
+    if parts < 1:
+        return times[:0], values[:0]
+    kept: list[int] = []
+    edges = np.linspace(0, len(times), parts + 1).astype(int)
+    for begin, end in pairwise(edges.tolist()):
+        part = values[begin:end]
+        if np.isnan(part).all():
+            kept.append(int(begin))
+            continue
+        kept += sorted({int(begin + np.nanargmin(part)), int(begin + np.nanargmax(part))})
+    return times[kept], values[kept]
+
+
+def _numbers(values: NDArray[Any]) -> list[float | None]:
+    return [float(f"{value:.7g}") if math.isfinite(value) else None for value in values.tolist()]

@@ -1,0 +1,106 @@
+"""One node that came to a link: who it is, what its datasheet is worth, what it has to say of its power.
+
+What detection allows (operation.md section 7) is decided here: in whitelist mode a session is opened only with a node
+that is on the list under its key; transparent mode also reads strangers, within limits.
+"""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass
+from typing import Any, Final
+
+from teds_provision.errors import BadData, NodeRefused, TedsProvisionError
+from teds_provision.protocol.messages.identity import NodeState
+from teds_provision.protocol.operation.commands import POWER, Power, PowerFlag
+from teds_provision.station.station import Station
+from teds_provision.steps.agree import session_if_keyed
+from teds_provision.steps.identify import Identified, identify
+from teds_provision.steps.read import list_blocks, read_block, read_identity, read_image
+from teds_provision.steps.verify import Verified, known_of, session, verify_image
+from teds_provision.talk.conversation import Conversation
+from teds_provision.teds.image import SECURITY, Image
+from teds_provision.teds.sheet import Sheet
+
+STRANGERS_TEDS: Final = 256
+STRANGERS_OCTETS: Final = 65_535
+STRANGERS_SECONDS: Final = 60.0
+
+
+@dataclass(frozen=True)
+class Look:
+    """What was found out. ``sheet`` is that of a node whose datasheet is not kept here, None otherwise."""
+
+    verified: Verified
+    sheet: Sheet | None = None
+    power: dict[str, Any] | None = None
+
+
+def is_listed(station: Station, uuid: bytes) -> bool:
+    """Whether whitelist mode opens a session with a node: it is on the list, with the key that it has to show."""
+    entry = station.pins.entry(uuid)
+    return entry is not None and entry.fingerprint is not None
+
+
+def look(station: Station, node: Conversation) -> Look:
+    """Verify a node: in a session where its key is held here, else what it shows; raises TedsProvisionError."""
+    if station.keys.held(node.uuid) and node.identity.state != NodeState.FACTORY:
+        found = _in_session(station, node)
+        if found is not None:
+            return found
+    who = identify(station, node)
+    return _stranger(station, node, who)
+
+
+def _in_session(station: Station, node: Conversation) -> Look | None:
+    """In a session, as before a measurement: octets that were verified before are not read again, only judged anew."""
+    if session_if_keyed(station, node) is None:
+        return None
+    identity = read_identity(node)
+    octets = read_block(node, SECURITY)
+    kept = station.nodes.datasheet(node.uuid)
+    image = kept if kept is not None and kept.security == octets else read_image(node)
+    checks = verify_image(station, image, known=known_of(station, node.uuid, identity))
+    checks.append(session("opened under the key that is held here", ""))
+    verified = Verified(node.uuid, tuple(checks))
+    if verified.verdict != "not authentic" and image is not kept:
+        with station.durable("verify"):
+            station.nodes.keep_datasheet(image)
+    return Look(verified, Sheet.of(image) if verified.verdict == "not authentic" else None, power_of(node))
+
+
+def _stranger(station: Station, node: Conversation, who: Identified) -> Look:
+    """A node of which no key is held: its TEDS are read to be shown, and nothing of it is kept."""
+    until = time.monotonic() + STRANGERS_SECONDS
+    blocks = {SECURITY: who.security_teds}
+    for block in list_blocks(node)[:STRANGERS_TEDS]:
+        if block == SECURITY:
+            continue
+        octets = read_block(node, block, until=until)
+        if len(octets) > STRANGERS_OCTETS:
+            raise BadData(f"TEDS {block[1]} of channel {block[0]} has {len(octets)} octets: too long for a stranger's.")
+        blocks[block] = octets
+    image = Image(node.uuid, blocks)
+    why = "the node opens no session under any key that is held here" if station.keys.held(node.uuid) else ""
+    checks = (*verify_image(station, image, known=known_of(station, node.uuid, None)), session("", why))
+    return Look(Verified(node.uuid, checks), Sheet.of(image))
+
+
+def power_of(node: Conversation) -> dict[str, Any] | None:
+    """128.18 in an open session, None where the node does not tell."""
+    try:
+        power = Power.decode(node.send(POWER, "to tell its power"))
+    except (NodeRefused, BadData):
+        return None
+    return {
+        "flags": [flag.name.lower().replace("_", " ") for flag in PowerFlag if power.flags & flag and flag.name],
+        "level": power.level,
+        "voltage": power.voltage,
+        "current": power.current,
+        "temperature": power.temperature,
+    }
+
+
+def as_problem(error: TedsProvisionError) -> dict[str, str]:
+    """An error as the API tells it."""
+    return {"code": error.code, "message": error.message, "hint": error.hint}

@@ -1,0 +1,236 @@
+"""What is known of every node, as the API shows it. Written by the threads of links and measurements, read by all.
+
+The rows of the store and the datasheets are read when something changed, not when somebody asks.
+"""
+
+from __future__ import annotations
+
+import math
+import threading
+import time
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, field
+from datetime import UTC, datetime
+from typing import Any, Final
+
+from teds_provision.ncap.live import Live
+from teds_provision.station.inventory import inventory
+from teds_provision.station.station import Station
+from teds_provision.store import Search
+from teds_provision.store.records import iso
+from teds_provision.teds.sheet import Channel, Sheet
+
+_READ_NOW: Final = "read now"
+MOST_SHOWN: Final = 1000
+
+
+@dataclass
+class Seen:
+    """What the links say of one node now."""
+
+    place: str = ""
+    address: int | None = None
+    present: bool = False
+    seen: float = 0.0
+    verdict: str | None = None
+    checks: list[dict[str, str]] = field(default_factory=list)
+    looked: float = 0.0
+    problem: dict[str, str] | None = None
+    power: dict[str, Any] | None = None
+    measurement: str | None = None
+    report: dict[str, Any] | None = None
+    busy: str = ""
+
+
+class Roster:
+    """The nodes by UUID (20 hex digits, lower case)."""
+
+    def __init__(self, station: Station, live: Live, topic: Callable[[str, int], str]) -> None:
+        self._station, self._live, self._topic = station, live, topic
+        self._lock = threading.RLock()
+        self._seen: dict[str, Seen] = {}
+        self._rows: dict[str, dict[str, Any]] = {}
+        self._channels: dict[str, tuple[str, list[dict[str, Any]]]] = {}
+        self._strangers: dict[str, set[str]] = {}
+
+    # -- the store ---------------------------------------------------------------------------------------------------
+
+    def refresh(self, uuids: Iterable[str] | None = None) -> None:
+        """Read the rows of these nodes anew, or of all that the store knows; datasheets when somebody asks for them."""
+        wanted = (
+            self._station.nodes.find(Search())
+            if uuids is None
+            else [bytes.fromhex(uuid) for uuid in dict.fromkeys(uuids)]
+        )
+        rows = {row["uuid"]: row for row in inventory(self._station, wanted)}
+        with self._lock:
+            if uuids is None:
+                self._rows = rows
+            else:
+                self._rows |= rows
+
+    def _sheet(self, uuid: str) -> list[dict[str, Any]]:
+        """The channels of the datasheet that a node had last; decoded once for each datasheet."""
+        with self._lock:
+            digest = self._rows.get(uuid, {}).get("teds_sha256") or ""
+            known = self._channels.get(uuid)
+        if known is not None and known[0] in (digest, _READ_NOW):
+            return known[1]
+        image = self._station.nodes.datasheet(bytes.fromhex(uuid))
+        channels = [channel_facts(one) for one in Sheet.of(image).channels] if image is not None else []
+        with self._lock:
+            self._channels[uuid] = digest, channels
+        return channels
+
+    def show_sheet(self, uuid: str, sheet: Sheet | None) -> None:
+        """Show the channels of a datasheet that was read just now; None: those of the one that is kept."""
+        with self._lock:
+            if sheet is None:
+                self._channels.pop(uuid, None)
+            else:
+                self._channels[uuid] = _READ_NOW, [channel_facts(one) for one in sheet.channels]
+
+    # -- what links and measurements say -----------------------------------------------------------------------------
+
+    def note(self, uuid: str, state: str | None = None, **facts: Any) -> None:
+        """Change what is known of a node; with ``state`` every client is told (``came``, ``left``, ``verified`` …)."""
+        with self._lock:
+            seen = self._seen.setdefault(uuid, Seen())
+            for name, value in facts.items():
+                setattr(seen, name, value)
+        if state is not None:
+            told = {key: value for key, value in facts.items() if key in ("verdict", "problem", "place", "busy")}
+            self._live.event("node", uuid=uuid, state=state, **told)
+
+    def seen(self, uuid: str) -> Seen:
+        """What the links say of a node."""
+        with self._lock:
+            return self._seen.get(uuid) or Seen()
+
+    def stranger(self, place: str, uuid: str, *, there: bool) -> bool:
+        """Count a node that whitelist mode does not look at; True where that is news."""
+        with self._lock:
+            known = self._strangers.setdefault(place, set())
+            news = (uuid in known) != there
+            (known.add if there else known.discard)(uuid)
+        return news
+
+    def strangers(self, place: str) -> int:
+        """How many nodes of a link are not looked at."""
+        with self._lock:
+            return len(self._strangers.get(place, ()))
+
+    def forget_place(self, place: str) -> None:
+        """A link was lost, or its mode changed: nobody is seen there any more."""
+        with self._lock:
+            self._strangers.pop(place, None)
+            gone = [uuid for uuid, seen in self._seen.items() if seen.place == place and seen.present]
+        for uuid in gone:
+            self.note(uuid, "left", present=False)
+
+    def present(self, place: str) -> int:
+        """How many nodes are there."""
+        with self._lock:
+            return sum(seen.present and seen.place == place for seen in self._seen.values())
+
+    # -- for the API -------------------------------------------------------------------------------------------------
+
+    def uuids(self) -> list[str]:
+        """Every node of the store or on a link, those that are there first."""
+        with self._lock:
+            known = set(self._rows) | {uuid for uuid, seen in self._seen.items() if seen.present or seen.looked}
+            return sorted(known, key=lambda uuid: (not self.seen(uuid).present, uuid))
+
+    def known(self, uuid: str) -> bool:
+        """Whether there is anything to show of a node."""
+        with self._lock:
+            return uuid in self._rows or uuid in self._seen
+
+    def nodes(self, most: int = MOST_SHOWN) -> list[dict[str, Any]]:
+        """The first ``most`` of them; those that are there come first."""
+        return [self.node(uuid) for uuid in self.uuids()[:most]]
+
+    def node(self, uuid: str) -> dict[str, Any]:
+        """One node: api.md, `/nodes/UUID`."""
+        channels = self._sheet(uuid)
+        with self._lock:
+            seen = self._seen.get(uuid) or Seen()
+            row = self._rows.get(uuid, {})
+            out = {
+                "uuid": uuid,
+                "name": row.get("name"),
+                "profile": row.get("profile"),
+                "link": seen.place or None,
+                "via": seen.place.partition(":")[0] or None,
+                "address": seen.address,
+                "present": seen.present,
+                "last_seen": _moment(seen.seen) or row.get("last_seen"),
+                "state": row.get("state"),
+                "whitelisted": row.get("whitelisted", False),
+                "fingerprint": row.get("fingerprint"),
+                "epoch": row.get("epoch", 0),
+                "sequence": row.get("sequence", 0),
+                "due": row.get("due"),
+                "verdict": seen.verdict,
+                "known_verdict": row.get("verdict"),
+                "verified": _moment(seen.looked),
+                "checks": seen.checks,
+                "problem": seen.problem,
+                "busy": seen.busy or None,
+                "group": row.get("group"),
+                "groups": row.get("groups", []),
+                "measurement": seen.measurement,
+                "measuring": seen.report,
+                "power": seen.power,
+            }
+        out["channels"] = [
+            {**one, "topic": self._topic(uuid, one["number"]), "last": self._value(uuid, one["number"])}
+            for one in channels
+        ]
+        return out
+
+    def _value(self, uuid: str, channel: int) -> dict[str, Any] | None:
+        last = self._live.last(uuid, channel)
+        if last is None:
+            return None
+        age = max(0.0, time.time() - last.time)
+        value = last.value if last.value is None or math.isfinite(last.value) else None
+        return {"value": value, "raw": last.raw, "valid": value is not None, "time": last.time, "age": round(age, 3)}
+
+
+def channel_facts(one: Channel) -> dict[str, Any]:
+    """What the datasheet says of a channel: limits and uncertainty in its SI unit; ``rate`` in Hz.
+
+    ``shown`` is the unit for people: its number is the SI value × ``factor`` + ``offset``.
+    """
+    unit = one.unit
+    zero = unit.from_si(0.0)
+    now = datetime.now(UTC)
+    return {
+        "number": one.number,
+        "name": one.name,
+        "kind": one.kind.word if one.kind is not None else None,
+        "unit": one.si_unit,
+        "shown": {"unit": unit.text, "factor": _finite(unit.from_si(1.0) - zero), "offset": _finite(zero)},
+        "low": _finite(one.low),
+        "high": _finite(one.high),
+        "uncertainty": _finite(one.stated_uncertainty),
+        "rate": _finite(1 / one.period) if one.period > 0 else None,
+        "calibrated": one.calibrated_at.date().isoformat() if one.calibrated_at else None,
+        "due": one.due.date().isoformat() if one.due else None,
+        "overdue": one.overdue(now),
+        "problem": one.value_problem or None,
+    }
+
+
+def check_lines(checks: Sequence[Any]) -> list[dict[str, str]]:
+    """Checks as the API shows them."""
+    return [{"name": one.name, "result": one.result, "why": one.why} for one in checks]
+
+
+def _finite(number: float) -> float | None:
+    return number if math.isfinite(number) else None
+
+
+def _moment(unix: float) -> str | None:
+    return iso(datetime.fromtimestamp(unix, UTC)) if unix else None

@@ -1,0 +1,98 @@
+"""From a start to an end: the daemon, its servers, its signals, its lines on stdout."""
+
+from __future__ import annotations
+
+import asyncio
+import os
+import signal
+import socket
+from collections.abc import Callable
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
+
+from teds_provision.client import SOCKET
+from teds_provision.ncap.daemon import Daemon
+from teds_provision.ncap.presence import Presence
+from teds_provision.ncap.settings import Settings, require_safe
+from teds_provision.ncap.web.app import build
+from teds_provision.ncap.web.guard import Guard, front
+from teds_provision.ncap.web.server import Servers, listen
+from teds_provision.station.station import Station
+
+Tell = Callable[[dict[str, Any]], None]
+
+
+def run(station: Station, settings: Settings, tell: Tell) -> None:
+    """Run until SIGTERM or Ctrl-C; ``tell`` gets the line that it is ready, then a line for each event.
+
+    Raises StoreLocked where this home has a daemon, LinkFailure where the address is taken, UsageFailure.
+    """
+    require_safe(settings)
+    with Presence(station.home) as presence:
+        local = presence.listen()
+        tcp = listen(*settings.http) if settings.http is not None else None
+        daemon = Daemon(station, settings)
+        try:
+            asyncio.run(_serve(daemon, local, tcp, tell))
+        finally:
+            for listener in (local, tcp):
+                if listener is not None:
+                    listener.close()
+
+
+async def _serve(daemon: Daemon, local: socket.socket, tcp: socket.socket | None, tell: Tell) -> None:
+    stop = asyncio.Event()
+    loop = asyncio.get_running_loop()
+    for number in (signal.SIGTERM, signal.SIGINT):
+        loop.add_signal_handler(number, _ending(stop))
+    servers = Servers()
+    app = build(daemon)
+    daemon.live.told = tell
+
+    async def begin() -> None:
+        await servers.serve(Guard(app, daemon.tokens, None), local)
+        if tcp is not None:
+            host, port = tcp.getsockname()[:2]
+            tls = daemon.settings.certificate is not None
+            named = front(daemon.settings.allow, port, tls=tls)
+            await servers.serve(Guard(app, daemon.tokens, named), tcp, daemon.settings)
+            daemon.url = f"{'https' if tls else 'http'}://{_shown(daemon.settings, host)}:{port}"
+        socket_path = str(Path(daemon.station.home) / SOCKET)
+        tell({"ready": True, "url": daemon.url, "api": f"unix:{socket_path}", "pid": os.getpid()})
+        notify("READY=1")
+
+    try:
+        with daemon.running():
+            await daemon.serve(begin, stop)
+            notify("STOPPING=1")
+            await servers.stop()
+    finally:
+        await servers.stop()
+
+
+def _shown(settings: Settings, host: str) -> str:
+    """The name under which people call it."""
+    name = settings.allow[0] if settings.allow and host in ("0.0.0.0", "::") else host
+    return f"[{name}]" if ":" in name else name
+
+
+def _ending(stop: asyncio.Event) -> Callable[[], None]:
+    """The first signal ends in order, a second one at once."""
+
+    def end() -> None:
+        if stop.is_set():
+            os._exit(130)
+        stop.set()
+
+    return end
+
+
+def notify(state: str) -> None:
+    """Tell systemd (sd_notify): one datagram to the socket that NOTIFY_SOCKET names; without one nothing."""
+    where = os.environ.get("NOTIFY_SOCKET", "")
+    if not where.startswith(("/", "@")):
+        return
+    address = "\0" + where[1:] if where.startswith("@") else where
+    with suppress(OSError), socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as out:
+        out.sendto(state.encode(), address)

@@ -1,0 +1,79 @@
+"""What `ncap run` was started with."""
+
+from __future__ import annotations
+
+import ipaddress
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final, Literal
+
+from teds_provision.errors import UsageFailure
+
+Detection = Literal["transparent", "whitelist"]
+SOURCE: Final = 0xF7
+"""The daemon's own address on a bus: the command line, which has 0xF1 unless told otherwise, works beside it."""
+_LOCAL_NAMES: Final = ("localhost",)
+
+
+@dataclass(frozen=True)
+class Settings:
+    """``places`` are links as ``can:…`` and ``nfc:…``; ``detection`` None: as it was last set, else ``whitelist``.
+
+    ``http`` is (host, port) or None: then only the Unix socket of the home is served. ``sinks`` take what is measured,
+    beside those of each measurement; ``record`` is a folder for a recording of each measurement.
+    """
+
+    places: tuple[str, ...] = ()
+    detection: Detection | None = None
+    adopt: bool = False
+    http: tuple[str, int] | None = None
+    allow: tuple[str, ...] = ()
+    certificate: Path | None = None
+    key: Path | None = None
+    record: Path | None = None
+    sinks: tuple[str, ...] = ()
+    metrics: bool = False
+    clause_12: bool = False
+
+
+def with_own_source(place: str) -> str:
+    """A CAN place with the daemon's own source address, unless it names one."""
+    link, _, where = place.partition(":")
+    if link != "can" or "source=" in where.partition("?")[2]:
+        return place
+    return f"{place}{'&' if '?' in where else '?'}source=0x{SOURCE:02X}"
+
+
+def parse_http(text: str) -> tuple[str, int]:
+    """``HOST:PORT``, ``[::1]:PORT`` or ``PORT`` alone (this machine); raises UsageFailure."""
+    host, colon, port = text.rpartition(":")
+    host = host.removeprefix("[").removesuffix("]") if colon else "127.0.0.1"
+    if not port.isdecimal() or int(port) > 0xFFFF or not host:
+        raise UsageFailure(f"--http {text!r} is no HOST:PORT.", hint="Write it like 127.0.0.1:8351.")
+    return host, int(port)
+
+
+def is_loopback(host: str) -> bool:
+    """Whether only this machine reaches a server on this address; False for names that would have to be looked up."""
+    try:
+        return ipaddress.ip_address(host).is_loopback
+    except ValueError:
+        return host.lower() in _LOCAL_NAMES
+
+
+def require_safe(settings: Settings) -> None:
+    """Raise UsageFailure where the page would go to other machines without TLS, or with half of it."""
+    if (settings.certificate is None) != (settings.key is None):
+        raise UsageFailure("--tls-cert and --tls-key belong together.", hint="Give both, or neither.")
+    if settings.http is None or is_loopback(settings.http[0]):
+        return
+    if settings.certificate is None:
+        raise UsageFailure(
+            f"--http {settings.http[0]} would send values and tokens over the network in the clear.",
+            hint="Add --tls-cert and --tls-key, or serve 127.0.0.1 and use an SSH tunnel.",
+        )
+    if not settings.allow:
+        raise UsageFailure(
+            f"--http {settings.http[0]} needs to know by which names browsers may call it.",
+            hint="Add --http-allow HOST for each.",
+        )

@@ -1,0 +1,160 @@
+"""Who may call: tokens of scripts and of browsers, kept as SHA-256 in ``ncap-tokens.json`` (mode 0600).
+
+A token is 32 random octets, so its digest needs no salt and no slow hash. The file is changed under its own lock, and
+read again when it has changed: `ncap token` works with and without a running daemon.
+"""
+
+from __future__ import annotations
+
+import fcntl
+import hashlib
+import hmac
+import json
+import os
+import secrets
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any, Final, Literal
+
+from teds_provision.errors import NotFound, StoreFailure, UsageFailure
+from teds_provision.files import write_whole
+
+FILE: Final = "ncap-tokens.json"
+BROWSER_SECONDS: Final = 30 * 86_400.0
+LOGIN_SECONDS: Final = 300.0
+_MOST_BROWSERS: Final = 100
+_LONGEST_NAME: Final = 64
+
+
+@dataclass(frozen=True)
+class Token:
+    """One token: its digest (hex), and until when it is good (unix seconds; 0: for ever)."""
+
+    name: str
+    kind: Literal["script", "browser"]
+    digest: str
+    read_only: bool = False
+    created: float = 0.0
+    until: float = 0.0
+
+
+def digest_of(token: str) -> str:
+    """SHA-256 of a token, hex."""
+    return hashlib.sha256(token.encode()).hexdigest()
+
+
+class Tokens:
+    """The tokens of one home. Thread-safe."""
+
+    def __init__(self, home: Path) -> None:
+        self._home = home
+        self._guard = threading.Lock()
+        self._stamp: tuple[int, int] | None = None
+        self._known: list[Token] = []
+        self._logins: dict[str, tuple[float, bool]] = {}
+
+    # -- for the command line ----------------------------------------------------------------------------------------
+
+    def add(self, name: str, *, read_only: bool = False) -> str:
+        """Make a token for a script; it is given back once and nowhere else. Raises UsageFailure for a taken name."""
+        if not name.strip() or not name.isprintable() or len(name) > _LONGEST_NAME:
+            raise UsageFailure(f"{name!r} cannot be the name of a token.", hint="Use up to 64 printable characters.")
+        with self._changing() as tokens:
+            if any(one.name == name and one.kind == "script" for one in tokens):
+                raise UsageFailure(f"There is a token {name!r} already.", hint=f"Remove it: ncap token remove {name}")
+            token = secrets.token_urlsafe(32)
+            tokens.append(Token(name, "script", digest_of(token), read_only, time.time()))
+        return token
+
+    def remove(self, name: str) -> int:
+        """Take tokens of this name away, at once also for who uses one now; raises NotFound."""
+        with self._changing() as tokens:
+            kept = [one for one in tokens if one.name != name]
+            gone = len(tokens) - len(kept)
+            if not gone:
+                known = ", ".join(dict.fromkeys(one.name for one in tokens)) or "none"
+                raise NotFound(f"There is no token {name!r}.", hint=f"There is: {known}.")
+            tokens[:] = kept
+        return gone
+
+    def all(self) -> list[Token]:
+        """Every token that is good now."""
+        now = time.time()
+        return [one for one in self._read() if not one.until or one.until > now]
+
+    # -- for the daemon ----------------------------------------------------------------------------------------------
+
+    def login_link(self, *, read_only: bool = False) -> str:
+        """A token for the URL of `ncap open`: it works once, within five minutes, and is never written down."""
+        token = secrets.token_urlsafe(32)
+        now = time.monotonic()
+        with self._guard:
+            self._logins = {key: value for key, value in self._logins.items() if value[0] > now}
+            self._logins[digest_of(token)] = now + LOGIN_SECONDS, read_only
+        return token
+
+    def login(self, token: str) -> str | None:
+        """Turn a token of `ncap open` into the token of a browser's cookie; None where it is not good (any more)."""
+        with self._guard:
+            until, read_only = self._logins.pop(digest_of(token), (0.0, False))
+        if until < time.monotonic():
+            return None
+        cookie = secrets.token_urlsafe(32)
+        now = time.time()
+        with self._changing() as tokens:
+            browsers = [one for one in tokens if one.kind == "browser"]
+            for old in browsers[: max(0, len(browsers) - _MOST_BROWSERS + 1)]:
+                tokens.remove(old)
+            tokens.append(Token("browser", "browser", digest_of(cookie), read_only, now, now + BROWSER_SECONDS))
+        return cookie
+
+    def find(self, token: str) -> Token | None:
+        """The token that this is, None for none; compares in constant time."""
+        digest, now = digest_of(token), time.time()
+        found = None
+        for one in self._read():
+            if hmac.compare_digest(one.digest, digest) and (not one.until or one.until > now):
+                found = one
+        return found
+
+    # -- the file ----------------------------------------------------------------------------------------------------
+
+    def _read(self) -> list[Token]:
+        path = self._home / FILE
+        with self._guard:
+            try:
+                status = path.stat()
+            except FileNotFoundError:
+                self._stamp, self._known = None, []
+                return []
+            stamp = status.st_mtime_ns, status.st_ino
+            if stamp != self._stamp:
+                self._known, self._stamp = _parsed(path.read_bytes()), stamp
+            return self._known
+
+    @contextmanager
+    def _changing(self) -> Iterator[list[Token]]:
+        descriptor = os.open(self._home / f"{FILE}.lock", os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_CLOEXEC, 0o600)
+        try:
+            fcntl.flock(descriptor, fcntl.LOCK_EX)
+            now = time.time()
+            tokens = [one for one in self._read() if not one.until or one.until > now]
+            yield tokens
+            text = json.dumps({"format": "ncap-tokens/1", "tokens": [asdict(one) for one in tokens]}, indent=1)
+            write_whole(self._home / FILE, text.encode())
+        finally:
+            os.close(descriptor)
+
+
+def _parsed(octets: bytes) -> list[Token]:
+    try:
+        rows: list[dict[str, Any]] = json.loads(octets)["tokens"]
+        return [Token(**row) for row in rows]
+    except (ValueError, KeyError, TypeError) as error:
+        raise StoreFailure(
+            f"{FILE} cannot be read: nobody is let in.", hint="Remove it, and make new tokens: ncap token add NAME"
+        ) from error

@@ -1,0 +1,210 @@
+"""A thread for each link: it opens it, again and again if need be, and sees who comes and who leaves.
+
+On a bus, nodes are looked at by a few workers, so that the bus goes on being watched; at a reader the tap is served
+there and then, because the node may be taken away.
+"""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, field
+from typing import Any, Final, Protocol
+
+from teds_provision.errors import Frozen, LinkFailure, NodeBusy, TedsProvisionError
+from teds_provision.links import Contact, Notice, Port
+from teds_provision.links.opening import open_place
+from teds_provision.ncap.live import Live
+from teds_provision.ncap.looking import Look, as_problem, is_listed, look
+from teds_provision.ncap.roster import Roster, check_lines
+from teds_provision.ncap.turns import Turns
+from teds_provision.station.station import Station
+from teds_provision.talk.conversation import Conversation, SessionLost
+
+WORKERS: Final = 4
+FIRST_PAUSE, LAST_PAUSE = 1.0, 30.0
+LOOK_AGAIN: Final = 30.0  # seconds until a node that could not be looked at is looked at again
+
+
+class Taps(Protocol):
+    """Who wants to know of a node that lies on a reader, or answers on a bus."""
+
+    def serve_node(self, node: Conversation) -> bool:
+        """Do what was asked for with this node; False where nothing was."""
+
+
+@dataclass
+class LinkState:
+    """A link as the API shows it."""
+
+    place: str
+    state: str = "opening"
+    problem: dict[str, str] | None = None
+    waiting: str = ""
+    since: float = field(default_factory=time.time)
+    told: str = ""
+
+
+class Watch:
+    """Watches one link until ``stop``."""
+
+    def __init__(
+        self,
+        place: str,
+        station: Station,
+        roster: Roster,
+        live: Live,
+        turns: Turns,
+        taps: Taps,
+        transparent: Callable[[], bool],
+    ) -> None:
+        self.place = place
+        self.state = LinkState(place)
+        self.port: Port | None = None
+        self._station, self._roster, self._live, self._turns = station, roster, live, turns
+        self._taps, self._transparent = taps, transparent
+        self._stop, self._anew = threading.Event(), threading.Event()
+        self._workers = ThreadPoolExecutor(WORKERS, thread_name_prefix=f"look {place[:20]}")
+        self._pending: set[str] = set()
+        self._guard = threading.Lock()
+        self._thread = threading.Thread(target=self._run, name=f"watch {place}", daemon=True)
+
+    def start(self) -> None:
+        """Begin."""
+        self._thread.start()
+
+    def stop(self) -> None:
+        """Ask it to end; see :meth:`join`."""
+        self._stop.set()
+        self._anew.set()
+
+    def join(self, seconds: float) -> None:
+        """Wait for its end, and close the link."""
+        self._thread.join(seconds)
+        self._workers.shutdown(wait=False, cancel_futures=True)
+        port, self.port = self.port, None
+        if port is not None:
+            port.close()
+
+    def look_at_all(self) -> None:
+        """Ask everyone now, and look at each of them anew."""
+        self._anew.set()
+
+    # -- the thread --------------------------------------------------------------------------------------------------
+
+    def _run(self) -> None:
+        pause = FIRST_PAUSE
+        while not self._stop.is_set():
+            try:
+                if self.port is None:
+                    self.port = open_place(self.place)
+                self._say("up")
+                pause = FIRST_PAUSE
+                self._watch(self.port)
+            except TedsProvisionError as error:
+                self._say("down", error)
+                self._roster.forget_place(self.place)
+                self._close()
+                self._stop.wait(pause)
+                pause = min(2 * pause, LAST_PAUSE)
+
+    def _watch(self, port: Port) -> None:
+        while not self._stop.is_set():
+            self._anew.clear()
+            for contact in port.watch(stop=self._anew, notice=self._notice):
+                self._came(contact)
+            if not self._stop.is_set():
+                self._live.event("link", place=self.place, state="asking")
+
+    def _close(self) -> None:
+        port, self.port = self.port, None
+        if port is not None:
+            port.close()
+
+    def _notice(self, notice: Notice) -> None:
+        uuid = notice.uuid.hex() if notice.uuid is not None else ""
+        if notice.kind == "node-left" and uuid:
+            if self._roster.stranger(self.place, uuid, there=False):
+                return
+            if self._turns.holder(uuid) is None:
+                self._roster.note(uuid, "left", present=False)
+        elif notice.kind == "reader-lost":
+            self._say("down", LinkFailure(notice.text))
+            self._roster.forget_place(self.place)
+        elif notice.kind == "reader-ready":
+            self._say("up")
+        elif notice.kind == "waiting":
+            self.state.waiting = notice.text
+        elif notice.text != self.state.told:
+            self.state.told = notice.text
+            self._live.event("link", place=self.place, state=notice.kind, text=notice.text)
+
+    def _say(self, state: str, error: TedsProvisionError | None = None) -> None:
+        problem = as_problem(error) if error is not None else None
+        if (self.state.state, self.state.problem) != (state, problem):
+            self.state.state, self.state.problem, self.state.since = state, problem, time.time()
+            self._live.event("link", place=self.place, state=state, problem=problem)
+
+    # -- nodes -------------------------------------------------------------------------------------------------------
+
+    def _came(self, contact: Contact) -> None:
+        uuid = contact.identity.uuid.hex()
+        facts: dict[str, Any] = {
+            "place": self.place, "address": contact.address, "present": True, "seen": time.time()
+        }  # fmt: skip
+        if contact.link.capabilities.tapped:
+            self._roster.note(uuid, "tapped", **facts)
+            self._serve(contact)
+            return
+        if not self._wanted(contact):
+            if self._roster.stranger(self.place, uuid, there=True):
+                self._live.event("link", place=self.place, state="strangers", count=self._roster.strangers(self.place))
+            return
+        self._roster.note(uuid, "came", **facts)
+        with self._guard:
+            if uuid in self._pending:
+                return
+            self._pending.add(uuid)
+        self._workers.submit(self._serve, contact)
+
+    def _wanted(self, contact: Contact) -> bool:
+        """Whether detection shows this node at all: whitelist mode shows others as a count."""
+        return self._transparent() or is_listed(self._station, contact.identity.uuid)
+
+    def _serve(self, contact: Contact) -> None:
+        uuid = contact.identity.uuid.hex()
+        try:
+            with self._turns.of(uuid, "it is looked at"), Conversation(contact, notice=self._notice) as node:
+                if not self._taps.serve_node(node):
+                    self._look(node)
+        except Frozen:
+            return  # its measurement verified it, and says how it does
+        except NodeBusy as error:
+            self._roster.note(uuid, problem=as_problem(error))
+        except SessionLost as lost:
+            self._roster.note(uuid, "problem", problem=as_problem(lost.cause))
+        except TedsProvisionError as error:
+            self._roster.note(uuid, "problem", problem=as_problem(error))
+        finally:
+            with self._guard:
+                self._pending.discard(uuid)
+            self._roster.refresh([uuid])
+
+    def _look(self, node: Conversation) -> None:
+        if not self._wanted(node.contact):
+            return  # a tap shows who lies there, and no more
+        found: Look = look(self._station, node)
+        uuid = node.uuid.hex()
+        self._roster.show_sheet(uuid, found.sheet)
+        self._roster.refresh([uuid])
+        self._roster.note(
+            uuid,
+            "verified",
+            verdict=found.verified.verdict,
+            checks=check_lines(found.verified.checks),
+            looked=time.time(),
+            power=found.power,
+            problem=None,
+        )

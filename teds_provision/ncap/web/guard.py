@@ -1,0 +1,260 @@
+"""In front of every request, WebSocket included: where it came from, who it is, and what it brings.
+
+A page in the user's browser reaches a server on loopback, and so does any page of the net through it. So Host and
+Origin are held against an exact list, fetch metadata say whether another site asks, a token says who it is, and what
+changes anything comes as JSON, which a form cannot send. The Unix socket has the file's mode in place of all that.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import time
+from collections import deque
+from collections.abc import Awaitable, Callable, Mapping, MutableMapping
+from dataclasses import dataclass, field
+from http.cookies import CookieError, SimpleCookie
+from typing import Any, Final, Literal
+from urllib.parse import parse_qs
+
+from teds_provision.ncap.tokens import Tokens
+
+Scope = MutableMapping[str, Any]
+Message = MutableMapping[str, Any]
+Receive = Callable[[], Awaitable[Message]]
+Send = Callable[[Message], Awaitable[None]]
+App = Callable[[Scope, Receive, Send], Awaitable[None]]
+
+CALLER: Final = "teds.caller"
+LARGEST_BODY: Final = 1 << 20
+_WRONG_TOKENS: Final = 10
+_WRONG_WITHIN: Final = 60.0
+_SLOWED: Final = 1.0
+_SAFE: Final = frozenset({"GET", "HEAD", "OPTIONS"})
+_CSP: Final = (
+    "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' data:; connect-src 'self'; "
+    "font-src 'self'; manifest-src 'self'; form-action 'self'; frame-ancestors 'none'; base-uri 'none'"
+)
+HEADERS: Final = (
+    (b"content-security-policy", _CSP.encode()),
+    (b"x-content-type-options", b"nosniff"),
+    (b"x-frame-options", b"DENY"),
+    (b"referrer-policy", b"no-referrer"),
+    (b"cross-origin-resource-policy", b"same-origin"),
+    (b"cross-origin-opener-policy", b"same-origin"),
+    (b"cache-control", b"no-store"),
+)
+
+
+@dataclass(frozen=True)
+class Caller:
+    """Who calls: by the Unix socket (the user himself), with a browser's cookie, or with a script's token."""
+
+    name: str
+    kind: Literal["socket", "browser", "script"]
+    read_only: bool = False
+
+
+@dataclass(eq=False)
+class Refusal(Exception):
+    """A request that goes no further: status, and code, message and hint as everywhere."""
+
+    status: int
+    code: str
+    message: str
+    hint: str = ""
+    headers: tuple[tuple[bytes, bytes], ...] = ()
+
+
+@dataclass(frozen=True)
+class Front:
+    """Under which names the page is served: ``host:port`` of each, and whether by TLS."""
+
+    hosts: frozenset[str]
+    port: int
+    tls: bool = False
+
+    @property
+    def origins(self) -> frozenset[str]:
+        """The origins that these names make."""
+        return frozenset(f"{'https' if self.tls else 'http'}://{host}" for host in self.hosts)
+
+    @property
+    def cookie(self) -> str:
+        """Name of the cookie: cookies know no ports, so the name does."""
+        return f"ncap-{self.port}"
+
+
+def front(hosts: tuple[str, ...], port: int, *, tls: bool) -> Front:
+    """The names of a server: loopback's always, and those that were allowed."""
+    names = {"127.0.0.1", "localhost", "[::1]", *(f"[{one}]" if one.count(":") > 1 else one.lower() for one in hosts)}
+    usual = 443 if tls else 80
+    return Front(frozenset({f"{one}:{port}" for one in names} | (names if port == usual else set())), port, tls)
+
+
+@dataclass
+class Guard:
+    """Wraps the application. ``front`` None: the Unix socket, where the caller is the user."""
+
+    app: App
+    tokens: Tokens
+    front: Front | None
+    _wrong: deque[float] = field(default_factory=deque)
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """One request or WebSocket."""
+        if scope["type"] not in ("http", "websocket"):
+            await self.app(scope, receive, send)
+            return
+        begun = False
+
+        async def with_headers(message: Message) -> None:
+            nonlocal begun
+            if message["type"] in ("http.response.start", "websocket.http.response.start"):
+                begun = True
+                own = {name.lower() for name, _ in message.get("headers", ())}
+                more = [(name, value) for name, value in HEADERS if name not in own]
+                message["headers"] = [*message.get("headers", ()), *more]
+            await send(message)
+
+        try:
+            headers = _headers(scope)
+            scope[CALLER] = await self._caller(scope, headers)
+            _require_form(scope, headers, scope[CALLER])
+            await self.app(scope, _limited(receive) if scope["type"] == "http" else receive, with_headers)
+        except Refusal as refusal:
+            if not begun:
+                await _refuse(scope, with_headers, refusal, html=_wants_html(scope))
+
+    async def _caller(self, scope: Scope, headers: Mapping[str, str]) -> Caller:
+        if self.front is None:
+            return Caller("socket", "socket")
+        _require_origin(self.front, headers)
+        path = scope["path"]
+        if path == "/login" and scope["type"] == "http":
+            raise await self._login(scope)
+        cookie, bearer = _cookie(headers, self.front.cookie), _bearer(headers)
+        given = bearer or cookie
+        if not given:
+            raise Refusal(401, "no-token", "This needs a token.", "Open the page by: teds-provision ncap open")
+        found = await asyncio.to_thread(self.tokens.find, given)
+        if found is None:
+            raise await self._wrong_token()
+        if scope["type"] == "websocket" and found.kind == "browser" and "origin" not in headers:
+            raise Refusal(403, "no-origin", "A browser says where a WebSocket comes from; this one does not.")
+        return Caller(found.name, found.kind, found.read_only)
+
+    async def _login(self, scope: Scope) -> Refusal:
+        """Trade the token of `ncap open` for a cookie; told as a redirection to the page without it."""
+        assert self.front is not None
+        if scope["method"] != "GET":
+            return Refusal(405, "usage", "The login is a link.")
+        given = parse_qs(scope["query_string"].decode("latin-1")).get("token", [""])[0]
+        cookie = await asyncio.to_thread(self.tokens.login, given)
+        if cookie is None:
+            return await self._wrong_token()
+        secure = "; Secure" if self.front.tls else ""
+        value = f"{self.front.cookie}={cookie}; HttpOnly; SameSite=Strict; Path=/; Max-Age=2592000{secure}"
+        return Refusal(303, "", "", headers=((b"set-cookie", value.encode()), (b"location", b"/")))
+
+    async def _wrong_token(self) -> Refusal:
+        now = time.monotonic()
+        while self._wrong and now - self._wrong[0] > _WRONG_WITHIN:
+            self._wrong.popleft()
+        self._wrong.append(now)
+        if len(self._wrong) > _WRONG_TOKENS:
+            if len(self._wrong) > 10 * _WRONG_TOKENS:
+                self._wrong.popleft()
+            await asyncio.sleep(_SLOWED)  # a right token is never slowed down: nobody can lock the others out
+            return Refusal(429, "too-many", "Too many wrong tokens.", headers=((b"retry-after", b"60"),))
+        return Refusal(401, "wrong-token", "This token is not good (any more).", "A new one: teds-provision ncap open")
+
+
+def _headers(scope: Scope) -> dict[str, str]:
+    found: dict[str, str] = {}
+    for name, value in scope["headers"]:
+        key = name.decode("latin-1").lower()
+        if key in found and key in ("host", "origin", "content-length", "content-type", "authorization"):
+            raise Refusal(400, "usage", f"The header {key} comes twice.")
+        found[key] = value.decode("latin-1") if key not in found else f"{found[key]}; {value.decode('latin-1')}"
+    return found
+
+
+def _require_origin(named: Front, headers: Mapping[str, str]) -> None:
+    if headers.get("host", "").lower() not in named.hosts:
+        raise Refusal(
+            421,
+            "foreign-host",
+            "This server is not called so.",
+            "Use the address that ncap open prints; see --http-allow.",
+        )
+    if "origin" in headers and headers["origin"].lower() not in named.origins:
+        raise Refusal(403, "foreign-origin", "Another page may not use this server.")
+    if headers.get("sec-fetch-site", "none") not in ("none", "same-origin"):
+        raise Refusal(403, "foreign-origin", "Another site may not use this server.")
+
+
+def _require_form(scope: Scope, headers: Mapping[str, str], caller: Caller) -> None:
+    """What changes anything comes as JSON, is not too long, and not from a read-only token."""
+    if scope["type"] != "http":
+        return
+    length = headers.get("content-length", "")
+    if length.isdecimal() and int(length) > LARGEST_BODY:
+        raise Refusal(413, "too-large", f"At most {LARGEST_BODY} octets are taken.")
+    if scope["method"] in _SAFE:
+        return
+    if caller.read_only:
+        raise Refusal(403, "read-only", f"The token {caller.name!r} may only read.", "Use one without --read-only.")
+    empty = scope["method"] == "DELETE" and length in ("", "0") and "transfer-encoding" not in headers
+    if not empty and headers.get("content-type", "").partition(";")[0].strip().lower() != "application/json":
+        raise Refusal(415, "not-json", "What changes anything comes as JSON.", "Send Content-Type: application/json.")
+
+
+def _limited(receive: Receive) -> Receive:
+    """A body without a stated length is cut off all the same."""
+    taken = 0
+
+    async def next_message() -> Message:
+        nonlocal taken
+        message = await receive()
+        taken += len(message.get("body", b""))
+        if taken > LARGEST_BODY:
+            raise Refusal(413, "too-large", f"At most {LARGEST_BODY} octets are taken.")
+        return message
+
+    return next_message
+
+
+def _cookie(headers: Mapping[str, str], name: str) -> str:
+    try:
+        found = SimpleCookie(headers.get("cookie", "")).get(name)
+    except CookieError:
+        return ""
+    return found.value if found is not None else ""
+
+
+def _bearer(headers: Mapping[str, str]) -> str:
+    scheme, _, token = headers.get("authorization", "").partition(" ")
+    return token.strip() if scheme.lower() == "bearer" else ""
+
+
+def _wants_html(scope: Scope) -> bool:
+    accept = dict(scope["headers"]).get(b"accept", b"")
+    return scope["type"] == "http" and scope["method"] == "GET" and b"text/html" in accept
+
+
+async def _refuse(scope: Scope, send: Send, refusal: Refusal, *, html: bool) -> None:
+    """Tell it as JSON, to a browser's address line as a plain page."""
+    if html and refusal.code:
+        text = f"<!doctype html><html lang=en><meta charset=utf-8><title>{refusal.status}</title>"
+        text += f"<p>{refusal.message}<p>{refusal.hint}"
+        body, kind = text.encode(), b"text/html; charset=utf-8"
+    else:
+        told = {"code": refusal.code, "message": refusal.message, "hint": refusal.hint}
+        body, kind = json.dumps({"error": told}).encode() if refusal.code else b"", b"application/json"
+    headers = [(b"content-type", kind), (b"content-length", str(len(body)).encode()), *refusal.headers]
+    if refusal.status == 413:
+        headers.append((b"connection", b"close"))
+    prefix = "websocket." if scope["type"] == "websocket" else ""
+    await send({"type": f"{prefix}http.response.start", "status": refusal.status, "headers": headers})
+    await send({"type": f"{prefix}http.response.body", "body": body})
