@@ -11,7 +11,7 @@ from teds_provision.protocol.messages.identity import NodeState
 from teds_provision.station.station import NodeKey, Station
 from teds_provision.steps.identify import Identified
 from teds_provision.steps.read import read_identity
-from teds_provision.store import WhitelistEntry
+from teds_provision.store import KeyRecord, WhitelistEntry
 from teds_provision.talk.conversation import Conversation, SessionLost
 
 _BEGINNINGS = 5
@@ -56,11 +56,8 @@ def _take_up(station: Station, node: Conversation, held: NodeKey) -> NodeKey:
     Epoch and sequence of a bundle are hearsay until here: the node's own words in this session replace them.
     """
     uuid, record = node.uuid, held.record
-    fresh = record.state == "pending"
-    told = read_identity(node) if fresh and record.source == "import" else None
-    known = station.nodes.get(uuid)
-    settled = known is not None and known.epoch == record.epoch and not station.pins.is_unsettled(uuid)
-    if settled and not fresh and not station.keys.outdated(record):
+    told = read_identity(node) if record.state == "pending" and record.source == "import" else None
+    if _is_taken_up(station, record):
         return held
     with station.durable("agree"):
         if told is not None and told.epoch != record.epoch:
@@ -69,13 +66,26 @@ def _take_up(station: Station, node: Conversation, held: NodeKey) -> NodeKey:
         station.pins.settled(uuid)
         # what is signed without the node is for this epoch
         station.nodes.remember(uuid, epoch=record.epoch, **({} if told is None else {"sequence": told.sequence}))
-        if fresh or station.keys.outdated(record):
-            station.keys.promote(uuid, record.key_id)
-            # a pending key out of a backup may have been used and shared since (model/README.md, OLD_PENDING)
-            if fresh and record.source == "agreement" and not station.keys.restored(uuid):
-                station.keys.rotated(uuid)
-            station.audit("key", uuid, "active", key_id=record.key_id, epoch=record.epoch)
+        if record.state == "pending" or station.keys.outdated(record):
+            _activate(station, record)
     return NodeKey(record, held.key)
+
+
+def _is_taken_up(station: Station, record: KeyRecord) -> bool:
+    """Whether the key is the active one already, no other of its time is left, and its epoch is known."""
+    if record.state == "pending" or station.pins.is_unsettled(record.uuid) or station.keys.outdated(record):
+        return False
+    known = station.nodes.get(record.uuid)
+    return known is not None and known.epoch == record.epoch
+
+
+def _activate(station: Station, record: KeyRecord) -> None:
+    uuid = record.uuid
+    station.keys.promote(uuid, record.key_id)
+    # a pending key out of a backup may have been used and shared since (model/README.md, OLD_PENDING)
+    if record.state == "pending" and record.source == "agreement" and not station.keys.restored(uuid):
+        station.keys.rotated(uuid)
+    station.audit("key", uuid, "active", key_id=record.key_id, epoch=record.epoch)
 
 
 def session_if_keyed(station: Station, node: Conversation) -> NodeKey | None:
@@ -156,33 +166,58 @@ def _agree(
     again: bool,
 ) -> Agreed:
     new = who.state == NodeState.FACTORY
-    returning = new and _may_return(station, node.uuid)
-    listed = newcomer is not None and station.pins.entry(node.uuid) is None
-    entry = newcomer if listed else station.policy.require_whitelisted(node.uuid, returning=returning)
-    assert entry is not None
+    returning = _may_return(station, who)
+    entry = _entry_for(station, node.uuid, newcomer, returning=returning)
+    demanded = rotate and not again
     # of a run that was just cut short the node may have the new key, whatever it said before
     held = open_session(station, node, word=rotate) if not new or again else None
-    if held is not None and newcomer is not None:
-        with station.durable("agree"):
-            _enlist(station, newcomer)
-    rotate = (rotate and not again) or (held is not None and station.keys.rotation_due(node.uuid) is not None)
-    if held is not None and not rotate:
+    if held is not None:
+        _enlist_keyed(station, newcomer)
+        if demanded or station.keys.rotation_due(node.uuid) is not None:
+            return _new_key(station, node, who, entry, returning=returning, demanded=True)
         return Agreed(held.record.epoch, held.record.key_id, fresh=again)
-    if held is None and not new and station.keys.held(node.uuid) and not (rotate or again):
-        raise unknown_key(node.uuid)
+    if not (new or rotate or again):
+        _require_no_key_held(station, node.uuid)
+    return _new_key(station, node, who, entry, returning=returning, demanded=demanded)
+
+
+def _new_key(
+    station: Station, node: Conversation, who: Identified, entry: WhitelistEntry, *, returning: bool, demanded: bool
+) -> Agreed:
+    """Agree on a key; where none is ``demanded``, one that a new node has stored after all is as good."""
+    new = who.state == NodeState.FACTORY
     pinned = _pin_for(entry, node, who)
     ca = station.ca if new else station.keys.ca_of(node.uuid)
     try:
         return _agree_anew(station, node, pinned, ca, returning=returning)
     except NodeRefused as refusal:
         # Identify may have been answered while the node was still storing the key of a run that was cut off
-        late = refusal.reason == Reason.NOT_PERMITTED and new and not rotate
+        late = refusal.reason == Reason.NOT_PERMITTED and new and not demanded
         held = open_session(station, node) if late else None
         if held is None:
             raise
         return Agreed(held.record.epoch, held.record.key_id, fresh=True)
     except SessionLost as lost:
         raise lost.cause from lost
+
+
+def _entry_for(station: Station, uuid: bytes, newcomer: WhitelistEntry | None, *, returning: bool) -> WhitelistEntry:
+    """The node's entry on the whitelist, or the one that a newcomer is to get; raises NotWhitelisted."""
+    if newcomer is not None and station.pins.entry(uuid) is None:
+        return newcomer
+    return station.policy.require_whitelisted(uuid, returning=returning)
+
+
+def _enlist_keyed(station: Station, newcomer: WhitelistEntry | None) -> None:
+    """A newcomer with which a session is open under a key of ours comes onto the list at once."""
+    if newcomer is not None:
+        with station.durable("agree"):
+            _enlist(station, newcomer)
+
+
+def _require_no_key_held(station: Station, uuid: bytes) -> None:
+    if station.keys.held(uuid):
+        raise unknown_key(uuid)
 
 
 def _enlist(station: Station, entry: WhitelistEntry) -> None:
@@ -196,8 +231,11 @@ def _enlist(station: Station, entry: WhitelistEntry) -> None:
         station.audit("whitelist", entry.uuid, "added", **told)
 
 
-def _may_return(station: Station, uuid: bytes) -> bool:
+def _may_return(station: Station, who: Identified) -> bool:
     """Whether a node whose move was closed by its receipt may be keyed here again, should it prove to be reset."""
+    if who.state != NodeState.FACTORY:
+        return False
+    uuid = who.uuid
     tombstone = station.policy.tombstone(uuid)
     row = station.handovers.get(tombstone.handover_id, "out") if tombstone is not None else None
     return row is not None and row.state == "closed" and not station.keys.held(uuid)

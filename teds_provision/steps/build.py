@@ -133,33 +133,18 @@ def propose(station: Station, prepared: Prepared, present: Survey, *, record: bo
 
     Raises UsageFailure (no profile known), NotFound, BadData, PolicyRefused (a calibration that the guard refuses).
     """
-    has, order = present.image, prepared.order
-    keep = {block: has.blocks[block] for block in present.read_only}
-    now = has.unsigned_blocks()
-    own = {block: octets for block, octets in now.items() if block not in keep}
-    if not own:
-        proposal = _composed(station, prepared, present, keep, named=True)
-    elif not _intact(station, present):
-        proposal = _mended(station, prepared, present) or _composed(
-            station, prepared, present, keep, named=order.profile is not None
-        )
-    elif order.names_nothing:
-        proposal = _as_it_is(station, present, keep)
-    elif order.profile is not None:
-        proposal = _composed(station, prepared, present, keep, named=True, resume=False)
-    else:
-        proposal = _only_what_is_named(station, prepared, present, keep)
-    profile = prepared.profile if proposal.calibrations else None
+    has = present.image
+    proposal = _proposal(station, prepared, present)
     warnings = guard(
         station,
         proposal.image,
         has,
-        order.accept_calibration,
+        prepared.order.accept_calibration,
         proposal.calibrations or None,
-        profile,
+        prepared.profile if proposal.calibrations else None,
         record=record,
     )
-    changes = tuple(diff_blocks(now, proposal.image.unsigned_blocks()))
+    changes = tuple(diff_blocks(has.unsigned_blocks(), proposal.image.unsigned_blocks()))
     return Proposal(
         proposal.image,
         changes,
@@ -169,6 +154,23 @@ def propose(station: Station, prepared: Prepared, present: Survey, *, record: bo
         proposal.name,
         proposal.calibrations,
     )
+
+
+def _proposal(station: Station, prepared: Prepared, present: Survey) -> Proposal:
+    """What the node is to have, by what it has now and what was ordered; not guarded yet."""
+    has, order = present.image, prepared.order
+    keep = {block: has.blocks[block] for block in present.read_only}
+    if not has.unsigned_blocks().keys() - keep.keys():
+        return _composed(station, prepared, present, keep, named=True)
+    if not _intact(station, present):
+        return _mended(station, prepared, present) or _composed(
+            station, prepared, present, keep, named=order.profile is not None
+        )
+    if order.names_nothing:
+        return _as_it_is(station, present, keep)
+    if order.profile is not None:
+        return _composed(station, prepared, present, keep, named=True, resume=False)
+    return _only_what_is_named(station, prepared, present, keep)
 
 
 def _intact(station: Station, present: Survey) -> bool:

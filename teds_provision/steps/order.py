@@ -189,14 +189,20 @@ def compose(
     calibrations = prepared.calibrations if prepared.calibrations is not None else _from_file(order, profile)
     warnings: tuple[str, ...] = ()
     if calibrations is None:
-        calibrations = {} if order.drop_calibration or has is None else teds_calibrations(has)
-        if calibrations:
-            numbers = ", ".join(map(str, calibrations))
-            warnings = (f"The calibration that was given before is kept (channel {numbers}).",)
+        calibrations, warnings = _kept_calibrations(order, has)
     record = station.nodes.get(uuid)
     kept = order.name or name or (record.name if record and as_known else None)
     made = _made(profile, uuid, calibrations, kept, edition)
     return Composed(profile, wanted, kept, calibrations, made.blocks, merged((*passed, *warnings, *made.warnings)))
+
+
+def _kept_calibrations(order: BuildOrder, has: Image | None) -> tuple[dict[int, Calibration], tuple[str, ...]]:
+    """The calibrations that the node has and the order does not drop, and a warning where there are any."""
+    if order.drop_calibration or has is None:
+        return {}, ()
+    kept = teds_calibrations(has)
+    numbers = ", ".join(map(str, kept))
+    return kept, (f"The calibration that was given before is kept (channel {numbers}).",) if kept else ()
 
 
 def teds_calibrations(image: Image) -> dict[int, Calibration]:
@@ -231,7 +237,7 @@ def guard(
 
     That reason goes into the audit log, unless ``record`` is False (dry run).
     """
-    if not any(code == AccessCode.CALIBRATION for _, code in (*image, *(has or ()))):
+    if not _is_calibrated(image, has):
         return ()
     from teds_provision.teds.guard.guard import check_calibration  # numpy: not for a datasheet without calibration
 
@@ -247,6 +253,10 @@ def guard(
     if errors and record:
         station.audit("accept-calibration", image.uuid, "accepted", why=accepted, findings=errors)
     return merged(tuple(map(_said, findings)))
+
+
+def _is_calibrated(*images: Image | None) -> bool:
+    return any(code == AccessCode.CALIBRATION for image in images for _, code in image or ())
 
 
 def merged(warnings: Sequence[str]) -> tuple[str, ...]:

@@ -57,24 +57,27 @@ def _whole(octets: bytes) -> bool:
 
 
 def _read_once(node: Conversation, block: BlockId, until: float | None) -> bytes:
-    channel, access_code = block
     largest = LARGEST_SECURITY if block == SECURITY else LARGEST_TEDS
     octets = bytearray()
     until = time.monotonic() + READING_SECONDS if until is None else until
     while True:
         if time.monotonic() > until:
             raise Garbled(f"The node hands out its TEDS too slowly: not done after {READING_SECONDS:.0f} s.")
-        payload = node.ask(
-            read_teds(channel, access_code, len(octets)), f"to read TEDS {access_code} of channel {channel}"
-        )
-        if len(payload) < 4 or int.from_bytes(payload[:4], "big") != len(octets):
-            raise Garbled(f"The node read TEDS {access_code} of channel {channel} from another offset than was asked.")
-        octets += payload[4:]
+        segment = _read_segment(node, block, len(octets))
+        octets += segment
         total = 4 + int.from_bytes(octets[:4], "big") if len(octets) >= 4 else largest
-        if len(payload) == 4 or len(octets) >= total:
+        if not segment or len(octets) >= total:
             return bytes(octets)
         if total > largest:
-            raise BadData(f"TEDS {access_code} of channel {channel} claims {total} octets; {largest} is the most read.")
+            raise BadData(f"TEDS {block[1]} of channel {block[0]} claims {total} octets; {largest} is the most read.")
+
+
+def _read_segment(node: Conversation, block: BlockId, offset: int) -> bytes:
+    channel, access_code = block
+    payload = node.ask(read_teds(channel, access_code, offset), f"to read TEDS {access_code} of channel {channel}")
+    if len(payload) < 4 or int.from_bytes(payload[:4], "big") != offset:
+        raise Garbled(f"The node read TEDS {access_code} of channel {channel} from another offset than was asked.")
+    return payload[4:]
 
 
 def list_blocks(node: Conversation) -> list[BlockId]:

@@ -102,15 +102,12 @@ def sign(
     kept, with its ``profile``, until it is written. The new sequence is durable in the store before the signature is
     given to anyone: one that was lost with its process was never seen, and its number may be used again.
     """
-    for block, teds in image.unsigned_blocks().items():
-        if not can_be_stored(block) or not passes_own_check(block, teds):
-            raise BadData(f"TEDS {block[1]} of channel {block[0]} is damaged: Length, checksum or class is wrong.")
+    _require_whole(image)
     if sequence is None:
-        for octets in (on_node, *earlier):
-            if octets is not None and _says_the_same(station, keys, image, octets, epoch):
-                number = security.decode(octets).sequence
-                if octets == on_node or number > node_sequence:
-                    return Signed(image.with_block(SECURITY, octets), number, reused=True)
+        for octets in filter(None, (on_node, *earlier)):
+            number = _sequence_if_the_same(station, keys, image, octets, epoch)
+            if number is not None and (octets == on_node or number > node_sequence):
+                return Signed(image.with_block(SECURITY, octets), number, reused=True)
     ca = station.keys.ca_of(keys.uuid)
     signature, credentials = station.identity.signature_under(ca), station.credentials(keys.uuid)
     with station.durable("sign"):
@@ -136,14 +133,20 @@ def sign(
     return Signed(made, number, reused=False)
 
 
-def _says_the_same(station: Station, keys: NodeKeys, image: Image, octets: bytes, epoch: int) -> bool:
-    """Unchanged content, epoch and signer."""
+def _require_whole(image: Image) -> None:
+    for block, teds in image.unsigned_blocks().items():
+        if not can_be_stored(block) or not passes_own_check(block, teds):
+            raise BadData(f"TEDS {block[1]} of channel {block[0]} is damaged: Length, checksum or class is wrong.")
+
+
+def _sequence_if_the_same(station: Station, keys: NodeKeys, image: Image, octets: bytes, epoch: int) -> int | None:
+    """The sequence of a Security TEDS that says the same of this image: content, epoch and signer unchanged."""
     try:
         found = security.decode(octets)
     except BadData:
-        return False
+        return None
     ca = station.keys.ca_of(keys.uuid)
-    return (
+    same = (
         found.signed
         and (found.node_key, found.node_key_signature) == (keys.key, keys.signature)
         and (found.station_key, found.station_key_signature) == (station.point, station.identity.signature_under(ca))
@@ -152,6 +155,7 @@ def _says_the_same(station: Station, keys: NodeKeys, image: Image, octets: bytes
         and found.signed_blocks == digests(image.blocks)
         and signature_good(found, octets, keys.uuid)
     )
+    return found.sequence if same else None
 
 
 def _now() -> bytes:

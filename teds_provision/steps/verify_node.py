@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from hashlib import sha256
 
 from teds_provision.errors import LinkFailure, NodeRefused, NotAuthentic
-from teds_provision.protocol.messages.identity import NodeState
+from teds_provision.protocol.messages.identity import Identity, NodeState
 from teds_provision.station.station import Station
 from teds_provision.steps.agree import session_if_keyed
 from teds_provision.steps.identify import Identified, prove
@@ -54,20 +54,7 @@ def verify_node(station: Station, node: Conversation, image: Image, point: bytes
     if verified.verdict == "unproven" or checks[-1].result == "failed":
         station.audit("verify", node.uuid, verified.verdict, why=why)
         return verified
-    security = image.security
-    facts: dict[str, object] = {
-        "verdict": verified.verdict,
-        "channels": len({c for c, code in image if code == AccessCode.CHANNEL}),
-    }
-    if security is not None:
-        facts["teds_sha256"] = sha256(security).hexdigest()
-    if identity is not None:
-        facts |= {
-            "state": int(identity.state),
-            "epoch": identity.epoch,
-            "sequence": identity.sequence,
-            "can_address": identity.can_address,
-        }
+    facts = _facts(image, verified, identity)
     with station.durable("verify"):
         worth = identity is not None and verified.verdict != "not authentic"  # else what it had stays known
         if worth and station.nodes.datasheet(node.uuid) != image:
@@ -75,6 +62,24 @@ def verify_node(station: Station, node: Conversation, image: Image, point: bytes
         station.nodes.remember(node.uuid, **facts)
         station.audit("verify", node.uuid, verified.verdict)
     return verified
+
+
+def _facts(image: Image, verified: Verified, identity: Identity | None) -> dict[str, object]:
+    """What is remembered of a node that was read; ``identity`` is what it said in a session, None outside one."""
+    facts: dict[str, object] = {
+        "verdict": verified.verdict,
+        "channels": len({c for c, code in image if code == AccessCode.CHANNEL}),
+    }
+    if image.security is not None:
+        facts["teds_sha256"] = sha256(image.security).hexdigest()
+    if identity is not None:
+        facts |= {
+            "state": int(identity.state),
+            "epoch": identity.epoch,
+            "sequence": identity.sequence,
+            "can_address": identity.can_address,
+        }
+    return facts
 
 
 def _vouched(node: Conversation, point: bytes, why: str) -> Check:

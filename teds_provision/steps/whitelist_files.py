@@ -152,6 +152,18 @@ class _Element:
     uuids: list[tuple[int, str]] = field(default_factory=list)
     entries: int = 0
 
+    @property
+    def own(self) -> dict[str, str]:
+        """Those of its fields that a whitelist has."""
+        return {key: value for key, value in self.fields.items() if key in FIELDS}
+
+    def take_field(self, line: int, tag: str, text: str) -> None:
+        """A child that is one field of this element."""
+        if tag == "uuid":
+            self.uuids.append((line, text))
+        else:
+            self.fields[tag] = text
+
 
 def _read_xml(text: str, reading: _Reading) -> None:
     from xml.sax import SAXException, SAXParseException
@@ -211,42 +223,53 @@ def _field_name(name: str) -> str:
 def _close_element(element: _Element, parent: _Element | None, reading: _Reading) -> None:
     text = "".join(element.text).strip()
     leaf = not element.uuids and not element.entries
-    if parent is not None and leaf and text and not element.fields and element.tag in FIELDS:
-        if element.tag == "uuid":
-            parent.uuids.append((element.line, text))
-        else:
-            parent.fields[element.tag] = text
+    if parent is not None and leaf and _is_field(element, text):
+        parent.take_field(element.line, element.tag, text)
         return
-    found = _entry_of(element, text, leaf, parent is None, reading)
+    entries = element.entries + _entry_of(element, text, leaf, parent is None, reading)
     if parent is not None:
-        parent.entries += found + element.entries
-    elif found + element.entries == 0 and element.tag != "whitelist" and not reading.mistakes:
+        parent.entries += entries
+    elif entries == 0 and element.tag != "whitelist" and not reading.mistakes:
         reading.wrong(element.line, element.tag, "there is no UUID in this document")
+
+
+def _is_field(element: _Element, text: str) -> bool:
+    """``<fingerprint>…</fingerprint>``: a text under a field's name, which belongs to the element around it."""
+    return bool(text) and not element.fields and element.tag in FIELDS
 
 
 def _entry_of(element: _Element, text: str, leaf: bool, root: bool, reading: _Reading) -> int:
     """Take in what the element holds by itself; returns how many entries that were."""
-    own = {key: value for key, value in element.fields.items() if key in FIELDS}
+    own = element.own
     if "uuid" in own:
         reading.add(element.line, own)
         return 1
-    if len(element.uuids) == 1 and not (root and not own):
+    if len(element.uuids) == 1 and (own or not root):
         line, uuid = element.uuids[0]
         reading.add(line, {**own, "uuid": uuid})
         return 1
+    if element.uuids:
+        return _add_several(element, own, reading)
+    if not leaf or not _is_entry_text(element, text, root):
+        return 0
+    for part in _parts(text):
+        reading.add(element.line, {**own, "uuid": part})
+    return 1
+
+
+def _add_several(element: _Element, own: dict[str, str], reading: _Reading) -> int:
     if len(element.uuids) > 1 and "fingerprint" in own:
         reading.wrong(element.line, "fingerprint", "it stands beside several UUIDs and belongs to none")
     for line, uuid in element.uuids:
         reading.add(line, {"uuid": uuid})
-    if element.uuids:
-        return len(element.uuids)
-    if not leaf or not (text or element.tag in _ENTRY_ELEMENTS):
-        return 0
-    if element.tag in _ENTRY_ELEMENTS or text[:2].lower() == "0x" or root:
-        for part in _parts(text):
-            reading.add(element.line, {**own, "uuid": part})
-        return 1
-    return 0
+    return len(element.uuids)
+
+
+def _is_entry_text(element: _Element, text: str, root: bool) -> bool:
+    """Whether the text of an element is a UUID by where it stands, or by how it looks."""
+    if element.tag in _ENTRY_ELEMENTS:
+        return True
+    return bool(text) and (root or text[:2].lower() == "0x")
 
 
 def _parts(text: str) -> list[str]:
@@ -260,9 +283,7 @@ def _parts(text: str) -> list[str]:
 
 
 def _read_csv(text: str, reading: _Reading) -> None:
-    first = next((line for line in text.splitlines() if line.strip() and not line.startswith("#")), "")
-    delimiter = max(",;\t", key=first.count)
-    rows = csv.reader(io.StringIO(text, newline=""), delimiter=delimiter, strict=True)
+    rows = csv.reader(io.StringIO(text, newline=""), delimiter=_delimiter(text), strict=True)
     columns: list[str] | None = None
     try:
         for row in rows:
@@ -270,16 +291,26 @@ def _read_csv(text: str, reading: _Reading) -> None:
             if not any(cells) or cells[0].startswith("#"):
                 continue
             if columns is None:
-                named = [_field_name(cell) for cell in cells]
-                columns = named if "uuid" in named else ["uuid", "fingerprint", "name"]
-                if columns is named:
+                columns, is_header = _columns_of(cells)
+                if is_header:
                     continue
-            if len(cells) > len(columns) and any(cells[len(columns) :]):
+            if any(cells[len(columns) :]):
                 reading.wrong(rows.line_num, "row", f"{len(cells)} cells for {len(columns)} columns")
                 continue
             reading.add(rows.line_num, dict(zip(columns, cells, strict=False)))
     except csv.Error as error:
         raise BadData(f"{reading.file}:{rows.line_num}: this is not CSV: {error}.") from error
+
+
+def _delimiter(text: str) -> str:
+    first = next((line for line in text.splitlines() if line.strip() and not line.startswith("#")), "")
+    return max(",;\t", key=first.count)
+
+
+def _columns_of(cells: list[str]) -> tuple[list[str], bool]:
+    """The columns of a file whose first row this is, and whether the row names them (else it is data already)."""
+    named = [_field_name(cell) for cell in cells]
+    return (named, True) if "uuid" in named else (["uuid", "fingerprint", "name"], False)
 
 
 # -- JSON --------------------------------------------------------------------------------------------------------------

@@ -75,6 +75,14 @@ def write(
     octets += _commit(station, node, image, has, progress)
     node.proven = replace(identity, sequence=signed.sequence, state=NodeState.PROVISIONED)
     back = read_image(node)
+    _conclude(station, image, back, facts, octets=octets, sequence=signed.sequence)
+    return Written(octets, time.monotonic() - started, back)
+
+
+def _conclude(
+    station: Station, image: Image, back: Image, facts: Mapping[str, object], *, octets: int, sequence: int
+) -> None:
+    """Record what was read back, and whether it is what was written; raises NotAuthentic where it is not."""
     differing = [block for block in image if back.blocks.get(block) != image.blocks[block]]
     with station.durable("write"):
         profile = facts.get("profile")
@@ -85,13 +93,12 @@ def write(
         else:
             station.nodes.remember(image.uuid, **facts)
             _forget_draft(station, image)
-            station.audit("write", image.uuid, "done", octets=octets, sequence=signed.sequence)
+            station.audit("write", image.uuid, "done", octets=octets, sequence=sequence)
     if differing:
         raise NotAuthentic(
             f"The node gives back another TEDS {access_code} of channel {channel} than was written.",
             hint="Try again; if it stays, the board's flash is broken.",
         )
-    return Written(octets, time.monotonic() - started, back)
 
 
 def _require_newer(signed: SecurityTeds, identity: Identity, *, jump: bool) -> None:
@@ -122,29 +129,40 @@ def _forget_draft(station: Station, image: Image) -> None:
 
 def _commit(station: Station, node: Conversation, image: Image, has: Image | None, progress: Progress | None) -> int:
     """Stage what is not there yet and commit; starts over where the session (and the staging with it) is lost."""
-    has = has or known_image(station, image.uuid)
-    skip = {block for block in image if has is not None and has.blocks.get(block) == image.blocks[block]}
-    for attempt in range(_STARTS):
-        last = attempt == _STARTS - 1
+    skip = _blocks_there(station, image, has)
+    for _ in range(_STARTS - 1):
         try:
-            octets = _stage(node, image, skip - {SECURITY}, progress)
-            node.send(update_teds(*SECURITY), "the commit")
-            return octets
+            return _stage_and_commit(node, image, skip, progress)
         except NodeRefused as refusal:
-            if refusal.reason != Reason.DIGEST_MISMATCH or not skip - {SECURITY} or last:
+            if refusal.reason != Reason.DIGEST_MISMATCH or not skip:
                 raise
             skip = set()  # the node does not hold what it was last read to hold: send everything
+            continue
         except (NodeSilent, Garbled):
-            if last or not node.lives():
+            if not node.lives():
                 raise
-            if _is_there(node, image):
-                return 0
-        except SessionLost as lost:
-            if last:
-                raise lost.cause from lost
-            if _is_there(node, image):
-                return 0
-    raise AssertionError("every attempt returns or raises")
+        except SessionLost:
+            pass  # the new session below tells whether only the reply was lost
+        if _is_there(node, image):
+            return 0
+    try:
+        return _stage_and_commit(node, image, skip, progress)
+    except SessionLost as lost:
+        raise lost.cause from lost
+
+
+def _stage_and_commit(node: Conversation, image: Image, skip: set[BlockId], progress: Progress | None) -> int:
+    octets = _stage(node, image, skip, progress)
+    node.send(update_teds(*SECURITY), "the commit")
+    return octets
+
+
+def _blocks_there(station: Station, image: Image, has: Image | None) -> set[BlockId]:
+    """Blocks that need not be sent; the Security TEDS is always sent, for it is what is committed."""
+    has = has or known_image(station, image.uuid)
+    if has is None:
+        return set()
+    return {block for block in image if block != SECURITY and has.blocks.get(block) == image.blocks[block]}
 
 
 def _is_there(node: Conversation, image: Image) -> bool:

@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Final
 
-from teds_provision.errors import NoNode, OtherKey, PolicyRefused, TedsProvisionError, UsageFailure
+from teds_provision.errors import OtherKey, PolicyRefused, TedsProvisionError, UsageFailure
 from teds_provision.links import Contact, LinkSettings, open_port
 from teds_provision.protocol.messages.identity import NodeState
 from teds_provision.station.station import Station
@@ -88,11 +88,8 @@ class Boards:
         self.prepared = prepare(station, order, self.node)
         if self.prepared.order.name is not None and self.node is not None:
             named_for(station, self.node, self.prepared)
-        sheet = read_sheet(station, request.sheet, order) if request.sheet is not None else None
-        if sheet is not None and request.everyone and any(row.by_order for row in sheet.rows):
-            raise UsageFailure("On a bus there is no order of taps.", hint="Give each row its uuid or fingerprint.")
-        self.progress = Progress(station.home, sheet) if sheet is not None else None
-        self.stop = Patience(links.timeout if sheet is not None and not request.watch else None)
+        self.progress = _progress(station, request, order)
+        self.stop = Patience(links.timeout if self.progress is not None and not request.watch else None)
         self._turn = threading.Lock()
         self._rows: dict[bytes, Row] = {}
         self._boards: list[Board] = []
@@ -154,10 +151,8 @@ class Boards:
     def totals(self) -> Totals:
         """What it came to: the whole sheet over all runs, or the nodes of this run."""
         if self.progress is not None:
-            if self.stop.ran_out and self.progress.untried:
-                missed = ", ".join(str(row.number) for row in self.progress.untried[:10])
-                error = NoNode(f"No board came within {self._links.timeout:.0f} s for row {missed}.")
-                self.progress.worst = worse(self.progress.worst, error)
+            if self.stop.ran_out:
+                self.progress.ran_out(self._links.timeout)
             return self.progress.totals()
         results = [board.result for board in self._boards]
         steps = [{step.name: step.seconds for step in board.done.steps} for board in self._boards if board.done]
@@ -205,13 +200,14 @@ class Boards:
         """On the whitelist or in the sheet, and not finished yet; said for those that are neither."""
         uuid = contact.identity.uuid
         listed = self._station.pins.entry(uuid) is not None
-        in_sheet = self.progress is not None and any(row.uuid == uuid or row.uuid is None for row in self.progress.open)
-        if not in_sheet and (not listed or self.progress is not None):
+        if self.progress is not None and any(row.uuid in (uuid, None) for row in self.progress.open):
+            return True
+        if not listed or self.progress is not None:
             self._station.notice(f"Left alone: node {uuid.hex()} is not {'in the sheet' if listed else 'whitelisted'}.")
             return False
         known = self._station.nodes.get(uuid)
-        finished = contact.identity.state == NodeState.PROVISIONED and known is not None
-        return in_sheet or not (finished and known is not None and known.verdict == "authentic")
+        verified = known is not None and known.verdict == "authentic"
+        return not (verified and contact.identity.state == NodeState.PROVISIONED)
 
     def _board(self, contact: Contact, place: str, questions: Questions) -> Board:
         began, uuid = time.monotonic(), contact.identity.uuid
@@ -266,6 +262,16 @@ class Boards:
         self._boards.append(board)
         if self.progress is not None and board.row is not None:
             self.progress.note(self.progress.sheet.rows[board.row - 1], board)
+
+
+def _progress(station: Station, request: Request, order: BuildOrder) -> Progress | None:
+    """The sheet that was named, with what became of it in earlier runs; None without one."""
+    if request.sheet is None:
+        return None
+    sheet = read_sheet(station, request.sheet, order)
+    if request.everyone and any(row.by_order for row in sheet.rows):
+        raise UsageFailure("On a bus there is no order of taps.", hint="Give each row its uuid or fingerprint.")
+    return Progress(station.home, sheet)
 
 
 def _check(request: Request, links: LinkSettings) -> None:

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import hashlib
 import json
+from collections import Counter
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any, Final
 
-from teds_provision.errors import NotFound, TedsProvisionError
+from teds_provision.errors import NoNode, NotFound, TedsProvisionError
 from teds_provision.files import private_folder, read_limited, write_whole
 from teds_provision.steps.many.board import Board, Totals, worse
 from teds_provision.steps.many.sheet import Row, Sheet
@@ -109,19 +110,25 @@ class Progress:
         self.worst = worse(self.worst, board.failure)
         self.save()
 
+    def ran_out(self, seconds: float) -> None:
+        """Note that no board came in time for the rows that nobody tried, if there are any."""
+        if self.untried:
+            missed = ", ".join(str(row.number) for row in self.untried[:10])
+            self.worst = worse(self.worst, NoNode(f"No board came within {seconds:.0f} s for row {missed}."))
+
     def totals(self) -> Totals:
         """What the whole sheet came to, over all runs; a row that was not reached is ``skipped``."""
         rows = list(self.rows.values())
-        passed = [row for row in rows if row.result == "passed"]
-        failed = [row for row in rows if row.result == "failed"]
-        tried = [row for row in rows if row.tries and row.result != "skipped"]
+        results = Counter(row.result for row in rows)
+        passed, failed = results["passed"], results["failed"]
+        firsts = [row.first for row in rows if row.tries and row.result != "skipped"]
         return Totals(
-            len(passed),
-            len(failed),
-            len(rows) - len(passed) - len(failed),
+            passed,
+            failed,
+            len(rows) - passed - failed,
             round(sum(row.seconds for row in rows), 3),
-            round(sum(row.first for row in tried) / len(tried), 4) if tried else None,
-            mean_steps([row.steps for row in passed]),
+            round(sum(firsts) / len(firsts), 4) if firsts else None,
+            mean_steps([row.steps for row in rows if row.result == "passed"]),
             self.worst,
         )
 

@@ -100,9 +100,10 @@ class _Reading:
             header = [cell.strip().lower() for cell in next(table, [])]
             if not self._header_is_good(header):
                 return
-            for cells in table:
-                if any(cell.strip() for cell in cells):
-                    self._row(table.line_num, header, [cell.strip() for cell in cells])
+            for row in table:
+                cells = [cell.strip() for cell in row]
+                if any(cells):
+                    self._row(table.line_num, header, cells)
                 if len(self.rows) > MAX_ROWS:
                     self.wrong(table.line_num, f"there are more than {MAX_ROWS} rows")
                     return

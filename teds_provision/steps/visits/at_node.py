@@ -153,6 +153,30 @@ class WriteDone:
     written: Written | None
 
 
+def _wanted(station: Station, uuid: bytes, file: Path | None) -> tuple[Image, dict[str, object]]:
+    """The signed image to write to a node, and what is remembered of the node once it is written."""
+    draft = station.nodes.draft(uuid)
+    profile = draft.profile if draft is not None else None
+    facts: dict[str, object] = {}
+    if file is not None:
+        wanted: Image | None = read_image_file(file)
+    elif draft is not None:
+        wanted = draft.image
+        facts = {"profile": profile} if profile is not None else {}
+    else:
+        wanted = known_image(station, uuid)
+    if wanted is None:
+        raise NotFound(f"Nothing is built for node {uuid.hex()}.", hint="build and sign it first, or give --image.")
+    name = own_name(station, wanted, profile)
+    if name is not None:
+        facts["name"] = name
+    if wanted.uuid != uuid:
+        raise PolicyRefused(f"The image is for node {wanted.uuid.hex()}, not for {uuid.hex()}.")
+    if wanted.security is None:
+        raise BadData("The image holds no Security TEDS.", hint=f"Sign it first: teds-provision sign {uuid.hex()}")
+    return wanted, facts
+
+
 def write_at(
     station: Station,
     links: LinkSettings,
@@ -170,24 +194,7 @@ def write_at(
     """
     uuid = station.nodes.resolve(node)
     station.policy.require_whitelisted(uuid)
-    draft = station.nodes.draft(uuid)
-    facts: dict[str, object] = {}
-    if file is not None:
-        wanted: Image | None = read_image_file(file)
-    elif draft is not None:
-        wanted = draft.image
-        facts = {"profile": draft.profile} if draft.profile is not None else {}
-    else:
-        wanted = known_image(station, uuid)
-    name = own_name(station, wanted, draft.profile if draft is not None else None) if wanted is not None else None
-    if name is not None:
-        facts["name"] = name
-    if wanted is None:
-        raise NotFound(f"Nothing is built for node {uuid.hex()}.", hint="build and sign it first, or give --image.")
-    if wanted.uuid != uuid:
-        raise PolicyRefused(f"The image is for node {wanted.uuid.hex()}, not for {uuid.hex()}.")
-    if wanted.security is None:
-        raise BadData("The image holds no Security TEDS.", hint=f"Sign it first: teds-provision sign {uuid.hex()}")
+    wanted, facts = _wanted(station, uuid, file)
     if dry_run:
         return WriteDone(wanted, None)
     if jump is not None:

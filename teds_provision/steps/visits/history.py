@@ -54,6 +54,15 @@ class BroughtBack:
     written: Written | None
 
 
+def _record_of(station: Station, uuid: bytes, sequence: int) -> DatasheetRecord:
+    known = station.nodes.history(uuid)
+    for record in known:
+        if record.sequence == sequence:
+            return record
+    listed = ", ".join(str(record.sequence) for record in known) or "none"
+    raise NotFound(f"Node {uuid.hex()} had no datasheet of sequence {sequence}.", hint=f"Known are: {listed}.")
+
+
 def bring_back(
     station: Station, links: LinkSettings, node: str, sequence: int, reporter: Reporter, *, dry_run: bool = False
 ) -> BroughtBack:
@@ -63,11 +72,7 @@ def bring_back(
     """
     uuid = station.nodes.resolve(node)
     station.policy.require_whitelisted(uuid)
-    known = station.nodes.history(uuid)
-    record = next((record for record in known if record.sequence == sequence), None)
-    if record is None:
-        listed = ", ".join(str(record.sequence) for record in known) or "none"
-        raise NotFound(f"Node {uuid.hex()} had no datasheet of sequence {sequence}.", hint=f"Known are: {listed}.")
+    record = _record_of(station, uuid, sequence)
     if dry_run:
         now = station.nodes.datasheet(uuid)
         before = now.unsigned_blocks() if now is not None else {}

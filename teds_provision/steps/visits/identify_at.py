@@ -63,11 +63,16 @@ def _one(station: Station, node: Conversation, add: bool) -> Found:
     name = (known.name if known else None) or described.name
     facts: dict[str, object] = {}
     if known is None or known.verdict is None:  # nothing is verified here: it stands for what is not known better
-        free = name is not None and station.nodes.all_named(name) in ([], [who.uuid])
-        facts = {"channels": described.channels} | ({"name": name} if free else {})
+        facts["channels"] = described.channels
+        if name is not None and station.nodes.all_named(name) in ([], [who.uuid]):
+            facts["name"] = name
     with station.durable("identify"):
         station.nodes.remember(who.uuid, **facts)
         station.audit("identify", who.uuid, "proven", fingerprint=who.fingerprint)
+    return _found(node, who, listed=entry is not None, channels=described.channels, name=name)
+
+
+def _found(node: Conversation, who: Identified, *, listed: bool, channels: int, name: str | None) -> Found:
     charging = node.contact.charging.to_json() if node.contact.charging else None
     ble = node.contact.ble.text if node.contact.ble else None
-    return Found(who, node.identity, entry is not None, described.channels, name, charging, ble)
+    return Found(who, node.identity, listed, channels, name, charging, ble)

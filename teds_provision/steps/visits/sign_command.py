@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -19,7 +20,7 @@ from teds_provision.talk.meeting import meet
 from teds_provision.talk.progress import Reporter
 from teds_provision.teds.codec import security
 from teds_provision.teds.diff.datasheets import diff_blocks
-from teds_provision.teds.image import SECURITY, Image
+from teds_provision.teds.image import SECURITY, BlockId, Image
 
 
 @dataclass(frozen=True)
@@ -80,43 +81,85 @@ def sign_image(station: Station, order: SignOrder, node: Conversation | None) ->
     uuid = order.uuid
     station.policy.require_whitelisted(uuid)
     draft = station.nodes.draft(uuid)
-    has = known_image(station, uuid)
-    image = order.image or (draft.image if draft is not None else has)
+    known = known_image(station, uuid)
+    image = order.image or (draft.image if draft is not None else known)
     if image is None or not image.unsigned_blocks():
         raise NotFound(f"Nothing is built for node {uuid.hex()}.", hint=f"Build it: teds-provision build {uuid.hex()}")
-    record = station.nodes.get(uuid)
-    epoch = station.keys.active_epoch(uuid) or (record.epoch if record else 0)
-    sequence = _sequence_of(has)
-    if node is not None:
-        if not order.dry_run:  # opening a session may settle or rotate keys
-            require_session(station, node)
-        found = survey(node)
-        has, epoch, sequence = found.image, found.identity.epoch, found.identity.sequence
-        keep = {block: has.blocks[block] for block in found.read_only if block not in image.blocks}
-        image = Image(uuid, {**image.blocks, **keep})
+    present = _last_known(station, uuid, known) if node is None else _read_now(station, node, order)
+    image, has = present.completing(image), present.image
     keys = known_node_keys(station, uuid, has or image)
     guard(station, image, has, order.accept_calibration, record=not order.dry_run)
     changes = diff_blocks(has.unsigned_blocks() if has else {}, image.unsigned_blocks())
     told = tuple(change.text for change in changes)
     if order.dry_run:
-        return SignDone(Signed(image, sequence, reused=False), told)
-    # a node whose TEDS are not what it was signed for takes them only under a newer sequence
-    intact = node is None or has is None or has.unsigned_blocks() == image.unsigned_blocks()
+        return SignDone(Signed(image, present.sequence, reused=False), told)
     signed = sign(
         station,
         keys,
         image,
-        epoch=epoch,
-        node_sequence=sequence,
-        on_node=has.security if has is not None and intact else None,
+        epoch=present.epoch,
+        node_sequence=present.sequence,
+        on_node=present.security_for(image),
         earlier=_signed_before(image, draft),
     )
-    built_here = draft is not None and draft.image.unsigned_blocks() == image.unsigned_blocks()
-    if built_here or (order.image is None and not signed.reused):
-        profile = draft.profile if draft is not None else record.profile if record is not None else None
-        with station.durable("sign"):
-            station.nodes.keep_draft(Draft(uuid, signed.image, "signed", profile))
+    _keep(station, order, signed, draft)
     return SignDone(signed, told)
+
+
+@dataclass(frozen=True)
+class _Present:
+    """What the node has: as last known, or (``read``) as it was read now. ``read_only`` blocks cannot be replaced."""
+
+    image: Image | None
+    epoch: int
+    sequence: int
+    read_only: Collection[BlockId] = ()
+    read: bool = False
+
+    def completing(self, image: Image) -> Image:
+        """The image with the read-only blocks of the node that it leaves out: they stay on the node and are signed."""
+        if self.image is None:
+            return image
+        keep = {block: self.image.blocks[block] for block in self.read_only if block not in image.blocks}
+        return Image(self.image.uuid, {**image.blocks, **keep})
+
+    def security_for(self, image: Image) -> bytes | None:
+        """The node's Security TEDS, where its signature may be used again for ``image``.
+
+        Not where the node was read to hold something else than it was signed for: it takes ``image`` only under a
+        newer sequence.
+        """
+        if self.image is None or (self.read and self.image.unsigned_blocks() != image.unsigned_blocks()):
+            return None
+        return self.image.security
+
+
+def _last_known(station: Station, uuid: bytes, known: Image | None) -> _Present:
+    record = station.nodes.get(uuid)
+    epoch = station.keys.active_epoch(uuid) or (record.epoch if record else 0)
+    return _Present(known, epoch, _sequence_of(known))
+
+
+def _read_now(station: Station, node: Conversation, order: SignOrder) -> _Present:
+    if not order.dry_run:  # opening a session may settle or rotate keys
+        require_session(station, node)
+    found = survey(node)
+    return _Present(found.image, found.identity.epoch, found.identity.sequence, found.read_only, read=True)
+
+
+def _keep(station: Station, order: SignOrder, signed: Signed, draft: Draft | None) -> None:
+    """Keep what was built here, or signed anew, until it is written; with the profile that it was built from.
+
+    An image file that was not built here stays the caller's.
+    """
+    uuid = order.uuid
+    built_here = draft is not None and draft.image.unsigned_blocks() == signed.image.unsigned_blocks()
+    if not built_here and (order.image is not None or signed.reused):
+        return
+    record = station.nodes.get(uuid)
+    profile = draft.profile if draft is not None else record.profile if record is not None else None
+    with station.durable("sign"):
+        station.nodes.keep_draft(Draft(uuid, signed.image, "signed", profile))
 
 
 def _sequence_of(has: Image | None) -> int:
