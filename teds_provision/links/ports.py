@@ -122,7 +122,7 @@ class Port(Protocol):
     ) -> Contact:
         """Wait until a node for which ``wanted`` is true is tapped or answers on the bus.
 
-        ``address`` is a known CAN address to try first (ignored by NFC). Raises NoNode after ``seconds``.
+        ``address`` is the CAN address to try first, a guess (ignored by NFC). Raises NoNode after ``seconds``.
         Foreign tags and unwanted nodes are reported through ``notice`` and waited past.
         """
 

@@ -7,7 +7,6 @@ import json
 import os
 import secrets
 import time
-import zlib
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -15,6 +14,7 @@ from typing import Any
 
 from teds_provision.errors import BadData, NotFound, StoreFailure, StoreLocked, UsageFailure
 from teds_provision.files import whole_file
+from teds_provision.protocol.announce import default_can_address
 from teds_provision.protocol.flash import Flash, FlashFailure
 from teds_provision.protocol.keys import SoftwareKey, node_key_message
 from teds_provision.teds.image import SECURITY, BlockId
@@ -22,11 +22,6 @@ from teds_provision.teds.image import SECURITY, BlockId
 FORMAT = "teds-virtual-node/2"
 _OLDER = "teds-virtual-node/1"
 FILE = "flash.json"
-
-
-def default_can_address(uuid: bytes) -> int:
-    """A node's own default address: 1 + CRC-32(UUID) mod 239 (profile: wire)."""
-    return 1 + zlib.crc32(uuid) % 239
 
 
 class FlashFile:

@@ -33,6 +33,11 @@ def uuid_crc(uuid: bytes) -> int:
     return zlib.crc32(uuid)
 
 
+def default_can_address(uuid: bytes) -> int:
+    """A node's own default address: 1 + CRC-32(UUID) mod 239 (profile: wire, 128.10)."""
+    return 1 + uuid_crc(uuid) % LAST_ADDRESS
+
+
 @dataclass(frozen=True)
 class Announce:
     """An Announce: ``address`` 1 to 239, ``crc`` = CRC-32 of the UUID. A hint, proves nothing."""

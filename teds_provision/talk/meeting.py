@@ -7,6 +7,7 @@ from contextlib import ExitStack, contextmanager
 
 from teds_provision.errors import AddressConflict, UsageFailure
 from teds_provision.links import Contact, LinkSettings, open_port
+from teds_provision.protocol.announce import default_can_address
 from teds_provision.protocol.messages.identity import Identity, NodeState
 from teds_provision.station.station import Station
 from teds_provision.talk.conversation import Conversation
@@ -34,19 +35,24 @@ def meet(
     def wanted(identity: Identity) -> bool:
         return uuid is None or identity.uuid == uuid
 
-    known = station.nodes.get(uuid) if uuid is not None else None
-    address = known.can_address if known is not None and known.can_address else None
     port = open_port(links)
     try:
         before()
         if uuid is None:
             contact = the_one(station, port.everyone(seconds=links.timeout, notice=reporter.notice))
         else:
+            address = likely_address(station, uuid)
             contact = port.find(wanted, seconds=links.timeout, notice=reporter.notice, address=address)
         with Conversation(contact, notice=reporter.notice) as node:
             yield node
     finally:
         port.close()
+
+
+def likely_address(station: Station, uuid: bytes) -> int:
+    """The CAN address to look for a node first: where it was last met, else its own default address. A hint."""
+    known = station.nodes.get(uuid)
+    return known.can_address if known is not None and known.can_address else default_can_address(uuid)
 
 
 @contextmanager

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from teds_provision.errors import NodeSilent
 from teds_provision.links import LINKS, Capabilities, Contact
-from teds_provision.node.flash_file import default_can_address
+from teds_provision.protocol.announce import default_can_address
 from teds_provision.protocol.flash import Flash
 from teds_provision.protocol.keys import SoftwareKey, node_key_message
 from teds_provision.protocol.messages.identity import Identity

@@ -32,6 +32,8 @@ from teds_provision.protocol.messages.identity import Identity
 ANNOUNCE: Final = 0x1CFF0000
 """Identifier of an Announce, its node in the last octet (profile: wire, "CAN")."""
 _HELLO_SECONDS: Final = 1.0
+_GUESS_SECONDS: Final = 0.1
+"""The wait for who may be at the address where a node is thought to be; everyone is asked after it."""
 _ROUND_SECONDS: Final = 1.0
 _REOPEN_SECONDS: Final = 1.0
 
@@ -94,10 +96,10 @@ class CanPort:
         if bus is not None:
             bus.close()
 
-    def identify(self, address: int) -> Identity | None:
+    def identify(self, address: int, *, seconds: float = _HELLO_SECONDS) -> Identity | None:
         """Ask one address who is there; None for nobody. Raises AddressConflict, LinkFailure."""
         link = self.link(address)
-        return ask_one(lambda frame: link.ask(frame, tries=1, seconds=_HELLO_SECONDS))
+        return ask_one(lambda frame: link.ask(frame, tries=1, seconds=seconds))
 
     # -- finding ---------------------------------------------------------------------------------------------------
 
@@ -112,10 +114,10 @@ class CanPort:
         until = time.monotonic() + seconds
         told: set[bytes] = set()
         notice(Notice("waiting", f"Looking for the node on {self.spec.text}.", seconds))
-        if address is not None and 1 <= address <= LAST_NODE:
-            contact = self._at(address, wanted, notice, told)
-            if contact is not None:
-                return contact
+        if self.spec.node is None and address is not None and 1 <= address <= LAST_NODE:
+            identity = self.identify(address, seconds=_GUESS_SECONDS)  # no random wait, unlike a question to everyone
+            if identity is not None and wanted(identity):
+                return self._contact(address, identity)
         while (left := until - time.monotonic()) > 0:
             round_ends = time.monotonic() + min(_ROUND_SECONDS, left)
             if self.spec.node is not None:

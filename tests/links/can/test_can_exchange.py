@@ -188,6 +188,15 @@ def test_two_nodes_under_one_address_are_a_conflict(hub: Hub) -> None:
         assert "conflict" in kinds
 
 
+def test_a_node_is_asked_first_where_it_is_thought_to_be(hub: Hub) -> None:
+    """Everyone answers after a random wait of up to 50 ms, one that is asked alone at once (profile: wire, "CAN")."""
+    with serving(hub.spec, EchoNode(0x21)), opened(hub.spec) as port:
+        assert find(port, address=0x21).address == 0x21
+        asked = {identifier for identifier, _ in hub.frames if identifier >> 16 in (0x18DA, 0x18DB)}
+        assert asked == {0x18DA21F1, 0x18DAF121}
+        assert find(port, address=0x22).address == 0x21, "the guess is wrong: then everyone is asked"
+
+
 def test_nobody_is_there(hub: Hub) -> None:
     with opened(hub.spec) as port:
         began = time.monotonic()
