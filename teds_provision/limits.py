@@ -70,10 +70,10 @@ def load_json(text: str | bytes, what: str, *, octets: int = LIMITS.teds_file, f
     """
     check_size(len(text), octets, what)
     if isinstance(text, str):
-        values = text.count("[") + text.count("{") + text.count(",")
+        opened, values = text.count("[") + text.count("{"), text.count(",")
     else:
-        values = text.count(b"[") + text.count(b"{") + text.count(b",")
-    check_count(values, LIMITS.json_values, f"values in {what}")
+        opened, values = text.count(b"[") + text.count(b"{"), text.count(b",")
+    check_count(opened + values, LIMITS.json_values, f"values in {what}")
     try:
         value = json.loads(text, object_pairs_hook=_unique, parse_int=_integer)
     except RecursionError as error:
@@ -84,7 +84,8 @@ def load_json(text: str | bytes, what: str, *, octets: int = LIMITS.teds_file, f
         raise BadData(f"{_upper(what)} is not JSON: line {error.lineno}: {error.msg}.") from error
     except ValueError as error:
         raise BadData(f"{file}:1: " * bool(file) + f"{_upper(what)} cannot be read: {error}.") from error
-    check_depth(value, LIMITS.json_depth, what)
+    if opened > LIMITS.json_depth:  # fewer brackets than levels nest no deeper
+        check_depth(value, LIMITS.json_depth, what)
     return value
 
 

@@ -184,7 +184,7 @@ class _Judge:
         policy = station.policy
         self.sender, self.mode = bundle.sender, bundle.mode
         self.nodes = {node.uuid: node for node in station.nodes.all()}
-        self.pins = station.pins.all()
+        self.pins = station.pins.all(self.nodes.values())
         self.names = {entry.name: entry.uuid for entry in station.pins.whitelist() if entry.name}
         self.names |= {node.name: node.uuid for node in self.nodes.values() if node.name}
         self.denied = {entry.uuid: (entry.fingerprint, entry.why) for entry in policy.revocations()}

@@ -35,8 +35,8 @@ class Selection:
 
     def __init__(self, station: Station, order: ExportOrder, receivers: set[str]) -> None:
         self.station, self.order, self.receivers = station, order, receivers
-        self.pins = station.pins.all()
         self.nodes = {node.uuid: node for node in station.nodes.all()}
+        self.pins = station.pins.all(self.nodes.values())
         held = list(station.keys.all())
         self.keys = {key.uuid: key for key in held if key.state == "active"}
         self.pending = {key.uuid for key in held if key.state == "pending"}

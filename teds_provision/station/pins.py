@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from typing import TYPE_CHECKING
 
 from teds_provision.lazy import late
 from teds_provision.station.node_keys import NodeKeys
 from teds_provision.station.seals import Seals
-from teds_provision.store import Store, WhitelistEntry
+from teds_provision.store import NodeRecord, Store, WhitelistEntry
 
 if TYPE_CHECKING:
     from teds_provision.protocol import agreement, keys
@@ -38,10 +38,10 @@ class Pins:
         self._seals.check_point(node)
         return keys.fingerprint(node.point)
 
-    def all(self) -> dict[bytes, str]:
-        """Fingerprint of every pinned UUID."""
+    def all(self, nodes: Iterable[NodeRecord] | None = None) -> dict[bytes, str]:
+        """Fingerprint of every pinned UUID; ``nodes`` are all of the store where they have been read already."""
         pins: dict[bytes, str] = {}
-        for node in self._store.nodes():
+        for node in self._store.nodes() if nodes is None else nodes:
             if node.point is not None:
                 self._seals.check_point(node)
                 pins[node.uuid] = keys.fingerprint(node.point)

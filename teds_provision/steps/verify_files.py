@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import multiprocessing
 import os
 from collections.abc import Iterator, Sequence
@@ -110,6 +111,7 @@ _judging: Judging | None = None
 def _begin(judging: Judging) -> None:
     global _judging  # noqa: PLW0603 - set once, in a process of its own
     _judging = judging
+    gc.freeze()  # the whole program is there before the first image: not looked through again for each few of them
 
 
 def _judge(path: Path) -> FileVerdict:

@@ -156,7 +156,9 @@ class NodeTables:
 
 
 def _node(*row: Any) -> NodeRecord:
-    values = (*row[:_GROUPS], tuple(json.loads(row[_GROUPS])), *row[_GROUPS + 1 :])
+    listed = row[_GROUPS]
+    groups = () if listed == "[]" else tuple(json.loads(listed))  # most nodes are in none, and there may be 100,000
+    values: tuple[Any, ...] = (*row[:_GROUPS], groups, *row[_GROUPS + 1 :])
     return NodeRecord(*values)
 
 

@@ -166,7 +166,7 @@ def has_profile_version(teds: bytes) -> bool:
 def _places(block: bytes) -> list[tuple[int, int, int]]:
     """Type, start and end of the value of every tuple (one length octet each); raises BadData where one runs out.
 
-    Walked three times for each datasheet (is it ours, what does it say, what is signed), so this loop does no more.
+    Walked twice for each datasheet (what does it say, what is signed), so this loop does no more.
     """
     places, at, size = [], 0, len(block)
     try:
