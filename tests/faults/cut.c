@@ -135,12 +135,14 @@ static void remember_all(const char *path)
 	closedir(folder);
 }
 
-__attribute__((constructor)) static void begin(void)
+/* At the start of a process; a fork that is a trial of its own calls it again when its environment stands. */
+__attribute__((constructor)) void faults_begin(void)
 {
 	roots = getenv("FAULT_ROOTS");
 	if (!roots)
 		return;
 	owner = getpid();
+	failing = 0;
 	at = strtoull(getenv("FAULT_AT") ? getenv("FAULT_AT") : "0", NULL, 10);
 	how = getenv("FAULT_HOW") ? getenv("FAULT_HOW") : "kill";
 	stays = getenv("FAULT_STAYS") != NULL;

@@ -1,0 +1,99 @@
+"""The changing commands that the bench cuts, and how the state that each starts from is made."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from tests.e2e.desk import ANGLE
+
+UUID = "8d4d9da65281f7000000"
+
+
+@dataclass(frozen=True)
+class Act:
+    """A changing command: from which state it starts, and what must be true when it was carried on after a cut.
+
+    ``ends`` are the exit codes with which carrying on may end. ``proof`` is the station that must then have the node
+    in its hands (none: the command gives it away), ``verdicts`` the exit codes of ``verify`` that count: 0 authentic,
+    4 for a node without a datasheet; 5 and 6 mean a lost key.
+    """
+
+    name: str
+    start: str
+    words: tuple[str, ...]
+    node: bool = True
+    home: str = "home"
+    ends: tuple[int, ...] = (0,)
+    proof: str = "home"
+    verdicts: tuple[int, ...] = (0,)
+
+
+NO_SHEET = (0, 4)
+ACTS = (
+    Act("whitelist add", "new", ("whitelist", "add", "{UUID}"), node=False, proof=""),
+    Act("identify", "new", ("identify", "--add", "TAP"), proof=""),
+    Act("agree", "listed", ("agree", "{UUID}", "TAP"), verdicts=NO_SHEET),
+    Act("build", "keyed", ("build", "{UUID}", "--profile", ANGLE), node=False, verdicts=NO_SHEET),
+    Act("sign", "built", ("sign", "{UUID}"), node=False, verdicts=NO_SHEET),
+    Act("write", "signed", ("write", "{UUID}", "LINK")),
+    Act("provision", "new", ("provision", "--profile", ANGLE, "--yes", "TAP")),
+    Act("rotate", "provisioned", ("agree", "{UUID}", "--rotate", "LINK"), verdicts=NO_SHEET),
+    Act("address", "provisioned", ("address", "{UUID}", "33", "LINK")),
+    Act("reset", "provisioned", ("reset", "{UUID}", "--yes", "LINK"), proof=""),
+    Act("trust add", "strangers", ("trust", "add", "crane", "{FILES}/crane.pem", "--yes"), node=False),
+    Act("copy", "pair", ("export-keys", "--to", "crane", "--all", "--yes", "--output", "{FILES}/c.jwe"), node=False),
+    Act(
+        "move",
+        "pair",
+        ("export-keys", "--to", "crane", "--all", "--mode", "move", "--yes", "--output", "{FILES}/m.jwe"),
+        node=False,
+        proof="",
+    ),
+    Act(
+        "import",
+        "bundled",
+        ("import-keys", "{FILES}/bundle.jwe", "--yes", "--no-prove"),
+        node=False,
+        home="other",
+        proof="other",
+    ),
+    Act("receipt", "imported", ("handover", "receipt", "{FILES}/receipt.jws"), node=False, proof="other"),
+    Act("undo", "bundled", ("handover", "undo", "{ID}", "--yes"), node=False),
+    Act("backup", "provisioned", ("backup", "{FILES}/backup", "--backup-passphrase-fd", "{FD}", "--yes"), node=False),
+    Act(
+        "restore",
+        "backed up",
+        ("restore", "{FILES}/backup", "--keystore", "file", "--backup-passphrase-fd", "{FD}", "--yes"),
+        node=False,
+        home="fresh",
+        proof="",
+    ),
+    Act("revoke", "provisioned", ("revoke", "{UUID}", "--why", "lost", "--yes"), node=False, proof=""),
+    Act("rewrap", "provisioned", ("vault", "rewrap", "--yes"), node=False),
+    Act("decommission", "provisioned", ("decommission", "{UUID}", "--yes", "LINK"), proof=""),
+)
+
+NEXT: dict[str, tuple[str, tuple[tuple[str, tuple[str, ...]], ...]]] = {
+    # state: (from which, ((station, words), ...)); "new" is made by hand
+    "listed": ("new", (("home", ("whitelist", "add", "{UUID}")),)),
+    "keyed": ("listed", (("home", ("agree", "{UUID}", "TAP")),)),
+    "built": ("keyed", (("home", ("build", "{UUID}", "--profile", ANGLE)),)),
+    "signed": ("built", (("home", ("sign", "{UUID}")),)),
+    "provisioned": ("new", (("home", ("provision", "--profile", ANGLE, "--yes", "TAP")),)),
+    "strangers": ("provisioned", (("other", ("trust", "add", "bench", "{FILES}/bench.pem", "--yes")),)),
+    "pair": ("strangers", (("home", ("trust", "add", "crane", "{FILES}/crane.pem", "--yes")),)),
+    "bundled": (
+        "pair",
+        (
+            (
+                "home",
+                ("export-keys", "--to", "crane", "--all", "--mode", "move", "--yes", "--output", "{FILES}/bundle.jwe"),
+            ),
+        ),
+    ),
+    "imported": (
+        "bundled",
+        (("other", ("import-keys", "{FILES}/bundle.jwe", "--yes", "--receipt", "{FILES}/receipt.jws", "TAP")),),
+    ),
+    "backed up": ("provisioned", (("home", ("backup", "{FILES}/backup", "--backup-passphrase-fd", "{FD}", "--yes")),)),
+}

@@ -1,0 +1,180 @@
+"""Where a trial runs: a folder with stations, a node's flash and files, and the processes that work on them."""
+
+from __future__ import annotations
+
+import itertools
+import json
+import os
+import re
+import shutil
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from teds_provision.station.station import initialise
+from teds_provision.vault.passphrase import THROWAWAY
+from tests.cli.shell import clean_environment
+from tests.e2e.desk import Links, free_port
+from tests.faults.acts import NEXT, UUID
+from tests.faults.zygote import FIRST_FD, Child, Zygote
+
+PASSPHRASE = "correct horse battery"
+READY = 60.0
+_groups = itertools.count()
+
+
+def own_links() -> Links:
+    """A reader and a bus that no other trial has: the bus has a multicast group of its own."""
+    number = next(_groups)
+    group = f"239.74.{164 + number // 250 % 32}.{1 + number % 250}"
+    return Links(f"udp:localhost:{free_port()}", f"udp_multicast:{group}?port={free_port()}")
+
+
+@dataclass(frozen=True)
+class Ended:
+    """How a command ended, and what it said."""
+
+    returncode: int
+    stdout: str
+    stderr: str
+
+    @property
+    def buggy(self) -> str:
+        """What it said, where that is no answer: a traceback, or exit code 1."""
+        if "Traceback" not in self.stderr and self.returncode != 1:
+            return ""
+        return f"a bug: {self.returncode} {self.stdout[-300:]}{self.stderr[-300:]}"
+
+
+@dataclass(frozen=True)
+class Desk:
+    """One folder with a station (``home``), another (``other``), a node's flash and the files that go to and fro."""
+
+    folder: Path
+    zygote: Zygote
+    links: Links = field(default_factory=own_links)
+
+    @property
+    def home(self) -> Path:
+        return self.folder / "home"
+
+    def words(self, words: tuple[str, ...]) -> list[str]:
+        """A command line with the places of this desk put in."""
+        files = self.folder / "files"
+        bundle = files / "bundle.id"
+        places = {"FILES": str(files), "UUID": UUID, "ID": bundle.read_text() if bundle.exists() else ""}
+        places["FD"] = str(FIRST_FD + 1)
+        result: list[str] = []
+        for word in words:
+            if word == "LINK":
+                result += self.links.over("can")
+            elif word == "TAP":
+                result += self.links.over("nfc")
+            else:
+                result.append(re.sub(r"\{(\w+)\}", lambda found: places.get(found[1], found[0]), word))
+        return result
+
+    def start(
+        self, *words: str, home: str = "home", fault: dict[str, str] | None = None, module: str = "teds_provision"
+    ) -> Child:
+        """Begin one command of a station of this desk; two descriptors hold the passphrase."""
+        secrets = [_pipe_with(PASSPHRASE), _pipe_with(PASSPHRASE)]
+        options = ["--home", str(self.folder / home), "--json", "--passphrase-fd", str(FIRST_FD)]
+        try:
+            return self.zygote.start(
+                module, [*options, *self.words(words)], clean_environment() | (fault or {}), tuple(secrets)
+            )
+        finally:
+            for each in secrets:
+                os.close(each)
+
+    def run(
+        self,
+        *words: str,
+        home: str = "home",
+        fault: dict[str, str] | None = None,
+        seconds: float = 60,
+        module: str = "teds_provision",
+    ) -> Ended:
+        """Run one command of a station of this desk to its end; raises TimeoutExpired."""
+        return ended(self.start(*words, home=home, fault=fault, module=module), seconds)
+
+    @contextmanager
+    def node(self, fault: dict[str, str] | None = None, *, nfc: bool = True) -> Iterator[Child]:
+        """The virtual node of this desk, on its bus and (unless told otherwise) on its reader."""
+        links = [*(["--nfc", self.links.nfc] if nfc else []), "--can", self.links.can]
+        words = ["--json", "--debug", "node", "run", str(self.folder / "flash"), *links]
+        running = self.zygote.start("teds_provision", words, clean_environment() | (fault or {}), piped=True)
+        try:
+            running.wait_for('"ready": true', READY)
+            yield running
+        finally:
+            running.close()
+
+
+def ended(running: Child, seconds: float) -> Ended:
+    """Wait for the end of a command; raises TimeoutExpired."""
+    try:
+        code = running.wait(seconds)
+        return Ended(code, running.stdout(), running.stderr())
+    finally:
+        running.close()
+
+
+def _pipe_with(line: str) -> int:
+    read, write = os.pipe()
+    os.write(write, line.encode() + b"\n")
+    os.close(write)
+    return read
+
+
+class States:
+    """The states from which commands start: each made once, copied for every trial."""
+
+    def __init__(self, folder: Path, zygote: Zygote) -> None:
+        self.folder = folder
+        self.zygote = zygote
+        self._lock = threading.RLock()
+
+    def of(self, name: str) -> Path:
+        """The folder of a state, made at first need."""
+        with self._lock:
+            place = self.folder / name.replace(" ", "-")
+            if not place.is_dir():
+                made = place.with_suffix(".new")
+                self._make(name, made)
+                made.rename(place)
+            return place
+
+    def _make(self, name: str, made: Path) -> None:
+        if name == "new":
+            self._new(made)
+            return
+        before, steps = NEXT[name]
+        shutil.copytree(self.of(before), made)
+        desk = Desk(made, self.zygote)
+        with desk.node():
+            for station, words in steps:
+                done = desk.run(*words, home=station)
+                assert done.returncode == 0, f"{name}: {words}: {done.stdout}{done.stderr}"
+                if words[0] == "export-keys":
+                    (made / "files" / "bundle.id").write_text(json.loads(done.stdout)["id"])
+        if name == "backed up":
+            (made / "fresh").mkdir(mode=0o700)
+
+    def _new(self, folder: Path) -> None:
+        folder.mkdir()
+        (folder / "files").mkdir()
+        desk = Desk(folder, self.zygote)
+        for home, name in (("home", "bench"), ("other", "crane")):
+            station, _ = initialise(
+                folder / home, name=name, keystore="file", ask=lambda prompt, confirm=False: PASSPHRASE, costs=THROWAWAY
+            )
+            station.close()
+            told = json.loads(desk.run("init", home=home).stdout)
+            (folder / "files" / f"{name}.pem").write_text(told["public_key"])
+        words = ["node", "create", str(folder / "flash"), "--uuid", UUID]
+        made = ended(self.zygote.start("teds_provision", words, clean_environment()), 60)
+        assert made.returncode == 0, made

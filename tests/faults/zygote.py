@@ -1,0 +1,297 @@
+"""Processes of the program that cost a fork instead of a start: one process imports everything once and waits.
+
+A trial of the fault bench runs the program five times; without this most of its time is Python importing the same
+modules. The zygote runs under cut.c's library with no fault set, has one thread and no open file of anybody's; a child
+of it gets its own environment, files and folder, lets the library begin anew (``faults_begin``), runs the module as
+``python -m`` would, and ends as a Python process ends.
+
+As a program: python -m tests.faults.zygote FD (the control socket that its parent holds the other end of).
+"""
+
+from __future__ import annotations
+
+import atexit
+import ctypes
+import fcntl
+import gc
+import importlib
+import json
+import os
+import pkgutil
+import runpy
+import selectors
+import signal
+import socket
+import subprocess
+import sys
+import threading
+import time
+import traceback
+from contextlib import suppress
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from tests.cli.shell import clean_environment
+
+ROOT = Path(__file__).resolve().parents[2]
+# What the commands of the bench import late: foreign and heavy. Seen by comparing sys.modules before and after each.
+FOREIGN = (
+    "can",
+    "can.interfaces.udp_multicast",
+    "cryptography.hazmat.primitives.asymmetric.ec",
+    "cryptography.hazmat.primitives.ciphers.aead",
+    "cryptography.hazmat.primitives.kdf.argon2",
+    "cryptography.hazmat.primitives.kdf.hkdf",
+    "cryptography.hazmat.primitives.keywrap",
+    "cryptography.hazmat.primitives.serialization",
+    "ndef",
+    "nfc",
+    "nfc.clf.udp",
+    "rich.console",
+    "rich.table",
+)
+FIRST_FD = 3  # of the descriptors that a child is given beside stdin, stdout and stderr
+LARGEST = 1 << 17
+
+
+@dataclass
+class Child:
+    """One process: its id, what it wrote, and how it ended."""
+
+    pid: int
+    status: int  # a pipe: the wait status comes here as text when it has ended
+    out: int  # a file in memory, or the reading end of a pipe
+    err: int
+    code: int | None = None
+
+    def poll(self) -> int | None:
+        """The exit code (minus the signal), or None while it runs."""
+        return self._wait(0)
+
+    def wait(self, seconds: float) -> int:
+        """The exit code; kills it and raises TimeoutExpired where it has not ended after ``seconds``."""
+        code = self._wait(seconds)
+        if code is None:
+            self.kill()
+            raise subprocess.TimeoutExpired(str(self.pid), seconds)
+        return code
+
+    def kill(self) -> None:
+        """End it at once, and wait for that."""
+        if self.poll() is None:
+            with suppress(ProcessLookupError):
+                os.kill(self.pid, signal.SIGKILL)
+            self._wait(30)
+
+    def stdout(self) -> str:
+        """What it wrote to a file in memory."""
+        return _whole(self.out)
+
+    def stderr(self) -> str:
+        """What it wrote to stderr."""
+        return _whole(self.err)
+
+    def wait_for(self, text: str, seconds: float) -> None:
+        """Read its stdout (a pipe) until ``text`` came; AssertionError where it ends without, or takes too long."""
+        came = ""
+        until = time.monotonic() + seconds
+        while text not in came:
+            left = until - time.monotonic()
+            octets = os.read(self.out, 65536) if left > 0 and _readable(self.out, left) else b""
+            assert octets, f"ended without {text!r}: {came!r} {self.stderr()[-500:]!r}"
+            came += octets.decode()
+
+    def close(self) -> None:
+        """End it and give its files back."""
+        self.kill()
+        for each in (self.status, self.out, self.err):
+            os.close(each)
+
+    def _wait(self, seconds: float) -> int | None:
+        if self.code is None and _readable(self.status, seconds):
+            self.code = os.waitstatus_to_exitcode(int(os.read(self.status, 64) or b"9"))
+        return self.code
+
+
+def first_of(one: Child, other: Child, seconds: float) -> Child | None:
+    """Which of two ends first (``one`` where both have), or None where neither does within ``seconds``."""
+    until = time.monotonic() + seconds
+    with selectors.PollSelector() as poll:
+        for child in (one, other):
+            poll.register(child.status, selectors.EVENT_READ)
+        while one.code is None and other.code is None:
+            left = until - time.monotonic()
+            if left <= 0 or not poll.select(left):
+                return None
+            one.poll()
+            other.poll()
+    return one if one.code is not None else other
+
+
+@dataclass
+class Zygote:
+    """The parent's end: starts the program again and again, from any thread."""
+
+    library: Path
+    _lock: threading.Lock = field(default_factory=threading.Lock)
+
+    def __post_init__(self) -> None:
+        ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+        for end in (ours, theirs):
+            end.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, LARGEST)
+        self._control = ours
+        with theirs:
+            self._process = subprocess.Popen(
+                [sys.executable, "-m", "tests.faults.zygote", str(theirs.fileno())],
+                stdin=subprocess.DEVNULL,
+                pass_fds=(theirs.fileno(),),
+                env=clean_environment(LD_PRELOAD=str(self.library)),
+                cwd=ROOT,
+            )
+
+    def start(
+        self,
+        module: str,
+        words: list[str],
+        environment: dict[str, str],
+        given: tuple[int, ...] = (),
+        *,
+        piped: bool = False,
+    ) -> Child:
+        """Run ``python -m module words``; ``given`` become descriptors 3, 4 … there, ``piped``: stdout is a pipe."""
+        nothing = os.open(os.devnull, os.O_RDONLY)
+        err = os.memfd_create("stderr", os.MFD_CLOEXEC)
+        out, written = os.pipe() if piped else (os.memfd_create("stdout", os.MFD_CLOEXEC),) * 2
+        status, told = os.pipe()
+        request = json.dumps({"module": module, "words": words, "environment": environment}).encode()
+        try:
+            with self._lock:
+                socket.send_fds(self._control, [request], [told, nothing, written, err, *given])
+        finally:
+            os.close(told)
+            os.close(nothing)
+            if piped:
+                os.close(written)
+        assert _readable(status, 60), "the zygote does not answer"
+        return Child(int(os.read(status, 16)), status, out, err)
+
+    def close(self) -> None:
+        """End it; it ends its children."""
+        self._control.close()
+        self._process.wait(60)
+
+
+def _readable(fd: int, seconds: float) -> bool:
+    with selectors.PollSelector() as poll:
+        poll.register(fd, selectors.EVENT_READ)
+        return bool(poll.select(max(0.0, seconds)))
+
+
+def _whole(fd: int) -> str:
+    return os.pread(fd, os.fstat(fd).st_size, 0).decode(errors="replace")
+
+
+# -- the zygote itself -------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class _Request:
+    module: str
+    words: list[str]
+    environment: dict[str, str]
+    files: tuple[int, ...]  # status pipe, stdin, stdout, stderr, and what else is given
+
+
+def _serve(control: socket.socket) -> _Request | None:
+    """Fork a child for each request; returns a request in the child that shall run it, None when all is over."""
+    children: dict[int, tuple[int, int]] = {}  # pidfd -> pid, status pipe
+    with selectors.DefaultSelector() as selector:
+        selector.register(control, selectors.EVENT_READ)
+        while True:
+            for key, _ in selector.select():
+                if key.fileobj is not control:
+                    selector.unregister(key.fileobj)
+                    _tell_end(key.fd, *children.pop(key.fd))
+                    continue
+                octets, files, _, _ = socket.recv_fds(control, LARGEST, 16)
+                if not octets:
+                    for pid, _pipe in children.values():
+                        os.kill(pid, signal.SIGKILL)
+                    return None
+                pid = os.fork()
+                if not pid:
+                    return _Request(**json.loads(octets), files=tuple(files))
+                for each in files[1:]:
+                    os.close(each)
+                os.write(files[0], f"{pid}".encode().ljust(16))
+                pidfd = os.pidfd_open(pid)
+                children[pidfd] = pid, files[0]
+                selector.register(pidfd, selectors.EVENT_READ)
+
+
+def _tell_end(pidfd: int, pid: int, pipe: int) -> None:
+    _, status = os.waitpid(pid, 0)
+    with suppress(BrokenPipeError):
+        os.write(pipe, str(status).encode())
+    os.close(pipe)
+    os.close(pidfd)
+
+
+def _become(request: _Request) -> None:
+    """In the child: take on files and environment of the request, and run its module."""
+    high = [fcntl.fcntl(each, fcntl.F_DUPFD, 512) for each in request.files[1:]]
+    os.closerange(0, 512)
+    for number, each in enumerate(high):
+        os.dup2(each, number)
+    os.closerange(512, max(high) + 1)
+    os.environ.clear()
+    os.environ.update(request.environment)
+    ctypes.CDLL(None).faults_begin()
+    sys.argv = [request.module, *request.words]
+    code = 0
+    try:
+        runpy.run_module(request.module, run_name="__main__", alter_sys=True)
+    except SystemExit as end:
+        code = end.code if isinstance(end.code, int) else int(end.code is not None)
+    except BaseException:  # noqa: BLE001  as Python itself ends: a traceback and 1
+        traceback.print_exc()
+        code = 1
+    _leave(code)
+
+
+def _leave(code: int) -> None:
+    """End as Python does, but for freeing what the zygote imported, which is most of the cost of a short command."""
+    threading._shutdown()
+    atexit._run_exitfuncs()
+    for stream in (sys.stdout, sys.stderr):
+        with suppress(OSError, ValueError, AttributeError):
+            stream.flush()
+    os._exit(code)
+
+
+def _import_all() -> None:
+    import teds_provision
+
+    for found in pkgutil.walk_packages(teds_provision.__path__, "teds_provision."):
+        if not found.name.endswith("__main__"):
+            with suppress(ImportError):  # of an extra that is not installed
+                importlib.import_module(found.name)
+    for name in FOREIGN:
+        importlib.import_module(name)
+
+
+def main() -> None:
+    """Import, then serve; in a child: run what was asked for."""
+    control = socket.socket(fileno=int(sys.argv[1]))
+    _import_all()
+    assert threading.active_count() == 1
+    gc.collect()
+    gc.freeze()
+    request = _serve(control)
+    control.detach()
+    if request is not None:
+        _become(request)
+
+
+if __name__ == "__main__":
+    main()
