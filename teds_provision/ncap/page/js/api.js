@@ -1,0 +1,61 @@
+// The API of the base station. Every refusal becomes a Refusal with cause and cure.
+
+const ROOT = new URL("api/v1/", document.baseURI);
+const PATIENCE = 60000; // ms; what waits for a person answers at once and is followed by events
+
+/** What the station, or the way to it, said no to. */
+export class Refusal extends Error {
+  constructor(status, code, message, hint) {
+    super(message);
+    this.status = status;
+    this.code = code;
+    this.hint = hint ?? "";
+  }
+}
+
+async function ask(method, path, body, { signal, keepalive } = {}) {
+  const limit = AbortSignal.timeout(PATIENCE);
+  let answer;
+  try {
+    answer = await fetch(new URL(path, ROOT), {
+      method,
+      keepalive: keepalive ?? false,
+      credentials: "same-origin",
+      cache: "no-store",
+      headers: body === undefined ? {} : { "Content-Type": "application/json" },
+      body: body === undefined ? undefined : JSON.stringify(body),
+      signal: signal ? AbortSignal.any([signal, limit]) : limit,
+    });
+  } catch (error) {
+    if (signal?.aborted) throw error;
+    throw new Refusal(0, "unreachable", "The base station does not answer.", "Is `teds-provision ncap run` still running?");
+  }
+  const said = await answer.json().catch(() => null);
+  if (answer.ok) return said ?? {};
+  const why = said?.error ?? {};
+  throw new Refusal(answer.status, why.code ?? String(answer.status), why.message ?? `Refused (${answer.status}).`, why.hint);
+}
+
+const at = (...parts) => parts.map(encodeURIComponent).join("/");
+
+export const get = (path, options) => ask("GET", path, undefined, options);
+export const post = (path, body = {}, options) => ask("POST", path, body, options);
+export const change = (path, body, options) => ask("PUT", path, body, options);
+export const remove = (path) => ask("DELETE", path, {});
+
+export const paths = {
+  node: (uuid) => at("nodes", uuid),
+  teds: (uuid) => `${at("nodes", uuid)}/teds`,
+  provision: (uuid) => `${at("nodes", uuid)}/provision`,
+  channel: (uuid, number) => `${at("nodes", uuid)}/channels/${number}`,
+  group: (name) => at("groups", name),
+  measurement: (id) => at("measurements", id),
+  virtual: (uuid) => at("virtual", uuid),
+};
+
+/** Address of the WebSocket. */
+export function liveAddress() {
+  const address = new URL("live", ROOT);
+  address.protocol = address.protocol === "https:" ? "wss:" : "ws:";
+  return address;
+}

@@ -1,0 +1,92 @@
+// How numbers, times and names are shown.
+
+/** Digits after the point so that the uncertainty has two figures; without one, five figures in all. */
+function places(value, uncertainty) {
+  if (uncertainty > 0) return Math.min(9, Math.max(0, 1 - Math.floor(Math.log10(uncertainty))));
+  const size = Math.abs(value);
+  return size >= 1e5 || size === 0 ? 0 : Math.min(9, Math.max(0, 4 - Math.floor(Math.log10(size))));
+}
+
+/** A value as people read it; "–" where there is none. Very large and very small ones as 1.2345e-9. */
+export function number(value, uncertainty = null) {
+  if (typeof value !== "number" || !Number.isFinite(value)) return "–";
+  const size = Math.abs(value);
+  if (size !== 0 && (size >= 1e7 || (size < 1e-4 && !(uncertainty > size)))) return sign(value.toExponential(4));
+  return sign(value.toFixed(places(value, uncertainty)));
+}
+
+/** Like number, without the zeros that a fixed width needs. */
+export function short(value) {
+  if (typeof value !== "number" || !Number.isFinite(value)) return "–";
+  return sign(String(Number(value.toPrecision(4))));
+}
+
+const sign = (words) => words.replace("-", "\u2212");
+
+/** "0 to 110 mm", "from 0 mm", or "not stated". */
+export function range(channel) {
+  const unit = channel.unit ? ` ${channel.unit}` : "";
+  const [low, high] = [channel.low, channel.high].map((end) => (typeof end === "number" ? short(end) : null));
+  if (low !== null && high !== null) return `${low} to ${high}${unit}`;
+  if (low !== null) return `from ${low}${unit}`;
+  return high !== null ? `up to ${high}${unit}` : "not stated";
+}
+
+/** "100 Hz", "2.5 kHz". */
+export function hertz(rate) {
+  if (typeof rate !== "number" || !(rate > 0)) return "not stated";
+  return rate >= 1000 ? `${short(rate / 1000)} kHz` : `${short(rate)} Hz`;
+}
+
+/** How long ago, in words that change seldom. */
+export function age(seconds) {
+  if (typeof seconds !== "number" || !Number.isFinite(seconds)) return "never";
+  if (seconds < 1.5) return "now";
+  if (seconds < 90) return `${Math.round(seconds)} s ago`;
+  if (seconds < 5400) return `${Math.round(seconds / 60)} min ago`;
+  if (seconds < 129600) return `${Math.round(seconds / 3600)} h ago`;
+  return `${Math.round(seconds / 86400)} days ago`;
+}
+
+/** Clock time of a unix second or an ISO string: 14:03:07; with the day where it is not today. */
+export function clock(time) {
+  if (time === null || time === undefined || time === "") return "–";
+  const moment = typeof time === "number" ? new Date(time * 1000) : new Date(time);
+  if (Number.isNaN(moment.getTime())) return String(time);
+  const pad = (part) => String(part).padStart(2, "0");
+  const hours = `${pad(moment.getHours())}:${pad(moment.getMinutes())}:${pad(moment.getSeconds())}`;
+  if (moment.toDateString() === new Date().toDateString()) return hours;
+  return `${moment.getFullYear()}-${pad(moment.getMonth() + 1)}-${pad(moment.getDate())} ${hours}`;
+}
+
+/** What a node is called: its name, else the first digits of its UUID. */
+export function nameOf(node) {
+  return node?.name || (node?.uuid ? `node ${node.uuid.slice(0, 8)}` : "unknown node");
+}
+
+/** What a channel is called. */
+export function channelName(channel) {
+  return channel.name || `channel ${channel.number}`;
+}
+
+/** "1 node", "2 nodes". */
+export function count(many, one, more = `${one}s`) {
+  return `${many} ${many === 1 ? one : more}`;
+}
+
+/** A UUID in groups of four, for reading aloud and comparing. */
+export function grouped(hex) {
+  return (hex ?? "").replace(/(.{4})(?=.)/g, "$1 ");
+}
+
+const VERDICTS = {
+  authentic: ["good", "good", "Authentic", "Signature, trust and key proof hold."],
+  unproven: ["warn", "ask", "Unproven", "The node could not prove that it holds its key."],
+  unsigned: ["warn", "warn", "Unsigned", "Nobody signed this datasheet."],
+  "not authentic": ["bad", "bad", "Not authentic", "A check failed: do not trust its values."],
+};
+
+/** Tone, sign, word and meaning of a verdict. */
+export function verdict(word) {
+  return VERDICTS[word] ?? ["plain", "ask", "Not checked", "Nobody has verified this node yet."];
+}

@@ -1,0 +1,58 @@
+// The WebSocket: values and events as they come. A connection that went silent is seen within two seconds.
+
+import { get, liveAddress } from "./api.js";
+
+const SILENCE = 1500; // ms without a beat (two a second): the connection is lost, whatever the socket believes
+const LOOK = 200; // ms between looks
+const WAIT = [300, 600, 1000, 2000, 3000]; // ms before the next try
+
+/** Connects, watches, connects again. `on.state(state, error)`: "live", "lost", "signed out". `on.event(event)`. */
+export class Live {
+  constructor(on) {
+    this.on = on;
+    this.tries = 0;
+    this.heard = 0;
+    this.socket = null;
+    setInterval(() => this.look(), LOOK);
+    this.connect();
+  }
+
+  connect() {
+    const socket = new WebSocket(liveAddress());
+    this.socket = socket;
+    this.heard = performance.now();
+    socket.onmessage = (message) => {
+      if (socket !== this.socket) return;
+      this.heard = performance.now();
+      const event = JSON.parse(message.data);
+      if (event.event === "hello") {
+        this.tries = 0;
+        this.on.state("live");
+      }
+      this.on.event(event);
+    };
+    socket.onclose = () => socket === this.socket && this.lost();
+  }
+
+  look() {
+    if (this.socket && performance.now() - this.heard > SILENCE) this.lost();
+  }
+
+  lost() {
+    const socket = this.socket;
+    this.socket = null;
+    socket.onmessage = socket.onclose = null;
+    socket.close();
+    this.on.state("lost");
+    setTimeout(() => this.again(), WAIT[Math.min(this.tries++, WAIT.length - 1)]);
+  }
+
+  async again() {
+    try {
+      await get("status", { signal: AbortSignal.timeout(2000) });
+    } catch (error) {
+      if (error.status === 401) return this.on.state("signed out", error);
+    }
+    return this.connect();
+  }
+}

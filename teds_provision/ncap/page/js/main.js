@@ -1,0 +1,167 @@
+// Starts the page: header, connection, and the view that the address names.
+
+import { change, post } from "./api.js";
+import { button, fill, h, icon, say, text, toast, trouble } from "./dom.js";
+import { count, nameOf } from "./format.js";
+import { Live } from "./live.js";
+import { changed, on, refresh, state, take } from "./state.js";
+import { logView } from "./views/log.js";
+import { measureView } from "./views/measure.js";
+import { nodesView } from "./views/nodes.js";
+import { stationView } from "./views/station.js";
+import { virtualView } from "./views/virtual.js";
+
+const VIEWS = {
+  nodes: ["Nodes", nodesView],
+  measure: ["Measure", measureView],
+  virtual: ["Virtual", virtualView],
+  log: ["Log", logView],
+  station: ["Station", stationView],
+};
+const STATUS_EVERY = 3000; // ms
+
+let shown = { name: null, view: null };
+
+function route() {
+  const [name, ...rest] = location.hash.replace(/^#\/?/, "").split("/").map(decodeURIComponent);
+  return VIEWS[name] ? { name, rest } : { name: "nodes", rest: [] };
+}
+
+function show() {
+  const { name, rest } = route();
+  if (shown.name === name && shown.view.go) {
+    shown.view.go(rest);
+    return;
+  }
+  shown.view?.end?.();
+  const main = document.getElementById("main");
+  main.replaceChildren();
+  main.className = `view-${name}`;
+  const [title, make] = VIEWS[name];
+  shown = { name, view: make(main, rest) };
+  document.title = `${title} – base station`;
+  changed("route");
+}
+
+function header() {
+  const title = h("h1", {}, "Base station");
+  const pill = h("span", { class: "pill", id: "connection" });
+  const modes = h("div", { class: "switch", role: "group", "aria-label": "Detection" });
+  const explained = {
+    whitelist: "Only nodes on the whitelist are opened; others are counted.",
+    transparent: "Every node that is found is read and shown.",
+  };
+  const choices = Object.entries(explained).map(([mode, why]) =>
+    button(mode === "whitelist" ? "Whitelist" : "Transparent", {
+      title: why,
+      "data-mode": mode,
+      onclick: () => detect(mode, why),
+    }),
+  );
+  modes.append(...choices);
+  const discover = button("Discover", { id: "discover", title: "Ask every link now which nodes are there." }, "wave");
+  discover.addEventListener("click", () => discover.busy(find));
+  const nav = h("nav", { "aria-label": "Views" });
+  const links = Object.entries(VIEWS).map(([name, [words]]) => h("a", { href: `#/${name}`, "data-view": name }, words));
+  nav.append(...links);
+  const bar = document.getElementById("bar");
+  fill(bar, h("div", { class: "who" }, title, pill), nav, h("div", { class: "tools" }, h("span", { class: "tool-label" }, "Detection"), modes, discover));
+
+  on("status connection route", () => {
+    text(title, state.status?.station?.name ? `Base station ${state.status.station.name}` : "Base station");
+    for (const choice of choices) choice.setAttribute("aria-pressed", String(state.status?.detection === choice.dataset.mode));
+    for (const control of [...choices, discover]) {
+      if (control.getAttribute("aria-busy") !== "true") control.disabled = state.connection !== "live" || state.status?.write === false;
+    }
+    for (const link of links) {
+      if (link.dataset.view === route().name) link.setAttribute("aria-current", "page");
+      else link.removeAttribute("aria-current");
+    }
+    connection(pill);
+  });
+}
+
+function connection(pill) {
+  const [tone, sign, words] = {
+    connecting: ["plain", "clock", "Connecting"],
+    live: ["good", "good", "Live"],
+    lost: ["bad", "bad", "Connection lost"],
+    "signed out": ["bad", "bad", "Signed out"],
+  }[state.connection];
+  pill.className = `pill ${tone}`;
+  if (pill.textContent !== words) fill(pill, icon(sign), h("span", {}, words));
+  document.body.classList.toggle("lost", state.connection !== "live");
+  const banner = document.getElementById("banner");
+  if (state.connection === "lost") {
+    text(banner, "Connection to the base station lost. What you see is old. Trying again …");
+  } else if (state.connection === "signed out") {
+    if (!banner.firstElementChild) {
+      fill(banner, "This browser is not signed in any more. Open the page anew with the address that this command prints: ", h("code", {}, "teds-provision ncap open"));
+    }
+  } else banner.replaceChildren();
+}
+
+async function detect(mode, why) {
+  try {
+    await change("detection", { mode });
+    say(`Detection: ${mode}. ${why}`);
+    await refresh("status", "nodes");
+  } catch (error) {
+    toast("bad", error.message, error.hint);
+  }
+}
+
+async function find() {
+  say("Asking every link which nodes are there.");
+  try {
+    const { nodes } = await post("discover");
+    await refresh("nodes", "status");
+    const words = nodes?.length ? `${count(nodes.length, "node")} answered.` : "No node answered.";
+    toast("good", words, nodes?.length ? "" : "Is it powered and on the bus? A node with NFC is found when you lay it on the reader.");
+  } catch (error) {
+    toast("bad", error.message, error.hint);
+  }
+}
+
+/** A tap opens that very node and marks it, wherever the person was: no button is needed. */
+function tapped() {
+  const { uuid } = state.tapped;
+  const node = state.nodes.get(uuid);
+  say(`Tapped: ${nameOf(node ?? { uuid })}.`);
+  const here = location.hash.startsWith(`#/nodes/${uuid}`);
+  if (document.querySelector("[data-held]")) {
+    toast("good", `Tapped: ${nameOf(node ?? { uuid })}.`, "Not opened, because you hold an actuator.");
+    return;
+  }
+  if (!here) location.hash = `#/nodes/${uuid}`;
+  changed("nodes");
+}
+
+function start() {
+  header();
+  window.addEventListener("hashchange", show);
+  on("tap", tapped);
+  show();
+  new Live({
+    state: (word, refusal = null) => {
+      if (state.connection === word) return;
+      state.connection = word;
+      state.refusal = refusal;
+      state.since = performance.now();
+      if (word === "lost") say("Connection lost.");
+      if (word === "live") say("Connected.");
+      changed("connection");
+    },
+    event: take,
+  });
+  setInterval(() => {
+    if (state.connection === "live" && !document.hidden) refresh("status");
+  }, STATUS_EVERY);
+}
+
+window.addEventListener("unhandledrejection", (event) => {
+  if (event.reason?.name !== "AbortError") toast("bad", event.reason?.message ?? String(event.reason));
+});
+
+if (window.uPlot) start();
+else fill(document.getElementById("main"), trouble({ message: "A file of this page is missing: vendor/uPlot.iife.min.js.", hint: "Install teds-provision anew." }));

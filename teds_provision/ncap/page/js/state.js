@@ -1,0 +1,213 @@
+// What the page knows, in one place. Views listen to topics; several changes in one frame are told once.
+
+import { get } from "./api.js";
+import { toast } from "./dom.js";
+import { Ring } from "./ring.js";
+
+const RINGS = 400; // channels whose course is kept at once
+
+export const state = {
+  connection: "connecting", // connecting, live, lost, signed out
+  since: performance.now(),
+  refusal: null,
+  status: null,
+  loaded: false,
+  nodes: new Map(), // by UUID
+  groups: [],
+  measurements: [],
+  virtual: [],
+  profiles: [],
+  names: [],
+  log: { entries: [], intact: null },
+  values: new Map(), // "uuid/channel" → {value, time, heard}
+  rings: new Map(), // "uuid/channel" → Ring
+  runs: new Map(), // UUID → what provisioning said so far
+  tapped: null, // {uuid, at}
+  offset: 0, // station's clock less this one's, s
+  dropped: 0, // points that this page was too slow for, told by the station
+  received: 0,
+};
+
+const listeners = new Map();
+const waiting = new Set();
+let planned = false;
+
+/** Call `listener` after changes of any of these topics; returns what ends it. */
+export function on(topics, listener) {
+  for (const topic of topics.split(" ")) {
+    if (!listeners.has(topic)) listeners.set(topic, new Set());
+    listeners.get(topic).add(listener);
+  }
+  return () => topics.split(" ").forEach((topic) => listeners.get(topic)?.delete(listener));
+}
+
+/** Say that something changed; views hear of it in the next frame. */
+export function changed(...topics) {
+  topics.forEach((topic) => waiting.add(topic));
+  if (planned) return;
+  planned = true;
+  const tell = () => {
+    planned = false;
+    const heard = new Set([...waiting].flatMap((topic) => [...(listeners.get(topic) ?? [])]));
+    waiting.clear();
+    heard.forEach((listener) => listener());
+  };
+  // A hidden page paints no frames, but what it shows shall be true when it is looked at.
+  if (document.hidden) setTimeout(tell, 200);
+  else requestAnimationFrame(tell);
+}
+
+/** The station's clock, unix seconds. */
+export const now = () => Date.now() / 1000 + state.offset;
+
+export const keyOf = (uuid, channel) => `${uuid}/${channel}`;
+
+/** The last value of a channel: what was streamed, or what the station told with the node. */
+export function lastOf(uuid, channel) {
+  const streamed = state.values.get(keyOf(uuid, channel.number));
+  const told = channel.last ?? null;
+  if (streamed && (!told || !(told.time > streamed.time))) return streamed;
+  return told;
+}
+
+/** Whether a value is too old to be taken for the present one. */
+export function isStale(last) {
+  return !last || state.connection !== "live" || now() - last.time > Math.max(2, 3 * (last.period ?? 0));
+}
+
+export function ringOf(uuid, channel) {
+  const key = keyOf(uuid, channel);
+  let ring = state.rings.get(key);
+  if (!ring) {
+    if (state.rings.size >= RINGS) state.rings.delete(state.rings.keys().next().value);
+    ring = new Ring();
+    state.rings.set(key, ring);
+  }
+  return ring;
+}
+
+/** The measurement that takes this node in, if any. */
+export function measuring(uuid) {
+  return state.measurements.find((one) => membersOf(one).includes(uuid)) ?? null;
+}
+
+/** UUIDs of a measurement. */
+export function membersOf(measurement) {
+  if (measurement.uuids?.length) return measurement.uuids;
+  return state.groups.find((group) => group.name === measurement.group)?.uuids ?? [];
+}
+
+const LISTS = {
+  status: async () => {
+    state.status = await get("status");
+    if (typeof state.status.now === "number") state.offset = state.status.now - Date.now() / 1000;
+  },
+  nodes: async () => {
+    const { nodes } = await get("nodes");
+    state.nodes = new Map((nodes ?? []).map((node) => [node.uuid, node]));
+    state.loaded = true;
+  },
+  groups: async () => (state.groups = (await get("groups")).groups ?? []),
+  measurements: async () => (state.measurements = (await get("measurements")).measurements ?? []),
+  virtual: async () => (state.virtual = (await get("virtual")).virtual ?? []),
+  profiles: async () => (state.profiles = (await get("profiles")).profiles ?? []),
+  names: async () => (state.names = (await get("names")).names ?? []),
+  log: async () => (state.log = await get("log?limit=300")),
+};
+
+const asking = new Map(); // list → whether it is to be asked once more after this answer
+
+/** Fetch a list anew. Asked twice while an answer is on its way, it is fetched once more after it. */
+export async function refresh(...lists) {
+  await Promise.all(lists.map(fetchOne));
+}
+
+async function fetchOne(list) {
+  if (asking.has(list)) {
+    asking.set(list, true);
+    return;
+  }
+  asking.set(list, false);
+  try {
+    await LISTS[list]();
+    changed(list);
+  } catch (error) {
+    if (error.status !== 0 && error.status !== 401) toast("bad", error.message, error.hint);
+  }
+  const again = asking.get(list);
+  asking.delete(list);
+  if (again) await fetchOne(list);
+}
+
+/** What hangs on a list that an event names. */
+const AFTER = {
+  measurement: ["measurements", "nodes", "status"],
+  group: ["groups", "nodes"],
+  virtual: ["virtual", "nodes"],
+  names: ["names"],
+  detection: ["status", "nodes"],
+  sink: ["status", "measurements"],
+  link: ["status", "nodes"],
+  log: [],
+};
+
+/** Take one event of the WebSocket. */
+export function take(event) {
+  const taker = TAKERS[event.event];
+  if (taker) taker(event);
+  else if (AFTER[event.event]) refresh(...AFTER[event.event]);
+  changed(event.event);
+}
+
+const TAKERS = {
+  hello: (event) => {
+    if (typeof event.now === "number") state.offset = event.now - Date.now() / 1000;
+    refresh("status", "nodes", "groups", "measurements", "virtual", "profiles");
+  },
+  beat: (event) => {
+    if (typeof event.dropped === "number") state.dropped = event.dropped;
+  },
+  values: (event) => event.streams.forEach(takeStream),
+  node: (event) => {
+    state.nodes.set(event.node.uuid, event.node);
+    changed("nodes");
+  },
+  gone: (event) => {
+    state.nodes.delete(event.uuid);
+    changed("nodes");
+  },
+  tap: (event) => {
+    state.tapped = { uuid: event.uuid, at: performance.now(), state: event.state };
+  },
+  provision: (event) => {
+    const run = state.runs.get(event.uuid) ?? { steps: [] };
+    const steps = event.state === "waiting" ? [] : [...run.steps];
+    if (event.step) {
+      const place = steps.findIndex((step) => step.name === event.step);
+      const step = { name: event.step, result: event.result ?? "running" };
+      if (place < 0) steps.push(step);
+      else steps[place] = step;
+    }
+    state.runs.set(event.uuid, { ...event, steps });
+  },
+  actuator: (event) => {
+    const channel = state.nodes.get(event.uuid)?.channels?.find((one) => one.number === event.channel);
+    if (channel) channel.actuator = { ...channel.actuator, value: event.value, safe: event.safe };
+  },
+};
+
+function takeStream(stream) {
+  const key = keyOf(stream.uuid, stream.channel);
+  const ring = ringOf(stream.uuid, stream.channel);
+  const points = stream.time.length;
+  for (let index = 0; index < points; index++) {
+    ring.push(stream.time[index], stream.low[index] ?? NaN, stream.high[index] ?? NaN);
+  }
+  state.received += points;
+  if (!points) return;
+  const time = stream.time[points - 1];
+  const old = state.values.get(key);
+  const value = stream.last === undefined ? stream.high[points - 1] : stream.last;
+  const period = old && time > old.time ? (time - old.time) / points : (old?.period ?? 0);
+  state.values.set(key, { value, time, period, valid: value !== null });
+}

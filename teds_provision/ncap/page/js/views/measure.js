@@ -1,0 +1,225 @@
+// Groups, what is measured, and the moving plot.
+
+import { paths, post, remove } from "../api.js";
+import { button, chip, empty, field, fill, h, icon, keyed, say, text, toast, trouble } from "../dom.js";
+import { channelName, count, nameOf, verdict } from "../format.js";
+import { LivePlot } from "../plot.js";
+import { measuring, membersOf, on, refresh, state } from "../state.js";
+import { plotHead, told } from "./values.js";
+
+const MOST = 20; // channels in the plot
+
+export function measureView(main) {
+  const groups = new Groups();
+  const course = new Course();
+  main.append(h("h2", { class: "view-title" }, "Measure"), h("div", { class: "columns" }, groups.element, course.element));
+  return { end: () => [groups, course].forEach((part) => part.end()) };
+}
+
+class Groups {
+  constructor() {
+    this.list = h("ul", { class: "groups" });
+    this.none = h("div", {});
+    this.name = h("input", { type: "text", maxlength: "64", autocomplete: "off", required: true });
+    this.members = h("fieldset", { class: "members" }, h("legend", {}, "Nodes"), h("div", { class: "ticks" }));
+    this.make = button("Make the group", { class: "main", onclick: () => this.make.busy(() => this.create()) }, "plus");
+    this.error = h("div", {});
+    this.fresh = h("details", { class: "panel new" }, h("summary", {}, icon("plus"), "New group"), h("div", { class: "stack" }, field("Name", this.name, "Letters, digits and _; it becomes the name of the topic."), this.members, h("div", { class: "row" }, this.make), this.error));
+    this.others = h("ul", { class: "groups" });
+    this.element = h("section", { class: "side-wide", "aria-label": "Groups" }, h("h3", {}, "Groups"), this.none, this.list, this.fresh, this.others);
+    this.off = on("groups measurements nodes status connection", () => this.paint());
+    this.paint();
+  }
+
+  paint() {
+    const may = state.connection === "live" && state.status?.write !== false;
+    if (state.groups.length) this.none.replaceChildren();
+    else if (!this.none.firstChild) fill(this.none, empty("No group yet.", h("p", {}, "A group is nodes that are measured together, on one time line. Open New group, name it, tick its nodes, then press Start.")));
+    keyed(this.list, state.groups, (group) => group.name, (group) => new GroupCard(group.name).element, (element, group) => element.card.paint(group, may));
+    const lone = state.measurements.filter((one) => !one.group);
+    keyed(this.others, lone, (one) => `${one.id}`, (one) => loneCard(one), (element, one) => element.paint(one, may));
+    const nodes = [...state.nodes.values()].filter((node) => node.whitelisted !== false);
+    keyed(this.members.lastChild, nodes, (node) => node.uuid, tick, (element, node) => {
+      text(element.querySelector("span"), nameOf(node));
+      text(element.querySelector(".hint"), verdict(node.verdict)[2].toLowerCase());
+    });
+    if (this.make.getAttribute("aria-busy") !== "true") this.make.disabled = !may;
+  }
+
+  async create() {
+    this.error.replaceChildren();
+    const name = this.name.value.trim();
+    const uuids = [...this.members.querySelectorAll("input:checked")].map((box) => box.value);
+    if (!name || !uuids.length) {
+      fill(this.error, trouble({ message: name ? "No node is ticked." : "The group has no name.", hint: name ? "Tick the nodes that are to be measured together." : "Give it a short name, such as hand." }));
+      return;
+    }
+    try {
+      await post("groups", { name, uuids });
+      this.name.value = "";
+      this.members.querySelectorAll("input:checked").forEach((box) => (box.checked = false));
+      this.fresh.open = false;
+      say(`Group ${name} made. Press Start to measure it.`);
+      await refresh("groups", "nodes");
+    } catch (error) {
+      fill(this.error, trouble(error));
+    }
+  }
+
+  end() {
+    this.off();
+  }
+}
+
+function tick(node) {
+  const box = h("input", { type: "checkbox", value: node.uuid });
+  return h("label", { class: "tick" }, box, h("span", {}, nameOf(node)), h("span", { class: "hint" }));
+}
+
+class GroupCard {
+  constructor(name) {
+    this.name = name;
+    this.state = h("span", {});
+    this.members = h("ul", { class: "member-list" });
+    this.rate = h("input", { type: "number", min: "0.01", step: "any", inputmode: "decimal", placeholder: "datasheet's", class: "narrow" });
+    this.kind = h("select", {}, h("option", { value: "periodic" }, "periodic"), h("option", { value: "event" }, "event"), h("option", { value: "free" }, "free"));
+    this.trigger = h("input", { type: "checkbox" });
+    this.record = h("input", { type: "text", placeholder: "run.csv", autocomplete: "off" });
+    this.start = button("Start", { class: "main", onclick: () => this.start.busy(() => this.go()) }, "play");
+    this.stop = button("Stop", { onclick: () => this.stop.busy(() => this.halt()) }, "stop");
+    this.drop = button("Delete group", { class: "quiet" });
+    this.drop.addEventListener("click", () => this.drop.busy(() => this.away()));
+    this.more = h("details", { class: "more" }, h("summary", {}, "More"), h("div", { class: "row" }, field("Kind", this.kind), h("label", { class: "tick" }, this.trigger, h("span", {}, "Begin together, by trigger")), field("Record to", this.record, "A file in the station's record folder: .csv, .txt, .mcap, .jsonl.")), h("div", { class: "row" }, this.drop));
+    this.error = h("div", {});
+    this.element = h("li", { class: "panel group" }, h("div", { class: "panel-head" }, h("h4", {}, name), this.state), this.members, h("div", { class: "row" }, field("Rate, Hz", this.rate), this.start, this.stop), this.more, this.error);
+    this.element.card = this;
+    this.start.setAttribute("aria-label", `Start ${name}`);
+    this.stop.setAttribute("aria-label", `Stop ${name}`);
+  }
+
+  get measurement() {
+    return state.measurements.find((one) => one.group === this.name) ?? null;
+  }
+
+  paint(group, may) {
+    const one = this.measurement;
+    const words = one ? (one.state ?? "running") : "idle";
+    const tone = !one ? ["plain", "stop"] : { running: ["busy", "wave"], failed: ["bad", "warn"], refused: ["bad", "warn"], lost: ["warn", "warn"] }[words] ?? ["plain", "clock"];
+    if (this.state.textContent !== words) fill(this.state, chip(...tone, words));
+    keyed(this.members, group.uuids ?? [], (uuid) => uuid, (uuid) => h("li", {}, h("a", { href: `#/nodes/${uuid}` }), h("span", { class: "hint" })), (element, uuid) => {
+      text(element.firstChild, nameOf(state.nodes.get(uuid) ?? { uuid }));
+      const line = one ? told(one, uuid) : [state.nodes.get(uuid)?.present === false ? "away" : ""];
+      const now = line.map((part) => (typeof part === "string" ? part : "")).join("");
+      if (element.lastChild.textContent !== now) fill(element.lastChild, line);
+    });
+    this.start.hidden = Boolean(one);
+    this.stop.hidden = !one;
+    if (this.start.getAttribute("aria-busy") !== "true") this.start.disabled = !may || !(group.uuids ?? []).length;
+    if (this.stop.getAttribute("aria-busy") !== "true") this.stop.disabled = !may;
+    this.drop.disabled = !may || Boolean(one);
+    this.rate.disabled = this.kind.disabled = this.trigger.disabled = this.record.disabled = Boolean(one);
+    if (one?.error && this.errorShown !== one.error.message) fill(this.error, trouble(one.error));
+    this.errorShown = one?.error?.message;
+  }
+
+  async go() {
+    const rate = this.rate.value.trim() === "" ? null : Number(this.rate.value);
+    const record = this.record.value.trim();
+    await this.does(() => post("measurements", { group: this.name, rate, kind: this.kind.value, trigger: this.trigger.checked, sinks: record ? [record] : [] }), `Group ${this.name} is being measured.`);
+  }
+
+  async halt() {
+    await this.does(() => remove(paths.measurement(this.measurement.id)), `Group ${this.name} is idle.`);
+  }
+
+  async away() {
+    await this.does(() => remove(paths.group(this.name)), `Group ${this.name} deleted. Its nodes stay as they are.`);
+    toast("good", `Group ${this.name} deleted.`);
+  }
+
+  async does(work, words) {
+    this.error.replaceChildren();
+    try {
+      await work();
+      say(words);
+      await refresh("measurements", "groups", "nodes");
+    } catch (error) {
+      fill(this.error, trouble(error));
+    }
+  }
+}
+
+function loneCard(one) {
+  const name = h("h4", {});
+  const words = h("p", { class: "hint" });
+  const stop = button("Stop", {}, "stop");
+  const element = h("li", { class: "panel group" }, h("div", { class: "panel-head" }, name, stop), words);
+  stop.addEventListener("click", () =>
+    stop.busy(async () => {
+      try {
+        await remove(paths.measurement(one.id));
+        await refresh("measurements", "nodes");
+      } catch (error) {
+        toast("bad", error.message, error.hint);
+      }
+    }),
+  );
+  element.paint = (now, may) => {
+    text(name, membersOf(now).map((uuid) => nameOf(state.nodes.get(uuid) ?? { uuid })).join(", "));
+    fill(words, told(now, membersOf(now)[0]));
+    if (stop.getAttribute("aria-busy") !== "true") stop.disabled = !may;
+  };
+  return element;
+}
+
+/** The moving plot with a choice of channels. */
+class Course {
+  constructor() {
+    this.chosen = new Map(); // "uuid/number" → yes or no, as the person said; others follow what is measured
+    this.ticks = h("div", { class: "ticks" });
+    this.pick = h("details", { class: "pick" }, h("summary", {}, "Channels"), this.ticks);
+    this.plot = new LivePlot([]);
+    this.none = h("div", {});
+    this.head = plotHead(this.plot, "h3", "Live plot");
+    this.element = h("section", { class: "panel wide", "aria-label": "Live plot" }, this.head, this.pick, this.none, this.plot.element);
+    this.off = on("nodes measurements groups", () => this.paint());
+    this.paint();
+  }
+
+  all() {
+    return [...state.nodes.values()].flatMap((node) => (node.channels ?? []).filter((channel) => channel.kind !== "actuator").map((channel) => ({ node, channel, key: `${node.uuid}/${channel.number}` })));
+  }
+
+  paint() {
+    const all = this.all();
+    const moving = (one) => this.chosen.get(one.key) ?? measuring(one.node.uuid) !== null;
+    const shown = all.filter(moving).slice(0, MOST);
+    const names = new Set(shown.map((one) => one.node.uuid)).size > 1;
+    this.plot.show(shown.map(({ node, channel }) => ({ uuid: node.uuid, number: channel.number, label: names ? `${nameOf(node)} ${channelName(channel)}` : channelName(channel), unit: channel.unit ?? "", uncertainty: channel.uncertainty })));
+    keyed(this.ticks, all, (one) => one.key, (one) => this.tick(one), (element, one) => {
+      element.firstChild.checked = shown.some((each) => each.key === one.key);
+      text(element.lastChild, `${nameOf(one.node)}: ${channelName(one.channel)}`);
+    });
+    const extra = all.filter(moving).length - MOST;
+    text(this.pick.firstChild, `Channels: ${shown.length} of ${all.length} shown${extra > 0 ? ` (at most ${MOST})` : ""}`);
+    this.pick.hidden = !all.length;
+    this.plot.element.hidden = !shown.length;
+    this.head.hidden = !shown.length;
+    if (shown.length) this.none.replaceChildren();
+    else if (!this.none.firstChild) fill(this.none, empty("Nothing is measured.", h("p", {}, "Start a group, or press Measure at a node: the curves move here.")));
+  }
+
+  tick(one) {
+    const box = h("input", { type: "checkbox", onchange: () => {
+      this.chosen.set(one.key, box.checked);
+      this.paint();
+    } });
+    return h("label", { class: "tick" }, box, h("span", {}));
+  }
+
+  end() {
+    this.off();
+    this.plot.end();
+  }
+}
+

@@ -1,0 +1,87 @@
+// One node: who it is, and its three tabs.
+
+import { chip, fill, h, keyed, text } from "../dom.js";
+import { grouped, nameOf, verdict } from "../format.js";
+import { on, state } from "../state.js";
+import { DatasheetTab } from "./datasheet.js";
+import { LiveTab } from "./values.js";
+import { facts } from "./nodes.js";
+import { ProvisionTab } from "./provision.js";
+
+const TABS = { live: ["Live", LiveTab], datasheet: ["Datasheet", DatasheetTab], provision: ["Provision", ProvisionTab] };
+
+export class NodePanel {
+  constructor(parent, uuid) {
+    this.uuid = uuid;
+    this.open = null;
+    this.title = h("h2", { tabindex: "-1" });
+    this.head = h("div", { class: "node-facts" });
+    this.checks = h("details", { class: "checks" }, h("summary", {}), h("ul", {}));
+    this.tabs = h(
+      "nav",
+      { class: "tabs", "aria-label": "Parts of this node" },
+      Object.entries(TABS).map(([name, [words]]) => h("a", { href: `#/nodes/${uuid}/${name}`, "data-tab": name }, words)),
+    );
+    this.body = h("div", { class: "tab" });
+    this.header = h(
+      "header",
+      { class: "node-head" },
+      h("a", { class: "back", href: "#/nodes" }, "All nodes"),
+      this.title,
+      h("p", { class: "uuid", title: "UUID" }, grouped(uuid)),
+      this.head,
+      this.checks,
+    );
+    fill(parent, this.header, this.tabs, this.body);
+    this.stop = on("nodes connection", () => this.paint());
+    this.paint();
+  }
+
+  get node() {
+    return state.nodes.get(this.uuid);
+  }
+
+  paint() {
+    const node = this.node;
+    if (!node) return;
+    text(this.title, nameOf(node));
+    const [tone, sign, words, why] = verdict(node.verdict);
+    fill(this.head, chip(tone, sign, words, why), node.whitelisted ? chip("plain", "list", "On the whitelist") : null, facts(node), node.why ? h("span", { class: "warn" }, node.why) : null);
+    const checks = node.checks ?? [];
+    this.checks.hidden = !checks.length && !node.fingerprint;
+    const passed = checks.filter((check) => check.result === "passed").length;
+    text(this.checks.firstChild, checks.length ? `Security check: ${passed} of ${checks.filter((one) => one.result !== "skipped").length} passed` : "Key");
+    keyed(this.checks.lastChild, [...checks, ...(node.fingerprint ? [{ name: "fingerprint", print: node.fingerprint }] : [])], (check) => check.name + (check.result ?? "") + (check.why ?? ""), checkLine);
+  }
+
+  tab(name) {
+    const known = TABS[name] ? name : "live";
+    for (const link of this.tabs.children) {
+      if (link.dataset.tab === known) link.setAttribute("aria-current", "page");
+      else link.removeAttribute("aria-current");
+    }
+    if (this.open?.name === known) return;
+    this.open?.tab.end();
+    this.body.replaceChildren();
+    this.open = { name: known, tab: new TABS[known][1](this.body, this.uuid) };
+  }
+
+  marked(yes) {
+    if (yes && !this.header.classList.contains("tapped")) this.title.focus({ preventScroll: true });
+    this.header.classList.toggle("tapped", yes);
+  }
+
+  end() {
+    this.stop();
+    this.open?.tab.end();
+  }
+}
+
+const RESULTS = { passed: ["good", "good", "passed"], failed: ["bad", "bad", "failed"], skipped: ["plain", "ask", "skipped"] };
+
+/** One check of the security check, with its reason. */
+export function checkLine(check) {
+  if (check.print) return h("li", {}, h("span", { class: "check-name" }, "Fingerprint of its key"), h("code", { class: "print" }, grouped(check.print)));
+  const [tone, sign, words] = RESULTS[check.result] ?? RESULTS.skipped;
+  return h("li", {}, chip(tone, sign, words), h("span", { class: "check-name" }, check.name), check.why ? h("span", { class: "hint" }, check.why) : null);
+}

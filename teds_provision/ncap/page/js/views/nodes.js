@@ -1,0 +1,165 @@
+// The nodes that are there, and the one that is open.
+
+import { chip, empty, fill, h, icon, keyed, text } from "../dom.js";
+import { age, channelName, count, nameOf, number, verdict } from "../format.js";
+import { isStale, lastOf, now, on, state } from "../state.js";
+import { NodePanel } from "./node.js";
+
+const MARKED = 8000; // ms that a tapped node stays marked
+const SHOWN_VALUES = 3;
+const SEARCH_FROM = 7; // nodes
+const LINKS = { nfc: "NFC", can: "CAN", ble: "BLE", virtual: "Virtual" };
+
+/** What a link is called. */
+export const linkName = (link) => LINKS[link] ?? link ?? "no link";
+
+const order = (one, other) => Number(other.present ?? false) - Number(one.present ?? false) || nameOf(one).localeCompare(nameOf(other));
+
+export function nodesView(main, rest) {
+  const search = h("input", { type: "search", placeholder: "Name or UUID", "aria-label": "Find a node", oninput: () => paint() });
+  const total = h("p", { class: "total" });
+  const list = h("ul", { class: "cards" });
+  const none = h("div", {});
+  const detail = h("div", { class: "detail" });
+  const side = h("section", { class: "side", "aria-label": "Nodes" }, h("div", { class: "side-head" }, h("h2", {}, "Nodes"), total), search, list);
+  main.append(side, none, detail);
+  let panel = null;
+  let chosen = rest;
+
+  function matching() {
+    const words = search.value.trim().toLowerCase();
+    return [...state.nodes.values()].filter((node) => !words || nameOf(node).toLowerCase().includes(words) || node.uuid.includes(words)).sort(order);
+  }
+
+  function paint() {
+    const nodes = matching();
+    const any = state.nodes.size > 0;
+    side.hidden = !any;
+    search.hidden = state.nodes.size < SEARCH_FROM && !search.value;
+    const strangers = state.status?.strangers ?? 0;
+    text(total, `${count(state.nodes.size, "node")}${strangers ? `, ${strangers} more not on the whitelist` : ""}`);
+    keyed(list, nodes, (node) => node.uuid, card, update);
+    main.classList.toggle("one-open", Boolean(chosen[0]) && any);
+    open(nodes);
+    if (any || chosen[0]) none.replaceChildren();
+    else if (!none.firstChild || none.dataset.loaded !== String(state.loaded)) {
+      none.dataset.loaded = String(state.loaded);
+      fill(none, state.loaded ? firstSteps() : h("p", { class: "empty" }, "Asking the base station …"));
+    }
+    if (!any && state.loaded) {
+      const hidden = none.querySelector("[data-strangers]");
+      if (hidden) hidden.hidden = !strangers;
+      if (hidden && strangers) text(hidden, strangersWords(strangers));
+    }
+  }
+
+  function open(nodes) {
+    const uuid = chosen[0] ?? nodes[0]?.uuid;
+    const node = state.nodes.get(uuid);
+    if (!node) {
+      panel?.end();
+      panel = null;
+      if (chosen[0] && state.loaded) fill(detail, empty("This node is not there.", h("p", {}, "Lay it on the reader, or connect it and press Discover."), h("p", {}, h("a", { href: "#/nodes" }, "All nodes"))));
+      else detail.replaceChildren();
+      return;
+    }
+    if (panel?.uuid !== uuid) {
+      panel?.end();
+      panel = new NodePanel(detail, uuid);
+    }
+    panel.tab(chosen[1] ?? "live");
+    panel.marked(state.tapped?.uuid === uuid && performance.now() - state.tapped.at < MARKED);
+  }
+
+  function update(element, node) {
+    const current = (chosen[0] ?? (matching()[0]?.uuid)) === node.uuid;
+    if (current) element.firstChild.setAttribute("aria-current", "true");
+    else element.firstChild.removeAttribute("aria-current");
+    element.classList.toggle("tapped", state.tapped?.uuid === node.uuid && performance.now() - state.tapped.at < MARKED);
+    element.classList.toggle("absent", node.present === false);
+    const told = JSON.stringify([node.name, node.verdict, node.link, node.present, node.state, node.mode, node.power, node.groups, node.whitelisted, node.channels?.map((one) => one.name)]);
+    if (element.told === told) return;
+    element.told = told;
+    const [tone, sign, words, why] = verdict(node.verdict);
+    const values = (node.channels ?? []).filter((channel) => channel.kind !== "actuator").slice(0, SHOWN_VALUES);
+    fill(
+      element.firstChild,
+      h("span", { class: "card-head" }, h("span", { class: "name" }, nameOf(node)), chip(tone, sign, words, why)),
+      h("span", { class: "facts" }, facts(node)),
+      values.length ? h("span", { class: "peek" }, values.map((channel) => h("span", { "data-channel": channel.number }, `${channelName(channel)} `, h("b", {}, "–"), channel.unit ? ` ${channel.unit}` : ""))) : null,
+    );
+  }
+
+  function values() {
+    for (const [uuid, element] of list.keyed ?? []) {
+      const node = state.nodes.get(uuid);
+      for (const peek of element.querySelectorAll("[data-channel]")) {
+        const channel = node?.channels?.find((one) => one.number === Number(peek.dataset.channel));
+        if (!channel) continue;
+        const last = lastOf(uuid, channel);
+        text(peek.querySelector("b"), last ? number(last.value, channel.uncertainty) : "–");
+        peek.classList.toggle("stale", isStale(last));
+      }
+    }
+  }
+
+  const ends = [on("nodes status measurements tap route connection groups", paint)];
+  const ticking = setInterval(values, 250);
+  const unmark = setInterval(() => state.tapped && paint(), 1000);
+  paint();
+  return {
+    go(next) {
+      chosen = next;
+      paint();
+      if (next[0]) detail.scrollIntoView?.({ block: "nearest" });
+    },
+    end() {
+      ends.forEach((end) => end());
+      clearInterval(ticking);
+      clearInterval(unmark);
+      panel?.end();
+    },
+  };
+}
+
+function card(node) {
+  return h("li", { class: "card" }, h("a", { href: `#/nodes/${node.uuid}` }));
+}
+
+/** Link, state, battery, in words with signs. */
+export function facts(node) {
+  const out = [h("span", {}, icon(node.virtual ? "virtual" : (node.link ?? "ask")), node.virtual ? "Virtual" : linkName(node.link))];
+  if (node.present === false) out.push(h("span", { class: "warn" }, icon("clock"), node.seen ? `away, seen ${age(now() - node.seen)}` : "away"));
+  else if (node.mode === "measuring") out.push(h("span", { class: "busy" }, icon("wave"), "measuring"));
+  else if (node.state) out.push(h("span", {}, node.state));
+  if (node.whitelisted === false) out.push(h("span", { class: "warn" }, icon("warn"), "not on the whitelist"));
+  if (node.groups?.length) out.push(h("span", {}, icon("list"), node.groups.join(", ")));
+  if (node.power) out.push(power(node.power));
+  return out;
+}
+
+/** Battery and charging in words. */
+export function power(told) {
+  const level = typeof told.percent === "number" ? `${told.percent} %` : "level not known";
+  const words = { charging: "charging", wanted: "wants charging", full: "full", error: "charging error" }[told.charging];
+  const low = typeof told.percent === "number" && told.percent < 10;
+  return h("span", { class: low ? "warn" : "" }, icon(told.charging === "charging" ? "charge" : "battery"), [level, words, low ? "low" : null].filter(Boolean).join(", "));
+}
+
+const strangersWords = (many) => `${count(many, "node")} answered, but not on the whitelist: lay one on the reader to take it in, or switch detection to Transparent to look at all.`;
+
+function firstSteps() {
+  return h(
+    "section",
+    { class: "first" },
+    h("h2", {}, "No node yet"),
+    h("p", { class: "warn-line", "data-strangers": true, hidden: true }),
+    h(
+      "ol",
+      {},
+      h("li", {}, icon("nfc"), h("div", {}, h("strong", {}, "Lay a node on the NFC reader."), h("p", {}, "It opens here by itself. Nothing is to be pressed."))),
+      h("li", {}, icon("can"), h("div", {}, h("strong", {}, "Or connect one to the bus."), h("p", {}, "It announces itself; Discover, above, asks every link now."))),
+      h("li", {}, icon("virtual"), h("div", {}, h("strong", {}, "None at hand? "), h("a", { href: "#/virtual" }, "Make a virtual transducer"), h("p", {}, "It speaks like a board and needs no hardware."))),
+    ),
+  );
+}

@@ -1,0 +1,139 @@
+// The provisioning tab: from a type to a signed datasheet, waiting for the tap and followed live.
+
+import { paths, post } from "../api.js";
+import { button, chip, field, fill, h, icon, keyed, say, text, trouble } from "../dom.js";
+import { clock, nameOf, short } from "../format.js";
+import { measuring, now, on, state } from "../state.js";
+
+const STEPS = {
+  identify: "Identify",
+  whitelist: "Take in the whitelist",
+  agree: "Agree on a key",
+  build: "Build the datasheet",
+  sign: "Sign",
+  write: "Write",
+  verify: "Read back and verify",
+};
+const RESULTS = { done: ["good", "good", "done"], skipped: ["plain", "good", "nothing to do"], running: ["busy", "clock", "at it"], failed: ["bad", "bad", "failed"] };
+
+export class ProvisionTab {
+  constructor(parent, uuid) {
+    this.uuid = uuid;
+    this.profile = h("select", {});
+    this.name = h("input", { type: "text", maxlength: "120", autocomplete: "off" });
+    this.calibration = h("input", { type: "file", accept: ".csv,.toml,.json,.txt" });
+    this.go = button("Provision", { class: "main", onclick: () => this.go.busy(() => this.start()) }, "good");
+    this.cancel = button("Do not wait any more", { onclick: () => this.cancel.busy(() => this.end_waiting()) });
+    this.waiting = h("div", { class: "waiting", role: "status" });
+    this.clock = h("span", { class: "figure", "aria-hidden": "true" });
+    this.steps = h("ol", { class: "steps" });
+    this.outcome = h("div", {});
+    this.why = h("p", { class: "hint" });
+    const node = state.nodes.get(uuid);
+    this.name.value = node?.name ?? "";
+    parent.append(
+      h(
+        "section",
+        { class: "panel", "aria-label": "Provision" },
+        h("h3", {}, "Provision"),
+        h("p", { class: "hint" }, "Gives the node a key of this station and a signed datasheet. When a tap is needed, this page waits for it: just lay the node on the reader."),
+        h("div", { class: "row" }, field("Transducer type", this.profile), field("Name", this.name), field("Calibration (if it has one)", this.calibration)),
+        h("div", { class: "row" }, this.go, this.why),
+        this.waiting,
+        this.steps,
+        this.outcome,
+      ),
+    );
+    this.off = on("profiles nodes status connection measurements provision", () => this.paint());
+    this.ticking = setInterval(() => this.tick(), 250);
+    this.paint();
+  }
+
+  get run() {
+    return state.runs.get(this.uuid) ?? null;
+  }
+
+  paint() {
+    const node = state.nodes.get(this.uuid);
+    const chosen = this.profile.value || node?.profile || "";
+    const many = state.profiles.map((one) => one.name).join("\n");
+    if (this.profile.told !== many) {
+      this.profile.told = many;
+      fill(this.profile, h("option", { value: "" }, "Choose a type"), state.profiles.map((one) => h("option", { value: one.name }, one.title || one.name)));
+      this.profile.value = chosen;
+    }
+    const run = this.run;
+    const busy = run?.state === "waiting" || run?.state === "running";
+    const blocked = measuring(this.uuid) ? "It is being measured: stop that first." : state.status?.write === false ? "This browser may only read." : "";
+    text(this.why, blocked);
+    if (this.go.getAttribute("aria-busy") !== "true") this.go.disabled = busy || Boolean(blocked) || state.connection !== "live";
+    this.follow(run);
+  }
+
+  follow(run) {
+    const waits = run?.state === "waiting";
+    if (waits && !this.waiting.firstChild) {
+      const words = run.waits_for === "tap" || !run.waits_for ? "Lay the node on the reader." : run.waits_for;
+      fill(this.waiting, icon("nfc"), h("div", {}, h("p", { class: "lead" }, words), h("p", {}, "Waiting until ", clock(run.until), " ", this.clock)), this.cancel);
+      say(words);
+    } else if (!waits && this.waiting.firstChild) this.waiting.replaceChildren();
+    keyed(this.steps, run?.steps ?? [], (step) => step.name, () => h("li", {}), (element, step) => {
+      const [tone, sign, words] = RESULTS[step.result] ?? ["plain", "good", step.result];
+      if (element.told === step.result) return;
+      element.told = step.result;
+      fill(element, chip(tone, sign, words), h("span", {}, STEPS[step.name] ?? step.name), step.detail ? h("span", { class: "hint" }, step.detail) : null);
+    });
+    if (this.shown === run) return;
+    this.shown = run;
+    if (run?.state === "done") {
+      fill(this.outcome, h("p", { class: "done" }, chip("good", "good", "Provisioned"), ` ${nameOf(state.nodes.get(this.uuid))} is ready. `, h("a", { href: `#/nodes/${this.uuid}/live` }, "See its values")));
+      say("Provisioned.");
+    } else if (run?.state === "failed") fill(this.outcome, trouble(run.error ?? { message: "It failed." }));
+    else this.outcome.replaceChildren();
+  }
+
+  tick() {
+    const run = this.run;
+    if (run?.state !== "waiting" || !run.until) return;
+    text(this.clock, `(${short(Math.max(0, Math.ceil(run.until - now())))} s)`);
+  }
+
+  async start() {
+    this.outcome.replaceChildren();
+    if (!this.profile.value) {
+      fill(this.outcome, trouble({ message: "No type is chosen.", hint: "Choose what this transducer is; the list comes from the profiles of this station." }));
+      this.profile.focus();
+      return;
+    }
+    const file = this.calibration.files[0];
+    try {
+      const answer = await post(paths.provision(this.uuid), {
+        profile: this.profile.value,
+        name: this.name.value.trim() || null,
+        calibration: file ? await file.text() : null,
+        calibration_name: file?.name ?? null,
+      });
+      const run = this.run;
+      // An event may have come before this answer, and then knows more.
+      if (!run || run.state === "done" || run.state === "failed") state.runs.set(this.uuid, { steps: [], ...answer, state: answer.state ?? (answer.waits_for ? "waiting" : "running") });
+      this.paint();
+    } catch (error) {
+      fill(this.outcome, trouble(error));
+    }
+  }
+
+  async end_waiting() {
+    try {
+      await post(paths.provision(this.uuid), { cancel: true });
+      state.runs.delete(this.uuid);
+      this.paint();
+    } catch (error) {
+      fill(this.outcome, trouble(error));
+    }
+  }
+
+  end() {
+    this.off();
+    clearInterval(this.ticking);
+  }
+}

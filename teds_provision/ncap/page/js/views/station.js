@@ -1,0 +1,102 @@
+// The station itself: links, where values go, clock, budget, published names.
+
+import { change } from "../api.js";
+import { button, chip, empty, fill, h, icon, keyed, say, text, toast } from "../dom.js";
+import { clock, count, grouped, nameOf, short } from "../format.js";
+import { on, refresh, state } from "../state.js";
+import { linkName } from "./nodes.js";
+
+export function stationView(main) {
+  const links = h("ul", { class: "lines" });
+  const sinks = h("ul", { class: "lines" });
+  const noSink = h("div", {});
+  const facts = h("dl", { class: "facts-list" });
+  const names = h("tbody", {});
+  const noName = h("div", {});
+  const table = h("table", { class: "names" }, h("caption", { class: "unseen" }, "Published names"), h("thead", {}, h("tr", {}, ["Channel", "Topic"].map((words) => h("th", { scope: "col" }, words)))), names);
+  main.append(
+    h("h2", { class: "view-title" }, "Station"),
+    h(
+      "div",
+      { class: "grid" },
+      h("section", { class: "panel", "aria-label": "Links" }, h("h3", {}, "Links"), links),
+      h("section", { class: "panel", "aria-label": "About" }, h("h3", {}, "About"), facts),
+      h("section", { class: "panel", "aria-label": "Where values go" }, h("h3", {}, "Where values go"), noSink, sinks),
+      h("section", { class: "panel", "aria-label": "Published names" }, h("h3", {}, "Published names"), noName, h("div", { class: "scroll", tabindex: "0", role: "group", "aria-label": "Published names" }, table)),
+    ),
+  );
+
+  function paint() {
+    const status = state.status ?? {};
+    keyed(links, status.links ?? [], (one) => one.name, () => h("li", {}), (element, one) => {
+      const up = one.state === "up" || one.state === "running";
+      again(element, [one.state, one.why], () => [icon(one.kind ?? "can"), h("span", { class: "grow" }, h("strong", {}, linkName(one.kind)), " ", one.name), chip(up ? "good" : "warn", up ? "good" : "warn", one.state), one.why ? h("p", { class: "hint full" }, one.why, one.hint ? ` ${one.hint}` : "") : null]);
+    });
+    if (!(status.links ?? []).length && !links.firstChild) fill(links, h("li", { class: "hint" }, "No link was given to ncap run: add --can or --nfc."));
+    keyed(sinks, status.sinks ?? [], (one) => one.name, () => h("li", {}), (element, one) => {
+      const bad = one.state === "failed";
+      again(element, one, () => [h("span", { class: "grow" }, h("strong", {}, one.name), h("span", { class: "hint" }, ` ${count(one.written ?? 0, "value")} written, ${one.dropped ?? 0} dropped`)), chip(bad ? "bad" : one.dropped ? "warn" : "good", bad || one.dropped ? "warn" : "good", one.state), one.error ? h("p", { class: "hint full" }, one.error, one.hint ? ` ${one.hint}` : "") : null]);
+    });
+    if ((status.sinks ?? []).length) noSink.replaceChildren();
+    else if (!noSink.firstChild) fill(noSink, empty("Values go to this page alone.", h("p", {}, "Start ncap run with --record, --ros1, --ros2 or --mqtt, or name a file when you start a group.")));
+    about(status);
+    if (state.names.length) noName.replaceChildren();
+    else if (!noName.firstChild) fill(noName, empty("No channel is published yet.", h("p", {}, "Names appear with the first node that has a datasheet.")));
+    table.hidden = !state.names.length;
+    keyed(names, state.names, (one) => `${one.uuid}/${one.channel}`, nameRow, (element, one) => element.paint(one));
+  }
+
+  function about(status) {
+    const budget = status.budget;
+    const rows = [
+      ["Name", status.station?.name],
+      ["Fingerprint", status.station?.fingerprint ? h("code", { class: "print" }, grouped(status.station.fingerprint)) : null],
+      ["Version", status.version],
+      ["Running since", status.started ? clock(status.started) : null],
+      ["Clock bound", typeof status.clock_error === "number" ? `± ${short(status.clock_error * 1e6)} µs at worst` : "no node is measured"],
+      ["Messages", budget ? `${short(budget.used ?? 0)} of ${short(budget.limit ?? 0)} a second` : null],
+      ["This browser", status.write === false ? "may only read" : "may read and change"],
+    ].filter(([, value]) => value !== null && value !== undefined);
+    again(facts, rows.map(([name, value]) => [name, value?.textContent ?? value]), () => rows.map(([name, value]) => [h("dt", {}, name), h("dd", {}, value)]));
+  }
+
+  const off = on("status names nodes", paint);
+  refresh("names", "status");
+  paint();
+  return { end: off };
+}
+
+function again(element, facts, make) {
+  const told = JSON.stringify(facts);
+  if (element.told === told) return;
+  element.told = told;
+  fill(element, make());
+}
+
+function nameRow(one) {
+  const entry = h("input", { type: "text", class: "topic", spellcheck: "false", autocomplete: "off" });
+  const keep = button("Rename", { onclick: () => keep.busy(rename) });
+  const label = h("th", { scope: "row" });
+  const element = h("tr", {}, label, h("td", {}, h("div", { class: "row tight" }, entry, keep)));
+  let known = one;
+  async function rename() {
+    try {
+      await change("names", { uuid: known.uuid, channel: known.channel, name: entry.value.trim() });
+      say("Renamed.");
+      await refresh("names", "nodes");
+    } catch (error) {
+      toast("bad", error.message, error.hint);
+    }
+  }
+  element.paint = (now) => {
+    const before = known;
+    known = now;
+    const node = state.nodes.get(now.uuid) ?? { uuid: now.uuid };
+    text(label, now.channel ? `${nameOf(node)}: ${now.name ?? `channel ${now.channel}`}` : nameOf(node));
+    entry.setAttribute("aria-label", `Topic of ${label.textContent}`);
+    if (document.activeElement !== entry && (before !== now || !entry.value)) entry.value = now.topic ?? "";
+    keep.disabled = state.status?.write === false || state.connection !== "live";
+  };
+  return element;
+}
+

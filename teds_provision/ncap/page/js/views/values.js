@@ -1,0 +1,231 @@
+// The live tab: values with units, actuators, measuring on and off, curves.
+
+import { paths, post, remove } from "../api.js";
+import { button, chip, empty, field, fill, h, icon, keyed, say, text, trouble } from "../dom.js";
+import { age, channelName, count, hertz, number, range, short } from "../format.js";
+import { LivePlot, WINDOWS } from "../plot.js";
+import { isStale, lastOf, measuring, now, on, refresh, state } from "../state.js";
+import { ActuatorPanel } from "./actuator.js";
+
+const MOVING = 12; // channels that a node's plot shows
+
+export class LiveTab {
+  constructor(parent, uuid) {
+    this.uuid = uuid;
+    this.rows = h("tbody", {});
+    this.table = h(
+      "table",
+      { class: "values" },
+      h("caption", { class: "unseen" }, "Channels and their last values"),
+      h("thead", {}, h("tr", {}, ["Channel", "Value", "", "Range", "Uncertainty", "Fastest", "Calibrated"].map((words, at) => (at === 2 ? h("td", {}) : h("th", { scope: "col", class: at === 1 ? "n" : "" }, words))))),
+      this.rows,
+    );
+    this.none = h("div", {});
+    this.mode = new ModePanel(uuid);
+    this.actuators = h("div", { class: "actuators" });
+    this.plotBox = h("section", { class: "panel", "aria-label": "Course" });
+    this.plot = null;
+    this.panels = new Map();
+    parent.append(this.mode.element, h("section", { class: "panel", "aria-label": "Values" }, h("h3", {}, "Values"), h("div", { class: "scroll", tabindex: "0", role: "group", "aria-label": "Table of values" }, this.table), this.none), this.actuators, this.plotBox);
+    this.stop = on("nodes measurements connection", () => this.paint());
+    this.ticking = setInterval(() => this.values(), 250);
+    this.paint();
+  }
+
+  get node() {
+    return state.nodes.get(this.uuid) ?? { channels: [] };
+  }
+
+  paint() {
+    const channels = this.node.channels ?? [];
+    this.table.hidden = !channels.length;
+    if (channels.length) this.none.replaceChildren();
+    else if (!this.none.firstChild) fill(this.none, empty("No channels are known.", h("p", {}, "Its datasheet was not read yet, or it has none. "), h("p", {}, h("a", { href: `#/nodes/${this.uuid}/datasheet` }, "Read or write its datasheet"), " or ", h("a", { href: `#/nodes/${this.uuid}/provision` }, "provision it"), ".")));
+    keyed(this.rows, channels, (one) => `${one.number}`, row, (element, one) => facts(element, one));
+    const movable = channels.filter((channel) => channel.kind === "actuator");
+    keyed(this.actuators, movable, (one) => one.number, (one) => this.actuator(one), (_, one) => this.panels.get(one.number).paint());
+    this.mode.paint();
+    this.course(channels.filter((channel) => channel.kind !== "actuator"));
+    this.values();
+  }
+
+  actuator(channel) {
+    const panel = new ActuatorPanel(this.uuid, channel.number);
+    this.panels.set(channel.number, panel);
+    return panel.element;
+  }
+
+  course(channels) {
+    const running = measuring(this.uuid) !== null || channels.some((channel) => state.rings.has(`${this.uuid}/${channel.number}`));
+    this.plotBox.hidden = !channels.length;
+    if (!running) {
+      this.plot?.end();
+      this.plot = null;
+      fill(this.plotBox, h("h3", {}, "Course"), h("p", { class: "hint" }, "Press Measure above: the curves move here."));
+      return;
+    }
+    const shown = channels.slice(0, MOVING).map((channel) => ({ uuid: this.uuid, number: channel.number, label: channelName(channel), unit: channel.unit ?? "", uncertainty: channel.uncertainty }));
+    if (this.plot) {
+      this.plot.show(shown);
+      return;
+    }
+    this.plot = new LivePlot(shown);
+    fill(this.plotBox, plotHead(this.plot, "h3"), this.plot.element);
+  }
+
+  values() {
+    const time = now();
+    for (const channel of this.node.channels ?? []) {
+      const element = this.rows.keyed?.get(`${channel.number}`);
+      if (!element) continue;
+      const last = lastOf(this.uuid, channel);
+      const stale = isStale(last);
+      const { figure, old, bar } = element.parts;
+      text(figure, last ? (last.value === null ? "not valid" : number(last.value, channel.uncertainty)) : "–");
+      text(old, last ? (stale ? age(time - last.time) : "") : "");
+      element.classList.toggle("stale", stale && channel.kind !== "actuator");
+      element.classList.toggle("fresh", !stale);
+      if (bar) bar.value = last?.value ?? channel.low;
+    }
+  }
+
+  end() {
+    this.stop();
+    clearInterval(this.ticking);
+    this.plot?.end();
+    this.panels.forEach((panel) => panel.end());
+    this.mode.end();
+  }
+}
+
+function row() {
+  const figure = h("span", { class: "figure" }, "–");
+  const old = h("span", { class: "old" });
+  const element = h("tr", {});
+  element.parts = { figure, old, bar: null };
+  return element;
+}
+
+function facts(element, channel) {
+  const told = JSON.stringify([channel.name, channel.unit, channel.low, channel.high, channel.uncertainty, channel.rate, channel.calibrated, channel.due, channel.overdue, channel.kind]);
+  if (element.told === told) return;
+  element.told = told;
+  const { figure, old } = element.parts;
+  const bounded = typeof channel.low === "number" && typeof channel.high === "number" && channel.high > channel.low;
+  const bar = bounded ? h("meter", { min: channel.low, max: channel.high, "aria-label": `${channelName(channel)} within its range` }) : null;
+  element.parts.bar = bar;
+  const kind = { actuator: ["plain", "play", "Actuator"], event: ["plain", "clock", "Event"] }[channel.kind];
+  fill(
+    element,
+    h("th", { scope: "row" }, h("span", { class: "number" }, `${channel.number}`), h("span", { class: "name" }, channelName(channel)), kind ? chip(...kind) : null),
+    h("td", { class: "n value" }, figure, channel.unit ? h("span", { class: "unit" }, ` ${channel.unit}`) : null),
+    h("td", { class: "within" }, bar, old),
+    h("td", { "data-label": "Range" }, range(channel)),
+    h("td", { "data-label": "Uncertainty" }, typeof channel.uncertainty === "number" ? `± ${short(channel.uncertainty)}${channel.unit ? ` ${channel.unit}` : ""}` : "not stated"),
+    h("td", { "data-label": "Fastest" }, channel.kind === "actuator" ? "–" : hertz(channel.rate)),
+    h("td", { "data-label": "Calibrated" }, calibrated(channel)),
+  );
+}
+
+function calibrated(channel) {
+  if (!channel.calibrated) return h("span", { class: "hint" }, "no calibration");
+  if (channel.overdue) return chip("warn", "warn", `${channel.calibrated}, was due ${channel.due}`);
+  return `${channel.calibrated}${channel.due ? `, due ${channel.due}` : ""}`;
+}
+
+/** Title of a plot with its window and a pause. */
+export function plotHead(plot, tag, title = "Course") {
+  const windows = h("div", { class: "switch", role: "group", "aria-label": "Time shown" });
+  const show = (seconds) => {
+    plot.window = seconds;
+    for (const choice of windows.children) choice.setAttribute("aria-pressed", String(Number(choice.dataset.seconds) === seconds));
+  };
+  windows.append(...WINDOWS.map((seconds) => button(seconds < 60 ? `${seconds} s` : `${seconds / 60} min`, { "data-seconds": seconds, onclick: () => show(seconds) })));
+  show(plot.window);
+  const pause = button("Pause", {
+    "aria-pressed": "false",
+    onclick: () => {
+      const yes = plot.paused === null;
+      plot.pause(yes);
+      pause.setAttribute("aria-pressed", String(yes));
+      text(pause.lastChild, yes ? "Go on" : "Pause");
+    },
+  });
+  return h("div", { class: "panel-head" }, h(tag, {}, title), windows, pause);
+}
+
+/** Idle or measuring, and how fast. */
+class ModePanel {
+  constructor(uuid) {
+    this.uuid = uuid;
+    this.rate = h("input", { type: "number", min: "0.01", step: "any", inputmode: "decimal", placeholder: "datasheet's", class: "narrow" });
+    this.idle = button("Idle", { onclick: () => this.idle.busy(() => this.stop()) }, "stop");
+    this.run = button("Measure", { class: "main", onclick: () => this.run.busy(() => this.start()) }, "play");
+    this.state = h("p", { class: "state" });
+    this.error = h("div", {});
+    const both = h("div", { class: "switch", role: "group", "aria-label": "What this node does" }, this.idle, this.run);
+    this.element = h("section", { class: "panel mode", "aria-label": "Configure" }, h("h3", {}, "Configure"), h("div", { class: "row" }, both, field("Rate, Hz", this.rate), this.state), this.error);
+    this.off = on("status connection measurements", () => this.paint());
+  }
+
+  get measurement() {
+    return measuring(this.uuid);
+  }
+
+  paint() {
+    const node = state.nodes.get(this.uuid);
+    const sensors = (node?.channels ?? []).filter((channel) => channel.kind !== "actuator").length;
+    this.element.hidden = !node || !(node.channels ?? []).length;
+    const one = this.measurement;
+    const may = state.connection === "live" && state.status?.write !== false;
+    this.idle.setAttribute("aria-pressed", String(!one));
+    this.run.setAttribute("aria-pressed", String(Boolean(one)));
+    const own = one && !one.group;
+    this.idle.disabled = !may || !own;
+    this.run.disabled = !may || Boolean(one) || !sensors || node?.whitelisted === false;
+    this.rate.disabled = Boolean(one);
+    if (!one) fill(this.state, sensors ? (node?.whitelisted === false ? "Not on the whitelist: provision it first." : "Idle.") : "No sensor to measure.");
+    else if (one.group) fill(this.state, "Measured with group ", h("a", { href: "#/measure" }, one.group), ": stop it there.");
+    else fill(this.state, told(one, this.uuid));
+  }
+
+  async start() {
+    this.error.replaceChildren();
+    const rate = this.rate.value.trim() === "" ? null : Number(this.rate.value);
+    try {
+      await post("measurements", { uuids: [this.uuid], rate, kind: "periodic", trigger: false, sinks: [] });
+      say("Measuring.");
+      await refresh("measurements", "nodes");
+    } catch (error) {
+      fill(this.error, trouble(error));
+    }
+  }
+
+  async stop() {
+    this.error.replaceChildren();
+    try {
+      await remove(paths.measurement(this.measurement.id));
+      say("Idle.");
+      await refresh("measurements", "nodes");
+    } catch (error) {
+      fill(this.error, trouble(error));
+    }
+  }
+
+  end() {
+    this.off();
+  }
+}
+
+/** How a node of a measurement fares, in words. */
+export function told(measurement, uuid) {
+  const node = measurement.nodes?.find((one) => one.uuid === uuid);
+  const word = node?.state ?? measurement.state ?? "starting";
+  const parts = [word];
+  if (typeof node?.samples === "number") parts.push(count(node.samples, "sample"), node.lost ? `${node.lost} lost` : "none lost");
+  if (node?.late) parts.push(`${node.late} late`);
+  if (node?.bad) parts.push(`${node.bad} bad`);
+  const why = node?.why ?? measurement.why;
+  return [icon(word === "running" ? "wave" : word === "refused" || word === "lost" ? "warn" : "clock"), ` ${parts.join(", ")}.`, why ? ` ${why}` : ""];
+}
+

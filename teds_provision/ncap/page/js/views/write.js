@@ -1,0 +1,126 @@
+// Write a datasheet from a file: what would change is shown in physical units, then it is signed and written.
+
+import { change, paths } from "../api.js";
+import { button, chip, fill, h, icon, say, trouble } from "../dom.js";
+import { channelName, count, nameOf } from "../format.js";
+import { measuring, on, state } from "../state.js";
+
+const LARGEST = 900000; // octets: the station takes bodies of at most 1 MiB
+
+export class WritePanel {
+  constructor(uuid, written) {
+    this.uuid = uuid;
+    this.written = written;
+    this.leaving = new AbortController();
+    this.file = h("input", { type: "file", class: "unseen-input", accept: ".xml,.json,application/xml,application/json", id: `file-${uuid}` });
+    this.file.addEventListener("change", () => this.take(this.file.files[0]));
+    this.drop = h("label", { class: "drop", for: this.file.id }, icon("plus"), h("span", {}, h("strong", {}, "Choose a datasheet file"), " or drop it here. XML or JSON."));
+    for (const name of ["dragenter", "dragover"]) this.drop.addEventListener(name, (event) => this.over(event, true));
+    for (const name of ["dragleave", "drop"]) this.drop.addEventListener(name, (event) => this.over(event, false));
+    this.drop.addEventListener("drop", (event) => this.take(event.dataTransfer.files[0]));
+    this.result = h("div", { class: "plan" });
+    this.frozen = h("p", { class: "hint" });
+    this.element = h(
+      "section",
+      { class: "panel", "aria-label": "Write a datasheet" },
+      h("h3", {}, "Write a datasheet"),
+      h("p", { class: "hint" }, "Nothing is written before you saw what changes."),
+      this.file,
+      this.drop,
+      this.frozen,
+      this.result,
+    );
+    this.off = on("measurements status", () => this.paint());
+    this.paint();
+  }
+
+  over(event, yes) {
+    event.preventDefault();
+    this.drop.classList.toggle("over", yes);
+  }
+
+  paint() {
+    const one = measuring(this.uuid);
+    const blocked = one ? `It is being measured${one.group ? ` with group ${one.group}` : ""}: stop that first, its datasheet is frozen.` : state.status?.write === false ? "This browser may only read." : "";
+    this.frozen.textContent = blocked;
+    this.file.disabled = Boolean(blocked) || state.connection !== "live";
+    this.drop.classList.toggle("off", this.file.disabled);
+    if (this.go && this.go.getAttribute("aria-busy") !== "true") this.go.disabled = this.file.disabled;
+  }
+
+  async take(file) {
+    this.file.value = "";
+    if (!file || this.file.disabled) return;
+    if (file.size > LARGEST) {
+      fill(this.result, trouble({ message: `${file.name} has ${file.size} octets: too large for a datasheet.`, hint: "Choose the XML or JSON file of one node." }));
+      return;
+    }
+    const content = await file.text();
+    const body = { format: content.trimStart().startsWith("<") ? "xml" : "json", content };
+    fill(this.result, h("p", { class: "busy-line" }, `Comparing ${file.name} with what the node has …`));
+    try {
+      const plan = await change(`${paths.teds(this.uuid)}?dry_run=1`, body, { signal: this.leaving.signal });
+      this.plan(file.name, body, plan);
+    } catch (error) {
+      if (error.name !== "AbortError") fill(this.result, trouble(error));
+    }
+  }
+
+  plan(name, body, plan) {
+    const node = state.nodes.get(this.uuid);
+    const changes = plan.changes ?? [];
+    const guard = plan.guard ?? [];
+    this.go = button(`Sign and write to ${nameOf(node)}`, { class: "main" }, "good");
+    this.go.addEventListener("click", () => this.go.busy(() => this.carry(body)));
+    const no = button("Leave it as it is", { onclick: () => this.clear() });
+    fill(
+      this.result,
+      h("h4", {}, changes.length ? `${name}: ${count(changes.length, "change")}` : `${name}: nothing to change`),
+      guard.length ? h("ul", { class: "guard" }, guard.map((one) => h("li", {}, chip(one.severity === "error" ? "bad" : "warn", "warn", one.severity ?? "warning"), h("span", {}, one.message, one.hint ? h("span", { class: "hint" }, ` ${one.hint}`) : null)))) : null,
+      changes.length ? this.table(changes, node) : h("p", {}, "The node has this datasheet already."),
+      changes.length ? h("div", { class: "row" }, this.go, no) : h("div", { class: "row" }, no),
+    );
+    say(changes.length ? `${count(changes.length, "change")} to look at.` : "Nothing to change.");
+    this.paint();
+  }
+
+  table(changes, node) {
+    const where = (one) => {
+      if (one.channel === 0) return "Node";
+      const channel = node?.channels?.find((each) => each.number === one.channel);
+      return channel ? channelName(channel) : `channel ${one.channel}`;
+    };
+    const rows = changes.map((one) =>
+      one.before || one.after
+        ? h("tr", {}, h("th", { scope: "row" }, where(one)), h("td", {}, one.label ?? one.field), h("td", { class: "before", "data-label": "now" }, one.before || "nothing"), h("td", { class: "after", "data-label": "then" }, h("span", { class: "arrow", "aria-hidden": "true" }, "→ "), one.after || "nothing"))
+        : h("tr", {}, h("th", { scope: "row" }, where(one)), h("td", { colspan: "3" }, one.text)),
+    );
+    return h(
+      "div",
+      { class: "scroll", tabindex: "0", role: "group", "aria-label": "What changes" },
+      h("table", { class: "diff" }, h("caption", { class: "unseen" }, "What changes, in physical units"), h("thead", {}, h("tr", {}, ["Where", "What", "Now on the node", "After writing"].map((words) => h("th", { scope: "col" }, words)))), h("tbody", {}, rows)),
+    );
+  }
+
+  async carry(body) {
+    try {
+      const done = await change(paths.teds(this.uuid), body);
+      fill(this.result, h("p", { class: "done" }, chip("good", "good", "Written"), ` Signed, written and verified${done.verdict ? `: ${done.verdict}` : ""}.`));
+      this.go = null;
+      say("Datasheet written and verified.");
+      this.written();
+    } catch (error) {
+      fill(this.result, trouble(error));
+    }
+  }
+
+  clear() {
+    this.go = null;
+    this.result.replaceChildren();
+  }
+
+  end() {
+    this.leaving.abort();
+    this.off();
+  }
+}
