@@ -86,7 +86,10 @@ const VERDICTS = {
   "not authentic": ["bad", "bad", "Not authentic", "A check failed: do not trust its values."],
 };
 
-/** Tone, sign, word and meaning of a verdict. */
-export function verdict(word) {
-  return VERDICTS[word] ?? ["plain", "ask", "Not checked", "Nobody has verified this node yet."];
+/** Tone, sign, word and meaning of the verdict on a node or a datasheet. */
+export function verdict(of) {
+  if (VERDICTS[of.verdict]) return VERDICTS[of.verdict];
+  const earlier = VERDICTS[of.earlier];
+  if (earlier) return ["plain", "clock", `${earlier[2]} when last read`, "It was not looked at since this station started."];
+  return ["plain", "ask", "Not checked", "Nobody has verified this node yet."];
 }

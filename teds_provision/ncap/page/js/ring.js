@@ -2,23 +2,21 @@
 
 const POINTS = 12000; // two minutes at the 100 points a second that the station sends at most
 
-/** Times (unix s) with the lowest and highest value around each. */
+/** Times (unix s) and values; NaN where there was none. */
 export class Ring {
   constructor(size = POINTS) {
     this.size = size;
     this.time = new Float64Array(size);
-    this.low = new Float32Array(size);
-    this.high = new Float32Array(size);
+    this.value = new Float32Array(size);
     this.next = 0;
     this.held = 0;
     this.total = 0;
   }
 
-  push(time, low, high) {
-    if (this.held && time < this.newest) this.clear(); // the station began anew
+  push(time, value) {
+    if (this.held && time < this.newest) this.clear(); // measured anew, by another clock
     this.time[this.next] = time;
-    this.low[this.next] = low;
-    this.high[this.next] = high;
+    this.value[this.next] = value;
     this.next = (this.next + 1) % this.size;
     this.held = Math.min(this.held + 1, this.size);
     this.total += 1;
@@ -43,19 +41,16 @@ export class Ring {
       const time = this.time[place];
       const column = Math.floor((time - from) / width);
       if (column >= columns) break;
-      const [low, high] = [this.low[place], this.high[place]];
+      const value = this.value[place];
       const at = 2 * column;
       if (time - before > silence && at > 0 && out[at] === undefined) out[at - 1] = out[at - 1] ?? null;
       before = time;
-      if (Number.isNaN(low)) {
+      if (Number.isNaN(value)) {
         if (out[at] === undefined) out[at] = out[at + 1] = null;
       } else if (out[at] === undefined || out[at] === null) {
-        out[at] = low;
-        out[at + 1] = high;
-      } else {
-        if (low < out[at]) out[at] = low;
-        if (high > out[at + 1]) out[at + 1] = high;
-      }
+        out[at] = out[at + 1] = value;
+      } else if (value < out[at]) out[at] = value;
+      else if (value > out[at + 1]) out[at + 1] = value;
     }
     return out;
   }

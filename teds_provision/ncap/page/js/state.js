@@ -1,8 +1,9 @@
 // What the page knows, in one place. Views listen to topics; several changes in one frame are told once.
 
-import { get } from "./api.js";
+import { get, paths } from "./api.js";
 import { toast } from "./dom.js";
 import { Ring } from "./ring.js";
+import * as shapes from "./shapes.js";
 
 const RINGS = 400; // channels whose course is kept at once
 
@@ -99,12 +100,12 @@ export function membersOf(measurement) {
 
 const LISTS = {
   status: async () => {
-    state.status = await get("status");
-    if (typeof state.status.now === "number") state.offset = state.status.now - Date.now() / 1000;
+    state.status = shapes.status(await get("status"));
+    if (state.status.now !== null) state.offset = state.status.now - Date.now() / 1000;
   },
   nodes: async () => {
     const { nodes } = await get("nodes");
-    state.nodes = new Map((nodes ?? []).map((node) => [node.uuid, node]));
+    state.nodes = new Map((nodes ?? []).map((wire) => [wire.uuid, settled(shapes.node(wire))]));
     state.loaded = true;
   },
   groups: async () => (state.groups = (await get("groups")).groups ?? []),
@@ -139,6 +140,32 @@ async function fetchOne(list) {
   if (again) await fetchOne(list);
 }
 
+/** What the node's own answer does not say: whether it is a virtual one of this station. */
+function settled(node) {
+  node.virtual = state.virtual.some((one) => one.uuid === node.uuid);
+  return node;
+}
+
+const due = new Set(); // UUIDs of nodes that changed
+
+/** Fetch one node anew, soon: events come in flocks. */
+function refreshNode(uuid) {
+  if (!due.size) setTimeout(fetchDue, 60);
+  due.add(uuid);
+}
+
+async function fetchDue() {
+  const uuids = [...due];
+  due.clear();
+  if (uuids.length > 5) return refresh("nodes");
+  const answers = await Promise.allSettled(uuids.map((uuid) => get(paths.node(uuid))));
+  answers.forEach((answer, index) => {
+    if (answer.status === "fulfilled") state.nodes.set(uuids[index], settled(shapes.node(answer.value)));
+    else if (answer.reason.status === 404) state.nodes.delete(uuids[index]);
+  });
+  return changed("nodes");
+}
+
 /** What hangs on a list that an event names. */
 const AFTER = {
   measurement: ["measurements", "nodes", "status"],
@@ -151,63 +178,65 @@ const AFTER = {
   log: [],
 };
 
-/** Take one event of the WebSocket. */
-export function take(event) {
+/** Take one message of the WebSocket. */
+export function take(message) {
+  const event = shapes.live(message);
   const taker = TAKERS[event.event];
   if (taker) taker(event);
   else if (AFTER[event.event]) refresh(...AFTER[event.event]);
   changed(event.event);
 }
 
+const everything = () => refresh("status", "nodes", "groups", "measurements", "virtual", "profiles");
+
 const TAKERS = {
-  hello: (event) => {
-    if (typeof event.now === "number") state.offset = event.now - Date.now() / 1000;
-    refresh("status", "nodes", "groups", "measurements", "virtual", "profiles");
+  hello: everything,
+  resync: everything,
+  store: everything,
+  beat: () => {},
+  dropped: (event) => (state.dropped += event.messages ?? 0),
+  values: (event) => {
+    for (const [key, [times, values]] of Object.entries(event.channels)) takeStream(key, times, values);
   },
-  beat: (event) => {
-    if (typeof event.dropped === "number") state.dropped = event.dropped;
-  },
-  values: (event) => event.streams.forEach(takeStream),
   node: (event) => {
-    state.nodes.set(event.node.uuid, event.node);
-    changed("nodes");
-  },
-  gone: (event) => {
-    state.nodes.delete(event.uuid);
-    changed("nodes");
-  },
-  tap: (event) => {
-    state.tapped = { uuid: event.uuid, at: performance.now(), state: event.state };
+    refreshNode(event.uuid);
+    // Whoever lays a node on the reader wants to see that very node: no button is needed.
+    if (event.state === "came" && (event.place ?? "").startsWith("nfc")) {
+      state.tapped = { uuid: event.uuid, at: performance.now() };
+      changed("tap");
+    }
   },
   provision: (event) => {
     const run = state.runs.get(event.uuid) ?? { steps: [] };
     const steps = event.state === "waiting" ? [] : [...run.steps];
     if (event.step) {
       const place = steps.findIndex((step) => step.name === event.step);
-      const step = { name: event.step, result: event.result ?? "running" };
+      const step = { name: event.step, result: event.result ?? "running", detail: event.detail };
       if (place < 0) steps.push(step);
       else steps[place] = step;
     }
-    state.runs.set(event.uuid, { ...event, steps });
+    state.runs.set(event.uuid, { ...run, ...event, steps });
+    if (event.state === "done") refreshNode(event.uuid);
   },
   actuator: (event) => {
     const channel = state.nodes.get(event.uuid)?.channels?.find((one) => one.number === event.channel);
-    if (channel) channel.actuator = { ...channel.actuator, value: event.value, safe: event.safe };
+    if (channel) channel.actuator = { value: shapes.toShown(channel.scale, event.value), safe: event.safe };
   },
 };
 
-function takeStream(stream) {
-  const key = keyOf(stream.uuid, stream.channel);
-  const ring = ringOf(stream.uuid, stream.channel);
-  const points = stream.time.length;
-  for (let index = 0; index < points; index++) {
-    ring.push(stream.time[index], stream.low[index] ?? NaN, stream.high[index] ?? NaN);
-  }
-  state.received += points;
-  if (!points) return;
-  const time = stream.time[points - 1];
+function takeStream(key, times, values) {
+  const [uuid, channel] = key.split("/");
+  const ring = ringOf(uuid, channel);
+  const scale = scaleOf(uuid, Number(channel));
+  for (let index = 0; index < times.length; index++) ring.push(times[index], shapes.toShown(scale, values[index]) ?? NaN);
+  state.received += times.length;
+  if (!times.length) return;
+  const time = times.at(-1);
+  const value = shapes.toShown(scale, values.at(-1));
   const old = state.values.get(key);
-  const value = stream.last === undefined ? stream.high[points - 1] : stream.last;
-  const period = old && time > old.time ? (time - old.time) / points : (old?.period ?? 0);
+  const period = old && time > old.time ? (time - old.time) / times.length : (old?.period ?? 0);
   state.values.set(key, { value, time, period, valid: value !== null });
 }
+
+const PLAIN = { factor: 1, offset: 0 };
+const scaleOf = (uuid, number) => state.nodes.get(uuid)?.channels?.find((one) => one.number === number)?.scale ?? PLAIN;

@@ -3,6 +3,7 @@
 import { change, paths } from "../api.js";
 import { chip, field, fill, h, icon, say, text, trouble } from "../dom.js";
 import { channelName, clock, nameOf, number, range, short } from "../format.js";
+import { toShown, toSi } from "../shapes.js";
 import { now, on, state } from "../state.js";
 
 const HOLD = 0.8; // s: the station lets go by itself when it hears nothing for so long
@@ -110,8 +111,8 @@ export class ActuatorPanel {
     while (this.holding && !refused) {
       const began = performance.now();
       try {
-        const done = await change(paths.channel(this.uuid, this.number), { value: Number(this.entry.value), unit: this.channel.unit, hold: HOLD });
-        this.applied = done.applied ?? null;
+        const done = await change(paths.channel(this.uuid, this.number), { value: toSi(this.channel.scale, Number(this.entry.value)), hold: HOLD });
+        this.applied = done.applied ? toShown(this.channel.scale, done.applied.value) : null;
         this.paint();
       } catch (error) {
         refused = error;
@@ -169,7 +170,7 @@ export class ActuatorPanel {
     text(this.limits, `Limits ${range(channel)}. It moves only while the button (or Space) is held; let go, and the node brings it to its safe state. No safety function: keep an emergency stop.`);
     const figure = (value) => `${number(value)}${channel.unit ? ` ${channel.unit}` : ""}`;
     let shown;
-    if (this.holding) shown = chip("busy", "play", `Moving: ${figure(this.applied?.value ?? Number(this.entry.value))}`);
+    if (this.holding) shown = chip("busy", "play", `Moving: ${figure(this.applied ?? Number(this.entry.value))}`);
     else if (this.stopping) shown = chip("warn", "clock", "Stopping …");
     else if (told?.safe === false) shown = chip("busy", "play", `Moved by another: ${figure(told.value)}`);
     else if (this.safeAt) shown = chip("good", "good", `Safe: the node said so at ${clock(this.safeAt)}`);

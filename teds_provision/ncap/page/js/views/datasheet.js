@@ -51,7 +51,7 @@ export class DatasheetTab {
     const api = paths.teds(this.uuid);
     fill(this.files, "Save as ", ["json", "xml", "hex"].map((form) => [h("a", { href: `api/v1/${api}?format=${form}`, download: `${this.uuid}.${form}` }, form.toUpperCase()), " "]));
     const teds = sheet.teds ?? [];
-    const [tone, sign, words, why] = verdict(sheet.verdict);
+    const [tone, sign, words, why] = verdict(sheet);
     const findings = teds.flatMap((one) => (one.findings ?? []).map((finding) => ({ ...finding, where: title(one) })));
     fill(
       this.body,

@@ -41,7 +41,7 @@ class Groups {
     const nodes = [...state.nodes.values()].filter((node) => node.whitelisted !== false);
     keyed(this.members.lastChild, nodes, (node) => node.uuid, tick, (element, node) => {
       text(element.querySelector("span"), nameOf(node));
-      text(element.querySelector(".hint"), verdict(node.verdict)[2].toLowerCase());
+      text(element.querySelector(".hint"), verdict(node)[2].toLowerCase());
     });
     if (this.make.getAttribute("aria-busy") !== "true") this.make.disabled = !may;
   }

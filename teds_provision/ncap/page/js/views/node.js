@@ -1,6 +1,6 @@
 // One node: who it is, and its three tabs.
 
-import { chip, fill, h, keyed, text } from "../dom.js";
+import { chip, fill, h, icon, keyed, text } from "../dom.js";
 import { grouped, nameOf, verdict } from "../format.js";
 import { on, state } from "../state.js";
 import { DatasheetTab } from "./datasheet.js";
@@ -45,8 +45,8 @@ export class NodePanel {
     const node = this.node;
     if (!node) return;
     text(this.title, nameOf(node));
-    const [tone, sign, words, why] = verdict(node.verdict);
-    fill(this.head, chip(tone, sign, words, why), node.whitelisted ? chip("plain", "list", "On the whitelist") : null, facts(node), node.why ? h("span", { class: "warn" }, node.why) : null);
+    const [tone, sign, words, why] = verdict(node);
+    fill(this.head, chip(tone, sign, words, why), node.whitelisted ? chip("plain", "list", "On the whitelist") : null, facts(node), node.why ? h("span", { class: "warn" }, icon("warn"), node.why, node.cure ? ` ${node.cure}` : "") : null);
     const checks = node.checks ?? [];
     this.checks.hidden = !checks.length && !node.fingerprint;
     const passed = checks.filter((check) => check.result === "passed").length;

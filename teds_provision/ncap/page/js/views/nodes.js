@@ -77,10 +77,10 @@ export function nodesView(main, rest) {
     else element.firstChild.removeAttribute("aria-current");
     element.classList.toggle("tapped", state.tapped?.uuid === node.uuid && performance.now() - state.tapped.at < MARKED);
     element.classList.toggle("absent", node.present === false);
-    const told = JSON.stringify([node.name, node.verdict, node.link, node.present, node.state, node.mode, node.power, node.groups, node.whitelisted, node.channels?.map((one) => one.name)]);
+    const told = JSON.stringify([node.name, node.verdict, node.earlier, node.busy, node.virtual, node.link, node.present, node.state, node.mode, node.power, node.groups, node.whitelisted, node.channels?.map((one) => one.name)]);
     if (element.told === told) return;
     element.told = told;
-    const [tone, sign, words, why] = verdict(node.verdict);
+    const [tone, sign, words, why] = verdict(node);
     const values = (node.channels ?? []).filter((channel) => channel.kind !== "actuator").slice(0, SHOWN_VALUES);
     fill(
       element.firstChild,
@@ -130,6 +130,7 @@ function card(node) {
 export function facts(node) {
   const out = [h("span", {}, icon(node.virtual ? "virtual" : (node.link ?? "ask")), node.virtual ? "Virtual" : linkName(node.link))];
   if (node.present === false) out.push(h("span", { class: "warn" }, icon("clock"), node.seen ? `away, seen ${age(now() - node.seen)}` : "away"));
+  else if (node.busy) out.push(h("span", { class: "busy" }, icon("clock"), node.busy));
   else if (node.mode === "measuring") out.push(h("span", { class: "busy" }, icon("wave"), "measuring"));
   else if (node.state) out.push(h("span", {}, node.state));
   if (node.whitelisted === false) out.push(h("span", { class: "warn" }, icon("warn"), "not on the whitelist"));
@@ -142,7 +143,7 @@ export function facts(node) {
 export function power(told) {
   const level = typeof told.percent === "number" ? `${told.percent} %` : "level not known";
   const words = { charging: "charging", wanted: "wants charging", full: "full", error: "charging error" }[told.charging];
-  const low = typeof told.percent === "number" && told.percent < 10;
+  const low = told.low || (typeof told.percent === "number" && told.percent < 10);
   return h("span", { class: low ? "warn" : "" }, icon(told.charging === "charging" ? "charge" : "battery"), [level, words, low ? "low" : null].filter(Boolean).join(", "));
 }
 

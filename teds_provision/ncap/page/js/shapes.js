@@ -1,0 +1,93 @@
+// From the API's answers to what the views show: numbers in the unit for people, times in unix seconds.
+//
+// The station speaks SI; `shown` of a channel says the unit for people: number = SI × factor + offset.
+
+const KINDS = { sensor: "sensor", actuator: "actuator", "event sensor": "event", event: "event" };
+
+/** Unix seconds of a number or an ISO 8601 text; null where there is neither. */
+export function moment(time) {
+  if (typeof time === "number") return time;
+  const parsed = time ? Date.parse(time) / 1000 : NaN;
+  return Number.isFinite(parsed) ? parsed : null;
+}
+
+/** How a channel's SI numbers become those that people read. */
+export function scaleOf(wire) {
+  const shown = wire.shown ?? {};
+  const factor = typeof shown.factor === "number" && shown.factor !== 0 ? shown.factor : 1;
+  return { unit: shown.unit ?? wire.unit ?? "", factor, offset: shown.offset ?? 0, si: wire.unit ?? "" };
+}
+
+export const toShown = (scale, value) => (typeof value === "number" ? value * scale.factor + scale.offset : null);
+export const toSi = (scale, value) => (value - scale.offset) / scale.factor;
+
+function channel(wire) {
+  const scale = scaleOf(wire);
+  const ends = [toShown(scale, wire.low), toShown(scale, wire.high)];
+  if (scale.factor < 0) ends.reverse();
+  const last = wire.last ? { value: toShown(scale, wire.last.value), raw: wire.last.raw, time: wire.last.time, valid: wire.last.valid } : null;
+  return {
+    ...wire,
+    name: wire.name ?? "",
+    kind: KINDS[wire.kind] ?? "sensor",
+    scale,
+    unit: scale.unit,
+    low: ends[0],
+    high: ends[1],
+    uncertainty: typeof wire.uncertainty === "number" ? Math.abs(wire.uncertainty * scale.factor) : null,
+    last,
+    actuator: wire.actuator ? { ...wire.actuator, value: toShown(scale, wire.actuator.value) } : null,
+  };
+}
+
+const CHARGE = { full: "full", charging: "charging", "in field": "charging", "charging field": "charging" };
+
+function power(wire) {
+  if (!wire) return null;
+  const flags = wire.flags ?? [];
+  if ("level" in wire && flags.length && !flags.includes("battery") && wire.level === null) return null;
+  return {
+    percent: wire.level ?? wire.percent ?? wire.battery_percent ?? null,
+    charging: wire.charging ?? flags.map((flag) => CHARGE[flag]).find(Boolean) ?? null,
+    low: flags.includes("too low"),
+  };
+}
+
+/** A node; `known_verdict` is what was said of it before it was looked at now. */
+export function node(wire) {
+  return {
+    ...wire,
+    name: wire.name ?? "",
+    link: wire.via ?? (wire.link ?? "").split(":")[0] ?? null,
+    place: wire.link ?? null,
+    seen: moment(wire.last_seen ?? wire.seen),
+    earlier: wire.verdict ? null : (wire.known_verdict ?? null),
+    why: wire.problem?.message ?? wire.why ?? "",
+    cure: wire.problem?.hint ?? "",
+    groups: wire.groups ?? (wire.group ? [wire.group] : []),
+    mode: wire.measurement ? "measuring" : (wire.mode ?? null),
+    power: power(wire.power),
+    channels: (wire.channels ?? []).map(channel),
+  };
+}
+
+/** The station. */
+export function status(wire) {
+  const links = (wire.links ?? []).map((link) => ({
+    name: (link.place ?? link.name ?? "").replace(/^(can|nfc|ble):/, ""),
+    kind: link.via ?? link.kind ?? "can",
+    state: link.state,
+    why: link.problem?.message ?? link.why ?? link.waiting ?? "",
+    hint: link.problem?.hint ?? "",
+    nodes: link.nodes ?? null,
+  }));
+  const strangers = wire.strangers ?? (wire.links ?? []).reduce((sum, link) => sum + (link.strangers ?? 0), 0);
+  return { ...wire, now: moment(wire.time ?? wire.now), started: moment(wire.started), links, strangers, write: !(wire.read_only ?? wire.write === false) };
+}
+
+/** One message of /live as an event with a name. */
+export function live(message) {
+  if (message.type === "event") return message;
+  if (message.type === "values") return { event: "values", channels: message.channels };
+  return { ...message, event: message.type ?? message.event };
+}
