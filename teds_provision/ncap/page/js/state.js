@@ -201,7 +201,7 @@ const TAKERS = {
   node: (event) => {
     refreshNode(event.uuid);
     // Whoever lays a node on the reader wants to see that very node: no button is needed.
-    if (event.state === "came" && (event.place ?? "").startsWith("nfc")) {
+    if (event.state === "tapped") {
       state.tapped = { uuid: event.uuid, at: performance.now() };
       changed("tap");
     }
