@@ -31,6 +31,7 @@ ARROWS = {
     "store": {"protocol", "teds"},
     "station": {"vault", "store", "protocol", "teds"},
     "node": {"links", "protocol", "teds"},
+    "trace": {"links", "protocol", "teds"},
     "talk": _BELOW_TALK,
     "steps": _BELOW_TALK | {"talk"},
     "handover": _BELOW_TALK | {"talk", "steps"},
@@ -42,7 +43,8 @@ ARROWS = {
     "doctor": {"station", "links", "vault", "store", "protocol", "teds"},
     "demo": _BELOW_TALK | {"talk", "steps", "handover", "measure"},
     "cli": _BELOW_TALK
-    | {"talk", "steps", "handover", "backup", "doctor", "demo", "node", "measure", "check", "ncap", "client"},
+    | {"talk", "steps", "handover", "backup", "doctor", "demo", "node", "measure", "check", "ncap", "client"}
+    | {"trace"},
     "__main__": {"cli"},
 }
 # Too slow to load before they are needed: --help, --version and a pure decode must not wait for them.

@@ -10,19 +10,17 @@ from teds_provision.errors import BadData, Garbled, NodeSilent, NotAuthentic
 from teds_provision.links import Contact
 from teds_provision.protocol.agreement import Credentials
 from teds_provision.protocol.messages.frames import (
-    COMMON,
-    SECURITY,
     Command,
     Function,
     Reason,
     Reply,
-    TedsFunction,
     decode_list,
     decode_reply,
     read_teds,
     security_command,
 )
 from teds_provision.protocol.messages.identity import Identity, NodeState
+from teds_provision.protocol.messages.words import answered, named, told
 from teds_provision.protocol.session import StationSession
 from teds_provision.teds.codec import security
 from teds_provision.teds.codec.security import SecurityTeds
@@ -32,22 +30,6 @@ from teds_provision.teds.image import BlockId
 _BUSY_PAUSE: Final = 0.25
 _BUSY_SECONDS: Final = 10.0
 _LARGEST_TEDS: Final = 1 << 20
-
-
-def named(command: Command) -> str:
-    """A command in words: class, function, payload octets; "Prove (128.8), 31 octets"."""
-    number = f"{command.command_class}.{command.function}"
-    kind = Function if command.command_class == SECURITY else TedsFunction
-    if command.command_class in (COMMON, SECURITY) and command.function in {int(each) for each in kind}:
-        number = f"{kind(command.function).name.replace('_', ' ').capitalize()} ({number})"
-    return f"{number}, {len(command.payload)} octets"
-
-
-def told(reply: Reply) -> str:
-    """A reply in words: "success, 64 octets", "refusal 4"."""
-    if reply.ok:
-        return f"success, {len(reply.payload)} octets"
-    return f"refusal {reply.reason}" if len(reply.payload) == 1 else f"a refusal of {len(reply.payload)} octets"
 
 
 class Probe:
@@ -63,13 +45,15 @@ class Probe:
 
     # -- frames ----------------------------------------------------------------------------------------------------
 
-    def octets(self, frame: bytes, what: str) -> Reply:
+    def octets(self, frame: bytes, what: str, *, inside: Command | None = None) -> Reply:
         """Send these octets as a whole command frame. Raises RuleBroken where no whole reply frame comes back.
 
-        Raises NodeSilent where the node does not answer Identify either.
+        ``inside`` is the command that is sealed in them. Raises NodeSilent where not even Identify is answered.
         """
+        opened = None if inside is None else inside.encode()
         until = time.monotonic() + _BUSY_SECONDS
         while True:
+            self.contact.note("out", frame, what, sealed=inside is not None, opened=opened)
             try:
                 raw = self.contact.link.exchange(frame)
             except NodeSilent:
@@ -79,6 +63,8 @@ class Probe:
                 reply = decode_reply(raw)
             except Garbled as error:
                 raise RuleBroken(f"{what}: {error.message}") from None
+            if inside is None or not reply.ok:  # what is sealed is told when it is opened
+                self.contact.note("in", raw, f"reply to {what}: {told(reply)}")
             if reply.reason != Reason.BUSY:
                 return reply
             if time.monotonic() >= until:
@@ -130,15 +116,18 @@ class Probe:
         """Send a command in the session, which is opened where none is; the inner reply."""
         session = self.session or self.open()
         sealed = session.seal(command)
-        outer = self.plain(sealed)
+        outer = self.octets(sealed.encode(), named(command), inside=command)
         if not outer.ok:
             self.session = None
             raise RuleBroken(f"{named(command)}, sealed: a sealed reply is due, {told(outer)} came.")
         try:
-            return session.unseal(outer.payload)
+            inner = session.unseal(outer.payload)
         except (Garbled, NotAuthentic) as error:
+            self.contact.note("in", outer.encode(), answered(command, outer), sealed=True)
             self.session = None
             raise RuleBroken(f"{named(command)}, sealed: {error.message}") from None
+        self.contact.note("in", outer.encode(), answered(command, inner), sealed=True, opened=inner.encode())
+        return inner
 
     def sealed_good(self, command: Command) -> bytes:
         """A sealed command that must succeed; the inner payload."""

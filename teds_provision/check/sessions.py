@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 
 from teds_provision.check.outcome import NotApplicable
-from teds_provision.check.probe import Probe, demand, holds, told
+from teds_provision.check.probe import Probe, demand, holds
 from teds_provision.check.rule import Stage, rule
 from teds_provision.links.ports import Repeats
 from teds_provision.protocol.agreement import key_id
@@ -19,6 +19,7 @@ from teds_provision.protocol.messages.frames import (
     decode_reply,
     security_command,
 )
+from teds_provision.protocol.messages.words import named, told
 from teds_provision.protocol.session import OPEN_OCTETS, StationSession, open_mac
 
 _IDENTIFY = security_command(Function.IDENTIFY)
@@ -121,9 +122,14 @@ def repetition(probe: Probe) -> str:
     if not isinstance(link, Repeats):
         raise NotApplicable("This link cannot send a request again.")
     frame = probe.open().seal(_IDENTIFY).encode()
+    contact, words = probe.contact, f"{named(_IDENTIFY)}, for repeating"
+    contact.note("out", frame, words, sealed=True, opened=_IDENTIFY.encode())
     first = link.exchange(frame)
+    contact.note("in", first, f"reply to {words}", sealed=True)
     for _ in range(2):
+        contact.note("out", frame, f"{words}, again", sealed=True, opened=_IDENTIFY.encode())
         second = link.again(frame)
+        contact.note("in", second, f"reply to {words}, again", sealed=True)
         holds(second == first, f"Sealed (128.4) repeated: the stored reply is due, {told(decode_reply(second))} came.")
     return f"the stored {len(first)} octets, twice"
 

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any, TypeVar
 
 import click
 
+from teds_provision.cli.tracing import tracing
 from teds_provision.links import LinkSettings
 
 Function = TypeVar("Function", bound=Callable[..., Any])
@@ -48,14 +50,22 @@ class Seconds(click.FloatRange):
 
 
 def link_options(function: Function) -> Function:
-    """Add --via, --nfc (several with --watch), --can, --ble, --timeout; the command gets ``links: LinkSettings``."""
+    """Add --via, --nfc (several with --watch), --can, --ble, --timeout, --trace; gives ``links: LinkSettings``."""
     from functools import wraps
 
     @wraps(function)
     def with_links(
-        *args: Any, via: str, nfc: tuple[str, ...], can: str | None, ble: str | None, timeout: float, **rest: Any
+        *args: Any,
+        via: str,
+        nfc: tuple[str, ...],
+        can: str | None,
+        ble: str | None,
+        timeout: float,
+        trace: Path | None,
+        **rest: Any,
     ) -> Any:
-        return function(*args, links=LinkSettings(via, nfc or None, can, ble, timeout), **rest)
+        with tracing(trace) as opened:
+            return function(*args, links=LinkSettings(via, nfc or None, can, ble, timeout, opened), **rest)
 
     options = [
         click.option(
@@ -78,6 +88,12 @@ def link_options(function: Function) -> Function:
             show_default=True,
             metavar="SECONDS",
             help="How long to wait for the node.",
+        ),
+        click.option(
+            "--trace",
+            metavar="FILE",
+            type=click.Path(path_type=Path, dir_okay=False),
+            help="Write down every frame, sealed ones opened beside; FILE.pcapng for Wireshark. See: trace show.",
         ),
     ]
     wrapped: Any = with_links

@@ -46,6 +46,7 @@ SECTIONS: Final[dict[str, dict[str, Entry]]] = {
         "nodes": Entry("station.nodes", "nodes", "What this station knows of its nodes."),
         "label": Entry("station.label", "label", "A label for a board: QR code and text of UUID and fingerprint."),
         "log": Entry("station.log", "log", "The audit log, and whether its hash chain holds."),
+        "trace": Entry("datasheet.trace", "trace", "What --trace wrote, in words: show."),
         "show": Entry("datasheet.show", "show", "Decode TEDS, images, profiles, bundles and messages."),
     },
     "Measure": {
@@ -77,6 +78,6 @@ SECTIONS: Final[dict[str, dict[str, Entry]]] = {
 
 COMMANDS: Final = {name: entry for section in SECTIONS.values() for name, entry in section.items()}
 GROUPS: Final = frozenset(
-    {"draft", "vault", "group", "trust", "config", "profile", "whitelist", "handover", "node", "ncap"}
+    {"draft", "vault", "group", "trace", "trust", "config", "profile", "whitelist", "handover", "node", "ncap"}
 )
 """The commands that have commands of their own."""

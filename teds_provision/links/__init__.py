@@ -9,7 +9,7 @@ Importing this package loads neither nfcpy nor python-can.
 from __future__ import annotations
 
 from teds_provision.links.opening import LINKS, open_place, open_port, open_ports
-from teds_provision.links.ports import Capabilities, Contact, Link, LinkSettings, Notice, Port
+from teds_provision.links.ports import Capabilities, Contact, Link, LinkSettings, Notice, Port, Trace
 
 __all__ = [
     "LINKS",
@@ -19,6 +19,7 @@ __all__ = [
     "LinkSettings",
     "Notice",
     "Port",
+    "Trace",
     "open_place",
     "open_port",
     "open_ports",

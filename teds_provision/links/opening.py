@@ -12,12 +12,12 @@ from importlib import import_module
 from typing import Final
 
 from teds_provision.errors import UsageFailure
-from teds_provision.links.ports import CAN, NFC, Capabilities, LinkSettings, Port
+from teds_provision.links.ports import CAN, NFC, Capabilities, LinkSettings, Port, Trace
 
 
 @dataclass(frozen=True)
 class LinkKind:
-    """One kind of link: ``module`` has a function ``open_port(where)``; ``example`` is a place of that kind.
+    """One kind of link: ``module`` has a function ``open_port(where, trace)``; ``example`` is a place of that kind.
 
     ``needs`` is what to say where the place is left out and there is no default.
     """
@@ -44,8 +44,11 @@ LINKS: Final = {
 }
 
 
-def open_place(place: str) -> Port:
-    """Open the reader or bus at ``LINK:WHERE``; raises NoReader with the cure, or UsageFailure."""
+def open_place(place: str, trace: Trace | None = None) -> Port:
+    """Open the reader or bus at ``LINK:WHERE``; raises NoReader with the cure, or UsageFailure.
+
+    What goes over it is written to ``trace``.
+    """
     name, _, where = place.partition(":")
     kind = LINKS.get(name)
     if kind is None:
@@ -54,8 +57,8 @@ def open_place(place: str) -> Port:
     if kind.needs and not where:
         problem, _, cure = kind.needs.partition(". ")
         raise UsageFailure(f"{problem}.", hint=cure)
-    opened: Callable[[str], Port] = import_module(kind.module).open_port
-    return opened(where)
+    opened: Callable[[str, Trace | None], Port] = import_module(kind.module).open_port
+    return opened(where, trace)
 
 
 def open_port(settings: LinkSettings) -> Port:
@@ -66,7 +69,7 @@ def open_port(settings: LinkSettings) -> Port:
             f"{len(places)} readers are named, and this command works with one.",
             hint="Several readers are for --watch; name one with --nfc.",
         )
-    return open_place(places[0])
+    return open_place(places[0], settings.trace)
 
 
 def open_ports(settings: LinkSettings) -> list[Port]:
@@ -74,7 +77,7 @@ def open_ports(settings: LinkSettings) -> list[Port]:
     ports: list[Port] = []
     try:
         for place in settings.places:
-            ports.append(open_place(place))
+            ports.append(open_place(place, settings.trace))
     except BaseException:
         for port in ports:
             port.close()

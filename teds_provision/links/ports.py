@@ -30,6 +30,37 @@ class Notice:
 
 
 NoticeSink = Callable[[Notice], None]
+Direction = Literal["out", "in"]
+"""To the node, and from it."""
+
+
+class Trace(Protocol):
+    """Where what goes over a link is written down (``--trace``). Thread-safe; never raises, whatever the disk does."""
+
+    def frame(
+        self,
+        link: str,
+        direction: Direction,
+        octets: bytes,
+        *,
+        identifier: int | None = None,
+        fd: bool = False,
+        at: float | None = None,
+    ) -> None:
+        """A frame as the link carried it; ``at`` is its arrival in seconds of ``time.monotonic()``, None for now."""
+
+    def message(
+        self,
+        link: str,
+        direction: Direction,
+        octets: bytes,
+        words: str,
+        *,
+        uuid: bytes,
+        sealed: bool = False,
+        opened: bytes | None = None,
+    ) -> None:
+        """A whole command or reply, with what it says in words, and its plain form where it was sealed."""
 
 
 @dataclass(frozen=True)
@@ -88,6 +119,7 @@ class Contact:
     """A node that was found: its unauthenticated Identify, its link, and where it was found.
 
     ``charging`` and ``ble`` are what its initial NFC message says beside; hints, as unauthenticated as the rest.
+    ``trace`` is where the messages with it are written down.
     """
 
     identity: Identity
@@ -96,6 +128,15 @@ class Contact:
     address: int | None = None
     charging: Charging | None = None
     ble: BleAddress | None = None
+    trace: Trace | None = None
+
+    def note(
+        self, direction: Direction, frame: bytes, words: str, *, sealed: bool = False, opened: bytes | None = None
+    ) -> None:
+        """Write a whole message with this node to the trace, where there is one; see ``Trace.message``."""
+        if self.trace is not None:
+            uuid = self.identity.uuid
+            self.trace.message(self.link.via, direction, frame, words, uuid=uuid, sealed=sealed, opened=opened)
 
 
 class Port(Protocol):
@@ -143,7 +184,7 @@ class Port(Protocol):
 class LinkSettings:
     """The user's link options, unparsed: ``--via``, ``--nfc`` (one, or several), ``--can``, ``--ble``, ``--timeout``.
 
-    ``timeout`` in seconds. ``nfc`` None or ``auto``: the one reader that is there.
+    ``timeout`` in seconds. ``nfc`` None or ``auto``: the one reader that is there. ``trace`` is an open one (--trace).
     """
 
     via: str = "nfc"
@@ -151,6 +192,7 @@ class LinkSettings:
     can: str | None = None
     ble: str | None = None
     timeout: float = 60.0
+    trace: Trace | None = None
 
     @property
     def places(self) -> tuple[str, ...]:

@@ -11,6 +11,7 @@ from teds_provision.links import Contact, Notice
 from teds_provision.links.ports import NoticeSink
 from teds_provision.protocol.messages.frames import Command, Function, Reason, Reply, decode_reply, security_command
 from teds_provision.protocol.messages.identity import Identity
+from teds_provision.protocol.messages.words import answered, asked
 from teds_provision.protocol.session import StationSession
 
 _log = logging.getLogger(__name__)
@@ -174,13 +175,15 @@ class Conversation:
         session = self._session
         if session is None:
             return self.plain(command, doing)
-        outer = self._exchange(session.seal(command))
+        outer = self._exchange(session.seal(command), command)
         if not outer.ok:
             raise SessionLost(refused(outer.reason, doing))
         try:
             inner = session.unseal(outer.payload)
         except TedsProvisionError as error:
+            self.contact.note("in", outer.encode(), answered(command, outer), sealed=True)
             raise SessionLost(error) from error
+        self.contact.note("in", outer.encode(), answered(command, inner), sealed=True, opened=inner.encode())
         if not inner.ok:
             raise refused(inner.reason, doing)
         return inner.payload
@@ -215,13 +218,18 @@ class Conversation:
             return False
         return True
 
-    def _exchange(self, command: Command) -> Reply:
+    def _exchange(self, command: Command, inside: Command | None = None) -> Reply:
+        """Send a command, again while the node is busy; ``inside`` is what is sealed in it."""
         until = time.monotonic() + _BUSY_SECONDS
         while True:
             frame = command.encode()
+            opened = None if inside is None else inside.encode()
+            self.contact.note("out", frame, asked(inside or command), sealed=inside is not None, opened=opened)
             raw = self.contact.link.exchange(frame)
             _log.debug("%d.%d: %d octets out, %d back", command.command_class, command.function, len(frame), len(raw))
             reply = decode_reply(raw)
+            if inside is None or not reply.ok:  # what is sealed is told when it is opened
+                self.contact.note("in", raw, answered(command, reply))
             if reply.ok or reply.reason != Reason.BUSY or time.monotonic() >= until:
                 return reply
             self._notice(Notice("retry", "The node is busy with another station", until - time.monotonic()))

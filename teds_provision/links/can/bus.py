@@ -16,6 +16,7 @@ from teds_provision.links.can.echoes import Echoes
 from teds_provision.links.can.frame import Frame
 from teds_provision.links.can.pacing import Pacer
 from teds_provision.links.can.spec import CanSpec
+from teds_provision.links.ports import Trace
 
 if TYPE_CHECKING:
     import can
@@ -36,10 +37,14 @@ __all__ = ["Bus", "Frame"]
 
 
 class Bus:
-    """An open bus. Sending from one thread while another receives is allowed; two senders take turns themselves."""
+    """An open bus; every frame goes to ``trace``.
 
-    def __init__(self, spec: CanSpec) -> None:
+    Sending from one thread while another receives is allowed; two senders take turns themselves.
+    """
+
+    def __init__(self, spec: CanSpec, trace: Trace | None = None) -> None:
         self.spec = spec
+        self._trace = trace
         self._bus = _open(spec)
         self._descriptor = _descriptor(self._bus)
         self._pacer = Pacer(spec.bitrate, spec.data_bitrate) if spec.pace else None
@@ -65,6 +70,8 @@ class Bus:
         )
         if self._echoes:
             self._echoes.sent(frame)
+        if self._trace is not None:  # before it goes, so that no answer stands before it
+            self._trace.frame("can", "out", frame.data, identifier=frame.identifier, fd=frame.fd)
         try:
             self._bus.send(message, timeout=_SEND_SECONDS)
         except (can.CanError, OSError, ValueError) as error:
@@ -95,7 +102,11 @@ class Bus:
         if message.is_remote_frame or not message.is_extended_id or not message.is_rx:
             return None
         frame = Frame(message.arbitration_id, bytes(message.data), message.is_fd, _arrival(message.timestamp))
-        return None if self._echoes and self._echoes.take(frame) else frame
+        if self._echoes and self._echoes.take(frame):
+            return None
+        if self._trace is not None:
+            self._trace.frame("can", "in", frame.data, identifier=frame.identifier, fd=frame.fd, at=frame.at)
+        return frame
 
     def wait(self, seconds: float, wake: socket.socket) -> None:
         """Sleep until there may be a frame to receive, ``wake`` can be read, or ``seconds`` are over.

@@ -26,7 +26,7 @@ from teds_provision.links.can.frame import Frame
 from teds_provision.links.can.link import CanLink, conflict
 from teds_provision.links.can.shared import Ear, SharedBus
 from teds_provision.links.can.spec import LAST_NODE, parse_spec
-from teds_provision.links.ports import CAN, Capabilities, Contact, Notice, NoticeSink
+from teds_provision.links.ports import CAN, Capabilities, Contact, Notice, NoticeSink, Trace
 from teds_provision.protocol.messages.identity import Identity
 
 ANNOUNCE: Final = 0x1CFF0000
@@ -38,9 +38,9 @@ _ROUND_SECONDS: Final = 1.0
 _REOPEN_SECONDS: Final = 1.0
 
 
-def open_port(where: str) -> CanPort:
+def open_port(where: str, trace: Trace | None = None) -> CanPort:
     """Open the bus that ``where`` names, as ``--can`` does; raises NoReader, UsageFailure."""
-    return CanPort(where)
+    return CanPort(where, trace)
 
 
 class CanPort:
@@ -48,10 +48,11 @@ class CanPort:
 
     via: Final = "can"
 
-    def __init__(self, spec_text: str) -> None:
+    def __init__(self, spec_text: str, trace: Trace | None = None) -> None:
         self.spec = parse_spec(spec_text)
         self.place = f"can:{spec_text}"
-        self._bus: SharedBus | None = SharedBus(Bus(self.spec))
+        self._trace = trace
+        self._bus: SharedBus | None = SharedBus(Bus(self.spec, trace))
         self._transaction = secrets.randbelow(256)
         self._lock = threading.Lock()
         self._rival_told = False
@@ -68,7 +69,7 @@ class CanPort:
                 if self._bus is not None:
                     self._bus.close()
                     self._bus = None
-                self._bus = SharedBus(Bus(self.spec))
+                self._bus = SharedBus(Bus(self.spec, self._trace))
             return self._bus
 
     def listen(self, wanted: Callable[[Frame], bool]) -> Ear:
@@ -200,7 +201,7 @@ class CanPort:
             notice(Notice("conflict", f"{rivals.text} {rivals.hint}"))
 
     def _contact(self, node: int, identity: Identity) -> Contact:
-        return Contact(identity, self.link(node), address=node)
+        return Contact(identity, self.link(node), address=node, trace=self._trace)
 
     def _at(
         self, node: int, wanted: Callable[[Identity], bool], notice: NoticeSink, told: set[bytes]

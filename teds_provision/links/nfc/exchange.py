@@ -12,6 +12,7 @@ import errno
 from typing import Any
 
 from teds_provision.links.nfc.library import nfc
+from teds_provision.links.ports import Trace
 
 _MOST_INDEX = 16  # of InCommunicateThru's time-out, 0.1 ms · 2^(n - 1)
 _LATE = 0.1  # seconds beyond the chip's own time-out that nfcpy gives the host command
@@ -19,13 +20,21 @@ _TIMED_OUT = 0x01  # status of the chip: the target has not answered
 
 
 class Frontend(nfc.ContactlessFrontend):  # type: ignore[misc]
-    """A front end that never answers for a target that is gone."""
+    """A front end that never answers for a target that is gone, and writes down what it exchanges."""
+
+    trace: Trace | None = None
 
     def exchange(self, send_data: bytes, timeout: float) -> Any:
         """Exchange one frame; raises nfc.clf.TimeoutError where no target is activated."""
         if self.target is None and self.device is not None:
             raise nfc.clf.TimeoutError("no target is activated")
-        return super().exchange(send_data, timeout)
+        if self.trace is None:
+            return super().exchange(send_data, timeout)
+        self.trace.frame("nfc", "out", bytes(send_data))
+        answer = super().exchange(send_data, timeout)
+        if answer is not None:
+            self.trace.frame("nfc", "in", bytes(answer))
+        return answer
 
     def open(self, path: str) -> bool:
         """Open the device at ``path``, a PN53x with its exchanges slimmed."""

@@ -14,6 +14,7 @@ from teds_provision.links.nfc.library import nfc
 from teds_provision.links.nfc.pcsc import PREFIX, PcscReader, names_if_any
 from teds_provision.links.nfc.tag import FieldLost, ReaderLost, ReaderTag, activate, translated
 from teds_provision.links.nfc.udp import ReaderDevice, address_of, frontend
+from teds_provision.links.ports import Trace
 
 AUTO = "auto"
 _PATH = re.compile(r"usb(:[0-9a-fA-F]{4}(:[0-9a-fA-F]{4})?|:\d{1,3}(:\d{1,3})?)?|(tty|com):[^:]+(:\w+)?")
@@ -24,8 +25,9 @@ _NO_LIBUSB = "usb: paths need the C library libusb, which is not installed."
 class Reader:
     """An opened reader. ``again`` is the path under which it will come back after it was unplugged."""
 
-    def __init__(self, clf: Any, *, again: str, simulated: bool) -> None:
+    def __init__(self, clf: Any, *, again: str, simulated: bool, trace: Trace | None = None) -> None:
         self._clf = clf
+        clf.trace = trace
         self._failures = 0
         self.again = again
         self.name = str(clf.device)
@@ -53,34 +55,34 @@ class Reader:
             self._clf.device = None
 
 
-def open_reader(path: str) -> Reader | PcscReader:
+def open_reader(path: str, trace: Trace | None = None) -> Reader | PcscReader:
     """Open the reader that ``path`` names: ``udp[:host][:port]``, ``pcsc[:READER]`` or any path of nfcpy.
 
     Those are ``usb``, ``usb:072f:2200``, ``tty:USB0:pn532``. ``auto`` is the one USB reader that is there, else the one
     PC/SC reader. Raises NoReader with the cause and its cure, UsageFailure for a path
-    that is none, and where ``auto`` finds several.
+    that is none, and where ``auto`` finds several. Every frame goes to ``trace``.
     """
     if path == AUTO:
         path = _the_only_one()
     if path.partition(":")[0] == PREFIX:
-        return PcscReader(path)
+        return PcscReader(path, trace)
     if path.startswith("udp"):
         device = ReaderDevice(*address_of(path))
-        return Reader(frontend(device, path), again=path, simulated=True)
+        return Reader(frontend(device, path), again=path, simulated=True, trace=trace)
     if not _PATH.fullmatch(path):
         raise UsageFailure(
             f"{path!r} is not the path of a reader.",
             hint="Write auto, usb, usb:072f:2200, tty:USB0:pn532, pcsc or udp:localhost:54321.",
         )
     if path.startswith("usb"):
-        return _open_usb(path)
+        return _open_usb(path, trace)
     try:
-        return Reader(Frontend(path), again=path, simulated=False)
+        return Reader(Frontend(path), again=path, simulated=False, trace=trace)
     except Exception as error:  # nfcpy and pyserial raise anything
         raise _explained(path, error) from error
 
 
-def _open_usb(path: str) -> Reader:
+def _open_usb(path: str, trace: Trace | None) -> Reader:
     """Open the first reader that can be opened, by its full path: a partial one hides why it fails."""
     failure: NoReader | None = None
     for vendor, product, bus, number in _usb_readers(path):
@@ -89,7 +91,7 @@ def _open_usb(path: str) -> Reader:
         except Exception as error:  # noqa: BLE001  (nfcpy's drivers raise anything)
             failure = failure or _explained(f"usb:{vendor:04x}:{product:04x}", error, vendor, product)
             continue
-        return Reader(clf, again=f"usb:{vendor:04x}:{product:04x}", simulated=False)
+        return Reader(clf, again=f"usb:{vendor:04x}:{product:04x}", simulated=False, trace=trace)
     raise failure or NoReader(f"No NFC reader was found on {path}.", hint=_candidates())
 
 

@@ -13,6 +13,7 @@ from typing import Any, Final
 from teds_provision.errors import NoReader, UsageFailure
 from teds_provision.links.nfc.library import Type2TagCommandError, Type4ATag, nfc
 from teds_provision.links.nfc.tag import FieldLost, ReaderLost, ReaderTag, Type2, Type4Ndef
+from teds_provision.links.ports import Trace
 
 PREFIX: Final = "pcsc"
 _STORAGE_CARD: Final = bytes.fromhex("A000000306")
@@ -70,7 +71,8 @@ def contactless(found: list[str]) -> list[str]:
 class PcscReader:
     """An opened PC/SC reader, as ``links.nfc.frontend.Reader``; ``path`` is ``pcsc``, or ``pcsc:PART OF A NAME``."""
 
-    def __init__(self, path: str) -> None:
+    def __init__(self, path: str, trace: Trace | None = None) -> None:
+        self._trace = trace
         self._scard = _scard()
         self.name = _chosen(path.partition(":")[2])
         self.again = f"{PREFIX}:{self.name}"
@@ -93,7 +95,7 @@ class PcscReader:
             raise ReaderLost("another program holds it")
         if result != scard.SCARD_S_SUCCESS:
             return None
-        self._card = card = _Card(scard, handle, protocol)
+        self._card = card = _Card(scard, handle, protocol, self._trace)
         try:
             return _tag(card)
         except FieldLost:
@@ -159,8 +161,8 @@ class _Target:
 class _Card:
     """A connected card; stands where nfcpy's tags have their front end."""
 
-    def __init__(self, scard: Any, handle: Any, protocol: int) -> None:
-        self._scard = scard
+    def __init__(self, scard: Any, handle: Any, protocol: int, trace: Trace | None) -> None:
+        self._scard, self._trace = scard, trace
         self.handle, self._protocol = handle, protocol
         self.target: _Target | None = None
 
@@ -174,11 +176,15 @@ class _Card:
 
     def transmit(self, apdu: bytes) -> bytes:
         """Exchange one APDU, status word last; raises FieldLost, ReaderLost."""
+        if self._trace is not None:
+            self._trace.frame("pcsc", "out", apdu)
         result, answer = self._scard.SCardTransmit(self.handle, self._protocol, list(apdu))
         if result in _gone(self._scard):
             raise ReaderLost(_said(self._scard, result))
         if result != self._scard.SCARD_S_SUCCESS or len(answer) < 2:
             raise FieldLost
+        if self._trace is not None:
+            self._trace.frame("pcsc", "in", bytes(answer))
         return bytes(answer)
 
 

@@ -16,7 +16,7 @@ from teds_provision.links.nfc.pcsc import PcscReader
 from teds_provision.links.nfc.poller import Poller
 from teds_provision.links.nfc.tag import FieldLost, ReaderLost
 from teds_provision.links.nfc.visit import Foreign, Visit, look
-from teds_provision.links.ports import NFC, Capabilities, Contact, Notice, NoticeSink
+from teds_provision.links.ports import NFC, Capabilities, Contact, Notice, NoticeSink, Trace
 from teds_provision.protocol.messages.identity import Identity
 
 REPEATS = 2  # of one transaction
@@ -29,12 +29,12 @@ _DEBOUNCE = 0.7  # seconds: the same node back within them was never away
 _LOOK_AGAIN = 1.0  # seconds until a tag that was not wanted is read anew
 
 
-def open_port(where: str) -> NfcPort:
+def open_port(where: str, trace: Trace | None = None) -> NfcPort:
     """Open the reader that ``where`` names, as ``--nfc`` does; empty or ``auto``: the one that is there.
 
     Raises NoReader, UsageFailure.
     """
-    return NfcPort(where or AUTO)
+    return NfcPort(where or AUTO, trace)
 
 
 class NfcPort:
@@ -44,8 +44,9 @@ class NfcPort:
     UsageFailure where ``auto`` finds several.
     """
 
-    def __init__(self, path: str) -> None:
-        self._reader: Reader | PcscReader | None = open_reader(path)
+    def __init__(self, path: str, trace: Trace | None = None) -> None:
+        self.trace = trace
+        self._reader: Reader | PcscReader | None = open_reader(path, trace)
         self._again = self._reader.again
         self._named = f" ({self._reader.name} at {self._again})" if path == AUTO else ""
         self.place = f"nfc:{self._again}"
@@ -132,7 +133,7 @@ class NfcPort:
             if not same:
                 here = seen.identity.uuid
                 link = NfcLink(self, seen, notice)
-                yield _contact(seen, link)
+                yield _contact(seen, link, self.trace)
                 link.close()
                 seen = link.visit
             if link is not None and link.lost:  # whoever comes next is a new visit, the same node too
@@ -177,21 +178,21 @@ class NfcPort:
         """Open the reader again after it failed; raises NoReader when it is gone."""
         with self.turn:
             if self._reader is None:
-                self._reader = open_reader(self._again)
+                self._reader = open_reader(self._again, self.trace)
 
     def lose_reader(self) -> None:
         """Close a reader that failed, so that the next look opens it again."""
         self.close()
 
     def _contact(self, visit: Visit, notice: NoticeSink) -> Contact:
-        return _contact(visit, NfcLink(self, visit, notice))
+        return _contact(visit, NfcLink(self, visit, notice), self.trace)
 
     def _look(self, notice: NoticeSink, stop: threading.Event) -> Visit | Foreign | None:
         """Poll once; None when nothing lies there or the reader is away (which is told once)."""
         try:
             with self.turn:
                 if self._reader is None:
-                    self._reader = open_reader(self._again)
+                    self._reader = open_reader(self._again, self.trace)
                 if self._lost:
                     self._lost = False
                     notice(Notice("reader-ready", f"The reader is back: {self._reader.name}."))
@@ -320,8 +321,8 @@ class NfcLink:
             self._poller = None
 
 
-def _contact(visit: Visit, link: NfcLink) -> Contact:
-    return Contact(visit.identity, link, visit.tag.uid, charging=visit.charging, ble=visit.ble)
+def _contact(visit: Visit, link: NfcLink, trace: Trace | None) -> Contact:
+    return Contact(visit.identity, link, visit.tag.uid, charging=visit.charging, ble=visit.ble, trace=trace)
 
 
 def _tell(seen: Visit | Foreign, told: str, notice: NoticeSink) -> str:

@@ -1,0 +1,68 @@
+"""``trace show``: what a link carried, a line for each frame and message."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from datetime import datetime
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import click
+
+from teds_provision.cli.context import App, pass_app
+from teds_provision.cli.options import COMMAND_SETTINGS, examples
+from teds_provision.cli.rendering import print_json_list
+from teds_provision.harmless import harmless
+from teds_provision.lazy import late
+
+if TYPE_CHECKING:
+    from teds_provision.trace import reading
+    from teds_provision.trace.record import Record
+else:  # the help of this command does without
+    reading = late("teds_provision.trace.reading")
+
+_ARROWS = {"out": ">", "in": "<"}
+_SHOWN = 24
+"""Octets of a line, unless --whole."""
+
+
+@click.group(context_settings=COMMAND_SETTINGS, epilog=examples("teds-provision trace show bench.trace"))
+def trace() -> None:
+    """What --trace FILE wrote: every frame and message of a link. docs/trace.md says what stands in the file."""
+
+
+@trace.command(
+    context_settings=COMMAND_SETTINGS,
+    short_help="Show a trace in words.",
+    epilog=examples(
+        "teds-provision trace show bench.trace",
+        "teds-provision trace show bench.pcapng --messages",
+        "teds-provision --json trace show bench.trace",
+    ),
+)
+@click.argument("file", type=click.Path(path_type=Path))
+@click.option("--messages", is_flag=True, help="Only whole commands and replies, not the frames that carried them.")
+@click.option("--whole", is_flag=True, help="Show all octets of each, not the first 24.")
+@pass_app
+def show(app: App, file: Path, messages: bool, whole: bool) -> None:
+    """Show each frame and message of FILE with time, direction and meaning; what was sealed is shown opened.
+
+    FILE is what --trace wrote, in either form, or another program's pcapng of a CAN bus. Exit 8 where it is no trace.
+    """
+    records = (record for record in reading.read_trace(file) if not messages or record.layer == "message")
+    if app.json:
+        print_json_list("frames", (record.as_json() for record in records))
+        return
+    app.emit({}, "\n".join(_lines(records, whole=whole)) or "Nothing went over the link.")
+
+
+def _lines(records: Iterator[Record], *, whole: bool) -> Iterator[str]:
+    for record in records:
+        moment = datetime.fromtimestamp(record.time).astimezone().strftime("%H:%M:%S.%f")[:-3]
+        seal = "  sealed" if record.sealed else ""
+        shown = record.opened if record.opened is not None else record.octets
+        where = f"{record.identifier:08x} " if record.identifier is not None else ""
+        mark = "  " if record.layer == "frame" else ""
+        octets = shown.hex() if whole or len(shown) <= _SHOWN else f"{shown[:_SHOWN].hex()}…"
+        head = f"{moment} {record.link:4} {_ARROWS[record.direction]} {mark}"
+        yield harmless(f"{head}{record.command}{seal}  {where}{octets}".rstrip())

@@ -1,0 +1,106 @@
+"""Writing a trace while commands talk: each record reaches the file at once, and a full disk harms no command."""
+
+from __future__ import annotations
+
+import os
+import threading
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+from teds_provision.errors import NotFound, StoreFailure
+from teds_provision.files import PRIVATE, require_new
+from teds_provision.links.ports import Direction
+from teds_provision.trace import lines, pcapng
+from teds_provision.trace.can_words import can_words
+from teds_provision.trace.nfc_words import nfc_words
+from teds_provision.trace.record import Record
+
+PCAPNG = ".pcapng"
+
+
+def open_trace(path: Path, tell: Callable[[str], None]) -> Recorder:
+    """Make the file of a trace, mode 0600, never over another one; ``tell`` hears of a disk that takes no more.
+
+    Raises UsageFailure where something lies at ``path``, NotFound where its folder is missing, else StoreFailure.
+    """
+    require_new(path)
+    try:
+        descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW | os.O_CLOEXEC, PRIVATE)
+    except FileNotFoundError:
+        raise NotFound(f"There is no folder {path.parent}.") from None
+    except OSError as error:
+        raise StoreFailure(
+            f"The trace {path} cannot be written: {error.strerror}.", hint="Name another file with --trace."
+        ) from error
+    return Recorder(path, descriptor, tell)
+
+
+class Recorder:
+    """An open trace; see ``links.ports.Trace``. Thread-safe. ``failure`` is why it is not whole, "" where it is."""
+
+    def __init__(self, path: Path, descriptor: int, tell: Callable[[str], None]) -> None:
+        self.path, self.failure = path, ""
+        self._descriptor, self._tell = descriptor, tell
+        self._lock = threading.Lock()
+        form = pcapng if path.suffix == PCAPNG else lines
+        self._encode = pcapng.block if form is pcapng else lines.line
+        self._write(form.head())
+
+    def frame(
+        self,
+        link: str,
+        direction: Direction,
+        octets: bytes,
+        *,
+        identifier: int | None = None,
+        fd: bool = False,
+        at: float | None = None,
+    ) -> None:
+        """A frame as the link carried it; ``at`` is its arrival in seconds of ``time.monotonic()``, None for now."""
+        moment = time.time() - (0.0 if at is None else time.monotonic() - at)
+        words = can_words(identifier, octets) if identifier is not None else ""
+        words = nfc_words(octets, direction) if link in ("nfc", "pcsc") else words
+        self._put(Record(moment, direction, link, "frame", octets, words, identifier=identifier, fd=fd))
+
+    def message(
+        self,
+        link: str,
+        direction: Direction,
+        octets: bytes,
+        words: str,
+        *,
+        uuid: bytes,
+        sealed: bool = False,
+        opened: bytes | None = None,
+    ) -> None:
+        """A whole command or reply, with what it says in words, and its plain form where it was sealed."""
+        told = f"{words}, not opened" if sealed and opened is None else words
+        self._put(
+            Record(time.time(), direction, link, "message", octets, told, opened=opened, sealed=sealed, uuid=uuid.hex())
+        )
+
+    def close(self) -> None:
+        """End the trace; never raises."""
+        with self._lock:
+            if self._descriptor >= 0:
+                os.close(self._descriptor)
+                self._descriptor = -1
+
+    def _put(self, record: Record) -> None:
+        if not self.failure:
+            self._write(self._encode(record))
+
+    def _write(self, octets: bytes) -> None:
+        """Write whole; what a disk does not take ends the trace, not the command that is traced."""
+        with self._lock:
+            if self._descriptor < 0 or self.failure:
+                return
+            try:
+                rest = memoryview(octets)
+                while rest:
+                    rest = rest[os.write(self._descriptor, rest) :]
+                return
+            except OSError as error:
+                self.failure = error.strerror or "it failed"
+        self._tell(f"The trace {self.path} ends here: {self.failure}. The command goes on.")
