@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime, timedelta
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Final
 
 from teds_provision.errors import NoKeyring, VaultFailure, WrongPassphrase
 from teds_provision.station.identity import Identity
@@ -22,6 +22,7 @@ MAX_PENDING = 8
 
 _FEW = 20
 """So many nodes are looked up one by one; for more the table of marks is read once."""
+_NO_MARKS: Final = Marks()
 
 RESTORED = "restored from a backup"
 """Begins the reason of a rotation that needs a tap or a person's word: nobody knows who else has that key by now."""
@@ -235,12 +236,14 @@ class NodeKeys:
         own = self._identity.ca
         wanted: dict[bytes, Marks] = {}
         for uuid, change in changes.items():
-            before = present.get(uuid, Marks())
-            after = replace(before, **change)
-            if after.ca == own:
-                after = replace(after, ca=None, ca_mac=None)
-            elif after.ca is not None and after.ca != before.ca:
-                after = replace(after, ca_mac=self._seals.ca(uuid, after.ca))
+            before = present.get(uuid, _NO_MARKS)
+            ca = change.get("ca", before.ca)
+            sealed: dict[str, bytes | None] = {}
+            if ca == own:
+                sealed = {"ca": None, "ca_mac": None}
+            elif ca is not None and ca != before.ca:
+                sealed = {"ca_mac": self._seals.ca(uuid, ca)}
+            after = replace(before, **{**change, **sealed})
             if after != before:
                 wanted[uuid] = after
         if wanted:
