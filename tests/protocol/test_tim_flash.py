@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from teds_provision.protocol.keys import GROUP_ORDER, SoftwareKey, station_key_message
+from teds_provision.protocol.keys import GROUP_ORDER, SoftwareKey, station_key_message, verify
 from teds_provision.protocol.messages.frames import (
     Attribute,
     Function,
@@ -22,11 +22,12 @@ from teds_provision.protocol.messages.frames import (
     update_teds,
     write_teds,
 )
+from teds_provision.protocol.tim.node import Tim
 from teds_provision.teds.codec import security
 from teds_provision.teds.codec.frame import frame
 from teds_provision.teds.image import SECURITY
 
-from .desk import CA, META, NAME, STATION, UUID, Desk, digest
+from .desk import CA, META, NAME, NODE, STATION, UUID, Desk, digest
 from .memory import PowerCut
 
 BLOCKS = {(0, 1): META, (1, 12): NAME}
@@ -148,6 +149,23 @@ def test_a_good_commit_answers_like_query_and_can_be_read_back(desk: Desk) -> No
     assert read(desk, 0, 1) == META
     assert read(desk, 1, 12) == NAME
     assert security.decode(read(desk, 0, 128)).sequence == 1
+
+
+def test_the_chip_of_the_node_checks_both_signatures_of_every_commit() -> None:
+    """104 and 100, by the node's own ``verify``: what a slow chip costs is told by it."""
+    asked: list[bytes] = []
+
+    def chip(point: bytes, message: bytes, signature: bytes) -> bool:
+        asked.append(point)
+        return verify(point, message, signature)
+
+    desk = Desk()
+    desk.tim = Tim(NODE, desk.memory, lambda: desk.now, max_message=desk.max_message, verify=chip)
+    desk.agree().open()
+    del asked[:]
+    assert desk.commit(BLOCKS).ok
+    assert desk.commit({(0, 1): META}).ok
+    assert asked == [CA.point, STATION.point] * 2
 
 
 def test_a_stored_block_that_is_not_listed_is_removed(desk: Desk) -> None:
