@@ -4,21 +4,21 @@ from __future__ import annotations
 
 import sys
 
+from teds_provision import __version__
+
 
 def main() -> None:
     """Run the command line and exit with the codes of the contract."""
     if sys.argv[1:] == ["--version"] and sys.stdout is not None:
-        from teds_provision import __version__
-
         print(f"teds-provision {__version__}")
         return
     try:
-        from teds_provision.cli.main import run, wants_json
-        from teds_provision.cli.stdout import ended, guard
+        from teds_provision.cli import main as command_line  # here, so that Ctrl-C while Python imports it is caught
+        from teds_provision.cli import stdout
 
-        output = guard()
-        code = run(sys.argv[1:])
-        sys.exit(ended(code, output, as_json=wants_json(sys.argv[1:])))
+        output = stdout.guard()
+        code = command_line.run(sys.argv[1:])
+        sys.exit(stdout.ended(code, output, as_json=command_line.wants_json(sys.argv[1:])))
     except KeyboardInterrupt:  # while Python was still importing, or already leaving
         sys.exit(130)
 

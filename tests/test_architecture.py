@@ -205,6 +205,30 @@ _MORE_ACTS = {"write": 1, "verify_files": 2, "whitelist": 9}
 _ROOMS_THAT_ACT = ("steps", "talk", "links", "handover", "backup")
 
 
+def room_of_name(dotted: str) -> str:
+    return dotted.split(".")[1] if dotted.count(".") else ""
+
+
+def named(tree: ast.Module) -> Iterator[tuple[str, str]]:
+    """What is named of our modules, as (module, name): imported by name, or reached through its room."""
+    rooms: dict[str, str] = {}
+    for node in ast.walk(tree):
+        if isinstance(node, ast.ImportFrom) and node.module and node.module.startswith("teds_provision"):
+            for alias in node.names:
+                full = f"{node.module}.{alias.name}"
+                file = file_of(full)
+                if file and file.stem == "__init__" and file.parent.name == alias.name:
+                    rooms[alias.asname or alias.name] = full
+                else:
+                    yield node.module, alias.name
+    for node in ast.walk(tree):
+        words = ast.unparse(node).split(".") if isinstance(node, ast.Attribute) else []
+        if words and words[0] in rooms and file_of(".".join([rooms[words[0]], *words[1:-1]])):
+            module, file = ".".join([rooms[words[0]], *words[1:-1]]), file_of(".".join([rooms[words[0]], *words[1:]]))
+            if file and file.stem == module.split(".")[-1]:
+                yield module, words[-1]
+
+
 def test_a_command_at_a_node_is_one_call_of_one_step() -> None:
     """The modules of ``cli/steps`` take one function for each command; meetings, sessions and locks are not theirs."""
     for path in sorted((PACKAGE / "cli" / "steps").glob("*.py")):
@@ -214,9 +238,9 @@ def test_a_command_at_a_node_is_one_call_of_one_step() -> None:
             for node in ast.walk(tree)
         )
         acts = {
-            (module, name)
-            for module, _, name in (full.removeprefix("teds_provision.").rpartition(".") for full, _ in imports(tree))
-            if module.split(".")[0] in _ROOMS_THAT_ACT and name[0].islower()
+            (module.removeprefix("teds_provision."), name)
+            for module, name in named(tree)
+            if room_of_name(module) in _ROOMS_THAT_ACT and name[0].islower()
         }
         assert len(acts) <= commands + _MORE_ACTS.get(path.stem, 0), f"{path.name}: {sorted(acts)}"
         assert not {module for module, _ in acts if module.split(".")[0] in ("talk", "links")}, path.name

@@ -13,7 +13,6 @@ from difflib import get_close_matches
 from pathlib import Path
 from typing import Any, Final
 
-from teds_provision.cli.context import App
 from teds_provision.cli.option_names import OPTIONS
 from teds_provision.cli.table import COMMANDS, GROUPS
 from teds_provision.errors import BadData
@@ -59,9 +58,18 @@ def as_parameters(values: dict[str, Any]) -> dict[str, Any]:
     }
 
 
+def home_of(home: Path | None) -> Path:
+    """Folder of the store: the option's, else the platform's user data folder."""
+    if home is not None:
+        return home.expanduser()
+    from platformdirs import user_data_path
+
+    return user_data_path("teds-provision")
+
+
 def config_path(home: Path | None) -> Path:
     """Where the file of a home lies."""
-    return App.home_of(home) / "config.toml"
+    return home_of(home) / "config.toml"
 
 
 def read_config(path: Path) -> dict[str, Any] | None:

@@ -12,6 +12,10 @@ from typing import TYPE_CHECKING, Any, ClassVar, TextIO
 
 import click
 
+from teds_provision import station as station_room
+from teds_provision import vault
+from teds_provision.cli import terminal
+from teds_provision.cli.configuration import home_of
 from teds_provision.errors import PolicyRefused, StoreFailure, TedsProvisionError, UsageFailure, WrongPassphrase
 from teds_provision.harmless import harmless, harmless_json
 
@@ -37,7 +41,7 @@ class App:
         no_input: bool = False,
         passphrase_fd: int | None = None,
     ) -> None:
-        self.home = self.home_of(home)
+        self.home = home_of(home)
         self.json, self.verbose, self.quiet, self.debug = as_json, verbose, quiet, debug
         self.no_input = no_input or as_json
         self._passphrase_fd = passphrase_fd
@@ -48,15 +52,6 @@ class App:
         if verbose or debug:
             _log_to_stderr(logging_level=10 if debug or verbose > 1 else 20, libraries=debug)
         App.current = self
-
-    @staticmethod
-    def home_of(home: Path | None) -> Path:
-        """Folder of the store: the option's, else the platform's user data folder."""
-        if home is not None:
-            return home.expanduser()
-        from platformdirs import user_data_path
-
-        return user_data_path("teds-provision")
 
     # -- telling ---------------------------------------------------------------------------------------------------
 
@@ -108,10 +103,8 @@ class App:
 
     def console(self, *, stderr: bool = False) -> Console:
         """Return a rich console; colour yields to NO_COLOR and to a pipe, long lines are not broken in a pipe."""
-        from teds_provision.cli.console import CleanConsole
-
         stream = sys.stderr if stderr else sys.stdout
-        return CleanConsole(stderr=stderr, highlight=False, soft_wrap=not stream.isatty())
+        return terminal.console.CleanConsole(stderr=stderr, highlight=False, soft_wrap=not stream.isatty())
 
     def note(self, text: str, *, level: int = 0) -> None:
         """Say something on stderr, unless --quiet (or fewer ``-v`` than ``level``); not with --json."""
@@ -174,9 +167,7 @@ class App:
 
     def ask_secret(self, prompt: str, confirm: bool = False) -> str:
         """Get a passphrase or PIN: from --passphrase-fd (one line, read once), else from the terminal."""
-        from teds_provision.vault.hardening import harden  # with the vault comes cryptography, which lists do without
-
-        harden()
+        vault.hardening.harden()
         if self._passphrase_fd is not None:
             if self._passphrase is None:
                 self._passphrase = read_line(self._passphrase_fd)
@@ -205,9 +196,7 @@ class App:
 
     def station(self) -> Station:
         """Open this base station (store now, vault when a key is first needed); NotFound says to run init."""
-        from teds_provision.station.station import Station
-
-        station = Station.open(self.home, ask=self.ask_secret, tell=self.warn)
+        station = station_room.station.Station.open(self.home, ask=self.ask_secret, tell=self.warn)
         station.notice = self.note
         self.closing(station.close)
         return station

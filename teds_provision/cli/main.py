@@ -15,6 +15,7 @@ from typing import Any, ClassVar, Final
 import click
 
 from teds_provision import __version__
+from teds_provision.cli import terminal
 from teds_provision.cli.configuration import PARAMETERS, Defaults, as_parameters, config_path, read_config
 from teds_provision.cli.context import App, nowhere
 from teds_provision.cli.globals import in_front
@@ -191,9 +192,7 @@ def _complete(instruction: str) -> int:
     """Answer a shell that completes a command line (``bash_source``, ``bash_complete``, zsh, fish alike)."""
     from click.shell_completion import shell_complete
 
-    from teds_provision.cli.completing import teach
-
-    LazyGroup.teachers.append(teach)
+    LazyGroup.teachers.append(terminal.completing.teach)
     return shell_complete(cli, {}, "teds-provision", _COMPLETE, instruction)
 
 

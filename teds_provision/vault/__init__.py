@@ -1,6 +1,29 @@
 """Where a station's secrets lie: the keyring of the operating system, a PKCS #11 token, or a passphrase file."""
 
-from teds_provision.vault.base import Ask, Vault, node_key_context
-from teds_provision.vault.choose import create_vault, forget_vaults, open_vault
+from typing import TYPE_CHECKING
+
+from teds_provision.lazy import lazy
+
+if TYPE_CHECKING:
+    from teds_provision.vault import (
+        ca_file,
+        file_vault,
+        hardening,
+        keyring_vault,
+        passphrase,
+        pkcs11,
+        pkcs11_token,
+        pkcs11_uri,
+    )
+    from teds_provision.vault.base import Ask, Vault, node_key_context
+    from teds_provision.vault.choose import create_vault, forget_vaults, open_vault
+else:
+    __getattr__ = lazy(
+        __name__,
+        {
+            **dict.fromkeys(("Ask", "Vault", "node_key_context"), "base"),
+            **dict.fromkeys(("create_vault", "forget_vaults", "open_vault"), "choose"),
+        },
+    )
 
 __all__ = ["Ask", "Vault", "create_vault", "forget_vaults", "node_key_context", "open_vault"]

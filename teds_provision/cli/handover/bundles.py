@@ -8,9 +8,12 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import click
 
+from teds_provision import handover, protocol
 from teds_provision.cli.context import App, pass_app
 from teds_provision.cli.options import command, dry_run_option, link_options, yes_option
+from teds_provision.cli.rendering import reporter_for
 from teds_provision.errors import BadData, PolicyRefused
+from teds_provision.files import read_limited, require_new, write_new
 from teds_provision.links import LinkSettings
 
 if TYPE_CHECKING:
@@ -73,18 +76,15 @@ def export_keys(
     it ("handover receipt"); before that "handover undo" takes it back. More nodes than one bundle holds go into FILE,
     FILE.2 and so on, each with a receipt of its own.
     """
-    from teds_provision.handover.export_keys import export_all, outputs_of, plan_exports
-    from teds_provision.handover.selection import ExportOrder
-
     if everything == bool(uuids):
         raise click.UsageError("Name the nodes, or say --all.")
     station = app.station()
     nodes = None if everything else tuple(station.nodes.resolve(uuid) for uuid in uuids)
-    order = ExportOrder(receivers, nodes, mode, expires, ca)
+    order = handover.selection.ExportOrder(receivers, nodes, mode, expires, ca)
     if not dry_run:
         station.unlock()
-    shown = plan_exports(station, order)
-    outputs = outputs_of(output, len(shown))
+    shown = handover.export_keys.plan_exports(station, order)
+    outputs = handover.export_keys.outputs_of(output, len(shown))
     if dry_run:
         told = _exported(shown, outputs, station)
         id_ = None if shown[0].earlier is None else shown[0].id
@@ -94,10 +94,10 @@ def export_keys(
     app.note(_plan_text(shown, station))
     app.confirm(f"{mode.capitalize()} {_count(shown)}?", yes=yes)
     with station.lock("export-keys", app.note):
-        plans = shown if station.version() == state else plan_exports(station, order)
+        plans = shown if station.version() == state else handover.export_keys.plan_exports(station, order)
         _require_same([plan.content for plan in plans] == [plan.content for plan in shown])
         told = _exported(plans, outputs, station)
-        done = export_all(station, plans, outputs)
+        done = handover.export_keys.export_all(station, plans, outputs)
     for bundle, one in zip(told["bundles"], done, strict=True):
         bundle |= {"sha256": one.sha256, "octets": one.octets, "fresh": one.fresh}
     fresh = any(one.fresh for one in done)
@@ -133,9 +133,6 @@ def _exported(plans: Sequence[ExportPlan], outputs: Sequence[Path], station: Sta
 
 
 def _plan_text(plans: Sequence[ExportPlan], station: Station) -> str:
-    from teds_provision.handover.pending import peer_name
-    from teds_provision.handover.trust import spoken
-
     plan, chosen = plans[0], [one for part in plans for one in part.nodes]
     lines = [f"{plan.mode.capitalize()} {_count(plans)}, to be imported by {plan.expires:%Y-%m-%d %H:%M} UTC"]
     lines += [f"  in {len(plans)} bundles"] if len(plans) > 1 else []
@@ -143,11 +140,11 @@ def _plan_text(plans: Sequence[ExportPlan], station: Station) -> str:
     lines += [f"  … and {len(chosen) - 20} more"] if len(chosen) > 20 else []
     lines += [f"  not {uuid.hex()}: {why}" for uuid, why in plan.skipped]
     if plan.also_held_by:
-        names = ", ".join(peer_name(station, digits) for digits in plan.also_held_by)
+        names = ", ".join(handover.pending.peer_name(station, digits) for digits in plan.also_held_by)
         lines.append(f"  also held, by an earlier copy, by {names}: until the keys are rotated")
     lines.append("For comparison by voice:")
-    lines += [f"  to   {record.name}\n       {spoken(record.fingerprint)}" for record in plan.receivers]
-    lines.append(f"  from {station.name}\n       {spoken(station.fingerprint)}")
+    lines += [f"  to   {record.name}\n       {handover.trust.spoken(record.fingerprint)}" for record in plan.receivers]
+    lines.append(f"  from {station.name}\n       {handover.trust.spoken(station.fingerprint)}")
     return "\n".join([*lines, _MEANS[plan.mode]])
 
 
@@ -183,36 +180,31 @@ def import_keys(
     A node counts as taken over when it opened a session here; after a move its key is rotated in it, and only then is
     the sender locked out. The same bundle again changes nothing and gives the same receipt.
     """
-    from teds_provision.files import read_limited
-    from teds_provision.handover.import_keys import Imported, plan_import
-    from teds_provision.handover.import_keys import import_keys as run
-    from teds_provision.protocol.handover.bundle import MAX_BUNDLE_OCTETS
-
     app = ctx.find_object(App)
     assert app is not None
     station = app.station()
     receipt = receipt or file.with_name(file.name + ".receipt")
-    octets = read_limited(file, MAX_BUNDLE_OCTETS, "bundle")
+    octets = read_limited(file, protocol.handover.bundle.MAX_BUNDLE_OCTETS, "bundle")
     if octets.lstrip()[:1] != b"{" or b'"ciphertext"' not in octets:
         raise BadData(f"{file} is no handover bundle.", hint="Give the file that export-keys wrote.")
     station.unlock()
-    shown = plan_import(station, octets)
+    shown = handover.import_keys.plan_import(station, octets)
     state = station.version()
     told, text = _import_plan(station, shown)
     if dry_run:
         app.emit({**told, "receipt": None, "plan": True}, text)
         return
-    if not isinstance(shown, Imported):
+    if not isinstance(shown, handover.import_keys.Imported):
         _require_receipt_place(receipt)
         app.note(text)
         app.confirm(f"Take {count_of(len(shown.taken))} in?", yes=yes)
     with station.lock("import-keys", app.note):
-        plan = shown if station.version() == state else plan_import(station, octets)
-        if isinstance(plan, Imported):
+        plan = shown if station.version() == state else handover.import_keys.plan_import(station, octets)
+        if isinstance(plan, handover.import_keys.Imported):
             done = plan
         else:
-            _require_same(not isinstance(shown, Imported) and plan.nodes == shown.nodes)
-            done = run(station, plan)
+            _require_same(not isinstance(shown, handover.import_keys.Imported) and plan.nodes == shown.nodes)
+            done = handover.import_keys.import_keys(station, plan)
         _write_receipt(receipt, done.receipt)
     given = any(ctx.get_parameter_source(name) != click.core.ParameterSource.DEFAULT for name in _LINK_OPTIONS)
     outcomes = _prove(app, station, done, links) if (given if prove is None else prove) else []
@@ -229,11 +221,7 @@ def _require_same(same: bool) -> None:
 
 def _import_plan(station: Station, plan: ImportPlan | Imported) -> tuple[dict[str, Any], str]:
     """The result as far as it is known before anything happens, and the plan for people."""
-    from teds_provision.handover.import_keys import Imported
-    from teds_provision.handover.pending import peer_name
-    from teds_provision.handover.trust import spoken
-
-    if isinstance(plan, Imported):
+    if isinstance(plan, handover.import_keys.Imported):
         sender, mode, handover_id = plan.row.peers[0], plan.row.mode, plan.row.id
         nodes = [{"uuid": uuid.hex(), "decision": "same", "why": ""} for uuid in plan.uuids]
         nodes += [{"uuid": uuid, "decision": "refused", "why": why} for uuid, why in plan.notes.refused]
@@ -246,17 +234,18 @@ def _import_plan(station: Station, plan: ImportPlan | Imported) -> tuple[dict[st
     notes = {one.node.uuid.hex(): list(one.notes) for one in plan.nodes if one.notes}
     passed_over = [{"uuid": one.uuid.hex(), "why": why} for one, why in plan.passed_over]
     told |= {"notes": notes, "revocations_passed_over": passed_over}
-    lines = [f"A {bundle.mode} of {count_of(len(nodes))} from {peer_name(station, bundle.sender)}"]
+    lines = [f"A {bundle.mode} of {count_of(len(nodes))} from {handover.pending.peer_name(station, bundle.sender)}"]
     lines += [f"  {node['decision']:<8} {node['uuid']}  {node['why']}".rstrip() for node in nodes[:40]]
     lines += [f"  … and {len(nodes) - 40} more"] if len(nodes) > 40 else []
     lines += [f"  {uuid}: {note}" for uuid, said in [*notes.items()][:40] for note in said]
     lines += [f"  revoked  {one['uuid']}  {one['why']}" for one in denied]
     lines += [f"  its ban of {one['uuid']} does not count: {one['why']}" for one in passed_over]
-    lines += [f"For comparison by voice:\n  from {spoken(bundle.sender)}\n  to   {spoken(station.fingerprint)}"]
+    own, sender = handover.trust.spoken(station.fingerprint), handover.trust.spoken(bundle.sender)
+    lines += [f"For comparison by voice:\n  from {sender}\n  to   {own}"]
     if not plan.ca_is_known:
-        from teds_provision.protocol.keys import fingerprint
-
-        lines.append(f"The CA {fingerprint(bundle.ca)[:32]} will be trusted for these nodes, and for no others.")
+        lines.append(
+            f"The CA {protocol.keys.fingerprint(bundle.ca)[:32]} will be trusted for these nodes, and for no others."
+        )
     lines.append(
         "A copy: the sender keeps the same keys, and either can pose as a node to the other."
         if bundle.mode == "copy"
@@ -281,31 +270,24 @@ def _import_result(
 
 
 def _require_receipt_place(receipt: Path) -> None:
-    from teds_provision.files import require_new
-
     require_new(receipt)
 
 
 def _write_receipt(receipt: Path, octets: bytes) -> None:
-    from teds_provision.files import write_new
-
     if not (receipt.is_file() and receipt.read_bytes().strip() == octets):
         write_new(receipt, octets + b"\n")
 
 
 def _prove(app: App, station: Station, done: Imported, links: LinkSettings) -> list[dict[str, Any]]:
-    from teds_provision.cli.rendering import reporter_for
-    from teds_provision.handover.prove import Proven, is_proven, prove_nodes
-
-    waiting = [uuid for uuid in done.uuids if not is_proven(station, uuid)]
+    waiting = [uuid for uuid in done.uuids if not handover.prove.is_proven(station, uuid)]
 
     def hold() -> AbstractContextManager[None]:
         return station.lock("import-keys", app.note)
 
-    outcomes = prove_nodes(station, links, waiting, reporter_for(app), hold=hold) if waiting else []
+    outcomes = handover.prove.prove_nodes(station, links, waiting, reporter_for(app), hold=hold) if waiting else []
     return [
         {"uuid": one.uuid.hex(), "rotated": one.rotated, "why": ""}
-        if isinstance(one, Proven)
+        if isinstance(one, handover.prove.Proven)
         else {"uuid": one.uuid.hex(), "rotated": False, "why": one.why}
         for one in outcomes
     ]
@@ -314,9 +296,7 @@ def _prove(app: App, station: Station, done: Imported, links: LinkSettings) -> l
 def _tell_import(
     app: App, station: Station, done: Imported, receipt: Path, told: dict[str, Any], outcomes: list[dict[str, Any]]
 ) -> None:
-    from teds_provision.handover.prove import is_proven
-
-    proven = [uuid.hex() for uuid in done.uuids if is_proven(station, uuid)]
+    proven = [uuid.hex() for uuid in done.uuids if handover.prove.is_proven(station, uuid)]
     pending = [uuid.hex() for uuid in done.uuids if uuid.hex() not in set(proven)]
     not_met = {one["uuid"]: one["why"] for one in outcomes if one["why"]}
     told |= {"receipt": str(receipt), "fresh": done.fresh, "proven": proven, "pending": pending, "not_proven": not_met}

@@ -6,8 +6,11 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from teds_provision import handover, steps, talk
 from teds_provision.cli.context import App, pass_app
 from teds_provision.cli.options import command, dry_run_option, link_options, yes_option
+from teds_provision.cli.rendering import reporter_for
+from teds_provision.errors import LinkFailure, PolicyRefused
 from teds_provision.links import LinkSettings
 
 if TYPE_CHECKING:
@@ -30,8 +33,6 @@ def revoke(app: App, uuid: str, why: str | None, lift: bool, yes: bool, dry_run:
     Stations that trust this one and know the node honour it when they import. --lift takes a ban back at this station,
     also one that another station made; deleted keys do not come back.
     """
-    from teds_provision.handover.life import revoke as run
-
     if lift == (why is not None):
         raise click.UsageError("Say --why TEXT to revoke, or --lift alone to take it back.")
     station = app.station()
@@ -50,7 +51,7 @@ def revoke(app: App, uuid: str, why: str | None, lift: bool, yes: bool, dry_run:
     if station.policy.revocation(octets) is None:
         app.confirm(f"Revoke node {octets.hex()}? Its keys are deleted here.", yes=yes)
     with station.lock("revoke", app.note):
-        done = run(station, octets, why)
+        done = handover.life.revoke(station, octets, why)
     told = {
         "uuid": octets.hex(),
         "fingerprint": done.entry.fingerprint,
@@ -62,8 +63,6 @@ def revoke(app: App, uuid: str, why: str | None, lift: bool, yes: bool, dry_run:
 
 
 def _lift(app: App, station: Station, uuid: bytes, *, yes: bool, dry_run: bool) -> None:
-    from teds_provision.handover.deny import lift as run
-
     entry = station.policy.revocation(uuid)
     told: dict[str, Any] = {"lifted": uuid.hex(), "why": entry.why if entry else None, "fresh": entry is not None}
     if entry is None:
@@ -75,7 +74,7 @@ def _lift(app: App, station: Station, uuid: bytes, *, yes: bool, dry_run: bool) 
     station.unlock()
     app.confirm(f"Lift the ban of node {uuid.hex()} ({entry.why}, {entry.created})?", yes=yes)
     with station.lock("revoke --lift", app.note):
-        run(station, uuid)
+        handover.deny.lift(station, uuid)
     app.emit(told, f"The ban of node {uuid.hex()} is lifted here; whitelist it and agree on a key to use it.")
 
 
@@ -91,8 +90,6 @@ def decommission(app: App, uuid: str, force: bool, yes: bool, dry_run: bool, lin
 
     One that does not answer is recorded as unconfirmed with --force; its keys stay, and the same command tries again.
     """
-    from teds_provision.handover.life import is_finished, retire
-
     station = app.station()
     octets = station.nodes.resolve(uuid)
     station.policy.require_not_given_away(octets)
@@ -100,13 +97,13 @@ def decommission(app: App, uuid: str, force: bool, yes: bool, dry_run: bool, lin
         app.emit({"uuid": octets.hex(), "plan": "decommission"}, f"Plan: reset {octets.hex()}, take it out of service.")
         return
     station.unlock(octets)
-    if is_finished(station, octets):
+    if handover.life.is_finished(station, octets):
         app.emit(_result(octets, None) | {"confirmed": True, "fresh": False}, "Nothing to do: it is out of service.")
         return
     app.confirm(f"Take node {octets.hex()} out of service? Its key is erased, there and here.", yes=yes)
     with station.lock("decommission", app.note):
         receipt = _reset(app, station, octets, links, force=force)
-        retire(station, octets, receipt)
+        handover.life.retire(station, octets, receipt)
     state = "is out of service; it signed that it is in factory state" if receipt else "is out of service, unconfirmed"
     app.emit(_result(octets, receipt) | {"fresh": True}, f"Node {octets.hex()} {state}.")
 
@@ -123,15 +120,9 @@ def _result(uuid: bytes, receipt: ResetReceipt | None) -> dict[str, Any]:
 
 def _reset(app: App, station: Station, uuid: bytes, links: LinkSettings, *, force: bool) -> ResetReceipt | None:
     """Reset the node; None where it cannot be had and that is to be recorded as unconfirmed."""
-    from teds_provision.cli.rendering import reporter_for
-    from teds_provision.errors import LinkFailure, PolicyRefused
-    from teds_provision.steps.identify import identify
-    from teds_provision.steps.reset import reset_node
-    from teds_provision.talk.meeting import meet
-
     try:
-        with meet(station, links, uuid, reporter_for(app)) as node:
-            return reset_node(station, node, identify(station, node))
+        with talk.meeting.meet(station, links, uuid, reporter_for(app)) as node:
+            return steps.reset.reset_node(station, node, steps.identify.identify(station, node))
     except (LinkFailure, PolicyRefused) as error:
         if not force and not app.interactive:
             error.hint = "Bring it near, or add --force to record it as unconfirmed."
@@ -160,15 +151,13 @@ def replace(
     A calibration belongs to one sensor and is not copied unless told. With link options OLD is reset when it can be
     reached, else it goes out of service unconfirmed.
     """
-    from teds_provision.handover.life import plan_takeover, take_over
-
     app = ctx.find_object(App)
     assert app is not None
     station = app.station()
     octets, spare = station.nodes.resolve(old), station.nodes.resolve(new)
     station.unlock(octets)
     with station.lock("replace", app.note):
-        plan = plan_takeover(station, octets, spare, copy_calibration=copy_calibration)
+        plan = handover.life.plan_takeover(station, octets, spare, copy_calibration=copy_calibration)
         taken = plan.new if plan.done else plan.old
         told: dict[str, Any] = {
             "old": octets.hex(),
@@ -189,7 +178,7 @@ def replace(
         app.confirm(f"{text}?", yes=yes)
         linked = any(ctx.get_parameter_source(name) != click.core.ParameterSource.DEFAULT for name in _LINK_OPTIONS)
         receipt = _reset(app, station, octets, links, force=True) if linked else None
-        warnings = take_over(station, plan, receipt)
+        warnings = handover.life.take_over(station, plan, receipt)
     for warning in warnings:
         app.warn(warning)
     confirmed = receipt is not None

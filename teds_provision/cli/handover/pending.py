@@ -7,10 +7,13 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from teds_provision import handover as handover_room
+from teds_provision import protocol
 from teds_provision.cli.context import App, pass_app
 from teds_provision.cli.handover.bundles import count_of
 from teds_provision.cli.options import COMMAND_SETTINGS, dry_run_option, examples, yes_option
-from teds_provision.errors import TedsProvisionError
+from teds_provision.errors import NotFound, TedsProvisionError
+from teds_provision.files import read_limited
 
 if TYPE_CHECKING:
     from teds_provision.handover.pending import Closed
@@ -31,9 +34,7 @@ def list_(app: App) -> None:
     """Every bundle that left or came."""
     from datetime import UTC, datetime
 
-    from teds_provision.handover.pending import list_handovers
-
-    listed = list_handovers(app.station(), datetime.now(UTC))
+    listed = handover_room.pending.list_handovers(app.station(), datetime.now(UTC))
     rows = [
         {
             "id": one.row.id,
@@ -69,11 +70,6 @@ def receipt(app: App, file: Path) -> None:
 
     FILE may be a folder: every *.receipt in it is taken.
     """
-    from teds_provision.errors import NotFound
-    from teds_provision.files import read_limited
-    from teds_provision.handover.pending import close
-    from teds_provision.protocol.handover.receipt import MAX_RECEIPT_OCTETS
-
     station = app.station()
     files = sorted(file.glob("*.receipt")) if file.is_dir() else [file]
     if not files:
@@ -82,7 +78,8 @@ def receipt(app: App, file: Path) -> None:
     with station.lock("handover receipt", app.note):
         for path in files:
             try:
-                closed.append(close(station, read_limited(path, MAX_RECEIPT_OCTETS, "receipt")))
+                octets = read_limited(path, protocol.handover.receipt.MAX_RECEIPT_OCTETS, "receipt")
+                closed.append(handover_room.pending.close(station, octets))
             except TedsProvisionError as error:
                 if not file.is_dir():
                     raise
@@ -106,10 +103,8 @@ def _closed(done: Closed) -> dict[str, Any]:
 
 
 def _closed_text(station: Station, done: Closed) -> str:
-    from teds_provision.handover.pending import peer_name
-
     imported, refused = done.receipt.imported, done.receipt.refused
-    text = f"Station {peer_name(station, done.receipt.sender)} took {count_of(len(imported))} in"
+    text = f"Station {handover_room.pending.peer_name(station, done.receipt.sender)} took {count_of(len(imported))} in"
     text += ("; their keys are deleted here." if done.row.mode == "move" else ".") if done.fresh else " (known before)."
     lines = [f"  refused {one.uuid.hex()}: {one.why}" for one in refused]
     if refused and done.row.mode == "move":
@@ -128,17 +123,14 @@ def _closed_text(station: Station, done: Closed) -> str:
 @pass_app
 def undo(app: App, id_: str, yes: bool, dry_run: bool) -> None:
     """Take a move back before its receipt; each node's key is rotated at the next contact, before anything else."""
-    from teds_provision.handover.pending import find_handover
-    from teds_provision.handover.pending import undo as run
-
     station = app.station()
-    row = find_handover(station, id_)
+    row = handover_room.pending.find_handover(station, id_)
     if dry_run:
         app.emit({"id": row.id, "state": row.state, "plan": "undo"}, f"Plan: take the {row.mode} {row.id} back.")
         return
     app.confirm("Take this move back? The receiver may have the keys all the same until they are rotated.", yes=yes)
     with station.lock("handover undo", app.note):
-        done = run(station, find_handover(station, id_))
+        done = handover_room.pending.undo(station, handover_room.pending.find_handover(station, id_))
     told = {"id": row.id, "state": "undone", "nodes": [uuid.hex() for uuid in done.uuids], "fresh": done.fresh}
     text = f"{count_of(len(done.uuids))} back here; the next contact with each rotates its key first."
     app.emit(told, text if done.fresh else "Nothing to do: this move was taken back before.")

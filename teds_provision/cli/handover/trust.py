@@ -7,8 +7,11 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import click
 
+from teds_provision import handover, protocol
 from teds_provision.cli.context import App, pass_app
+from teds_provision.cli.handover.bundles import count_of
 from teds_provision.cli.options import COMMAND_SETTINGS, dry_run_option, examples, yes_option
+from teds_provision.files import read_limited, write_new
 
 if TYPE_CHECKING:
     from teds_provision.handover.trust import Candidate, Removal
@@ -53,18 +56,15 @@ def add(
 
     Compare the fingerprint with its owner by voice. In a folder NAME.pem and NAME.cert are stations, NAME.ca.pem CAs.
     """
-    from teds_provision.handover.trust import add as run
-    from teds_provision.handover.trust import candidate, candidates_of
-
     if (folder is None) == (name is None) or (name is not None and file is None):
         raise click.UsageError("Give NAME and FILE, or --from DIR.")
     station = app.station()
     if folder is not None:
-        found = candidates_of(station, folder, role)
+        found = handover.trust.candidates_of(station, folder, role)
     else:
         assert name is not None
         assert file is not None
-        found = [candidate(station, name, file, role)]
+        found = [handover.trust.candidate(station, name, file, role)]
     fresh = [one for one in found if not one.known]
     told = {"trusted": [_record(one.record) for one in found], "added": len(fresh)}
     if dry_run:
@@ -74,7 +74,7 @@ def add(
     if any(not one.known for one in chosen):
         station.unlock()  # whom this station trusts is sealed under its vault
     with station.lock("trust add", app.note):
-        added = run(station, chosen)
+        added = handover.trust.add(station, chosen)
     told = {"trusted": [_record(one.record) for one in chosen], "added": added}
     names = ", ".join(one.record.name for one in chosen if not one.known)
     app.emit(told, f"Trusted from now on: {names}." if added else "Nothing to do.")
@@ -90,16 +90,12 @@ def _agreed(app: App, one: Candidate, yes: bool) -> bool:
 
 
 def _shown(found: list[Candidate]) -> str:
-    from teds_provision.handover.trust import spoken
-
     lines = []
     for one in found:
         lines.append(f"{one.record.role} {one.record.name}  ({one.path}){'  trusted already' if one.known else ''}")
-        lines.append(f"  {spoken(one.record.fingerprint)}")
+        lines.append(f"  {handover.trust.spoken(one.record.fingerprint)}")
         if one.certificate is not None:
-            from teds_provision.protocol.keys import fingerprint
-
-            lines.append(f"  certified by the CA {fingerprint(one.certificate.ca)[:32]}")
+            lines.append(f"  certified by the CA {protocol.keys.fingerprint(one.certificate.ca)[:32]}")
     return "\n".join(lines)
 
 
@@ -118,12 +114,9 @@ def remove(app: App, name: str, yes: bool, dry_run: bool) -> None:
     Nodes whose key that station holds are rotated at the next contact; CAs that it alone brought count no more for the
     nodes that keep them; bans that it made are lifted.
     """
-    from teds_provision.handover.trust import find_trusted, plan_removal
-    from teds_provision.handover.trust import remove as run
-
     station = app.station()
-    record = find_trusted(station, name)
-    plan = plan_removal(station, record)
+    record = handover.trust.find_trusted(station, name)
+    plan = handover.trust.plan_removal(station, record)
     told = {"removed": _record(record), "ends": _ends(plan)}
     text = f"{record.role} {record.name}, {record.fingerprint[:32]}"
     if dry_run:
@@ -133,16 +126,14 @@ def remove(app: App, name: str, yes: bool, dry_run: bool) -> None:
     app.confirm(f"Trust the {text} no more?", yes=yes)
     station.unlock()
     with station.lock("trust remove", app.note):
-        done = run(station, find_trusted(station, name))
+        done = handover.trust.remove(station, handover.trust.find_trusted(station, name))
     app.emit({**told, "ends": _ends(done)}, "\n".join([f"Not trusted any more: {text}.", *_ended(done)]))
 
 
 def _ends(removal: Removal) -> dict[str, Any]:
-    from teds_provision.protocol.keys import fingerprint
-
     return {
         "rotations": [uuid.hex() for uuid in removal.shared],
-        "cas": [fingerprint(ca) for ca in removal.cas],
+        "cas": [protocol.keys.fingerprint(ca) for ca in removal.cas],
         "nodes_under_them": removal.under,
         "bans": [uuid.hex() for uuid in removal.bans],
         "open_handovers": list(removal.open),
@@ -151,14 +142,11 @@ def _ends(removal: Removal) -> dict[str, Any]:
 
 def _ended(removal: Removal) -> list[str]:
     """What ends with it, for people."""
-    from teds_provision.cli.handover.bundles import count_of
-    from teds_provision.protocol.keys import fingerprint
-
     lines = []
     if removal.shared:
         lines.append(f"  {count_of(len(removal.shared))} whose key it holds: rotated at the next contact")
         lines += [f"    {uuid.hex()}" for uuid in removal.shared[:20]]
-    lines += [f"  the CA {fingerprint(ca)[:32]} counts no more" for ca in removal.cas]
+    lines += [f"  the CA {protocol.keys.fingerprint(ca)[:32]} counts no more" for ca in removal.cas]
     if removal.under:
         lines.append(f"    {count_of(removal.under)} keep it: reset them and provision them anew")
     lines += [f"  its ban of node {uuid.hex()} is lifted" for uuid in removal.bans]
@@ -170,8 +158,6 @@ def _ended(removal: Removal) -> list[str]:
 @pass_app
 def list_(app: App) -> None:
     """Every key that counts here besides this station's own."""
-    from teds_provision.protocol.keys import fingerprint
-
     station = app.station()
     records = station.policy.listed()
     ca, certificate = station.ca, station.identity.certificate
@@ -182,7 +168,7 @@ def list_(app: App) -> None:
         else {**_record(record), "added": record.added}
         for record in records
     ]
-    own = {"name": station.name, "fingerprint": station.fingerprint, "ca": fingerprint(station.ca)}
+    own = {"name": station.name, "fingerprint": station.fingerprint, "ca": protocol.keys.fingerprint(station.ca)}
     lines = [f"this station   {station.name}  {station.fingerprint[:16]}, CA {own['ca'][:16]}"]
     for record in records:
         mark = "  certified by this station's CA" if record.role == "station" and certified[record.fingerprint] else ""
@@ -209,12 +195,9 @@ def ca() -> None:
 @pass_app
 def create(app: App) -> None:
     """Show the CA key, which init made; a station that another CA certified has none."""
-    from teds_provision.handover.certify import require_ca
-    from teds_provision.protocol.keys import fingerprint, to_pem
-
     station = app.station()
-    require_ca(station)
-    digits, pem = fingerprint(station.ca), to_pem(station.ca)
+    handover.certify.require_ca(station)
+    digits, pem = protocol.keys.fingerprint(station.ca), protocol.keys.to_pem(station.ca)
     app.emit({"fingerprint": digits, "public_key": pem, "here": True}, f"CA key {digits[:16]}, in this vault\n\n{pem}")
 
 
@@ -230,16 +213,16 @@ def create(app: App) -> None:
 @pass_app
 def sign(app: App, request: Path, output: Path, yes: bool, dry_run: bool) -> None:
     """Certify the station that made REQUEST (init --request): it may then key and write this owner's nodes."""
-    from teds_provision.files import read_limited, write_new
-    from teds_provision.handover.certify import MAX_OCTETS, read_request, sign_request, write_certificate
-    from teds_provision.handover.trust import spoken
-    from teds_provision.protocol.keys import fingerprint
-
     station = app.station()
-    wanted = read_request(read_limited(request, MAX_OCTETS, "request"))
-    digits = fingerprint(wanted.station)
-    told = {"name": wanted.name, "fingerprint": digits, "ca": fingerprint(station.ca), "certificate": str(output)}
-    shown = f"Station {wanted.name}\n  {spoken(digits)}"
+    wanted = handover.certify.read_request(read_limited(request, handover.certify.MAX_OCTETS, "request"))
+    digits = protocol.keys.fingerprint(wanted.station)
+    told = {
+        "name": wanted.name,
+        "fingerprint": digits,
+        "ca": protocol.keys.fingerprint(station.ca),
+        "certificate": str(output),
+    }
+    shown = f"Station {wanted.name}\n  {handover.trust.spoken(digits)}"
     if dry_run:
         app.emit({**told, "plan": True}, f"Plan: certify\n{shown}")
         return
@@ -247,7 +230,7 @@ def sign(app: App, request: Path, output: Path, yes: bool, dry_run: bool) -> Non
     app.note(shown)
     app.confirm("Certify it? Whoever holds its key can then write and rekey every node of this owner.", yes=yes)
     with station.lock("trust ca sign", app.note):
-        octets = write_certificate(sign_request(station, wanted))
+        octets = handover.certify.write_certificate(handover.certify.sign_request(station, wanted))
         fresh = not (output.is_file() and output.read_bytes() == octets)
         if fresh:
             write_new(output, octets)
@@ -267,13 +250,11 @@ def export(app: App, file: Path) -> None:
 
     The vault keeps it until "trust ca drop".
     """
-    from teds_provision.handover.certify import export_ca
-
     station = app.station()
     vault = station.vault
     passphrase = app.ask_secret("New passphrase for the CA key's file", confirm=True)
     with station.lock("trust ca export", app.note):
-        export_ca(station, vault, file, passphrase)
+        handover.certify.export_ca(station, vault, file, passphrase)
     app.emit({"file": str(file)}, f"The CA key is in {file}. Keep it away, then: teds-provision trust ca drop")
 
 
@@ -282,13 +263,11 @@ def export(app: App, file: Path) -> None:
 @pass_app
 def drop(app: App, yes: bool) -> None:
     """Take the CA key out of the vault for good. Export it first: without it no station can be certified any more."""
-    from teds_provision.handover.certify import drop_ca
-
     station = app.station()
     station.unlock()
     app.confirm("Delete the CA key from this vault? Only its exported file can bring it back.", yes=yes)
     with station.lock("trust ca drop", app.note):
-        dropped = drop_ca(station)
+        dropped = handover.certify.drop_ca(station)
     app.emit({"dropped": dropped}, "The CA key is not in this vault any more." if dropped else "Nothing to do.")
 
 
@@ -297,13 +276,10 @@ def drop(app: App, yes: bool) -> None:
 @pass_app
 def import_(app: App, file: Path) -> None:
     """Bring the CA key back from the file that "trust ca export" wrote."""
-    from teds_provision.handover.certify import import_ca
-    from teds_provision.protocol.keys import fingerprint
-
     station = app.station()
     vault = station.vault
     passphrase = app.ask_secret("Passphrase of the CA key's file")
     with station.lock("trust ca import", app.note):
-        import_ca(station, vault, file, passphrase)
-    digits = fingerprint(station.ca)
+        handover.certify.import_ca(station, vault, file, passphrase)
+    digits = protocol.keys.fingerprint(station.ca)
     app.emit({"fingerprint": digits}, f"The CA key {digits[:16]} is in this vault.")

@@ -11,11 +11,17 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from teds_provision import links as links_room
+from teds_provision import measure as measure_room
+from teds_provision import teds
+from teds_provision.cli import measure as measure_cli
 from teds_provision.cli.context import App, pass_app
 from teds_provision.cli.measure.values import ending, over_the_bus
 from teds_provision.cli.options import command, link_options
+from teds_provision.cli.steps.build import read_file
 from teds_provision.errors import PolicyRefused, UsageFailure
-from teds_provision.links import LinkSettings
+from teds_provision.links import LinkSettings, can
+from teds_provision.protocol import operation
 
 if TYPE_CHECKING:
     from teds_provision.measure.blocks import Command
@@ -70,9 +76,6 @@ def measure(
     if what[0] == "recover":
         _recover(app, what[1:])
         return
-    from teds_provision.measure.orders import Wish
-    from teds_provision.measure.sinks import open_sink
-    from teds_provision.protocol.operation.stream_commands import Kind
 
     links = over_the_bus(links)
     if links.via != "can":
@@ -80,12 +83,13 @@ def measure(
     specs = [*files, *(name for name in ("ros1", "ros2") if wished[name])]
     orders = Orders()
     sinks = [
-        open_sink(spec, orders.take if wished["actuators"] else None) for spec in [*specs, *([mqtt] if mqtt else [])]
+        measure_room.sinks.open_sink(spec, orders.take if wished["actuators"] else None)
+        for spec in [*specs, *([mqtt] if mqtt else [])]
     ]
-    wish = Wish(
+    wish = measure_room.orders.Wish(
         channels=tuple(dict.fromkeys(wished["channels"])),
         rate=wished["rate"],
-        kind=None if wished["kind"] is None else Kind[wished["kind"].upper()],
+        kind=None if wished["kind"] is None else operation.stream_commands.Kind[wished["kind"].upper()],
         trigger=wished["trigger"],
         test_pattern=wished["test_pattern"],
         timeout=links.timeout,
@@ -138,22 +142,16 @@ def _run(
     group: str,
     scalar_rate: float,
 ) -> Ended:
-    from teds_provision.cli.measure.showing import watcher_for
-    from teds_provision.links import open_port
-    from teds_provision.links.can.port import CanPort
-    from teds_provision.measure.blocks import StationFacts
-    from teds_provision.measure.runner import Measurement
-
-    port = open_port(links)
-    assert isinstance(port, CanPort)
+    port = links_room.open_port(links)
+    assert isinstance(port, can.port.CanPort)
     stop = threading.Event()
-    facts = StationFacts(
+    facts = measure_room.blocks.StationFacts(
         station.name, group=group, started=time.time(), scalar_rate=scalar_rate, test_pattern=wish.test_pattern
     )
     try:
-        with watcher_for(app, station, sinks, stop) as watcher, ending(stop):
+        with measure_cli.showing.watcher_for(app, station, sinks, stop) as watcher, ending(stop):
             station.audit("measure", None, "begun", nodes=[uuid.hex() for uuid in uuids], group=group)
-            measurement = Measurement(station, port, uuids, wish, sinks, facts, watcher)
+            measurement = measure_room.runner.Measurement(station, port, uuids, wish, sinks, facts, watcher)
             orders.to = measurement.command
             ended = measurement.run(stop, duration)
     finally:
@@ -178,25 +176,21 @@ def _tell_end(app: App, ended: Ended) -> None:
 
 def _require(app: App, station: Station, uuids: Sequence[bytes], file: Path) -> None:
     """Judge the datasheets as this station knows them against what the task needs; raises PolicyRefused (6)."""
-    from teds_provision.cli.steps.build import read_file
-    from teds_provision.teds.fits import judge, met, parse_require
-    from teds_provision.teds.sheet import Sheet
-
-    requirements = parse_require(read_file(file).decode(errors="replace"), str(file))
+    requirements = teds.fits.parse_require(read_file(file).decode(errors="replace"), str(file))
     sheets = {}
     for uuid in uuids:
         image = station.nodes.datasheet(uuid)
         if image is not None:
-            sheets[uuid] = Sheet.of(image)
+            sheets[uuid] = teds.sheet.Sheet.of(image)
     fits: list[dict[str, object]] = []
     unmet: list[str] = []
     for requirement in requirements:
         found = []
         for uuid, sheet in sheets.items():
-            for fit in judge(requirement, sheet):
+            for fit in teds.fits.judge(requirement, sheet):
                 found.append(fit)
                 fits.append({"uuid": uuid.hex(), "channel": fit.channel, "result": fit.result, "why": fit.why})
-        if not met(requirement, found):
+        if not teds.fits.met(requirement, found):
             unmet.append(requirement.subject)
     if unmet:
         error = PolicyRefused(
@@ -208,11 +202,9 @@ def _require(app: App, station: Station, uuids: Sequence[bytes], file: Path) -> 
 def _recover(app: App, files: Sequence[str]) -> None:
     if len(files) != 1:
         raise UsageFailure("Name one recording.", hint="teds-provision measure recover FILE.mcap")
-    from teds_provision.measure.sinks.lines import iso
-    from teds_provision.measure.sinks.recover import recover
 
-    done = recover(Path(files[0]))
-    until = iso(done.until) if done.until is not None else None
+    done = measure_room.sinks.recover.recover(Path(files[0]))
+    until = measure_room.sinks.lines.iso(done.until) if done.until is not None else None
     told = "is whole" if done.was_whole else f"made whole ({done.cut} octets of a torn end cut off)"
     app.emit(
         {"recovered": {"messages": done.messages, "until": until}, "file": files[0], "cut": done.cut},

@@ -9,11 +9,14 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from typing import TYPE_CHECKING, Any
 
+from teds_provision import measure
 from teds_provision.cli.context import App
+from teds_provision.cli.rendering import shown
 from teds_provision.measure.blocks import Block, ChannelFacts, NodeReport
 from teds_provision.measure.runner import Watcher
 from teds_provision.measure.sinks import Sink, ThreadedSink
 from teds_provision.measure.sinks.lines import as_line, data_lines, status_line
+from teds_provision.teds import units
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -45,9 +48,7 @@ def watcher_for(app: App, station: Station, sinks: Sequence[Sink], stop: threadi
 
 
 def _no_station(name: str) -> StationFacts:
-    from teds_provision.measure.blocks import StationFacts
-
-    return StationFacts(name)
+    return measure.blocks.StationFacts(name)
 
 
 class JsonLines(ThreadedSink):
@@ -184,8 +185,6 @@ class LiveTable:
         from rich.markup import escape
         from rich.table import Table
 
-        from teds_provision.cli.rendering import shown
-
         table = Table("node", "channel", "value", "unit", "age", "rate", box=None, pad_edge=False)
         with self._guard:
             newest, facts, reports = dict(self._newest), dict(self._facts), dict(self._reports)
@@ -211,12 +210,10 @@ class LiveTable:
 
 def in_peoples_units(value: float | None, known: ChannelFacts) -> tuple[float | None, str]:
     """A value in SI units as people see it."""
-    from teds_provision.teds.units.units import in_display_units, short_unit
-
     if value is None or known.units is None:
         return value, known.unit
-    number, unit = in_display_units(value, known.units, known.shown_unit)
-    return number, short_unit(unit)
+    number, unit = units.units.in_display_units(value, known.units, known.shown_unit)
+    return number, units.units.short_unit(unit)
 
 
 def _line(report: NodeReport) -> str:

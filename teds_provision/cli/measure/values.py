@@ -13,10 +13,13 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from teds_provision import measure, talk
 from teds_provision.cli.context import App, pass_app
 from teds_provision.cli.options import command, link_options
-from teds_provision.errors import LinkFailure, UsageFailure
+from teds_provision.cli.rendering import print_table, reporter_for, shown
+from teds_provision.errors import LinkFailure, NodeRefused, UsageFailure
 from teds_provision.links import LinkSettings
+from teds_provision.protocol import operation
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -35,16 +38,11 @@ def over_the_bus(links: LinkSettings) -> LinkSettings:
 @contextmanager
 def trusted_node(app: App, station: Station, links: LinkSettings, uuid: bytes) -> Iterator[Trusted]:
     """A node in a session, its datasheet verified; left in order."""
-    from teds_provision.cli.rendering import reporter_for
-    from teds_provision.measure.trusting import open_trusted
-    from teds_provision.talk.conversation import SessionLost
-    from teds_provision.talk.meeting import meet
-
     reporter = reporter_for(app)
-    with meet(station, over_the_bus(links), uuid, reporter, before=lambda: station.unlock(uuid)) as node:
+    with talk.meeting.meet(station, over_the_bus(links), uuid, reporter, before=lambda: station.unlock(uuid)) as node:
         try:
-            yield open_trusted(station, node)
-        except SessionLost as lost:
+            yield measure.trusting.open_trusted(station, node)
+        except talk.conversation.SessionLost as lost:
             raise lost.cause from lost
 
 
@@ -58,12 +56,10 @@ def trusted_node(app: App, station: Station, links: LinkSettings, uuid: bytes) -
 @pass_app
 def sample(app: App, node: str, channels: Sequence[int], links: LinkSettings) -> None:
     """Take one reading now: datasheet verified, values calibrated. Without channels every sensor is read."""
-    from teds_provision.measure.sampling import take_samples
-
     station = app.station()
     uuid = station.nodes.resolve(node)
     with trusted_node(app, station, links, uuid) as trusted:
-        samples = take_samples(trusted, channels)
+        samples = measure.sampling.take_samples(trusted, channels)
     result = {"uuid": uuid.hex(), "samples": [one.as_json() for one in samples]}
     app.emit(result, lambda console: _samples(console, samples))
 
@@ -71,8 +67,6 @@ def sample(app: App, node: str, channels: Sequence[int], links: LinkSettings) ->
 def _samples(console: Console, samples: Sequence[Sample]) -> None:
     from rich.markup import escape
     from rich.table import Table
-
-    from teds_provision.cli.rendering import print_table, shown
 
     table = Table("channel", "name", "value", "±", "unit", "raw", box=None, pad_edge=False)
     for one in samples:
@@ -88,17 +82,13 @@ def _samples(console: Console, samples: Sequence[Sample]) -> None:
 @pass_app
 def mode(app: App, node: str, links: LinkSettings) -> None:
     """What a node claims and does: mode, the state of each channel, power."""
-    from teds_provision.errors import NodeRefused
-    from teds_provision.measure.trusting import operation
-    from teds_provision.protocol.operation.commands import POWER, Power
-
     station = app.station()
     uuid = station.nodes.resolve(node)
-    power: Power | None = None
+    power: operation.commands.Power | None = None
     with trusted_node(app, station, links, uuid) as trusted:
-        found = operation(trusted.node)
+        found = measure.trusting.operation(trusted.node)
         try:
-            power = Power.decode(trusted.node.send(POWER, "to tell its power"))
+            power = operation.commands.Power.decode(trusted.node.send(operation.commands.POWER, "to tell its power"))
         except NodeRefused:
             power = None
         names = {one.number: one.name for one in trusted.sheet.channels}
@@ -116,18 +106,19 @@ def mode(app: App, node: str, links: LinkSettings) -> None:
 
 def words(state: int) -> list[str]:
     """State bits of a channel as words."""
-    from teds_provision.protocol.operation.commands import ChannelState
-
-    return [bit.name.lower().replace("_", " ") for bit in ChannelState if state & bit and bit.name]
+    return [bit.name.lower().replace("_", " ") for bit in operation.commands.ChannelState if state & bit and bit.name]
 
 
 def _power(power: Power | None) -> dict[str, Any] | None:
     if power is None:
         return None
-    from teds_provision.protocol.operation.commands import PowerFlag
 
     return {
-        "flags": [flag.name.lower().replace("_", " ") for flag in PowerFlag if power.flags & flag and flag.name],
+        "flags": [
+            flag.name.lower().replace("_", " ")
+            for flag in operation.commands.PowerFlag
+            if power.flags & flag and flag.name
+        ],
         "level": power.level,
         "voltage": power.voltage,
         "current": power.current,
@@ -138,8 +129,6 @@ def _power(power: Power | None) -> dict[str, Any] | None:
 def _mode(console: Console, found: Operation, names: dict[int, str], power: Power | None) -> None:
     from rich.markup import escape
     from rich.table import Table
-
-    from teds_provision.cli.rendering import print_table, shown
 
     console.print(f"{'measurement' if found.measuring else 'configuration'} mode")
     table = Table("channel", "name", "state", "claimed by", box=None, pad_edge=False)
@@ -185,17 +174,14 @@ def set_value(
 
     This is no safety function: see docs/actuators.md.
     """
-    from teds_provision.measure.acting import Acting
-    from teds_provision.measure.trusting import require_whitelisted
-
     if not math.isfinite(value):
         raise UsageFailure("VALUE is not a finite number.")
     station = app.station()
     uuid = station.nodes.resolve(node)
-    require_whitelisted(station, uuid)
+    measure.trusting.require_whitelisted(station, uuid)
     stop = threading.Event()
     with trusted_node(app, station, links, uuid) as trusted, ending(stop):
-        acting = Acting(trusted, channel, unit=unit, dead_man=dead_man)
+        acting = measure.acting.Acting(trusted, channel, unit=unit, dead_man=dead_man)
         acting.octets_of(value)  # the limits, before anything is claimed
         station.audit("set", uuid, "begun", channel=channel, value=value, unit=acting.unit.text)
         with acting:

@@ -6,8 +6,10 @@ from typing import TYPE_CHECKING
 
 import click
 
+from teds_provision import check as check_room
 from teds_provision.cli.context import App, pass_app
 from teds_provision.cli.options import command, dry_run_option, link_options, yes_option
+from teds_provision.cli.rendering import print_table, reporter_for
 from teds_provision.errors import NotAuthentic
 from teds_provision.links import LinkSettings
 
@@ -39,9 +41,6 @@ def check(app: App, factory: bool, yes: bool, dry_run: bool, links: LinkSettings
     station's, is then keyed, written and reset.
     Exits 4 where a rule failed, 5 where no node is.
     """
-    from teds_provision.check.run import check_at
-    from teds_provision.cli.rendering import reporter_for
-
     station = app.station()
     if dry_run:
         plan = "key, write and reset the node, then every rule" if factory else "the rules that change no key"
@@ -51,7 +50,7 @@ def check(app: App, factory: bool, yes: bool, dry_run: bool, links: LinkSettings
         app.confirm(
             "Key, write and reset the node that is met? If it is one of yours its key and datasheet go.", yes=yes
         )
-    report = check_at(station, links, reporter_for(app), factory=factory)
+    report = check_room.run.check_at(station, links, reporter_for(app), factory=factory)
     counts = {result: report.count(result) for result in ("passed", "failed", "skipped")}
     checks = [
         {"rule": each.rule, "clause": each.clause, "result": each.result, "detail": each.detail}
@@ -67,8 +66,6 @@ def check(app: App, factory: bool, yes: bool, dry_run: bool, links: LinkSettings
 def _table(console: Console, report: Report) -> None:
     from rich.markup import escape
     from rich.table import Table
-
-    from teds_provision.cli.rendering import print_table
 
     style = {"passed": "green", "failed": "bold red", "skipped": "dim"}
     table = Table("rule", "result", "clause", "seen", box=None, pad_edge=False)

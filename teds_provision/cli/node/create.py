@@ -6,6 +6,8 @@ from pathlib import Path
 
 import click
 
+from teds_provision import node, protocol
+from teds_provision import teds as teds_room
 from teds_provision.cli.context import App, pass_app
 from teds_provision.cli.options import command
 from teds_provision.errors import UsageFailure
@@ -72,24 +74,19 @@ def create(
 
     With --teds or --profile the channels of that datasheet are its hardware; the TEDS lie on it unsigned.
     """
-    from teds_provision.node import described
-    from teds_provision.protocol.keys import fingerprint
-    from teds_provision.teds.profile import default_folders
-    from teds_provision.teds.sheet import Sheet
-
     if teds is not None and profile is not None:
         raise UsageFailure("A node has one datasheet.", hint="Give --teds or --profile, not both.")
-    made = described.create(
+    made = node.described.create(
         folder,
         uuid=uuid,
         name=name,
         max_message=max_message,
         teds=teds,
         profile=profile,
-        folders=default_folders(app.home),
+        folders=teds_room.profile.default_folders(app.home),
     )
     flash = made.load()
-    print_of_key = fingerprint(flash.node_key)
+    print_of_key = protocol.keys.fingerprint(flash.node_key)
     channels = [
         {
             "channel": channel.number,
@@ -97,7 +94,7 @@ def create(
             "kind": channel.kind.word if channel.kind is not None else None,
             "unit": channel.unit.text,
         }
-        for channel in Sheet.of_blocks(made.hardware).channels
+        for channel in teds_room.sheet.Sheet.of_blocks(made.hardware).channels
     ]
     app.emit(
         {

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import click
 
+from teds_provision import node as node_room
 from teds_provision.cli.context import App, pass_app
 from teds_provision.cli.node.check import check
 from teds_provision.cli.node.create import create
@@ -38,9 +39,7 @@ node.add_command(run)
 @pass_app
 def reset(app: App, folder: Path) -> None:
     """Reset the node in DIR by hand (button held 5 s) while it is not running."""
-    from teds_provision.node.virtual import VirtualNode
-
-    node = VirtualNode(folder, exclusive=True)
+    node = node_room.virtual.VirtualNode(folder, exclusive=True)
     node.reset_by_hand()
     uuid = node.tim.flash.uuid.hex()
     app.emit({"uuid": uuid, "state": "factory"}, f"Node {uuid} is back in factory state.")

@@ -11,9 +11,15 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from teds_provision import node as node_room
+from teds_provision import protocol, teds
 from teds_provision.cli.context import App, pass_app
+from teds_provision.cli.node.actuators import ActuatorLines
 from teds_provision.cli.options import command
 from teds_provision.errors import UsageFailure
+from teds_provision.node import can as can_room
+from teds_provision.node import hardware as hardware_room
+from teds_provision.node import nfc as nfc_room
 
 if TYPE_CHECKING:
     from teds_provision.cli.node.actuators import ActuatorLines
@@ -83,15 +89,14 @@ def run(
 
     Prints one line when the links are up, then a line for what an actuator does.
     """
-    from teds_provision.cli.node.actuators import ActuatorLines
-    from teds_provision.node.pulse import Pulse
-    from teds_provision.node.virtual import Delays, VirtualNode
-
     _check(len(folders), source, **links)
-    delays = Delays(crypto_delay / 1000, flash_delay / 1000)
-    lines, pulse = ActuatorLines(app), Pulse()
+    delays = node_room.virtual.Delays(crypto_delay / 1000, flash_delay / 1000)
+    lines, pulse = ActuatorLines(app), node_room.pulse.Pulse()
     make = _boards(app, lines, source, battery)
-    nodes = [VirtualNode(folder, delays=delays, exclusive=True, board=make, pulse=pulse) for folder in folders]
+    nodes = [
+        node_room.virtual.VirtualNode(folder, delays=delays, exclusive=True, board=make, pulse=pulse)
+        for folder in folders
+    ]
     stop = threading.Event()
     for number in (signal.SIGTERM, signal.SIGINT):
         signal.signal(number, lambda *_: stop.set())
@@ -115,25 +120,18 @@ def run(
 
 def _check(count: int, source: str, *, nfc: str | None, can: str | None, **_: Any) -> None:
     """Raise UsageFailure where the options do not go together."""
-    from teds_provision.node.sources import ONE_NODE_ONLY, kind_of
-
     if not nfc and not can:
         raise UsageFailure(
             "A node needs a link.", hint="Add --nfc udp:localhost:54321, --can udp_multicast:239.74.163.2, or both."
         )
-    kind = kind_of(source)
-    if count > 1 and (nfc or kind in ONE_NODE_ONLY):
+    kind = node_room.sources.kind_of(source)
+    if count > 1 and (nfc or kind in node_room.sources.ONE_NODE_ONLY):
         what = "--nfc" if nfc else f"--source {source}"
         raise UsageFailure(f"{what} is for one node.", hint="Run the others in processes of their own.")
 
 
 def _boards(app: App, lines: ActuatorLines, source: str, percent: float | None) -> Callable[[FlashFile], Board | None]:
-    from teds_provision.node.hardware.battery import Battery
-    from teds_provision.node.hardware.board import Board
-    from teds_provision.teds.image import Image
-    from teds_provision.teds.sheet import Sheet
-
-    def make(file: FlashFile) -> Board | None:
+    def make(file: FlashFile) -> hardware_room.board.Board | None:
         uuid, hardware = file.load().uuid, file.hardware
         if not hardware and source != _DEFAULT_SOURCE:
             app.warn(
@@ -141,10 +139,10 @@ def _boards(app: App, lines: ActuatorLines, source: str, percent: float | None) 
             )
         if not hardware and percent is None:
             return None
-        return Board(
-            Sheet.of(Image(uuid, hardware)),
+        return hardware_room.board.Board(
+            teds.sheet.Sheet.of(teds.image.Image(uuid, hardware)),
             source=source,
-            battery=None if percent is None else Battery(percent),
+            battery=None if percent is None else hardware_room.battery.Battery(percent),
             shown=lines.of(uuid.hex()),
             tell=app.warn,
         )
@@ -158,10 +156,8 @@ def _reset_all(nodes: Sequence[VirtualNode]) -> None:
 
 
 def _say_ready(app: App, nodes: Sequence[VirtualNode], up: list[str], source: str) -> None:
-    from teds_provision.protocol.keys import fingerprint
-
     flashes = [node.tim.flash for node in nodes]
-    named = [{"uuid": flash.uuid.hex(), "fingerprint": fingerprint(flash.node_key)} for flash in flashes]
+    named = [{"uuid": flash.uuid.hex(), "fingerprint": protocol.keys.fingerprint(flash.node_key)} for flash in flashes]
     several = {"nodes": named} if len(named) > 1 else {}
     who = f"Node {named[0]['uuid']}" if len(named) == 1 else f"{len(named)} nodes"
     app.emit(
@@ -174,15 +170,13 @@ def _servers(
 ) -> list[LinkServer]:
     servers: list[LinkServer] = []
     if nfc:
-        from teds_provision.node.nfc.server import NfcServer
-
         servers.append(
-            NfcServer(nfc, nodes[0], tag=tag, pace=pace, wt_int=wait_time // 4 * 4, extras=_extras(nodes[0]))
+            nfc_room.server.NfcServer(
+                nfc, nodes[0], tag=tag, pace=pace, wt_int=wait_time // 4 * 4, extras=_extras(nodes[0])
+            )
         )
     if can:
-        from teds_provision.node.can.server import CanServer
-
-        bus = CanServer(can, tell=app.warn)
+        bus = can_room.server.CanServer(can, tell=app.warn)
         for node in nodes:
             tapped = node.in_factory_state if nfc is None else lambda: False
             bus.add(node, counts_as_tapped=tapped, measuring=node)
@@ -197,9 +191,10 @@ def _send(bus: CanServer, node: VirtualNode, frame: DataFrame) -> None:
 
 def _extras(node: VirtualNode) -> Extras:
     """What a node with a battery says in its initial message, and how a field charges it."""
-    from teds_provision.node.nfc.charging import NO_EXTRAS, Extras, charge_records
-
     battery = node.board.battery if node.board is not None else None
     if battery is None:
-        return NO_EXTRAS
-    return Extras(before=lambda: charge_records(battery.power()), field=lambda present: battery.field(present=present))
+        return nfc_room.charging.NO_EXTRAS
+    return nfc_room.charging.Extras(
+        before=lambda: nfc_room.charging.charge_records(battery.power()),
+        field=lambda present: battery.field(present=present),
+    )

@@ -8,8 +8,14 @@ from typing import TYPE_CHECKING
 
 import click
 
+from teds_provision import backup as backup_room
+from teds_provision import handover, protocol
+from teds_provision import store as store_room
+from teds_provision import vault as vault_room
 from teds_provision.cli.context import App, pass_app, read_line
 from teds_provision.cli.options import command, dry_run_option, yes_option
+from teds_provision.cli.steps.build import read_file
+from teds_provision.errors import NotFound, UsageFailure, VaultFailure, WrongPassphrase
 
 if TYPE_CHECKING:
     from teds_provision.backup.content import Content
@@ -50,13 +56,9 @@ def backup(
     Whitelist, nodes, keys, trust, handovers and the audit log, at one moment, also while the station is at work.
     With a PKCS #11 keystore the keys in the token are not in it. config.toml is not in it.
     """
-    from teds_provision.backup.backup import backup as run
-    from teds_provision.cli.steps.build import read_file
-    from teds_provision.protocol.keys import fingerprint, from_pem
-
     station = app.station()
-    point = from_pem(read_file(recovery)) if recovery is not None else None
-    to = f"recovery key {fingerprint(point)[:32]}" if point is not None else "a passphrase"
+    point = protocol.keys.from_pem(read_file(recovery)) if recovery is not None else None
+    to = f"recovery key {protocol.keys.fingerprint(point)[:32]}" if point is not None else "a passphrase"
     if dry_run:
         plan = {"backup": str(file), "to": to, "replaces": file.exists(), "dry_run": True}
         app.emit(plan, f"Plan: seal the store of {station.name} to {to}, into {file}.")
@@ -64,7 +66,7 @@ def backup(
     _require_place(app.home, file)
     if file.exists():
         app.confirm(f"{file} exists. Replace it?", yes=yes)
-    done = run(station, file, _asker(app, backup_passphrase_fd), recovery=point, notice=app.note)
+    done = backup_room.backup.backup(station, file, _asker(app, backup_passphrase_fd), recovery=point, notice=app.note)
     for warning in done.warnings:
         app.warn(warning)
     result = {
@@ -111,16 +113,14 @@ def restore(
     the audit log only grows. A backup of another station is refused (exit 6). A wrong passphrase is exit 7, a file
     that was changed 4, one that is cut off or something else 8.
     """
-    from teds_provision.backup.restore import keystore_for, open_present, rebuild
-
     content = _open(app, file, recovery_key, _asker(app, backup_passphrase_fd))
     app.closing(content.close)
-    present = open_present(app.home, content)
+    present = backup_room.restore.open_present(app.home, content)
     if present is not None:
         app.closing(present.close)
         _merge(app, present, content, keystore, yes=yes, dry_run=dry_run)
         return
-    wanted = keystore_for(content, keystore)
+    wanted = backup_room.restore.keystore_for(content, keystore)
     app.note(_told(content, wanted))
     if dry_run:
         plan = {"action": "rebuild", "station": content.station, "created": content.created, "dry_run": True}
@@ -128,7 +128,7 @@ def restore(
         return
     if recovery_key is not None:  # whoever has the public key can seal: only the fingerprint tells whose this is
         app.confirm(f"Is that your station, and shall its keys lie in {_named(wanted)}?", yes=yes)
-    done = rebuild(app.home, content, app.ask_secret, keystore=keystore)
+    done = backup_room.restore.rebuild(app.home, content, app.ask_secret, keystore=keystore)
     if done.set_aside is not None:
         app.warn(f"The damaged store is kept as {done.set_aside}.")
     if done.rotations_due:
@@ -141,12 +141,11 @@ def restore(
 
 def _told(content: Content, keystore: str | None) -> str:
     """Whose backup it is, how old, and where the keys shall lie: what a person has to compare."""
-    from teds_provision.handover.trust import spoken
-
     days = content.age_days()
     age = f"{days} day{'' if days == 1 else 's'} ago" if days >= 0 else "in the future: compare the clocks"
     return (
-        f"Backup of station {content.name}, made {content.created} ({age})\n  key      {spoken(content.station)}\n"
+        f"Backup of station {content.name}, made {content.created} ({age})\n"
+        f"  key      {handover.trust.spoken(content.station)}\n"
         f"  keystore {_named(keystore)}"
     )
 
@@ -157,8 +156,6 @@ def _named(keystore: str | None) -> str:
 
 def _require_place(home: Path, file: Path) -> None:
     """Refuse a folder that is not there, and the station's own files, before anyone is asked for a passphrase."""
-    from teds_provision.errors import NotFound, UsageFailure
-
     folder = file.absolute().parent
     if not folder.is_dir():
         raise NotFound(f"There is no folder {folder}.")
@@ -168,10 +165,7 @@ def _require_place(home: Path, file: Path) -> None:
 
 
 def _merge(app: App, store: Store, content: Content, keystore: str | None, *, yes: bool, dry_run: bool) -> None:
-    from teds_provision.backup.restore import complete_vault, merge, merge_sealed
-    from teds_provision.store import StoreLock
-
-    plan = merge(store, content, dry_run=True)
+    plan = backup_room.restore.merge(store, content, dry_run=True)
     how = plan.relation.value if plan.relation is not None else ""
     facts = store.facts()
     head = f"{_told(content, facts.keystore if facts is not None else keystore)}\nIt is {how} of this station."
@@ -181,9 +175,9 @@ def _merge(app: App, store: Store, content: Content, keystore: str | None, *, ye
         return
     if plan.back:
         app.confirm("Bring this back?", yes=yes)
-    with StoreLock(app.home, command="restore", notice=app.note):
-        vault = complete_vault(store, content, app.ask_secret, keystore=keystore)
-        done = merge_sealed(store, content, vault, app.ask_secret)
+    with store_room.StoreLock(app.home, command="restore", notice=app.note):
+        vault = backup_room.restore.complete_vault(store, content, app.ask_secret, keystore=keystore)
+        done = backup_room.restore.merge_sealed(store, content, vault, app.ask_secret)
     _emit(app, content, done, "Brought back." if done.back else "The store lacks nothing of it (nothing to do).")
 
 
@@ -210,19 +204,14 @@ def _emit(app: App, content: Content, done: Restored, text: str, *, dry: bool = 
 
 
 def _open(app: App, file: Path, recovery_key: Path | None, ask: Callable[[str, bool], str]) -> Content:
-    from teds_provision.backup.sealed_file import SealedFile
-    from teds_provision.errors import UsageFailure, VaultFailure, WrongPassphrase
-    from teds_provision.protocol.keys import SoftwareKey
-    from teds_provision.vault.ca_file import read_ca
-
-    sealed = SealedFile(file)
+    sealed = backup_room.sealed_file.SealedFile(file)
     if not sealed.is_for_key:
         return sealed.open_with_passphrase(ask("Passphrase of the backup", False))
     if recovery_key is None:
         raise UsageFailure("This backup is sealed to a recovery key.", hint="Give it with --recovery-key PEM.")
     passphrase = ask(f"Passphrase of {recovery_key}", False)
     try:
-        key = SoftwareKey.from_secret(read_ca(recovery_key, passphrase))
+        key = protocol.keys.SoftwareKey.from_secret(vault_room.ca_file.read_ca(recovery_key, passphrase))
     except WrongPassphrase:
         raise
     except VaultFailure as failure:

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import signal
 
+from teds_provision import demo as demo_room
 from teds_provision.cli.context import App, pass_app
 from teds_provision.cli.options import command
+from teds_provision.cli.rendering import reporter_for
 
 NEXT = """
 Next, with a node of your own (or a virtual one: node create, node run):
@@ -22,11 +24,8 @@ def demo(app: App) -> None:
 
     Uses throwaway homes and vaults, talks to this machine alone, leaves nothing behind.
     """
-    from teds_provision.cli.rendering import reporter_for
-    from teds_provision.demo.demo import run_demo
-
     signal.signal(signal.SIGTERM, signal.default_int_handler)  # as Ctrl-C: a folder and a process are to be taken away
-    done = run_demo(reporter_for(app), lambda text: app.note(f"\n{text}"))
+    done = demo_room.demo.run_demo(reporter_for(app), lambda text: app.note(f"\n{text}"))
     steps = [{"name": step.name, "result": step.result, "seconds": step.seconds} for step in done.steps]
     app.emit(
         {"uuid": done.uuid.hex(), "steps": steps, "verdict": done.verdict},

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING
 
 import click
 
+from teds_provision import doctor as doctor_room
 from teds_provision.cli.context import App, pass_app
 from teds_provision.cli.options import command
 from teds_provision.cli.settings import known_settings
@@ -29,15 +30,13 @@ def doctor(app: App, nfc: str | None, can: str | None) -> None:
     of pins and trust are checked too. Exits 0 unless something failed
     (warnings are no failure): 7 for the store, the keyring or the vault, 5 for a named reader or bus, 1 for the rest.
     """
-    from teds_provision.doctor.doctor import Place, examine, exit_code
-
     group = click.get_current_context().find_root().command
     settings = known_settings(group) if isinstance(group, click.Group) else None
     ask = app.ask_secret if app.has_passphrase else None
-    found = list(examine(Place(app.home, nfc, can, settings=settings, ask=ask)))
+    found = list(doctor_room.doctor.examine(doctor_room.doctor.Place(app.home, nfc, can, settings=settings, ask=ask)))
     findings = [finding for _, finding in found]
     checks = [{"name": one.name, "result": one.result, "why": one.why, "fix": one.fix} for one in findings]
-    code = exit_code(found)
+    code = doctor_room.doctor.exit_code(found)
     counts = {word: sum(one.result == word for one in findings) for word in _STYLES}
     app.emit({"checks": checks, **counts}, lambda console: _print(console, findings))
     app.note(", ".join(f"{count} {word}" for word, count in counts.items()) + ".")

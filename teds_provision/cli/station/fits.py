@@ -5,6 +5,7 @@ from __future__ import annotations
 from datetime import UTC, datetime
 from typing import TYPE_CHECKING, Any
 
+from teds_provision import steps, teds
 from teds_provision.cli.context import App
 from teds_provision.cli.rendering import print_table, shown
 from teds_provision.errors import BadData, UsageFailure
@@ -17,14 +18,11 @@ if TYPE_CHECKING:
 
 def show_fits(app: App, station: Station, expression: str, uuids: list[bytes]) -> None:
     """Tell for every channel of these nodes whether it meets ``expression``, and why not."""
-    from teds_provision.steps.fits import fits_of  # TEDS: a plain list does not wait for them
-    from teds_provision.teds.fits import parse_fits
-
     try:
-        requirement = parse_fits(expression)
+        requirement = teds.fits.parse_fits(expression)
     except BadData as error:
         raise UsageFailure(f"--fits: {error.message}", hint=error.hint) from error
-    found = [fit.to_json() for fit in fits_of(station, [requirement], uuids, datetime.now(UTC))]
+    found = [fit.to_json() for fit in steps.fits.fits_of(station, [requirement], uuids, datetime.now(UTC))]
     app.emit({"fits": found}, lambda console: _table(console, found))
 
 

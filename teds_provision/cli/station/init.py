@@ -7,9 +7,12 @@ from typing import TYPE_CHECKING
 
 import click
 
+from teds_provision import handover, protocol
+from teds_provision import station as station_room
 from teds_provision.cli.context import App, pass_app
 from teds_provision.cli.options import command, yes_option
-from teds_provision.errors import UsageFailure
+from teds_provision.errors import TedsProvisionError, UsageFailure
+from teds_provision.files import read_limited, require_new, write_new
 
 if TYPE_CHECKING:
     from teds_provision.station.station import Station
@@ -39,9 +42,6 @@ def init(
     The keys lie in the OS keyring, in a PKCS #11 token, or sealed under a passphrase. Stations of one owner share one
     CA: --request here, "trust ca sign" where the CA key is, --certificate here.
     """
-    from teds_provision.protocol.keys import fingerprint, to_pem
-    from teds_provision.station.station import initialise
-
     if request is not None and certificate is not None:
         raise click.UsageError("--request comes first, --certificate when the CA has signed it.")
     if request is not None:
@@ -52,21 +52,22 @@ def init(
         why = "this station was certified"
         station = app.station()
     else:
-        station, why = initialise(app.home, name=name, keystore=keystore, ask=app.ask_secret)
+        station, why = station_room.station.initialise(app.home, name=name, keystore=keystore, ask=app.ask_secret)
         app.closing(station.close)
         _require_same(station, name, keystore)
-    ca = fingerprint(station.ca)
+    ca = protocol.keys.fingerprint(station.ca)
     app.emit(
         {
             "name": station.name,
-            "public_key": to_pem(station.point),
+            "public_key": protocol.keys.to_pem(station.point),
             "fingerprint": station.fingerprint,
-            "ca": {"public_key": to_pem(station.ca), "fingerprint": ca},
+            "ca": {"public_key": protocol.keys.to_pem(station.ca), "fingerprint": ca},
             "keystore": station.identity.keystore,
             "why": why,
         },
         f"Station  {station.name}\n  key      {station.fingerprint[:16]}\n  CA key   {ca[:16]}\n"
-        f"  keystore {station.identity.keystore} ({why})\n  home     {app.home}\n\n{to_pem(station.point)}",
+        f"  keystore {station.identity.keystore} ({why})\n  home     {app.home}\n\n"
+        f"{protocol.keys.to_pem(station.point)}",
     )
 
 
@@ -81,46 +82,43 @@ def _require_same(station: Station, name: str | None, keystore: str | None) -> N
 
 
 def _request(app: App, name: str | None, keystore: str | None, path: Path) -> None:
-    from teds_provision.files import require_new, write_new
-    from teds_provision.handover.certify import ask_for_certificate, read_request
-    from teds_provision.handover.trust import spoken
-    from teds_provision.protocol.keys import fingerprint, to_pem
-
     if not path.exists():
         require_new(path)
-    octets = ask_for_certificate(app.home, name=name, keystore=keystore, ask=app.ask_secret)
-    asked = read_request(octets)
+    octets = handover.certify.ask_for_certificate(app.home, name=name, keystore=keystore, ask=app.ask_secret)
+    asked = handover.certify.read_request(octets)
     fresh = not _is_request_of(path, asked.station)
     if fresh:
         write_new(path, octets)
-    digits = fingerprint(asked.station)
-    told = {"name": asked.name, "public_key": to_pem(asked.station), "fingerprint": digits, "request": str(path)}
+    digits = protocol.keys.fingerprint(asked.station)
+    told = {
+        "name": asked.name,
+        "public_key": protocol.keys.to_pem(asked.station),
+        "fingerprint": digits,
+        "request": str(path),
+    }
     app.emit(
         {**told, "ca": None},
-        f"Station {asked.name} asks for a certificate in {path}.\nFor comparison by voice:\n  {spoken(digits)}\n"
+        f"Station {asked.name} asks for a certificate in {path}.\n"
+        f"For comparison by voice:\n  {handover.trust.spoken(digits)}\n"
         f"Where the CA key is: teds-provision trust ca sign {path.name} --output {path.stem}.cert",
     )
 
 
 def _is_request_of(path: Path, point: bytes) -> bool:
     """Whether the file is a request of this very station already (a token signs it differently each time)."""
-    from teds_provision.errors import TedsProvisionError
-    from teds_provision.files import read_limited
-    from teds_provision.handover.certify import MAX_OCTETS, read_request
-
     try:
-        return path.exists() and read_request(read_limited(path, MAX_OCTETS, "request")).station == point
+        if not path.exists():
+            return False
+        return (
+            handover.certify.read_request(read_limited(path, handover.certify.MAX_OCTETS, "request")).station == point
+        )
     except TedsProvisionError:
         return False
 
 
 def _adopt(app: App, path: Path, yes: bool) -> None:
-    from teds_provision.files import read_limited
-    from teds_provision.handover.certify import MAX_OCTETS, adopt_certificate, read_certificate
-    from teds_provision.handover.trust import spoken
-    from teds_provision.protocol.keys import fingerprint
-
-    certificate = read_certificate(read_limited(path, MAX_OCTETS, "certificate"))
-    app.note(f"The CA of this certificate, for comparison by voice:\n  {spoken(fingerprint(certificate.ca))}")
+    certificate = handover.certify.read_certificate(read_limited(path, handover.certify.MAX_OCTETS, "certificate"))
+    digits = protocol.keys.fingerprint(certificate.ca)
+    app.note(f"The CA of this certificate, for comparison by voice:\n  {handover.trust.spoken(digits)}")
     app.confirm("Trust this CA as the owner of this station's nodes?", yes=yes)
-    adopt_certificate(app.home, certificate, ask=app.ask_secret).close()
+    handover.certify.adopt_certificate(app.home, certificate, ask=app.ask_secret).close()

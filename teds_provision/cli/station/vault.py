@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import click
 
+from teds_provision import station as station_room
 from teds_provision.cli.context import App, pass_app, read_line
 from teds_provision.cli.options import COMMAND_SETTINGS, dry_run_option, examples, yes_option
 
@@ -67,8 +68,6 @@ def rewrap(app: App, yes: bool, dry_run: bool) -> None:
     Who has an old copy of the store and the old master key still has the node keys of that day: agree anew with the
     nodes (agree UUID --rotate) where that matters. A run that was cut is carried on by the same command.
     """
-    from teds_provision.station.rewrap import rewrap as run
-
     del yes  # nothing here is lost: the old master key goes when nothing needs it any more
     station = app.station()
     kind = station.identity.keystore.partition(":")[0]
@@ -80,7 +79,7 @@ def rewrap(app: App, yes: bool, dry_run: bool) -> None:
         return
     station.unlock()
     with station.lock("vault rewrap", app.note):
-        done = run(station)
+        done = station_room.rewrap.rewrap(station)
     if done.damaged:
         app.warn(f"{done.damaged} keys in the store open under no master key; run teds-provision doctor.")
     app.emit(

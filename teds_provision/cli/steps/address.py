@@ -6,7 +6,9 @@ import click
 
 from teds_provision.cli.context import App, pass_app
 from teds_provision.cli.options import command, dry_run_option, link_options, yes_option
+from teds_provision.cli.rendering import reporter_for
 from teds_provision.links import LinkSettings
+from teds_provision.steps import visits
 
 
 def _address(_ctx: click.Context, _parameter: click.Parameter, text: str) -> int:
@@ -29,11 +31,8 @@ def _address(_ctx: click.Context, _parameter: click.Parameter, text: str) -> int
 @pass_app
 def address(app: App, uuid: str, address: int, yes: bool, dry_run: bool, links: LinkSettings) -> None:
     """Give a node another CAN address, 1 to 239, for good: by tap, or in a session where its key is held."""
-    from teds_provision.cli.rendering import reporter_for
-    from teds_provision.steps.visits.at_node import set_address_at
-
     del yes  # the old address can be given back the same way
-    done = set_address_at(app.station(), links, uuid, address, reporter_for(app), dry_run=dry_run)
+    done = visits.at_node.set_address_at(app.station(), links, uuid, address, reporter_for(app), dry_run=dry_run)
     node = done.uuid.hex()
     if done.changed is None:
         plan = f"Plan: node {node} gets CAN address 0x{address:02x}."

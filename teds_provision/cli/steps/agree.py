@@ -6,7 +6,9 @@ import click
 
 from teds_provision.cli.context import App, pass_app
 from teds_provision.cli.options import command, dry_run_option, link_options, yes_option
+from teds_provision.cli.rendering import reporter_for
 from teds_provision.links import LinkSettings
+from teds_provision.steps import visits
 
 
 @command(
@@ -24,13 +26,13 @@ def agree(app: App, uuid: str, links: LinkSettings, rotate: bool, yes: bool, dry
 
     The first agreement needs a tap (or the bus of a node built without NFC); a rotation goes over any link.
     """
-    from teds_provision.cli.rendering import reporter_for
-    from teds_provision.steps.visits.at_node import agree_at
 
     def confirm(question: str) -> None:
         app.confirm(question, yes=yes)
 
-    done = agree_at(app.station(), links, uuid, reporter_for(app), rotate=rotate, dry_run=dry_run, confirm=confirm)
+    done = visits.at_node.agree_at(
+        app.station(), links, uuid, reporter_for(app), rotate=rotate, dry_run=dry_run, confirm=confirm
+    )
     node, agreed = done.uuid.hex(), done.agreed
     if agreed is None:
         told = f"Plan: {done.plan} ({', '.join(done.held) or 'no key held'})."

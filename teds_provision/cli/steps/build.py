@@ -9,6 +9,8 @@ from typing import Any, TypeVar
 
 import click
 
+from teds_provision import steps
+from teds_provision import teds as teds_room
 from teds_provision.cli.context import App, pass_app
 from teds_provision.cli.options import command, dry_run_option, yes_option
 from teds_provision.errors import UsageFailure
@@ -25,10 +27,10 @@ def order_options(function: Function) -> Function:
 
     @wraps(function)
     def with_order(*args: Any, profile: Any, calibration: Any, no_calibration: bool, name: Any, **rest: Any) -> Any:
-        from teds_provision.steps.order import BuildOrder
-
         accepted = rest.pop("accept_calibration")
-        return function(*args, order=BuildOrder(profile, calibration, name, no_calibration, accepted), **rest)
+        return function(
+            *args, order=steps.order.BuildOrder(profile, calibration, name, no_calibration, accepted), **rest
+        )
 
     options = [
         click.option(
@@ -65,12 +67,10 @@ def order_options(function: Function) -> Function:
 @pass_app
 def build(app: App, uuid: str, order: Any, output: Path | None, edition: str, yes: bool, dry_run: bool) -> None:
     """Build the TEDS of the node's type, plus calibration, plus the Security TEDS, still unsigned."""
-    from teds_provision.steps.build import build as run
-
     del yes  # a build can always be made again
     station = app.station()
     octets = station.nodes.resolve(uuid)
-    built = run(station, octets, order, edition=int(edition), keep_draft=not dry_run)
+    built = steps.build.build(station, octets, order, edition=int(edition), keep_draft=not dry_run)
     if output is not None and not dry_run:
         write_file(output, built.image.to_json())
     for warning in built.warnings:
@@ -79,10 +79,11 @@ def build(app: App, uuid: str, order: Any, output: Path | None, edition: str, ye
         {"access_code": code, "channel": channel, "octets": len(teds), "sha256": hashlib.sha256(teds).hexdigest()}
         for (channel, code), teds in sorted(built.image.blocks.items())
     ]
-    from teds_provision.teds.calibration import describe_calibration, sentence
 
-    calibrations = [describe_calibration(calibration) for calibration in built.calibrations.values()]
-    fits = "".join(f"\n  {sentence(calibration)}" for calibration in built.calibrations.values())
+    calibrations = [
+        teds_room.calibration.describe_calibration(calibration) for calibration in built.calibrations.values()
+    ]
+    fits = "".join(f"\n  {teds_room.calibration.sentence(calibration)}" for calibration in built.calibrations.values())
     lines = [f"{b['access_code']:>4}  channel {b['channel']:<3} {b['octets']:>5} octets" for b in blocks]
     app.emit(
         {

@@ -6,6 +6,7 @@ import click
 
 from teds_provision.cli.context import App, pass_app
 from teds_provision.cli.options import command, dry_run_option, examples, yes_option
+from teds_provision.steps import visits
 
 
 @click.group(epilog=examples("teds-provision draft list", "teds-provision draft drop 8d4d"))
@@ -32,10 +33,8 @@ def list_(app: App) -> None:
 @pass_app
 def drop(app: App, uuid: str, yes: bool, dry_run: bool) -> None:
     """Drop the draft of a node: its datasheet stays as it is."""
-    from teds_provision.steps.visits.history import drop_draft
-
     del yes  # what was built can be built again
-    done = drop_draft(app.station(), uuid, dry_run=dry_run)
+    done = visits.history.drop_draft(app.station(), uuid, dry_run=dry_run)
     node = done.uuid.hex()
     if done.draft is None:
         app.emit({"uuid": node, "dropped": False}, f"Nothing lies ready for node {node}.")
@@ -53,9 +52,7 @@ draft.add_command(drop, "drop")
 @pass_app
 def history(app: App, uuid: str) -> None:
     """The datasheets that a node had, newest first; write UUID --from SEQUENCE brings one back, signed anew."""
-    from teds_provision.steps.visits.history import history_of
-
-    node, records = history_of(app.station(), uuid)
+    node, records = visits.history.history_of(app.station(), uuid)
     told = [
         {
             "sequence": record.sequence,

@@ -7,9 +7,12 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from teds_provision import talk
 from teds_provision.cli.context import App, pass_app
 from teds_provision.cli.options import command, link_options
+from teds_provision.cli.rendering import reporter_for
 from teds_provision.links import LinkSettings
+from teds_provision.steps import visits
 
 if TYPE_CHECKING:
     from teds_provision.steps.visits.identify_at import Found
@@ -28,16 +31,14 @@ def identify(app: App, links: LinkSettings, watch: bool, add: bool) -> None:
 
     Over --via can every node on the bus is asked; with --json several are listed under "nodes".
     """
-    from teds_provision.cli.rendering import reporter_for
-    from teds_provision.steps.visits.identify_at import identify_at
-    from teds_provision.talk.watching import Patience
-
-    stop = Patience(None)
+    stop = talk.watching.Patience(None)
     if watch:
         signal.signal(signal.SIGTERM, lambda *_: stop.ask())
     several = len(links.places) > 1
     found: list[dict[str, Any]] = []
-    for came in identify_at(app.station(), links, reporter_for(app, several=several), add=add, watch=watch, stop=stop):
+    for came in visits.identify_at.identify_at(
+        app.station(), links, reporter_for(app, several=several), add=add, watch=watch, stop=stop
+    ):
         if came.error is not None:
             app.fail_line(came.error, uuid=came.uuid.hex(), time=came.time)
         elif came.result is not None:

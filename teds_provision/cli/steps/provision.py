@@ -8,11 +8,16 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from teds_provision import station
+from teds_provision import steps as steps_room
 from teds_provision.cli.context import App, pass_app
 from teds_provision.cli.options import command, dry_run_option, link_options, yes_option
+from teds_provision.cli.rendering import print_table, reporter_for
 from teds_provision.cli.steps.build import order_options
+from teds_provision.cli.steps.screen import screen_for
 from teds_provision.errors import NotWhitelisted, TedsProvisionError
 from teds_provision.links import LinkSettings
+from teds_provision.steps import many
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -71,12 +76,9 @@ def provision(
     --yes accepts the node that lies on the reader. A finished node is left as it is: what it has changes only in what
     this command names (--profile, --calibration, --name), or after a yes to the changes that are shown.
     """
-    from teds_provision.cli.rendering import reporter_for
-    from teds_provision.steps.many.boards import Boards, Request
-
-    request = Request(uuid, order, watch, everything, batch, report)
+    request = many.boards.Request(uuid, order, watch, everything, batch, report)
     several = everything or len(links.places) > 1
-    boards = Boards(app.station(), links, request, reporter_for(app, several=several))
+    boards = many.boards.Boards(app.station(), links, request, reporter_for(app, several=several))
     for warning in boards.prepared.warnings:
         app.warn(warning)
     if dry_run:
@@ -88,19 +90,15 @@ def provision(
 
 
 def _one(app: App, boards: Boards, questions: Questions) -> None:
-    from teds_provision.steps.build import NotNamed
-
     try:
         done = boards.one(questions)
-    except NotNamed as error:
+    except steps_room.build.NotNamed as error:
         _tell_not_named(app, error)
         return
     _tell(app, done, error=_failure(done))
 
 
 def _many(app: App, boards: Boards, questions: Questions, *, totals: bool) -> None:
-    from teds_provision.cli.steps.screen import screen_for
-
     signal.signal(signal.SIGTERM, lambda *_: boards.stop.ask())
     with screen_for(app, boards) as screen:
         try:
@@ -126,9 +124,6 @@ def _questions(app: App, yes: bool, *, strangers: bool = True) -> Questions:
     """Whom to ask; ``strangers`` False: a yes on the command line does not add nodes that nobody named."""
     import threading
 
-    from teds_provision.steps.many.board import Declined
-    from teds_provision.steps.many.boards import Questions
-
     accepted: set[tuple[bytes, str]] = set()
     turn = threading.Lock()  # one question at a time, however many readers there are
 
@@ -142,7 +137,9 @@ def _questions(app: App, yes: bool, *, strangers: bool = True) -> Questions:
             )
         with turn:
             if not app.ask(f"Whitelist node {who.uuid.hex()} with key {who.fingerprint[:32]}?"):
-                raise Declined(f"You said no: node {who.uuid.hex()} was not whitelisted, nothing was changed.")
+                raise many.board.Declined(
+                    f"You said no: node {who.uuid.hex()} was not whitelisted, nothing was changed."
+                )
         accepted.add((who.uuid, who.fingerprint))
 
     def confirm(uuid: bytes, changes: tuple[Change, ...]) -> None:
@@ -153,9 +150,9 @@ def _questions(app: App, yes: bool, *, strangers: bool = True) -> Questions:
             if len(changes) > _CHANGES_SHOWN:
                 app.note(f"  and {len(changes) - _CHANGES_SHOWN} more")
             if not app.ask("Write it?"):
-                raise Declined(f"You said no: node {uuid.hex()} keeps its datasheet.")
+                raise many.board.Declined(f"You said no: node {uuid.hex()} keeps its datasheet.")
 
-    return Questions(accept, confirm if app.interactive else None)
+    return many.boards.Questions(accept, confirm if app.interactive else None)
 
 
 # -- telling -----------------------------------------------------------------------------------------------------------
@@ -183,18 +180,14 @@ def _tell_not_named(app: App, error: NotNamed) -> None:
 
 
 def _failure(done: Provisioned) -> TedsProvisionError | None:
-    from teds_provision.steps.many.board import Board
-
-    return Board(done.who.uuid, 0.0, done).failure
+    return many.board.Board(done.who.uuid, 0.0, done).failure
 
 
 def _tell(app: App, done: Provisioned, *, error: TedsProvisionError | None = None, **more: object) -> None:
     """Tell one node's end; ``error`` ends the command, ``more`` stands on the line of one of many."""
-    from teds_provision.station.summary import summarise
-
     for warning in done.warnings:
         app.warn(warning)
-    summary = summarise(done.image)
+    summary = station.summary.summarise(done.image)
     result = {
         "uuid": done.who.uuid.hex(),
         "fingerprint": done.who.fingerprint,
@@ -210,8 +203,6 @@ def _tell(app: App, done: Provisioned, *, error: TedsProvisionError | None = Non
 
 def _tell_board(app: App, board: Board) -> None:
     """One line of JSON, or what a person reads: UUID, time and row of the sheet on each."""
-    from teds_provision.steps.build import NotNamed
-
     if board.done is not None:
         _tell(app, board.done, row=board.row, time=board.time, seconds=round(board.seconds, 3))
         if board.failure is not None and not app.json:
@@ -220,7 +211,7 @@ def _tell_board(app: App, board: Board) -> None:
         of: dict[str, object] = {"uuid": board.uuid.hex(), "time": board.time, "row": board.row}
         if app.json:
             of["seconds"] = round(board.seconds, 3)
-            if isinstance(board.error, NotNamed):
+            if isinstance(board.error, steps_room.build.NotNamed):
                 of["changes"] = [change.text for change in board.error.changes]
         app.fail_line(board.error, **of)
 
@@ -249,10 +240,7 @@ def _summary(console: Console, done: Provisioned) -> None:
     from rich.markup import escape
     from rich.table import Table
 
-    from teds_provision.cli.rendering import print_table
-    from teds_provision.station.summary import summarise
-
-    summary = summarise(done.image)
+    summary = station.summary.summarise(done.image)
     table = Table(show_header=False, box=None, pad_edge=False)
     table.add_row("node", f"[bold]{escape(summary.name or '(no name)')}[/]")
     table.add_row("UUID", done.who.uuid.hex())

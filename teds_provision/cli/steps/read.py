@@ -9,7 +9,10 @@ import click
 
 from teds_provision.cli.context import App, pass_app
 from teds_provision.cli.options import command, link_options
+from teds_provision.cli.rendering import reporter_for
+from teds_provision.cli.steps.build import write_file
 from teds_provision.links import LinkSettings
+from teds_provision.steps import visits
 
 
 @command("teds-provision read 8d4d --nfc udp:localhost:54321 --output node.json")
@@ -21,11 +24,7 @@ from teds_provision.links import LinkSettings
 @pass_app
 def read(app: App, uuid: str, output: Path | None, links: LinkSettings) -> None:
     """Read every TEDS of a node, over a session where this station holds its key; look at it with show."""
-    from teds_provision.cli.rendering import reporter_for
-    from teds_provision.cli.steps.build import write_file
-    from teds_provision.steps.visits.at_node import read_at
-
-    done = read_at(app.station(), links, uuid, reporter_for(app))
+    done = visits.at_node.read_at(app.station(), links, uuid, reporter_for(app))
     if not done.proven:
         app.warn("Nothing here is proven: the node opened no session under the key that is held for it.")
     text = done.image.to_json()

@@ -9,7 +9,10 @@ import click
 
 from teds_provision.cli.context import App, pass_app
 from teds_provision.cli.options import command, dry_run_option, link_options, yes_option
+from teds_provision.cli.rendering import reporter_for
+from teds_provision.cli.steps.build import write_file
 from teds_provision.links import LinkSettings
+from teds_provision.steps import visits
 
 
 @command("teds-provision sign 8d4d", "teds-provision sign angle.json --output signed.json")
@@ -35,13 +38,9 @@ def sign(
 
     Unchanged content, key epoch and signer give back the existing signature.
     """
-    from teds_provision.cli.rendering import reporter_for
-    from teds_provision.cli.steps.build import write_file
-    from teds_provision.steps.visits.sign_command import sign_at
-
     del yes  # a signature uses up a sequence number, nothing else
     station = app.station()
-    done = sign_at(
+    done = visits.sign_command.sign_at(
         station,
         links,
         what,

@@ -6,10 +6,13 @@ from typing import TYPE_CHECKING
 
 import click
 
+from teds_provision.cli import steps as steps_cli
 from teds_provision.cli.context import App, pass_app
 from teds_provision.cli.options import command, link_options
+from teds_provision.cli.rendering import print_table, reporter_for
 from teds_provision.errors import UsageFailure
 from teds_provision.links import LinkSettings
+from teds_provision.steps import visits
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -34,16 +37,14 @@ def verify(app: App, what: tuple[str, ...], links: LinkSettings, accept_calibrat
     Exits 0 for "authentic", 4 for "unsigned" and "not authentic", 5 for "unproven", 6 for a harmful calibration;
     of several the worst.
     """
-    from teds_provision.cli.rendering import reporter_for
-    from teds_provision.cli.steps.verify_files import are_files, verify_many
-    from teds_provision.steps.visits.at_node import verify_at
-
-    if are_files(what):
+    if steps_cli.verify_files.are_files(what):
         if accept_calibration is not None:
             raise UsageFailure("--accept-calibration is for one image.", hint="Verify that one by itself.")
-        verify_many(app, what)
+        steps_cli.verify_files.verify_many(app, what)
         return
-    done = verify_at(app.station(), links, what[0], reporter_for(app), accept_calibration=accept_calibration)
+    done = visits.at_node.verify_at(
+        app.station(), links, what[0], reporter_for(app), accept_calibration=accept_calibration
+    )
     verified = done.verified
     result = {
         "uuid": verified.uuid.hex(),
@@ -60,8 +61,6 @@ def verify(app: App, what: tuple[str, ...], links: LinkSettings, accept_calibrat
 def _table(console: Console, verified: Verified) -> None:
     from rich.markup import escape
     from rich.table import Table
-
-    from teds_provision.cli.rendering import print_table
 
     style = {"passed": "green", "failed": "bold red", "skipped": "dim"}
     table = Table("check", "result", "found", box=None, pad_edge=False)

@@ -10,9 +10,11 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from teds_provision import steps
 from teds_provision.cli.context import App, pass_app
 from teds_provision.cli.options import COMMAND_SETTINGS, dry_run_option, examples, yes_option
 from teds_provision.cli.rendering import print_json_list, shown
+from teds_provision.cli.steps.build import write_file
 from teds_provision.station.label import read_label
 
 if TYPE_CHECKING:
@@ -61,10 +63,6 @@ def add(app: App, uuid: str, fingerprint: str | None, name: str | None, dry_run:
 
     What a scanner reads of a label (see: label) is taken in place of the UUID, and pins the key.
     """
-    from teds_provision.steps.whitelist import add as run
-    from teds_provision.steps.whitelist import plan_addition
-    from teds_provision.steps.whitelist_files import Listed, require_name
-
     station = app.station()
     scanned = read_label(uuid)
     octets = station.nodes.resolve(uuid) if scanned is None else scanned[0]
@@ -72,16 +70,16 @@ def add(app: App, uuid: str, fingerprint: str | None, name: str | None, dry_run:
         if fingerprint not in (None, scanned[1]):
             raise click.BadParameter("the label names another key.", param_hint="--fingerprint")
         fingerprint = scanned[1]
-    require_name(name)
-    wanted = Listed(0, octets, fingerprint, name)
-    plan = plan_addition(station, [wanted])
+    steps.whitelist_files.require_name(name)
+    wanted = steps.whitelist_files.Listed(0, octets, fingerprint, name)
+    plan = steps.whitelist.plan_addition(station, [wanted])
     if dry_run or not plan.write:
         _emit_plan(app, station, plan, dry_run=dry_run)
         return
     station.unlock()
     with station.lock("whitelist add", app.note):
-        plan = plan_addition(station, [wanted])
-        run(station, plan)
+        plan = steps.whitelist.plan_addition(station, [wanted])
+        steps.whitelist.add(station, plan)
     _emit_plan(app, station, plan, dry_run=False)
 
 
@@ -96,15 +94,12 @@ def add(app: App, uuid: str, fingerprint: str | None, name: str | None, dry_run:
 @pass_app
 def remove(app: App, uuid: str, yes: bool, dry_run: bool) -> None:
     """Take a node off the whitelist and forget its pinned key, so that a replaced board can be pinned anew."""
-    from teds_provision.steps.whitelist import is_pinned
-    from teds_provision.steps.whitelist import remove as run
-
     station = app.station()
     octets = station.nodes.resolve(uuid)
     entry = station.pins.entry(octets)
     told = f"{octets.hex()}{f' ({entry.name})' if entry and entry.name else ''}"
     pinned = entry.fingerprint if entry is not None else None
-    if entry is None and not is_pinned(station, octets):
+    if entry is None and not steps.whitelist.is_pinned(station, octets):
         text = f"{told} is not on the whitelist (nothing to do)."
     elif dry_run:
         text = f"Plan: take {told} off the whitelist, forget its key {(pinned or 'that it showed')[:16]}."
@@ -112,7 +107,7 @@ def remove(app: App, uuid: str, yes: bool, dry_run: bool) -> None:
         app.confirm(f"Take {told} off the whitelist and forget its pinned key?", yes=yes)
         station.unlock()
         with station.lock("whitelist remove", app.note):
-            run(station, octets)
+            steps.whitelist.remove(station, octets)
         text = f"{told} is off the whitelist{'' if entry else ' as before, and its key is forgotten'}."
     _emit(app, station, text, removed=entry is not None and not dry_run)
 
@@ -124,12 +119,10 @@ def list_entries(app: App) -> None:
 
     UUID, the pinned key, how well it was proven, when the entry was added, and the node's name.
     """
-    from teds_provision.steps.whitelist import as_dict
-
     station = app.station()
     entries = station.pins.each()
     if app.json:
-        print_json_list("whitelist", map(as_dict, entries))
+        print_json_list("whitelist", map(steps.whitelist.as_dict, entries))
         return
     first = next(entries, None)
     if first is None:
@@ -158,19 +151,15 @@ def import_file(app: App, file: Path, form: str | None, dry_run: bool) -> None:
     One wrong line refuses the whole file (exit 8), one UUID that is pinned to another key too (exit 6). Taken are UUID,
     fingerprint and name; when it was added, and with which assurance, is this station's to say.
     """
-    from teds_provision.steps.whitelist import add as run
-    from teds_provision.steps.whitelist import plan_addition
-    from teds_provision.steps.whitelist_files import read_whitelist
-
     station = app.station()
-    listed = read_whitelist(file, form)
+    listed = steps.whitelist_files.read_whitelist(file, form)
     if dry_run:
-        _emit_plan(app, station, plan_addition(station, listed), dry_run=True)
+        _emit_plan(app, station, steps.whitelist.plan_addition(station, listed), dry_run=True)
         return
     station.unlock()
     with station.lock("whitelist import", app.note):
-        plan = plan_addition(station, listed)
-        run(station, plan, source=str(file))
+        plan = steps.whitelist.plan_addition(station, listed)
+        steps.whitelist.add(station, plan, source=str(file))
     _emit_plan(app, station, plan, dry_run=False)
 
 
@@ -186,17 +175,14 @@ def import_file(app: App, file: Path, form: str | None, dry_run: bool) -> None:
 @pass_app
 def export_file(app: App, file: Path, form: str | None, dry_run: bool) -> None:
     """Write every entry, sorted, to a file in one piece; a file of that name is replaced."""
-    from teds_provision.cli.steps.build import write_file
-    from teds_provision.steps.whitelist import as_dict, form_of, render
-
     station = app.station()
-    form = form_of(file, form)
+    form = steps.whitelist.form_of(file, form)
     entries = station.pins.whitelist()
     if not dry_run:
-        write_file(file, render(entries, form))
+        write_file(file, steps.whitelist.render(entries, form))
     verb = "Would write" if dry_run else "Wrote"
     app.emit(
-        {"whitelist": [as_dict(entry) for entry in entries], "file": str(file), "format": form},
+        {"whitelist": [steps.whitelist.as_dict(entry) for entry in entries], "file": str(file), "format": form},
         f"{verb} {len(entries)} entries as {form} to {file}.",
     )
 
@@ -210,7 +196,5 @@ def _emit_plan(app: App, station: Station, plan: Plan, *, dry_run: bool) -> None
 
 def _emit(app: App, station: Station, text: str, **more: Any) -> None:
     """Tell a change in one line; with --json the whole whitelist as it stands now."""
-    from teds_provision.steps.whitelist import as_dict
-
-    listed = [as_dict(entry) for entry in station.pins.whitelist()] if app.json else []
+    listed = [steps.whitelist.as_dict(entry) for entry in station.pins.whitelist()] if app.json else []
     app.emit({"whitelist": listed, **more}, lambda console: console.print(text, markup=False))

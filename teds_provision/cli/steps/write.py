@@ -10,8 +10,10 @@ import click
 
 from teds_provision.cli.context import App, pass_app
 from teds_provision.cli.options import command, dry_run_option, link_options, yes_option
+from teds_provision.cli.rendering import reporter_for
 from teds_provision.errors import UsageFailure
 from teds_provision.links import LinkSettings
+from teds_provision.steps import visits
 
 if TYPE_CHECKING:
     from teds_provision.steps.write import Written
@@ -52,16 +54,13 @@ def write(
 
     --from brings an older datasheet of the node back, signed anew.
     """
-    from teds_provision.cli.rendering import reporter_for
-    from teds_provision.steps.visits.at_node import write_at
-
     if sequence is not None:
         if image is not None:
             raise UsageFailure("--from and --image name two datasheets.", hint="Give one of them.")
         _bring_back(app, uuid, sequence, links, dry_run=dry_run)
         return
     confirm = partial(app.confirm, yes=yes)
-    done = write_at(
+    done = visits.at_node.write_at(
         app.station(),
         links,
         uuid,
@@ -80,10 +79,7 @@ def write(
 
 
 def _bring_back(app: App, uuid: str, sequence: int, links: LinkSettings, *, dry_run: bool) -> None:
-    from teds_provision.cli.rendering import reporter_for
-    from teds_provision.steps.visits.history import bring_back
-
-    done = bring_back(app.station(), links, uuid, sequence, reporter_for(app), dry_run=dry_run)
+    done = visits.history.bring_back(app.station(), links, uuid, sequence, reporter_for(app), dry_run=dry_run)
     node, changes = done.uuid.hex(), [change.text for change in done.changes]
     lines = "".join(f"\n  {text}" for text in changes) or "\n  no change of what it has"
     if done.written is None:

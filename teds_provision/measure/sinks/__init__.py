@@ -8,8 +8,10 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from teds_provision.errors import UsageFailure
+from teds_provision.lazy import lazy
 from teds_provision.measure.sinks.base import CommandTaker, Sink, ThreadedSink, as_sink_failure
 from teds_provision.measure.sinks.jsonl import JsonLinesSink
 from teds_provision.measure.sinks.mcap import McapSink
@@ -19,6 +21,11 @@ from teds_provision.measure.sinks.ros2 import Ros2Sink
 from teds_provision.measure.sinks.text import TextSink
 
 __all__ = ["CommandTaker", "Sink", "ThreadedSink", "as_sink_failure", "open_sink"]
+
+if TYPE_CHECKING:
+    from teds_provision.measure.sinks import lines, recover
+else:
+    __getattr__ = lazy(__name__)
 
 FILES: dict[str, Callable[[Path], Sink]] = {
     ".csv": TextSink,

@@ -7,12 +7,10 @@ from pathlib import Path
 import click
 from click.shell_completion import CompletionItem
 
-from teds_provision.cli.context import App
+from teds_provision import station as station_room
+from teds_provision import teds
+from teds_provision.cli.configuration import home_of
 from teds_provision.errors import TedsProvisionError
-from teds_provision.lazy import late
-
-stations = late("teds_provision.station.station")
-profiles = late("teds_provision.teds.profile.load")
 
 _NODES = frozenset({"uuid", "uuids", "what", "old", "new", "node", "nodes", "text", "names"})
 _MOST = 50
@@ -30,13 +28,13 @@ def teach(command: click.Command) -> None:
 
 
 def _home(ctx: click.Context) -> Path:
-    return App.home_of(ctx.find_root().params.get("home"))
+    return home_of(ctx.find_root().params.get("home"))
 
 
 def _nodes(ctx: click.Context, _parameter: click.Parameter, incomplete: str) -> list[CompletionItem]:
     """UUIDs and names of known nodes, and files where they are taken."""
     try:
-        station = stations.Station.open(_home(ctx), ask=_nobody)  # type: ignore[attr-defined]
+        station = station_room.station.Station.open(_home(ctx), ask=_nobody)
     except TedsProvisionError:
         return []
     try:
@@ -48,7 +46,7 @@ def _nodes(ctx: click.Context, _parameter: click.Parameter, incomplete: str) -> 
 
 
 def _profiles(ctx: click.Context, _parameter: click.Parameter, incomplete: str) -> list[CompletionItem]:
-    listed = profiles.list_profiles(profiles.default_folders(_home(ctx)))  # type: ignore[attr-defined]
+    listed = teds.profile.list_profiles(teds.profile.default_folders(_home(ctx)))
     names = [CompletionItem(entry.name) for entry in listed if entry.name.startswith(incomplete)]
     return names or [CompletionItem(incomplete, type="file")]
 
