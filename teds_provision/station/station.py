@@ -9,6 +9,7 @@ part          what it knows
 ``policy``    trusted stations and CAs, the deny list, nodes given away
 ``nodes``     what is known of each node, its datasheets and drafts
 ``groups``    which nodes are measured together
+``measurements`` what is measured, also after a restart; detection; names
 ``handovers`` bundles that left and came
 ``seals``     MACs over the rows that decide whom the station believes
 ============  ======================================================================
@@ -29,6 +30,7 @@ from teds_provision.lazy import late
 from teds_provision.station.groups import Groups
 from teds_provision.station.handovers import Handovers
 from teds_provision.station.identity import DEFAULT_NAME, Identity
+from teds_provision.station.measurements import Measurements
 from teds_provision.station.node_keys import NodeKey, NodeKeys
 from teds_provision.station.nodes import Nodes
 from teds_provision.station.pins import Pins
@@ -64,6 +66,7 @@ class Station:
         self.policy = Policy(store, self.identity, self.keys, self.pins, self.seals)
         self.nodes = Nodes(store, self.seals)
         self.groups = Groups(store, store.home)
+        self.measurements = Measurements(store, self.groups, store.home)
         self.handovers = Handovers(store, self.keys, self.seals)
 
     @classmethod

@@ -52,7 +52,7 @@ class StoreLock:
             raise as_store_failure(error, self._path) from error
         try:
             self._acquire(descriptor)
-            self._sign(descriptor)
+            _sign(descriptor, self._command)
         except BaseException:
             os.close(descriptor)
             raise
@@ -80,7 +80,7 @@ class StoreLock:
                 raise as_store_failure(error, self._path) from error
             else:
                 return
-            holder = self._holder(descriptor)
+            holder = _holder(descriptor)
             if time.monotonic() >= until:
                 raise StoreLocked(f"The store is held by {holder}.", hint="Wait until it has ended, or end it.")
             if not told and pause >= _POLL_SECONDS and self._notice is not None:
@@ -89,18 +89,85 @@ class StoreLock:
             time.sleep(pause)
             pause = min(2 * pause, _POLL_SECONDS)  # a durable step of another command takes milliseconds
 
-    def _sign(self, descriptor: int) -> None:
-        text = json.dumps({"pid": os.getpid(), "command": self._command, "since": utc_now()})
-        with suppress(OSError):  # a full disk must not hide the store's own, better message
-            os.ftruncate(descriptor, 0)
-            os.pwrite(descriptor, text.encode(), 0)
 
-    def _holder(self, descriptor: int) -> str:
+class Mark:
+    """``with Mark(path, command="measure hand") as mark:`` something is taken, for as long as this process lives.
+
+    Does not wait: raises :class:`Taken`, which names the holder. ``left_behind`` says that the one before had no time
+    to put its mark away (it was killed, or the power failed).
+    """
+
+    def __init__(self, path: Path, *, command: str) -> None:
+        self._path, self._command = path, command
+        self._descriptor: int | None = None
+        self.left_behind = False
+
+    def __enter__(self) -> Mark:
         try:
-            said = json.loads(os.pread(descriptor, 4096, 0))
-            return f"pid {int(said['pid'])} ({said['command']}) since {said['since']}"
-        except (OSError, ValueError, KeyError, TypeError):
-            return "another process"
+            self._path.parent.mkdir(mode=0o700, exist_ok=True)
+            descriptor = os.open(self._path, os.O_CREAT | os.O_RDWR | os.O_NOFOLLOW | os.O_CLOEXEC, 0o600)
+        except OSError as error:
+            raise as_store_failure(error, self._path) from error
+        try:
+            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            self.left_behind = bool(os.pread(descriptor, 1, 0))
+        except BlockingIOError:
+            holder = _holder(descriptor)
+            os.close(descriptor)
+            raise Taken(f"It is held by {holder}.", holder) from None
+        except BaseException:
+            os.close(descriptor)
+            raise
+        _sign(descriptor, self._command)
+        self._descriptor = descriptor
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        if self._descriptor is not None:
+            with suppress(OSError):
+                os.ftruncate(self._descriptor, 0)
+            os.close(self._descriptor)
+            self._descriptor = None
+
+    @property
+    def is_taken(self) -> bool:
+        """Whether somebody holds it now."""
+        try:
+            descriptor = os.open(self._path, os.O_RDWR | os.O_NOFOLLOW | os.O_CLOEXEC)
+        except OSError:
+            return False
+        try:
+            fcntl.flock(descriptor, fcntl.LOCK_SH | fcntl.LOCK_NB)
+        except BlockingIOError:
+            return True
+        finally:
+            os.close(descriptor)
+        return False
+
+
+class Taken(StoreLocked):
+    """Somebody else holds a :class:`Mark`; ``holder`` names the process."""
+
+    def __init__(self, message: str, holder: str) -> None:
+        super().__init__(message, hint="Wait until it has ended, or end it.")
+        self.holder = holder
+
+
+def _sign(descriptor: int, command: str) -> None:
+    text = json.dumps({"pid": os.getpid(), "command": command, "since": utc_now()})
+    with suppress(OSError):  # a full disk must not hide the store's own, better message
+        os.ftruncate(descriptor, 0)
+        os.pwrite(descriptor, text.encode(), 0)
+
+
+def _holder(descriptor: int) -> str:
+    try:
+        said = json.loads(os.pread(descriptor, 4096, 0))
+        return f"pid {int(said['pid'])} ({said['command']}) since {said['since']}"
+    except (OSError, ValueError, KeyError, TypeError):
+        return "another process"
 
 
 class NodeTurn:

@@ -18,6 +18,7 @@ KeyState = Literal["pending", "active"]
 KeySource = Literal["agreement", "import"]
 DraftStage = Literal["built", "signed"]
 MeasurementKind = Literal["periodic", "event", "free"]
+DetectionMode = Literal["transparent", "whitelist"]
 TrustRole = Literal["station", "ca"]
 Direction = Literal["out", "in"]
 HandoverMode = Literal["copy", "move"]
@@ -172,16 +173,25 @@ class Group:
 class Measurement:
     """What the station measures after every start (operation.md section 7): a group, or nodes by UUID.
 
-    ``rate`` in Hz, None for what the datasheets say; ``sinks`` are the strings that name files and topics.
+    ``channels`` empty: every sensor. ``rate`` in Hz, None for what the datasheets say; ``kind`` None: as each channel
+    is. ``sinks`` are the strings that name files and topics; ``actuators`` says whether set points may come by them,
+    with a ``dead_man`` in ms. ``scalar_rate`` in Hz is that of topics of one value. One that is ``lasting`` is kept
+    until it is deleted, any other until it ends in order. ``ends`` is when (unix seconds), None for never.
     """
 
     id: str
     group: str | None = None
     uuids: tuple[bytes, ...] = ()
+    channels: tuple[int, ...] = ()
     rate: float | None = None
-    kind: MeasurementKind = "periodic"
+    kind: MeasurementKind | None = None
     trigger: bool = False
+    actuators: bool = False
+    dead_man: int = 1000
+    scalar_rate: float = 10.0
     sinks: tuple[str, ...] = ()
+    lasting: bool = True
+    ends: float | None = None
     created: str = field(default_factory=utc_now)
 
 

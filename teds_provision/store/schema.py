@@ -9,7 +9,7 @@ from __future__ import annotations
 from typing import Final
 
 APPLICATION_ID: Final = 0x54454453  # "TEDS"
-SCHEMA_VERSION: Final = 2
+SCHEMA_VERSION: Final = 3
 
 _VERSION_1: Final = (
     "CREATE TABLE meta(name TEXT PRIMARY KEY, value TEXT NOT NULL) STRICT, WITHOUT ROWID",
@@ -126,5 +126,29 @@ _VERSION_2: Final = (
         CHECK((group_name IS NULL) <> (uuids = '[]'))) STRICT, WITHOUT ROWID""",
 )
 
+# What came with version 3: measurements that name channels and may be without a kind (as each channel is), which of
+# them last beyond their own end, names of topics, and how nodes are detected. SQLite cannot loosen a CHECK: made anew.
+_VERSION_3: Final = (
+    "ALTER TABLE measurements RENAME TO measurements_2",
+    """CREATE TABLE measurements(
+        id TEXT PRIMARY KEY CHECK(id <> ''), group_name TEXT REFERENCES groups(name) ON DELETE CASCADE,
+        uuids TEXT NOT NULL, channels TEXT NOT NULL, rate REAL CHECK(rate > 0),
+        kind TEXT CHECK(kind IN ('periodic', 'event', 'free')), trigger INTEGER NOT NULL CHECK(trigger IN (0, 1)),
+        actuators INTEGER NOT NULL CHECK(actuators IN (0, 1)),
+        dead_man INTEGER NOT NULL CHECK(dead_man BETWEEN 20 AND 10000),
+        scalar_rate REAL NOT NULL CHECK(scalar_rate BETWEEN 0 AND 1000), sinks TEXT NOT NULL,
+        lasting INTEGER NOT NULL CHECK(lasting IN (0, 1)), ends REAL, created TEXT NOT NULL,
+        CHECK((group_name IS NULL) <> (uuids = '[]'))) STRICT, WITHOUT ROWID""",
+    """INSERT INTO measurements SELECT id, group_name, uuids, '[]', rate, kind, trigger, 0, 1000, 10.0, sinks, 1, NULL,
+        created FROM measurements_2""",
+    "DROP TABLE measurements_2",
+    """CREATE TABLE topics(
+        uuid BLOB NOT NULL CHECK(length(uuid) = 10), channel INTEGER NOT NULL CHECK(channel BETWEEN 0 AND 255),
+        name TEXT NOT NULL UNIQUE CHECK(name <> ''), PRIMARY KEY(uuid, channel)) STRICT, WITHOUT ROWID""",
+    """CREATE TABLE detection(
+        one INTEGER PRIMARY KEY CHECK(one = 1),
+        mode TEXT NOT NULL CHECK(mode IN ('transparent', 'whitelist'))) STRICT""",
+)
+
 # STEPS_TO[n] are the statements that bring a store of version n - 1 to version n.
-STEPS_TO: Final[dict[int, tuple[str, ...]]] = {1: _VERSION_1, 2: _VERSION_2}
+STEPS_TO: Final[dict[int, tuple[str, ...]]] = {1: _VERSION_1, 2: _VERSION_2, 3: _VERSION_3}

@@ -48,3 +48,29 @@ def test_with_a_group_go_its_measurements(store: Store) -> None:
 def test_a_measurement_names_a_group_or_nodes(store: Store, wrong: Measurement) -> None:
     with pytest.raises(BadData):
         store.put_measurement(wrong)
+
+
+def test_a_measurement_comes_back_as_it_was_kept(store: Store) -> None:
+    wanted = Measurement(
+        "m3", uuids=(ONE,), channels=(1, 4), kind=None, trigger=True, actuators=True, dead_man=200,
+        scalar_rate=0.5, sinks=("/r/run.csv", "ros1"), lasting=False, ends=1.5e9,
+    )  # fmt: skip
+    store.put_measurement(wanted)
+    assert store.measurement("m3") == wanted
+
+
+def test_names_of_topics_are_kept_each_once(store: Store) -> None:
+    store.put_topic_name(ONE, 1, "crane/angle")
+    store.put_topic_name(ONE, 1, "crane/slew")
+    assert store.topic_names() == {(ONE, 1): "crane/slew"}
+    with pytest.raises(TedsProvisionError):
+        store.put_topic_name(TWO, 1, "crane/slew")
+    assert store.remove_topic_name(ONE, 1)
+    assert store.topic_names() == {}
+
+
+def test_how_nodes_are_detected_is_kept(store: Store) -> None:
+    assert store.detection() is None
+    for mode in ("transparent", "whitelist"):
+        store.put_detection(mode)
+        assert store.detection() == mode

@@ -15,6 +15,7 @@ import pytest
 
 from teds_provision.errors import StoreFailure
 from teds_provision.store import Store
+from teds_provision.store.schema import SCHEMA_VERSION
 from teds_provision.vault import forget_vaults, node_key_context, open_vault
 
 MADE = Path(__file__).parent / "fixtures" / "version1"
@@ -107,7 +108,7 @@ def test_nothing_of_the_old_tables_is_left(home: Path, store: Store) -> None:
     assert store.damage() is None
     store.close()
     with Store.open(home) as again:  # and a second opening has nothing to bring forward
-        assert again._database.one("PRAGMA user_version") == (2,)
+        assert again._database.one("PRAGMA user_version") == (SCHEMA_VERSION,)
 
 
 def test_a_migration_that_fails_leaves_the_store_as_it_was(home: Path) -> None:

@@ -1,14 +1,15 @@
-"""Measurement groups, and what the station measures after every start (operation.md section 7)."""
+"""Measurement groups, what is measured after every start, names, detection (operation.md section 7)."""
 
 from __future__ import annotations
 
 import json
 from collections.abc import Iterable
-from typing import Any
+from dataclasses import replace
+from typing import Any, cast
 
 from teds_provision.errors import BadData
 from teds_provision.store.database import Database
-from teds_provision.store.records import Group, Measurement
+from teds_provision.store.records import DetectionMode, Group, Measurement
 
 
 class MeasurementTables:
@@ -76,27 +77,64 @@ class MeasurementTables:
         """Keep what the station measures from now on; raises BadData where it names both a group and nodes, or none."""
         if (measurement.group is None) == (not measurement.uuids):
             raise BadData("A measurement names a group, or nodes by UUID.")
-        self._database.execute(
-            "INSERT OR REPLACE INTO measurements VALUES(?, ?, ?, ?, ?, ?, ?, ?)",
-            (
-                measurement.id,
-                measurement.group,
-                json.dumps([uuid.hex() for uuid in measurement.uuids]),
-                measurement.rate,
-                measurement.kind,
-                int(measurement.trigger),
-                json.dumps(list(measurement.sinks)),
-                measurement.created,
-            ),
+        one = measurement
+        values = (
+            one.id,
+            one.group,
+            json.dumps([uuid.hex() for uuid in one.uuids]),
+            json.dumps(list(one.channels)),
+            one.rate,
+            one.kind,
+            int(one.trigger),
+            int(one.actuators),
+            one.dead_man,
+            float(one.scalar_rate),
+            json.dumps(list(one.sinks)),
+            int(one.lasting),
+            one.ends,
+            one.created,
         )
+        marks = ", ".join("?" * len(values))
+        self._database.execute(f"INSERT OR REPLACE INTO measurements VALUES({marks})", values)
 
     def remove_measurement(self, measurement_id: str) -> bool:
         """Measure this no more; False if there is none."""
         return self._database.change("DELETE FROM measurements WHERE id = ?", (measurement_id,)) > 0
 
+    # -- names of topics, and how nodes are detected -----------------------------------------------------------------
 
-def _measurement(
-    name: str, group: str | None, uuids: str, rate: float | None, kind: Any, trigger: int, sinks: str, created: str
-) -> Measurement:
-    members = tuple(bytes.fromhex(uuid) for uuid in json.loads(uuids))
-    return Measurement(name, group, members, rate, kind, bool(trigger), tuple(json.loads(sinks)), created)
+    def topic_names(self) -> dict[tuple[bytes, int], str]:
+        """Return every name that somebody chose, by UUID and channel; channel 0 is the node's part of its topics."""
+        rows = self._database.execute("SELECT uuid, channel, name FROM topics ORDER BY uuid, channel")
+        return {(bytes(uuid), int(channel)): str(name) for uuid, channel, name in rows}
+
+    def put_topic_name(self, uuid: bytes, channel: int, name: str) -> None:
+        """Keep a chosen name, in place of the one before."""
+        statement = "INSERT INTO topics VALUES(?, ?, ?) ON CONFLICT(uuid, channel) DO UPDATE SET name = excluded.name"
+        self._database.execute(statement, (uuid, channel, name))
+
+    def remove_topic_name(self, uuid: bytes, channel: int) -> bool:
+        """Forget a chosen name; False if there is none."""
+        return self._database.change("DELETE FROM topics WHERE uuid = ? AND channel = ?", (uuid, channel)) > 0
+
+    def detection(self) -> DetectionMode | None:
+        """Return how nodes are detected, None where nobody has said."""
+        row = self._database.one("SELECT mode FROM detection")
+        return None if row is None else cast(DetectionMode, row[0])
+
+    def put_detection(self, mode: DetectionMode) -> None:
+        """Keep how nodes are detected."""
+        self._database.execute("INSERT OR REPLACE INTO detection VALUES(1, ?)", (mode,))
+
+
+def _measurement(*row: Any) -> Measurement:
+    one = Measurement(*row)
+    return replace(
+        one,
+        uuids=tuple(bytes.fromhex(uuid) for uuid in json.loads(row[2])),
+        channels=tuple(json.loads(row[3])),
+        trigger=bool(one.trigger),
+        actuators=bool(one.actuators),
+        sinks=tuple(json.loads(row[10])),
+        lasting=bool(one.lasting),
+    )

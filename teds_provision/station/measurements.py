@@ -1,0 +1,147 @@
+"""What this station measures (operation.md section 7), how it detects nodes, and the names under which it publishes.
+
+A measurement is kept from before its first session until it is deleted (``lasting``), or until it ends in order. So
+after ``kill -9``, power loss or a restart it is still there, and is carried on: by ``measure GROUP`` (the same
+command, without options) or by ``ncap run``. A topic's name may be changed as long as nobody measures its node.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import secrets
+import time
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
+from dataclasses import replace
+from pathlib import Path
+
+from teds_provision.errors import NotFound, PolicyRefused, UsageFailure
+from teds_provision.station.groups import Groups
+from teds_provision.store import Store
+from teds_provision.store.lock import Mark, Taken
+from teds_provision.store.records import DetectionMode, Measurement
+
+FOLDER = "measuring"  # of the home: who measures what now
+
+STATION = bytes(10)
+"""Stands for the station in :attr:`Measurements.names`: the first part of every topic."""
+
+
+class Measurements:
+    """The measurements of one station. One that runs is frozen: its group, its nodes and their names stay."""
+
+    def __init__(self, store: Store, groups: Groups, home: Path) -> None:
+        self._store, self._groups, self._home = store, groups, home
+
+    def all(self) -> list[Measurement]:
+        """Every one that is kept, oldest first."""
+        return self._store.measurements()
+
+    def due(self) -> list[Measurement]:
+        """Those to carry on now: kept, not past their end."""
+        return [one for one in self.all() if one.ends is None or one.ends > time.time()]
+
+    def get(self, measurement_id: str) -> Measurement:
+        """One of them; raises NotFound."""
+        found = self._store.measurement(measurement_id)
+        if found is None:
+            raise NotFound(
+                f"There is no measurement {measurement_id!r}.",
+                hint=f"There is: {', '.join(one.id for one in self.all()) or 'none'}.",
+            )
+        return found
+
+    def of_group(self, group: str) -> Measurement | None:
+        """The one of a group that was cut off, or lasts: what `measure GROUP` carries on; None where there is none."""
+        return next((one for one in reversed(self.due()) if one.group == group), None)
+
+    def nodes_of(self, measurement: Measurement) -> tuple[bytes, ...]:
+        """UUIDs of its nodes, 10 octets each; raises NotFound where its group is gone."""
+        return measurement.uuids if measurement.group is None else self._groups.get(measurement.group).uuids
+
+    def keep(self, measurement: Measurement) -> Measurement:
+        """Keep it, durable when this returns; one with id "" gets one. Raises NotFound (its group), BadData."""
+        if measurement.group is not None:
+            self._groups.get(measurement.group)
+        kept = measurement if measurement.id else replace(measurement, id=secrets.token_hex(4))
+        self._store.put_measurement(kept)
+        return kept
+
+    def forget(self, measurement_id: str) -> bool:
+        """Measure it no more after the next start; False where it is not there. Ends nothing that runs."""
+        return self._store.remove_measurement(measurement_id)
+
+    @contextmanager
+    def running(self, uuids: tuple[bytes, ...], *, group: str | None = None, what: str = "measure") -> Iterator[None]:
+        """Hold these nodes (and their group) for one measurement; raises PolicyRefused, naming who holds them.
+
+        The marks are locks of the system: they go with the process, however that ends.
+        """
+        with ExitStack() as stack:
+            if group is not None:
+                stack.enter_context(self._groups.frozen(group))
+            for uuid in sorted(set(uuids)):
+                try:
+                    stack.enter_context(self._mark(uuid, what))
+                except Taken as taken:
+                    raise PolicyRefused(
+                        f"Node {uuid.hex()} is being measured by {taken.holder}.",
+                        hint="End that measurement first, or measure other nodes.",
+                    ) from taken
+            yield
+
+    def is_running(self, uuid: bytes) -> bool:
+        """Whether a measurement of this station holds the node, in this process or another one."""
+        return self._mark(uuid).is_taken
+
+    def _mark(self, uuid: bytes, what: str = "") -> Mark:
+        return Mark(self._home / FOLDER / f"{uuid.hex()}.lock", command=what)
+
+    def source(self, bus: str, source: int, *, command: str) -> Mark:
+        """Take a source address on a bus for this process.
+
+        A session belongs to a pair of addresses, and a second
+        Open on it ends the first (operation.md section 6). ``bus`` names interface and channel. To be entered by
+        ``with``, which raises Taken (7) and names the holder.
+        """
+        name = hashlib.sha256(f"{bus}\0{source}".encode()).hexdigest()[:16]
+        return Mark(self._home / FOLDER / f"bus-{name}.lock", command=command)
+
+    # -- detection ---------------------------------------------------------------------------------------------------
+
+    @property
+    def detection(self) -> DetectionMode:
+        """How nodes are detected; ``whitelist`` unless somebody asked otherwise."""
+        return self._store.detection() or "whitelist"
+
+    @detection.setter
+    def detection(self, mode: DetectionMode) -> None:
+        self._store.put_detection(mode)
+
+    # -- names of topics ---------------------------------------------------------------------------------------------
+
+    @property
+    def names(self) -> dict[tuple[bytes, int], str]:
+        """Chosen names by UUID and channel: channel 0 is the node's part, :data:`STATION` the station's part."""
+        return self._store.topic_names()
+
+    def rename(self, uuid: bytes, channel: int, name: str | None) -> None:
+        """Publish a channel (0: the node's part) under this name from the next measurement on; None: as it was made.
+
+        The caller has checked that it can be a topic. Raises PolicyRefused while the node is measured, UsageFailure
+        where another one has the name.
+        """
+        if self.is_running(uuid):
+            raise PolicyRefused(
+                f"Node {uuid.hex()} is being measured: its names stay as they are.", hint="End that measurement first."
+            )
+        if name is None:
+            self._store.remove_topic_name(uuid, channel)
+            return
+        for (other, number), taken in self.names.items():
+            if taken == name and (other, number) != (uuid, channel):
+                raise UsageFailure(
+                    f"{name!r} is the name of channel {number} of node {other.hex()} already.",
+                    hint="Choose another name.",
+                )
+        self._store.put_topic_name(uuid, channel, name)
