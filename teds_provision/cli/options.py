@@ -50,7 +50,7 @@ class Seconds(click.FloatRange):
 
 
 def link_options(function: Function) -> Function:
-    """Add --via, --nfc (several with --watch), --can, --ble, --timeout, --trace; gives ``links: LinkSettings``."""
+    """Add --via, --nfc and --can (several for some commands), --ble, --timeout, --trace; gives ``links``."""
     from functools import wraps
 
     @wraps(function)
@@ -58,14 +58,15 @@ def link_options(function: Function) -> Function:
         *args: Any,
         via: str,
         nfc: tuple[str, ...],
-        can: str | None,
+        can: tuple[str, ...],
         ble: str | None,
         timeout: float,
         trace: Path | None,
         **rest: Any,
     ) -> Any:
+        named = can[0] if len(can) == 1 else can or None
         with tracing(trace) as opened:
-            return function(*args, links=LinkSettings(via, nfc or None, can, ble, timeout, opened), **rest)
+            return function(*args, links=LinkSettings(via, nfc or None, named, ble, timeout, opened), **rest)
 
     options = [
         click.option(
@@ -79,7 +80,13 @@ def link_options(function: Function) -> Function:
             help="Reader: auto (the one that is there), usb, usb:072f:2200, tty:USB0:pn532, udp:localhost:54321; "
             "several with --watch.",
         ),
-        click.option("--can", metavar="INTERFACE:CHANNEL", help="Bus: socketcan:can0, udp_multicast:239.74.163.2, …"),
+        click.option(
+            "--can",
+            metavar="INTERFACE:CHANNEL",
+            multiple=True,
+            cls=_Several,
+            help="Bus: socketcan:can0, udp_multicast:239.74.163.2, …; several with measure.",
+        ),
         click.option("--ble", metavar="ADAPTER", help="Not in this version."),
         click.option(
             "--timeout",

@@ -21,10 +21,11 @@ from teds_provision.steps.verify import require_authentic
 from teds_provision.talk.meeting import meet
 
 if TYPE_CHECKING:
-    from teds_provision.measure import acting, blocks, orders, runner, sinks, trusting
+    from teds_provision.measure import acting, blocks, finding, orders, runner, sinks, trusting
 else:  # numpy and what measuring needs are loaded when the demo gets there
-    acting, blocks, orders, runner, sinks, trusting = (
-        late(f"teds_provision.measure.{name}") for name in ("acting", "blocks", "orders", "runner", "sinks", "trusting")
+    acting, blocks, finding, orders, runner, sinks, trusting = (
+        late(f"teds_provision.measure.{name}")
+        for name in ("acting", "blocks", "finding", "orders", "runner", "sinks", "trusting")
     )
 
 GRIPPER = "gripper"
@@ -82,8 +83,8 @@ def measure_group(demo: Demo, station: Station, uuids: tuple[bytes, ...]) -> Non
             sink = sinks.open_sink(str(file))
             facts = blocks.StationFacts(station.name, group="robot", started=time.time())
             wish = orders.Wish(rate=RATE, timeout=15.0)
-            measured = runner.Measurement(station, port, uuids, wish, [sink], facts)
-            ended = measured.run(threading.Event(), SECONDS)
+            with finding.buses.Buses([port]) as buses:
+                ended = runner.Measurement(station, buses, uuids, wish, [sink], facts).run(threading.Event(), SECONDS)
         finally:
             port.close()
         if ended.error is not None:

@@ -66,8 +66,8 @@ def open_port(settings: LinkSettings) -> Port:
     places = settings.places
     if len(places) > 1:
         raise UsageFailure(
-            f"{len(places)} readers are named, and this command works with one.",
-            hint="Several readers are for --watch; name one with --nfc.",
+            f"{len(places)} readers or buses are named, and this command works with one.",
+            hint=f"Name one with --{settings.via}; several are for --watch and measure.",
         )
     return open_place(places[0], settings.trace)
 

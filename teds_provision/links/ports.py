@@ -182,14 +182,14 @@ class Port(Protocol):
 
 @dataclass(frozen=True)
 class LinkSettings:
-    """The user's link options, unparsed: ``--via``, ``--nfc`` (one, or several), ``--can``, ``--ble``, ``--timeout``.
+    """The user's link options, unparsed: ``--via``, ``--nfc``, ``--can`` (one or several), ``--ble``, ``--timeout``.
 
     ``timeout`` in seconds. ``nfc`` None or ``auto``: the one reader that is there. ``trace`` is an open one (--trace).
     """
 
     via: str = "nfc"
     nfc: str | tuple[str, ...] | None = None
-    can: str | None = None
+    can: str | tuple[str, ...] | None = None
     ble: str | None = None
     timeout: float = 60.0
     trace: Trace | None = None

@@ -8,8 +8,10 @@ if TYPE_CHECKING:
     from teds_provision.measure import (
         acting,
         blocks,
+        carrying,
         clock,
         facts,
+        finding,
         grid,
         hands,
         hearing,

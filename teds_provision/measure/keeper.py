@@ -21,20 +21,21 @@ from teds_provision.errors import (
     StoreFailure,
     TedsProvisionError,
 )
-from teds_provision.links.can.port import CanPort
-from teds_provision.links.ports import Contact, Notice
 from teds_provision.measure.blocks import Command, NodeReport, State
+from teds_provision.measure.carrying.together import Together
 from teds_provision.measure.clock import AT_FIRST, ClockMap, Monotone, Wall
+from teds_provision.measure.finding.buses import Bus, Buses
+from teds_provision.measure.finding.lookout import Sighting
 from teds_provision.measure.hands import Hands
-from teds_provision.measure.hearing import HeardStream, Hearing
+from teds_provision.measure.hearing import HeardStream
 from teds_provision.measure.interpreter import StreamInterpreter
-from teds_provision.measure.orders import BusShare, Events, StreamTotals, Wish
+from teds_provision.measure.orders import Events, StreamTotals, Wish
 from teds_provision.measure.planning import BusTime, Plans, plan_node, sensors_of
 from teds_provision.measure.trusting import Trusted, claim, exchange_clock, open_trusted
 from teds_provision.protocol.messages.frames import Reason
 from teds_provision.protocol.operation.can_frames import Assembly
 from teds_provision.protocol.operation.commands import idle
-from teds_provision.protocol.operation.stream_commands import SOON, WAITS, Kind, decode_stopped, stop
+from teds_provision.protocol.operation.stream_commands import SOON, Kind, decode_stopped, stop
 from teds_provision.protocol.operation.subscription import Plan, Receiver
 from teds_provision.station.station import Station
 from teds_provision.talk.conversation import Conversation, SessionLost
@@ -42,6 +43,9 @@ from teds_provision.teds.sheet import Channel
 
 FIRST_PAUSE, LAST_PAUSE = 1.0, 30.0
 SILENT = 2.0  # seconds without a good message, beside two messages' time: then the node is lost
+LOOKING = 2.0  # seconds that a node which ran before is looked for, between its reports
+LOOK = 0.2  # seconds between looks at how it does
+ANNOUNCED = 1.0  # seconds between questions that announcements cause
 SLOWER = 10  # halvings of the rate while the firmware says that its shortest period is longer
 _CURED_BY_TIME = frozenset({Reason.WRONG_STATE, Reason.BUSY, Reason.BAD_TAG, 21, 22, 23})
 _FINAL = (NotAuthentic, PolicyRefused, BadData, StoreFailure)
@@ -53,13 +57,12 @@ class NodeKeeper:
     def __init__(
         self,
         station: Station,
-        port: CanPort,
-        hearing: Hearing,
-        bus: BusShare,
+        buses: Buses,
         uuid: bytes,
         wish: Wish,
         wall: Wall,
         events: Events,
+        together: Together,
     ) -> None:
         self.uuid = uuid
         self.error: TedsProvisionError | None = None
@@ -72,13 +75,14 @@ class NodeKeeper:
         self.turn = threading.Lock()  # of the session: one exchange at a time
         self.ready = threading.Event()  # streams were asked for
         self.done = threading.Event()
-        self._station, self._port, self._hearing, self._bus = station, port, hearing, bus
-        self._wish, self._wall, self._events = wish, wall, events
+        self._station, self._buses = station, buses
+        self.bus: Bus | None = None  # where it is, once it was found
+        self._wish, self._wall, self._events, self._together = wish, wall, events, together
         self._mapping = threading.Lock()
         self._monotone: dict[int, Monotone] = {}
         self._stop = threading.Event()
-        self._anew = threading.Event()
-        self._address: int | None = None
+        self._anew, self._announced = threading.Event(), threading.Event()
+        self._lost_at = 0.0
         self._halved = 0
         self._hands: Hands | None = None
         self._told = ""
@@ -125,7 +129,9 @@ class NodeKeeper:
                 pause = min(2 * pause, LAST_PAUSE)
             self._say("ended")
         finally:
-            self._bus.gone(self.uuid)
+            self._together.gone(self.uuid)
+            for bus in self._buses.all():
+                bus.share.gone(self.uuid)
             self.done.set()
             self.ready.set()
 
@@ -141,7 +147,7 @@ class NodeKeeper:
 
     def _gives_up(self, error: TedsProvisionError, first: float) -> bool:
         """Before the first value a refusal ends it; later anyone could have sent it, so it is tried again."""
-        if self.ever_ran:
+        if self.ever_ran or self._wish.patient:
             return False
         final = isinstance(error, _FINAL) and not self._passing(error)
         return final or time.monotonic() - first > self._wish.timeout
@@ -151,37 +157,31 @@ class NodeKeeper:
         return isinstance(error, NodeRefused) and error.reason in _CURED_BY_TIME
 
     def _once(self) -> None:
-        contact = self._find()
-        address = contact.address or 0
-        self._address = address
-        with Conversation(contact, notice=lambda _notice: None) as node:
+        seconds = self._wish.timeout if not self.ever_ran else LOOKING
+        sighting = self._buses.sightings.find(self.uuid, seconds=seconds, stop=self._stop, fresh=self._lost_at)
+        self.bus = self._buses.of(sighting)
+        for other in self._buses.all():
+            if other is not self.bus:
+                other.share.gone(self.uuid)
+        try:
+            self._in_session(self.bus, sighting)
+        except BaseException:
+            self._lost_at = time.monotonic()
+            self._buses.sightings.wrong(sighting)
+            raise
+
+    def _in_session(self, bus: Bus, sighting: Sighting) -> None:
+        with Conversation(sighting.contact(), notice=lambda _notice: None) as node:
             trusted = open_trusted(self._station, node)
             self.trusted = trusted
-            self._hearing.on_announce(address, self._anew.set)
+            bus.hearing.on_announce(sighting.address, self._announced.set)
             try:
-                channels = self._measure(trusted, address)
-                self._keep(trusted, channels)
+                self._measure(bus, trusted, sighting.address)
+                self._keep(trusted)
             finally:
-                self._end(trusted, address)
+                self._end(bus, trusted, sighting.address)
 
-    def _find(self) -> Contact:
-        record = self._station.nodes.get(self.uuid)
-        known = record.can_address if record is not None and record.can_address else None
-
-        def wanted(identity: object) -> bool:
-            return getattr(identity, "uuid", None) == self.uuid
-
-        seconds = self._wish.timeout if not self.ever_ran else 2.0
-        until = time.monotonic() + seconds
-        while True:
-            try:
-                left = max(0.5, min(2.0, until - time.monotonic()))
-                return self._port.find(wanted, seconds=left, notice=_nothing, address=self._address or known)
-            except LinkFailure:
-                if self._stop.is_set() or time.monotonic() >= until:
-                    raise
-
-    def _measure(self, trusted: Trusted, address: int) -> list[Channel]:
+    def _measure(self, bus: Bus, trusted: Trusted, address: int) -> None:
         """Clock, Operate, Subscribe; every stream is heard from then on."""
         with self._mapping:
             self.clock = ClockMap()
@@ -190,17 +190,16 @@ class NodeKeeper:
         actuators = self._actuators(trusted)
         channels = self._sensors(trusted.sheet.channels, actuators)
         self._claim(trusted, channels)
-        plans = self._subscribe(trusted, channels, address) if channels else Plans((), 0.0)
+        plans = self._subscribe(bus, trusted, channels, address) if channels else Plans((), 0.0)
         periods = {number: p.subscribe.period / 1e9 for p in plans.streams for number in p.layout.channels}
         self._events.facts([trusted.facts(one, periods.get(one.number)) for one in (*channels, *actuators)])
         if actuators:
-            self._hands = self._hands_for(trusted, actuators, address)
+            self._hands = self._hands_for(bus, trusted, actuators, address)
         notes = [plans.slowed] if plans.slowed else []
         notes += [problem for heard in self.running.values() for problem in heard.interpreter.problems.values()]
         self.ever_ran, self.error = True, None
         self._say("running", why="; ".join(notes))
         self.ready.set()
-        return channels
 
     def _actuators(self, trusted: Trusted) -> list[Channel]:
         """Actuators that set points may come for: of a node on the whitelist, with a way from values to raw."""
@@ -229,10 +228,10 @@ class NodeKeeper:
         for number in [0] if whole else [one.number for one in channels]:
             claim(trusted, number, lease=self._wish.lease)
 
-    def _hands_for(self, trusted: Trusted, actuators: list[Channel], address: int) -> Hands:
+    def _hands_for(self, bus: Bus, trusted: Trusted, actuators: list[Channel], address: int) -> Hands:
         return Hands(
             trusted,
-            self._port,
+            bus.port,
             address,
             tuple(sorted(one.number for one in actuators)),
             dead_man=self._wish.dead_man,
@@ -243,37 +242,42 @@ class NodeKeeper:
             tell=lambda why: self._say(self.state, why=why),
         )
 
-    def _subscribe(self, trusted: Trusted, channels: list[Channel], address: int) -> Plans:
+    def _subscribe(self, bus: Bus, trusted: Trusted, channels: list[Channel], address: int) -> Plans:
+        rate, share = self._wish.rate, bus.share
+        if rate is None:
+            share.want(self.uuid, self._plan(channels, share.time, SOON).load)
+        start = self._together.start(self.uuid, self.clock)
         while True:
-            rate = self._wish.rate
-            if rate is None:
-                self._bus.want(self.uuid, self._plan(channels, self._bus.time).load)
-            with self._bus.lock:
-                plans = self._plan(channels, self._bus.others(self.uuid, sharing=rate is None))
-                self._bus.taken[self.uuid] = plans.load
+            with share.lock:
+                plans = self._plan(channels, share.others(self.uuid, sharing=rate is None), start)
+                share.taken[self.uuid] = plans.load
             try:
                 for plan in plans.streams:
-                    self._stream(trusted, plan, address)
+                    self._stream(bus, trusted, plan, address)
             except NodeRefused as refusal:
-                if refusal.reason != Reason.OUT_OF_RANGE or rate is not None or self._halved >= SLOWER:
+                if refusal.reason == Reason.TOO_LATE and start != SOON:
+                    self._together.late(self.uuid)
+                    start = SOON
+                elif refusal.reason != Reason.OUT_OF_RANGE or rate is not None or self._halved >= SLOWER:
                     raise
-                self._halved += 1  # the firmware's shortest period is longer than the datasheet's: nobody says it
-                self._stop_streams(trusted, address)
+                else:
+                    self._halved += 1  # the firmware's shortest period is longer than the datasheet's: nobody says it
+                self._stop_streams(bus, trusted, address)
                 continue
             return plans
 
-    def _plan(self, channels: list[Channel], bus: BusTime) -> Plans:
+    def _plan(self, channels: list[Channel], bus: BusTime, start: int) -> Plans:
         return plan_node(
             channels,
             bus,
             rate=self._wish.rate,
             kind=self._wish.kind,
             test_pattern=self._wish.test_pattern,
-            start=WAITS if self._wish.trigger else SOON,
+            start=start,
             slower=2**self._halved,
         )
 
-    def _stream(self, trusted: Trusted, plan: Plan, address: int) -> None:
+    def _stream(self, bus: Bus, trusted: Trusted, plan: Plan, address: int) -> None:
         number = plan.subscribe.stream
         payload = trusted.node.send(plan.command(), "to stream")
         with self._mapping:
@@ -284,11 +288,12 @@ class NodeKeeper:
         )
         monotone = self._monotone.setdefault(number, Monotone())
         interpreter = StreamInterpreter(trusted.sheet, plan, reply.run, self.clock, self._wall, monotone)
-        assembly = Assembly(plan.length, fd=self._port.spec.fd)
+        assembly = Assembly(plan.length, fd=bus.port.spec.fd)
         heard = HeardStream(receiver, assembly, interpreter, self.clock, self._mapping, self._events.block)
+        heard.heard += self._together.until(plan.subscribe.start)
         self.running[number] = heard
         self.totals.setdefault(number, StreamTotals(plan.layout.channels, plan.subscribe.period / 1e9))
-        self._hearing.register(address, number, heard)
+        bus.hearing.register(address, number, heard)
 
     def _tell_time(self, trusted: Trusted) -> None:
         """One Clock: sends and waits without the map's lock, which the hearing thread needs."""
@@ -300,16 +305,18 @@ class NodeKeeper:
             if fresh.lie:
                 self.clock.lie = fresh.lie
 
-    def _keep(self, trusted: Trusted, channels: list[Channel]) -> None:
+    def _keep(self, trusted: Trusted) -> None:
         """Clock every lease / 3 until the end, or until the node is lost."""
         told = time.monotonic()
         every = self._wish.lease / 3
         lied = False
         while not self._stop.is_set():
-            if self._anew.wait(0.2) and not self._stop.is_set():
-                raise LinkFailure("The node has started anew.")
+            self._anew.wait(LOOK)
             now = time.monotonic()
-            if now - told >= every:
+            # An announcement says that the node has started anew; anyone can send one, so the node is asked.
+            announced = self._announced.is_set() and now - told >= ANNOUNCED
+            if announced or now - told >= every:
+                self._announced.clear()
                 with self.turn:
                     self._tell_time(trusted)
                 told = now
@@ -332,27 +339,27 @@ class NodeKeeper:
                 return now - heard.heard
         return 0.0
 
-    def _stop_streams(self, trusted: Trusted | None, address: int) -> None:
+    def _stop_streams(self, bus: Bus, trusted: Trusted | None, address: int) -> None:
         for number, heard in list(self.running.items()):
             if trusted is not None:
                 with suppress(TedsProvisionError, SessionLost):
                     counter = decode_stopped(trusted.node.send(stop(number), "to stop a stream"))
                     heard.hear_out(counter)
                     heard.receiver.finish(counter)
-            self._hearing.forget(address, number)
+            bus.hearing.forget(address, number)
             self.totals[number].add(heard)
         self.running.clear()
 
-    def _end(self, trusted: Trusted, address: int) -> None:
+    def _end(self, bus: Bus, trusted: Trusted, address: int) -> None:
         """Let go in order, as far as the node still answers."""
         alive = self._stop.is_set()
         if self._hands is not None:
             self._hands.close()
             self._hands = None
-        self._hearing.on_announce(address, None)
-        self._stop_streams(trusted if alive else None, address)
-        with self._bus.lock:
-            self._bus.taken.pop(self.uuid, None)
+        bus.hearing.on_announce(address, None)
+        self._stop_streams(bus, trusted if alive else None, address)
+        with bus.share.lock:
+            bus.share.taken.pop(self.uuid, None)
         if alive:
             with suppress(TedsProvisionError, SessionLost):
                 trusted.node.send(idle(0), "to let go")
@@ -383,7 +390,3 @@ class NodeKeeper:
         self.state = state
         self._told = why or (error.message.rstrip(".") + more if error is not None else "")
         self._events.report(self.report())
-
-
-def _nothing(_notice: Notice) -> None:
-    """Looking for a node is told once, as its state."""

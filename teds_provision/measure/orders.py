@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import threading
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field, replace
 
 from teds_provision.measure.blocks import Block, ChannelFacts, NodeReport
@@ -31,6 +31,7 @@ class Wish:
     timeout: float = 60.0
     actuators: bool = False  # whether set points may come for actuators of nodes on the whitelist
     dead_man: int = DEAD_MAN
+    patient: bool = False  # whether a node is waited for, and tried again, for ever: no refusal is final
 
 
 @dataclass
@@ -103,10 +104,16 @@ class BusShare:
             self.lock.notify_all()
             self.lock.wait_for(lambda: self.expected <= self.wanted.keys(), SAYING)
 
+    def expect(self, uuids: Iterable[bytes]) -> None:
+        """More nodes are to come."""
+        with self.lock:
+            self.expected.update(uuids)
+
     def gone(self, uuid: bytes) -> None:
-        """A node that ended for good wants nothing any more."""
+        """A node that ended for good, or is on another bus, wants nothing any more."""
         with self.lock:
             self.expected.discard(uuid)
+            self.wanted.pop(uuid, None)
             self.lock.notify_all()
 
     def _kept(self, uuid: bytes, room: float) -> float:

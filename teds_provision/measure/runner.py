@@ -9,34 +9,26 @@ from __future__ import annotations
 import math
 import threading
 import time
-from collections.abc import Callable, Sequence
-from contextlib import suppress
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass, field
 from typing import Any
 
 from teds_provision.errors import NoNode, TedsProvisionError
-from teds_provision.links.can.bus import Frame
-from teds_provision.links.can.port import CanPort
 from teds_provision.measure.blocks import Block, ChannelFacts, Command, NodeReport, StationFacts
+from teds_provision.measure.carrying import trigger
+from teds_provision.measure.carrying.together import Together
 from teds_provision.measure.clock import Wall
+from teds_provision.measure.finding.buses import Buses
 from teds_provision.measure.grid import Grid
-from teds_provision.measure.hearing import Hearing
 from teds_provision.measure.keeper import NodeKeeper
-from teds_provision.measure.orders import BusShare, Events, Wish
-from teds_provision.measure.planning import BusTime
+from teds_provision.measure.orders import Events, Wish
 from teds_provision.measure.sinks import Sink
-from teds_provision.measure.trusting import Trusted, exchange_clock
-from teds_provision.protocol.operation.can_frames import trigger_identifier
-from teds_provision.protocol.operation.stream_commands import Action
-from teds_provision.protocol.operation.subscription import TickBounds
-from teds_provision.protocol.operation.timing import START_AFTER_MARK, Token, mark_is_honest
+from teds_provision.measure.trusting import Trusted
 from teds_provision.station.station import Station
-from teds_provision.talk.conversation import SessionLost
 
 BEAT = 0.02  # seconds between rows of the group
 REPORTING = 1.0
-TOGETHER = 15.0  # seconds that a trigger waits for all nodes
-TRIGGER_LIFE = 30  # seconds
 ENDING = 10.0  # seconds for all nodes to let go
 
 
@@ -63,15 +55,16 @@ class Ended:
 
 @dataclass
 class Measurement:
-    """Nodes of one bus, measured together into sinks. ``run`` does all of it."""
+    """Nodes of one bus or several, measured together into sinks. ``run`` does all of it."""
 
     station: Station
-    port: CanPort
+    buses: Buses
     uuids: Sequence[bytes]
     wish: Wish
     sinks: Sequence[Sink]
     facts: StationFacts
     watcher: Watcher = field(default_factory=Watcher)
+    began: Callable[[], None] = lambda: None
     keepers: list[NodeKeeper] = field(default_factory=list, init=False)
 
     def run(self, stop: threading.Event, duration: float | None = None) -> Ended:
@@ -83,7 +76,7 @@ class Measurement:
         self._known: dict[tuple[str, int], ChannelFacts] = {}
         self._grid: Grid | None = None
         self._failed: set[str] = set()
-        self._apart = 0.0
+        self._together = Together(self.uuids, trigger=self.wish.trigger)
         opened: list[Sink] = []
         try:
             for sink in self.sinks:
@@ -93,11 +86,10 @@ class Measurement:
             for sink in opened:
                 sink.close()
             raise
-        hearing = Hearing(self.port)
-        share = BusShare(_bus_time(self.port), set(self.uuids))
+        self.buses.expect(self.uuids)
         events = Events(self._block, self._describe, self._report)
         self.keepers = [
-            NodeKeeper(self.station, self.port, hearing, share, uuid, self.wish, self._wall, events)
+            NodeKeeper(self.station, self.buses, uuid, self.wish, self._wall, events, self._together)
             for uuid in self.uuids
         ]
         for keeper in self.keepers:
@@ -105,20 +97,18 @@ class Measurement:
         try:
             self._loop(stop, duration)
         finally:
-            self._end(hearing)
+            self._end()
         return self._ended()
 
     def _loop(self, stop: threading.Event, duration: float | None) -> None:
         until = math.inf
         reported = 0.0
-        triggered = not self.wish.trigger
         while not stop.wait(BEAT):
             now = time.monotonic()
             if self._all_done():
                 return
-            if not triggered and all(keeper.ready.is_set() for keeper in self.keepers):
-                triggered = True
-                self._trigger()
+            if self._together.due(sum(one.ready.is_set() for one in self.keepers), len(self.keepers)):
+                trigger.pull(self._together, self.keepers, self.watcher.note)
             if until == math.inf:
                 until = self._until(now, duration)
             if now >= until:
@@ -134,6 +124,7 @@ class Measurement:
         """When ``duration`` seconds of data are over: they count from the first node's first value."""
         if duration is None or not any(keeper.ever_ran for keeper in self.keepers):
             return math.inf
+        self.began()
         return now + duration
 
     def _all_done(self) -> bool:
@@ -157,6 +148,19 @@ class Measurement:
         if rows is not None:
             for sink in self.sinks:
                 sink.write_group(rows)
+
+    @contextmanager
+    def session(self, uuid: bytes) -> Iterator[Trusted | None]:
+        """The session in which a node is measured now, for one more command; None where there is none.
+
+        The node's other exchanges wait meanwhile: be brief. Raises nothing of its own.
+        """
+        keeper = next((one for one in self.keepers if one.uuid == uuid), None)
+        if keeper is None:
+            yield None
+            return
+        with keeper.turn:
+            yield keeper.trusted
 
     def command(self, command: Command) -> None:
         """A set point that came by a sink."""
@@ -195,67 +199,14 @@ class Measurement:
             sink.report(report)
         self.watcher.report(report)
 
-    # -- beginning together ------------------------------------------------------------------------------------------
-
-    def _trigger(self) -> None:
-        """Arm every node, send one frame, read each node's mark: it must meet the time at which the frame went out."""
-        token = Token.draw()
-        armed = self._arm(token)
-        before = time.monotonic_ns()
-        self.port.send(Frame(trigger_identifier(self.port.spec.source), token.octets))
-        after = time.monotonic_ns() + 5_000_000  # a controller may hold a frame back while others win arbitration
-        marks = []
-        for keeper, trusted in armed:
-            mark = self._mark(keeper, trusted, before, after)
-            if mark is None:
-                continue
-            marks.append(keeper.clock.host_of(mark))
-            for heard in list(keeper.running.values()):
-                heard.begin(mark + START_AFTER_MARK)
-        self._apart = max(marks) - min(marks) if marks else 0.0
-
-    def _arm(self, token: Token) -> list[tuple[NodeKeeper, Trusted]]:
-        """The nodes that wait for the trigger now."""
-        armed = []
-        for keeper in self.keepers:
-            trusted = keeper.trusted
-            if trusted is None or not keeper.ever_ran:
-                continue
-            try:
-                with keeper.turn:
-                    trusted.node.send(token.arm(Action.START, TRIGGER_LIFE).command(), "to wait for the trigger")
-                armed.append((keeper, trusted))
-            except (TedsProvisionError, SessionLost) as error:
-                self.watcher.note(f"Node {keeper.uuid.hex()} does not take the trigger: {error}")
-        return armed
-
-    def _mark(self, keeper: NodeKeeper, trusted: Trusted, before: int, after: int) -> int | None:
-        """The tick at which the node saw the trigger, which went out between two times (monotonic ns).
-
-        None where it does not say, or names a moment at which the frame was not on the bus; such a node is stopped.
-        """
-        try:
-            with keeper.turn:
-                mark = exchange_clock(trusted.node, keeper.clock).mark
-        except (TedsProvisionError, SessionLost) as error:
-            self.watcher.note(f"Node {keeper.uuid.hex()} did not say when it saw the trigger: {error}")
-            return None
-        low, high = keeper.clock.ticks_at(before).low, keeper.clock.ticks_at(after).high
-        if not mark or not mark_is_honest(mark, TickBounds(low, high)):
-            self.watcher.note(f"Node {keeper.uuid.hex()} names another moment for the trigger: it is not begun.")
-            keeper.stop()
-            return None
-        return mark
-
     # -- the end -------------------------------------------------------------------------------------------------------
 
-    def _end(self, hearing: Hearing) -> None:
+    def _end(self) -> None:
         for keeper in self.keepers:
             keeper.stop()
         end = time.monotonic() + ENDING
         for keeper in self.keepers:
             keeper.join(max(0.1, end - time.monotonic()))
-        hearing.close()
         with suppress(TedsProvisionError):
             self._rows()
         for sink in self.sinks:
@@ -268,7 +219,7 @@ class Measurement:
         errors += [TedsProvisionError(s.stats.error, hint=s.stats.hint) for s in self.sinks if s.stats.error]
         worst = min(errors, key=_rank) if errors else None
         files = [name for sink in self.sinks for name in sink.files]
-        return Ended(nodes, files, worst, self._apart)
+        return Ended(nodes, files, worst, self._together.apart)
 
 
 def _summary(keeper: NodeKeeper) -> dict[str, Any]:
@@ -284,8 +235,3 @@ def _rank(error: TedsProvisionError) -> int:
     """Not authentic before refused before the link before the rest (cli.md, `measure`)."""
     order = (4, 6, 5)
     return order.index(error.exit_code) if error.exit_code in order else len(order)
-
-
-def _bus_time(port: CanPort) -> BusTime:
-    spec = port.spec
-    return BusTime(spec.bitrate, spec.data_bitrate if spec.fd else None)

@@ -10,7 +10,7 @@ from __future__ import annotations
 import hashlib
 import secrets
 import time
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import replace
 from pathlib import Path
@@ -67,15 +67,24 @@ class Measurements:
         self._store.put_measurement(kept)
         return kept
 
+    def begin(self, measurement: Measurement) -> Measurement:
+        """Keep one that begins now; what was cut off before of the same group is not carried on any more."""
+        with self._store.transaction():
+            for one in self.all():
+                if one.group == measurement.group and not one.lasting and one.id != measurement.id:
+                    self.forget(one.id)
+            return self.keep(measurement)
+
     def forget(self, measurement_id: str) -> bool:
         """Measure it no more after the next start; False where it is not there. Ends nothing that runs."""
         return self._store.remove_measurement(measurement_id)
 
     @contextmanager
-    def running(self, uuids: tuple[bytes, ...], *, group: str | None = None, what: str = "measure") -> Iterator[None]:
-        """Hold these nodes (and their group) for one measurement; raises PolicyRefused, naming who holds them.
+    def running(self, uuids: Iterable[bytes], *, group: str | None = None, what: str = "measure") -> Iterator[None]:
+        """Hold these nodes (and their group) as they are while they are measured.
 
-        The marks are locks of the system: they go with the process, however that ends.
+        The marks are locks of the system: they go with the process, however that ends. Raises PolicyRefused where the
+        group is being measured already, or one of the nodes is being renamed.
         """
         with ExitStack() as stack:
             if group is not None:
@@ -84,10 +93,7 @@ class Measurements:
                 try:
                     stack.enter_context(self._mark(uuid, what))
                 except Taken as taken:
-                    raise PolicyRefused(
-                        f"Node {uuid.hex()} is being measured by {taken.holder}.",
-                        hint="End that measurement first, or measure other nodes.",
-                    ) from taken
+                    raise PolicyRefused(f"Node {uuid.hex()} is held by {taken.holder}.", hint="Try again.") from taken
             yield
 
     def is_running(self, uuid: bytes) -> bool:
@@ -95,17 +101,16 @@ class Measurements:
         return self._mark(uuid).is_taken
 
     def _mark(self, uuid: bytes, what: str = "") -> Mark:
-        return Mark(self._home / FOLDER / f"{uuid.hex()}.lock", command=what)
+        return Mark(self._home / FOLDER / f"{uuid.hex()}.lock", command=what, shared=True)
 
-    def source(self, bus: str, source: int, *, command: str) -> Mark:
-        """Take a source address on a bus for this process.
+    def source(self, bus: str, source: int, *, command: str = "", shared: bool = False) -> Mark:
+        """The mark of who uses a source address on a bus: to be entered by ``with``, which raises Taken (7).
 
-        A session belongs to a pair of addresses, and a second
-        Open on it ends the first (operation.md section 6). ``bus`` names interface and channel. To be entered by
-        ``with``, which raises Taken (7) and names the holder.
+        A session belongs to a pair of addresses, and a second Open on it ends the first (operation.md section 6).
+        ``bus`` names interface and channel. Who has one short session after another takes it ``shared``.
         """
         name = hashlib.sha256(f"{bus}\0{source}".encode()).hexdigest()[:16]
-        return Mark(self._home / FOLDER / f"bus-{name}.lock", command=command)
+        return Mark(self._home / FOLDER / f"bus-{name}.lock", command=command, shared=shared)
 
     # -- detection ---------------------------------------------------------------------------------------------------
 

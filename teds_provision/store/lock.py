@@ -93,12 +93,13 @@ class StoreLock:
 class Mark:
     """``with Mark(path, command="measure hand") as mark:`` something is taken, for as long as this process lives.
 
-    Does not wait: raises :class:`Taken`, which names the holder. ``left_behind`` says that the one before had no time
-    to put its mark away (it was killed, or the power failed).
+    Does not wait: raises :class:`Taken`, which names the holder. Several may hold it together where each takes it as
+    ``shared``. ``left_behind`` says that the one before had no time to put its mark away (it was killed, or the power
+    failed).
     """
 
-    def __init__(self, path: Path, *, command: str) -> None:
-        self._path, self._command = path, command
+    def __init__(self, path: Path, *, command: str, shared: bool = False) -> None:
+        self._path, self._command, self._shared = path, command, shared
         self._descriptor: int | None = None
         self.left_behind = False
 
@@ -109,7 +110,7 @@ class Mark:
         except OSError as error:
             raise as_store_failure(error, self._path) from error
         try:
-            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            fcntl.flock(descriptor, (fcntl.LOCK_SH if self._shared else fcntl.LOCK_EX) | fcntl.LOCK_NB)
             self.left_behind = bool(os.pread(descriptor, 1, 0))
         except BlockingIOError:
             holder = _holder(descriptor)
@@ -127,19 +128,20 @@ class Mark:
     ) -> None:
         if self._descriptor is not None:
             with suppress(OSError):
-                os.ftruncate(self._descriptor, 0)
+                if not self._shared:
+                    os.ftruncate(self._descriptor, 0)
             os.close(self._descriptor)
             self._descriptor = None
 
     @property
     def is_taken(self) -> bool:
-        """Whether somebody holds it now."""
+        """Whether somebody holds it now, alone or shared."""
         try:
             descriptor = os.open(self._path, os.O_RDWR | os.O_NOFOLLOW | os.O_CLOEXEC)
         except OSError:
             return False
         try:
-            fcntl.flock(descriptor, fcntl.LOCK_SH | fcntl.LOCK_NB)
+            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
             return True
         finally:

@@ -5,8 +5,9 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 
-from teds_provision.errors import AddressConflict, UsageFailure
+from teds_provision.errors import AddressConflict, StoreLocked, UsageFailure
 from teds_provision.links import Contact, LinkSettings, open_port
+from teds_provision.links.ports import Port
 from teds_provision.protocol.announce import default_can_address
 from teds_provision.protocol.messages.identity import Identity, NodeState
 from teds_provision.station.station import Station
@@ -37,6 +38,8 @@ def meet(
 
     port = open_port(links)
     try:
+        if uuid is not None:
+            _require_no_measurement(station, port, uuid)
         before()
         if uuid is None:
             contact = the_one(station, port.everyone(seconds=links.timeout, notice=reporter.notice))
@@ -53,6 +56,22 @@ def likely_address(station: Station, uuid: bytes) -> int:
     """The CAN address to look for a node first: where it was last met, else its own default address. A hint."""
     known = station.nodes.get(uuid)
     return known.can_address if known is not None and known.can_address else default_can_address(uuid)
+
+
+def _require_no_measurement(station: Station, port: Port, uuid: bytes) -> None:
+    """Raise StoreLocked where a process of this station measures the node from the same source address.
+
+    A session belongs to a pair of addresses: another one from here would end that one's.
+    """
+    spec = getattr(port, "spec", None)
+    if spec is None or port.via != "can" or not station.measurements.is_running(uuid):
+        return
+    if station.measurements.source(spec.text, spec.source).is_taken:
+        other = 0xF2 if spec.source == 0xF1 else 0xF1
+        raise StoreLocked(
+            f"Node {uuid.hex()} is being measured from source address 0x{spec.source:02X}.",
+            hint=f"Add source=0x{other:02X} to --can, or end that measurement.",
+        )
 
 
 @contextmanager

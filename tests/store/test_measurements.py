@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from teds_provision.errors import BadData, StoreFailure
+from teds_provision.errors import BadData, StoreFailure, TedsProvisionError
 from teds_provision.store import Group, Measurement, Store
 
 ONE, TWO = bytes(range(10)), bytes(range(1, 11))

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import threading
-import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from contextlib import ExitStack
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -21,10 +21,10 @@ from teds_provision.cli.options import command, link_options
 from teds_provision.cli.steps.build import read_file
 from teds_provision.errors import PolicyRefused, UsageFailure
 from teds_provision.links import LinkSettings, can
-from teds_provision.protocol import operation
+from teds_provision.store import Measurement
 
 if TYPE_CHECKING:
-    from teds_provision.measure.blocks import Command
+    from teds_provision.measure.carrying.job import Job
     from teds_provision.measure.runner import Ended
     from teds_provision.station.station import Station
 
@@ -76,48 +76,35 @@ def measure(
     if what[0] == "recover":
         _recover(app, what[1:])
         return
-
     links = over_the_bus(links)
     if links.via != "can":
         raise UsageFailure("Streams need a bus.", hint="Name it with --can; over NFC: teds-provision sample UUID")
-    specs = [*files, *(name for name in ("ros1", "ros2") if wished[name])]
-    orders = Orders()
-    sinks = [
-        measure_room.sinks.open_sink(spec, orders.take if wished["actuators"] else None)
-        for spec in [*specs, *([mqtt] if mqtt else [])]
-    ]
-    wish = measure_room.orders.Wish(
-        channels=tuple(dict.fromkeys(wished["channels"])),
-        rate=wished["rate"],
-        kind=None if wished["kind"] is None else operation.stream_commands.Kind[wished["kind"].upper()],
-        trigger=wished["trigger"],
-        test_pattern=wished["test_pattern"],
-        timeout=links.timeout,
-        actuators=wished["actuators"] and (wished["ros1"] or wished["ros2"]),
-        dead_man=wished["dead_man"],
-    )
     station = app.station()
     group, uuids = _who(station, what)
-    with ExitStack() as stack:
-        if group:
-            stack.enter_context(station.groups.frozen(group))
-        for uuid in uuids:
-            station.unlock(uuid)
-        if require is not None:
-            _require(app, station, uuids, require)
-        ended = _run(app, station, links, uuids, wish, sinks, duration, orders, group=group, scalar_rate=scalar_rate)
-    _tell_end(app, ended)
-
-
-class Orders:
-    """Passes set points on to the measurement, which is made after the sinks that they come from."""
-
-    def __init__(self) -> None:
-        self.to: Callable[[Command], None] = lambda _command: None
-
-    def take(self, command: Command) -> None:
-        """A set point."""
-        self.to(command)
+    sinks = (*files, *(name for name in ("ros1", "ros2") if wished[name]), *([mqtt] if mqtt else []))
+    kept = Measurement(
+        "",
+        group=group or None,
+        uuids=() if group else tuple(uuids),
+        channels=tuple(dict.fromkeys(wished["channels"])),
+        rate=wished["rate"],
+        kind=wished["kind"],
+        trigger=wished["trigger"],
+        actuators=wished["actuators"] and (wished["ros1"] or wished["ros2"]),
+        dead_man=wished["dead_man"],
+        scalar_rate=scalar_rate,
+        sinks=tuple(measure_room.carrying.job.whole_path(spec) for spec in sinks),
+        lasting=False,
+    )
+    wish = measure_room.orders.Wish(test_pattern=wished["test_pattern"], timeout=links.timeout)
+    if group and duration is None and not wish.test_pattern:
+        kept = _carried_on(app, station, kept)
+    job = measure_room.carrying.job.Job(station, kept, wish=wish)
+    for uuid in uuids:
+        station.unlock(uuid)
+    if require is not None:
+        _require(app, station, uuids, require)
+    _tell_end(app, _run(app, job, links, uuids, duration))
 
 
 def _who(station: Station, what: Sequence[str]) -> tuple[str, list[bytes]]:
@@ -129,35 +116,38 @@ def _who(station: Station, what: Sequence[str]) -> tuple[str, list[bytes]]:
     return "", list(dict.fromkeys(station.nodes.resolve(text) for text in what))
 
 
-def _run(
-    app: App,
-    station: Station,
-    links: LinkSettings,
-    uuids: Sequence[bytes],
-    wish: Any,
-    sinks: Sequence[Any],
-    duration: float | None,
-    orders: Orders,
-    *,
-    group: str,
-    scalar_rate: float,
-) -> Ended:
-    port = links_room.open_port(links)
-    assert isinstance(port, can.port.CanPort)
-    stop = threading.Event()
-    facts = measure_room.blocks.StationFacts(
-        station.name, group=group, started=time.time(), scalar_rate=scalar_rate, test_pattern=wish.test_pattern
-    )
+def _carried_on(app: App, station: Station, asked: Measurement) -> Measurement:
+    """What is kept of the group, where nothing else was asked for; else what was asked for."""
+    kept = station.measurements.of_group(asked.group or "")
+    plain = replace(Measurement("", group=asked.group, lasting=False), created=asked.created)
+    if kept is None or asked != plain:
+        return asked
+    rate = f"{kept.rate:g} Hz" if kept.rate else "the datasheets' rates"
+    to = f" to {', '.join(kept.sinks)}" if kept.sinks else ""
+    app.note(f"Carrying on what was begun at {kept.created}: {rate}{to}.")
+    return kept
+
+
+def _run(app: App, job: Job, links: LinkSettings, uuids: Sequence[bytes], duration: float | None) -> Ended:
+    station, stop = job.station, threading.Event()
+    group = job.kept.group or ""
+    nodes = [uuid.hex() for uuid in uuids]
+    ports = [port for port in links_room.open_ports(links) if isinstance(port, can.port.CanPort)]
     try:
-        with measure_cli.showing.watcher_for(app, station, sinks, stop) as watcher, ending(stop):
-            station.audit("measure", None, "begun", nodes=[uuid.hex() for uuid in uuids], group=group)
-            measurement = measure_room.runner.Measurement(station, port, uuids, wish, sinks, facts, watcher)
-            orders.to = measurement.command
-            ended = measurement.run(stop, duration)
+        with ExitStack() as stack:
+            stack.enter_context(
+                measure_room.finding.sources.sole_user(station, ports, f"measure {group or ', '.join(nodes)}")
+            )
+            watcher = stack.enter_context(measure_cli.showing.watcher_for(app, station, job.sinks, stop))
+            stack.enter_context(ending(stop))
+            buses = stack.enter_context(measure_room.finding.buses.Buses(ports, note=app.warn))
+            station.audit("measure", None, "begun", nodes=nodes, group=group)
+            ended = job.run(buses, stop, watcher=watcher, duration=duration)
     finally:
-        port.close()
+        for port in ports:
+            port.close()
     outcome = "done" if ended.error is None else ended.error.code
-    station.audit("measure", None, outcome, nodes=[uuid.hex() for uuid in uuids], group=group)
+    station.audit("measure", None, outcome, nodes=nodes, group=group)
     return ended
 
 

@@ -1,0 +1,66 @@
+"""One process for each source address on a bus: a second Open on a pair of addresses ends the first's session.
+
+On this machine a mark in the home says who uses an address. Another machine, or another home, is noticed by the frames
+that it sends from the same address (operation.md section 6).
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator, Sequence
+from contextlib import ExitStack, contextmanager
+
+from teds_provision.errors import AddressConflict, StoreLocked
+from teds_provision.links.can.frame import Frame
+from teds_provision.links.can.port import CanPort
+from teds_provision.station.station import Station
+from teds_provision.store.lock import Taken
+
+LISTENING = 0.25  # seconds in which the data of somebody else's streams to our address is heard
+SIGN_OF_LIFE = 4.0  # seconds in which whoever reads it sends something: lease / 3 is 3.3 s unless he says otherwise
+_DATA, _MASK = 0x1CFF0000, 0x1FFF0000
+
+
+@contextmanager
+def sole_user(station: Station, ports: Sequence[CanPort], command: str, *, shared: bool = False) -> Iterator[None]:
+    """Use the source addresses of these ports alone; ``shared`` beside others who take them so.
+
+    Raises StoreLocked (7) where another process of this home has one, and names it; AddressConflict (5) where another
+    machine is heard to measure under it.
+    """
+    with ExitStack() as stack:
+        for port in ports:
+            spec = port.spec
+            mark = station.measurements.source(spec.text, spec.source, command=command, shared=shared)
+            try:
+                stack.enter_context(mark)
+            except Taken as taken:
+                raise StoreLocked(
+                    f"Source address 0x{spec.source:02X} on {spec.text} is in use by {taken.holder}.",
+                    hint=f"Add source={_another(spec.source)} to --can, or end that process.",
+                ) from taken
+            # After a process that was killed its nodes still send to us, for a lease: nobody else is behind that.
+            if not shared and not mark.left_behind:
+                _require_alone(port)
+        yield
+
+
+def _another(source: int) -> str:
+    return "0xF2" if source == 0xF1 else "0xF1"
+
+
+def _require_alone(port: CanPort) -> None:
+    """Raise AddressConflict where data comes for our address, and somebody who is not us sends from it."""
+    bus, own = port.bus(), port.spec.source & 7
+
+    def ours(frame: Frame) -> bool:
+        return frame.identifier & _MASK == _DATA and frame.identifier >> 13 & 7 == own
+
+    with bus.listen(ours, most=64) as ear:
+        if ear.get(LISTENING) is None:
+            return
+    until = time.monotonic() + SIGN_OF_LIFE
+    while time.monotonic() < until:
+        if bus.rivals.seen():
+            raise AddressConflict(bus.rivals.text, hint=bus.rivals.hint)
+        time.sleep(0.05)
