@@ -17,6 +17,8 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
+from teds_provision import steps as steps_room
+from teds_provision import vault
 from teds_provision.demo.desk import Demo
 from teds_provision.demo.handover import hand_over
 from teds_provision.demo.measuring import (
@@ -91,12 +93,14 @@ def _measure(demo: Demo, station: Station) -> None:
 
 
 def _station(demo: Demo, name: str) -> Station:
-    from teds_provision.vault.passphrase import THROWAWAY
-
     secret = secrets.token_hex(16)
     with demo.steps.step("init") as step:
         station, _ = initialise(
-            demo.folder / name, name=name, keystore="file", ask=lambda prompt, confirm: secret, costs=THROWAWAY
+            demo.folder / name,
+            name=name,
+            keystore="file",
+            ask=lambda prompt, confirm: secret,
+            costs=vault.passphrase.THROWAWAY,
         )
         step.detail = f"station {name}, key {station.fingerprint[:16]}"
     demo.stack.callback(station.close)
@@ -112,16 +116,13 @@ def _provision(demo: Demo, station: Station) -> Provisioned:
 
 
 def _over_can(demo: Demo, station: Station) -> None:
-    from teds_provision.steps.agree import agree
-    from teds_provision.steps.identify import identify
-
     with meet(station, demo.over("can"), demo.uuid, demo.reporter) as node:
         order = BuildOrder(PROFILE, name="crane slew angle")
         done = provision(station, node, order, accept=lambda who: None, reporter=demo.reporter)
         require_authentic(done.verified)
         demo.steps.done += done.steps
     with meet(station, demo.over("can"), demo.uuid, demo.reporter) as node, demo.steps.step("rotate") as step:
-        agreed = agree(station, node, identify(station, node), rotate=True)
+        agreed = steps_room.agree.agree(station, node, steps_room.identify.identify(station, node), rotate=True)
         step.detail = f"key epoch {agreed.epoch}, key {agreed.key_id}"
 
 

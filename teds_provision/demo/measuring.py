@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 from teds_provision.demo.desk import Demo
 from teds_provision.errors import LinkFailure
 from teds_provision.lazy import late
+from teds_provision.links import can
 from teds_provision.station.station import Station
 from teds_provision.steps.agree import agree
 from teds_provision.steps.identify import identify
@@ -73,12 +74,10 @@ def calibrate_sensor(demo: Demo, station: Station, calibration: Path) -> None:
 
 def measure_group(demo: Demo, station: Station, uuids: tuple[bytes, ...]) -> None:
     """Both nodes at once: sessions, datasheets verified, claims, streams, calibrated values in a file."""
-    from teds_provision.links.can.port import open_port
-
     file = demo.folder / "run.csv"
     station.groups.create("robot", list(uuids))
     with demo.steps.step("measure") as step:
-        port: Any = open_port(demo.can)
+        port: Any = can.port.open_port(demo.can)
         try:
             sink = sinks.open_sink(str(file))
             facts = blocks.StationFacts(station.name, group="robot", started=time.time())

@@ -18,6 +18,8 @@ from typing import Any, Final
 
 from teds_provision.doctor.doctor import Finding, Place, Result, check
 from teds_provision.errors import LinkFailure, NoReader, UsageFailure
+from teds_provision.links import can as can_room
+from teds_provision.links import nfc as nfc_room
 
 READERS: Final = {
     (0x054C, 0x0193): "Sony PN531",
@@ -106,10 +108,9 @@ def pcsc(place: Place) -> Iterator[Finding]:
     if place.system != Path("/"):
         yield Finding("pc/sc", "skipped", "Another machine's folders are looked at.")
         return
-    from teds_provision.links.nfc.pcsc import contactless, names
 
     try:
-        found = contactless(names())
+        found = nfc_room.pcsc.contactless(nfc_room.pcsc.names())
     except NoReader as failure:
         yield Finding("pc/sc", "failed" if asked else "skipped", failure.message, failure.hint if asked else "")
         return
@@ -161,17 +162,15 @@ def nfc(place: Place) -> Iterator[Finding]:
     if place.nfc is None:
         yield Finding("nfc", "skipped", "No reader was named, so none was opened.", "")
         return
-    from teds_provision.links.nfc.frontend import open_reader
-    from teds_provision.links.nfc.tag import ReaderLost
 
     try:
-        reader = open_reader(place.nfc)
+        reader = nfc_room.frontend.open_reader(place.nfc)
     except (NoReader, UsageFailure) as failure:
         yield Finding("nfc", "failed", failure.message, failure.hint)
         return
     try:
         tag = any(reader.sense() is not None for _ in range(_SENSES))
-    except ReaderLost as error:
+    except nfc_room.tag.ReaderLost as error:
         yield Finding("nfc", "failed", f"{reader.name} opened, but failed at once: {error}.", "Unplug it, plug it in.")
         return
     finally:
@@ -241,13 +240,10 @@ def can_loopback(place: Place) -> Iterator[Finding]:
 
 
 def _self_test(spec: str) -> tuple[bool, str, str]:
-    from teds_provision.links.can.bus import Bus, Frame
-    from teds_provision.links.can.spec import parse_spec
-
-    sent = Frame(0x18DAF101, b"doctor")
-    buses: list[Bus] = []
+    sent = can_room.bus.Frame(0x18DAF101, b"doctor")
+    buses: list[can_room.bus.Bus] = []
     try:
-        buses += [Bus(parse_spec(spec)), Bus(parse_spec(spec))]
+        buses += [can_room.bus.Bus(can_room.spec.parse_spec(spec)), can_room.bus.Bus(can_room.spec.parse_spec(spec))]
         buses[0].send(sent)
         arrived = buses[1].receive(2.0) == sent
     except LinkFailure as failure:
@@ -265,16 +261,13 @@ def can(place: Place) -> Iterator[Finding]:
     if place.can is None:
         yield Finding("can", "skipped", "No bus was named, so none was opened.", "")
         return
-    from teds_provision.links.can.bus import Bus
-    from teds_provision.links.can.rivals import Rivals
-    from teds_provision.links.can.spec import parse_spec
 
     try:
-        bus = Bus(parse_spec(place.can))
+        bus = can_room.bus.Bus(can_room.spec.parse_spec(place.can))
     except (LinkFailure, UsageFailure) as failure:
         yield Finding("can", "failed", failure.message, failure.hint)
         return
-    rivals = Rivals(bus.spec.source)
+    rivals = can_room.rivals.Rivals(bus.spec.source)
     until = time.monotonic() + _LISTEN_SECONDS
     try:
         while (left := until - time.monotonic()) > 0:

@@ -11,7 +11,10 @@ from datetime import UTC, datetime
 from importlib import metadata
 from typing import Final
 
+from teds_provision import store as store_room
+from teds_provision import vault
 from teds_provision.doctor.doctor import Finding, Place, check
+from teds_provision.errors import StoreFailure
 
 _MIN_PYTHON: Final = (3, 11)
 _LIBRARIES: Final = {
@@ -82,9 +85,7 @@ def _shadowed() -> Iterator[Finding]:
 @check("argon2id", "machine")
 def argon2id(place: Place) -> Iterator[Finding]:
     """Can this OpenSSL derive keys from passphrases."""
-    from teds_provision.vault.passphrase import THROWAWAY, SealingKey
-
-    SealingKey.derive("a self-test, no secret", costs=THROWAWAY)
+    vault.passphrase.SealingKey.derive("a self-test, no secret", costs=vault.passphrase.THROWAWAY)
     yield Finding("argon2id", "ok", "Passphrases can be used.")
 
 
@@ -126,13 +127,10 @@ def clock(place: Place) -> Iterator[Finding]:
 
 
 def _last_entry(place: Place) -> datetime | None:
-    from teds_provision.errors import StoreFailure
-    from teds_provision.store import Store
-
     if not (place.home / "store.sqlite3").exists():
         return None
     try:
-        with Store.open(place.home) as store:
+        with store_room.Store.open(place.home) as store:
             latest = store.audit.latest()
         return datetime.strptime(latest, "%Y-%m-%dT%H:%M:%SZ").replace(tzinfo=UTC) if latest is not None else None
     except (StoreFailure, ValueError):  # the checks of the store say so

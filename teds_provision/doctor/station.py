@@ -12,6 +12,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Final
 
+from teds_provision import vault as vault_room
 from teds_provision.doctor.doctor import Finding, Place, check
 from teds_provision.errors import NoKeyring, StoreFailure, VaultFailure
 from teds_provision.store import Choice, Store
@@ -129,12 +130,10 @@ def _lock(place: Place) -> Iterator[Finding]:
 @check("keyring", "store")
 def keyring(place: Place) -> Iterator[Finding]:
     """Which keyring would hold the keys, is it one that may, and does it answer; a failure only where it is used."""
-    from teds_provision.vault.keyring_vault import inspect
-
     used = _keystore(place)
     try:
         with _quiet_logging():
-            name = inspect()
+            name = vault_room.keyring_vault.inspect()
     except VaultFailure as failure:
         if used == "keyring":
             yield Finding("keyring", "failed", failure.message, failure.hint)
@@ -170,25 +169,18 @@ def vault(place: Place) -> Iterator[Finding]:
     elif used == "file":
         yield _file_vault(place)
     elif used == "keyring":
-        from teds_provision.vault.keyring_vault import KeyringVault
-
         with Store.open(place.home) as opened:
-            yield Finding("vault", "ok", f"{KeyringVault.open(opened.id).description}.")
+            yield Finding("vault", "ok", f"{vault_room.keyring_vault.KeyringVault.open(opened.id).description}.")
     else:
-        from teds_provision.vault.pkcs11_token import find_token
-        from teds_provision.vault.pkcs11_uri import Pkcs11Uri
-
-        token = find_token(Pkcs11Uri.parse(used))
+        token = vault_room.pkcs11_token.find_token(vault_room.pkcs11_uri.Pkcs11Uri.parse(used))
         if not (place.home / "vault-pkcs11.json").exists():
             raise VaultFailure("The file vault-pkcs11.json is missing.", hint="teds-provision restore FILE")
         yield Finding("vault", "ok", f"The token {token.label.strip()!r} is there.")
 
 
 def _file_vault(place: Place) -> Finding:
-    from teds_provision.vault.file_vault import read_sealed
-
     with Store.open(place.home) as opened:
-        content = read_sealed(place.home / "vault.json")
+        content = vault_room.file_vault.read_sealed(place.home / "vault.json")
         if content.get("store") != opened.id:
             raise VaultFailure("vault.json belongs to another store.", hint="teds-provision restore FILE")
     memory = content.get("memory_kib")
