@@ -24,12 +24,9 @@ export class Live {
     socket.onmessage = (message) => {
       if (socket !== this.socket) return;
       this.heard = performance.now();
-      const event = JSON.parse(message.data);
-      if (event.event === "hello") {
-        this.tries = 0;
-        this.on.state("live");
-      }
-      this.on.event(event);
+      this.tries = 0;
+      this.on.state("live");
+      this.on.event(JSON.parse(message.data));
     };
     socket.onclose = () => socket === this.socket && this.lost();
   }

@@ -45,7 +45,7 @@ const CHARGE = { full: "full", charging: "charging", "in field": "charging", "ch
 function power(wire) {
   if (!wire) return null;
   const flags = wire.flags ?? [];
-  if ("level" in wire && flags.length && !flags.includes("battery") && wire.level === null) return null;
+  if ("level" in wire && !flags.includes("battery")) return null; // it has none, so there is nothing to tell
   return {
     percent: wire.level ?? wire.percent ?? wire.battery_percent ?? null,
     charging: wire.charging ?? flags.map((flag) => CHARGE[flag]).find(Boolean) ?? null,

@@ -1,0 +1,59 @@
+from __future__ import annotations
+
+import shutil
+from collections.abc import Iterator
+from typing import TYPE_CHECKING
+
+import pytest
+
+from tests.e2e.desk import ANGLE
+
+from .lab import GRIPPER, Lab
+
+if TYPE_CHECKING:
+    from playwright.sync_api import Browser
+
+QUIET = (
+    "--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run", "--disable-background-networking",
+    "--disable-component-update", "--disable-sync", "--disable-dev-shm-usage", "--enable-precise-memory-info",
+)  # fmt: skip
+
+
+# Of this package, not of the session: while playwright runs, its thread has an event loop, and other tests want theirs.
+@pytest.fixture(scope="package")
+def browser() -> Iterator[Browser]:
+    """One chromium for all tests of the page."""
+    found = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
+    if found is None:
+        pytest.skip("no chromium here: scripts/install-test-packages installs it")
+    api = pytest.importorskip("playwright.sync_api", reason="playwright is not installed (pip install playwright)")
+    with api.sync_playwright() as playwright:
+        browser = playwright.chromium.launch(executable_path=found, args=list(QUIET))
+        yield browser
+        browser.close()
+
+
+@pytest.fixture(scope="package")
+def lab(tmp_path_factory: pytest.TempPathFactory, browser: Browser) -> Iterator[Lab]:
+    """A station that runs, with an angle sensor and a gripper that it provisioned, on one bus; a reader beside it."""
+    lab = Lab.make(tmp_path_factory.mktemp("page"))
+    try:
+        lab.create("slew", ANGLE)
+        lab.create("hand", GRIPPER)
+        lab.power("slew", "hand")
+        lab.provision("slew", ANGLE)
+        lab.provision("hand", GRIPPER)
+        lab.run()
+        yield lab
+    finally:
+        lab.desk.clear()
+
+
+@pytest.fixture
+def fresh(tmp_path_factory: pytest.TempPathFactory, browser: Browser) -> Iterator[Lab]:
+    """A station of its own for one test, empty and not started."""
+    lab = Lab.make(tmp_path_factory.mktemp("fresh"))
+    try:
+        yield lab
+    finally:
+        lab.desk.clear()

@@ -1,0 +1,142 @@
+"""A base station that runs, nodes in processes of their own, and browsers: all real, all on this machine."""
+
+from __future__ import annotations
+
+import signal
+import socket
+from collections.abc import Iterator
+from contextlib import closing, contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from teds_provision import client
+from tests.e2e.desk import ANGLE, Desk, Node, Running, Station
+from tests.workflow.bench import PASSPHRASE, make_station
+
+if TYPE_CHECKING:
+    from playwright.sync_api import Browser, Page
+
+GRIPPER = "gripper"
+CALIBRATIONS = {
+    ANGLE: ("csv", "# date: 2026-11-01\nraw,value [degree]\n0,0\n65535,360\n"),
+    GRIPPER: (
+        "toml",
+        "".join(
+            f"[[calibration]]\nchannel = {channel}\ndate = 2026-11-01\n"
+            f'unit = "{unit}"\npoints = [[0, 0], [4095, {high}]]\n'
+            for channel, unit, high in ((1, "mm", 110), (2, "mm", 110), (3, "N", 140))
+        ),
+    ),
+}
+PATIENCE = 10_000  # ms that a test waits for something to be seen
+
+
+def free_tcp_port() -> int:
+    with closing(socket.socket()) as probe:
+        probe.bind(("127.0.0.1", 0))
+        return int(probe.getsockname()[1])
+
+
+@dataclass
+class Lab:
+    """A home, its bus and its reader; the daemon when it runs."""
+
+    folder: Path
+    desk: Desk
+    station: Station
+    port: int = field(default_factory=free_tcp_port)
+    daemon: Running | None = None
+    nodes: dict[str, Node] = field(default_factory=dict)
+
+    @classmethod
+    def make(cls, folder: Path) -> Lab:
+        """A station without nodes; nothing runs yet."""
+        make_station(folder / "prepared" / "bench", "bench").close()
+        (folder / "desk").mkdir()
+        desk = Desk(folder / "desk", folder / "prepared")
+        return cls(folder, desk, desk.station())
+
+    @property
+    def can(self) -> str:
+        return f"{self.desk.links.can}&fd=1"
+
+    @property
+    def url(self) -> str:
+        return f"http://127.0.0.1:{self.port}"
+
+    def run(self, *options: object) -> None:
+        """Start the daemon and wait until it serves."""
+        links = ["--can", self.can, "--nfc", self.desk.links.nfc]
+        words = ["--home", self.station.home, "--json", "ncap", "run", "--http", f"127.0.0.1:{self.port}", *links]
+        self.daemon = self.desk.start(*words, *options, passphrase=PASSPHRASE)
+        self.daemon.wait_for('"ready": true')
+
+    def end(self, number: int = signal.SIGTERM) -> None:
+        """End the daemon."""
+        assert self.daemon is not None
+        self.daemon.signal(number)
+        self.daemon.process.wait(20)
+        self.daemon.close()
+
+    def create(self, name: str, type_: str) -> Node:
+        """A virtual node in factory state, from a transducer type; not powered."""
+        folder = self.desk.folder / name
+        made = self.desk.start("--json", "node", "create", folder, "--name", name, "--profile", type_).end()
+        assert made.code == 0, made
+        node = self.nodes[name] = Node(self.desk, folder, made.json["uuid"])
+        return node
+
+    def power(self, *names: str, nfc: bool = False, source: str = "ramp:2") -> Running:
+        """Power nodes on the bus, in one process; ``nfc``: on the reader instead (one node)."""
+        where = ["--nfc", self.desk.links.nfc] if nfc else ["--can", self.can]
+        folders = [self.nodes[name].folder for name in names]
+        running = self.desk.start("--json", "node", "run", *folders, *where, "--source", source)
+        running.wait_for('"ready": true')
+        return running
+
+    def provision(self, name: str, type_: str, called: str | None = None) -> None:
+        """By the command line over the bus."""
+        node = self.nodes[name]
+        ending, text = CALIBRATIONS[type_]
+        calibration = self.desk.folder / f"{name}.{ending}"
+        calibration.write_text(text)
+        words = ["--profile", type_, "--calibration", calibration, "--name", called or name, "--via", "can"]
+        done = self.station.ask(
+            "provision", *words, "--can", f"{self.can}&node=0x{node.flash['can_address']:02X}", "--yes"
+        )
+        assert done["verdict"] == "authentic"
+
+    def ask(self, *words: object) -> Any:
+        """A command of the same home."""
+        return self.station.ask(*words)
+
+    def login(self, *, read_only: bool = False) -> str:
+        """An address of the page with a token that works once."""
+        with client.connect(home=self.station.home) as station:
+            return station.login_url(read_only=read_only)
+
+
+@contextmanager
+def opened(
+    browser: Browser, lab: Lab, *, width: int = 1280, height: int = 900, route: str = "", **more: Any
+) -> Iterator[Page]:
+    """A browser of its own, signed in. An error, a breach of its policy or a foreign address fails the test."""
+    context = browser.new_context(viewport={"width": width, "height": height}, **more)
+    page = context.new_page()
+    page.set_default_timeout(PATIENCE)
+    wrong: list[str] = []
+    page.on("pageerror", lambda error: wrong.append(str(error)))
+    page.on(
+        "console", lambda message: wrong.append(message.text) if "Content Security Policy" in message.text else None
+    )
+    page.on("request", lambda request: wrong.append(f"foreign: {request.url}") if lab.url not in request.url else None)
+    try:
+        page.goto(lab.login())
+        if route:
+            page.goto(f"{lab.url}/#/{route}")
+        page.locator("#connection", has_text="Live").wait_for()
+        yield page
+    finally:
+        context.close()
+    assert not wrong, wrong

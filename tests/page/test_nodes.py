@@ -1,0 +1,101 @@
+"""The page in a real browser: which nodes are there, whether they are to be trusted; taps; a lost connection."""
+
+from __future__ import annotations
+
+import signal
+import time
+from typing import TYPE_CHECKING
+
+import pytest
+
+from tests.e2e.desk import ANGLE
+
+from .lab import Lab, opened
+
+if TYPE_CHECKING:
+    from playwright.sync_api import Browser
+
+pytestmark = pytest.mark.system
+
+
+def test_nodes_are_shown_with_verdict_link_and_channels(browser: Browser, lab: Lab) -> None:
+    with opened(browser, lab) as page:
+        nodes = page.get_by_role("region", name="Nodes")
+        for name in ("slew", "hand"):
+            card = nodes.get_by_role("link", name=name)
+            card.get_by_text("Authentic", exact=True).wait_for()
+            assert "CAN" in card.inner_text()
+        nodes.get_by_role("link", name="hand").click()
+        page.get_by_role("heading", name="hand", exact=True).wait_for()
+        rows = page.get_by_role("table", name="Channels and their last values")
+        row = rows.get_by_role("row", name="opening", exact=False).nth(1)
+        for words in ("opening", "mm", "0 to 110 mm", "± 0.1 mm", "100 Hz", "2026-11-01"):
+            assert words in row.inner_text(), row.inner_text()
+        page.get_by_text("Security check:").click()
+        assert page.get_by_text("passed", exact=True).count() > 10
+        assert lab.nodes["hand"].uuid in page.locator(".uuid").inner_text().replace(" ", "")
+
+
+def test_an_empty_home_says_what_to_do_next_and_a_tap_opens_the_node(browser: Browser, fresh: Lab) -> None:
+    fresh.run("--detection", "transparent")
+    fresh.create("oven", "temperature-sensor")
+    with opened(browser, fresh, route="log") as page:
+        page.goto(f"{fresh.url}/#/nodes")
+        page.get_by_role("heading", name="No node yet").wait_for()
+        page.get_by_role("link", name="Make a virtual transducer").wait_for()
+        page.goto(f"{fresh.url}/#/station")
+        page.get_by_role("heading", name="Links").wait_for()
+        fresh.power("oven", nfc=True)  # laid on the reader while the person looks at something else
+        page.get_by_text("This one was just tapped").or_(page.locator(".node-head.tapped")).first.wait_for()
+        assert fresh.nodes["oven"].uuid in page.url
+        page.get_by_role("status").filter(has_text="Tapped").first.wait_for(state="attached")
+        page.locator(".card.tapped").wait_for()
+
+
+def test_a_node_that_leaves_is_shown_as_away(browser: Browser, fresh: Lab) -> None:
+    fresh.run("--detection", "transparent")
+    fresh.create("oven", "temperature-sensor")
+    running = fresh.power("oven", nfc=True)
+    with opened(browser, fresh) as page:
+        card = page.locator(".card", has_text="NFC")
+        card.wait_for()
+        running.signal(signal.SIGTERM)
+        card.get_by_text("away").wait_for()
+
+
+def test_detection_is_switched_and_seen_by_the_command_line(browser: Browser, lab: Lab) -> None:
+    lab.create("stranger", ANGLE)
+    running = lab.power("stranger")
+    with opened(browser, lab) as page:
+        page.get_by_text("1 more not on the whitelist").wait_for()
+        page.get_by_role("button", name="Transparent").click()
+        page.locator(".card", has_text="not on the whitelist").wait_for()
+        assert lab.ask("ncap", "status")["detection"] == "transparent"
+        page.get_by_role("button", name="Whitelist").click()
+        page.get_by_role("button", name="Whitelist", pressed=True).wait_for()
+        assert lab.ask("ncap", "status")["detection"] == "whitelist"
+        page.get_by_role("button", name="Discover").click()
+        page.get_by_text("nodes answered").wait_for()
+    running.close()
+
+
+@pytest.mark.parametrize("how", [signal.SIGKILL, signal.SIGSTOP], ids=["killed", "frozen"])
+def test_a_lost_connection_is_seen_within_two_seconds_and_healed(
+    browser: Browser, fresh: Lab, how: signal.Signals
+) -> None:
+    fresh.run()
+    assert fresh.daemon is not None
+    with opened(browser, fresh) as page:
+        began = time.monotonic()
+        fresh.daemon.signal(how)
+        page.locator("#connection", has_text="Connection lost").wait_for()
+        seen = time.monotonic() - began
+        page.get_by_role("alert").filter(has_text="What you see is old").wait_for()
+        assert page.get_by_role("button", name="Discover").is_disabled()
+        if how == signal.SIGSTOP:
+            fresh.daemon.signal(signal.SIGCONT)
+        else:
+            fresh.daemon.close()
+            fresh.run()
+        page.locator("#connection", has_text="Live").wait_for()
+        assert seen < 2.5  # two seconds, and what a loaded machine adds to this test
