@@ -7,7 +7,7 @@ from collections.abc import Iterable
 from dataclasses import replace
 
 from teds_provision.protocol.keys import fingerprint
-from teds_provision.store import NodeRecord, Revocation, Store, Tombstone
+from teds_provision.store import NodeRecord, Revocation, Store, Tombstone, WhitelistEntry
 from teds_provision.store.snapshot import Relation, extend_audit
 
 
@@ -56,16 +56,22 @@ class Merge:
                 self.live.put_handover(handover)
                 self.back["handovers"] += 1
         if not self.older:  # what an older copy has and this store lacks was undone, or rotated away, since
-            for tombstone in self.copy.tombstones():
-                if self.live.tombstone(tombstone.uuid) is None:
-                    self.live.put_tombstone(tombstone)
-                    self.back["tombstones"] += 1
-            present = {(holder.uuid, holder.fingerprint) for holder in self.live.holders()}
-            for holder in self.copy.holders():
-                if (holder.uuid, holder.fingerprint) not in present:
-                    self.live.put_holder(holder)
-                    self.back["holders"] += 1
+            self._tombstones()
+            self._holders()
         self.kept["nodes moved away since"] = _more(self.live.tombstones(), self.copy.tombstones())
+
+    def _tombstones(self) -> None:
+        for tombstone in self.copy.tombstones():
+            if self.live.tombstone(tombstone.uuid) is None:
+                self.live.put_tombstone(tombstone)
+                self.back["tombstones"] += 1
+
+    def _holders(self) -> None:
+        present = {(holder.uuid, holder.fingerprint) for holder in self.live.holders()}
+        for holder in self.copy.holders():
+            if (holder.uuid, holder.fingerprint) not in present:
+                self.live.put_holder(holder)
+                self.back["holders"] += 1
 
     def _nodes(self) -> None:
         for record in self.copy.nodes():
@@ -97,10 +103,8 @@ class Merge:
 
     def _whitelist(self) -> None:
         for entry in self.copy.whitelist():
-            known, node = self.live.whitelisted(entry.uuid), self.live.node(entry.uuid)
-            pin = known.fingerprint if known else None
-            if pin is None and node is not None and node.point is not None:
-                pin = fingerprint(node.point)
+            known = self.live.whitelisted(entry.uuid)
+            pin = self._pin(known, entry.uuid)
             if self.live.revocation(entry.uuid) is not None:
                 self.kept["revoked nodes off the whitelist"] += known is None
             elif entry.fingerprint is not None and pin not in (None, entry.fingerprint):
@@ -108,6 +112,13 @@ class Merge:
             elif known is None or (self.newer and known != entry):
                 self.live.put_whitelist(entry)
                 self.back["whitelist"] += 1
+
+    def _pin(self, known: WhitelistEntry | None, uuid: bytes) -> str | None:
+        """Fingerprint of the key that this store ties a node to: that of its entry, else of what it showed."""
+        if known is not None and known.fingerprint is not None:
+            return known.fingerprint
+        node = self.live.node(uuid)
+        return fingerprint(node.point) if node is not None and node.point is not None else None
 
     def _keys(self) -> None:
         for record in self.copy.all_keys():
@@ -127,15 +138,20 @@ class Merge:
 
     def _images(self) -> None:
         for record in self.copy.nodes():
-            draft, history = self.copy.draft(record.uuid), self.copy.history(record.uuid)
-            known = self.live.draft(record.uuid)
-            if draft is not None and draft != known and (self.newer or (known is None and not self.older)):
-                self.live.put_draft(draft)
-                self.back["drafts"] += 1
-            present = self.live.history(record.uuid)
-            if history and history != present and (not present or self.newer):
-                self.live.put_history(history[::-1])
-                self.back["datasheets"] += 1
+            self._draft(record.uuid)
+            self._history(record.uuid)
+
+    def _draft(self, uuid: bytes) -> None:
+        draft, known = self.copy.draft(uuid), self.live.draft(uuid)
+        if draft is not None and draft != known and (self.newer or (known is None and not self.older)):
+            self.live.put_draft(draft)
+            self.back["drafts"] += 1
+
+    def _history(self, uuid: bytes) -> None:
+        history, present = self.copy.history(uuid), self.live.history(uuid)
+        if history and history != present and (not present or self.newer):
+            self.live.put_history(history[::-1])
+            self.back["datasheets"] += 1
 
     def _trust(self) -> None:
         names = {record.name for record in self.live.trusted()}

@@ -127,24 +127,34 @@ def keystore_for(content: Content, asked: str | None) -> str | None:
     No path of a module ever comes from a backup: for keys in a token the URI has to be given (UsageFailure). Raises
     PolicyRefused where the keys cannot be put there.
     """
-    wanted = asked or (None if content.keystore in ("keyring", "pkcs11") or content.in_token else content.keystore)
-    if wanted not in (None, "keyring", "file") and not wanted.startswith("pkcs11:"):
+    wanted = asked or _kept_keystore(content)
+    into_token = _is_token(wanted)
+    if wanted not in (None, "keyring", "file") and not into_token:
         raise UsageFailure("There is no such keystore.", hint="Give --keystore keyring, file or pkcs11:URI.")
     if content.in_token and asked is None:
         raise UsageFailure(
             "The station's key is in a token, and a backup does not say by which module it is reached.",
             hint="Add --keystore 'pkcs11:token=LABEL?module-path=/path/of/the/module.so'.",
         )
-    if content.in_token != (wanted or "").startswith("pkcs11:"):
+    if content.in_token and not into_token:
         raise PolicyRefused(
-            "The station's key is in a token and cannot be put elsewhere."
-            if content.in_token
-            else "The keys of this backup cannot be put into a token.",
-            hint="Restore with --keystore pkcs11:URI of that token."
-            if content.in_token
-            else "Restore with --keystore keyring or file.",
+            "The station's key is in a token and cannot be put elsewhere.",
+            hint="Restore with --keystore pkcs11:URI of that token.",
+        )
+    if into_token and not content.in_token:
+        raise PolicyRefused(
+            "The keys of this backup cannot be put into a token.", hint="Restore with --keystore keyring or file."
         )
     return wanted
+
+
+def _is_token(keystore: str | None) -> bool:
+    return keystore is not None and keystore.startswith("pkcs11:")
+
+
+def _kept_keystore(content: Content) -> str | None:
+    """The keystore that the backup was made of, where it can be made anywhere; None for what this machine has."""
+    return None if content.in_token or content.keystore in ("keyring", "pkcs11") else content.keystore
 
 
 def bring_vault(

@@ -72,6 +72,6 @@ def _has_authority(station: Station, statement: Statement) -> bool:
     tombstone = station.policy.tombstone(uuid)
     if tombstone is not None and tombstone.to_fingerprint == signer:
         return True
-    point = next((one.point for one in station.policy.trusted("station") if one.fingerprint == signer), None)
+    point = station.policy.station_points().get(signer)
     known = station.nodes.get(uuid) is not None or station.pins.entry(uuid) is not None
     return known and point is not None and station.identity.certificate(station.keys.ca_of(uuid), point) is not None

@@ -80,10 +80,7 @@ def plan_exports(
     """
     now = now or datetime.now(UTC)
     receivers = tuple({record.point: record for record in _receivers(station, order)}.values())
-    if order.mode == "move" and len(receivers) != 1:
-        raise UsageFailure("A move has exactly one receiver.", hint="Use --mode copy for several.")
-    if order.days < 1:
-        raise UsageFailure("A bundle is valid for at least one day.")
+    _check(order, receivers)
     selection = Selection(station, order, {record.fingerprint for record in receivers})
     nodes, skipped = selection.choose()
     ca = _one_ca(station, order, nodes)
@@ -94,6 +91,13 @@ def plan_exports(
     common = _Common(order, receivers, ca, signatures, now, station.fingerprint, selection.rows)
     plans = [common.plan(part, _other_holders(station, part, receivers)) for part in selection.parts(nodes, most)]
     return [replace(plans[0], skipped=tuple(skipped)), *plans[1:]]
+
+
+def _check(order: ExportOrder, receivers: Sequence[TrustRecord]) -> None:
+    if order.mode == "move" and len(receivers) != 1:
+        raise UsageFailure("A move has exactly one receiver.", hint="Use --mode copy for several.")
+    if order.days < 1:
+        raise UsageFailure("A bundle is valid for at least one day.")
 
 
 @dataclass(frozen=True)
@@ -241,7 +245,7 @@ def _already(plan: ExportPlan, output: Path) -> str | None:
         return None
     with output.open("rb") as file:
         digest = hashlib.file_digest(file, "sha256").hexdigest()
-    return digest if digest in Notes.from_json(plan.earlier.nodes).files else None
+    return digest if digest in _files_before(plan) else None
 
 
 def _seal(station: Station, plan: ExportPlan, now: datetime) -> tuple[bytes, str]:
@@ -282,27 +286,35 @@ def _record(station: Station, plan: ExportPlan, digests: tuple[str, ...]) -> Han
 
     ``digests`` are those of the file and of what was signed in it; none where a bundle of several is announced.
     """
-    before = Notes.from_json(plan.earlier.nodes) if plan.earlier else None
-    files = (*(before.files if before else ()), *digests)
+    files = _files_before(plan)
     uuids_hex = tuple(node.uuid.hex() for node, _ in plan.nodes)
     keys = tuple(key.key_id for _, key in plan.nodes)
-    notes = Notes(uuids_hex, plan.content, plan.ca.hex(), time_text(plan.expires), files, (), keys, plan.run)
+    notes = Notes(
+        uuids_hex, plan.content, plan.ca.hex(), time_text(plan.expires), (*files, *digests), (), keys, plan.run
+    )
     peers = tuple(record.fingerprint for record in plan.receivers)
     row = plan.earlier or Handover(plan.id, "out", plan.mode, peers, OPEN, "")
     row = replace(row, nodes=notes.to_json(), bundle_sha256=digests[0] if digests else row.bundle_sha256)
     station.handovers.put(row)
     for record in plan.receivers:
         station.identity.keep_certificate(plan.ca, record.point, plan.signatures[record.fingerprint])
-    if plan.mode == "copy":
-        now = utc_now()
-        holders = [Holder(node.uuid, peer, now) for node, _ in plan.nodes for peer in peers]
-        station.handovers.take_in(Batch(holders=holders))
-    elif plan.earlier is None:
-        now = utc_now()
-        tombstones = [Tombstone(node.uuid, peers[0], plan.id, now) for node, _ in plan.nodes]
-        station.handovers.take_in(Batch(tombstones=tombstones))
+    _record_holders(station, plan, peers)
     if digests:
         detail = {"handover": plan.id, "mode": plan.mode, "to": list(peers), "nodes": list(uuids_hex)}
-        again = before is not None and bool(before.files)
-        station.audit("export", None, "again" if again else "done", file=digests[0], **detail)
+        station.audit("export", None, "again" if files else "done", file=digests[0], **detail)
     return row
+
+
+def _files_before(plan: ExportPlan) -> tuple[str, ...]:
+    """Digests of the files that this very handover gave in earlier runs."""
+    return Notes.from_json(plan.earlier.nodes).files if plan.earlier else ()
+
+
+def _record_holders(station: Station, plan: ExportPlan, peers: tuple[str, ...]) -> None:
+    """Who holds the keys from now on: each receiver of a copy beside us; of a move, that is, the receiver alone."""
+    now, uuids_of_nodes = utc_now(), [node.uuid for node, _ in plan.nodes]
+    if plan.mode == "copy":
+        station.handovers.take_in(Batch(holders=[Holder(uuid, peer, now) for uuid in uuids_of_nodes for peer in peers]))
+    elif plan.earlier is None:
+        tombstones = [Tombstone(uuid, peers[0], plan.id, now) for uuid in uuids_of_nodes]
+        station.handovers.take_in(Batch(tombstones=tombstones))

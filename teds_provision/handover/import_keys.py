@@ -91,23 +91,14 @@ def plan_import(station: Station, octets: bytes, now: datetime | None = None) ->
     :func:`open_bundle` raises, and PolicyRefused: an id seen with other content, no signature of the bundle's CA over
     this station, or every node refused.
     """
-    came = [row for row in station.handovers.all() if row.direction == "in"]
-    stations = {record.fingerprint: record.point for record in station.policy.trusted() if record.role == "station"}
-    opened = open_bundle(octets, station.vault.identity(), stations.get, None)
+    opened = open_bundle(octets, station.vault.identity(), station.policy.station_points().get, None)
     bundle, content = opened.bundle, digest_of(opened.bundle)
-    for row in came:
-        if row.id == bundle.id:
-            if Notes.from_json(row.nodes).content != content:
-                raise PolicyRefused(
-                    f"The bundle {bundle.id} was taken in before with other content: it is replayed or forged.",
-                    hint="Ask its sender, by voice, what was sent.",
-                )
-            return _before(row)
+    row = station.handovers.get(bundle.id, "in")
+    if row is not None:
+        return _before(row, content)
     check_times(bundle, now or datetime.now(UTC))
     _check_certified(station, opened)
-    news = [one for one in opened.revocations if station.policy.revocation(one.uuid) is None]
-    judged = [(one, why_not(station, one, bundle)) for one in news]
-    denied = tuple(one for one, why in judged if not why)
+    denied, passed_over = _judged(station, opened)
     nodes = tuple(_Judge(station, denied, bundle).each(bundle.nodes))
     if nodes and all(node.decision == "refused" for node in nodes):
         first = nodes[0]
@@ -115,9 +106,24 @@ def plan_import(station: Station, octets: bytes, now: datetime | None = None) ->
             f"No node of the bundle can be taken in; {first.node.uuid.hex()}: {first.why}.",
             hint="Nothing was imported. Tell the sender.",
         )
-    certified = station.identity.certificate(bundle.ca, station.point) is not None
-    known = station.policy.counts(bundle.ca) and (certified or bundle.ca in station.policy.trusted_cas())
-    return ImportPlan(opened, content, nodes, denied, known, tuple((one, why) for one, why in judged if why))
+    return ImportPlan(opened, content, nodes, denied, _is_known_ca(station, bundle.ca), passed_over)
+
+
+_PassedOver = tuple[tuple[Statement, str], ...]
+
+
+def _judged(station: Station, opened: OpenedBundle) -> tuple[tuple[Statement, ...], _PassedOver]:
+    """The revocations of the bundle that are new here: those that count, and those that do not, with why."""
+    news = [one for one in opened.revocations if station.policy.revocation(one.uuid) is None]
+    judged = [(one, why_not(station, one, opened.bundle)) for one in news]
+    denied = tuple(one for one, why in judged if not why)
+    return denied, tuple((one, why) for one, why in judged if why)
+
+
+def _is_known_ca(station: Station, ca: bytes) -> bool:
+    """Whether the CA stands here without this bundle: it certified this station before, or a person trusts it."""
+    certified = station.identity.certificate(ca, station.point) is not None
+    return station.policy.counts(ca) and (certified or ca in station.policy.trusted_cas())
 
 
 def import_keys(station: Station, plan: ImportPlan, now: datetime | None = None) -> Imported:
@@ -162,9 +168,16 @@ def import_keys(station: Station, plan: ImportPlan, now: datetime | None = None)
     return Imported(row, notes, text, fresh=True)
 
 
-def _before(row: Handover) -> Imported:
+def _before(row: Handover, content: str) -> Imported:
+    """A bundle of an id that came before: the same import again, or PolicyRefused where its content differs."""
+    notes = Notes.from_json(row.nodes)
+    if notes.content != content:
+        raise PolicyRefused(
+            f"The bundle {row.id} was taken in before with other content: it is replayed or forged.",
+            hint="Ask its sender, by voice, what was sent.",
+        )
     assert row.receipt is not None
-    return Imported(row, Notes.from_json(row.nodes), row.receipt.encode("ascii"), fresh=False)
+    return Imported(row, notes, row.receipt.encode("ascii"), fresh=False)
 
 
 def _check_certified(station: Station, opened: OpenedBundle) -> None:
@@ -197,11 +210,12 @@ class _Judge:
     def each(self, nodes: Iterable[BundledNode]) -> Iterable[PlannedNode]:
         """Judge every node."""
         for node in nodes:
-            why = self._obstacle(node)
+            why = self._obstacle(node) or self._stale_key(node)
             yield PlannedNode(node, "refused", why) if why else self._taken(node)
 
     def _obstacle(self, node: BundledNode) -> str:
-        known, pin = self.nodes.get(node.uuid), self.pins.get(node.uuid)
+        """Why the node itself is not taken, "" for nothing."""
+        pin = self.pins.get(node.uuid)
         key, why = self.denied.get(node.uuid, (None, ""))
         if why and key in (None, fingerprint(node.node_key)):
             return f"it is revoked: {why}"
@@ -210,14 +224,18 @@ class _Judge:
             return f"it was moved to station {tombstone.to_fingerprint[:32]}, which alone can move it back"
         if pin is not None and pin != fingerprint(node.node_key):
             return "this UUID is known here with another node key"
+        return ""
+
+    def _stale_key(self, node: BundledNode) -> str:
+        """Why the key that it comes with is not taken beside those that are held, "" for nothing."""
         held = self.held.get(node.uuid, {})
         if key_id(node.key).hex() in held:
             return ""
         if sum(state == "pending" for state, _ in held.values()) >= MAX_PENDING:
             return f"{MAX_PENDING} keys of it wait here for their proof"
+        known = self.nodes.get(node.uuid)
         active = max((epoch for state, epoch in held.values() if state == "active"), default=0)
-        hearsay = max((epoch for _, epoch in held.values()), default=0)
-        latest = max(active, hearsay, known.epoch if known is not None else 0)
+        latest = max(known.epoch if known is not None else 0, *(epoch for _, epoch in held.values()), 0)
         if node.epoch < latest:
             return f"its key epoch {node.epoch} is older than {latest}, which is known here"
         if node.epoch == active:
@@ -258,7 +276,7 @@ def _keep_ca(station: Station, plan: ImportPlan) -> None:
     if signature is not None:
         station.identity.keep_certificate(bundle.ca, station.point, signature)
     station.policy.renew_ca(bundle.ca)
-    points = {record.fingerprint: record.point for record in station.policy.trusted() if record.role == "station"}
+    points = station.policy.station_points()
     for digits, signature in bundle.station_signatures.items():
         point = points.get(digits)
         if point is None or digits == station.fingerprint:
@@ -285,21 +303,26 @@ class _Arrivals:
     def take_in(self) -> None:
         """Write all of them."""
         self.station.keys.refresh()
-        taken, now = self.plan.taken, self.now
-        back = [one.node.uuid for one in taken if one.node.uuid in self.resting]
-        self.station.policy.take_back(back)
-        for uuid in back:
-            self.station.audit("handover", uuid, "came back", handover=self.bundle.id)
-        mode = self.bundle.mode
+        taken = self.plan.taken
+        self._take_back([one.node.uuid for one in taken if one.node.uuid in self.resting])
         self.station.handovers.take_in(
             Batch(
                 nodes=[self._node(one) for one in taken],
-                whitelist=[entry for entry in (self._entry(one) for one in taken) if entry is not None],
+                whitelist=[entry for entry in map(self._entry, taken) if entry is not None],
                 keys=[self._key(one.node) for one in taken if one.decision != "same"],
-                holders=[Holder(one.node.uuid, other, now, mode) for one in taken for other in self.others],
+                holders=[holder for one in taken for holder in self._holders(one.node)],
                 marks=self._marks(),
             )
         )
+
+    def _take_back(self, uuids: list[bytes]) -> None:
+        self.station.policy.take_back(uuids)
+        for uuid in uuids:
+            self.station.audit("handover", uuid, "came back", handover=self.bundle.id)
+
+    def _holders(self, node: BundledNode) -> list[Holder]:
+        """The other stations that have this key from now on: the sender, and who else the bundle is for."""
+        return [Holder(node.uuid, other, self.now, self.bundle.mode) for other in self.others]
 
     def _key(self, node: BundledNode) -> KeyRecord:
         return self.station.keys.wrapped(

@@ -15,7 +15,7 @@ from teds_provision.steps.build import BuildOrder, build
 from teds_provision.steps.sign import known_image
 from teds_provision.store import NodeRecord, Revocation
 from teds_provision.teds.codec.codes import AccessCode
-from teds_provision.teds.image import Image
+from teds_provision.teds.image import BlockId, Image
 
 if TYPE_CHECKING:
     from teds_provision.steps.reset import ResetReceipt
@@ -86,7 +86,7 @@ class TakeOver:
 
     old: NodeRecord
     new: NodeRecord
-    calibration: dict[tuple[int, int], bytes]
+    calibration: dict[BlockId, bytes]
 
     @property
     def done(self) -> bool:
@@ -104,17 +104,20 @@ def plan_takeover(station: Station, old: bytes, new: bytes, *, copy_calibration:
     station.policy.require_not_given_away(old)
     station.policy.require_whitelisted(new)
     after = station.nodes.get(new) or NodeRecord(new)
-    blocks: dict[tuple[int, int], bytes] = {}
-    if copy_calibration:
-        image = known_image(station, old) or Image(old, {})
-        blocks = {
-            block: octets for block, octets in image.blocks.items() if block[1] == AccessCode.CALIBRATION and block[0]
-        }
-        if not blocks:
-            raise NotFound(f"No calibration of node {old.hex()} is known here.", hint="Leave --copy-calibration away.")
-        if before.profile is None:
-            raise BadData("The profile of the old node is not known, so its calibration cannot be built in.")
-    return TakeOver(before, after, blocks)
+    return TakeOver(before, after, _calibration_of(station, before) if copy_calibration else {})
+
+
+def _calibration_of(station: Station, old: NodeRecord) -> dict[BlockId, bytes]:
+    """The Calibration TEDS that a node was last read to have; raises NotFound, BadData (they cannot be built in)."""
+    image = known_image(station, old.uuid) or Image(old.uuid, {})
+    blocks = {
+        block: octets for block, octets in image.blocks.items() if block[1] == AccessCode.CALIBRATION and block[0]
+    }
+    if not blocks:
+        raise NotFound(f"No calibration of node {old.uuid.hex()} is known here.", hint="Leave --copy-calibration away.")
+    if old.profile is None:
+        raise BadData("The profile of the old node is not known, so its calibration cannot be built in.")
+    return blocks
 
 
 def take_over(station: Station, plan: TakeOver, receipt: ResetReceipt | None) -> tuple[str, ...]:

@@ -83,8 +83,8 @@ def digest_of(bundle: Bundle) -> str:
 
 def peer_name(station: Station, fingerprint: str) -> str:
     """Name under which a station is trusted, else the first digits of its fingerprint."""
-    for record in station.policy.trusted():
-        if record.fingerprint == fingerprint and record.role == "station":
+    for record in station.policy.trusted("station"):
+        if record.fingerprint == fingerprint:
             return record.name
     return fingerprint[:16]
 
@@ -151,8 +151,7 @@ def close(station: Station, octets: bytes) -> Closed:
     What the receiver refused comes back to this station, to be rotated at the next contact. Raises NotAuthentic
     (signature, sender, another file), PolicyRefused (not ours, undone), NotFound (unknown id), BadData.
     """
-    stations = {record.fingerprint: record.point for record in station.policy.trusted() if record.role == "station"}
-    receipt = open_receipt(octets, stations.get)
+    receipt = open_receipt(octets, station.policy.station_points().get)
     row = station.handovers.get(receipt.id, "out")
     if row is None:
         raise NotFound(f"No bundle {receipt.id} left this station.", hint="Give the receipt to the bundle's sender.")
@@ -169,13 +168,7 @@ def close(station: Station, octets: bytes) -> Closed:
             hint="Rotate them at once: teds-provision agree UUID --rotate. Or export the move anew.",
         )
     with station.transaction():
-        if row.mode == "move":
-            _delete_what_left(station, row, receipt.imported)
-        for refused in receipt.refused:
-            if row.mode == "move":
-                _lift(station, refused.uuid, row)
-            else:
-                station.keys.remove_holder(refused.uuid, receipt.sender)
+        _settle(station, row, receipt)
         texts.append(text)
         state = CLOSED if len(texts) >= len(row.peers) else row.state
         row = replace(row, state=state, receipt="\n".join(texts))
@@ -183,6 +176,17 @@ def close(station: Station, octets: bytes) -> Closed:
         detail = {"handover": row.id, "imported": len(receipt.imported), "refused": len(receipt.refused)}
         station.audit("handover", None, "receipt", state=state, **{"from": receipt.sender}, **detail)
     return Closed(row, receipt, fresh=True)
+
+
+def _settle(station: Station, row: Handover, receipt: Receipt) -> None:
+    """Who holds which key now that the receiver said what it took in and what not."""
+    if row.mode == "move":
+        _delete_what_left(station, row, receipt.imported)
+    for refused in receipt.refused:
+        if row.mode == "move":
+            _lift(station, refused.uuid, row)
+        else:
+            station.keys.remove_holder(refused.uuid, receipt.sender)
 
 
 def _delete_what_left(station: Station, row: Handover, uuids: Iterable[bytes]) -> None:
@@ -245,7 +249,7 @@ class Listed:
 
 def list_handovers(station: Station, now: datetime) -> list[Listed]:
     """Every bundle that left or came, oldest first; ``expired`` says that an open one can be imported no more."""
-    names = {record.fingerprint: record.name for record in station.policy.trusted() if record.role == "station"}
+    names = {record.fingerprint: record.name for record in station.policy.trusted("station")}
     listed = []
     for row in station.handovers.all():
         notes = Notes.from_json(row.nodes)

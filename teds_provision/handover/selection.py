@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 from teds_provision.errors import NotFound, PolicyRefused
@@ -10,6 +11,7 @@ from teds_provision.protocol.handover.bundle import Mode
 from teds_provision.protocol.keys import fingerprint
 from teds_provision.station.station import Station
 from teds_provision.store import KeyRecord, NodeRecord
+from teds_provision.store.records import KeyState
 
 DEFAULT_DAYS = 7
 OUT_OF_SERVICE = ("decommissioned", "replaced by")  # verdicts that workflow.life gives
@@ -38,8 +40,8 @@ class Selection:
         self.nodes = {node.uuid: node for node in station.nodes.all()}
         self.pins = station.pins.all(self.nodes.values())
         held = list(station.keys.all())
-        self.keys = {key.uuid: key for key in held if key.state == "active"}
-        self.pending = {key.uuid for key in held if key.state == "pending"}
+        self.keys = _in_state(held, "active")
+        self.pending = _in_state(held, "pending").keys()
         self.due = station.keys.rotations_due().keys()
         self.tombstones = {tombstone.uuid: tombstone for tombstone in station.policy.tombstones()}
         self.revoked = {revocation.uuid for revocation in station.policy.revocations()}
@@ -57,23 +59,32 @@ class Selection:
 
     def choose(self) -> tuple[Chosen, list[tuple[bytes, str]]]:
         """The nodes with their keys, and those that ``--all`` leaves out."""
-        wanted = sorted(self.keys.keys() | self.pending) if self.order.nodes is None else sorted(set(self.order.nodes))
-        why = {uuid: self._obstacle(uuid) for uuid in wanted}
-        if self.order.nodes is None and all(why.values()):
-            carried_on = self._cut_move()
-            if carried_on:
-                wanted, why = carried_on, dict.fromkeys(carried_on, "")
-        if self.order.nodes is not None:
-            for uuid, obstacle in why.items():
-                if obstacle:
-                    raise PolicyRefused(f"Node {uuid.hex()} cannot be handed over: {obstacle}.", hint=_CURE)
-        chosen = [(self.nodes[uuid], self.keys[uuid]) for uuid in wanted if not why[uuid]]
+        why = self._every() if self.order.nodes is None else self._named(self.order.nodes)
+        chosen = [(self.nodes[uuid], self.keys[uuid]) for uuid, obstacle in why.items() if not obstacle]
         if not chosen:
             raise NotFound("There is no node to hand over.", hint="Name nodes, or see: teds-provision nodes")
         return chosen, [(uuid, obstacle) for uuid, obstacle in why.items() if obstacle]
 
+    def _named(self, nodes: tuple[bytes, ...]) -> dict[bytes, str]:
+        """The nodes that were named; raises PolicyRefused where one cannot go."""
+        why = {uuid: self._obstacle(uuid) for uuid in sorted(set(nodes))}
+        for uuid, obstacle in why.items():
+            if obstacle:
+                raise PolicyRefused(f"Node {uuid.hex()} cannot be handed over: {obstacle}.", hint=_CURE)
+        return why
+
+    def _every(self) -> dict[bytes, str]:
+        """Every node of which a key is held, with what keeps it here; where all stay, those of a move that was cut."""
+        why = {uuid: self._obstacle(uuid) for uuid in sorted(self.keys.keys() | self.pending)}
+        if all(why.values()):
+            return dict.fromkeys(self._cut_move(), "") or why
+        return why
+
     def _obstacle(self, uuid: bytes) -> str:
-        node, tombstone = self.nodes.get(uuid), self.tombstones.get(uuid)
+        return self._key_stays(uuid) or self._node_stays(uuid)
+
+    def _key_stays(self, uuid: bytes) -> str:
+        tombstone = self.tombstones.get(uuid)
         if uuid in self.revoked:
             return "it is revoked"
         if tombstone is not None and not (self.order.nodes is not None and self._is_cut(uuid)):
@@ -84,6 +95,10 @@ class Selection:
             return "an agreement with it is not settled: the key that it has now may be a newer one"
         if uuid in self.due:
             return "its key must be rotated first"
+        return ""
+
+    def _node_stays(self, uuid: bytes) -> str:
+        node = self.nodes.get(uuid)
         if node is not None and (node.verdict or "").startswith(OUT_OF_SERVICE):
             return "it is out of service"
         if node is None or node.point is None:
@@ -109,6 +124,14 @@ class Selection:
         if self.order.mode != "move":
             return []
         rows = [row for row in self.open.values() if row.mode == "move" and set(row.peers) == self.receivers]
-        notes = [Notes.from_json(row.nodes) for row in rows]
-        together = [one for one in notes if one.run and one.run == notes[-1].run] or notes[-1:]
+        together = _of_the_last_run([Notes.from_json(row.nodes) for row in rows])
         return sorted(bytes.fromhex(uuid) for one in together for uuid in one.uuids)
+
+
+def _in_state(keys: Iterable[KeyRecord], state: KeyState) -> dict[bytes, KeyRecord]:
+    return {key.uuid: key for key in keys if key.state == state}
+
+
+def _of_the_last_run(notes: list[Notes]) -> list[Notes]:
+    """The newest bundle, with all that one command made together with it."""
+    return [one for one in notes if one.run and one.run == notes[-1].run] or notes[-1:]

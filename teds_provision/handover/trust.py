@@ -17,6 +17,7 @@ from teds_provision.store.records import TrustRole
 
 MAX_KEY_FILE = 64 * 1024
 _MIN_PREFIX = 8
+_DER_SUFFIXES = (".der", ".key", ".p8", ".pk8", ".p12", ".pfx")
 _CA_SUFFIXES = (".ca.pem", ".ca.pub")
 
 
@@ -49,15 +50,19 @@ def candidate(station: Station, name: str, path: Path, role: TrustRole) -> Candi
         raise PolicyRefused(f"{path} holds this station's own key ({digits[:16]}); it needs no trust.")
     _check_name(name)
     record = TrustRecord(name, role, point, digits)
-    present = [known for known in station.policy.listed() if known.name == name or known.fingerprint == digits]
-    known = any((old.name, old.role, old.point) == (name, role, point) for old in present)
-    for old in present:
-        if old.name == name and (old.role, old.point) != (role, point):
+    return Candidate(record, path, certificate, _is_listed(station, record))
+
+
+def _is_listed(station: Station, wanted: TrustRecord) -> bool:
+    """Whether this very key stands under this very name already; raises PolicyRefused where another one does."""
+    named = [record for record in station.policy.listed() if record.name == wanted.name]
+    for old in named:
+        if (old.role, old.point) != (wanted.role, wanted.point):
             raise PolicyRefused(
-                f"The name {name!r} already stands for the {old.role} {old.fingerprint[:16]}.",
-                hint=f"Choose another name, or run teds-provision trust remove {name} first.",
+                f"The name {wanted.name!r} already stands for the {old.role} {old.fingerprint[:16]}.",
+                hint=f"Choose another name, or run teds-provision trust remove {wanted.name} first.",
             )
-    return Candidate(record, path, certificate, known)
+    return bool(named)
 
 
 def candidates_of(station: Station, folder: Path, role: TrustRole) -> list[Candidate]:
@@ -96,16 +101,22 @@ def private_keys(folder: Path) -> Iterator[tuple[Path, str]]:
     for path in sorted(folder.rglob("*")):
         if not path.is_file() or ".git" in path.parts:
             continue
-        octets = read_limited(path, 16 << 20, "key")
-        if b"PRIVATE KEY" in octets:
-            yield path, "a private key"
-        elif path.suffix in (".der", ".key", ".p8", ".pk8", ".p12", ".pfx") and octets[:1] == b"\x30":
-            if not _is_public_der(octets):
-                yield path, "a private key"
-        elif b'"kty"' in octets and (b'"d"' in octets or b'"k"' in octets):
-            yield path, "a private or secret JSON Web Key"
-        elif b'"teds-provision-vault' in octets or b'"teds-vault' in octets:
-            yield path, "a vault"
+        secret = _secret_in(read_limited(path, 16 << 20, "key"), path.suffix)
+        if secret:
+            yield path, secret
+
+
+def _secret_in(octets: bytes, suffix: str) -> str:
+    """What a file holds that must not be shared, "" for nothing."""
+    if b"PRIVATE KEY" in octets:
+        return "a private key"
+    if suffix in _DER_SUFFIXES and octets[:1] == b"\x30":
+        return "" if _is_public_der(octets) else "a private key"
+    if b'"kty"' in octets and (b'"d"' in octets or b'"k"' in octets):
+        return "a private or secret JSON Web Key"
+    if b'"teds-provision-vault' in octets or b'"teds-vault' in octets:
+        return "a vault"
+    return ""
 
 
 def add(station: Station, chosen: list[Candidate]) -> int:
@@ -133,27 +144,34 @@ def find_trusted(station: Station, text: str, role: TrustRole | None = None) -> 
     Raises NotFound, UsageFailure (several fit), BadData (file), PolicyRefused (the file's key is not trusted).
     """
     known = station.policy.listed() if role is None else station.policy.trusted(role)
-    digits = text.replace(" ", "").lower()
-    by_digits = len(digits) >= _MIN_PREFIX and not set(digits) - set("0123456789abcdef")
-    fits = [record for record in known if record.name == text] or [
-        record for record in known if by_digits and record.fingerprint.startswith(digits)
-    ]
+    fits = [record for record in known if record.name == text] or _by_digits(known, text)
     if len(fits) > 1:
         raise UsageFailure(f"{text!r} fits {len(fits)} trusted keys.", hint="Give the name, or more digits.")
     if fits:
         return fits[0]
     if Path(text).is_file():
-        point = _read(Path(text))[0]
-        for record in known:
-            if record.point == point:
-                return record
-        raise PolicyRefused(
-            f"The key {fingerprint(point)[:16]} of {text} is not trusted here.",
-            hint=f"Compare its fingerprint by voice, then: teds-provision trust add NAME {text}",
-        )
+        return _by_file(known, text)
     what = "station" if role == "station" else "key"
     raise NotFound(
         f"No trusted {what} is known as {text!r}.", hint="teds-provision trust add NAME FILE; see trust list"
+    )
+
+
+def _by_digits(known: list[TrustRecord], text: str) -> list[TrustRecord]:
+    digits = text.replace(" ", "").lower()
+    if len(digits) < _MIN_PREFIX or set(digits) - set("0123456789abcdef"):
+        return []
+    return [record for record in known if record.fingerprint.startswith(digits)]
+
+
+def _by_file(known: list[TrustRecord], file: str) -> TrustRecord:
+    point = _read(Path(file))[0]
+    for record in known:
+        if record.point == point:
+            return record
+    raise PolicyRefused(
+        f"The key {fingerprint(point)[:16]} of {file} is not trusted here.",
+        hint=f"Compare its fingerprint by voice, then: teds-provision trust add NAME {file}",
     )
 
 
@@ -210,12 +228,18 @@ def _cas_of(station: Station, record: TrustRecord) -> tuple[bytes, ...]:
     if record.role == "ca":
         return () if record.point == station.ca else (record.point,)
     stations = {one.fingerprint for one in station.policy.trusted("station")} - {record.fingerprint}
+    brought = _brought_cas(station)
+    ended = [ca for ca, by in brought.items() if record.fingerprint in by and not by & stations and ca not in trusted]
+    return tuple(ended)
+
+
+def _brought_cas(station: Station) -> dict[bytes, set[str]]:
+    """CAs that came in bundles, each with the fingerprints of the stations that sent one."""
     brought: dict[bytes, set[str]] = {}
     for row in station.handovers.all():
         if row.direction == "in":
             brought.setdefault(bytes.fromhex(Notes.from_json(row.nodes).ca), set()).update(row.peers)
-    ended = [ca for ca, by in brought.items() if record.fingerprint in by and not by & stations and ca not in trusted]
-    return tuple(ended)
+    return brought
 
 
 def _read(path: Path) -> tuple[bytes, Certificate | None]:

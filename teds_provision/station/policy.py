@@ -79,6 +79,10 @@ class Policy:
         """Station keys that count here: its own, and those added."""
         return [self._identity.point, *(record.point for record in self.trusted("station"))]
 
+    def station_points(self) -> dict[str, bytes]:
+        """Keys of the other stations that count here, by fingerprint."""
+        return {record.fingerprint: record.point for record in self.trusted("station")}
+
     # -- nodes that are refused ------------------------------------------------------------------------------------
 
     def revocations(self) -> list[Revocation]:

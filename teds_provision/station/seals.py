@@ -26,6 +26,7 @@ if TYPE_CHECKING:
 SEAL_OCTETS = 16
 _KEY_OCTETS = 32
 _SHOWN = 5
+_Values = tuple[str | bytes | None, ...]
 
 
 class Seals:
@@ -99,22 +100,25 @@ class Seals:
 
     def all_broken(self) -> Iterator[str]:
         """Name every row whose seal does not hold (the vault is open), for doctor."""
+        for name, mac, kind, values in self._sealed_rows():
+            if not self._holds(mac, kind, *values):
+                yield name
+
+    def _sealed_rows(self) -> Iterator[tuple[str, bytes | None, str, _Values]]:
+        """Every row that must have a seal: its name, its seal, the kind and the values that the seal is over."""
         facts = self._store.facts()
-        if facts is not None and not self._holds(facts.mac, "station", *_facts(facts)):
-            yield "the station's own key and CA"
-        yield from (
-            f"trust in {one.name}" for one in self._store.trusted() if not self._holds(one.mac, "trust", *_trust(one))
-        )
+        if facts is not None:
+            yield "the station's own key and CA", facts.mac, "station", _facts(facts)
+        for record in self._store.trusted():
+            yield f"trust in {record.name}", record.mac, "trust", _trust(record)
         for entry in self._store.whitelist():
-            if not self._holds(entry.mac, "whitelist", *_entry(entry)):
-                yield f"the whitelist entry of {entry.uuid.hex()}"
+            yield f"the whitelist entry of {entry.uuid.hex()}", entry.mac, "whitelist", _entry(entry)
         for node in self._store.nodes():
-            sealed = node.point is not None and node.point_mac is not None
-            if sealed and not self._holds(node.point_mac, "node", node.uuid, node.point):
-                yield f"the key of node {node.uuid.hex()}"
+            if node.point is not None and node.point_mac is not None:
+                yield f"the key of node {node.uuid.hex()}", node.point_mac, "node", (node.uuid, node.point)
         for uuid, marks in self._store.all_marks().items():
-            if marks.ca is not None and not self._holds(marks.ca_mac, "ca", uuid, marks.ca):
-                yield f"the CA of node {uuid.hex()}"
+            if marks.ca is not None:
+                yield f"the CA of node {uuid.hex()}", marks.ca_mac, "ca", (uuid, marks.ca)
 
     # -- when the vault opens --------------------------------------------------------------------------------------
 
@@ -160,24 +164,29 @@ class Seals:
 
     def seal_what_has_none(self) -> dict[str, int]:
         """Seal every row without a seal, as it is; returns how many of each kind. For what version 0.1 wrote."""
-        counts = dict.fromkeys(("trust", "whitelist", "nodes", "cas"), 0)
-        for record in self._store.trusted():
-            if record.mac is None:
-                self._store.put_trust(self.trust(record))
-                counts["trust"] += 1
+        trust = self._seal_trust()
         entries = [self.entry(entry) for entry in self._store.whitelist() if entry.mac is None]
         nodes = [node for node in self._store.nodes() if node.point is not None and node.point_mac is None]
         self._store.put_seals(
             {entry.uuid: entry.mac for entry in entries},
             {node.uuid: self._mac("node", node.uuid, node.point) for node in nodes},
         )
+        return {"trust": trust, "whitelist": len(entries), "nodes": len(nodes), "cas": self._seal_cas()}
+
+    def _seal_trust(self) -> int:
+        unsealed = [record for record in self._store.trusted() if record.mac is None]
+        for record in unsealed:
+            self._store.put_trust(self.trust(record))
+        return len(unsealed)
+
+    def _seal_cas(self) -> int:
         marks = {
             uuid: replace(mark, ca_mac=self.ca(uuid, mark.ca))
             for uuid, mark in self._store.all_marks().items()
             if mark.ca is not None and mark.ca_mac is None
         }
         self._store.put_marks(marks)
-        return counts | {"whitelist": len(entries), "nodes": len(nodes), "cas": len(marks)}
+        return len(marks)
 
     def rewrap(self, vault: Vault) -> None:
         """Wrap the seal key under the vault's newest master key; the seals stay as they are."""
@@ -206,15 +215,15 @@ class Seals:
         return mac is not None and hmac.compare_digest(mac, self._mac(kind, *values))
 
 
-def _facts(facts: Facts) -> tuple[str | bytes | None, ...]:
+def _facts(facts: Facts) -> _Values:
     return (facts.requested, facts.point, facts.ca, facts.signature, facts.taken_over)
 
 
-def _entry(entry: WhitelistEntry) -> tuple[str | bytes | None, ...]:
+def _entry(entry: WhitelistEntry) -> _Values:
     return (entry.uuid, entry.fingerprint, entry.assurance, entry.name)
 
 
-def _trust(record: TrustRecord) -> tuple[str | bytes | None, ...]:
+def _trust(record: TrustRecord) -> _Values:
     return (record.name, record.role, record.point, record.fingerprint)
 
 

@@ -135,10 +135,7 @@ def _head(source: RowSource) -> tuple[int, dict[str, list[str]]]:
     try:
         head = json.loads(source.read_line(_MAX_HEAD_OCTETS))
         version, tables = head["schema"], head["tables"]
-        whole = type(version) is int and all(
-            _NAME.fullmatch(name) and columns and all(_NAME.fullmatch(column) for column in columns)
-            for name, columns in tables.items()
-        )
+        whole = type(version) is int and all(_is_table(name, columns) for name, columns in tables.items())
     except (ValueError, KeyError, TypeError, AttributeError, RecursionError):
         raise BadData("The backup holds no store.") from None
     if not whole or version < 1 or len(tables) >= _END:
@@ -149,6 +146,10 @@ def _head(source: RowSource) -> tuple[int, dict[str, list[str]]]:
             hint="Use the newer version of teds-provision that made it.",
         )
     return version, tables
+
+
+def _is_table(name: str, columns: list[str]) -> bool:
+    return bool(columns) and all(_NAME.fullmatch(word) for word in (name, *columns))
 
 
 def _pages(source: RowSource, widths: list[int]) -> Iterator[tuple[int, list[tuple[Any, ...]]]]:

@@ -39,22 +39,19 @@ class Pkcs11Uri:
         found = _attributes(path, ";") | {f"?{name}": value for name, value in _attributes(query, "&").items()}
         _refuse(found)
         module = found.pop("?module-path", None)
-        if module is None or found:
-            unknown = ", ".join(name.removeprefix("?") for name in found.keys() - _PATH)
-            if module is None:
-                raise UsageFailure("The PKCS #11 URI names no module (module-path).", hint=_EXAMPLE)
-            if unknown:
-                raise UsageFailure(f"This tool does not know the PKCS #11 URI attribute {unknown}.", hint=_EXAMPLE)
+        if module is None:
+            raise UsageFailure("The PKCS #11 URI names no module (module-path).", hint=_EXAMPLE)
+        unknown = ", ".join(name.removeprefix("?") for name in found.keys() - _PATH)
+        if unknown:
+            raise UsageFailure(f"This tool does not know the PKCS #11 URI attribute {unknown}.", hint=_EXAMPLE)
         if found.get("type", b"private") != b"private":
             raise UsageFailure("The PKCS #11 URI names another type than a private key.")
-        slot = found.get("slot-id")
-        if slot is not None and not slot.isdigit():
-            raise UsageFailure("The slot-id of the PKCS #11 URI is no number.")
+        slot = _number("slot-id", found.get("slot-id"))
         texts = {name: _text(name, found.get(name)) for name in ("token", "serial", "manufacturer", "model", "object")}
         return cls(
             _text("module-path", module) or "",
             id=found.get("id"),
-            slot_id=None if slot is None else int(slot),
+            slot_id=slot,
             **texts,
         )
 
@@ -85,6 +82,14 @@ def _refuse(found: dict[str, bytes]) -> None:
         )
     if "?module-name" in found:
         raise UsageFailure("Name the module by its path (module-path), not by module-name.", hint=_EXAMPLE)
+
+
+def _number(name: str, octets: bytes | None) -> int | None:
+    if octets is None:
+        return None
+    if not octets.isdigit():
+        raise UsageFailure(f"The {name} of the PKCS #11 URI is no number.")
+    return int(octets)
 
 
 def _text(name: str, octets: bytes | None) -> str | None:

@@ -117,17 +117,18 @@ def read_tagged(payload: bytes, layout: str, base: int) -> list[Argument] | None
         tag, length = payload[at], int.from_bytes(payload[at + 1 : at + 3], "big")
         name, kind = wanted[len(parts)]
         raw = payload[at + 3 : at + 3 + length]
-        expected = _TAG_OF.get(kind)
-        if (
-            len(raw) < length
-            or not 1 <= tag <= _HIGHEST_TAG
-            or TAGS.get(tag, length) != length
-            or (expected is not None and tag not in expected)
-        ):
+        if len(raw) < length or not _tag_fits(tag, length, kind):
             return None
         parts.append(_argument(name, kind, raw, base + at + 3))
         at += 3 + length
     return parts if parts and len(parts) == len(wanted) else None
+
+
+def _tag_fits(tag: int, length: int, kind: str) -> bool:
+    if not 1 <= tag <= _HIGHEST_TAG or TAGS.get(tag, length) != length:
+        return False
+    expected = _TAG_OF.get(kind)
+    return expected is None or tag in expected
 
 
 def _argument(name: str, kind: str, raw: bytes, offset: int) -> Argument:
@@ -184,15 +185,19 @@ def _meaning(name: str, value: object) -> str:
     if name == "access_code":
         return name_of(value)
     if name == "error":
-        number = value & 0x1FFF
-        known = ERRORS[number] if number < len(ERRORS) else f"unknown error {number}"
-        return known if value == 0 else f"{known} ({ERROR_SOURCES[value >> 13]})"
+        return _error(value)
     if name == "channel":
         return {0: "the TIM itself", 0xFFFF: "every TransducerChannel"}.get(value, "")
     if name in FLAGS:
         names = FLAGS[name]
         return ", ".join(names[bit] if bit < len(names) else f"bit {bit}" for bit in range(32) if value >> bit & 1)
     return ENUMERATIONS.get(name, {}).get(value, "")
+
+
+def _error(value: int) -> str:
+    number = value & 0x1FFF
+    known = ERRORS[number] if number < len(ERRORS) else f"unknown error {number}"
+    return known if value == 0 else f"{known} ({ERROR_SOURCES[value >> 13]})"
 
 
 def write_plain(layout: str, values: Mapping[str, MessageValue | Blocks], *, of: str) -> bytes:

@@ -125,10 +125,8 @@ def _sniff(octets: bytes, *, lenient: bool = False) -> Kind:
     """Kind by header; ``lenient`` takes unknown functions of the standard's classes for commands, too."""
     if _is_network(octets):
         return "network-service"
-    if len(octets) >= COMMAND_HEADER and int.from_bytes(octets[4:6], "big") == len(octets) - COMMAND_HEADER:
-        group, function = octets[2], octets[3]
-        if (group, function) in COMMANDS or (function and (group >= 128 or (lenient and group in CLASSES))):
-            return "command"
+    if _is_command(octets, lenient=lenient):
+        return "command"
     if len(octets) >= REPLY_HEADER and octets[0] <= 1:
         return "reply" if int.from_bytes(octets[1:3], "big") == len(octets) - REPLY_HEADER else "unknown"
     return "unknown"
@@ -140,6 +138,15 @@ def _is_network(octets: bytes) -> bool:
     known = (octets[0], octets[1]) in NETWORK or octets[0] in {5, 9}
     body = len(octets) - NETWORK_HEADER
     return known and int.from_bytes(octets[3:5], "big") in {body, body - 1}
+
+
+def _is_command(octets: bytes, *, lenient: bool) -> bool:
+    if len(octets) < COMMAND_HEADER or int.from_bytes(octets[4:6], "big") != len(octets) - COMMAND_HEADER:
+        return False
+    group, function = octets[2], octets[3]
+    if (group, function) in COMMANDS:
+        return True
+    return function != 0 and (group >= 128 or (lenient and group in CLASSES))
 
 
 def _network(octets: bytes) -> Message:
@@ -205,12 +212,8 @@ def _command(octets: bytes) -> Message:
 
 
 def _reply(octets: bytes, request: Message | None) -> Message:
-    length = int.from_bytes(octets[1:3], "big")
     payload = octets[REPLY_HEADER:]
-    findings: list[Finding] = []
-    if len(octets) < REPLY_HEADER or length != len(payload):
-        text = f"The reply announces {length} octets and carries {len(payload)}."
-        findings.append(Finding("error", "message-length", text, min(1, len(octets)), "length"))
+    findings = _reply_length(octets)
     ok = octets[:1] not in {b"", b"\0"}
     layout, name, guessed = _reply_layout(ok, payload, request)
     if guessed and payload:
@@ -218,21 +221,30 @@ def _reply(octets: bytes, request: Message | None) -> Message:
         findings.append(Finding("note", "reply-guessed", text, REPLY_HEADER))
     tagged = read_tagged(payload, layout, REPLY_HEADER) if request is not None and request.school == "tagged" else None
     arguments, more = (tagged, []) if tagged is not None else read_plain(payload, layout, REPLY_HEADER)
+    asked = request or Message(b"", "unknown", 2007, "")  # of which nothing is known
     return Message(
         octets,
         "reply",
         2007,
         name,
-        tuple(_with_reason(argument) for argument in arguments),
+        tuple(map(_with_reason, arguments)),
         (*findings, *more),
-        request.group if request else None,
-        request.group_name if request else "",
-        request.function if request else None,
-        channel=request.channel if request else None,
+        asked.group,
+        asked.group_name,
+        asked.function,
+        channel=asked.channel,
         ok=ok,
         school="tagged" if tagged is not None else "concatenated",
         teds=_embedded(arguments),
     )
+
+
+def _reply_length(octets: bytes) -> list[Finding]:
+    length, carried = int.from_bytes(octets[1:3], "big"), max(0, len(octets) - REPLY_HEADER)
+    if len(octets) >= REPLY_HEADER and length == carried:
+        return []
+    text = f"The reply announces {length} octets and carries {carried}."
+    return [Finding("error", "message-length", text, min(1, len(octets)), "length")]
 
 
 def _reply_layout(ok: bool, payload: bytes, request: Message | None) -> tuple[str, str, bool]:
@@ -241,18 +253,26 @@ def _reply_layout(ok: bool, payload: bytes, request: Message | None) -> tuple[st
         return "reason:u8", "Refusal", request is None
     if request is not None and request.group is not None and request.function is not None:
         spec = COMMANDS.get((request.group, request.function), Spec(request.name, reply="octets:octets"))
-        form = spec.reply if spec.answer is None or request.arguments else spec.answer
-        layout = (form or "") if ok or len(payload) in {4, 12} else "octets:octets"
-        return layout, f"Reply to {spec.name}" if ok else f"Failure of {spec.name}", False
-    if not payload:
-        return "", "Success" if ok else "Failure", True
+        return (*_layout_asked_for(ok, payload, request, spec), False)
+    return (*_layout_guessed(ok, payload), True)
+
+
+def _layout_asked_for(ok: bool, payload: bytes, request: Message, spec: Spec) -> tuple[str, str]:
+    """Layout and name of the reply to a command that is known; a failure carries a reply of that form, or nothing."""
+    form = spec.reply if spec.answer is None or request.arguments else spec.answer
+    layout = (form or "") if ok or len(payload) in {4, 12} else "octets:octets"
+    return layout, f"Reply to {spec.name}" if ok else f"Failure of {spec.name}"
+
+
+def _layout_guessed(ok: bool, payload: bytes) -> tuple[str, str]:
+    """Layout and name by the form alone."""
     if len(payload) == 12 and int.from_bytes(payload[2:6], "big") <= int.from_bytes(payload[8:12], "big"):
-        return STATUS, "Reply to Query or Update TEDS", True
+        return STATUS, "Reply to Query or Update TEDS"
     if len(payload) >= 4:
         whole = payload[:4] == bytes(4) and _is_whole_teds(payload[4:])
         name = "Reply to Read TEDS segment" if whole else "Reply with a segment of a TEDS or data set"
-        return SEGMENT, name if ok else "Failure with a segment", True
-    return "octets:octets", "Success" if ok else "Failure", True
+        return SEGMENT, name if ok else "Failure with a segment"
+    return "octets:octets" if payload else "", "Success" if ok else "Failure"
 
 
 def _with_reason(argument: Argument) -> Argument:

@@ -167,24 +167,19 @@ class OperationRole:
     def _operate(self, inner: Inner) -> bytes:
         number, session = inner.command.channel, inner.session
         channels = self._hardware.channels
-        sensors = [channel for channel, facts in channels.items() if not facts.actuator]
+        sensors = self._sensors()
         demand(number in channels or (number == 0 and bool(sensors)), Reason.UNKNOWN_COMMAND)
         acting = number != 0 and channels[number].actuator
         asked = Operate.decode(number, inner.command.payload, actuator=acting)
         digest = hashlib.sha256(self._flash().security_teds()).digest()[:DIGEST_OCTETS]
         demand(asked.digest == digest, Reason.DIGEST_MISMATCH)
-        if number == 0:
-            wanted = [channel for channel in sensors if self._fits(channel) and not self._hardware.fault(channel)]
-            demand(bool(wanted), Reason.DIGEST_MISMATCH)
-        else:
-            wanted = [number]
-            demand(self._fits(number), Reason.DIGEST_MISMATCH)
+        wanted = [number] if number else [one for one in sensors if not self._hardware.fault(one)]
+        wanted = list(filter(self._fits, wanted))
+        demand(bool(wanted), Reason.DIGEST_MISMATCH)
         demand(FIRST_LEASE <= asked.lease <= LAST_LEASE, Reason.OUT_OF_RANGE)
         if asked.dead_man is not None:
             demand(FIRST_DEAD_MAN <= asked.dead_man <= LAST_DEAD_MAN, Reason.OUT_OF_RANGE)
-        held = self.claims.actuators.get(number)
-        if held is not None:
-            raise Refused(Reason.WRONG_STATE if held.session is session else Reason.BUSY)
+        self._demand_free(number, session)
         low = self._hardware.power().flags & PowerFlag.TOO_LOW
         demand(not low and not any(map(self._hardware.fault, wanted)), Reason.FAULT)
         if asked.dead_man is not None:
@@ -192,6 +187,15 @@ class OperationRole:
         else:
             self.claims.claim_sensors(session, wanted, asked.lease)
         return b""
+
+    def _sensors(self) -> list[int]:
+        return [channel for channel, facts in self._hardware.channels.items() if not facts.actuator]
+
+    def _demand_free(self, actuator: int, session: NodeSession) -> None:
+        """An actuator is claimed once: by this session already (13), or by another (17)."""
+        held = self.claims.actuators.get(actuator)
+        if held is not None:
+            raise Refused(Reason.WRONG_STATE if held.session is session else Reason.BUSY)
 
     def _idle(self, inner: Inner) -> bytes:
         number = inner.command.channel

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import hmac
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import Final, NamedTuple
 
@@ -128,10 +128,7 @@ class StreamRole:
         asked = Subscribe.decode(payload)
         demand(port.kind != "nfc", Reason.DOES_NOT_FIT)
         layout = self._layout(asked.channels, session)
-        kinds = [self._hardware.channels[channel].kind for channel in asked.channels]
-        demand(ChannelKind.ACTUATOR not in kinds, Reason.NOT_PERMITTED)
-        events = [kind is ChannelKind.EVENT_SENSOR for kind in kinds]
-        demand(all(events) if asked.kind == Kind.EVENT else not any(events), Reason.OUT_OF_RANGE)
+        self._check_kinds(asked)
         self._check_period(asked)
         length = asked.length(layout.octets)
         most = min(MOST_OCTETS, port.mtu - budget.BLE_OVERHEAD) if port.kind == "ble" else MOST_OCTETS
@@ -153,6 +150,12 @@ class StreamRole:
         stream = Stream(session, port, asked, layout, own.run, None if start == WAITS else start)
         self._streams.append(stream)
         return Subscribed(own.run, length, start).encode()
+
+    def _check_kinds(self, asked: Subscribe) -> None:
+        kinds = [self._hardware.channels[channel].kind for channel in asked.channels]
+        demand(ChannelKind.ACTUATOR not in kinds, Reason.NOT_PERMITTED)
+        events = [kind is ChannelKind.EVENT_SENSOR for kind in kinds]
+        demand(all(events) if asked.kind == Kind.EVENT else not any(events), Reason.OUT_OF_RANGE)
 
     def stop(self, payload: bytes, session: NodeSession) -> bytes:
         """Stop: the counter that the next message would have had."""
@@ -235,17 +238,20 @@ class StreamRole:
         drive.last = counter
         values = DriveValues.decode(plain)
         channels = drive.layout.channels
-        ahead = (values.until - self._hardware.now() // MICRO) % _WRAP
-        longest = min(self._claims.actuators[channel].dead_man for channel in channels) // MICRO
-        if ahead > longest:  # past (which shows as far ahead, mod 2^32), or further ahead than the dead-man
-            return
         data = dict(zip(channels, drive.layout.cut(values.data), strict=True))
+        if self._in_time(values.until, channels) and self._can_apply(data):
+            self._hardware.apply(data)
+            self._claims.fed(channels, self._real())
+
+    def _in_time(self, until: int, channels: Sequence[int]) -> bool:
+        """Not past (which shows as far ahead, mod 2^32), nor further ahead than the shortest dead-man."""
+        ahead = (until - self._hardware.now() // MICRO) % _WRAP
+        return ahead <= min(self._claims.actuators[channel].dead_man for channel in channels) // MICRO
+
+    def _can_apply(self, data: dict[int, bytes]) -> bool:
         if not all(self._hardware.bears(channel, octets) for channel, octets in data.items()):
-            return
-        if any(self._hardware.fault(channel) for channel in channels):
-            return
-        self._hardware.apply(data)
-        self._claims.fed(channels, self._real())
+            return False
+        return not any(map(self._hardware.fault, data))
 
     def event(self, channel: int, tick: int, octets: bytes, *, valid: bool) -> None:
         """An event sensor has seen something."""

@@ -192,12 +192,16 @@ class Receiver:
             self.counts.unasked += 1
             return None
         if self.start is None and not self._timed:
-            if len(self._held) == MOST_HELD:
-                self._held.popleft()
-                self.counts.overflow += 1
-            self._held.append((message, now))
+            self._hold(message, now)
             return None
         return message if self._fresh(message, now) else None
+
+    def _hold(self, message: Message, now: TickBounds) -> None:
+        """Keep a message whose time is not known yet; the oldest goes where there are too many."""
+        if len(self._held) == MOST_HELD:
+            self._held.popleft()
+            self.counts.overflow += 1
+        self._held.append((message, now))
 
     def begin(self, start: int) -> list[Message]:
         """The first instant of a stream that waited is known (mark + 10 ms): gives the messages held, where fresh."""

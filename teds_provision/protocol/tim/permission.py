@@ -74,12 +74,7 @@ class Permission:
 
     def _plain_security(self, function: Function, payload: bytes, origin: Origin) -> None:
         """The columns "factory" and "keyed or provisioned"."""
-        if function in _TAPPED and not origin.tapped:
-            raise Refused(Reason.NOT_PERMITTED)
-        if function == Function.CLOSE or function in _MEASURING:
-            raise Refused(Reason.NOT_PERMITTED)
-        if function == Function.RESET and not self.in_factory():
-            raise Refused(Reason.NOT_PERMITTED)
+        self._permitted_plain(function, origin)
         if function == Function.OPEN and self.in_factory():
             raise Refused(Reason.WRONG_STATE)
         if function == Function.SEALED and not self.open_on(origin.link):
@@ -88,6 +83,14 @@ class Permission:
             self._spare_actuators()
         if function == Function.LIST:
             self._hold_strangers_back()
+
+    def _permitted_plain(self, function: Function, origin: Origin) -> None:
+        if function in _TAPPED and not origin.tapped:
+            raise Refused(Reason.NOT_PERMITTED)
+        if function == Function.CLOSE or function in _MEASURING:
+            raise Refused(Reason.NOT_PERMITTED)
+        if function == Function.RESET and not self.in_factory():
+            raise Refused(Reason.NOT_PERMITTED)
 
     def _plain(self, command: Command) -> None:
         """Other classes outside a session: Query and Read alone."""
