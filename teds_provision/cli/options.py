@@ -87,7 +87,12 @@ def link_options(function: Function) -> Function:
             cls=_Several,
             help="Bus: socketcan:can0, udp_multicast:239.74.163.2, …; several with measure.",
         ),
-        click.option("--ble", metavar="ADAPTER", help="Not in this version."),
+        click.option(
+            "--ble",
+            metavar="ADAPTER",
+            help="Bluetooth: auto, hci0, 'hci0?address=C1:D8:57:00:01:01'; with --nfc: the reader for identify and "
+            "agree, the air for the rest.",
+        ),
         click.option(
             "--timeout",
             type=Seconds(min=0.1),

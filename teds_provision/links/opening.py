@@ -12,7 +12,7 @@ from importlib import import_module
 from typing import Final
 
 from teds_provision.errors import UsageFailure
-from teds_provision.links.ports import CAN, NFC, Capabilities, LinkSettings, Port, Trace
+from teds_provision.links.ports import BLE, CAN, NFC, Capabilities, LinkSettings, Port, Trace
 
 
 @dataclass(frozen=True)
@@ -40,6 +40,7 @@ LINKS: Final = {
             "can:socketcan:can0",
             needs="--via can needs to know the bus. Add --can, e.g. --can socketcan:can0?bitrate=500000.",
         ),
+        LinkKind("ble", "teds_provision.links.ble.port", BLE, "ble:hci0"),
     )
 }
 

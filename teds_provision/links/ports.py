@@ -68,17 +68,23 @@ class Capabilities:
     """What a link can do, so that nobody asks for its name.
 
     ``tapped``: somebody holds the node to this reader, so that a key that comes this way may be pinned and agreed.
-    ``streams``: data messages of measuring nodes can be heard (``CanPort.listen``). ``many``: several nodes are there
-    at once, and may be talked to from one thread each.
+    ``wired``: who answers hangs on this very wire, so that a new node's first key may be taken for its own.
+    ``streams``: data messages of measuring nodes can be heard. ``many``: several nodes are there at once, and may be
+    talked to from one thread each, ``at_once`` of them at a time.
     """
 
     tapped: bool = False
+    wired: bool = False
     streams: bool = False
     many: bool = False
+    at_once: int = 1
 
 
 NFC = Capabilities(tapped=True)
-CAN = Capabilities(streams=True, many=True)
+CAN = Capabilities(wired=True, streams=True, many=True, at_once=24)
+"""While most of 24 nodes calculate, a bus is never idle at 500 kbit/s."""
+BLE = Capabilities(streams=True, many=True)
+"""One node after the other: an adapter holds few connections (notes in docs/hardware.md)."""
 
 
 class Link(Protocol):
@@ -118,8 +124,9 @@ class Repeats(Protocol):
 class Contact:
     """A node that was found: its unauthenticated Identify, its link, and where it was found.
 
-    ``charging`` and ``ble`` are what its initial NFC message says beside; hints, as unauthenticated as the rest.
-    ``trace`` is where the messages with it are written down.
+    ``address`` is its CAN address, ``connection`` the number of its BLE connection. ``charging`` and ``ble`` are what
+    its initial NFC message says beside; hints, as unauthenticated as the rest. ``trace`` is where the messages with it
+    are written down.
     """
 
     identity: Identity
@@ -129,6 +136,12 @@ class Contact:
     charging: Charging | None = None
     ble: BleAddress | None = None
     trace: Trace | None = None
+    connection: int | None = None
+
+    @property
+    def line(self) -> int:
+        """What its data messages are told apart by on its port: CAN address, or number of the connection."""
+        return self.address or self.connection or 0
 
     def note(
         self, direction: Direction, frame: bytes, words: str, *, sealed: bool = False, opened: bytes | None = None

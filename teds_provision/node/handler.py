@@ -37,8 +37,21 @@ class Measuring(Protocol):
     def tick(self) -> int:
         """The present tick of the node's clock, ns."""
 
-    def request_received(self, link: str, frame: bytes, *, tapped: bool, fd: bool, received: int) -> bytes:
-        """As NodeHandler.request, for a frame whose last part came by CAN FD or not, at the tick ``received``."""
+    def request_received(
+        self,
+        link: str,
+        frame: bytes,
+        *,
+        tapped: bool,
+        received: int,
+        fd: bool = False,
+        mtu: int = 23,
+        hears: bool = True,
+    ) -> bytes:
+        """As NodeHandler.request, for a frame whose last part came by CAN FD or not, at the tick ``received``.
+
+        ``mtu`` and ``hears`` are those of a BLE connection; see Port.
+        """
 
     def reply_left(self, link: str) -> None:
         """The last reply on this link has left (or will not any more): data may follow."""
@@ -48,3 +61,16 @@ class Measuring(Protocol):
 
     def drive(self, link: str, data: bytes) -> None:
         """A Drive frame of this link's station came."""
+
+
+class InTheAir(NodeHandler, Measuring, Protocol):
+    """What a node's BLE asks beside (wire, "BLE")."""
+
+    def in_factory_state(self) -> bool:
+        """Whether the node holds no key."""
+
+    def in_session(self, link: str) -> bool:
+        """Whether a session is open on this link."""
+
+    def unheard(self, link: str) -> None:
+        """The station has disabled data messages on this link: its streams end."""

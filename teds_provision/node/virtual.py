@@ -164,14 +164,24 @@ class VirtualNode:
 
     def request(self, link: str, frame: bytes, *, tapped: bool) -> bytes:
         """Run one command frame; see NodeHandler."""
-        return self.request_received(link, frame, tapped=tapped, fd=False, received=self.tick())
+        return self.request_received(link, frame, tapped=tapped, received=self.tick())
 
-    def request_received(self, link: str, frame: bytes, *, tapped: bool, fd: bool, received: int) -> bytes:
+    def request_received(
+        self,
+        link: str,
+        frame: bytes,
+        *,
+        tapped: bool,
+        received: int,
+        fd: bool = False,
+        mtu: int = 23,
+        hears: bool = True,
+    ) -> bytes:
         """Run one command frame; see Measuring."""
         simulated = self.board is not None and not self.board.clock.runs_by_itself
         at = None if simulated else received  # a simulation's tick stands still while a command runs
         with self._core.command():
-            port = port_of(link)._replace(fd=fd)
+            port = port_of(link)._replace(fd=fd, mtu=mtu, hears=hears)
             reply = self.tim.handle(frame, link=link, tapped=tapped, port=port, received=at)
         with self._wire:
             pass  # a data frame that was on its way out is out: nothing of a stream leaves behind the reply to Stop
@@ -199,6 +209,16 @@ class VirtualNode:
         """A Drive frame came; see Measuring."""
         with self._core.interrupt():
             self.tim.drive(link, data)
+
+    def unheard(self, link: str) -> None:
+        """Data messages were disabled; see InTheAir."""
+        with self._core.interrupt():
+            self.tim.unheard(link)
+
+    def in_session(self, link: str) -> bool:
+        """Whether a session is open; see InTheAir."""
+        with self._core.interrupt():
+            return self.tim.in_session(link)
 
     def identify(self) -> bytes:
         """Identify as it is now; see NodeHandler."""

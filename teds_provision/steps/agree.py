@@ -247,7 +247,7 @@ def _pin_for(entry: WhitelistEntry, node: Conversation, who: Identified) -> Whit
         return entry
     if node.tapped:
         return replace(entry, fingerprint=who.fingerprint, assurance="tap")
-    if who.state == NodeState.FACTORY:
+    if who.state == NodeState.FACTORY and node.wired:
         return replace(entry, fingerprint=who.fingerprint, assurance="bus")
     raise PolicyRefused(
         f"The whitelist knows node {node.uuid.hex()} by UUID alone; only a tap can pin its key.",

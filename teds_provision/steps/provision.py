@@ -194,10 +194,10 @@ class _Run:
 def newcomer(station: Station, node: Conversation, who: Identified) -> WhitelistEntry:
     """The whitelist entry of a node that was just identified, pinned to its key by tap, or by the bus of a new node.
 
-    A node that already has a key is not pinned over a bus, where anyone may show any UUID; its first tap does. Changes
-    nothing. Raises PolicyRefused (revoked), OtherKey.
+    A node that already has a key is not pinned over a bus, where anyone may show any UUID; its first tap does. Over the
+    air nothing is pinned. Changes nothing. Raises PolicyRefused (revoked), OtherKey.
     """
-    new = who.state == NodeState.FACTORY
+    new = who.state == NodeState.FACTORY and node.wired
     assurance: Assurance = "tap" if node.tapped else "bus" if new else "uuid"
     revoked = station.policy.revocation(who.uuid)
     if revoked is not None:

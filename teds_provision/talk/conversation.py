@@ -113,6 +113,11 @@ class Conversation:
         return self.contact.link.capabilities.tapped
 
     @property
+    def wired(self) -> bool:
+        """Whether the node hangs on a wired bus."""
+        return self.contact.link.capabilities.wired
+
+    @property
     def sealed(self) -> bool:
         """Whether a session is open."""
         return self._session is not None

@@ -102,7 +102,7 @@ class Port(NamedTuple):
     """Where a session's link lies: ``kind`` nfc, can or ble; streams of one ``bus`` share its budget.
 
     ``source`` is the station's address there (F1 to F7 on CAN, 1 on NFC, 2 and up on BLE); ``fd`` says that the command
-    came by CAN FD, ``mtu`` is that of a BLE connection.
+    came by CAN FD; ``mtu`` is that of a BLE connection, ``hears`` whether the station has enabled data messages on it.
     """
 
     kind: str
@@ -110,6 +110,7 @@ class Port(NamedTuple):
     source: int
     fd: bool = False
     mtu: int = 23
+    hears: bool = True
 
 
 def port_of(link: str) -> Port:

@@ -127,6 +127,7 @@ class StreamRole:
         """Subscribe: every check in the order of section 4, then the stream."""
         asked = Subscribe.decode(payload)
         demand(port.kind != "nfc", Reason.DOES_NOT_FIT)
+        demand(port.hears, Reason.WRONG_STATE)
         layout = self._layout(asked.channels, session)
         self._check_kinds(asked)
         self._check_period(asked)
@@ -273,6 +274,11 @@ class StreamRole:
     def session_ended(self, session: NodeSession) -> None:
         """The session is over, and its claims with it."""
         self._sessions.pop(session, None)
+
+    def unheard(self, session: NodeSession) -> None:
+        """The station has disabled data messages on its connection: the session's streams end (section 6)."""
+        for stream in [stream for stream in self._streams if stream.session is session]:
+            self._end(stream)
 
     # -- time ------------------------------------------------------------------------------------------------------
 

@@ -208,6 +208,16 @@ class Tim:
         else:
             self._role.streams.drive_message(session, octets)
 
+    def unheard(self, link: str) -> None:
+        """The station of this link has disabled data messages there (BLE): its streams end."""
+        session = self._lines.on(link)
+        if self._role is not None and session is not None:
+            self._role.streams.unheard(session)
+
+    def in_session(self, link: str) -> bool:
+        """Whether a session is open on this link."""
+        return self._lines.on(link) is not None
+
     def actuator_claimed(self) -> bool:
         """Whether a session claims an actuator."""
         return self._role is not None and bool(self._role.claims.actuators)

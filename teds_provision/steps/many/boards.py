@@ -28,8 +28,6 @@ from teds_provision.talk.meeting import meet, refuse_twins
 from teds_provision.talk.progress import Reporter
 from teds_provision.talk.watching import Patience, watch_nodes
 
-WORKERS: Final = 24
-"""Nodes of one bus that are worked on at once: while most of them calculate, the bus is never idle at 500 kbit/s."""
 _TOKEN_WORKERS: Final = 1
 """A token takes one command at a time."""
 
@@ -182,7 +180,7 @@ class Boards:
             found = refuse_twins(port.everyone(seconds=self._links.timeout, notice=self._reporter.notice))
             contacts = [contact for contact in found if self._is_meant(contact)]
             token = self._station.identity.keystore.startswith("pkcs11:")
-            workers = max(1, min(_TOKEN_WORKERS if token else WORKERS, len(contacts)))
+            workers = max(1, min(_TOKEN_WORKERS if token else port.capabilities.at_once, len(contacts)))
             with ThreadPoolExecutor(workers, thread_name_prefix="node") as pool:
                 running = [pool.submit(self._board, contact, port.place, questions) for contact in contacts]
                 try:

@@ -1,0 +1,92 @@
+"""One node's line over BLE: a request, its reply, and what is done when the connection ends in between."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from typing import Final
+
+from teds_provision.errors import LinkFailure
+from teds_provision.links.ble import troubles
+from teds_provision.links.ble.connection import Connection, ConnectionLost
+from teds_provision.links.ble.loop import Loop
+from teds_provision.links.ports import BLE, Capabilities, Notice, NoticeSink
+
+REPLY_SECONDS: Final = 5.0
+REPEAT_SECONDS: Final = 15.0
+TRIES: Final = 3
+"""A request is repeated at most twice, within 15 s (wire, "Repetition")."""
+_FIRST_PAUSE: Final = 0.3
+
+
+class BleLink:
+    """One node's line. ``make_room`` gives up a connection that nobody needs now; False where there is none."""
+
+    via: Final = "ble"
+
+    def __init__(
+        self,
+        loop: Loop,
+        connection: Connection,
+        number: Callable[[], int],
+        make_room: Callable[[], bool],
+        notice: NoticeSink,
+    ) -> None:
+        self._loop, self.connection, self._number = loop, connection, number
+        self._make_room, self._notice = make_room, notice
+        self._last = 0
+
+    @property
+    def capabilities(self) -> Capabilities:
+        """What a node in the air can do."""
+        return BLE
+
+    @property
+    def mtu(self) -> int:
+        """ATT MTU of the present connection."""
+        return self.connection.mtu
+
+    def exchange(self, frame: bytes) -> bytes:
+        """Send one command frame and return its reply; see ``Link.exchange``.
+
+        Where the connection ends it is made anew, and the request repeated: the session is gone then, so a sealed one
+        is refused, and a new session opened above.
+        """
+        self._last = self._number()
+        return self._ask(frame, self._last)
+
+    def again(self, frame: bytes) -> bytes:
+        """Send the last frame once more under its transaction; see ``Repeats.again``."""
+        return self._ask(frame, self._last)
+
+    def drive(self, message: bytes) -> None:
+        """Write a Drive message; raises LinkFailure."""
+        try:
+            self._loop.run(self.connection.write_data(message))
+        except ConnectionLost as lost:
+            raise troubles.silent(self.connection.address, lost) from lost
+
+    def close(self) -> None:
+        """Disconnect; never raises."""
+        self._loop.run(self.connection.down())
+
+    def _ask(self, frame: bytes, transaction: int) -> bytes:
+        began, last = time.monotonic(), None
+        tries = rooms = 0
+        while tries < TRIES and time.monotonic() - began < REPEAT_SECONDS:
+            if tries:
+                time.sleep(_FIRST_PAUSE * 2 ** (tries - 1))
+            try:
+                return self._loop.run(self.connection.exchange(transaction, frame, REPLY_SECONDS))
+            except ConnectionLost as lost:
+                last = lost
+                self._notice(Notice("retry", f"BLE: {str(lost).rstrip('.')}. Connecting again"))
+            except TimeoutError:
+                last = None
+            except LinkFailure as failure:
+                if not troubles.is_full(failure.__cause__ or failure) or not self._make_room():
+                    raise
+                rooms += 1
+                continue
+            tries += 1
+        raise troubles.silent(self.connection.address, last)

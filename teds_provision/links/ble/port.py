@@ -1,0 +1,281 @@
+"""The station's Bluetooth: finds nodes by their service, asks each who it is, and keeps as few connections as it can.
+
+Nodes are connected one after the other; a connection ends when its link is closed. Only measuring keeps several.
+"""
+
+from __future__ import annotations
+
+import queue
+import secrets
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass
+from typing import Final
+
+from teds_provision.errors import LinkFailure, NodeRefused, NoNode, NoReader
+from teds_provision.links.ble.adapter import Adapter
+from teds_provision.links.ble.connection import Connection
+from teds_provision.links.ble.link import BleLink
+from teds_provision.links.ble.loop import Loop
+from teds_provision.links.ble.spec import parse_spec
+from teds_provision.links.ports import BLE, Capabilities, Contact, Notice, NoticeSink, Trace
+from teds_provision.protocol.messages.frames import Function, decode_reply, security_command
+from teds_provision.protocol.messages.identity import Identity
+
+_IDENTIFY: Final = security_command(Function.IDENTIFY).encode()
+_ROUND_SECONDS: Final = 2.0
+_SILENCE_SECONDS: Final = 1.5
+"""Nobody new for so long: everyone was seen. Nodes advertise every 0.1 to 1 s."""
+_LONGEST_SECONDS: Final = 8.0
+_GONE_SECONDS: Final = 10.0
+_REOPEN_SECONDS: Final = 1.0
+_MOST_HELD: Final = 20_000
+
+
+def open_port(where: str, trace: Trace | None = None) -> BlePort:
+    """Open the adapter that ``where`` names, as ``--ble`` does; raises UsageFailure. Frames go to ``trace``."""
+    return BlePort(where, trace)
+
+
+@dataclass(frozen=True)
+class DataMessage:
+    """A data message as it came: ``connection`` is the number of its connection, ``at`` monotonic ns."""
+
+    connection: int
+    octets: bytes
+    at: int
+
+
+class BlePort:
+    """Finds nodes through one Bluetooth adapter; see ``links.ports.Port``. Thread-safe."""
+
+    via: Final = "ble"
+
+    def __init__(self, spec_text: str, trace: Trace | None = None) -> None:
+        self._trace = trace
+        self.spec = parse_spec(spec_text)
+        self.place = f"ble:{spec_text}"
+        self._loop = Loop()
+        self._adapter = Adapter(self.spec)
+        self._connections: dict[str, Connection] = {}
+        self._known: dict[str, Identity] = {}
+        self._data: queue.Queue[DataMessage] = queue.Queue(_MOST_HELD)
+        self._heard = False
+        self._transaction = secrets.randbelow(1 << 16)
+        self._lock = threading.Lock()
+
+    @property
+    def capabilities(self) -> Capabilities:
+        """What Bluetooth LE can do."""
+        return BLE
+
+    def next_transaction(self) -> int:
+        """A transaction number, 0 to 65535; the first of a process is random."""
+        with self._lock:
+            self._transaction = (self._transaction + 1) & 0xFFFF
+            return self._transaction
+
+    def close(self) -> None:
+        """End every connection; never raises."""
+        with suppress(Exception):
+            self._loop.run(self._all_down())
+        self._loop.stop()
+
+    @contextmanager
+    def listen(self) -> Iterator[Callable[[float], DataMessage | None]]:
+        """Hear data messages: gives a function that waits so many seconds for the next one."""
+        self._heard = True
+        try:
+            yield self._next_data
+        finally:
+            self._heard = False
+
+    # -- finding ---------------------------------------------------------------------------------------------------
+
+    def find(
+        self, wanted: Callable[[Identity], bool], *, seconds: float, notice: NoticeSink, address: int | None = None
+    ) -> Contact:
+        """Return the node for which ``wanted`` holds: at ``address=``, else whichever advertises and is it.
+
+        Raises NoNode after ``seconds``, NoReader where Bluetooth cannot be used.
+        """
+        return self._find(wanted, seconds, notice)
+
+    def find_at(
+        self, address: str, wanted: Callable[[Identity], bool], *, seconds: float, notice: NoticeSink
+    ) -> Contact:
+        """As :meth:`find`, where a tap has named the address: that one first."""
+        return self._find(wanted, seconds, notice, first=address)
+
+    def _find(
+        self, wanted: Callable[[Identity], bool], seconds: float, notice: NoticeSink, first: str | None = None
+    ) -> Contact:
+        where = f"at {self.spec.address} " if self.spec.address else ""
+        notice(Notice("waiting", f"Looking for the node {where}over BLE ({self.spec.text}).", seconds))
+        until = time.monotonic() + seconds
+        told: set[bytes] = set()
+        asked: dict[str, float] = {}
+        for known in self._guesses(wanted, first):
+            contact = self._ask(known, wanted, notice, told)
+            asked[known] = time.monotonic()
+            if contact is not None:
+                return contact
+        while (left := until - time.monotonic()) > 0:
+            for address_seen in self._advertising(min(left, _ROUND_SECONDS), asked):
+                asked[address_seen] = time.monotonic()
+                contact = self._ask(address_seen, wanted, notice, told)
+                if contact is not None:
+                    return contact
+        others = f"; others did: {', '.join(sorted(uuid.hex() for uuid in told))}" if told else ""
+        raise NoNode(
+            f"No such node was met over BLE {where}within {seconds:g} s{others}.",
+            hint="A node advertises for 60 s after a tap, and while it has a key. Bring it closer, or tap it.",
+        )
+
+    def everyone(self, *, seconds: float, notice: NoticeSink) -> list[Contact]:
+        """Every node that advertises, asked one after the other; raises NoNode after ``seconds``."""
+        notice(Notice("waiting", f"Looking for nodes over BLE ({self.spec.text}).", seconds))
+        until = time.monotonic() + seconds
+        while (left := until - time.monotonic()) > 0:
+            addresses = [self.spec.address] if self.spec.address else self._all_seen(left)
+            told: set[bytes] = set()
+            found = []
+            for each in addresses:
+                contact = self._ask(each, _anyone, notice, told)
+                if contact is not None:
+                    contact.link.close()  # there may be twenty: each is connected again when its turn comes
+                    found.append(contact)
+            if found:
+                return found
+        raise NoNode(
+            f"No node advertises within {seconds:g} s.",
+            hint="A node advertises for 60 s after a tap, and while it has a key.",
+        )
+
+    def watch(self, *, stop: threading.Event, notice: NoticeSink) -> Iterator[Contact]:
+        """Yield each node when it first advertises, and when it comes back after it was silent for 10 s."""
+        notice(Notice("waiting", f"Watching for nodes over BLE ({self.spec.text})."))
+        last: dict[str, float] = {}
+        lost = False
+        while not stop.is_set():
+            try:
+                seen = self._loop.run(self._adapter.scan(_ROUND_SECONDS, lambda _now: stop.is_set()))
+                if lost:
+                    lost = False
+                    notice(Notice("reader-ready", "Bluetooth is back."))
+            except NoReader as error:
+                if not lost:
+                    lost = True
+                    notice(Notice("reader-lost", f"{error.message} Waiting for it."))
+                stop.wait(_REOPEN_SECONDS)
+                continue
+            for address, at in seen.items():
+                new = at - last.get(address, -_GONE_SECONDS) >= _GONE_SECONDS
+                last[address] = time.monotonic()
+                contact = self._ask(address, _anyone, notice, set()) if new else None
+                if contact is not None:
+                    yield contact
+                    last[address] = time.monotonic()
+                if stop.is_set():
+                    return
+
+    # -- the inside ------------------------------------------------------------------------------------------------
+
+    def _guesses(self, wanted: Callable[[Identity], bool], first: str | None) -> list[str]:
+        """Addresses to try before anyone else is listened for: as the tap said, as it was found before."""
+        if self.spec.address:
+            return []
+        known = [address for address, identity in self._known.items() if wanted(identity)]
+        return list(dict.fromkeys([*([first] if first else []), *known]))
+
+    def _advertising(self, seconds: float, asked: dict[str, float]) -> list[str]:
+        """Who advertises and was not asked for a while, the first that comes."""
+        now = time.monotonic()
+
+        def fresh(seen: dict[str, float]) -> list[str]:
+            return [
+                address
+                for address in seen
+                if (self.spec.address is None or address == self.spec.address)
+                and now - asked.get(address, -_GONE_SECONDS) >= _GONE_SECONDS / 2
+            ]
+
+        return fresh(self._loop.run(self._adapter.scan(seconds, lambda seen: bool(fresh(seen)))))
+
+    def _all_seen(self, seconds: float) -> list[str]:
+        """All that advertise: until nobody new came for a while."""
+        began = time.monotonic()
+        first_at: dict[str, float] = {}
+
+        def enough(seen: dict[str, float]) -> bool:
+            now = time.monotonic()
+            for address in seen:
+                first_at.setdefault(address, now)
+            return bool(first_at) and now - max(*first_at.values(), began) >= _SILENCE_SECONDS
+
+        return sorted(self._loop.run(self._adapter.scan(min(seconds, _LONGEST_SECONDS), enough)))
+
+    def _ask(
+        self, address: str, wanted: Callable[[Identity], bool], notice: NoticeSink, told: set[bytes]
+    ) -> Contact | None:
+        """Connect and ask who it is; the connection stays where it is the one that is wanted, alone."""
+        link = self._link(address, notice)
+        try:
+            identity = Identity.decode(decode_reply(link.exchange(_IDENTIFY)).payload)
+        except NoReader:
+            raise
+        except (LinkFailure, NodeRefused) as error:
+            notice(Notice("unfinished", f"The node at {address} did not say who it is: {error.message}"))
+            link.close()
+            return None
+        except Exception:
+            link.close()
+            raise
+        self._known[address] = identity
+        if not wanted(identity):
+            link.close()
+            if identity.uuid not in told:
+                told.add(identity.uuid)
+                uuid = identity.uuid.hex().upper()
+                notice(Notice("foreign-tag", f"Node {uuid} is at {address}, but it is not the one looked for."))
+            return None
+        return Contact(identity, link, connection=link.connection.number, trace=self._trace)
+
+    def _link(self, address: str, notice: NoticeSink) -> BleLink:
+        with self._lock:
+            connection = self._connections.get(address)
+            if connection is None:
+                connection = self._connections[address] = Connection(
+                    self._adapter, address, self._take_data, self._trace
+                )
+        return BleLink(self._loop, connection, self.next_transaction, self._make_room, notice)
+
+    def _make_room(self) -> bool:
+        """End a connection on which nothing is under way; False where there is none."""
+        with self._lock:
+            idle = [each for each in self._connections.values() if each.is_up and not (each.asking or each.streaming)]
+        if not idle:
+            return False
+        self._loop.run(idle[0].down())
+        return True
+
+    def _take_data(self, connection: int, octets: bytes) -> None:
+        if self._heard:
+            with suppress(queue.Full):
+                self._data.put_nowait(DataMessage(connection, octets, time.monotonic_ns()))
+
+    def _next_data(self, seconds: float) -> DataMessage | None:
+        try:
+            return self._data.get(timeout=seconds)
+        except queue.Empty:
+            return None
+
+    async def _all_down(self) -> None:
+        for connection in self._connections.values():
+            await connection.down()
+
+
+def _anyone(_identity: Identity) -> bool:
+    return True

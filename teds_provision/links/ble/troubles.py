@@ -1,0 +1,92 @@
+"""What bleak and BlueZ raise, as errors with cause and cure.
+
+Names of D-Bus errors and BlueZ's words ("le-connection-…") are those of bluetoothd 5.66.
+"""
+
+from __future__ import annotations
+
+from typing import Final
+
+from teds_provision.errors import LinkFailure, NodeSilent, NoReader
+
+SERVICE_HINT: Final = "sudo systemctl start bluetooth (package bluez); teds-provision doctor looks closer."
+POWER_HINT: Final = "bluetoothctl power on; where that is refused: rfkill unblock bluetooth."
+_FULL: Final = (
+    "le-connection-concurrent-connection-limit",
+    "le-connection-refused",
+    "le-connection-busy",
+    "le-connection-memory-allocation",
+)
+_BUSY: Final = ("org.bluez.Error.InProgress", "org.bluez.Error.NotReady")
+_UNKNOWN: Final = ("org.freedesktop.DBus.Error.UnknownObject", "org.freedesktop.DBus.Error.UnknownMethod")
+_NO_SERVICE: Final = ("org.freedesktop.DBus.Error.ServiceUnknown", "org.freedesktop.DBus.Error.NameHasNoOwner")
+
+
+def missing_bleak() -> NoReader:
+    """The error where bleak is not installed."""
+    return NoReader("BLE needs bleak, which is not installed.", hint="pip install 'teds-provision[ble]'")
+
+
+def is_full(error: BaseException) -> bool:
+    """Whether the adapter took no further connection."""
+    return any(word in str(error) for word in _FULL)
+
+
+def is_busy(error: BaseException) -> bool:
+    """Whether another program (or a killed one) has a connect or a scan under way on this adapter."""
+    return getattr(error, "dbus_error", "") in _BUSY
+
+
+def is_gone(error: BaseException) -> bool:
+    """Whether BlueZ has forgotten the device since it was seen."""
+    unknown = getattr(error, "dbus_error", "") in _UNKNOWN
+    return unknown or type(error).__name__ == "BleakDeviceNotFoundError" or "not found" in str(error)
+
+
+def adapter_trouble(error: Exception, adapter: str) -> LinkFailure | None:
+    """The error for Bluetooth that cannot be used at all; None where the trouble is the node's or the air's."""
+    reason = getattr(getattr(error, "reason", None), "name", "")
+    if isinstance(error, FileNotFoundError | ConnectionRefusedError | PermissionError):
+        return NoReader("There is no D-Bus system bus, so no Bluetooth.", hint=SERVICE_HINT)
+    if getattr(error, "dbus_error", "") in _NO_SERVICE:
+        return NoReader("The Bluetooth service (bluetoothd) does not run.", hint=SERVICE_HINT)
+    if reason == "POWERED_OFF" or "adapter-not-powered" in str(error):
+        return NoReader(f"Bluetooth is switched off on {adapter}.", hint=POWER_HINT)
+    if reason == "NO_BLE_CENTRAL_ROLE":
+        return NoReader(
+            f"The Bluetooth of {adapter} has no LE central role.", hint="Use an adapter of Bluetooth 4.0 up."
+        )
+    if reason:
+        return NoReader("There is no Bluetooth adapter.", hint="Plug one in; bluetoothctl list shows which are there.")
+    if "adapter '" in str(error):
+        return NoReader(
+            f"There is no Bluetooth adapter {adapter}.", hint="bluetoothctl list, or: ls /sys/class/bluetooth"
+        )
+    if "AccessDenied" in str(error):
+        return NoReader(
+            "This user may not use Bluetooth.", hint="sudo adduser $USER bluetooth, or log in at the machine itself."
+        )
+    return None
+
+
+def too_many(held: int, adapter: str) -> LinkFailure:
+    """The error for an adapter whose connections are used up."""
+    return LinkFailure(
+        f"The Bluetooth of {adapter} holds {held} connection{'' if held == 1 else 's'} and takes no more.",
+        hint="Measure fewer nodes over it, or add an adapter: many take 5 to 9, Nordic's own controllers 20.",
+    )
+
+
+def silent(address: str, last: Exception | None) -> NodeSilent:
+    """The error for a node that does not answer."""
+    why = f" ({_text(last)})" if last is not None and _text(last) else ""
+    return NodeSilent(
+        f"The node at {address} does not answer over BLE{why}.",
+        hint="Bring it closer. It advertises for 60 s after a tap, and while it has a key.",
+    )
+
+
+def _text(error: Exception) -> str:
+    if isinstance(error, LinkFailure):
+        return error.message.rstrip(".")
+    return str(error).strip().rstrip(".") or type(error).__name__

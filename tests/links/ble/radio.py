@@ -1,0 +1,99 @@
+"""The air of a test: a private D-Bus with a stand-in for bluetoothd, and nodes, in processes of their own."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import subprocess
+import sys
+import threading
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[3]
+CONFIG = """<!DOCTYPE busconfig PUBLIC "-//freedesktop//DTD D-Bus Bus Configuration 1.0//EN"
+ "http://www.freedesktop.org/standards/dbus/1.0/busconfig.dtd">
+<busconfig><type>system</type><listen>unix:path={path}</listen><auth>EXTERNAL</auth><policy context="default">
+<allow send_destination="*" eavesdrop="true"/><allow eavesdrop="true"/><allow own="*"/></policy></busconfig>"""
+
+needs_dbus = pytest.mark.skipif(shutil.which("dbus-daemon") is None, reason="dbus-daemon is not installed")
+"""For tests that need the private bus."""
+
+
+class Radio:
+    """Air, bus and nodes; everything ends by :meth:`close`, by its id."""
+
+    def __init__(
+        self,
+        folder: Path,
+        nodes: list[Path] | None = None,
+        *,
+        manners: dict[str, Any] | None = None,
+        hci: list[int] | None = None,
+        stranger_seconds: float = 10.0,
+    ) -> None:
+        self.path = folder / "bus"
+        self._processes: list[subprocess.Popen[str]] = []
+        config = folder / "bus.conf"
+        config.write_text(CONFIG.format(path=self.path))
+        daemon = self._start(["dbus-daemon", f"--config-file={config}", "--nofork", "--nopidfile", "--print-address"])
+        assert daemon.stdout is not None
+        daemon.stdout.readline()
+        self._air = self._start([sys.executable, "-m", "tests.links.ble.air"])
+        self._lock = threading.Lock()
+        self.addresses: list[str] = self._say(
+            {
+                "nodes": [str(node) for node in nodes or []],
+                "bus": self.address,
+                "manners": manners or {},
+                "hci": hci or [],
+                "stranger_seconds": stranger_seconds,
+            }
+        )["nodes"]
+
+    @property
+    def address(self) -> str:
+        """What DBUS_SYSTEM_BUS_ADDRESS must say."""
+        return f"unix:path={self.path}"
+
+    def do(self, *words: Any) -> Any:
+        """Have the air do something; see air.Everything.do."""
+        answer = self._say(list(words))
+        assert "error" not in answer, answer
+        return answer["result"]
+
+    def close(self) -> None:
+        """End everything."""
+        for process in reversed(self._processes):
+            with suppress(OSError):
+                if process.stdin is not None:
+                    process.stdin.close()
+            try:
+                process.wait(5 if process is self._air else 0.1)
+            except subprocess.TimeoutExpired:
+                process.kill()
+                process.wait(10)
+            if process.stdout is not None:
+                process.stdout.close()
+
+    def _say(self, words: Any) -> Any:
+        assert self._air.stdin is not None
+        assert self._air.stdout is not None
+        with self._lock:
+            self._air.stdin.write(json.dumps(words) + "\n")
+            self._air.stdin.flush()
+            line = self._air.stdout.readline()
+        assert line, f"the air ended with {self._air.poll()}"
+        return json.loads(line)
+
+    def _start(self, words: list[str]) -> subprocess.Popen[str]:
+        environment = os.environ | {"PYTHONPATH": str(ROOT)}
+        process = subprocess.Popen(
+            words, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, env=environment, cwd=ROOT
+        )
+        self._processes.append(process)
+        return process
