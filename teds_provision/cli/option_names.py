@@ -58,5 +58,5 @@ OPTIONS: Final[dict[str, frozenset[str]]] = {
     "restore": frozenset({"recovery-key", "keystore", "backup-passphrase-fd", "yes", "dry-run"}),
     "node check": frozenset({"factory", "yes", "dry-run", "via", "nfc", "can", "ble", "timeout", "trace"}),
     "node create": frozenset({"uuid", "name", "teds", "profile", "max-message"}),
-    "node run": frozenset({"nfc", "tag", "can", "source", "crypto-delay", "flash-delay", "wait-time", "battery", "pace"}),
+    "node run": frozenset({"nfc", "tag", "can", "ble", "source", "crypto-delay", "flash-delay", "wait-time", "battery", "pace"}),
 }

@@ -17,12 +17,14 @@ from teds_provision.cli.context import App, pass_app
 from teds_provision.cli.node.actuators import ActuatorLines
 from teds_provision.cli.options import command
 from teds_provision.errors import UsageFailure
+from teds_provision.node import ble as ble_room
 from teds_provision.node import can as can_room
 from teds_provision.node import hardware as hardware_room
 from teds_provision.node import nfc as nfc_room
 
 if TYPE_CHECKING:
     from teds_provision.cli.node.actuators import ActuatorLines
+    from teds_provision.node.ble.server import BleServer
     from teds_provision.node.can.server import CanServer
     from teds_provision.node.flash_file import FlashFile
     from teds_provision.node.hardware.board import Board
@@ -45,6 +47,11 @@ _DEFAULT_SOURCE = "noise"
 @click.option("--tag", type=click.Choice(["4", "2"]), default="4", show_default=True, help="NFC Forum tag type.")
 @click.option(
     "--can", metavar="INTERFACE:CHANNEL", help="Hang on this bus; without --nfc it counts as tapped in factory state."
+)
+@click.option(
+    "--ble",
+    metavar="CONTROLLER",
+    help="Advertise on this Bluetooth controller, as bumble names it: usb:0, tcp-client:127.0.0.1:46100 (one node).",
 )
 @click.option(
     "--source",
@@ -108,7 +115,7 @@ def run(
         for part in parts:
             part.start()
             running.append(part)
-        _say_ready(app, nodes, [links[kind] for kind in ("nfc", "can") if links[kind]], source)
+        _say_ready(app, nodes, [links[kind] for kind in ("nfc", "can", "ble") if links[kind]], source)
         lines.start()
         running.insert(0, lines)  # the last to end: it tells that actuators are safe
         while not stop.wait(0.5):
@@ -118,16 +125,17 @@ def run(
             part.stop()
 
 
-def _check(count: int, source: str, *, nfc: str | None, can: str | None, **_: Any) -> None:
+def _check(count: int, source: str, *, nfc: str | None, can: str | None, ble: str | None, **_: Any) -> None:
     """Raise UsageFailure where the options do not go together."""
-    if not nfc and not can:
+    if not nfc and not can and not ble:
         raise UsageFailure(
             "A node needs a link.", hint="Add --nfc udp:localhost:54321, --can udp_multicast:239.74.163.2, or both."
         )
-    kind = node_room.sources.kind_of(source)
-    if count > 1 and (nfc or kind in node_room.sources.ONE_NODE_ONLY):
-        what = "--nfc" if nfc else f"--source {source}"
-        raise UsageFailure(f"{what} is for one node.", hint="Run the others in processes of their own.")
+    alone = "--nfc" if nfc else "--ble" if ble else ""
+    if not alone and node_room.sources.kind_of(source) in node_room.sources.ONE_NODE_ONLY:
+        alone = f"--source {source}"
+    if count > 1 and alone:
+        raise UsageFailure(f"{alone} is for one node.", hint="Run the others in processes of their own.")
 
 
 def _boards(app: App, lines: ActuatorLines, source: str, percent: float | None) -> Callable[[FlashFile], Board | None]:
@@ -166,13 +174,24 @@ def _say_ready(app: App, nodes: Sequence[VirtualNode], up: list[str], source: st
 
 
 def _servers(
-    app: App, nodes: Sequence[VirtualNode], *, nfc: str | None, tag: Any, can: str | None, pace: bool, wait_time: int
+    app: App,
+    nodes: Sequence[VirtualNode],
+    *,
+    nfc: str | None,
+    tag: Any,
+    can: str | None,
+    ble: str | None,
+    pace: bool,
+    wait_time: int,
 ) -> list[LinkServer]:
     servers: list[LinkServer] = []
+    air = _in_the_air(ble, nodes[0]) if ble else None
+    if air is not None:
+        servers.append(air)
     if nfc:
         servers.append(
             nfc_room.server.NfcServer(
-                nfc, nodes[0], tag=tag, pace=pace, wt_int=wait_time // 4 * 4, extras=_extras(nodes[0])
+                nfc, nodes[0], tag=tag, pace=pace, wt_int=wait_time // 4 * 4, extras=_extras(nodes[0], air)
             )
         )
     if can:
@@ -185,16 +204,30 @@ def _servers(
     return servers
 
 
+def _in_the_air(controller: str, node: VirtualNode) -> BleServer:
+    address = ble_room.address.StaticAddress(node.flash_file.path.parent, factory=node.in_factory_state())
+    server = ble_room.server.BleServer(controller, node, address)
+    node.streams_over(server.send_data, ble_room.peripheral.BUS)
+    return server
+
+
 def _send(bus: CanServer, node: VirtualNode, frame: DataFrame) -> None:
     bus.send_data(node, frame.identifier, frame.data, fd=frame.fd)
 
 
-def _extras(node: VirtualNode) -> Extras:
-    """What a node with a battery says in its initial message, and how a field charges it."""
+def _extras(node: VirtualNode, air: BleServer | None) -> Extras:
+    """What the initial message says beside: charge, and the address in the air; and what a reader's field does."""
     battery = node.board.battery if node.board is not None else None
-    if battery is None:
-        return nfc_room.charging.NO_EXTRAS
-    return nfc_room.charging.Extras(
-        before=lambda: nfc_room.charging.charge_records(battery.power()),
-        field=lambda present: battery.field(present=present),
+    charging = nfc_room.charging
+
+    def field(present: bool) -> None:
+        if battery is not None:
+            battery.field(present=present)
+        if air is not None:
+            air.tapped()
+
+    return charging.Extras(
+        before=lambda: charging.charge_records(battery.power()) if battery is not None else (),
+        after=lambda: (charging.out_of_band_record(air.address.octets, random=True),) if air is not None else (),
+        field=field,
     )
