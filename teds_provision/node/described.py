@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import secrets
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Final
 
 from teds_provision.errors import BadData
 from teds_provision.files import read_limited
@@ -14,16 +13,10 @@ from teds_provision.limits import LIMITS
 from teds_provision.node.flash_file import FILE, FlashFile
 from teds_provision.node.hardware.board import Board
 from teds_provision.protocol.datasheet import can_be_stored, passes_own_check
-from teds_provision.teds.codec.codes import AccessCode
-from teds_provision.teds.codec.frame import frame, raw_tuple, tuples, unframe
-from teds_provision.teds.formats import detect, read_blocks
+from teds_provision.teds.formats.placing import UUID_OCTETS, placed, stated_uuid, under
 from teds_provision.teds.image import SECURITY, BlockId, Image
 from teds_provision.teds.profile import load_profile
 from teds_provision.teds.sheet import Sheet
-
-UUID_OCTETS: Final = 10
-_META: Final[BlockId] = (0, AccessCode.META)
-_UUID_FIELD: Final = 4
 
 
 @dataclass(frozen=True)
@@ -35,14 +28,7 @@ class Described:
 
     def of(self, uuid: bytes) -> Described:
         """The same node under another UUID: field 4 of a Meta-TEDS of the 2007 form says that one."""
-        meta = self.blocks.get(_META)
-        if meta is None or self.uuid == uuid:
-            return replace(self, uuid=uuid)
-        parts = [
-            raw_tuple(part.type, uuid if part.type == _UUID_FIELD and len(part.value) == UUID_OCTETS else part.value)
-            for part in tuples(unframe(meta))
-        ]
-        return Described({**self.blocks, _META: frame(b"".join(parts))}, uuid)
+        return Described(under(self.blocks, uuid), uuid)
 
 
 def from_file(path: Path) -> Described:
@@ -50,35 +36,23 @@ def from_file(path: Path) -> Described:
 
     Raises NotFound, and BadData that names the TEDS which no node holds.
     """
-    placed = _placed(path)
-    for (channel, code), teds in placed.items():
+    found = _placed(path)
+    for (channel, code), teds in found.items():
         if not can_be_stored((channel, code)) or not passes_own_check((channel, code), teds):
             raise BadData(
                 f"{path}: no node can hold the TEDS of access code {code} of channel {channel}, or it is damaged.",
                 hint=f"See what is wrong: show {path}",
             )
-    if not placed:
-        raise BadData(f"{path} holds no TEDS.")
-    stated = Sheet.of_blocks(placed).meta.uuid
-    return Described(placed, stated if stated and len(stated) == UUID_OCTETS and any(stated) else None)
+    return Described(found, stated_uuid(found))
 
 
 def _placed(path: Path) -> dict[BlockId, bytes]:
-    """TEDS of a file by place, without Security TEDS."""
+    """TEDS of a file by place, without Security TEDS; a profile is read beside what it extends."""
     octets = read_limited(path, LIMITS.teds_file, "file of TEDS")
     try:
-        blocks = read_blocks(octets, detect(octets), path=path)
+        return placed(octets, path=path)
     except BadData as error:
         raise BadData(f"{path}: {error.message}", hint=error.hint) from error
-    placed: dict[BlockId, bytes] = {}
-    for channel, code, teds in blocks:
-        if code is None:
-            raise BadData(f"{path} holds octets that are no TEDS.", hint=f"See what it holds: show {path}")
-        key = (_usual_channel(code) if channel is None else channel, int(code))
-        if key in placed:
-            raise BadData(f"{path} holds two TEDS of access code {code} for channel {key[0]}.")
-        placed[key] = teds
-    return {key: teds for key, teds in placed.items() if key[1] != AccessCode.SECURITY}
 
 
 def from_profile(profile: str, folders: tuple[Path, ...] | None, uuid: bytes, name: str = "") -> Described:
@@ -112,7 +86,3 @@ def create(
         blocks = described.of(wanted).blocks
         Board(Sheet.of(Image(wanted, blocks)))  # what it could not imitate is told now, not when it runs
     return FlashFile.create(folder, uuid=wanted, name=name, max_message=max_message, blocks=blocks)
-
-
-def _usual_channel(code: int) -> int:
-    return 1 if code in {AccessCode.CHANNEL, AccessCode.CALIBRATION} else 0

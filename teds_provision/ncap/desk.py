@@ -1,0 +1,148 @@
+"""Work with one node on behalf of a request: where it is now, or at its next tap.
+
+A node on a bus is met by the thread of the request. One that comes by NFC is worked with by the thread of its reader,
+while it lies there; the request waits for that, and says until when.
+"""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Any, Final, Generic, TypeVar, cast
+
+from teds_provision.errors import NoNode, TedsProvisionError
+from teds_provision.links import Port
+from teds_provision.links.ports import Contact, Notice
+from teds_provision.ncap.roster import Roster
+from teds_provision.ncap.turns import Turns
+from teds_provision.talk.conversation import Conversation, SessionLost
+
+Result = TypeVar("Result")
+FOR_A_TAP: Final = 45.0  # seconds that a request waits for a tap
+ON_A_BUS: Final = 10.0
+
+PortOf = Callable[[str], Port | None]
+
+
+@dataclass
+class Errand(Generic[Result]):
+    """Something to do with a node (None: whichever is tapped next), once. ``done`` is set when it was, or failed."""
+
+    uuid: str | None
+    what: str
+    work: Callable[[Conversation], Result]
+    until: float
+    done: threading.Event = field(default_factory=threading.Event)
+    result: Result | None = None
+    error: TedsProvisionError | None = None
+    cancelled: bool = False
+
+    def run(self, node: Conversation) -> None:
+        """Do it; what is raised is kept for who waits."""
+        try:
+            self.result = self.work(node)
+        except SessionLost as lost:
+            self.error = lost.cause
+        except TedsProvisionError as error:
+            self.error = error
+        finally:
+            self.done.set()
+
+
+class Desk:
+    """Errands, and the nodes that come. ``port_of`` gives the open port of a place."""
+
+    def __init__(self, roster: Roster, turns: Turns, port_of: PortOf) -> None:
+        self._roster, self._turns, self._port_of = roster, turns, port_of
+        self._waiting: list[Errand[Any]] = []
+        self._guard = threading.Lock()
+
+    def with_node(
+        self, uuid: str, what: str, work: Callable[[Conversation], Result], *, wait: float = FOR_A_TAP
+    ) -> Result:
+        """Do ``work`` with a node: at once on a bus, else at its next tap within ``wait`` seconds.
+
+        Raises Frozen (it is measured), NodeBusy, NoNode, and what the work raises.
+        """
+        port = self._bus_of(uuid)
+        if port is not None:
+            return self._on_a_bus(port, uuid, what, work)
+        errand = self.wait_for(uuid, what, work, wait)
+        if not errand.done.wait(wait):
+            self.cancel(errand)
+            if not errand.done.is_set():
+                raise NoNode(
+                    f"Node {uuid} is on no bus of this station, and was not held to a reader within {wait:.0f} s.",
+                    hint="Hold it to the reader, or connect it to the bus.",
+                )
+            errand.done.wait()
+        if errand.error is not None:
+            raise errand.error
+        return cast("Result", errand.result)
+
+    def contact(self, uuid: str) -> Contact | None:
+        """A node that is on a bus now; None where it is not."""
+        port = self._bus_of(uuid)
+        return None if port is None else self._found(port, uuid)
+
+    def on_a_bus(self, uuid: str) -> bool:
+        """Whether a node is on a bus of this station now."""
+        return self._bus_of(uuid) is not None
+
+    def _bus_of(self, uuid: str) -> Port | None:
+        seen = self._roster.seen(uuid)
+        port = self._port_of(seen.place) if seen.present and seen.place else None
+        return port if port is not None and port.capabilities.many else None
+
+    def _found(self, port: Port, uuid: str) -> Contact:
+        wanted = bytes.fromhex(uuid)
+        address = self._roster.seen(uuid).address
+        return port.find(lambda identity: identity.uuid == wanted, seconds=ON_A_BUS, notice=_quiet, address=address)
+
+    def _on_a_bus(self, port: Port, uuid: str, what: str, work: Callable[[Conversation], Result]) -> Result:
+        with self._turns.of(uuid, what), Conversation(self._found(port, uuid), notice=_quiet) as node:
+            try:
+                return work(node)
+            except SessionLost as lost:
+                raise lost.cause from lost
+
+    # -- taps --------------------------------------------------------------------------------------------------------
+
+    def wait_for(
+        self, uuid: str | None, what: str, work: Callable[[Conversation], Result], seconds: float
+    ) -> Errand[Result]:
+        """Do ``work`` when the node is tapped; returns at once."""
+        errand = Errand(uuid, what, work, time.monotonic() + seconds)
+        with self._guard:
+            self._waiting.append(errand)
+        return errand
+
+    def cancel(self, errand: Errand[Any]) -> bool:
+        """Wait no more; False where it runs already."""
+        with self._guard:
+            if errand not in self._waiting:
+                return False
+            self._waiting.remove(errand)
+        errand.cancelled = True
+        return True
+
+    def serve(self, node: Conversation) -> bool:
+        """Run what waits for this node, which lies on a reader; False where nothing does."""
+        if not node.tapped:
+            return False
+        uuid, now = node.uuid.hex(), time.monotonic()
+        with self._guard:
+            self._waiting = [one for one in self._waiting if one.until > now]
+            found = next((one for one in self._waiting if one.uuid in (uuid, None)), None)
+            if found is not None:
+                self._waiting.remove(found)
+        if found is None:
+            return False
+        found.run(node)
+        return True
+
+
+def _quiet(_notice: Notice) -> None:
+    """Requests answer; they have nobody to tell in between."""

@@ -1,0 +1,227 @@
+"""Actuators: a set point is held for as long as it was asked for, then let go, and the node says that it is safe.
+
+What keeps an actuator moving is that somebody asks again. Each request holds it for some tenths of a second or some
+seconds; when the next one does not come (the page is closed, the browser died, the network is gone) the daemon lets go,
+and when the daemon dies the node's dead-man does (operation.md section 2). One thread for each actuator that is held.
+"""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager, contextmanager
+from dataclasses import dataclass, field
+from typing import Any, Final
+
+from teds_provision.errors import LinkFailure, NoNode, TedsProvisionError
+from teds_provision.links.ports import Notice
+from teds_provision.measure.acting import DEAD_MAN, Acting
+from teds_provision.measure.trusting import Trusted, open_trusted, require_whitelisted
+from teds_provision.ncap.desk import Desk
+from teds_provision.ncap.live import Live
+from teds_provision.ncap.turns import Turns
+from teds_provision.station.station import Station
+from teds_provision.talk.conversation import Conversation, SessionLost
+
+HOLD: Final = 1.0  # seconds, where a request does not say
+LONGEST: Final = 60.0
+_STARTING: Final = 15.0
+Measured = Callable[[str], AbstractContextManager[Trusted | None]]
+
+
+@dataclass
+class _Order:
+    value: float
+    unit: str | None
+    number: int
+
+
+@dataclass
+class _Held:
+    uuid: str
+    channel: int
+    until: float
+    order: _Order
+    news: threading.Condition = field(default_factory=threading.Condition)
+    applied: dict[str, Any] | None = None
+    answered: int = 0
+    error: TedsProvisionError | None = None
+    safe: bool | None = None
+    ended: bool = False
+    let_go: bool = False
+
+
+class Holding:
+    """The actuators that are held now. ``measured`` gives the session of a node that is being measured."""
+
+    def __init__(
+        self,
+        station: Station,
+        live: Live,
+        desk: Desk,
+        turns: Turns,
+        measured: Measured,
+        is_measured: Callable[[str], bool],
+    ) -> None:
+        self._station, self._live, self._desk, self._turns = station, live, desk, turns
+        self._measured, self._is_measured = measured, is_measured
+        self._held: dict[tuple[str, int], _Held] = {}
+        self._last: dict[tuple[str, int], dict[str, Any]] = {}
+        self._guard = threading.Lock()
+
+    def state(self, uuid: str, channel: int) -> dict[str, Any] | None:
+        """What an actuator was told last, and whether it is known to be safe."""
+        return self._last.get((uuid, channel))
+
+    def put(self, uuid: str, channel: int, value: float, unit: str | None, hold: float | None) -> dict[str, Any]:
+        """Set and hold for ``hold`` seconds; again before they are over, it is held on. Returns when it was applied.
+
+        Raises PolicyRefused (whitelist, limits of the datasheet), NodeRefused (claimed by another), NoNode, BadData.
+        """
+        require_whitelisted(self._station, bytes.fromhex(uuid))
+        seconds = HOLD if hold is None else min(hold, LONGEST)
+        key = (uuid, channel)
+        with self._guard:
+            held = self._held.get(key)
+            if held is None or held.ended or held.let_go:
+                held = self._held[key] = _Held(uuid, channel, 0.0, _Order(value, unit, 1))
+                thread = threading.Thread(
+                    target=self._run, args=(held, value, unit), name=f"hold {uuid[:8]}", daemon=True
+                )
+                fresh = True
+            else:
+                fresh = False
+        with held.news:
+            held.until = time.monotonic() + seconds + (_STARTING if fresh else 0.0)
+            mine = held.order.number + (0 if fresh else 1)
+            held.order = _Order(value, unit, mine)
+            held.news.notify_all()
+            if fresh:
+                thread.start()
+            done = held.news.wait_for(lambda: held.answered >= mine or held.ended, _STARTING)
+            if held.error is not None and held.answered <= mine:
+                raise held.error
+            if not done or held.applied is None:
+                raise LinkFailure(
+                    "The actuator did not answer in time.", hint="Its dead-man brings it to its safe state."
+                )
+            held.until = time.monotonic() + seconds
+            return {"applied": held.applied, "until": time.time() + seconds, "safe": False}
+
+    def let_go(self, uuid: str, channel: int) -> dict[str, Any]:
+        """Let go now; ``safe`` is what the node itself said, None where it did not say."""
+        with self._guard:
+            held = self._held.get((uuid, channel))
+        if held is None:
+            last = self._last.get((uuid, channel))
+            return {"applied": None, "until": None, "safe": last["safe"] if last else None}
+        with held.news:
+            held.let_go = True
+            held.news.notify_all()
+            held.news.wait_for(lambda: held.ended, _STARTING)
+            return {"applied": held.applied, "until": None, "safe": held.safe}
+
+    def end(self) -> None:
+        """Let go of all of them, in order."""
+        with self._guard:
+            every = list(self._held)
+        for uuid, channel in every:
+            self.let_go(uuid, channel)
+
+    # -- the thread of one actuator ----------------------------------------------------------------------------------
+
+    def _run(self, held: _Held, value: float, unit: str | None) -> None:
+        self._station.audit(
+            "set", bytes.fromhex(held.uuid), "begun", channel=held.channel, value=value, unit=unit or ""
+        )
+        try:
+            with self._session(held.uuid) as session:
+                self._hold(held, session)
+        except SessionLost as lost:
+            held.error = LinkFailure(f"The session was lost: {lost.cause.message}", hint="It goes to its safe state.")
+        except TedsProvisionError as error:
+            held.error = error
+        finally:
+            with self._guard:
+                self._held.pop((held.uuid, held.channel), None)
+            with held.news:
+                held.ended = True
+                held.news.notify_all()
+            outcome = "done" if held.error is None else held.error.code
+            self._station.audit("set", bytes.fromhex(held.uuid), outcome, channel=held.channel, safe=held.safe)
+            self._tell(held, safe=held.safe)
+
+    @contextmanager
+    def _session(self, uuid: str) -> Iterator[Measured]:
+        """How to get at the node's session, again and again: the measurement's, or one of our own."""
+        if self._is_measured(uuid):
+            yield self._measured
+            return
+        contact = self._desk.contact(uuid)
+        if contact is None:
+            raise NoNode(f"Node {uuid} is on no bus of this station.", hint="Connect it; see /nodes.")
+        with self._turns.of(uuid, "its actuator is held"), Conversation(contact, notice=_quiet) as node:
+            trusted = open_trusted(self._station, node)
+
+            @contextmanager
+            def own(_uuid: str) -> Iterator[Trusted | None]:
+                yield trusted
+
+            yield own
+
+    def _hold(self, held: _Held, session: Measured) -> None:
+        """Claim, feed until it is let go or nobody asks again, let go."""
+        acting: Acting | None = None
+        unit: str | None = None
+        answered = 0
+        try:
+            while True:
+                with held.news:
+                    order, over = held.order, held.let_go or time.monotonic() >= held.until
+                if over and answered >= order.number:
+                    return
+                with session(held.uuid) as trusted:
+                    if trusted is None:
+                        raise LinkFailure("The node is not there now.", hint="See /nodes.")
+                    if acting is None or order.unit != unit:
+                        acting, unit = _acting(trusted, held.channel, order, claimed=acting is not None), order.unit
+                    applied = acting.apply(order.value)
+                answered = order.number
+                with held.news:
+                    held.applied, held.answered = applied.as_json(), order.number
+                    held.news.notify_all()
+                self._tell(held, safe=False)
+                self._until_news(held, answered, acting.pause)
+        finally:
+            if acting is not None:
+                with session(held.uuid):
+                    acting.__exit__(None, None, None)
+                held.safe = acting.safe
+
+    @staticmethod
+    def _until_news(held: _Held, answered: int, pause: float) -> None:
+        """Wait until the value has to be sent again, there is another one, or it is to be let go."""
+        with held.news:
+            left = max(0.0, min(pause, held.until - time.monotonic()))
+            held.news.wait_for(lambda: held.let_go or held.order.number != answered, left)
+
+    def _tell(self, held: _Held, *, safe: bool | None) -> None:
+        applied = held.applied or {}
+        facts = {"value": applied.get("value"), "unit": applied.get("unit"), "safe": safe}
+        self._last[held.uuid, held.channel] = facts
+        self._live.event("actuator", uuid=held.uuid, state="held" if safe is False else "released",
+                         channel=held.channel, **facts)  # fmt: skip
+
+
+def _acting(trusted: Trusted, channel: int, order: _Order, *, claimed: bool) -> Acting:
+    """The actuator, claimed; the limits are looked at before anything is claimed."""
+    acting = Acting(trusted, channel, unit=order.unit, dead_man=DEAD_MAN)
+    acting.octets_of(order.value)
+    if not claimed:
+        acting.__enter__()
+    return acting
+
+
+def _quiet(_notice: Notice) -> None:
+    """The request answers."""

@@ -1,0 +1,241 @@
+"""Provisioning on request: it waits for the tap where one is needed, and every step is told as it happens.
+
+No button is needed for a tap: the request says what shall be done, and the node that it is for does the rest when it
+lies on the reader. A node on a wired bus is provisioned there where it takes that; where it wants a tap, it is waited.
+"""
+
+from __future__ import annotations
+
+import tempfile
+import threading
+import time
+from collections.abc import Callable
+from contextlib import suppress
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Final
+
+from teds_provision.errors import NodeRefused, NotFound, TedsProvisionError, UsageFailure
+from teds_provision.links.ports import Notice
+from teds_provision.ncap.desk import Desk, Errand
+from teds_provision.ncap.live import Live
+from teds_provision.ncap.looking import as_problem
+from teds_provision.ncap.roster import Roster, check_lines
+from teds_provision.protocol.messages.frames import Reason
+from teds_provision.station.station import Station
+from teds_provision.steps.identify import Identified
+from teds_provision.steps.order import BuildOrder, prepare
+from teds_provision.steps.provision import Provisioned, provision
+from teds_provision.steps.verify import require_authentic
+from teds_provision.talk.conversation import Conversation, SessionLost
+from teds_provision.talk.progress import StepResult
+
+WAITING: Final = 300.0  # seconds for a tap
+NEXT: Final = "next"
+_SUFFIXES: Final = (".csv", ".json", ".toml", ".txt")
+
+
+@dataclass
+class Run:
+    """One request; as the API shows it by :meth:`as_json`."""
+
+    uuid: str
+    state: str = "running"  # waiting, running, done, failed, cancelled
+    waits_for: str | None = None
+    until: float | None = None
+    steps: list[dict[str, Any]] = field(default_factory=list)
+    error: dict[str, str] | None = None
+    verdict: str | None = None
+    errand: Errand[Any] | None = None
+
+    def as_json(self) -> dict[str, Any]:
+        """api.md, `/nodes/UUID/provision`."""
+        names = ("uuid", "state", "waits_for", "until", "steps", "error", "verdict")
+        return {name: getattr(self, name) for name in names}
+
+
+class Provisioning:
+    """The requests of one daemon, one for each node at a time."""
+
+    def __init__(self, station: Station, roster: Roster, live: Live, desk: Desk) -> None:
+        self._station, self._roster, self._live, self._desk = station, roster, live, desk
+        self._runs: dict[str, Run] = {}
+        self._guard = threading.Lock()
+
+    def of(self, uuid: str) -> dict[str, Any]:
+        """How the last request for a node stands; raises NotFound."""
+        with self._guard:
+            run = self._runs.get(uuid)
+        if run is None:
+            raise NotFound(f"Nobody asked to provision node {uuid}.", hint="POST to this resource.")
+        return run.as_json()
+
+    def begin(
+        self, uuid: str, *, profile: str | None, name: str | None, calibration: str | None, calibration_name: str | None
+    ) -> dict[str, Any]:
+        """Ask for it; ``uuid`` may be ``next``: whichever node is tapped next. Returns what is waited for.
+
+        Raises UsageFailure, NotFound, BadData, PolicyRefused for what cannot be built, before anybody is waited for.
+        """
+        with self._guard:
+            before = self._runs.get(uuid)
+            if before is not None and before.state in ("waiting", "running"):
+                raise UsageFailure(f"Node {uuid} is being provisioned already.", hint="Cancel that one first.")
+            run = self._runs[uuid] = Run(uuid)
+        folder = tempfile.TemporaryDirectory(prefix="ncap-")
+        try:
+            order = BuildOrder(
+                profile=profile, calibration=_file(Path(folder.name), calibration, calibration_name), name=name
+            )
+            prepare(self._station, order, None if uuid == NEXT else bytes.fromhex(uuid))
+        except BaseException:
+            folder.cleanup()
+            with self._guard:
+                self._runs.pop(uuid, None)
+            raise
+
+        def work(node: Conversation) -> None:
+            self._work(run, node, order)
+
+        if uuid != NEXT and self._desk.on_a_bus(uuid):
+            self._tell(run)
+            threading.Thread(
+                target=self._on_the_bus, args=(run, work, folder.cleanup), name=f"provision {uuid[:8]}", daemon=True
+            ).start()
+        else:
+            self._wait_for_a_tap(run, work, folder.cleanup)
+        return run.as_json()
+
+    def cancel(self, uuid: str) -> dict[str, Any]:
+        """Wait no more; a run that has begun goes on to its end. Raises NotFound."""
+        with self._guard:
+            run = self._runs.get(uuid)
+        if run is None:
+            raise NotFound(f"Nobody asked to provision node {uuid}.")
+        if run.errand is not None and self._desk.cancel(run.errand):
+            run.state, run.waits_for, run.until = "cancelled", None, None
+            run.errand.done.set()
+            self._tell(run)
+        return run.as_json()
+
+    # -- the ways to the node ----------------------------------------------------------------------------------------
+
+    def _wait_for_a_tap(self, run: Run, work: Callable[[Conversation], None], clean: Callable[[], None]) -> None:
+        run.state, run.waits_for, run.until = "waiting", "tap", time.time() + WAITING
+        errand = run.errand = self._desk.wait_for(None if run.uuid == NEXT else run.uuid, "provision", work, WAITING)
+        self._tell(run)
+
+        def watch() -> None:
+            if not errand.done.wait(WAITING) and self._desk.cancel(errand):
+                self._fail(run, _no_tap(run.uuid))
+            else:
+                errand.done.wait()
+                if errand.error is not None:
+                    self._fail(run, as_problem(errand.error))
+            clean()
+
+        threading.Thread(target=watch, name=f"provision {run.uuid[:8]}", daemon=True).start()
+
+    def _on_the_bus(self, run: Run, work: Callable[[Conversation], None], clean: Callable[[], None]) -> None:
+        try:
+            self._desk.with_node(run.uuid, "it is provisioned", work)
+            clean()
+        except NodeRefused as refusal:
+            if refusal.reason != Reason.NOT_PERMITTED:
+                self._fail(run, as_problem(refusal))
+                clean()
+                return
+            run.steps.clear()  # this node takes a key at a reader alone
+            self._wait_for_a_tap(run, work, clean)
+        except TedsProvisionError as error:
+            self._fail(run, as_problem(error))
+            clean()
+
+    def _work(self, run: Run, node: Conversation, order: BuildOrder) -> None:
+        run.state, run.waits_for, run.until = "running", None, None
+        uuid = node.uuid.hex()
+        if run.uuid == NEXT:
+            with self._guard:
+                self._runs.pop(NEXT, None)
+                run.uuid = uuid
+                self._runs[uuid] = run
+        self._tell(run)
+        reporter = _Told(run, self._live)
+        try:
+            done: Provisioned = provision(self._station, node, order, accept=_accepted, reporter=reporter)
+        except SessionLost as lost:
+            raise lost.cause from lost
+        run.verdict = done.verified.verdict
+        require_authentic(done.verified)
+        run.state = "done"
+        self._roster.show_sheet(uuid, None)
+        with suppress(TedsProvisionError):
+            self._roster.refresh([uuid])
+        checks = check_lines(done.verified.checks)
+        self._roster.note(uuid, "verified", verdict=run.verdict, checks=checks, looked=time.time(), problem=None)
+        self._tell(run)
+
+    def _fail(self, run: Run, error: dict[str, str]) -> None:
+        run.state, run.error, run.waits_for, run.until = "failed", error, None, None
+        self._tell(run)
+
+    def _tell(self, run: Run) -> None:
+        facts = {"waits_for": run.waits_for, "until": run.until, "error": run.error, "verdict": run.verdict}
+        self._live.event("provision", uuid=run.uuid, state=run.state, **facts)
+
+
+class _Told:
+    """A reporter whose steps go to the run and to everybody who watches."""
+
+    def __init__(self, run: Run, live: Live) -> None:
+        self._run, self._live = run, live
+
+    def started(self, step: str) -> None:
+        """A step begins."""
+        self._step(step, "running", "")
+
+    def finished(self, step: StepResult) -> None:
+        """A step ended well."""
+        self._step(step.name, step.result, step.detail)
+
+    def notice(self, notice: Notice) -> None:
+        """Something is waited for, or came by."""
+        self._live.event("provision", uuid=self._run.uuid, state="running", text=notice.text)
+
+    def written(self, octets: int, total: int) -> None:
+        """So many octets of the datasheet are staged."""
+        self._live.event(
+            "provision", uuid=self._run.uuid, state="running", step="write", result="running",
+            detail=f"{octets} of {total} octets",
+        )  # fmt: skip
+
+    def _step(self, name: str, result: str, detail: str) -> None:
+        said = {"name": name, "result": result, "detail": detail}
+        self._run.steps = [one for one in self._run.steps if one["name"] != name] + [said]
+        self._live.event("provision", uuid=self._run.uuid, state="running", step=name, result=result, detail=detail)
+
+
+def _accepted(_who: Identified) -> None:
+    """Whoever asks for this very node, or for the one that he is about to tap, has said yes to it."""
+
+
+def _no_tap(uuid: str) -> dict[str, str]:
+    return {
+        "code": "no-node",
+        "message": f"Node {uuid} was not held to a reader within {WAITING:.0f} s.",
+        "hint": "Ask again, and hold its NFC antenna flat on the reader.",
+    }
+
+
+def _file(folder: Path, text: str | None, name: str | None) -> Path | None:
+    """A calibration that came as text, as the file that the steps read; its ending says which form it has."""
+    if text is None:
+        return None
+    suffix = Path(name or "calibration.csv").suffix.lower()
+    if suffix not in _SUFFIXES:
+        raise UsageFailure(
+            f"A calibration named {name!r} cannot be read.", hint=f"Let it end in {', '.join(_SUFFIXES)}."
+        )
+    path = folder / f"calibration{suffix}"
+    path.write_text(text, encoding="utf-8")
+    return path

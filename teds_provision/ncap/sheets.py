@@ -1,0 +1,202 @@
+"""The datasheet of a node for the API: read and decoded with its security check, or written from a document."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, Final
+
+from teds_provision.errors import BadData, NotFound, TedsProvisionError, UsageFailure
+from teds_provision.lazy import late
+from teds_provision.ncap.desk import Desk
+from teds_provision.ncap.roster import Roster, check_lines
+from teds_provision.station.station import Station
+from teds_provision.steps.agree import session_if_keyed
+from teds_provision.steps.identify import identify
+from teds_provision.steps.order import guard
+from teds_provision.steps.read import read_identity, read_image
+from teds_provision.steps.verify import Verified, known_of, session, verify_image
+from teds_provision.steps.visits.sheet_file import SheetPlan, plan_sheet, write_sheet
+from teds_provision.talk.conversation import Conversation
+from teds_provision.talk.progress import Silent, StepResult
+from teds_provision.teds.calibration.decoded import is_finite
+from teds_provision.teds.formats import Block, write_blocks
+from teds_provision.teds.formats.placing import placed
+from teds_provision.teds.image import BlockId, Image
+from teds_provision.teds.sheet import Sheet
+from teds_provision.teds.show import describe, shown_to_json
+
+if TYPE_CHECKING:
+    from teds_provision.teds.guard import curve as curves_of_guard
+else:  # numpy
+    curves_of_guard = late("teds_provision.teds.guard.curve")
+
+FORMATS: Final = {"json": "application/json", "xml": "application/xml", "hex": "text/plain; charset=utf-8"}
+_POINTS: Final = 200
+MeasuredSheet = Callable[[str], Image | None]
+
+
+@dataclass(frozen=True)
+class ReadSheet:
+    """What a node has, or had when it was last read (``now`` False)."""
+
+    image: Image
+    verified: Verified
+    now: bool
+
+
+class Sheets:
+    """Reads and writes. ``measured`` gives the datasheet of a node that a measurement holds, as its session has it."""
+
+    def __init__(self, station: Station, roster: Roster, desk: Desk, measured: MeasuredSheet) -> None:
+        self._station, self._roster, self._desk, self._measured = station, roster, desk, measured
+
+    def read(self, uuid: str) -> ReadSheet:
+        """From the node where it is on a bus, else as it was last read; raises NotFound, and what reading raises."""
+        held = self._measured(uuid)
+        if held is not None:
+            return ReadSheet(held, self._judged(held, "verified in the session that measures it"), True)
+        if self._desk.on_a_bus(uuid):
+            found = self._desk.with_node(uuid, "its datasheet is read", self._read)
+            self._roster.refresh([uuid])
+            return found
+        kept = self._station.nodes.datasheet(bytes.fromhex(uuid))
+        if kept is None:
+            raise NotFound(
+                f"The datasheet of node {uuid} was never read.", hint="Connect it to the bus, or hold it to the reader."
+            )
+        return ReadSheet(kept, self._judged(kept, ""), False)
+
+    def _judged(self, image: Image, opened: str) -> Verified:
+        checks = verify_image(self._station, image, known=known_of(self._station, image.uuid, None))
+        return Verified(image.uuid, (*checks, session(opened, "")), scope="node" if opened else "image")
+
+    def _read(self, node: Conversation) -> ReadSheet:
+        station = self._station
+        held = session_if_keyed(station, node)
+        if held is None:
+            identify(station, node)
+        image = read_image(node)
+        identity = read_identity(node) if held is not None else None
+        checks = verify_image(station, image, known=known_of(station, node.uuid, identity))
+        why = "" if held is not None or not station.keys.held(node.uuid) else "it opens no session under our key"
+        checks.append(session("opened under the key that is held here" if held is not None else "", why))
+        verified = Verified(node.uuid, tuple(checks))
+        if held is not None and verified.verdict != "not authentic":
+            with station.durable("read"):
+                station.nodes.keep_datasheet(image)
+        return ReadSheet(image, verified, True)
+
+    def document(self, uuid: str, form: str) -> tuple[str, str]:
+        """The datasheet as a document, and its media type; raises UsageFailure for a format that is none of ours."""
+        if form not in FORMATS:
+            raise UsageFailure(f"{form!r} is no format of a datasheet.", hint=f"Use {', '.join(FORMATS)}.")
+        image = self.read(uuid).image
+        blocks = [Block(channel, code, image.blocks[channel, code]) for channel, code in image]
+        text = write_blocks(blocks, form)  # type: ignore[arg-type]
+        return (text if isinstance(text, str) else text.decode()), FORMATS[form]
+
+    def as_json(self, uuid: str) -> dict[str, Any]:
+        """api.md, `/nodes/UUID/teds`: verdict, checks, every TEDS decoded with findings, the calibrations' curves."""
+        found = self.read(uuid)
+        blocks = found.image.blocks
+        teds = [
+            shown_to_json(describe(Block(channel, code, blocks[channel, code]), blocks))
+            for channel, code in found.image
+        ]
+        return {
+            "uuid": uuid,
+            "read_now": found.now,
+            "verdict": found.verified.verdict,
+            "checks": check_lines(found.verified.checks),
+            "teds": teds,
+            "guard": self._guarded(found.image),
+            "curves": curves(blocks),
+        }
+
+    def _guarded(self, image: Image) -> list[dict[str, str]]:
+        try:
+            return [_warning(text) for text in guard(self._station, image, None, None, record=False)]
+        except TedsProvisionError as error:
+            return [{"severity": "error", "message": error.message, "hint": error.hint}]
+
+    # -- writing -----------------------------------------------------------------------------------------------------
+
+    def plan(self, uuid: str, content: str, *, accept: str | None = None) -> dict[str, Any]:
+        """What writing this document would change; nothing is changed."""
+        blocks = parsed(content)
+        plan = self._desk.with_node(
+            uuid,
+            "a datasheet is compared",
+            lambda node: plan_sheet(self._station, node, blocks, accept_calibration=accept),
+        )
+        return {"uuid": uuid, "dry_run": True, **_plan_json(plan), "steps": [], "verdict": None}
+
+    def write(self, uuid: str, content: str, *, accept: str | None = None) -> dict[str, Any]:
+        """Write it: built, guarded, diffed, signed, written, verified."""
+        blocks = parsed(content)
+
+        def work(node: Conversation) -> dict[str, Any]:
+            with self._station.turn(node.uuid):
+                done = write_sheet(self._station, node, blocks, Silent(), accept_calibration=accept)
+            verdict = done.verified.verdict if done.verified is not None else None
+            return {**_plan_json(done.plan), "steps": [_step(one) for one in done.steps], "verdict": verdict}
+
+        done = self._desk.with_node(uuid, "a datasheet is written", work)
+        self._roster.show_sheet(uuid, None)
+        self._roster.refresh([uuid])
+        self._roster.note(uuid, "written", verdict=done["verdict"], problem=None)
+        return {"uuid": uuid, "dry_run": False, **done}
+
+
+def parsed(content: str) -> dict[BlockId, bytes]:
+    """The TEDS of a document in XML, JSON or hex; raises BadData."""
+    if not content.strip():
+        raise BadData("The datasheet is empty.")
+    return placed(content.encode())
+
+
+def _plan_json(plan: SheetPlan) -> dict[str, Any]:
+    changes = [
+        {
+            "channel": one.channel,
+            "access_code": one.access_code,
+            "field": one.field,
+            "before": one.before,
+            "after": one.after,
+            "text": one.text,
+        }
+        for one in plan.changes
+    ]
+    return {"changes": changes, "guard": [_warning(text) for text in plan.warnings]}
+
+
+def _warning(text: str) -> dict[str, str]:
+    return {"severity": "warning", "message": text, "hint": ""}
+
+
+def _step(one: StepResult) -> dict[str, Any]:
+    return {"name": one.name, "result": one.result, "seconds": one.seconds, "detail": one.detail}
+
+
+def curves(blocks: Mapping[BlockId, bytes]) -> list[dict[str, Any]]:
+    """Every calibration of one input that can be drawn: points of (raw value, value in ``y_unit``), at most 200."""
+    sheet = Sheet.of_blocks(blocks)
+    found = []
+    for number, calibration in sheet.calibrations.items():
+        channel = sheet.channel(number)
+        if channel is None or len(calibration.inputs) != 1 or not is_finite(calibration):
+            continue
+        if channel.calibration is None or channel.actuator:
+            continue
+        own = curves_of_guard.channel_of(number, blocks, None)
+        curve = curves_of_guard.curve_of(calibration, own, {number: own})
+        raws, values = curve.axes[0].tolist(), curve.result.tolist()
+        step = max(1, math.ceil(len(raws) / _POINTS))
+        kept = sorted({*range(0, len(raws), step), len(raws) - 1})
+        points = [[raws[at], channel.unit.from_si(values[at])] for at in kept if math.isfinite(values[at])]
+        found.append(
+            {"channel": number, "name": channel.name, "x_unit": "raw", "y_unit": channel.unit.text, "points": points}
+        )
+    return found

@@ -1,0 +1,266 @@
+"""Virtual transducers of this station: each a process of its own, on a bus that does not leave this machine.
+
+They are nodes like others: own key and UUID, same commands, same checks. Their folder in the home holds their flash and
+how they are fed; the daemon starts them, again after they ended, and provisions them when they are made, as it knows
+their key from the file that it made itself.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import json
+import re
+import secrets
+import shutil
+import signal
+import socket
+import subprocess
+import sys
+import threading
+from contextlib import suppress
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Final
+
+from teds_provision.errors import NotFound, UsageFailure
+from teds_provision.files import write_whole
+from teds_provision.ncap.live import Live
+from teds_provision.ncap.settings import SOURCE
+from teds_provision.node.described import create
+from teds_provision.node.flash_file import default_can_address
+from teds_provision.protocol.keys import fingerprint
+from teds_provision.station.station import Station
+from teds_provision.store.records import WhitelistEntry
+from teds_provision.teds.formats.placing import UUID_OCTETS, placed, stated_uuid
+from teds_provision.teds.profile import default_folders
+from teds_provision.teds.sheet import Sheet
+
+FOLDER: Final = "virtual"
+_FACTS: Final = "virtual.json"
+_SOURCES: Final = re.compile(r"noise\Z|(sine|ramp):[0-9.]+\Z|unix:/[^\0]+\Z|file:/[^\0]+\Z")
+_AGAIN, _LONGEST = 1.0, 30.0
+_ENDING: Final = 5.0
+MOST: Final = 100
+_LIBC: Final = ctypes.CDLL(None)
+
+
+@dataclass
+class Virtual:
+    """One virtual transducer; ``state`` is running, starting, ended."""
+
+    uuid: str
+    name: str
+    source: str
+    folder: Path
+    channels: int = 0
+    state: str = "starting"
+    why: str = ""
+    process: subprocess.Popen[bytes] | None = field(default=None, repr=False)
+
+    def as_json(self) -> dict[str, Any]:
+        """api.md, `/virtual`."""
+        return {name: getattr(self, name) for name in ("uuid", "name", "source", "state", "why", "channels")}
+
+
+class Virtuals:
+    """The virtual transducers of one daemon. ``place`` is their bus, a CAN place on loopback."""
+
+    def __init__(self, station: Station, live: Live) -> None:
+        self._station, self._live = station, live
+        self._home = station.home / FOLDER
+        self._guard = threading.Lock()
+        self._stop = threading.Event()
+        self._all: dict[str, Virtual] = {}
+        self._port = _free_port()
+        for folder in sorted(self._home.glob("*/")):
+            with suppress(OSError, ValueError, KeyError):
+                facts = json.loads((folder / _FACTS).read_text())
+                one = Virtual(facts["uuid"], facts["name"], facts["source"], folder, facts["channels"])
+                self._all[one.uuid] = one
+
+    @property
+    def bus(self) -> str:
+        """The bus without the daemon's source, for the nodes."""
+        return f"udp_multicast:239.74.163.3?port={self._port}&hop_limit=0&fd=1"
+
+    @property
+    def place(self) -> str:
+        """The bus as a link of the daemon."""
+        return f"can:{self.bus}&source=0x{SOURCE:02X}"
+
+    def all(self) -> list[dict[str, Any]]:
+        """Every one."""
+        with self._guard:
+            return [one.as_json() for one in self._all.values()]
+
+    def __contains__(self, uuid: object) -> bool:
+        return uuid in self._all
+
+    def start(self) -> None:
+        """Start those that were made before."""
+        for one in list(self._all.values()):
+            self._keep(one)
+
+    def stop(self) -> None:
+        """End them all."""
+        self._stop.set()
+        for one in list(self._all.values()):
+            _end(one.process)
+
+    # -- making and removing -----------------------------------------------------------------------------------------
+
+    def make(self, *, name: str | None, source: str, content: str | None, profile: str | None) -> Virtual:
+        """Make one from a datasheet (XML, JSON, hex) or a profile, whitelist it under the key in its file, start it.
+
+        Raises UsageFailure, BadData, NotFound.
+        """
+        if not _SOURCES.match(source):
+            raise UsageFailure(
+                f"{source!r} is no source.", hint="Use noise, sine:SECONDS, ramp:SECONDS, file:/PATH or unix:/PATH."
+            )
+        if (content is None) == (profile is None):
+            raise UsageFailure("A virtual transducer needs a datasheet or a profile.", hint="Give one of the two.")
+        if len(self._all) >= MOST:
+            raise UsageFailure(f"There are {MOST} virtual transducers already.", hint="Remove one.")
+        folder = self._home / secrets.token_hex(6)
+        try:
+            one = self._made(folder, name or "", source, content, profile)
+        except BaseException:
+            shutil.rmtree(folder, ignore_errors=True)
+            raise
+        with self._guard:
+            self._all[one.uuid] = one
+        self._keep(one)
+        self._live.event("virtual", state="made", uuid=one.uuid, name=one.name)
+        return one
+
+    def _made(self, folder: Path, name: str, source: str, content: str | None, profile: str | None) -> Virtual:
+        folder.mkdir(parents=True, mode=0o700)
+        teds: Path | None = None
+        if content is not None:
+            teds = folder / "datasheet"
+            placed(content.encode())  # what is wrong with it is told in its own words, not in the file's
+            teds.write_text(content, encoding="utf-8")
+        uuid_ = None if content is not None and stated_uuid(placed(content.encode())) else self._new_uuid()
+        folders = default_folders(self._station.home)
+        flash = create(folder, uuid=uuid_, name=name, teds=teds, profile=profile, folders=folders)
+        state = flash.load()
+        uuid = state.uuid.hex()
+        if uuid in self._all or self._station.nodes.is_known(state.uuid):
+            raise UsageFailure(
+                f"Node {uuid} is there already.",
+                hint="Take the UUID out of its Meta-TEDS: a new one is made.",
+            )
+        if state.can_address in self._addresses():
+            raise UsageFailure(
+                f"Another virtual transducer has CAN address 0x{state.can_address:02X}.",
+                hint="Take the UUID out of the datasheet's Meta-TEDS: one that fits is made.",
+            )
+        sheet = Sheet.of_blocks(flash.hardware)
+        one = Virtual(uuid, name or sheet.meta.name, source, folder, len(sheet.channels))
+        write_whole(folder / _FACTS, json.dumps({**one.as_json(), "profile": profile}).encode())
+        self._whitelist(state.uuid, fingerprint(state.node_key), one.name)
+        return one
+
+    def _addresses(self) -> set[int]:
+        return {default_can_address(bytes.fromhex(uuid)) for uuid in self._all}
+
+    def _new_uuid(self) -> bytes:
+        """A UUID whose address on the bus nobody has."""
+        taken = self._addresses()
+        while True:
+            uuid = secrets.token_bytes(UUID_OCTETS)
+            if default_can_address(uuid) not in taken:
+                return uuid
+
+    def _whitelist(self, uuid: bytes, key: str, name: str) -> None:
+        with self._station.durable("virtual"):
+            self._station.pins.put(WhitelistEntry(uuid, key, assurance="import", name=name or None))
+            self._station.audit("virtual", uuid, "made", fingerprint=key)
+
+    def profile_of(self, uuid: str) -> str | None:
+        """The profile that one was made from; None: from a datasheet."""
+        found = json.loads((self._of(uuid).folder / _FACTS).read_text()).get("profile")
+        return found if isinstance(found, str) else None
+
+    def document_of(self, uuid: str) -> str | None:
+        """The datasheet that one was made from, None where it was a profile."""
+        path = self._of(uuid).folder / "datasheet"
+        return path.read_text(encoding="utf-8") if path.exists() else None
+
+    def remove(self, uuid: str) -> None:
+        """End it, and its key with it; raises NotFound."""
+        one = self._of(uuid)
+        with self._guard:
+            self._all.pop(uuid, None)
+        _end(one.process)
+        with self._station.durable("virtual"):
+            self._station.pins.remove(bytes.fromhex(uuid))
+            self._station.audit("virtual", bytes.fromhex(uuid), "removed")
+        shutil.rmtree(one.folder, ignore_errors=True)
+        self._live.event("virtual", state="removed", uuid=uuid)
+
+    def _of(self, uuid: str) -> Virtual:
+        with self._guard:
+            found = self._all.get(uuid)
+        if found is None:
+            raise NotFound(f"{uuid} is no virtual transducer of this station.")
+        return found
+
+    # -- the processes -----------------------------------------------------------------------------------------------
+
+    def _keep(self, one: Virtual) -> None:
+        threading.Thread(target=self._run, args=(one,), name=f"virtual {one.uuid[:8]}", daemon=True).start()
+
+    def _run(self, one: Virtual) -> None:
+        """Run it, and again when it ended, until it is removed or the daemon ends."""
+        pause = _AGAIN
+        while not self._stop.is_set() and one.uuid in self._all:
+            words = [sys.executable, "-m", "teds_provision", "--json", "node", "run", str(one.folder)]
+            words += ["--can", self.bus, "--source", one.source]
+            one.process = subprocess.Popen(
+                words,
+                stdin=subprocess.DEVNULL,
+                stdout=subprocess.PIPE,
+                stderr=subprocess.PIPE,
+                process_group=0,  # Ctrl-C is for the daemon, which ends its nodes in order
+                preexec_fn=_die_with_us,  # noqa: PLW1509 - one call of the system, nothing else
+            )
+            if self._stop.is_set() or one.uuid not in self._all:
+                _end(one.process)
+            assert one.process.stdout is not None
+            if b'"ready"' in one.process.stdout.readline():
+                self._say(one, "running")
+                pause = _AGAIN
+            _, errors = one.process.communicate()
+            if self._stop.is_set() or one.uuid not in self._all:
+                return
+            last = errors.decode(errors="replace").strip().splitlines()
+            self._say(one, "ended", last[-1] if last else "")
+            self._stop.wait(pause)
+            pause = min(2 * pause, _LONGEST)
+
+    def _say(self, one: Virtual, state: str, why: str = "") -> None:
+        one.state, one.why = state, why
+        self._live.event("virtual", uuid=one.uuid, state=state, why=why)
+
+
+def _end(process: subprocess.Popen[bytes] | None) -> None:
+    if process is None or process.poll() is not None:
+        return
+    process.terminate()
+    try:
+        process.wait(_ENDING)
+    except subprocess.TimeoutExpired:
+        process.kill()
+
+
+def _die_with_us() -> None:
+    """End when the daemon does, however it ends (prctl PR_SET_PDEATHSIG)."""
+    _LIBC.prctl(1, signal.SIGTERM)
+
+
+def _free_port() -> int:
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+        probe.bind(("127.0.0.1", 0))
+        return int(probe.getsockname()[1])

@@ -1,0 +1,117 @@
+"""A datasheet out of an XML or JSON document onto a node that is being talked to: planned, guarded, signed, written.
+
+The document says all of the datasheet. What the node has beside it and calls read-only stays; what else it has and the
+document does not name goes.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+from teds_provision.errors import BadData
+from teds_provision.protocol.datasheet import can_be_stored, passes_own_check
+from teds_provision.station.station import Station
+from teds_provision.steps.agree import require_session
+from teds_provision.steps.order import guard
+from teds_provision.steps.read import Survey, survey
+from teds_provision.steps.sign import known_node_keys, sign
+from teds_provision.steps.verify import Verified, require_authentic
+from teds_provision.steps.verify_node import verify_node
+from teds_provision.steps.write import write
+from teds_provision.talk.conversation import Conversation
+from teds_provision.talk.progress import DONE, NOTHING, Reporter, StepResult, Steps
+from teds_provision.teds.diff.datasheets import Change, diff_blocks
+from teds_provision.teds.formats.placing import stated_uuid, under
+from teds_provision.teds.image import BlockId, Image
+
+
+@dataclass(frozen=True)
+class SheetPlan:
+    """What a document would change on a node: ``image`` is what it is to have, without its Security TEDS."""
+
+    image: Image
+    changes: tuple[Change, ...]
+    warnings: tuple[str, ...]
+    present: Survey
+
+
+@dataclass(frozen=True)
+class SheetWritten:
+    """What was done, step by step, and what the node is worth now."""
+
+    plan: SheetPlan
+    steps: tuple[StepResult, ...]
+    verified: Verified | None
+
+
+def plan_sheet(
+    station: Station,
+    node: Conversation,
+    blocks: Mapping[BlockId, bytes],
+    *,
+    accept_calibration: str | None = None,
+    record: bool = False,
+) -> SheetPlan:
+    """What writing these TEDS would change, in a session of the node; changes nothing.
+
+    Raises NotWhitelisted, PolicyRefused (no key, the guard), BadData (damaged TEDS, another node's).
+    """
+    station.policy.require_whitelisted(node.uuid)
+    for (channel, code), teds in blocks.items():
+        if not can_be_stored((channel, code)) or not passes_own_check((channel, code), teds):
+            raise BadData(f"No node can hold the TEDS of access code {code} of channel {channel}, or it is damaged.")
+    meant = stated_uuid(blocks)
+    if meant is not None and meant != node.uuid:
+        raise BadData(
+            f"This datasheet is of node {meant.hex()}, not of {node.uuid.hex()}.",
+            hint="Take the UUID out of its Meta-TEDS (or write zeros) to use it for this one.",
+        )
+    if not node.sealed:
+        require_session(station, node)
+    present = survey(node)
+    keep = {block: present.image.blocks[block] for block in present.read_only}
+    image = Image(node.uuid, {**keep, **under(blocks, node.uuid)})
+    warnings = guard(station, image, present.image, accept_calibration, record=record)
+    changes = tuple(diff_blocks(present.image.unsigned_blocks(), image.unsigned_blocks()))
+    return SheetPlan(image, changes, warnings, present)
+
+
+def write_sheet(
+    station: Station,
+    node: Conversation,
+    blocks: Mapping[BlockId, bytes],
+    reporter: Reporter,
+    *,
+    accept_calibration: str | None = None,
+) -> SheetWritten:
+    """Plan, sign, write, read back and verify; raises as the steps do, and NotAuthentic where the end is not good."""
+    steps = Steps(reporter)
+    with steps.step("build") as step:
+        plan = plan_sheet(station, node, blocks, accept_calibration=accept_calibration, record=True)
+        step.result = DONE if plan.changes else NOTHING
+        step.detail = f"{len(plan.image.blocks)} TEDS"
+    present = plan.present
+    keys = known_node_keys(station, node.uuid, present.image)
+    with steps.step("sign") as step:
+        on_node = None if plan.changes else present.image.security
+        signed = sign(
+            station,
+            keys,
+            plan.image,
+            epoch=present.identity.epoch,
+            node_sequence=present.identity.sequence,
+            on_node=on_node,
+            keep_draft=True,
+        )
+        step.result = NOTHING if signed.reused else DONE
+        step.detail = f"sequence {signed.sequence}"
+    with steps.step("write") as step:
+        written = write(station, node, signed.image, present=present, progress=reporter.written)
+        step.result = DONE if written.octets else NOTHING
+        step.detail = f"{written.octets} octets" if written.octets else ""
+    with steps.step("verify") as step:
+        verified = verify_node(station, node, written.on_node, keys.key)
+        step.detail = verified.verdict
+    require_authentic(verified)
+    return SheetWritten(plan, tuple(steps.done), verified)
