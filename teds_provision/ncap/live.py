@@ -33,7 +33,7 @@ POINTS: Final = 100.0  # a second and channel, at most
 _CREDIT: Final = 20.0  # points that a channel may be behind: samples come in bursts
 _WAITING: Final = 512  # blocks between two beats; beyond that the oldest go
 _EVENTS: Final = 256  # events that a client may leave unread
-_TOLD: Final = 1.0  # seconds between two signs of life
+_TOLD: Final = 0.5  # seconds between two signs of life
 
 Key = tuple[str, int]
 

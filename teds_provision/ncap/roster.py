@@ -32,6 +32,7 @@ class Seen:
     address: int | None = None
     present: bool = False
     seen: float = 0.0
+    tapped: float = 0.0
     verdict: str | None = None
     checks: list[dict[str, str]] = field(default_factory=list)
     looked: float = 0.0
@@ -45,8 +46,11 @@ class Seen:
 class Roster:
     """The nodes by UUID (20 hex digits, lower case)."""
 
-    def __init__(self, station: Station, live: Live, topic: Callable[[str, int], str]) -> None:
-        self._station, self._live, self._topic = station, live, topic
+    def __init__(self, station: Station, live: Live) -> None:
+        self._station, self._live = station, live
+        self.topic: Callable[[str, int], str | None] = lambda _uuid, _number: None
+        self.actuator: Callable[[str, int], dict[str, Any] | None] = lambda _uuid, _number: None
+        self.virtual: Callable[[str], bool] = lambda _uuid: False
         self._lock = threading.RLock()
         self._seen: dict[str, Seen] = {}
         self._rows: dict[str, dict[str, Any]] = {}
@@ -165,6 +169,7 @@ class Roster:
                 "address": seen.address,
                 "present": seen.present,
                 "last_seen": _moment(seen.seen) or row.get("last_seen"),
+                "tapped": seen.tapped or None,
                 "state": row.get("state"),
                 "whitelisted": row.get("whitelisted", False),
                 "fingerprint": row.get("fingerprint"),
@@ -183,11 +188,18 @@ class Roster:
                 "measuring": seen.report,
                 "power": seen.power,
             }
-        out["channels"] = [
-            {**one, "topic": self._topic(uuid, one["number"]), "last": self._value(uuid, one["number"])}
-            for one in channels
-        ]
+        out["virtual"] = self.virtual(uuid)
+        out["mode"] = "measuring" if out["measurement"] else "idle" if out["present"] else None
+        out["channels"] = [{**one, **self._now(uuid, one["number"])} for one in channels]
         return out
+
+    def _now(self, uuid: str, channel: int) -> dict[str, Any]:
+        """What changes of a channel."""
+        return {
+            "topic": self.topic(uuid, channel),
+            "last": self._value(uuid, channel),
+            "actuator": self.actuator(uuid, channel),
+        }
 
     def _value(self, uuid: str, channel: int) -> dict[str, Any] | None:
         last = self._live.last(uuid, channel)

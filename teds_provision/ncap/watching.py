@@ -1,7 +1,7 @@
 """A thread for each link: it opens it, again and again if need be, and sees who comes and who leaves.
 
-On a bus, nodes are looked at by a few workers, so that the bus goes on being watched; at a reader the tap is served
-there and then, because the node may be taken away.
+A bus is asked by the look-out that measurements use as well, and its nodes are looked at by a few workers; at a reader
+the tap is served there and then, because the node may be taken away.
 """
 
 from __future__ import annotations
@@ -10,12 +10,16 @@ import threading
 import time
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
 from dataclasses import dataclass, field
 from typing import Any, Final, Protocol
 
 from teds_provision.errors import Frozen, LinkFailure, NodeBusy, TedsProvisionError
 from teds_provision.links import Contact, Notice, Port
+from teds_provision.links.can.port import CanPort
 from teds_provision.links.opening import open_place
+from teds_provision.measure.finding.buses import Buses
+from teds_provision.measure.finding.lookout import Sighting
 from teds_provision.ncap.live import Live
 from teds_provision.ncap.looking import Look, as_problem, is_listed, look
 from teds_provision.ncap.roster import Roster, check_lines
@@ -26,6 +30,9 @@ from teds_provision.talk.conversation import Conversation, SessionLost
 WORKERS: Final = 4
 FIRST_PAUSE, LAST_PAUSE = 1.0, 30.0
 LOOK_AGAIN: Final = 30.0  # seconds until a node that could not be looked at is looked at again
+POLL, POLL_PER_NODE = 2.0, 0.05  # seconds between questions to everybody: 5 % of a bus however many there are
+GONE_POLLS: Final = 2.5
+LOOK: Final = 0.5
 
 
 class Taps(Protocol):
@@ -59,12 +66,14 @@ class Watch:
         turns: Turns,
         taps: Taps,
         transparent: Callable[[], bool],
+        buses: Buses,
     ) -> None:
         self.place = place
         self.state = LinkState(place)
         self.port: Port | None = None
         self._station, self._roster, self._live, self._turns = station, roster, live, turns
-        self._taps, self._transparent = taps, transparent
+        self._taps, self._transparent, self._buses = taps, transparent, buses
+        self._known: dict[str, Sighting] = {}
         self._stop, self._anew = threading.Event(), threading.Event()
         self._workers = ThreadPoolExecutor(WORKERS, thread_name_prefix=f"look {place[:20]}")
         self._pending: set[str] = set()
@@ -111,12 +120,53 @@ class Watch:
                 pause = min(2 * pause, LAST_PAUSE)
 
     def _watch(self, port: Port) -> None:
+        """See who comes until the link fails or the daemon ends."""
+        if isinstance(port, CanPort):
+            self._watch_bus(port)
+            return
         while not self._stop.is_set():
             self._anew.clear()
             for contact in port.watch(stop=self._anew, notice=self._notice):
                 self._came(contact)
             if not self._stop.is_set():
                 self._live.event("link", place=self.place, state="asking")
+
+    def _watch_bus(self, port: CanPort) -> None:
+        """The look-out tells of who answers (:meth:`saw`); here is seen who does not any more, and whether it works."""
+        bus = self._buses.add(port)
+        while not self._stop.is_set():
+            if self._anew.is_set():
+                self._anew.clear()
+                self._known.clear()
+                with suppress(LinkFailure):
+                    bus.lookout.discover()
+            failure = bus.lookout.failure
+            self._say("up" if failure is None else "down", failure)
+            every = max(POLL, POLL_PER_NODE * len(self._known))
+            bus.lookout.poll(every)
+            self._see_who_left(GONE_POLLS * every + 1.0)
+            self._anew.wait(LOOK)
+
+    def saw(self, sighting: Sighting) -> None:
+        """A node answered on this bus; called from the look-out's thread."""
+        uuid, identity = sighting.uuid.hex(), sighting.identity
+        before = self._known.get(uuid)
+        self._known[uuid] = sighting
+        if before is not None:
+            same = (before.address, before.identity.state) == (sighting.address, identity.state)
+            seen = self._roster.seen(uuid)
+            retry = seen.problem is not None and time.time() - seen.seen > LOOK_AGAIN
+            if same and not retry:
+                return
+        self._came(sighting.contact())
+
+    def _see_who_left(self, silence: float) -> None:
+        now = time.monotonic()
+        for uuid, last in list(self._known.items()):
+            if now - last.at < silence:
+                continue
+            self._known.pop(uuid, None)
+            self._notice(Notice("node-left", f"Node {uuid} does not answer any more.", uuid=last.uuid))
 
     def _close(self) -> None:
         port, self.port = self.port, None
@@ -155,7 +205,7 @@ class Watch:
             "place": self.place, "address": contact.address, "present": True, "seen": time.time()
         }  # fmt: skip
         if contact.link.capabilities.tapped:
-            self._roster.note(uuid, "tapped", **facts)
+            self._roster.note(uuid, "tapped", tapped=time.time(), **facts)
             self._serve(contact)
             return
         if not self._wanted(contact):

@@ -1,0 +1,376 @@
+"""The measurements of the daemon: kept in the store, carried on after every start, ended in order.
+
+Each is a :class:`Job` of the room ``measure``; here it gets its nodes (nothing else is done with them meanwhile), its
+watchers (the live channel, the roster), and the sinks that the daemon was started with.
+"""
+
+from __future__ import annotations
+
+import re
+import threading
+import time
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Final
+
+from teds_provision.errors import NodeBusy, NotFound, TedsProvisionError, UsageFailure
+from teds_provision.measure.blocks import ChannelFacts, NodeReport
+from teds_provision.measure.carrying.job import Job
+from teds_provision.measure.finding.buses import Buses
+from teds_provision.measure.runner import Watcher
+from teds_provision.measure.sinks import FILES, Sink, open_sink
+from teds_provision.measure.trusting import Trusted
+from teds_provision.ncap.live import Live
+from teds_provision.ncap.looking import as_problem
+from teds_provision.ncap.roster import Roster
+from teds_provision.ncap.turns import Turns
+from teds_provision.station.station import Station
+from teds_provision.store import Measurement
+from teds_provision.teds.image import Image
+
+RECORDINGS: Final = "recordings"
+BUDGET: Final = 5000
+"""Messages a second that ROS 1, ROS 2 and MQTT carried in measurements of this machine's class (docs/ros.md)."""
+_SERVICE: Final = re.compile(r"ros1\Z|ros2\Z|mqtts?://\S+\Z")
+_NAME: Final = re.compile(r"[A-Za-z0-9][A-Za-z0-9._ -]{0,80}\Z")
+
+
+@dataclass
+class Running:
+    """One measurement that runs, or tries to."""
+
+    kept: Measurement
+    uuids: tuple[str, ...]
+    job: Job | None = None
+    state: str = "starting"
+    why: str = ""
+    reports: dict[str, dict[str, Any]] = field(default_factory=dict)
+    stop: threading.Event = field(default_factory=threading.Event)
+    thread: threading.Thread | None = None
+
+
+class Measuring:
+    """All of them. ``sinks`` are the words of those that take every measurement, ``record`` a folder for recordings."""
+
+    def __init__(
+        self,
+        station: Station,
+        roster: Roster,
+        live: Live,
+        turns: Turns,
+        buses: Buses,
+        *,
+        sinks: Sequence[str] = (),
+        record: Path | None = None,
+    ) -> None:
+        self._station, self._roster, self._live, self._turns = station, roster, live, turns
+        self._buses, self._sinks, self._record = buses, tuple(sinks), record
+        self._running: dict[str, Running] = {}
+        self._guard = threading.Lock()
+        self._messages: tuple[float, int] = (time.monotonic(), 0)
+        self._rate = 0.0
+
+    # -- its life ----------------------------------------------------------------------------------------------------
+
+    def start(self) -> None:
+        """Carry on what is kept."""
+        for kept in self._station.measurements.due():
+            self._begin(kept)
+
+    def stop(self) -> None:
+        """End all of them in order; what is kept stays kept."""
+        with self._guard:
+            every = list(self._running.values())
+        for one in every:
+            one.stop.set()
+        for one in every:
+            self._end(one)
+
+    # -- what the API asks -------------------------------------------------------------------------------------------
+
+    def add(
+        self,
+        *,
+        group: str | None,
+        uuids: Sequence[str],
+        channels: Sequence[int] = (),
+        rate: float | None = None,
+        kind: Any = None,
+        trigger: bool = False,
+        sinks: Sequence[str] = (),
+    ) -> dict[str, Any]:
+        """Measure from now on, after every restart too, until it is deleted.
+
+        Raises UsageFailure (no node, a sink that cannot be named so), NotFound (the group), NodeBusy (one of the nodes
+        is measured already).
+        """
+        if (group is None) == (not uuids):
+            raise UsageFailure("A measurement names a group, or nodes.", hint='Give "group" or "uuids".')
+        kept = Measurement(
+            "",
+            group=group,
+            uuids=tuple(bytes.fromhex(uuid) for uuid in dict.fromkeys(uuids)),
+            channels=tuple(dict.fromkeys(channels)),
+            rate=rate,
+            kind=kind,
+            trigger=trigger,
+            sinks=tuple(self._whole(spec) for spec in sinks),
+        )
+        nodes = self._station.measurements.nodes_of(kept)
+        if not nodes:
+            raise UsageFailure(f"Group {group!r} has no node.", hint="Add one to it first.")
+        for uuid in nodes:
+            other = self.of(uuid.hex())
+            if other is not None:
+                raise NodeBusy(f"Node {uuid.hex()} is measured already ({other}).", hint="End that measurement first.")
+        for spec in kept.sinks:
+            open_sink(spec)
+        with self._station.durable("measure"):
+            kept = self._station.measurements.keep(kept)
+            self._station.audit("measure", None, "begun", id=kept.id, group=group, nodes=[one.hex() for one in nodes])
+        return self._json(self._begin(kept))
+
+    def delete(self, measurement_id: str) -> None:
+        """End it, and forget it; raises NotFound."""
+        with self._guard:
+            one = self._running.pop(measurement_id, None)
+        if one is None and self._station.measurements.all() == []:
+            raise NotFound(f"There is no measurement {measurement_id!r}.")
+        if one is not None:
+            one.stop.set()
+            self._end(one)
+        with self._station.durable("measure"):
+            if not self._station.measurements.forget(measurement_id) and one is None:
+                raise NotFound(f"There is no measurement {measurement_id!r}.")
+            self._station.audit("measure", None, "ended", id=measurement_id)
+        self._live.event("measurement", state="deleted", id=measurement_id)
+
+    def all(self) -> list[dict[str, Any]]:
+        """Every one."""
+        with self._guard:
+            every = list(self._running.values())
+        return [self._json(one) for one in every]
+
+    def of(self, uuid: str) -> str | None:
+        """The measurement that has a node."""
+        with self._guard:
+            return next((key for key, one in self._running.items() if uuid in one.uuids), None)
+
+    def is_measured(self, uuid: str) -> bool:
+        """Whether a node is in a session of a measurement now."""
+        job = self._job_of(uuid)
+        return job is not None and job.measurement is not None and self._turns.holder(uuid) is not None
+
+    def group_is_measured(self, name: str) -> bool:
+        """Whether a measurement of this group runs."""
+        with self._guard:
+            return any(one.kept.group == name for one in self._running.values())
+
+    def _job_of(self, uuid: str) -> Job | None:
+        with self._guard:
+            return next((one.job for one in self._running.values() if uuid in one.uuids), None)
+
+    @contextmanager
+    def session(self, uuid: str) -> Iterator[Trusted | None]:
+        """The session in which a node is measured, for one more command; None where there is none now."""
+        job = self._job_of(uuid)
+        measurement = job.measurement if job is not None else None
+        if measurement is None:
+            yield None
+            return
+        with measurement.session(bytes.fromhex(uuid)) as trusted:
+            yield trusted
+
+    def sheet(self, uuid: str) -> Image | None:
+        """The datasheet of a node that is measured: the one that its session verified, and that nobody may change."""
+        with self.session(uuid) as trusted:
+            if trusted is None:
+                return None
+        return self._station.nodes.datasheet(bytes.fromhex(uuid))
+
+    def sinks(self) -> list[dict[str, Any]]:
+        """Every sink with what became of what it was given."""
+        with self._guard:
+            jobs = [(key, one.job) for key, one in self._running.items() if one.job is not None]
+        return [_sink_json(key, sink) for key, job in jobs for sink in job.sinks]
+
+    def budget(self) -> dict[str, Any]:
+        """Messages a second that go to ROS and MQTT now, and how many are known to be carried."""
+        now, sent = time.monotonic(), sum(one["messages"] for one in self.sinks() if not one["recorder"])
+        before, count = self._messages
+        if now - before >= 1.0:
+            self._rate = max(0, sent - count) / (now - before)
+            self._messages = now, sent
+        return {"used": round(self._rate, 1), "limit": BUDGET}
+
+    def clock_error(self) -> float | None:
+        """The worst bound of a node's clock, seconds; None where nothing is measured."""
+        with self._guard:
+            found = [report.get("clock_error") for one in self._running.values() for report in one.reports.values()]
+        return max((one for one in found if one is not None), default=None)
+
+    def _json(self, one: Running) -> dict[str, Any]:
+        kept = one.kept
+        return {
+            "id": kept.id,
+            "group": kept.group,
+            "uuids": list(one.uuids),
+            "channels": list(kept.channels),
+            "rate": kept.rate,
+            "kind": kept.kind,
+            "trigger": kept.trigger,
+            "sinks": list(kept.sinks),
+            "created": kept.created,
+            "state": one.state,
+            "why": one.why,
+            "nodes": [one.reports.get(uuid, {"uuid": uuid, "state": "waiting", "why": ""}) for uuid in one.uuids],
+            "files": [str(file) for sink in (one.job.sinks if one.job is not None else ()) for file in sink.files],
+        }
+
+    # -- running -----------------------------------------------------------------------------------------------------
+
+    def _whole(self, spec: str) -> str:
+        """The words for a sink: a service, or a file by its bare name, which lies in the folder of recordings."""
+        if _SERVICE.match(spec):
+            return spec
+        if not _NAME.match(spec) or Path(spec).suffix.lower() not in FILES:
+            raise UsageFailure(
+                f"{spec!r} is no sink.", hint=f"Use ros1, ros2, mqtt://HOST, or a file name in {', '.join(FILES)}."
+            )
+        return str(self._folder() / spec)
+
+    def _folder(self) -> Path:
+        folder = self._record or self._station.home / RECORDINGS
+        folder.mkdir(parents=True, exist_ok=True)
+        return folder
+
+    def _begin(self, kept: Measurement) -> Running:
+        uuids = tuple(uuid.hex() for uuid in self._station.measurements.nodes_of(kept))
+        one = Running(kept, uuids)
+        with self._guard:
+            self._running[kept.id] = one
+        one.thread = threading.Thread(target=self._run, args=(one,), name=f"begin {kept.id}", daemon=True)
+        one.thread.start()
+        return one
+
+    def _run(self, one: Running) -> None:
+        """Take the nodes, then measure until it is stopped; a job ends of itself only when its time is over."""
+        taken: list[str] = []
+        try:
+            for uuid in one.uuids:
+                self._take(one, uuid)
+                if one.stop.is_set():
+                    return
+                taken.append(uuid)
+                self._roster.note(uuid, measurement=one.kept.id)
+            job = Job(self._station, one.kept, more=lambda: self._more(one.kept))
+            one.job = job
+            self._say(one, "running")
+            job.start(self._buses, self._watcher(one))
+            while job.alive and not one.stop.wait(0.5):
+                self._say(one, *_state_of(one, job))
+            job.stop()
+            self._say(one, "ended")
+        except TedsProvisionError as error:
+            self._say(one, "failed", error.message)
+        finally:
+            for uuid in taken:
+                self._turns.give(uuid)
+                self._roster.note(uuid, "idle", measurement=None, report=None)
+
+    def _take(self, one: Running, uuid: str) -> None:
+        while not one.stop.is_set():
+            try:
+                self._turns.take(uuid, f"measurement {one.kept.id}", frozen=True)
+                return
+            except TedsProvisionError as error:
+                self._say(one, "waiting", error.message)
+                one.stop.wait(1.0)
+
+    def _end(self, one: Running) -> None:
+        thread = one.thread
+        if thread is not None:
+            thread.join(20.0)
+        with self._guard:
+            self._running.pop(one.kept.id, None)
+
+    def _say(self, one: Running, state: str, why: str = "") -> None:
+        if (one.state, one.why) != (state, why):
+            one.state, one.why = state, why
+            self._live.event("measurement", state=state, id=one.kept.id, group=one.kept.group, why=why)
+
+    def _more(self, kept: Measurement) -> list[Sink]:
+        """The daemon's own sinks for one run of a measurement."""
+        specs = list(self._sinks)
+        if self._record is not None:
+            stamp = time.strftime("%Y%m%d-%H%M%S")
+            specs.append(str(self._folder() / f"{_plain(kept.group or kept.id)}-{stamp}.csv"))
+        return [open_sink(spec) for spec in specs]
+
+    # -- what it hears -----------------------------------------------------------------------------------------------
+
+    def _watcher(self, one: Running) -> Watcher:
+        def report(said: NodeReport) -> None:
+            self._report(one, said)
+
+        def facts(said: Sequence[ChannelFacts]) -> None:
+            for uuid in {fact.uuid for fact in said}:
+                self._roster.show_sheet(uuid, None)
+                self._roster.refresh([uuid])
+
+        def sink(failed: Sink) -> None:
+            self._live.event("sink", state="failed", **_sink_json(one.kept.id, failed))
+
+        def note(text: str) -> None:
+            self._live.event("measurement", state="note", id=one.kept.id, why=text)
+
+        return Watcher(self._live.block, facts, report, sink, note)
+
+    def _report(self, one: Running, said: NodeReport) -> None:
+        names = ("uuid", "state", "why", "samples", "lost", "late", "bad", "invalid", "clock_error")
+        report = {name: getattr(said, name) for name in names}
+        before = one.reports.get(said.uuid, {})
+        one.reports[said.uuid] = report
+        changed = (before.get("state"), before.get("why")) != (said.state, said.why)
+        facts: dict[str, Any] = {"report": report}
+        if said.state == "running":
+            facts |= {"present": True, "seen": time.time(), "problem": None}
+            if before.get("state") != "running":
+                facts |= {"verdict": "authentic", "looked": time.time()}
+        elif said.state in ("lost", "refused", "waiting") and said.why:
+            facts["problem"] = as_problem(TedsProvisionError(said.why))
+        self._roster.note(said.uuid, said.state if changed else None, **facts)
+
+
+def _state_of(one: Running, job: Job) -> tuple[str, str]:
+    states = {report["state"] for report in one.reports.values()}
+    if "running" in states:
+        lacking = [uuid for uuid in one.uuids if one.reports.get(uuid, {}).get("state") != "running"]
+        return "running", f"{len(lacking)} of {len(one.uuids)} nodes are missing" if lacking else ""
+    if job.error is not None:
+        return "waiting", job.error.message
+    return ("waiting", "no node has answered yet") if states else ("running", "")
+
+
+def _sink_json(measurement: str, sink: Sink) -> dict[str, Any]:
+    stats = sink.stats
+    return {
+        "measurement": measurement,
+        "name": sink.name,
+        "sink_state": stats.state,
+        "detail": stats.detail,
+        "error": stats.error,
+        "hint": stats.hint,
+        "written": stats.written,
+        "dropped": stats.dropped,
+        "octets": stats.octets,
+        "messages": stats.messages,
+        "recorder": bool(getattr(sink, "recorder", False)),
+        "files": [str(file) for file in sink.files],
+    }
+
+
+def _plain(name: str) -> str:
+    return re.sub(r"[^A-Za-z0-9_-]+", "_", name)[:60] or "measurement"

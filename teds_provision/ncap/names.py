@@ -1,0 +1,81 @@
+"""The topic of every channel: station, node, channel (sinks publish under them); unique, and renameable."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable
+from typing import Any
+
+from teds_provision.errors import Frozen, UsageFailure
+from teds_provision.measure.blocks import ChannelFacts, StationFacts
+from teds_provision.measure.sinks.names import Topics, is_topic
+from teds_provision.ncap.live import Live
+from teds_provision.ncap.roster import Roster
+from teds_provision.station.measurements import STATION
+from teds_provision.station.station import Station
+
+
+class Names:
+    """The names of one station, as sinks make them; ``is_measured`` freezes those of a node."""
+
+    def __init__(self, station: Station, roster: Roster, live: Live, is_measured: Callable[[str], bool]) -> None:
+        self._station, self._roster, self._live, self._is_measured = station, roster, live, is_measured
+        self._guard = threading.Lock()
+        self._topics: Topics | None = None
+
+    def forget(self) -> None:
+        """A node, a datasheet or a name has changed: make them anew when somebody asks."""
+        with self._guard:
+            self._topics = None
+
+    def topic(self, uuid: str, channel: int) -> str:
+        """Whole topic of a channel."""
+        return self._now().channel(uuid, channel)
+
+    def all(self) -> list[dict[str, Any]]:
+        """Every channel with its topic, and what was chosen for it; channel 0 is the node's part."""
+        topics, chosen = self._now(), self._station.measurements.names
+        found = []
+        for uuid in self._roster.uuids():
+            raw = bytes.fromhex(uuid)
+            found.append({"uuid": uuid, "channel": 0, "name": chosen.get((raw, 0)), "topic": topics.node(uuid)})
+            for number, _ in self._roster.channel_names(uuid):
+                name = chosen.get((raw, number))
+                found.append(
+                    {"uuid": uuid, "channel": number, "name": name, "topic": topics.channel(uuid, number)}
+                )
+        return found
+
+    def rename(self, uuid: str, channel: int, name: str | None) -> None:
+        """Publish it under this name; None: under the one that is made for it. Raises UsageFailure, Frozen."""
+        if name is not None and not is_topic(name):
+            raise UsageFailure(
+                f"{name!r} cannot be the name of a topic.",
+                hint="Use letters, digits and single _, beginning with a letter; / between parts.",
+            )
+        raw = bytes.fromhex(uuid)
+        if self._is_measured(uuid) or self._station.measurements.is_running(raw):
+            raise Frozen(f"Node {uuid} is being measured: its names stay.", hint="End that measurement first.")
+        with self._station.durable("rename"):
+            self._station.measurements.rename(raw, channel, name.strip("/") if name is not None else None)
+            self._station.audit("rename", raw, "done", channel=channel, name=name)
+        self.forget()
+        self._live.event("names", state="changed", uuid=uuid, channel=channel)
+
+    def _now(self) -> Topics:
+        with self._guard:
+            topics = self._topics
+        if topics is not None:
+            return topics
+        names = {(uuid.hex(), channel): name for (uuid, channel), name in self._station.measurements.names.items()}
+        station = names.pop((STATION.hex(), 0), self._station.name)
+        topics = Topics(StationFacts(station, names=names))
+        facts = [
+            ChannelFacts(uuid, self._roster.name(uuid), number, name)
+            for uuid in self._roster.uuids()
+            for number, name in self._roster.channel_names(uuid)
+        ]
+        topics.learn(facts)
+        with self._guard:
+            self._topics = topics
+        return topics
