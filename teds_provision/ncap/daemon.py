@@ -10,13 +10,24 @@ from collections.abc import Callable, Iterator
 from typing import Any, Final, get_args
 
 from teds_provision import __version__
-from teds_provision.errors import NotFound, UsageFailure
+from teds_provision.errors import Frozen, NotFound, UsageFailure
+from teds_provision.links import Port
+from teds_provision.measure.finding.buses import Buses
+from teds_provision.measure.finding.lookout import Sighting
 from teds_provision.ncap.live import Live
-from teds_provision.ncap.roster import Roster
+from teds_provision.ncap.measuring import Measuring
+from teds_provision.ncap.names import Names
+from teds_provision.ncap.nodes.adopting import Adopting
+from teds_provision.ncap.nodes.desk import Desk
+from teds_provision.ncap.nodes.holding import Holding
+from teds_provision.ncap.nodes.provisioning import Provisioning
+from teds_provision.ncap.nodes.roster import Roster
+from teds_provision.ncap.nodes.sheets import Sheets
+from teds_provision.ncap.nodes.turns import Turns
+from teds_provision.ncap.nodes.virtual import Virtuals
+from teds_provision.ncap.nodes.watching import Watch
 from teds_provision.ncap.settings import Detection, Settings
-from teds_provision.ncap.tokens import Tokens
-from teds_provision.ncap.turns import Turns
-from teds_provision.ncap.watching import Watch
+from teds_provision.ncap.web.tokens import Tokens
 from teds_provision.station.station import Station
 from teds_provision.talk.conversation import Conversation
 
@@ -31,19 +42,29 @@ class Daemon:
 
     def __init__(self, station: Station, settings: Settings) -> None:
         self.station, self.settings = station, settings
-        self.live = Live()
-        self.turns = Turns()
-        self.tokens = Tokens(station.home)
-        self.roster = Roster(station, self.live, lambda uuid, number: "")
-        self.detection: Detection = settings.detection or "whitelist"
+        self.live, self.turns, self.tokens = Live(), Turns(), Tokens(station.home)
+        self.roster = Roster(station, self.live)
+        self.buses = Buses(news=self._saw)
+        self.desk = Desk(self.roster, self.turns, self._port_of)
+        self.measuring = Measuring(
+            station, self.roster, self.live, self.turns, self.buses, sinks=settings.sinks, record=settings.record
+        )
+        self.names = Names(station, self.roster, self.live, self.measuring.is_measured)
+        self.sheets = Sheets(station, self.roster, self.desk, self.measuring.sheet)
+        self.provisioning = Provisioning(station, self.roster, self.live, self.desk)
+        self.holding = Holding(
+            station, self.live, self.desk, self.turns, self.measuring.session, self.measuring.is_measured
+        )
+        self.virtuals = Virtuals(station, self.live)
+        self.adopting = Adopting(station, self.roster, self.live, self.virtuals, lambda: self._adopts)
+        self.roster.topic, self.roster.actuator = self.names.topic, self.holding.state
+        self.roster.virtual = lambda uuid: uuid in self.virtuals
         self.url: str | None = None
         self.started = time.time()
         self._version = station.version()
         self._stop = threading.Event()
-        self.watches = [
-            Watch(place, station, self.roster, self.live, self.turns, self, lambda: self.detection == "transparent")
-            for place in settings.places
-        ]
+        self._guard = threading.Lock()
+        self.watches = [self._watch(place) for place in settings.places]
         self._observer = threading.Thread(target=self._observe, name="store", daemon=True)
 
     # -- its life ----------------------------------------------------------------------------------------------------
@@ -51,20 +72,33 @@ class Daemon:
     @contextlib.contextmanager
     def running(self) -> Iterator[None]:
         """Links, measurements and the eye on the store, for the length of the block; then all let go, in order."""
+        if self.settings.detection is not None and self.settings.detection != self.detection:
+            self.set_detection(self.settings.detection)
         self.roster.refresh()
         self._observer.start()
         for watch in self.watches:
             watch.start()
+        if self.virtuals.all():
+            self._start_virtuals()
+        self.measuring.start()
         try:
             yield
         finally:
-            self._stop.set()
-            for watch in self.watches:
-                watch.stop()
-            until = time.monotonic() + _ENDING
-            for watch in self.watches:
-                watch.join(max(0.1, until - time.monotonic()))
-            self._observer.join(_LOOK)
+            self._end()
+
+    def _end(self) -> None:
+        """Actuators safe first, then claims released and files closed, then links, then the virtual nodes."""
+        self._stop.set()
+        self.holding.end()
+        self.measuring.stop()
+        for watch in self.watches:
+            watch.stop()
+        self.buses.close()
+        until = time.monotonic() + _ENDING
+        for watch in self.watches:
+            watch.join(max(0.1, until - time.monotonic()))
+        self.virtuals.stop()
+        self._observer.join(_LOOK)
 
     async def serve(self, begin: Callable[[], Any], stop: asyncio.Event) -> None:
         """Fan out what is live until ``stop``; ``begin`` is awaited once the loop runs."""
@@ -77,6 +111,21 @@ class Daemon:
             with contextlib.suppress(asyncio.CancelledError):
                 await fan
 
+    def _watch(self, place: str) -> Watch:
+        def transparent() -> bool:
+            return self.detection == "transparent"
+
+        return Watch(place, self.station, self.roster, self.live, self.turns, self, transparent, self.buses)
+
+    def _start_virtuals(self) -> None:
+        """Virtual transducers hang on a bus of their own, which is a link like others."""
+        with self._guard:
+            if all(watch.place != self.virtuals.place for watch in self.watches):
+                watch = self._watch(self.virtuals.place)
+                self.watches.append(watch)
+                watch.start()
+            self.virtuals.start()
+
     def _observe(self) -> None:
         """What the command line does beside us is seen within a second."""
         while not self._stop.wait(_LOOK):
@@ -84,12 +133,32 @@ class Daemon:
             if version != self._version:
                 self._version = version
                 self.roster.refresh()
+                self.names.forget()
                 self.live.event("store", state="changed")
+
+    # -- links -------------------------------------------------------------------------------------------------------
+
+    def _port_of(self, place: str) -> Port | None:
+        return next((watch.port for watch in self.watches if watch.place == place), None)
+
+    def _saw(self, sighting: Sighting) -> None:
+        for watch in self.watches:
+            if watch.port is sighting.port:
+                watch.saw(sighting)
+
+    def serve_node(self, node: Conversation) -> bool:
+        """Whether somebody asked for this node, or it is to be taken up; then that was done."""
+        return self.desk.serve(node) or self.adopting.serve(node)
+
+    @property
+    def _adopts(self) -> bool:
+        return self.settings.adopt and self.detection == "transparent"
 
     # -- what the API asks -------------------------------------------------------------------------------------------
 
     def status(self) -> dict[str, Any]:
         """api.md, `/status`."""
+        links = [self._link(watch) for watch in self.watches]
         return {
             "version": __version__,
             "station": {"name": self.station.name, "fingerprint": self.station.fingerprint},
@@ -97,9 +166,15 @@ class Daemon:
             "time": time.time(),
             "url": self.url,
             "detection": self.detection,
-            "links": [self._link(watch) for watch in self.watches],
-            "nodes": sum(self.roster.present(watch.place) for watch in self.watches),
+            "adopt": self.settings.adopt,
+            "links": links,
+            "nodes": sum(link["nodes"] for link in links),
+            "strangers": sum(link["strangers"] for link in links),
             "clients": self.live.listeners,
+            "measurements": self.measuring.all(),
+            "sinks": self.measuring.sinks(),
+            "clock_error": self.measuring.clock_error(),
+            "budget": self.measuring.budget(),
         }
 
     def _link(self, watch: Watch) -> dict[str, Any]:
@@ -107,6 +182,7 @@ class Daemon:
         return {
             "place": watch.place,
             "via": watch.place.partition(":")[0],
+            "virtual": watch.place == self.virtuals.place,
             "state": state.state,
             "problem": state.problem,
             "waiting": state.waiting or None,
@@ -119,12 +195,18 @@ class Daemon:
         """The first message of /live."""
         return {"type": "hello", "version": __version__, "station": self.station.name, "time": time.time()}
 
+    @property
+    def detection(self) -> Detection:
+        """Which nodes are taken up."""
+        return self.station.measurements.detection
+
     def set_detection(self, mode: str) -> None:
         """Change the mode, and look at all links anew; raises UsageFailure."""
         if mode not in get_args(Detection):
             raise UsageFailure(f"{mode!r} is no mode of detection.", hint="Use transparent or whitelist.")
-        self.detection = mode  # type: ignore[assignment]
-        self.station.audit("detection", None, "set", mode=mode)
+        with self.station.durable("detection"):
+            self.station.measurements.detection = mode  # type: ignore[assignment]
+            self.station.audit("detection", None, "set", mode=mode)
         self.live.event("detection", state=mode)
         for watch in self.watches:
             self.roster.forget_place(watch.place)
@@ -156,8 +238,67 @@ class Daemon:
             raise UsageFailure("The page is not served.", hint="Start it with --http: ncap run --http 127.0.0.1:8351")
         return f"{self.url}/login?token={self.tokens.login_link(read_only=read_only)}"
 
-    # -- nodes that come ---------------------------------------------------------------------------------------------
+    # -- groups ------------------------------------------------------------------------------------------------------
 
-    def serve_node(self, node: Conversation) -> bool:
-        """Whether somebody asked for this node and it was done."""
-        return False
+    def groups(self) -> list[dict[str, Any]]:
+        """Every group, and whether it is measured."""
+        return [
+            {
+                "name": group.name,
+                "uuids": [uuid.hex() for uuid in group.uuids],
+                "measuring": self.measuring.group_is_measured(group.name),
+            }
+            for group in self.station.groups.all()
+        ]
+
+    def make_group(self, name: str, uuids: list[str]) -> None:
+        """A new group; raises UsageFailure."""
+        with self.station.lock("group create"):
+            self.station.groups.create(name, [bytes.fromhex(uuid) for uuid in uuids])
+        self._group_changed(name)
+
+    def change_group(self, name: str, uuids: list[str]) -> None:
+        """Other members; raises NotFound, Frozen while it is measured."""
+        wanted = {bytes.fromhex(uuid) for uuid in uuids}
+        with self.station.lock("group change"):
+            present = set(self.station.groups.get(name).uuids)
+            self._require_thawed(name)
+            with self.station.transaction():
+                self.station.groups.remove(name, present - wanted)
+                self.station.groups.add(name, wanted - present)
+        self._group_changed(name)
+
+    def drop_group(self, name: str) -> None:
+        """Delete a group; raises NotFound, Frozen while it is measured."""
+        with self.station.lock("group delete"):
+            self.station.groups.get(name)
+            self._require_thawed(name)
+            self.station.groups.delete(name)
+        self._group_changed(name)
+
+    def _require_thawed(self, name: str) -> None:
+        if self.measuring.group_is_measured(name):
+            raise Frozen(f"Group {name!r} is being measured: it stays as it is.", hint="End that measurement first.")
+
+    def _group_changed(self, name: str) -> None:
+        self.roster.refresh()
+        self.live.event("group", state="changed", name=name)
+
+    # -- virtual transducers -----------------------------------------------------------------------------------------
+
+    def make_virtual(
+        self, *, name: str | None, source: str, content: str | None, profile: str | None
+    ) -> dict[str, Any]:
+        """Make one and start it; it is provisioned when it answers. Raises UsageFailure, BadData, NotFound."""
+        made = self.virtuals.make(name=name, source=source, content=content, profile=profile)
+        self._start_virtuals()
+        self.roster.refresh([made.uuid])
+        return made.as_json()
+
+    def drop_virtual(self, uuid: str) -> None:
+        """End one, and its key with it; raises NotFound, Frozen while it is measured."""
+        if self.measuring.of(uuid) is not None:
+            raise Frozen(f"Node {uuid} is being measured.", hint="End that measurement first.")
+        self.virtuals.remove(uuid)
+        self.roster.note(uuid, "left", present=False)
+        self.roster.refresh()

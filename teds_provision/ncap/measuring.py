@@ -23,9 +23,9 @@ from teds_provision.measure.runner import Watcher
 from teds_provision.measure.sinks import FILES, Sink, open_sink
 from teds_provision.measure.trusting import Trusted
 from teds_provision.ncap.live import Live
-from teds_provision.ncap.looking import as_problem
-from teds_provision.ncap.roster import Roster
-from teds_provision.ncap.turns import Turns
+from teds_provision.ncap.nodes.looking import as_problem
+from teds_provision.ncap.nodes.roster import Roster
+from teds_provision.ncap.nodes.turns import Turns
 from teds_provision.station.station import Station
 from teds_provision.store import Measurement
 from teds_provision.teds.image import Image
@@ -321,7 +321,7 @@ class Measuring:
                 self._roster.refresh([uuid])
 
         def sink(failed: Sink) -> None:
-            self._live.event("sink", state="failed", **_sink_json(one.kept.id, failed))
+            self._live.event("sink", **_sink_json(one.kept.id, failed))
 
         def note(text: str) -> None:
             self._live.event("measurement", state="note", id=one.kept.id, why=text)
@@ -359,7 +359,7 @@ def _sink_json(measurement: str, sink: Sink) -> dict[str, Any]:
     return {
         "measurement": measurement,
         "name": sink.name,
-        "sink_state": stats.state,
+        "state": stats.state,
         "detail": stats.detail,
         "error": stats.error,
         "hint": stats.hint,

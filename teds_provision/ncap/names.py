@@ -10,7 +10,7 @@ from teds_provision.errors import Frozen, UsageFailure
 from teds_provision.measure.blocks import ChannelFacts, StationFacts
 from teds_provision.measure.sinks.names import Topics, is_topic
 from teds_provision.ncap.live import Live
-from teds_provision.ncap.roster import Roster
+from teds_provision.ncap.nodes.roster import Roster
 from teds_provision.station.measurements import STATION
 from teds_provision.station.station import Station
 
@@ -41,9 +41,7 @@ class Names:
             found.append({"uuid": uuid, "channel": 0, "name": chosen.get((raw, 0)), "topic": topics.node(uuid)})
             for number, _ in self._roster.channel_names(uuid):
                 name = chosen.get((raw, number))
-                found.append(
-                    {"uuid": uuid, "channel": number, "name": name, "topic": topics.channel(uuid, number)}
-                )
+                found.append({"uuid": uuid, "channel": number, "name": name, "topic": topics.channel(uuid, number)})
         return found
 
     def rename(self, uuid: str, channel: int, name: str | None) -> None:

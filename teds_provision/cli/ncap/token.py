@@ -13,9 +13,9 @@ from teds_provision.lazy import late
 from teds_provision.store.records import iso
 
 if TYPE_CHECKING:
-    from teds_provision.ncap import tokens
+    from teds_provision.ncap.web import tokens
 else:
-    tokens = late("teds_provision.ncap.tokens")
+    tokens = late("teds_provision.ncap.web.tokens")
 
 
 @click.group(

@@ -15,23 +15,29 @@ from starlette.staticfiles import StaticFiles
 from starlette.types import Scope
 from starlette.websockets import WebSocket, WebSocketDisconnect
 
-from teds_provision.errors import NotFound, PolicyRefused, TedsProvisionError
+from teds_provision.errors import NotFound, TedsProvisionError
 from teds_provision.ncap.daemon import Daemon
 from teds_provision.ncap.live import Listener
-from teds_provision.ncap.web.answers import Body, answer_bug, answer_error, answer_refusal
-from teds_provision.ncap.web.guard import CALLER, Caller, Refusal
+from teds_provision.ncap.web.answers import answer_bug, answer_error, answer_refusal
+from teds_provision.ncap.web.guard import Refusal
+from teds_provision.ncap.web.resources import Resources
 
 PAGE: Final = Path(__file__).parent.parent / "page"
 API: Final = "/api/v1"
 MOST_LISTENERS: Final = 200
 
-Handler = Callable[[Request], Awaitable[Response]]
-
 
 def build(daemon: Daemon) -> Starlette:
     """The application; the guard goes in front of it."""
     routes: list[BaseRoute] = [
-        Mount(API, routes=[*_routes(daemon), WebSocketRoute("/live", _live(daemon)), Route("/{rest:path}", _nothing)]),
+        Mount(
+            API,
+            routes=[
+                *Resources(daemon).routes(),
+                WebSocketRoute("/live", _live(daemon)),
+                Route("/{rest:path}", _nothing),
+            ],
+        ),
     ]
     if PAGE.is_dir():
         routes.append(Mount("/", _Page(directory=PAGE, html=True)))
@@ -67,48 +73,6 @@ def _no_method(request: Request, error: Exception) -> Response:
 
 async def _nothing(_request: Request) -> Response:
     raise NotFound("There is no such resource.", hint="See /api/v1/openapi.json.")
-
-
-def _routes(daemon: Daemon) -> list[Route]:
-    async def status(_request: Request) -> Response:
-        return JSONResponse(await asyncio.to_thread(daemon.status))
-
-    async def detection(request: Request) -> Response:
-        if request.method == "PUT":
-            body = await Body.of(request)
-            mode = body.need("mode", str)
-            body.done()
-            await asyncio.to_thread(daemon.set_detection, mode)
-        return JSONResponse({"mode": daemon.detection})
-
-    async def discover(request: Request) -> Response:
-        (await Body.of(request)).done()
-        return JSONResponse({"nodes": await asyncio.to_thread(daemon.discover)})
-
-    async def nodes(_request: Request) -> Response:
-        return JSONResponse({"nodes": await asyncio.to_thread(daemon.roster.nodes)})
-
-    async def node(request: Request) -> Response:
-        uuid = await asyncio.to_thread(daemon.resolve, request.path_params["uuid"])
-        return JSONResponse(await asyncio.to_thread(daemon.roster.node, uuid))
-
-    async def login_link(request: Request) -> Response:
-        caller: Caller = request.scope[CALLER]
-        body = await Body.of(request)
-        read_only = body.take("read_only", bool, False)
-        body.done()
-        if caller.kind != "socket":
-            raise PolicyRefused("A link to log in is given on the machine alone.", hint="teds-provision ncap open")
-        return JSONResponse({"url": daemon.login_url(read_only=read_only)})
-
-    return [
-        Route("/status", status),
-        Route("/detection", detection, methods=["GET", "PUT"]),
-        Route("/discover", discover, methods=["POST"]),
-        Route("/nodes", nodes),
-        Route("/nodes/{uuid}", node),
-        Route("/login-link", login_link, methods=["POST"]),
-    ]
 
 
 def _live(daemon: Daemon) -> Callable[[WebSocket], Awaitable[None]]:

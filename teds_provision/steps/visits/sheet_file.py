@@ -42,7 +42,7 @@ class SheetWritten:
 
     plan: SheetPlan
     steps: tuple[StepResult, ...]
-    verified: Verified | None
+    verified: Verified
 
 
 def plan_sheet(

@@ -21,9 +21,9 @@ from teds_provision.links.opening import open_place
 from teds_provision.measure.finding.buses import Buses
 from teds_provision.measure.finding.lookout import Sighting
 from teds_provision.ncap.live import Live
-from teds_provision.ncap.looking import Look, as_problem, is_listed, look
-from teds_provision.ncap.roster import Roster, check_lines
-from teds_provision.ncap.turns import Turns
+from teds_provision.ncap.nodes.looking import Look, as_problem, is_listed, look
+from teds_provision.ncap.nodes.roster import Roster, check_lines
+from teds_provision.ncap.nodes.turns import Turns
 from teds_provision.station.station import Station
 from teds_provision.talk.conversation import Conversation, SessionLost
 

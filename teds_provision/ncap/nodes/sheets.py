@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Any, Final
 
 from teds_provision.errors import BadData, NotFound, TedsProvisionError, UsageFailure
 from teds_provision.lazy import late
-from teds_provision.ncap.desk import Desk
-from teds_provision.ncap.roster import Roster, check_lines
+from teds_provision.ncap.nodes.desk import Desk
+from teds_provision.ncap.nodes.roster import Roster, check_lines
 from teds_provision.station.station import Station
 from teds_provision.steps.agree import session_if_keyed
 from teds_provision.steps.identify import identify
@@ -140,8 +140,8 @@ class Sheets:
         def work(node: Conversation) -> dict[str, Any]:
             with self._station.turn(node.uuid):
                 done = write_sheet(self._station, node, blocks, Silent(), accept_calibration=accept)
-            verdict = done.verified.verdict if done.verified is not None else None
-            return {**_plan_json(done.plan), "steps": [_step(one) for one in done.steps], "verdict": verdict}
+            steps = [_step(one) for one in done.steps]
+            return {**_plan_json(done.plan), "steps": steps, "verdict": done.verified.verdict}
 
         done = self._desk.with_node(uuid, "a datasheet is written", work)
         self._roster.show_sheet(uuid, None)

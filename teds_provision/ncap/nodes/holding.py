@@ -18,9 +18,9 @@ from teds_provision.errors import LinkFailure, NoNode, TedsProvisionError
 from teds_provision.links.ports import Notice
 from teds_provision.measure.acting import DEAD_MAN, Acting
 from teds_provision.measure.trusting import Trusted, open_trusted, require_whitelisted
-from teds_provision.ncap.desk import Desk
 from teds_provision.ncap.live import Live
-from teds_provision.ncap.turns import Turns
+from teds_provision.ncap.nodes.desk import Desk
+from teds_provision.ncap.nodes.turns import Turns
 from teds_provision.station.station import Station
 from teds_provision.talk.conversation import Conversation, SessionLost
 

@@ -145,6 +145,15 @@ class Roster:
             known = set(self._rows) | {uuid for uuid, seen in self._seen.items() if seen.present or seen.looked}
             return sorted(known, key=lambda uuid: (not self.seen(uuid).present, uuid))
 
+    def name(self, uuid: str) -> str:
+        """The name of a node in the store, "" where it has none."""
+        with self._lock:
+            return self._rows.get(uuid, {}).get("name") or ""
+
+    def channel_names(self, uuid: str) -> list[tuple[int, str]]:
+        """Number and name of every channel."""
+        return [(one["number"], one["name"]) for one in self._sheet(uuid)]
+
     def known(self, uuid: str) -> bool:
         """Whether there is anything to show of a node."""
         with self._lock:

@@ -19,6 +19,7 @@ import sys
 import threading
 from contextlib import suppress
 from dataclasses import dataclass, field
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, Final
 
@@ -27,7 +28,7 @@ from teds_provision.files import write_whole
 from teds_provision.ncap.live import Live
 from teds_provision.ncap.settings import SOURCE
 from teds_provision.node.described import create
-from teds_provision.node.flash_file import default_can_address
+from teds_provision.protocol.announce import default_can_address
 from teds_provision.protocol.keys import fingerprint
 from teds_provision.station.station import Station
 from teds_provision.store.records import WhitelistEntry
@@ -37,6 +38,8 @@ from teds_provision.teds.sheet import Sheet
 
 FOLDER: Final = "virtual"
 _FACTS: Final = "virtual.json"
+_LOG: Final = "log"
+_CALIBRATION: Final = "calibration.toml"
 _SOURCES: Final = re.compile(r"noise\Z|(sine|ramp):[0-9.]+\Z|unix:/[^\0]+\Z|file:/[^\0]+\Z")
 _AGAIN, _LONGEST = 1.0, 30.0
 _ENDING: Final = 5.0
@@ -56,6 +59,7 @@ class Virtual:
     state: str = "starting"
     why: str = ""
     process: subprocess.Popen[bytes] | None = field(default=None, repr=False)
+    kept: bool = False
 
     def as_json(self) -> dict[str, Any]:
         """api.md, `/virtual`."""
@@ -97,9 +101,11 @@ class Virtuals:
         return uuid in self._all
 
     def start(self) -> None:
-        """Start those that were made before."""
+        """Start those that were made and do not run yet."""
         for one in list(self._all.values()):
-            self._keep(one)
+            if not one.kept:
+                one.kept = True
+                self._keep(one)
 
     def stop(self) -> None:
         """End them all."""
@@ -110,7 +116,7 @@ class Virtuals:
     # -- making and removing -----------------------------------------------------------------------------------------
 
     def make(self, *, name: str | None, source: str, content: str | None, profile: str | None) -> Virtual:
-        """Make one from a datasheet (XML, JSON, hex) or a profile, whitelist it under the key in its file, start it.
+        """Make one from a datasheet (XML, JSON, hex) or a profile, whitelist it under the key in its file.
 
         Raises UsageFailure, BadData, NotFound.
         """
@@ -130,7 +136,6 @@ class Virtuals:
             raise
         with self._guard:
             self._all[one.uuid] = one
-        self._keep(one)
         self._live.event("virtual", state="made", uuid=one.uuid, name=one.name)
         return one
 
@@ -158,6 +163,8 @@ class Virtuals:
             )
         sheet = Sheet.of_blocks(flash.hardware)
         one = Virtual(uuid, name or sheet.meta.name, source, folder, len(sheet.channels))
+        if profile is not None and (lines := ideal_calibration(sheet)):
+            write_whole(folder / _CALIBRATION, lines.encode())
         write_whole(folder / _FACTS, json.dumps({**one.as_json(), "profile": profile}).encode())
         self._whitelist(state.uuid, fingerprint(state.node_key), one.name)
         return one
@@ -182,6 +189,15 @@ class Virtuals:
         """The profile that one was made from; None: from a datasheet."""
         found = json.loads((self._of(uuid).folder / _FACTS).read_text()).get("profile")
         return found if isinstance(found, str) else None
+
+    def calibration_of(self, uuid: str) -> Path | None:
+        """The straight lines of one that was made from a profile, None where it has none."""
+        path = self._of(uuid).folder / _CALIBRATION
+        return path if path.exists() else None
+
+    def name_of(self, uuid: str) -> str:
+        """The name that it was given, "" for none."""
+        return self._of(uuid).name
 
     def document_of(self, uuid: str) -> str | None:
         """The datasheet that one was made from, None where it was a profile."""
@@ -215,27 +231,30 @@ class Virtuals:
     def _run(self, one: Virtual) -> None:
         """Run it, and again when it ended, until it is removed or the daemon ends."""
         pause = _AGAIN
+        log = one.folder / _LOG
         while not self._stop.is_set() and one.uuid in self._all:
             words = [sys.executable, "-m", "teds_provision", "--json", "node", "run", str(one.folder)]
             words += ["--can", self.bus, "--source", one.source]
-            one.process = subprocess.Popen(
-                words,
-                stdin=subprocess.DEVNULL,
-                stdout=subprocess.PIPE,
-                stderr=subprocess.PIPE,
-                process_group=0,  # Ctrl-C is for the daemon, which ends its nodes in order
-                preexec_fn=_die_with_us,  # noqa: PLW1509 - one call of the system, nothing else
-            )
+            with log.open("wb") as errors:
+                process = one.process = subprocess.Popen(
+                    words,
+                    stdin=subprocess.DEVNULL,
+                    stdout=subprocess.PIPE,
+                    stderr=errors,
+                    process_group=0,  # Ctrl-C is for the daemon, which ends its nodes in order
+                    preexec_fn=_die_with_us,  # noqa: PLW1509 - one call of the system, nothing else
+                )
             if self._stop.is_set() or one.uuid not in self._all:
-                _end(one.process)
-            assert one.process.stdout is not None
-            if b'"ready"' in one.process.stdout.readline():
-                self._say(one, "running")
-                pause = _AGAIN
-            _, errors = one.process.communicate()
+                _end(process)
+            assert process.stdout is not None
+            for line in process.stdout:
+                if b'"ready"' in line:
+                    self._say(one, "running")
+                    pause = _AGAIN
+            process.wait()
             if self._stop.is_set() or one.uuid not in self._all:
                 return
-            last = errors.decode(errors="replace").strip().splitlines()
+            last = log.read_text(errors="replace").strip().splitlines()
             self._say(one, "ended", last[-1] if last else "")
             self._stop.wait(pause)
             pause = min(2 * pause, _LONGEST)
@@ -243,6 +262,26 @@ class Virtuals:
     def _say(self, one: Virtual, state: str, why: str = "") -> None:
         one.state, one.why = state, why
         self._live.event("virtual", uuid=one.uuid, state=state, why=why)
+
+
+def ideal_calibration(sheet: Sheet) -> str:
+    """Straight lines over the whole raw range, for the channels that have no values without: nobody measured these.
+
+    A profile does not know the curve of a single board; a transducer in software has none but this.
+    """
+    today = datetime.now(UTC).date().isoformat()
+    lines = []
+    for channel in sheet.channels:
+        ends = channel.sample.raw_range if channel.sample is not None else None
+        if not channel.value_problem or ends is None or not channel.has_range or channel.calibration_problem:
+            continue
+        low, high = channel.unit.from_si(channel.low), channel.unit.from_si(channel.high)
+        points = f"[[{ends[0]}, {low!r}], [{ends[1]}, {high!r}]]"
+        lines.append(
+            f'[[calibration]]\nchannel = {channel.number}\ndate = {today}\nunit = "{channel.unit.text}"\n'
+            f"points = {points}\n"
+        )
+    return "\n".join(lines)
 
 
 def _end(process: subprocess.Popen[bytes] | None) -> None:

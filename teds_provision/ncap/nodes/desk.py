@@ -15,8 +15,8 @@ from typing import Any, Final, Generic, TypeVar, cast
 from teds_provision.errors import NoNode, TedsProvisionError
 from teds_provision.links import Port
 from teds_provision.links.ports import Contact, Notice
-from teds_provision.ncap.roster import Roster
-from teds_provision.ncap.turns import Turns
+from teds_provision.ncap.nodes.roster import Roster
+from teds_provision.ncap.nodes.turns import Turns
 from teds_provision.talk.conversation import Conversation, SessionLost
 
 Result = TypeVar("Result")

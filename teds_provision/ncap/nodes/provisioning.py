@@ -17,10 +17,10 @@ from typing import Any, Final
 
 from teds_provision.errors import NodeRefused, NotFound, TedsProvisionError, UsageFailure
 from teds_provision.links.ports import Notice
-from teds_provision.ncap.desk import Desk, Errand
 from teds_provision.ncap.live import Live
-from teds_provision.ncap.looking import as_problem
-from teds_provision.ncap.roster import Roster, check_lines
+from teds_provision.ncap.nodes.desk import Desk, Errand
+from teds_provision.ncap.nodes.looking import as_problem
+from teds_provision.ncap.nodes.roster import Roster, check_lines
 from teds_provision.protocol.messages.frames import Reason
 from teds_provision.station.station import Station
 from teds_provision.steps.identify import Identified

@@ -1,0 +1,314 @@
+"""The resources of the API: each takes a request apart, calls the daemon on a thread, and answers JSON."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Awaitable, Callable
+from datetime import datetime
+from typing import Any, Final
+
+from starlette.requests import Request
+from starlette.responses import JSONResponse, Response
+from starlette.routing import Route
+
+from teds_provision.errors import NotFound, PolicyRefused, UsageFailure
+from teds_provision.ncap.daemon import Daemon
+from teds_provision.ncap.nodes.holding import LONGEST
+from teds_provision.ncap.web.answers import Body
+from teds_provision.ncap.web.guard import CALLER, Caller
+from teds_provision.store import Choice, is_failure
+from teds_provision.teds.profile import default_folders, list_profiles, listed
+
+Handler = Callable[[Request], Awaitable[Response]]
+_KINDS: Final = ("periodic", "event", "free")
+_MOST_ENTRIES: Final = 10_000
+_FASTEST: Final = 1e6
+_LARGEST: Final = 1e300
+
+
+class Resources:
+    """Handlers over one daemon; :meth:`routes` lists them."""
+
+    def __init__(self, daemon: Daemon) -> None:
+        self._daemon = daemon
+
+    def routes(self) -> list[Route]:
+        """Paths below /api/v1."""
+        return [
+            Route("/status", self.status),
+            Route("/detection", self.detection, methods=["GET", "PUT"]),
+            Route("/discover", self.discover, methods=["POST"]),
+            Route("/nodes", self.nodes),
+            Route("/nodes/{uuid}", self.node),
+            Route("/nodes/{uuid}/teds", self.teds, methods=["GET", "PUT"]),
+            Route("/nodes/{uuid}/provision", self.provision, methods=["GET", "POST"]),
+            Route("/nodes/{uuid}/channels/{number:int}", self.channel, methods=["PUT"]),
+            Route("/groups", self.groups, methods=["GET", "POST"]),
+            Route("/groups/{name}", self.group, methods=["PUT", "DELETE"]),
+            Route("/measurements", self.measurements, methods=["GET", "POST"]),
+            Route("/measurements/{id}", self.measurement, methods=["DELETE"]),
+            Route("/names", self.names, methods=["GET", "PUT"]),
+            Route("/virtual", self.virtual, methods=["GET", "POST"]),
+            Route("/virtual/{uuid}", self.one_virtual, methods=["DELETE"]),
+            Route("/profiles", self.profiles),
+            Route("/log", self.log),
+            Route("/login-link", self.login_link, methods=["POST"]),
+        ]
+
+    async def _node_of(self, request: Request) -> str:
+        return await asyncio.to_thread(self._daemon.resolve, request.path_params["uuid"])
+
+    async def _nodes_of(self, texts: tuple[str, ...]) -> list[str]:
+        return [await asyncio.to_thread(self._daemon.resolve, text) for text in texts]
+
+    # -- the station -------------------------------------------------------------------------------------------------
+
+    async def status(self, request: Request) -> Response:
+        """GET /status."""
+        caller: Caller = request.scope[CALLER]
+        found = await asyncio.to_thread(self._daemon.status)
+        return JSONResponse({**found, "write": not caller.read_only})
+
+    async def detection(self, request: Request) -> Response:
+        """GET, PUT /detection."""
+        if request.method == "PUT":
+            body = await Body.of(request)
+            mode = body.need("mode", str)
+            body.done()
+            await asyncio.to_thread(self._daemon.set_detection, mode)
+        return JSONResponse({"mode": await asyncio.to_thread(lambda: self._daemon.detection)})
+
+    async def discover(self, request: Request) -> Response:
+        """POST /discover."""
+        (await Body.of(request)).done()
+        return JSONResponse({"nodes": await asyncio.to_thread(self._daemon.discover)})
+
+    async def profiles(self, _request: Request) -> Response:
+        """GET /profiles: the transducer types that can be built."""
+
+        def found() -> list[dict[str, Any]]:
+            entries = [listed(entry) for entry in list_profiles(default_folders(self._daemon.station.home))]
+            return [entry for entry in entries if "error" not in entry and not entry.get("abstract")]
+
+        return JSONResponse({"profiles": await asyncio.to_thread(found)})
+
+    async def log(self, request: Request) -> Response:
+        """GET /log: the newest entries, and whether the chain holds over them."""
+        limit = _integer(request, "limit", 200, _MOST_ENTRIES)
+        uuid = request.query_params.get("uuid")
+        found = await asyncio.to_thread(self._log, limit, uuid)
+        return JSONResponse(found)
+
+    def _log(self, limit: int, uuid: str | None) -> dict[str, Any]:
+        log = self._daemon.station.audit_log
+        choice = Choice(bytes.fromhex(self._daemon.resolve(uuid)) if uuid else None)
+        after = log.before(choice, last=limit)
+        verdict = log.check(after)
+        entries = [
+            {
+                "seq": one.seq,
+                "time": datetime.fromisoformat(one.at).timestamp(),
+                "who": one.who,
+                "act": one.act,
+                "uuid": one.uuid.hex() if one.uuid is not None else None,
+                "subject": one.uuid.hex() if one.uuid is not None else "",
+                "outcome": one.outcome,
+                "detail": _sentence(one.outcome, one.detail),
+                "facts": one.detail,
+                "failed": is_failure(one.outcome),
+            }
+            for one in log.chosen(choice, after)
+        ]
+        return {"entries": entries, "intact": verdict.intact, "why": verdict.why}
+
+    async def login_link(self, request: Request) -> Response:
+        """POST /login-link: the page's address with a token that works once; over the Unix socket alone."""
+        caller: Caller = request.scope[CALLER]
+        body = await Body.of(request)
+        read_only = body.take("read_only", bool, False)
+        body.done()
+        if caller.kind != "socket":
+            raise PolicyRefused("A link to log in is given on the machine alone.", hint="teds-provision ncap open")
+        return JSONResponse({"url": self._daemon.login_url(read_only=read_only)})
+
+    # -- nodes -------------------------------------------------------------------------------------------------------
+
+    async def nodes(self, _request: Request) -> Response:
+        """GET /nodes."""
+        return JSONResponse({"nodes": await asyncio.to_thread(self._daemon.roster.nodes)})
+
+    async def node(self, request: Request) -> Response:
+        """GET /nodes/UUID."""
+        uuid = await self._node_of(request)
+        return JSONResponse(await asyncio.to_thread(self._daemon.roster.node, uuid))
+
+    async def teds(self, request: Request) -> Response:
+        """GET, PUT /nodes/UUID/teds."""
+        uuid, sheets = await self._node_of(request), self._daemon.sheets
+        if request.method == "GET":
+            form = request.query_params.get("format")
+            if form is None:
+                return JSONResponse(await asyncio.to_thread(sheets.as_json, uuid))
+            text, kind = await asyncio.to_thread(sheets.document, uuid, form)
+            disposition = f'attachment; filename="{uuid}.{form}"'
+            return Response(text, media_type=kind, headers={"content-disposition": disposition})
+        body = await Body.of(request)
+        content, accept = body.need("content", str), body.take("accept_calibration", str)
+        body.take("format", str)  # what it is shows in itself
+        body.done()
+        dry = request.query_params.get("dry_run", "0") not in ("0", "", "false")
+        step = sheets.plan if dry else sheets.write
+        return JSONResponse(await asyncio.to_thread(lambda: step(uuid, content, accept=accept)))
+
+    async def provision(self, request: Request) -> Response:
+        """GET, POST /nodes/UUID/provision; UUID ``next``: whichever node is tapped next."""
+        word = request.path_params["uuid"]
+        uuid = word if word == "next" else await self._uuid_of_a_label(word)
+        runs = self._daemon.provisioning
+        if request.method == "GET":
+            return JSONResponse(await asyncio.to_thread(runs.of, uuid))
+        body = await Body.of(request)
+        if body.take("cancel", bool, False):
+            body.done()
+            return JSONResponse(await asyncio.to_thread(runs.cancel, uuid))
+        profile, name = body.take("profile", str), body.take("name", str)
+        calibration, calibration_name = body.take("calibration", str), body.take("calibration_name", str)
+        body.done()
+
+        def begin() -> dict[str, Any]:
+            return runs.begin(
+                uuid, profile=profile, name=name, calibration=calibration, calibration_name=calibration_name
+            )
+
+        return JSONResponse(await asyncio.to_thread(begin), 202)
+
+    async def _uuid_of_a_label(self, word: str) -> str:
+        """A node that nobody has seen yet is named by its whole UUID, as its label says it."""
+        digits = word.lower().removeprefix("0x")
+        if len(digits) == 20 and not set(digits) - set("0123456789abcdef"):
+            return digits
+        return await asyncio.to_thread(self._daemon.resolve, word)
+
+    async def channel(self, request: Request) -> Response:
+        """PUT /nodes/UUID/channels/N: an actuator."""
+        uuid, number = await self._node_of(request), request.path_params["number"]
+        body = await Body.of(request)
+        value = body.number("value", -_LARGEST, _LARGEST)
+        unit, hold = body.take("unit", str), body.number("hold", 0, LONGEST)
+        body.done()
+        if value is None and hold != 0:
+            raise UsageFailure("A set point is missing.", hint='Send {"value": …}, or {"hold": 0} to let go.')
+        if value is None or hold == 0:
+            return JSONResponse(await asyncio.to_thread(self._daemon.holding.let_go, uuid, number))
+        found = value
+        return JSONResponse(await asyncio.to_thread(lambda: self._daemon.holding.put(uuid, number, found, unit, hold)))
+
+    # -- groups and measurements -------------------------------------------------------------------------------------
+
+    async def groups(self, request: Request) -> Response:
+        """GET, POST /groups."""
+        if request.method == "POST":
+            body = await Body.of(request)
+            name, uuids = body.need("name", str), await self._nodes_of(body.texts("uuids"))
+            body.done()
+            await asyncio.to_thread(self._daemon.make_group, name, uuids)
+        found = {"groups": await asyncio.to_thread(self._daemon.groups)}
+        return JSONResponse(found, 201 if request.method == "POST" else 200)
+
+    async def group(self, request: Request) -> Response:
+        """PUT, DELETE /groups/NAME."""
+        name = request.path_params["name"]
+        if request.method == "DELETE":
+            await asyncio.to_thread(self._daemon.drop_group, name)
+        else:
+            body = await Body.of(request)
+            uuids = await self._nodes_of(tuple(body.need("uuids", list)))
+            body.done()
+            await asyncio.to_thread(self._daemon.change_group, name, uuids)
+        return JSONResponse({"groups": await asyncio.to_thread(self._daemon.groups)})
+
+    async def measurements(self, request: Request) -> Response:
+        """GET, POST /measurements."""
+        measuring = self._daemon.measuring
+        if request.method == "GET":
+            return JSONResponse({"measurements": await asyncio.to_thread(measuring.all)})
+        body = await Body.of(request)
+        asked: dict[str, Any] = {
+            "group": body.take("group", str),
+            "uuids": await self._nodes_of(body.texts("uuids")),
+            "rate": body.number("rate", 0.001, _FASTEST),
+            "kind": body.take("kind", str),
+            "trigger": body.take("trigger", bool, False),
+            "sinks": body.texts("sinks"),
+            "channels": _numbers(body.take("channels", list, [])),
+        }
+        body.done()
+        if asked["kind"] not in (None, *_KINDS):
+            raise UsageFailure(f"{asked['kind']!r} is no kind.", hint=f"Use {', '.join(_KINDS)}.")
+        return JSONResponse(await asyncio.to_thread(lambda: measuring.add(**asked)), 201)
+
+    async def measurement(self, request: Request) -> Response:
+        """DELETE /measurements/ID."""
+        await asyncio.to_thread(self._daemon.measuring.delete, request.path_params["id"])
+        return JSONResponse({"measurements": await asyncio.to_thread(self._daemon.measuring.all)})
+
+    # -- names, virtual transducers ----------------------------------------------------------------------------------
+
+    async def names(self, request: Request) -> Response:
+        """GET, PUT /names."""
+        names = self._daemon.names
+        if request.method == "PUT":
+            body = await Body.of(request)
+            [uuid] = await self._nodes_of((body.need("uuid", str),))
+            channel, name = body.take("channel", int, 0), body.take("name", str)
+            body.take("topic", str)  # the row of GET, sent back
+            body.done()
+            if not 0 <= channel <= 255:
+                raise UsageFailure(f"{channel} is no channel.")
+            await asyncio.to_thread(names.rename, uuid, channel, name or None)
+        return JSONResponse({"names": await asyncio.to_thread(names.all)})
+
+    async def virtual(self, request: Request) -> Response:
+        """GET, POST /virtual."""
+        if request.method == "GET":
+            return JSONResponse({"virtual": self._daemon.virtuals.all()})
+        body = await Body.of(request)
+        asked: dict[str, Any] = {
+            "name": body.take("name", str),
+            "source": body.take("source", str, "noise"),
+            "content": body.take("content", str),
+            "profile": body.take("profile", str),
+        }
+        body.take("format", str)
+        body.done()
+        return JSONResponse(await asyncio.to_thread(lambda: self._daemon.make_virtual(**asked)), 201)
+
+    async def one_virtual(self, request: Request) -> Response:
+        """DELETE /virtual/UUID."""
+        uuid = request.path_params["uuid"].lower()
+        if uuid not in self._daemon.virtuals:
+            raise NotFound(f"{uuid} is no virtual transducer of this station.")
+        await asyncio.to_thread(self._daemon.drop_virtual, uuid)
+        return JSONResponse({"virtual": self._daemon.virtuals.all()})
+
+
+def _integer(request: Request, name: str, default: int, most: int) -> int:
+    text = request.query_params.get(name)
+    if text is None:
+        return default
+    if not text.isdecimal() or not 1 <= int(text) <= most:
+        raise UsageFailure(f"{name} has to be a whole number from 1 to {most}.")
+    return int(text)
+
+
+def _numbers(values: list[Any]) -> tuple[int, ...]:
+    if not all(isinstance(one, int) and not isinstance(one, bool) and 1 <= one <= 255 for one in values):
+        raise UsageFailure("Channels are numbers from 1 to 255.")
+    return tuple(values)
+
+
+def _sentence(outcome: str, detail: dict[str, Any]) -> str:
+    facts = ", ".join(
+        f"{key} {value}" for key, value in detail.items() if isinstance(value, str | int | float) and value
+    )
+    return f"{outcome}: {facts}" if facts else outcome
