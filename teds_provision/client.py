@@ -17,18 +17,16 @@ import os
 import socket
 import ssl
 from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Final
 from urllib.parse import quote, urlsplit
 
 from teds_provision.errors import LinkFailure, TedsProvisionError, UsageFailure
+from teds_provision.files import short_path
 
 API: Final = "/api/v1"
 SOCKET: Final = "ncap.sock"
-_LONGEST_PATH: Final = 100
-"""Octets: Linux takes 107 for the name of a Unix socket."""
 
 
 class ApiError(TedsProvisionError):
@@ -205,16 +203,3 @@ class _UnixConnection(http.client.HTTPConnection):
             raise LinkFailure(
                 f"No base station runs in {self._path.parent}.", hint="Start it: teds-provision ncap run"
             ) from error
-
-
-@contextmanager
-def short_path(path: Path) -> Iterator[str]:
-    """A name for a Unix socket that the system takes, however deep its folder lies; raises OSError."""
-    if len(os.fsencode(path)) <= _LONGEST_PATH:
-        yield str(path)
-        return
-    folder = os.open(path.parent, os.O_PATH | os.O_DIRECTORY | os.O_CLOEXEC)
-    try:
-        yield f"/proc/self/fd/{folder}/{path.name}"
-    finally:
-        os.close(folder)

@@ -28,6 +28,8 @@ SHARED: Final = 0o666
 """Mode of results that are no secret; the user's umask takes away from it."""
 _SUFFIX: Final = ".teds-part"
 _STALE_SECONDS: Final = 60.0  # between making the file and locking it a living writer looks like a dead one
+_LONGEST_SOCKET: Final = 100
+"""Octets: Linux takes 107 for the name of a Unix socket."""
 _NO_FOLDER_SYNC: Final = frozenset({errno.EINVAL, errno.ENOTSUP, errno.ENOSYS, errno.EROFS, errno.EACCES})
 _NO_HARD_LINKS: Final = frozenset({errno.EPERM, errno.ENOTSUP, errno.ENOSYS, errno.EMLINK, errno.EXDEV, errno.EACCES})
 
@@ -151,6 +153,19 @@ def private_folder(folder: Path) -> Path:
     if not stat.S_ISDIR(status.st_mode) or status.st_uid != os.geteuid() or status.st_mode & 0o077:
         raise PermissionError(errno.EPERM, "it is not a folder of this user alone", str(folder))
     return folder
+
+
+@contextmanager
+def short_path(path: Path) -> Iterator[str]:
+    """A name for a Unix socket that the system takes, however deep its folder lies; raises OSError."""
+    if len(os.fsencode(path)) <= _LONGEST_SOCKET:
+        yield str(path)
+        return
+    folder = os.open(path.parent, os.O_PATH | os.O_DIRECTORY | os.O_CLOEXEC)
+    try:
+        yield f"/proc/self/fd/{folder}/{path.name}"
+    finally:
+        os.close(folder)
 
 
 def _publish(draft: Path, path: Path, *, replace: bool) -> None:

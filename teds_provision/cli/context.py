@@ -198,6 +198,7 @@ class App:
         """Open this base station (store now, vault when a key is first needed); NotFound says to run init."""
         station = station_room.station.Station.open(self.home, ask=self.ask_secret, tell=self.warn)
         station.notice = self.note
+        station.use_agent = not self.has_passphrase
         self.closing(station.close)
         return station
 

@@ -10,6 +10,14 @@ from teds_provision.errors import UsageFailure
 _UNITS = {"s": "seconds", "m": "minutes", "h": "hours", "d": "days", "w": "weeks"}
 
 
+def duration(text: str) -> float:
+    """Seconds of a time span as people give it: ``90s``, ``15m``, ``2h``; raises UsageFailure."""
+    found = re.fullmatch(r"(\d{1,6})\s*([smhdw])", text.strip().lower())
+    if found is None:
+        raise UsageFailure(f"{text!r} is no span of time.", hint="Give 90s, 15m or 2h.")
+    return timedelta(**{_UNITS[found[2]]: int(found[1])}).total_seconds()
+
+
 def moment(text: str, now: datetime | None = None) -> str:
     """Return a moment in UTC as the store writes it (``2026-01-31T12:00:00Z``); raises UsageFailure.
 

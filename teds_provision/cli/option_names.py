@@ -55,6 +55,7 @@ OPTIONS: Final[dict[str, frozenset[str]]] = {
     "backup": frozenset({"to", "backup-passphrase-fd", "yes", "dry-run"}),
     "vault passphrase": frozenset({"new-passphrase-fd", "dry-run"}),
     "vault rewrap": frozenset({"yes", "dry-run"}),
+    "unlock": frozenset({"for"}),
     "restore": frozenset({"recovery-key", "keystore", "backup-passphrase-fd", "yes", "dry-run"}),
     "node check": frozenset({"factory", "yes", "dry-run", "via", "nfc", "can", "ble", "timeout", "trace"}),
     "node create": frozenset({"uuid", "name", "teds", "profile", "max-message"}),

@@ -68,6 +68,8 @@ SECTIONS: Final[dict[str, dict[str, Entry]]] = {
         "replace": Entry("handover.life", "replace", "Put a spare in the place of a broken node."),
         "backup": Entry("station.backup", "backup", "Write the whole store to a sealed file."),
         "vault": Entry("station.vault", "vault", "A new passphrase or PIN; a new master key over every node key."),
+        "unlock": Entry("station.unlock", "unlock", "Hold the vault open for a while, in memory alone."),
+        "lock": Entry("station.unlock", "lock", "Close the vault that unlock holds open."),
         "restore": Entry("station.backup", "restore", "Bring a sealed store back; no epoch or sequence goes back."),
     },
     "Try it": {

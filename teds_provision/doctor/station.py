@@ -16,6 +16,7 @@ from teds_provision import vault as vault_room
 from teds_provision.doctor.doctor import Finding, Place, check
 from teds_provision.errors import NoKeyring, StoreFailure, VaultFailure
 from teds_provision.store import Choice, Store
+from teds_provision.vault.agent import asking
 
 _STORE: Final = "store.sqlite3"
 _LOCK: Final = "store.lock"
@@ -176,6 +177,17 @@ def vault(place: Place) -> Iterator[Finding]:
         if not (place.home / "vault-pkcs11.json").exists():
             raise VaultFailure("The file vault-pkcs11.json is missing.", hint="teds-provision restore FILE")
         yield Finding("vault", "ok", f"The token {token.label.strip()!r} is there.")
+
+
+@check("unlock", "store")
+def unlocked(place: Place) -> Iterator[Finding]:
+    """Does a process hold the vault open."""
+    left = asking.seconds_left(place.home)
+    if left is None:
+        yield Finding("unlock", "ok", "No process holds the vault open.")
+    else:
+        why = f"The vault is held open for {left // 60} min {left % 60} s more: whoever runs as this user opens it."
+        yield Finding("unlock", "warning", why, "teds-provision lock")
 
 
 def _file_vault(place: Place) -> Finding:

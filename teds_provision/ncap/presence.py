@@ -10,8 +10,9 @@ from pathlib import Path
 from types import TracebackType
 from typing import Final
 
-from teds_provision.client import SOCKET, short_path
+from teds_provision.client import SOCKET
 from teds_provision.errors import StoreLocked
+from teds_provision.files import short_path
 
 LOCK: Final = "ncap.lock"
 

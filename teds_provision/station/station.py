@@ -58,6 +58,8 @@ class Station:
         self._turn, self._held = threading.RLock(), 0
         self.notice: Callable[[str], object] = lambda text: None
         """Told in one sentence whom this station waits for."""
+        self.use_agent = True
+        """Whether what ``unlock`` holds open opens the vault; False where the passphrase itself is asked for."""
         store.when_waiting(lambda text: self.notice(text))  # noqa: PLW0108 - it is replaced later
         self.seals = Seals(store, self._opened, tell)
         self.identity = Identity(store, self._opened, self.seals)
@@ -131,7 +133,8 @@ class Station:
         if self._vault is None:
             from teds_provision.vault import open_vault  # argon2 and the keyrings: not for commands that only list
 
-            self.adopt(open_vault(self.home, self.id, self.identity.keystore, self._ask))
+            keystore = self.identity.keystore
+            self.adopt(open_vault(self.home, self.id, keystore, self._ask, agent=self.use_agent))
         assert self._vault is not None
         return self._vault
 
@@ -143,6 +146,10 @@ class Station:
         except BaseException:
             self._vault = None
             raise
+
+    def ask_by(self, ask: Ask) -> None:
+        """Ask for the passphrase by another function from now on."""
+        self._ask = ask
 
     def _reopened(self) -> Vault:
         """Open the vault again: another process has replaced what this one read."""

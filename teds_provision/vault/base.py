@@ -53,6 +53,12 @@ class Vault(Protocol):
         ``ask`` is called for the new one, and before it for the old one where the vault has to give it on.
         """
 
+    def opener(self) -> bytes:
+        """What opens this vault without asking, for an agent (``unlock``): the key of a passphrase file.
+
+        Empty where only the passphrase or PIN itself would do, or where nothing is asked for.
+        """
+
     def export_ca(self, path: Path, passphrase: str) -> None:
         """Write the CA key to a new file as an encrypted PKCS #8 PEM; the vault keeps it until :meth:`drop_ca`.
 

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from teds_provision.errors import UsageFailure, VaultFailure
+from teds_provision.errors import UsageFailure, VaultFailure, WrongPassphrase
+from teds_provision.vault.agent import asking
 from teds_provision.vault.base import Ask, Vault
 from teds_provision.vault.hardening import harden
 from teds_provision.vault.passphrase import PRODUCT, Costs
@@ -36,16 +37,17 @@ def create_vault(
     return vault, why
 
 
-def open_vault(home: Path, store_id: str, keystore: str, ask: Ask) -> Vault:
+def open_vault(home: Path, store_id: str, keystore: str, ask: Ask, *, agent: bool = False) -> Vault:
     """Open the vault of a station; a second call in one process gives the same, without asking again.
 
-    Raises VaultFailure and its leaves: locked, missing, damaged, wrong passphrase.
+    With ``agent`` nobody is asked while ``unlock`` holds it open. Raises VaultFailure and its leaves: locked, missing,
+    damaged, wrong passphrase.
     """
     harden()
     place = (home.resolve(), store_id, keystore)
     vault = _opened.get(place)
     if vault is None or vault.replaced():
-        _opened[place] = vault = _open(home, store_id, keystore, ask)
+        _opened[place] = vault = _open(home, store_id, keystore, ask, agent=agent)
     return vault
 
 
@@ -90,11 +92,11 @@ def _create(
     return FileVault.create(home, store_id, ask, costs=costs, restored=restored), why
 
 
-def _open(home: Path, store_id: str, keystore: str, ask: Ask) -> Vault:
+def _open(home: Path, store_id: str, keystore: str, ask: Ask, *, agent: bool) -> Vault:
     if keystore == "file":
         from teds_provision.vault.file_vault import FileVault
 
-        return FileVault.open(home, store_id, ask)
+        return FileVault.open(home, store_id, ask, held=asking.held(home, "file") if agent else None)
     if keystore == "keyring":
         from teds_provision.vault.keyring_vault import KeyringVault
 
@@ -102,5 +104,21 @@ def _open(home: Path, store_id: str, keystore: str, ask: Ask) -> Vault:
     if keystore.startswith("pkcs11:"):
         from teds_provision.vault.pkcs11 import Pkcs11Vault
 
+        pin = asking.held(home, "pkcs11") if agent else None
+        if pin is not None:
+            try:
+                return Pkcs11Vault.open(home, store_id, keystore, _holding(pin, ask))
+            except WrongPassphrase:  # the PIN is another one by now: a second try could lock the token
+                asking.lock(home)
+                raise
         return Pkcs11Vault.open(home, store_id, keystore, ask)
     raise UsageFailure(f"There is no keystore {keystore!r}.", hint="Give keyring, file or pkcs11:URI.")
+
+
+def _holding(pin: bytes, ask: Ask) -> Ask:
+    """Give the PIN that is held, unless the token has one try left: that is for a person."""
+
+    def give(prompt: str, confirm: bool) -> str:
+        return ask(prompt, confirm) if "the last try" in prompt else pin.decode()
+
+    return give

@@ -10,7 +10,7 @@ from teds_provision.errors import BadData, NotFound, VaultFailure
 from teds_provision.files import read_limited, write_new, write_whole
 from teds_provision.vault.base import Ask
 from teds_provision.vault.master import Material
-from teds_provision.vault.passphrase import PRODUCT, Costs, SealingKey, check_new, unseal
+from teds_provision.vault.passphrase import PRODUCT, Costs, SealingKey, check_new, unseal, unseal_with
 from teds_provision.vault.software import SoftwareVault, settle
 
 FILE_NAME = "vault.json"
@@ -55,8 +55,8 @@ class FileVault(SoftwareVault):
         return cls(path, store_id, material, key)
 
     @classmethod
-    def open(cls, home: Path, store_id: str, ask: Ask) -> FileVault:
-        """Open the vault with the passphrase that ``ask`` gives.
+    def open(cls, home: Path, store_id: str, ask: Ask, *, held: bytes | None = None) -> FileVault:
+        """Open the vault with what an agent held (:meth:`opener`), else with the passphrase that ``ask`` gives.
 
         Raises VaultFailure (missing, damaged, of another store), WrongPassphrase.
         """
@@ -64,9 +64,16 @@ class FileVault(SoftwareVault):
         content = read_sealed(path)
         if content.get("store") != store_id:
             raise VaultFailure(f"{path} belongs to another store.", hint="Restore the backup that holds both.")
-        passphrase = ask("Passphrase of this station's keys", False)
-        plaintext, key = unseal(passphrase, content, context=_context(store_id))
+        opened = None if held is None else unseal_with(held, content, context=_context(store_id))
+        if opened is None:  # nothing is held, or the passphrase is another one by now
+            passphrase = ask("Passphrase of this station's keys", False)
+            opened = unseal(passphrase, content, context=_context(store_id))
+        plaintext, key = opened
         return cls(path, store_id, Material.decode(plaintext.decode("ascii", "replace")), key)
+
+    def opener(self) -> bytes:
+        """What opens this file without its passphrase, as long as that stays: for an agent that the user started."""
+        return self._key.salt + self._key.key
 
     def change_passphrase(self, ask: Ask, *, costs: Costs = PRODUCT) -> None:
         """Seal the same keys under a new passphrase. Copies and backups made before still open with the old one."""

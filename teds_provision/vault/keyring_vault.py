@@ -83,6 +83,10 @@ class KeyringVault(SoftwareVault):
             hint="Open the keyring of the user who ran init, or restore a backup (teds-provision restore).",
         )
 
+    def opener(self) -> bytes:
+        """Nothing that could be held beside what is asked for."""
+        return b""
+
     def change_passphrase(self, ask: Ask) -> None:
         """Refuse: the keyring asks for its own passphrase. Raises VaultFailure always."""
         raise VaultFailure(

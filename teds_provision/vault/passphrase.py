@@ -110,9 +110,27 @@ def unseal(passphrase: str, sealed: Mapping[str, Any], *, context: bytes) -> tup
     Raises WrongPassphrase if the tag does not hold (wrong passphrase, or the object was changed: these cannot be told
     apart), VaultFailure if it is not a sealed object at all.
     """
-    from cryptography.exceptions import InvalidTag
-    from cryptography.hazmat.primitives.ciphers.aead import AESGCM
+    costs, salt, _, _ = _parts(sealed)
+    key = SealingKey.derive(passphrase, costs=costs, salt=salt)
+    opened = _decrypted(key, sealed, context)
+    if opened is None:
+        raise WrongPassphrase(
+            "The passphrase does not open the sealed file, or the file was changed.",
+            hint="Try again; mind the keyboard layout.",
+        )
+    return opened, key
 
+
+def unseal_with(held: bytes, sealed: Mapping[str, Any], *, context: bytes) -> tuple[bytes, SealingKey] | None:
+    """As :func:`unseal`, by salt ‖ key (32 octets) instead of the passphrase; None where they are of another one."""
+    costs, salt, _, _ = _parts(sealed)
+    key = SealingKey(costs, held[:-_KEY_OCTETS], held[-_KEY_OCTETS:])
+    opened = _decrypted(key, sealed, context) if key.salt == salt else None
+    return None if opened is None else (opened, key)
+
+
+def _parts(sealed: Mapping[str, Any]) -> tuple[Costs, bytes, bytes, bytes]:
+    """Costs, salt, nonce and ciphertext of a sealed object; raises VaultFailure where it is none."""
     try:
         known = (sealed["kdf"], sealed["cipher"]) == ("argon2id", "aes-256-gcm")
         costs = Costs(int(sealed["memory_kib"]), int(sealed["iterations"]), int(sealed["lanes"]))
@@ -123,14 +141,18 @@ def unseal(passphrase: str, sealed: Mapping[str, Any], *, context: bytes) -> tup
         known and costs.bounded() and 8 <= len(salt) <= 64 and len(nonce) == _NONCE_OCTETS and len(ciphertext) > 16
     ):
         raise VaultFailure("What should be sealed under a passphrase is damaged.", hint="Restore a backup of it.")
-    key = SealingKey.derive(passphrase, costs=costs, salt=salt)
+    return costs, salt, nonce, ciphertext
+
+
+def _decrypted(key: SealingKey, sealed: Mapping[str, Any], context: bytes) -> bytes | None:
+    from cryptography.exceptions import InvalidTag
+    from cryptography.hazmat.primitives.ciphers.aead import AESGCM
+
+    _, _, nonce, ciphertext = _parts(sealed)
     try:
-        return AESGCM(key.key).decrypt(nonce, ciphertext, context), key
+        return AESGCM(key.key).decrypt(nonce, ciphertext, context)
     except InvalidTag:
-        raise WrongPassphrase(
-            "The passphrase does not open the sealed file, or the file was changed.",
-            hint="Try again; mind the keyboard layout.",
-        ) from None
+        return None
 
 
 def check_new(passphrase: str) -> None:

@@ -128,6 +128,10 @@ class Pkcs11Vault:
         """Return the numbers of the master keys, ascending; the last one wraps."""
         return tuple(sorted(self._content.masters.keys))
 
+    def opener(self) -> bytes:
+        """Nothing that could be held beside what is asked for."""
+        return b""
+
     def change_passphrase(self, ask: Ask) -> None:
         """Have the token set a new PIN; it asks for the old one. Raises WrongPassphrase, VaultFailure."""
         old, new = ask("PIN of the token, as it is now", False), ask("New PIN of the token", True)

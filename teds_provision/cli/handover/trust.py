@@ -251,6 +251,7 @@ def export(app: App, file: Path) -> None:
     The vault keeps it until "trust ca drop".
     """
     station = app.station()
+    station.use_agent = False  # who walks up to an unlocked desk shall not take the CA key along
     vault = station.vault
     passphrase = app.ask_secret("New passphrase for the CA key's file", confirm=True)
     with station.lock("trust ca export", app.note):

@@ -13,6 +13,7 @@ from teds_provision.cli.context import App, pass_app
 from teds_provision.cli.options import command, yes_option
 from teds_provision.errors import TedsProvisionError, UsageFailure
 from teds_provision.files import read_limited, require_new, write_new
+from teds_provision.vault.agent import asking
 
 if TYPE_CHECKING:
     from teds_provision.station.station import Station
@@ -66,9 +67,14 @@ def init(
             "why": why,
         },
         f"Station  {station.name}\n  key      {station.fingerprint[:16]}\n  CA key   {ca[:16]}\n"
-        f"  keystore {station.identity.keystore} ({why})\n  home     {app.home}\n\n"
+        f"  keystore {station.identity.keystore} ({why}){_open_for(app)}\n  home     {app.home}\n\n"
         f"{protocol.keys.to_pem(station.point)}",
     )
+
+
+def _open_for(app: App) -> str:
+    left = asking.seconds_left(app.home)
+    return "" if left is None else f", held open for {left // 60 + 1} min more (teds-provision lock)"
 
 
 def _require_same(station: Station, name: str | None, keystore: str | None) -> None:

@@ -7,6 +7,7 @@ import click
 from teds_provision import station as station_room
 from teds_provision.cli.context import App, pass_app, read_line
 from teds_provision.cli.options import COMMAND_SETTINGS, dry_run_option, examples, yes_option
+from teds_provision.vault.agent import asking
 
 
 @click.group(
@@ -39,6 +40,7 @@ def passphrase(app: App, new_passphrase_fd: int | None, dry_run: bool) -> None:
     if dry_run:
         app.emit({"keystore": kind, "rewrapped": 0, "plan": True}, f"Plan: a new passphrase for the {kind} keystore.")
         return
+    station.use_agent = False  # who walks up to an unlocked desk shall not lock its owner out
     opened = station.vault
 
     def ask(prompt: str, confirm: bool) -> str:
@@ -48,6 +50,7 @@ def passphrase(app: App, new_passphrase_fd: int | None, dry_run: bool) -> None:
     with station.lock("vault passphrase", app.note):
         opened.change_passphrase(ask)
         station.audit("vault", None, "new passphrase")
+        asking.lock(app.home)  # what is held open is of the old one
     app.emit(
         {"keystore": kind, "rewrapped": 0},
         f"{opened.description} opens with the new passphrase. Copies and backups made before open with the old one.",

@@ -1,0 +1,200 @@
+"""``unlock`` and ``lock``: asked once, held in memory alone, gone in time, and for nobody else."""
+
+from __future__ import annotations
+
+import os
+import signal
+import socket
+import threading
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+
+from teds_provision.cli.main import run as in_process
+from teds_provision.vault import forget_vaults
+from teds_provision.vault.agent import asking, holding
+from tests.cli.shell import Outcome, clean_environment, spawn
+from tests.vault.softhsm import PIN, loaded, unload
+from tests.workflow.bench import PASSPHRASE, make_station
+
+NODE = "0102030405060708090a"
+NEW = "four other random words"
+
+
+@pytest.fixture
+def home(tmp_path: Path) -> Iterator[Path]:
+    forget_vaults()
+    make_station(tmp_path / "home").close()
+    yield tmp_path / "home"
+    asking.lock(tmp_path / "home")
+    forget_vaults()
+
+
+def run(home: Path, *words: str, passphrase: str | None = None) -> Outcome:
+    """A command in a process of its own; without a passphrase nobody can be asked."""
+    return spawn("--json", "--home", home, *words, passphrase=passphrase)
+
+
+def opens(home: Path, node: str = NODE) -> int:
+    """Exit code of a command that needs the vault, and asks nobody."""
+    return run(home, "whitelist", "add", node, "--fingerprint", "ab" * 32).code
+
+
+def process_of(home: Path) -> int:
+    with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as line:
+        line.connect(str(home / asking.SOCKET))
+        return int.from_bytes(line.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, 12)[:4], "little")
+
+
+def wait_until(holds: Callable[[], bool], seconds: float = 20) -> None:
+    until = time.monotonic() + seconds
+    while not holds():
+        assert time.monotonic() < until
+        time.sleep(0.02)
+
+
+def test_asked_once_and_closed_by_lock(home: Path) -> None:
+    assert opens(home) == 7
+    assert not run(home, "lock").json["was_open"]
+    said = run(home, "unlock", "--for", "10m", passphrase=PASSPHRASE)
+    assert said.code == 0, said
+    assert said.json["unlocked"]
+    assert (home / asking.SOCKET).stat().st_mode & 0o777 == 0o600
+    assert 500 < (asking.seconds_left(home) or 0) <= 600
+    assert [opens(home) for _ in range(2)] == [0, 0]
+    (seen,) = [check for check in run(home, "doctor").json["checks"] if check["name"] == "unlock"]
+    assert (seen["result"], seen["fix"]) == ("warning", "teds-provision lock")
+    assert "held open" in spawn("--home", home, "init").out
+    assert run(home, "lock").json == {"locked": True, "was_open": True}
+    assert not (home / asking.SOCKET).exists()
+    assert opens(home, "0f" * 10) == 7
+    acts = [
+        (entry["outcome"], entry["detail"]) for entry in run(home, "log").json["entries"] if entry["act"] == "vault"
+    ]
+    assert acts == [("unlocked", {"seconds": 600}), ("locked", {})]
+
+
+def test_it_ends_by_itself_at_the_time(home: Path) -> None:
+    assert run(home, "unlock", "--for", "1s", passphrase=PASSPHRASE).code == 0
+    wait_until(lambda: not (home / asking.SOCKET).exists())
+    assert opens(home) == 7
+
+
+def test_a_machine_that_slept_finds_it_closed(home: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The clock ran on while the wait stood still: the next one who asks gets nothing."""
+    clock = [100.0]
+    monkeypatch.setattr(holding, "_now", lambda: clock[0])
+    page = page_with(b"Fsecret")
+    listener = holding._listening(home / asking.SOCKET)
+    thread = threading.Thread(target=holding.serve, args=(listener, page, 200.0))
+    thread.start()
+    assert asking.held(home, "file") == b"secret"
+    assert asking.held(home, "pkcs11") is None
+    clock[0] = 201.0
+    assert asking.held(home, "file") is None
+    thread.join(10)
+    listener.close()
+    assert not thread.is_alive()
+    assert bytes(page.view()) == b""
+
+
+def test_another_user_at_either_end_gets_nothing(home: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    page = page_with(b"Fsecret")
+    listener = holding._listening(home / asking.SOCKET)
+    thread = threading.Thread(target=holding.serve, args=(listener, page, holding._now() + 60))
+    thread.start()
+    for module in (asking, holding):
+        with monkeypatch.context() as patch:
+            patch.setattr(module, "user_at", lambda line: os.geteuid() + 1)
+            assert asking.held(home, "file") is None
+            assert not asking.lock(home)
+    assert asking.held(home, "file") == b"secret"
+    assert asking.lock(home)
+    thread.join(10)
+    listener.close()
+
+
+def test_the_process_keeps_its_secret(home: Path) -> None:
+    """No core dump, its page locked, nothing in its arguments or environment, no stream of whoever started it."""
+    assert run(home, "unlock", passphrase=PASSPHRASE).code == 0
+    proc = Path("/proc") / str(process_of(home))
+    limits = next(line for line in (proc / "limits").read_text().splitlines() if line.startswith("Max core file size"))
+    assert limits.split()[4:6] == ["0", "0"]
+    locked = next(line for line in (proc / "status").read_text().splitlines() if line.startswith("VmLck"))
+    assert int(locked.split()[1]) >= 4
+    assert PASSPHRASE.encode() not in (proc / "cmdline").read_bytes()
+    assert {os.readlink(proc / "fd" / str(number)) for number in (0, 1, 2)} == {"/dev/null"}
+
+
+def test_a_killed_one_is_none_and_is_replaced(home: Path) -> None:
+    assert run(home, "unlock", passphrase=PASSPHRASE).code == 0
+    os.kill(process_of(home), signal.SIGKILL)
+    wait_until(lambda: asking.seconds_left(home) is None)
+    assert opens(home) == 7
+    assert run(home, "unlock", passphrase=PASSPHRASE).code == 0
+    first = process_of(home)
+    assert run(home, "unlock", "--for", "1h", passphrase=PASSPHRASE).code == 0
+    assert process_of(home) != first
+    assert opens(home) == 0
+    os.kill(process_of(home), signal.SIGTERM)
+    wait_until(lambda: not (home / asking.SOCKET).exists())
+
+
+def test_what_changes_or_takes_the_keys_along_asks_all_the_same(home: Path, tmp_path: Path) -> None:
+    assert run(home, "unlock", passphrase=PASSPHRASE).code == 0
+    assert run(home, "vault", "passphrase").code == 7
+    assert run(home, "trust", "ca", "export", str(tmp_path / "ca.pem")).code == 7
+    assert asking.seconds_left(home)
+
+
+def test_a_new_passphrase_ends_it(home: Path) -> None:
+    assert run(home, "unlock", passphrase=PASSPHRASE).code == 0
+    read, write = os.pipe()
+    os.write(write, f"{PASSPHRASE}\n{NEW}\n".encode())
+    os.close(write)
+    new, more = os.pipe()
+    os.write(more, NEW.encode() + b"\n")
+    os.close(more)
+    words = ["--passphrase-fd", str(read), "vault", "passphrase", "--new-passphrase-fd", str(new)]
+    assert in_process(["--home", str(home), *words]) == 0
+    assert asking.seconds_left(home) is None
+    assert opens(home) == 7
+    assert run(home, "unlock", passphrase=PASSPHRASE).code == 7
+    assert run(home, "unlock", passphrase=NEW).code == 0
+    assert opens(home) == 0
+
+
+@pytest.mark.system
+def test_a_token_is_asked_for_its_pin_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    uri = loaded(tmp_path, monkeypatch, ("bench",))["bench"]
+    home = tmp_path / "home"
+    more = clean_environment()
+
+    def at_token(*words: str, passphrase: str | None = None) -> Outcome:
+        return spawn("--json", "--home", home, *words, passphrase=passphrase, environment=more)
+
+    try:
+        assert at_token("init", "--keystore", uri, passphrase=PIN).code == 0
+        assert at_token("whitelist", "add", NODE).code == 7
+        assert at_token("unlock", passphrase=PIN).json["keystore"] == "pkcs11"
+        assert at_token("whitelist", "add", NODE).code == 0
+    finally:
+        asking.lock(home)
+        unload()
+
+
+@pytest.mark.parametrize("span", ["", "15", "0m", "13h", "soon"])
+def test_a_span_that_is_none_is_usage(home: Path, span: str) -> None:
+    assert run(home, "unlock", "--for", span, passphrase=PASSPHRASE).code == 2
+
+
+def page_with(secret: bytes) -> holding.Page:
+    read, write = os.pipe()
+    os.write(write, secret)
+    os.close(write)
+    page = holding.Page()
+    page.read(read)
+    os.close(read)
+    return page
