@@ -28,6 +28,7 @@ unit: $(VENV)/.dev
 
 bench: $(VENV)/.dev
 	$(BIN)/python -m benchmarks.provisioning
+	$(BIN)/python -m benchmarks.commands
 
 bench-teds: $(VENV)/.dev
 	$(BIN)/python -m benchmarks.teds_codec

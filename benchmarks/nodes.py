@@ -1,7 +1,9 @@
-"""The other side of the provisioning benchmark: virtual nodes, one after the other on one reader or bus.
+"""The other side of the provisioning benchmarks: virtual nodes, one after the other on one reader or bus, or many.
 
-Started as a process of its own: ``python -m benchmarks.nodes nfc|can LINK [--pace] [--wait-time N]``. For every line on
-stdin it takes the present node away and puts a new one down; it answers each with the node's UUID.
+Started as a process of its own: ``python -m benchmarks.nodes nfc|can LINK [--pace] [--tag 2] [--crypto-delay MS]``. For
+every line on stdin it takes the present node away and puts a new one down, and answers with two words: the node's UUID,
+and how many point operations (signatures, ECDH, checks of signatures; one-time keys are made in idle time) the node
+before it did. With ``--many N`` there are N nodes on a bus at once, until stdin closes.
 """
 
 from __future__ import annotations
@@ -10,11 +12,62 @@ import argparse
 import sys
 import tempfile
 from pathlib import Path
+from typing import Literal
 
 from teds_provision.node.can.server import CanServer
 from teds_provision.node.flash_file import FlashFile
 from teds_provision.node.nfc.server import NfcServer
-from teds_provision.node.virtual import VirtualNode
+from teds_provision.node.virtual import Delays, VirtualNode
+
+TAGS: dict[str, Literal["2", "4"]] = {"2": "2", "4": "4"}
+
+
+class CountingNode(VirtualNode):
+    """A virtual node that counts its point operations."""
+
+    operations = 0
+
+    def _work(self) -> None:
+        self.operations += 1
+        super()._work()
+
+
+def made(folder: Path, delay: float) -> CountingNode:
+    """A new node in factory state; ``delay`` seconds a point operation."""
+    FlashFile.create(folder)
+    return CountingNode(folder, delays=Delays(crypto=delay))
+
+
+def one_after_the_other(options: argparse.Namespace, place: Path) -> None:
+    """A line in, another node."""
+    server: NfcServer | CanServer | None = None
+    node: CountingNode | None = None
+    for number, _ in enumerate(sys.stdin):
+        if server is not None:
+            server.stop()
+        operations = node.operations if node is not None else 0
+        node = made(place / str(number), options.crypto_delay / 1000)
+        if options.via == "nfc":
+            tag = TAGS[options.tag]
+            server = NfcServer(options.link, node, tag=tag, wt_int=options.wait_time, pace=options.pace)
+        else:
+            server = CanServer(options.link, node, counts_as_tapped=node.in_factory_state)
+        server.start()
+        print(node.tim.flash.uuid.hex(), operations, flush=True)
+    if server is not None:
+        server.stop()
+
+
+def all_at_once(options: argparse.Namespace, place: Path) -> None:
+    """So many nodes on one bus; their UUIDs in one line when they listen."""
+    server = CanServer(options.link)
+    nodes = [made(place / str(number), options.crypto_delay / 1000) for number in range(options.many)]
+    for node in nodes:
+        server.add(node, counts_as_tapped=node.in_factory_state)
+    server.start()
+    print(*(node.tim.flash.uuid.hex() for node in nodes), flush=True)
+    sys.stdin.read()
+    server.stop()
 
 
 def main() -> None:
@@ -23,23 +76,12 @@ def main() -> None:
     parser.add_argument("link")
     parser.add_argument("--pace", action="store_true")
     parser.add_argument("--wait-time", type=int, default=4)
+    parser.add_argument("--tag", choices=sorted(TAGS), default="4")
+    parser.add_argument("--crypto-delay", type=float, default=0)
+    parser.add_argument("--many", type=int, default=0)
     options = parser.parse_args()
-    server: NfcServer | CanServer | None = None
     with tempfile.TemporaryDirectory() as folder:
-        for number, _ in enumerate(sys.stdin):
-            if server is not None:
-                server.stop()
-            home = Path(folder) / str(number)
-            FlashFile.create(home)
-            node = VirtualNode(home)
-            if options.via == "nfc":
-                server = NfcServer(options.link, node, wt_int=options.wait_time, pace=options.pace)
-            else:
-                server = CanServer(options.link, node, counts_as_tapped=node.in_factory_state)
-            server.start()
-            print(node.tim.flash.uuid.hex(), flush=True)
-        if server is not None:
-            server.stop()
+        (all_at_once if options.many else one_after_the_other)(options, Path(folder))
 
 
 if __name__ == "__main__":

@@ -1,8 +1,10 @@
-"""How long a node takes from tap to verified, how much of it is the tool's own, and how fast the tool starts.
+"""One node from first Identify to verdict, in this process: what of it is the tool, the link, the node, the disk.
 
-``python -m benchmarks.provisioning [--nodes 100]``: prints everything from one run on one machine, so that ratios can
-be compared; nothing here is a test. Nodes are virtual, in a process of their own, with no delays for cryptography or
-flash; the station lives in this process. "Link" is the time inside ``Link.exchange``, "own" everything else.
+``python -m benchmarks.provisioning [--nodes 15]``: everything from one run on one machine, as ratios; nothing here is a
+test. Nodes are virtual, in a process of their own; paced links last as long as real ones. Of each row: *find* (until the
+node is known), *link* (the least that its octets occupy the wire), *node* (point operations × their delay), *disk* (time
+in COMMIT), *tool* (everything in this process that is neither exchange nor COMMIT), and *rest*: turnarounds, both ends'
+drivers, the scheduler. The ratio is the whole, find included, to link + node.
 """
 
 from __future__ import annotations
@@ -16,50 +18,51 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
+from benchmarks import limits
 from teds_provision.links import Capabilities, Contact, LinkSettings, Notice, open_port
-from teds_provision.links.can.pacing import classic_bits
-from teds_provision.node.nfc.air import answer_seconds, command_seconds
+from teds_provision.protocol.announce import default_can_address
 from teds_provision.station.station import Station, initialise
 from teds_provision.steps.build import BuildOrder
+from teds_provision.steps.order import prepare
 from teds_provision.steps.provision import provision
+from teds_provision.store.database import Database
 from teds_provision.talk.conversation import Conversation
 from teds_provision.talk.progress import Silent
 from teds_provision.vault.passphrase import THROWAWAY
 
-PROFILE = BuildOrder("magnetic-angular-position-sensor")
-FRAME_DELAY = (9 * 128 + 84 + 1172) / 13.56e6  # seconds: ISO/IEC 14443-3 clause 6.2, both directions
-RECORD, STATUS = 40, 6  # octets: header, type and piece header of the payload record; the Te record
-LARGEST_APDU_DATA = 248
+PROFILE = "magnetic-angular-position-sensor"
+SLOW = 0.08
 
 
 @dataclass
 class Timed:
     """A link that counts: seconds inside exchange, and the octets of every request and reply."""
 
-    inner: object
+    inner: Any
     seconds: float = 0.0
     sizes: list[tuple[int, int]] = field(default_factory=list)
 
     @property
     def via(self) -> str:
         """As the link says."""
-        return str(self.inner.via)  # type: ignore[attr-defined]
+        return str(self.inner.via)
 
     @property
     def capabilities(self) -> Capabilities:
         """As the link says."""
-        return self.inner.capabilities  # type: ignore[attr-defined, no-any-return]
+        return self.inner.capabilities  # type: ignore[no-any-return]
 
     def exchange(self, frame: bytes) -> bytes:
         """Exchange, with a watch on it."""
         began = time.perf_counter()
         try:
-            reply: bytes = self.inner.exchange(frame)  # type: ignore[attr-defined]
+            reply: bytes = self.inner.exchange(frame)
         finally:
             self.seconds += time.perf_counter() - began
         self.sizes.append((len(frame), len(reply)))
@@ -67,55 +70,89 @@ class Timed:
 
     def close(self) -> None:
         """Close the link."""
-        self.inner.close()  # type: ignore[attr-defined]
+        self.inner.close()
+
+
+@dataclass
+class Disk:
+    """Seconds and number of COMMITs since it was last asked."""
+
+    seconds: float = 0.0
+    commits: int = 0
+
+    def watch(self) -> None:
+        """Have every COMMIT of this process counted from now on."""
+        plain = Database.execute
+
+        def execute(database: Database, statement: str, values: Any = ()) -> list[tuple[Any, ...]]:
+            if statement != "COMMIT":
+                return plain(database, statement, values)
+            began = time.perf_counter()
+            try:
+                return plain(database, statement, values)
+            finally:
+                self.seconds += time.perf_counter() - began
+                self.commits += 1
+
+        Database.execute = execute  # type: ignore[method-assign]
+
+    def taken(self) -> tuple[float, int]:
+        """What came together, and begin anew."""
+        both = self.seconds, self.commits
+        self.seconds, self.commits = 0.0, 0
+        return both
 
 
 @dataclass(frozen=True)
 class Run:
-    """One node: seconds from its first Identify to the verdict, seconds inside the link, and the link's limit."""
+    """One node. Seconds; ``operations`` are those of the node's chip."""
 
-    seconds: float
+    find: float
+    whole: float
     link: float
-    limit: float
+    least: float
+    disk: float
+    commits: int
+    operations: int
     authentic: bool
 
-
-def can_limit(sizes: list[tuple[int, int]]) -> float:
-    """Seconds that all frames of these exchanges occupy a classic CAN bus of 500 kbit/s."""
-    bits = classic_bits(0x18DA21F1, bytes(range(8)))
-    return sum(_can_frames(size + 1) for pair in sizes for size in pair) * bits / 500_000
-
-
-def _can_frames(octets: int) -> int:
-    if octets <= 7:
-        return 1
-    consecutive = -(-(octets - 6) // 7)
-    return 1 + consecutive + 1 + (consecutive - 1) // 16
+    @property
+    def tool(self) -> float:
+        """Seconds that this process took beside the link and the disk."""
+        return self.whole - self.link - self.disk
 
 
-def nfc_limit(sizes: list[tuple[int, int]]) -> float:
-    """Seconds that these exchanges take on a Type 4 tag at 106 kbit/s, waiting times and presence checks left out."""
+@dataclass(frozen=True)
+class Line:
+    """What one row of the table measures. ``limit`` gives the least seconds of the octets, None for unpaced links."""
 
-    def block(there: int, back: int) -> float:
-        command = bytes(there + 1)
-        return command_seconds(command) + FRAME_DELAY + answer_seconds(command, bytes(back + 1))
-
-    total = 0.0
-    for request, reply in sizes:
-        for octets in _cut(2 + RECORD + request):
-            total += block(5 + octets, 2)
-        total += block(5, 4)
-        for octets in _cut(RECORD + STATUS + reply):
-            total += block(5, octets + 2)
-    return total
+    title: str
+    via: str
+    words: tuple[str, ...] = ()
+    limit: Callable[[limits.Sizes], float] | None = None
+    options: str = ""
+    delay: float = 0.0
+    aim: float | None = None
+    named: bool = False
 
 
-def _cut(octets: int) -> list[int]:
-    return [min(LARGEST_APDU_DATA, octets - at) for at in range(0, octets, LARGEST_APDU_DATA)]
+LINES = (
+    Line("NFC Type 4", "nfc"),
+    Line("NFC Type 4, 106 kbit/s", "nfc", ("--pace",), limits.type4, aim=1.10),
+    Line("NFC Type 4, 106 kbit/s, slow chip", "nfc", ("--pace",), limits.type4, delay=SLOW),
+    Line("NFC Type 2, 106 kbit/s", "nfc", ("--pace", "--tag", "2")),
+    Line("CAN", "can"),
+    Line("CAN 500 kbit/s", "can", (), limits.classic, "&pace=1", aim=1.15),
+    Line("CAN 500 kbit/s, named by UUID", "can", (), limits.classic, "&pace=1", aim=1.15, named=True),
+    Line("CAN FD 500k/2M", "can", (), limits.fd, "&pace=1&fd=1", aim=1.5),
+    Line("CAN FD 500k/2M, named by UUID", "can", (), limits.fd, "&pace=1&fd=1", aim=1.5, named=True),
+    Line("CAN 500 kbit/s, slow chip", "can", (), limits.classic, "&pace=1", SLOW),
+)
 
 
 @contextmanager
 def nodes(via: str, link: str, *extra: str) -> Iterator[subprocess.Popen[str]]:
+    """The process with the nodes, until the block ends."""
     process = subprocess.Popen(
         [sys.executable, "-m", "benchmarks.nodes", via, link, *extra],
         stdin=subprocess.PIPE,
@@ -127,107 +164,125 @@ def nodes(via: str, link: str, *extra: str) -> Iterator[subprocess.Popen[str]]:
     finally:
         assert process.stdin is not None
         process.stdin.close()
-        process.wait(10)
+        process.wait(20)
 
 
-def next_node(process: subprocess.Popen[str]) -> bytes:
+def next_node(process: subprocess.Popen[str]) -> tuple[bytes, int]:
+    """Put another node down: its UUID, and the point operations of the one before."""
     assert process.stdin is not None
     assert process.stdout is not None
     process.stdin.write("\n")
     process.stdin.flush()
-    return bytes.fromhex(process.stdout.readline())
+    uuid, operations = process.stdout.readline().split()
+    return bytes.fromhex(uuid), int(operations)
 
 
-def measure(station: Station, settings: LinkSettings, count: int, *extra: str) -> list[Run]:
+def measure(station: Station, disk: Disk, line: Line, count: int) -> list[Run]:
     """Provision ``count`` new nodes, one after the other."""
-    limit_of = nfc_limit if settings.via == "nfc" else can_limit
-    link = settings.nfc if settings.via == "nfc" else settings.can
-    assert link is not None
-    runs = []
-    with nodes(settings.via, link, *extra) as process:
+    if line.via == "nfc":
+        link = f"udp:127.0.0.1:{free_port()}"
+        settings = LinkSettings("nfc", nfc=link)
+    else:
+        link = f"udp_multicast:239.74.163.9?port={free_port()}{line.options}"
+        settings = LinkSettings("can", can=link)
+    runs: list[Run] = []
+    order = prepare(station, BuildOrder(PROFILE))  # before the tap, as the command does
+    words = (*line.words, *(("--crypto-delay", str(line.delay * 1000)) if line.delay else ()))
+    with nodes(line.via, link, *words) as process:
         port = open_port(settings)
         try:
-            for _ in range(count):
-                uuid = next_node(process)
-                contact = port.find(lambda identity, uuid=uuid: identity.uuid == uuid, seconds=20, notice=_quiet)
+            for number in range(count + 1):
+                uuid, operations = next_node(process)
+                if runs:
+                    runs[-1] = _with(runs[-1], operations)
+                if number == count:
+                    break
+                time.sleep(0.7 if line.via == "can" else 0.0)  # its Announce, which is no part of this
+                disk.taken()
                 began = time.perf_counter()
+                address = default_can_address(uuid) if line.named else None
+                contact = port.find(
+                    lambda identity, uuid=uuid: identity.uuid == uuid, seconds=20, notice=_quiet, address=address
+                )
+                found = time.perf_counter()
                 timed = Timed(contact.link)
                 known = Contact(contact.identity, timed, contact.tag_uid, contact.address)
                 with Conversation(known, notice=_quiet) as node:
-                    done = provision(station, node, PROFILE, accept=lambda who: None, reporter=Silent())
-                    seconds = time.perf_counter() - began
-                authentic = done.verified.verdict == "authentic"
-                runs.append(Run(seconds, timed.seconds, limit_of(timed.sizes), authentic))
+                    done = provision(station, node, order, accept=lambda who: None, reporter=Silent())
+                ended = time.perf_counter()
+                seconds, commits = disk.taken()
+                least = line.limit(timed.sizes) if line.limit else 0.0
+                good = done.verified.verdict == "authentic"
+                runs.append(Run(found - began, ended - found, timed.seconds, least, seconds, commits, 0, good))
         finally:
             port.close()
     return runs
+
+
+def _with(run: Run, operations: int) -> Run:
+    return Run(run.find, run.whole, run.link, run.least, run.disk, run.commits, operations, run.authentic)
 
 
 def _quiet(notice: Notice) -> None:
     return None
 
 
-def report(title: str, runs: list[Run], *, limit: bool = False) -> None:
-    total = statistics.median(run.seconds for run in runs) * 1e3
-    own = statistics.median(run.seconds - run.link for run in runs) * 1e3
-    line = f"{title:<34} {total:7.0f} ms per node, tool's own {own:5.0f} ms"
-    if limit:
-        least = statistics.median(run.limit for run in runs) * 1e3
-        line += f", link's limit {least:5.0f} ms, ratio {total / least:.2f}"
-    failures = sum(not run.authentic for run in runs)
-    print(f"{line}{f', {failures} FAILED' if failures else ''}", flush=True)
+HEAD = (
+    f"{'one node, in ms (median)':<36}{'find':>6}{'whole':>8}{'spread':>12}{'tool':>7}{'disk':>7}{'link':>7}"
+    f"{'node':>7}{'rest':>7}{'ratio':>8}  aim"
+)
 
 
-def start_up() -> None:
-    """Median of ten, beside the least that a click program can take."""
+def report(line: Line, runs: list[Run]) -> None:
+    """Print one row."""
 
-    def median(*command: str) -> float:
-        times = []
-        for _ in range(10):
-            began = time.perf_counter()
-            subprocess.run(command, check=True, capture_output=True)
-            times.append(time.perf_counter() - began)
-        return statistics.median(times) * 1e3
+    def median(of: Callable[[Run], float]) -> float:
+        return statistics.median(of(run) for run in runs)
 
-    python = sys.executable
-    floor = median(python, "-c", "import click")
-    for name in ("--help", "--version"):
-        took = median(python, "-m", "teds_provision", name)
-        print(f"{name:<34} {took:7.0f} ms, bare import click {floor:.0f} ms, ratio {took / floor:.2f}", flush=True)
+    find, whole, least = median(lambda r: r.find), median(lambda r: r.whole), median(lambda r: r.least)
+    tool, disk, operations = median(lambda r: r.tool), median(lambda r: r.disk), median(lambda r: r.operations)
+    chip = operations * line.delay
+    rest = whole - tool - disk - least - chip
+    floor = least + chip
+    ratio = (find + whole) / floor if least else None
+    spread = f"{min(r.whole for r in runs) * 1e3:.0f}-{max(r.whole for r in runs) * 1e3:.0f}"
+    cells = "".join(f"{value * 1e3:>7.0f}" for value in (tool, disk, least, chip, rest))
+    told = f"{ratio:.2f}" if ratio is not None else "-"
+    aim = "" if line.aim is None or ratio is None else f"{line.aim:.2f} {'met' if ratio <= line.aim else 'MISSED'}"
+    failed = sum(not run.authentic for run in runs)
+    bad = f"  {failed} FAILED" if failed else ""
+    print(f"{line.title:<36}{find * 1e3:>6.0f}{whole * 1e3:>8.0f}{spread:>12}{cells}{told:>8}  {aim}{bad}", flush=True)
 
 
-def main() -> None:
+def main(words: list[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--nodes", type=int, default=100, help="nodes of the tap-after-tap run")
-    options = parser.parse_args()
+    parser.add_argument("--nodes", type=int, default=11, help="nodes a row")
+    options = parser.parse_args(words)
     secret = secrets.token_hex(8)
-    start_up()
-    with tempfile.TemporaryDirectory() as folder:
+    with tempfile.TemporaryDirectory(dir=os.environ.get("BENCH_DISK")) as folder:
         station, _ = initialise(
             Path(folder) / "home", name="bench", keystore="file", ask=lambda p, c: secret, costs=THROWAWAY
         )
-        nfc = LinkSettings("nfc", nfc=f"udp:127.0.0.1:{_port()}")
-        can = LinkSettings("can", can=f"udp_multicast:239.74.163.9?port={_port()}")
-        measure(station, nfc, 1)  # loads libraries and caches once, as --watch does
-        report("NFC Type 4, t_wait 1 ms", measure(station, nfc, 15))
-        report("NFC Type 4, t_wait 16 ms", measure(station, nfc, 10, "--wait-time", "20"))
-        report("CAN, udp_multicast", measure(station, can, 15))
-        report("NFC Type 4, paced at 106 kbit/s", measure(station, nfc, 5, "--pace"), limit=True)
-        paced = LinkSettings("can", can=f"udp_multicast:239.74.163.9?port={_port()}&pace=1")
-        report("CAN, paced at 500 kbit/s", measure(station, paced, 5), limit=True)
-        began = time.perf_counter()
-        runs = measure(station, nfc, options.nodes)
-        took = time.perf_counter() - began
-        failures = sum(not run.authentic for run in runs)
-        each = statistics.mean(run.seconds for run in runs)
-        print(
-            f"{options.nodes} nodes tap after tap: {failures} failures, {3600 / each:.0f} nodes per hour of work, "
-            f"{3600 * len(runs) / took:.0f} with the making of each node and the change of taps"
-        )
+        disk = Disk()
+        disk.watch()
+        measure(station, disk, LINES[0], 2)  # loads libraries and caches once, as --watch does
+        print(HEAD)
+        own: list[float] = []
+        commits: list[int] = []
+        for line in LINES:
+            runs = measure(station, disk, line, options.nodes)
+            report(line, runs)
+            if line is LINES[0]:
+                own = [run.tool + run.disk for run in runs]
+                commits = [run.commits for run in runs]
+        share, count = statistics.median(own) * 1e3, statistics.median(commits)
+        met = "met" if share <= 10 and count <= 8 else "MISSED"
+        print(f"own share (tool and disk): {share:.1f} ms, {count:.0f} commits; aim 10 ms, 8 commits: {met}")
         station.close()
 
 
-def _port() -> int:
+def free_port() -> int:
+    """A UDP port that nobody uses now."""
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
         probe.bind(("127.0.0.1", 0))
         return int(probe.getsockname()[1])

@@ -1,0 +1,244 @@
+"""What a user waits for: the shipped commands as processes of their own, from start to verdict.
+
+``python -m benchmarks.commands [--only WORD] [--nodes 200]``: start-up, one ``provision`` warm and cold (nothing
+compiled yet), ``--watch`` with boards that change at once, eight readers, a whole bus. Passphrase and Argon2id as
+shipped, but where many run side by side. Slow nodes take 80 ms for every point operation; beside them stands the floor,
+operations counted × 80 ms.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import statistics
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
+from pathlib import Path
+
+from benchmarks.provisioning import PROFILE, SLOW, free_port, next_node, nodes
+from teds_provision.station.station import initialise
+from teds_provision.vault import forget_vaults
+from teds_provision.vault.passphrase import THROWAWAY
+
+PASSPHRASE = "correct horse battery"
+PROVISION = ("provision", "--profile", PROFILE, "--yes")
+READERS = 8
+_WAIT = 120.0
+
+
+class Rows:
+    """Prints lines: what was measured, what it came to, its aim and whether that is met."""
+
+    def tell(self, what: str, value: float, unit: str, *, aim: float | None = None, least: bool = False) -> None:
+        """One row; ``least``: the aim is a floor, not a ceiling."""
+        good = aim is None or (value >= aim if least else value <= aim)
+        sign = "≥" if least else "≤"
+        told = "" if aim is None else f"aim {sign} {aim:g}: {'met' if good else 'MISSED'}"
+        shown = f"{value:,.0f}" if value >= 100 else f"{value:.2f}"
+        print(f"{what:<58}{shown:>9} {unit:<9}{told}", flush=True)
+
+
+@contextmanager
+def station(*, quick: bool = False) -> Iterator[Path]:
+    """A home with a station; ``quick``: its passphrase costs next to nothing."""
+    forget_vaults()
+    with tempfile.TemporaryDirectory(dir=os.environ.get("BENCH_DISK")) as folder:
+        home = Path(folder) / "home"
+        costs = {"costs": THROWAWAY} if quick else {}
+        made, _ = initialise(home, name="bench", keystore="file", ask=lambda p, c: PASSPHRASE, **costs)  # type: ignore[arg-type]
+        made.close()
+        forget_vaults()
+        yield home
+
+
+def started(home: Path, *words: str, **environment: str) -> subprocess.Popen[str]:
+    """Start the command; the passphrase comes through a pipe."""
+    read, write = os.pipe()
+    os.write(write, PASSPHRASE.encode() + b"\n")
+    os.close(write)
+    command = [sys.executable, "-m", "teds_provision", "--home", str(home), "--json", "--passphrase-fd", str(read)]
+    process = subprocess.Popen(
+        [*command, *words],
+        stdin=subprocess.DEVNULL,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        pass_fds=(read,),
+        env={**os.environ, **environment},
+    )
+    os.close(read)
+    return process
+
+
+def finished(process: subprocess.Popen[str]) -> str:
+    """Wait for a command that has to succeed; returns what it printed."""
+    out, error = process.communicate(timeout=_WAIT)
+    if process.returncode != 0:
+        raise SystemExit(f"{process.args}\nexit {process.returncode}: {error}")
+    return out
+
+
+def start_up(rows: Rows) -> None:
+    """Median of ten, beside the least that a click program can take."""
+
+    def median(*command: str) -> float:
+        times = []
+        for _ in range(10):
+            began = time.perf_counter()
+            subprocess.run(command, check=True, capture_output=True)
+            times.append(time.perf_counter() - began)
+        return statistics.median(times)
+
+    floor = median(sys.executable, "-c", "import click")
+    rows.tell("import click, bare", floor * 1e3, "ms")
+    for name in ("--help", "--version"):
+        rows.tell(f"{name} against it", median(sys.executable, "-m", "teds_provision", name) / floor, "×", aim=1.4)
+
+
+def one_command(rows: Rows) -> None:
+    """``provision`` from start to verdict, Argon2id and all."""
+    for via, link, extra in (
+        ("nfc", f"udp:127.0.0.1:{free_port()}", ("--pace",)),
+        ("can", f"udp_multicast:239.74.163.9?port={free_port()}&pace=1", ()),
+    ):
+        for slow in (0.0, SLOW):
+            delay = ("--crypto-delay", str(slow * 1000)) if slow else ()
+            kind = f"{'slow' if slow else 'immediate'} node"
+            with station() as home, nodes(via, link, *extra, *delay) as process, tempfile.TemporaryDirectory() as empty:
+                for name, environment in (("cold", {"PYTHONPYCACHEPREFIX": empty}), ("warm", {})):
+                    taken = []
+                    for _ in range(1 if environment else 3):
+                        next_node(process)
+                        time.sleep(0.7)
+                        began = time.perf_counter()
+                        finished(started(home, *PROVISION, "--via", via, f"--{via}", link, **environment))
+                        taken.append(time.perf_counter() - began)
+                    rows.tell(f"provision over {via}, paced, {kind}, {name}", statistics.median(taken), "s")
+                _, operations = next_node(process)
+                if slow:
+                    rows.tell(f"  of it {operations} point operations", operations * slow, "s")
+
+
+def watching(rows: Rows) -> None:
+    """``provision --watch``, the next board put down as soon as the line about the last one is out."""
+    aims = {("nfc", 0.0): 15_000, ("nfc", SLOW): 2_200, ("can", 0.0): 30_000, ("can", SLOW): 3_500}
+    for (via, slow), aim in aims.items():
+        link = f"udp:127.0.0.1:{free_port()}" if via == "nfc" else f"udp_multicast:239.74.163.9?port={free_port()}"
+        delay = ("--crypto-delay", str(slow * 1000)) if slow else ()
+        count = 8 if slow else 25
+        with station(quick=True) as home, nodes(via, link, *delay) as process:
+            watch = started(home, *PROVISION, "--watch", "--via", via, f"--{via}", link)
+            assert watch.stdout is not None
+            began, operations = 0.0, 0
+            for number in range(count + 1):
+                _, operations = next_node(process)
+                passed = _next_board(watch)
+                if not passed:
+                    raise SystemExit("a board failed under --watch")
+                if number == 0:
+                    began = time.perf_counter()
+            each = (time.perf_counter() - began) / count
+            watch.terminate()
+            watch.communicate(timeout=_WAIT)
+        kind = f"{'80 ms' if slow else 'immediate'} nodes"
+        rows.tell(f"provision --watch over {via}, {kind}, changed at once", 3600 / each, "nodes/h", aim=aim, least=True)
+        if slow:
+            rows.tell(f"  floor of {operations} point operations", 3600 / (operations * slow), "nodes/h")
+
+
+def _next_board(watch: subprocess.Popen[str]) -> bool:
+    """Read lines until one tells of a board."""
+    assert watch.stdout is not None
+    for text in watch.stdout:
+        line = json.loads(text)
+        if "uuid" in line:
+            return _passed(line)
+    return False
+
+
+def _passed(line: dict[str, object]) -> bool:
+    return line.get("verdict") == "authentic"
+
+
+def eight_readers(rows: Rows) -> None:
+    """One ``--watch`` over eight readers against one reader; then eight commands on one store."""
+    slow = ("--crypto-delay", str(SLOW * 1000))
+
+    def side_by_side(home: Path, count: int) -> float:
+        links = [f"udp:127.0.0.1:{free_port()}" for _ in range(count)]
+        with ExitStack() as stack:
+            boards = [stack.enter_context(nodes("nfc", link, *slow)) for link in links]
+            watch = started(home, *PROVISION, "--watch", *(word for link in links for word in ("--nfc", link)))
+            next_node(boards[0])  # everything is loaded and unlocked with the first board
+            _next_board(watch)
+            began = time.perf_counter()
+            for board in boards:
+                next_node(board)
+            passed = sum(_next_board(watch) for _ in boards)
+            taken = time.perf_counter() - began
+            watch.terminate()
+            watch.communicate(timeout=_WAIT)
+            if passed != count:
+                raise SystemExit(f"{passed} of {count} boards passed")
+            return taken
+
+    with station(quick=True) as home:
+        one, all_of_them = side_by_side(home, 1), side_by_side(home, READERS)
+    rows.tell(f"--watch, one reader, 80 ms node ({READERS}: {all_of_them:.2f} s)", one, "s")
+    rows.tell(f"--watch, {READERS} readers against one", all_of_them / one, "×", aim=1.2)
+    with station(quick=True) as home, ExitStack() as stack:
+        links = [f"udp:127.0.0.1:{free_port()}" for _ in range(READERS)]
+        for link in links:
+            next_node(stack.enter_context(nodes("nfc", link, *slow)))
+        before, began = os.times(), time.perf_counter()
+        commands = [started(home, *PROVISION, "--nfc", link) for link in links]
+        for command in commands:
+            finished(command)
+        taken, after = time.perf_counter() - began, os.times()
+    cpu = after.children_user + after.children_system - before.children_user - before.children_system
+    rows.tell(f"{READERS} commands at once, wall", taken, "s")
+    cores = len(os.sched_getaffinity(0))
+    rows.tell(f"{READERS} commands at once against their CPU on {cores} cores", taken / (cpu / cores), "×", aim=1.2)
+
+
+def whole_bus(rows: Rows, count: int) -> None:
+    """``provision --all`` on a bus of ``count`` slow nodes in one process."""
+    for name, options, aim in (("500 kbit/s", "&pace=1", 65.0), ("FD 500k/2M", "&pace=1&fd=1", 15.0)):
+        link = f"udp_multicast:239.74.163.9?port={free_port()}{options}"
+        delay = ("--crypto-delay", str(SLOW * 1000))
+        with station(quick=True) as home, nodes("can", link, *delay, "--many", str(count)) as process:
+            assert process.stdout is not None
+            uuids = process.stdout.readline().split()
+            time.sleep(1.0)  # Announces
+            listed = home.parent / "list.csv"
+            listed.write_text("uuid\n" + "".join(f"{uuid}\n" for uuid in uuids))
+            finished(started(home, "whitelist", "import", str(listed)))
+            began = time.perf_counter()
+            lines = finished(started(home, *PROVISION, "--all", "--via", "can", "--can", link)).splitlines()
+            taken = time.perf_counter() - began
+        passed = sum(_passed(json.loads(line)) for line in lines)
+        aimed = aim if count == 200 else None
+        rows.tell(f"provision --all, {passed} of {count} slow nodes, {name}", taken, "s", aim=aimed)
+
+
+def main(words: list[str] | None = None) -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--only", default="", help="start_up, one_command, watching, eight_readers or whole_bus")
+    parser.add_argument("--nodes", type=int, default=200, help="nodes of the whole bus")
+    options = parser.parse_args(words)
+    rows = Rows()
+    for part in (start_up, one_command, watching, eight_readers):
+        if options.only in ("", part.__name__):
+            part(rows)
+    if options.only in ("", "whole_bus"):
+        whole_bus(rows, options.nodes)
+
+
+if __name__ == "__main__":
+    print(f"Python {sys.version.split()[0]}, {os.cpu_count()} cores, load {os.getloadavg()[0]:.1f}")
+    main()
