@@ -1,4 +1,4 @@
-"""What no tool can beat: how long the octets of an exchange occupy its link. Seconds; ``sizes`` are (request, reply)."""
+"""What no tool can beat: how long the octets of an exchange occupy its link; seconds, from (request, reply) sizes."""
 
 from __future__ import annotations
 

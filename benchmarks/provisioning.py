@@ -1,9 +1,9 @@
 """One node from first Identify to verdict, in this process: what of it is the tool, the link, the node, the disk.
 
-``python -m benchmarks.provisioning [--nodes 15]``: everything from one run on one machine, as ratios; nothing here is a
-test. Nodes are virtual, in a process of their own; paced links last as long as real ones. Of each row: *find* (until the
-node is known), *link* (the least that its octets occupy the wire), *node* (point operations × their delay), *disk* (time
-in COMMIT), *tool* (everything in this process that is neither exchange nor COMMIT), and *rest*: turnarounds, both ends'
+``python -m benchmarks.provisioning [--nodes 15]``: everything from one run on one machine, as ratios; nothing here is
+a test. Nodes are virtual, in a process of their own; paced links last as long as real ones. Of each row: *find* (until
+the node is known), *link* (the least that its octets occupy the wire), *node* (point operations × their delay), *disk*
+(time in COMMIT), *tool* (what in this process is neither exchange nor COMMIT), and *rest*: turnarounds, both ends'
 drivers, the scheduler. The ratio is the whole, find included, to link + node.
 """
 
