@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal, Protocol, runtime_checkable
 
 from teds_provision.links.hints import BleAddress, Charging
@@ -213,3 +213,12 @@ class LinkSettings:
         named = getattr(self, self.via, None)
         wheres = (named,) if isinstance(named, str) else named or ("",)
         return tuple(f"{self.via}:{where}" for where in wheres)
+
+    @property
+    def onward(self) -> str | None:
+        """The place to go on at once a key is agreed on: BLE, where a reader is named beside it; else None."""
+        return f"ble:{self.ble}" if self.via == "nfc" and self.nfc and self.ble else None
+
+    def after_agreeing(self) -> LinkSettings:
+        """The links of a command that needs no tap: BLE, where a reader is named beside it."""
+        return replace(self, via="ble") if self.onward else self

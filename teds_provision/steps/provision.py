@@ -26,6 +26,7 @@ from teds_provision.steps.write import Written, write
 from teds_provision.store import Draft, WhitelistEntry
 from teds_provision.store.records import Assurance
 from teds_provision.talk.conversation import Conversation
+from teds_provision.talk.onward import Onward, stay
 from teds_provision.talk.progress import DONE, NOTHING, Reporter, StepResult, Steps
 from teds_provision.teds.calibration.describe import sentence
 from teds_provision.teds.image import SECURITY, Image
@@ -55,13 +56,15 @@ def provision(
     accept: Accept,
     reporter: Reporter,
     confirm: Confirm = nobody,
+    onward: Onward = stay,
 ) -> Provisioned:
     """Bring one node from wherever it stands to a verified datasheet; raises at the first step that fails.
 
     ``accept`` is asked before an unknown node is whitelisted, ``confirm`` before a datasheet changes in what the order
-    does not name. A failure stands in the audit log with the step that it happened in.
+    does not name. ``onward`` takes the conversation to another link once the key is agreed on. A failure stands in the
+    audit log with the step that it happened in.
     """
-    run = _Run(station, node, order, accept, confirm, reporter)
+    run = _Run(station, node, order, accept, confirm, reporter, onward)
     try:
         with station.turn(node.uuid):
             return run.run()
@@ -80,16 +83,18 @@ class _Run:
         accept: Accept,
         confirm: Confirm,
         reporter: Reporter,
+        onward: Onward,
     ) -> None:
         self.station, self.node, self.order = station, node, order
         self.accept, self.confirm, self.reporter = accept, confirm, reporter
-        self.steps = Steps(reporter)
+        self.steps, self.onward = Steps(reporter), onward
 
     def run(self) -> Provisioned:
         who = self._identify()
         prepared = self._prepared(who)
         entry = self._whitelist(who)
         self._agree(who, entry)
+        self.onward(self.node)
         present = survey(self.node, initial=who.security_teds)
         proposal = self._build(prepared, present)
         signed = self._sign(who, proposal, present)

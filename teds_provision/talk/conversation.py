@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import time
+from collections.abc import Callable
 from types import TracebackType
 
 from teds_provision.errors import Garbled, LinkFailure, NodeRefused, NodeSilent, NotAuthentic, TedsProvisionError
@@ -96,6 +97,7 @@ class Conversation:
         self._notice = notice
         self._key: bytes | None = None
         self._session: StationSession | None = None
+        self._release: Callable[[], object] = _nothing
 
     def __enter__(self) -> Conversation:
         return self
@@ -106,6 +108,7 @@ class Conversation:
         if kind is None:
             self.leave()
         self.contact.link.close()
+        self._release()
 
     @property
     def tapped(self) -> bool:
@@ -150,6 +153,19 @@ class Conversation:
         assert self._key is not None, "reopen() before open()"
         self._session = None
         self.open(self._key)
+
+    def move_to(self, find: Callable[[], Contact], release: Callable[[], object]) -> None:
+        """Go on with the same node on another link: close the session here, open one there under the same key.
+
+        ``find`` meets it there; ``release`` is called when the conversation is over.
+        """
+        assert self._key is not None, "move_to() before open()"
+        key = self._key
+        self.leave()
+        self.contact.link.close()
+        self.contact = find()
+        self.identity, self._release = self.contact.identity, release
+        self.open(key)
 
     def forget(self) -> None:
         """The node ended the session (Confirm, Reset): go on plain."""
@@ -239,6 +255,10 @@ class Conversation:
                 return reply
             self._notice(Notice("retry", "The node is busy with another station", until - time.monotonic()))
             time.sleep(_BUSY_PAUSE)
+
+
+def _nothing() -> None:
+    """There is nothing to release."""
 
 
 def wrong_reply(what: str) -> NotAuthentic:

@@ -32,7 +32,10 @@ if TYPE_CHECKING:
 
 def over_the_bus(links: LinkSettings) -> LinkSettings:
     """The links of a command for which a bus that is named is meant, also without ``--via can``."""
-    return replace(links, via="can") if links.via == "nfc" and links.can and not links.nfc else links
+    bare = links.via == "nfc" and not links.nfc
+    if bare and (links.can or links.ble):
+        return replace(links, via="can" if links.can else "ble")
+    return links.after_agreeing()
 
 
 @contextmanager

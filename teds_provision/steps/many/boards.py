@@ -25,6 +25,7 @@ from teds_provision.steps.provision import Accept, Provisioned, provision
 from teds_provision.steps.read import survey
 from teds_provision.talk.conversation import Conversation, SessionLost
 from teds_provision.talk.meeting import meet, refuse_twins
+from teds_provision.talk.onward import onward
 from teds_provision.talk.progress import Reporter
 from teds_provision.talk.watching import Patience, watch_nodes
 
@@ -236,6 +237,7 @@ class Boards:
             accept=accept,
             reporter=self._reporter,
             confirm=questions.confirm or nobody,
+            onward=onward(self._links, self._reporter.notice),
         )
 
     def _for(self, who: Identified) -> Prepared:

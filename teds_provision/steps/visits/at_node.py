@@ -88,7 +88,7 @@ class ReadDone:
 def read_at(station: Station, links: LinkSettings, node: str, reporter: Reporter) -> ReadDone:
     """Read every TEDS of the node that ``node`` names, in a session where this station holds its key."""
     uuid = station.nodes.resolve(node)
-    with at_node(station, links, uuid, reporter) as visit:
+    with at_node(station, links.after_agreeing(), uuid, reporter) as visit:
         session_if_keyed(station, visit.node)
         image = read_image(visit.node)
         verdict = Verified(uuid, tuple(verify_image(station, image))).verdict
@@ -127,7 +127,7 @@ def verify_at(
     else:
         in_session = False
         try:
-            with at_node(station, links, found, reporter) as visit:
+            with at_node(station, links.after_agreeing(), found, reporter) as visit:
                 try:
                     looked = look_at_node(station, visit.node, visit.who)
                 finally:
@@ -199,7 +199,7 @@ def write_at(
         return WriteDone(wanted, None)
     if jump is not None:
         jump("The sequence of this node is then used up that far, for good. Write it?")
-    with at_node(station, links, uuid, reporter) as visit:
+    with at_node(station, links.after_agreeing(), uuid, reporter) as visit:
         visit.session()
         written = write(station, visit.node, wanted, progress=reporter.written, facts=facts, jump=jump is not None)
         return WriteDone(wanted, written)

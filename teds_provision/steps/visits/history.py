@@ -77,7 +77,7 @@ def bring_back(
         now = station.nodes.datasheet(uuid)
         before = now.unsigned_blocks() if now is not None else {}
         return BroughtBack(uuid, sequence, tuple(diff_blocks(before, record.image.unsigned_blocks())), None)
-    with at_node(station, links, uuid, reporter, unlock="always") as visit:
+    with at_node(station, links.after_agreeing(), uuid, reporter, unlock="always") as visit:
         visit.session()
         present = survey(visit.node)
         keep = {block: present.image.blocks[block] for block in present.read_only}

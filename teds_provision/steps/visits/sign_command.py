@@ -68,7 +68,7 @@ def sign_at(
         station.unlock()
     if not read_node:
         return sign_image(station, order, None)
-    with meet(station, links, uuid, reporter) as node, station.turn(uuid):
+    with meet(station, links.after_agreeing(), uuid, reporter) as node, station.turn(uuid):
         return sign_image(station, order, node)
 
 

@@ -1,0 +1,176 @@
+"""Tap first, air after; whole runs over the air, cut in the middle of every step; the program and a node by command."""
+
+from __future__ import annotations
+
+import json
+import random
+import socket
+from collections.abc import Callable, Iterator
+from contextlib import suppress
+from pathlib import Path
+
+import pytest
+
+from teds_provision.links import Contact, LinkSettings, Notice
+from teds_provision.links.hints import BleAddress
+from teds_provision.links.ports import NFC
+from teds_provision.node import described
+from teds_provision.node.virtual import VirtualNode
+from teds_provision.protocol.messages.identity import Identity
+from teds_provision.station.station import Station as OpenStation
+from teds_provision.steps.build import BuildOrder
+from teds_provision.steps.identify import Identified
+from teds_provision.steps.provision import Provisioned, provision
+from teds_provision.talk.conversation import Conversation
+from teds_provision.talk.meeting import meet
+from teds_provision.talk.progress import Silent, StepResult
+from tests.e2e.desk import Desk, Station, results
+from tests.workflow.bench import make_station
+
+from .conftest import ANGLE
+from .radio import Radio, needs_dbus
+
+pytestmark = [pytest.mark.link, needs_dbus]
+Air = Callable[..., Radio]
+
+
+def free_tcp_port() -> int:
+    """A TCP port of 127.0.0.1 that nobody has."""
+    while True:
+        port = random.SystemRandom().randrange(10_000, 32_000)
+        with socket.socket() as probe, suppress(OSError):
+            probe.bind(("127.0.0.1", port))
+            return port
+
+
+def accept(_who: Identified) -> None:
+    """Whoever it is."""
+
+
+class Tap:
+    """A node on the desk, tapped in memory."""
+
+    via = "nfc"
+    capabilities = NFC
+
+    def __init__(self, node: VirtualNode) -> None:
+        self._node = node
+
+    def exchange(self, frame: bytes) -> bytes:
+        return self._node.request("nfc", frame, tapped=True)
+
+    def close(self) -> None:
+        self._node.lost("nfc")
+
+
+def tapped_once(station: OpenStation, folder: Path) -> None:
+    """Provision the node in ``folder`` at a tap, so that it has a key of ``station``."""
+    described.create(folder, profile=ANGLE)
+    node = VirtualNode(folder, exclusive=True)
+    contact = Contact(Identity.decode(node.identify()), Tap(node))
+    with Conversation(contact, notice=lambda _notice: None) as there:
+        provision(station, there, BuildOrder(profile=ANGLE), accept=accept, reporter=Silent())
+    node.flash_file.release()
+
+
+class CutsAt(Silent):
+    """Cuts the connection in the middle of a step, when it has begun."""
+
+    def __init__(self, radio: Radio, step: str, pieces: int) -> None:
+        self._radio, self._step, self._pieces = radio, step, pieces
+        self.notices: list[Notice] = []
+        self.done: list[str] = []
+
+    def started(self, step: str) -> None:
+        if step == self._step:
+            self._radio.do("cut", 0, self._pieces)
+
+    def finished(self, step: StepResult) -> None:
+        self.done.append(step.name)
+
+    def notice(self, notice: Notice) -> None:
+        if notice.kind == "retry":
+            self.notices.append(notice)
+
+
+@pytest.fixture
+def station(tmp_path: Path) -> Iterator[OpenStation]:
+    made = make_station(tmp_path / "home")
+    yield made
+    made.close()
+
+
+def over_the_air(station: OpenStation, reporter: Silent, order: BuildOrder) -> Provisioned:
+    with meet(station, LinkSettings(via="ble", timeout=20), None, reporter) as node:
+        return provision(station, node, order, accept=accept, reporter=reporter)
+
+
+def test_a_cut_in_the_middle_of_every_step_does_no_harm(station: OpenStation, air: Air, tmp_path: Path) -> None:
+    tapped_once(station, tmp_path / "node")
+    radio = air([tmp_path / "node"], manners={"mtu": 23})
+    cut: set[str] = set()
+    for number, (step, pieces) in enumerate(
+        [("identify", 2), ("agree", 1), ("agree", 7), ("build", 3), ("write", 1), ("write", 12), ("verify", 5)]
+    ):
+        reporter = CutsAt(radio, step, pieces)
+        done = over_the_air(station, reporter, BuildOrder(profile=ANGLE, name=f"angle-{number}"))
+        assert done.verified.verdict == "authentic", step
+        assert reporter.done == ["identify", "whitelist", "agree", "build", "sign", "write", "verify"]
+        if reporter.notices:
+            cut.add(step)
+    assert cut == {"identify", "agree", "build", "write", "verify"}
+
+
+# -- by command --------------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def desk(tmp_path: Path) -> Iterator[Desk]:
+    prepared = tmp_path / "prepared"
+    make_station(prepared / "bench", "bench").close()
+    desk = Desk(tmp_path, prepared)
+    yield desk
+    desk.clear()
+
+
+@pytest.fixture
+def bench(desk: Desk) -> Station:
+    return desk.station()
+
+
+def test_agreed_at_the_reader_and_written_over_the_air(desk: Desk, bench: Station, air: Air) -> None:
+    hci = free_tcp_port()
+    radio = air([], hci=[hci])
+    node = desk.node().start("--ble", f"tcp-client:127.0.0.1:{hci}")
+    trace, both = desk.folder / "run.trace", ["--nfc", desk.links.nfc, "--ble", "auto"]
+    done = bench.ask("provision", "--profile", ANGLE, "--yes", *both, "--trace", trace)
+    assert done["verdict"] == "authentic"
+    assert radio.do("counts")["connects"] == 1
+    lines = [json.loads(line) for line in trace.read_text().splitlines()]
+    links = {(line["command"].split(" ")[0], line["link"]) for line in lines if line.get("layer") == "message"}
+    assert {("Request", "nfc"), ("Write", "ble"), ("Update", "ble")} <= links
+    assert ("Write", "nfc") not in links
+    assert ("Request", "ble") not in links
+    # while it is carried away: nobody needs the reader any more
+    again = bench.ask("provision", "--profile", ANGLE, "--yes", "--via", "ble")
+    assert set(results(again).values()) == {"done", "nothing to do"}
+    assert results(again)["write"] == "nothing to do"
+    assert bench.ask("verify", node.uuid, *both)["verdict"] == "authentic"
+    shown = bench.ask("identify", "--nfc", desk.links.nfc)
+    address = bytes.fromhex(json.loads((node.folder / "ble.json").read_text())["address"])
+    assert shown["ble"] == BleAddress(address, random=True).text
+
+
+def test_a_node_is_neither_agreed_with_nor_pinned_over_the_air(desk: Desk, bench: Station, air: Air) -> None:
+    hci = free_tcp_port()
+    air([], hci=[hci])
+    node = desk.node().start("--ble", f"tcp-client:127.0.0.1:{hci}")
+    bench.ask("identify", "--nfc", desk.links.nfc)  # a tap: now it advertises for a minute
+    found = bench.ask("identify", "--add", "--via", "ble")
+    assert found["uuid"] == node.uuid
+    (entry,) = bench.ask("whitelist", "list")["whitelist"]
+    assert entry["fingerprint"] is None
+    assert entry["assurance"] == "uuid"
+    refused = bench.refuses("provision", "--profile", ANGLE, "--yes", "--via", "ble", code=6)
+    assert "tap" in (refused["message"] + refused["hint"]).lower()
+    assert node.flash["key"] is None
