@@ -25,24 +25,25 @@ def in_front(arguments: Sequence[str], command_of: Callable[[str], click.Command
     front, rest = list(arguments[:at]), [arguments[at]]
     words = iter(arguments[at + 1 :])
     for word in words:
-        name = _name(word)
-        if word == "--":
-            rest += [word, *words]
-        elif name in own:
-            rest.append(word)
-            if name in valued and "=" not in word:
-                rest += _next(words)
-        elif name in _FLAGS:
-            front.append(word)
-        elif name in _WITH_VALUE:
-            value = [] if "=" in word else _next(words)
-            if "=" in word or value:
-                front += [word, *value]
-            else:
-                rest.append(word)  # click says what is missing
+        if _name(word) in own:
+            takes = _name(word) in valued and "=" not in word
+            rest += [word, *(_next(words) if takes else [])]
         else:
-            rest.append(word)
+            moved, kept = _divided(word, words)
+            front += moved
+            rest += kept
     return front + rest
+
+
+def _divided(word: str, words: Iterator[str]) -> tuple[list[str], list[str]]:
+    """What goes to the front and what stays, of a word that is none of the command's own options and its value."""
+    if word == "--":
+        return [], [word, *words]
+    name = _name(word)
+    if name in _FLAGS or (name in _WITH_VALUE and "=" in word):
+        return [word], []
+    value = _next(words) if name in _WITH_VALUE else []
+    return ([word, *value], []) if value else ([], [word])  # where the value is missing, click says so
 
 
 def _next(words: Iterator[str]) -> list[str]:

@@ -138,7 +138,6 @@ def cli(ctx: click.Context, /, as_json: bool, **options: Any) -> None:
 
 def run(arguments: list[str]) -> int:
     """Run one command line; returns the exit code. Every error is told in at most three lines."""
-    app: App | None = None
     asked = os.environ.get(_COMPLETE)
     if asked:
         return _complete(asked)
@@ -151,31 +150,39 @@ def run(arguments: list[str]) -> int:
         return finished.exit_code
     except (click.Abort, KeyboardInterrupt):
         return _fail(arguments, INTERRUPTED, "interrupted", "Interrupted: the same command carries on from here.", "")
-    except click.exceptions.NoArgsIsHelpError as error:
-        return _help_instead(arguments, error)
     except click.ClickException as error:
-        return _fail(arguments, 2, "usage", _usage(error), _usage_hint(error))
+        return _misused(arguments, error)
     except TedsProvisionError as error:
         _traceback(arguments)
         return _fail(arguments, error.exit_code, error.code, error.message, error.hint)
-    except BrokenPipeError:  # whoever read has gone; the work was done before it was told
-        nowhere(sys.stdout)
-        return BROKEN_PIPE
     except OSError as error:
-        if error.errno not in _FULL:
-            return _bug(arguments, error)
-        nowhere(sys.stdout)  # a table that was being printed; what reads a store or a file has errors of its own
-        told = f"The result cannot be written to stdout: {error.strerror}."
-        if _wants(arguments, "--json"):
-            return _fail(arguments, StoreFailure.exit_code, StoreFailure.code, told, "")
-        _say(told)
-        return 0
+        return _untold(arguments, error)
     except Exception as error:  # noqa: BLE001 - the last line of defence: a foreign exception is a bug of ours
         return _bug(arguments, error)
     finally:
-        app = App.current
-        if app is not None:
-            app.close()
+        if App.current is not None:
+            App.current.close()
+
+
+def _misused(arguments: list[str], error: click.ClickException) -> int:
+    if isinstance(error, click.exceptions.NoArgsIsHelpError):
+        return _help_instead(arguments, error)
+    return _fail(arguments, 2, "usage", _usage(error), _usage_hint(error))
+
+
+def _untold(arguments: list[str], error: OSError) -> int:
+    """Whoever read has gone, or the disk behind stdout is full; the work was done before it was told."""
+    if isinstance(error, BrokenPipeError):
+        nowhere(sys.stdout)
+        return BROKEN_PIPE
+    if error.errno not in _FULL:
+        return _bug(arguments, error)
+    nowhere(sys.stdout)  # a table that was being printed; what reads a store or a file has errors of its own
+    told = f"The result cannot be written to stdout: {error.strerror}."
+    if _wants(arguments, "--json"):
+        return _fail(arguments, StoreFailure.exit_code, StoreFailure.code, told, "")
+    _say(told)
+    return 0
 
 
 def _bug(arguments: list[str], error: Exception) -> int:

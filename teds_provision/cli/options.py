@@ -114,6 +114,13 @@ def link_options(function: Function) -> Function:
     return wrapped  # type: ignore[no-any-return]
 
 
+def links_given(ctx: click.Context) -> bool:
+    """Whether an option (or setting) of this run says over which link a node is to be met."""
+    return any(
+        ctx.get_parameter_source(name) != click.core.ParameterSource.DEFAULT for name in ("via", "nfc", "can", "ble")
+    )
+
+
 def yes_option(function: Function) -> Function:
     """Add --yes: no question is asked."""
     return click.option("--yes", "-y", is_flag=True, help="Do not ask.")(function)

@@ -1,27 +1,63 @@
 """What a station remembers: whitelist, nodes, wrapped keys, trust and the audit log, in one SQLite file."""
 
-from teds_provision.store.audit import AuditEntry, AuditLog, AuditVerdict, Choice, is_failure
-from teds_provision.store.lock import NodeTurn, StoreLock
-from teds_provision.store.records import (
-    DatasheetRecord,
-    Draft,
-    Facts,
-    Group,
-    Handover,
-    Holder,
-    KeyRecord,
-    Marks,
-    Measurement,
-    NodeRecord,
-    Revocation,
-    Tombstone,
-    TrustRecord,
-    WhitelistEntry,
-    utc_now,
-)
-from teds_provision.store.store import Store
-from teds_provision.store.tables.batches import Batch
-from teds_provision.store.tables.overview import Known, Search
+from typing import TYPE_CHECKING
+
+from teds_provision.lazy import lazy
+
+if TYPE_CHECKING:
+    from teds_provision.store.audit import AuditEntry, AuditLog, AuditVerdict, Choice, is_failure
+    from teds_provision.store.lock import NodeTurn, StoreLock
+    from teds_provision.store.records import (
+        DatasheetRecord,
+        Draft,
+        Facts,
+        Group,
+        Handover,
+        Holder,
+        KeyRecord,
+        Marks,
+        Measurement,
+        NodeRecord,
+        Revocation,
+        Tombstone,
+        TrustRecord,
+        WhitelistEntry,
+        utc_now,
+    )
+    from teds_provision.store.store import Store
+    from teds_provision.store.tables.batches import Batch
+    from teds_provision.store.tables.overview import Known, Search
+else:
+    __getattr__ = lazy(
+        __name__,
+        {
+            **dict.fromkeys(("AuditEntry", "AuditLog", "AuditVerdict", "Choice", "is_failure"), "audit"),
+            **dict.fromkeys(("NodeTurn", "StoreLock"), "lock"),
+            **dict.fromkeys(
+                (
+                    "DatasheetRecord",
+                    "Draft",
+                    "Facts",
+                    "Group",
+                    "Handover",
+                    "Holder",
+                    "KeyRecord",
+                    "Marks",
+                    "Measurement",
+                    "NodeRecord",
+                    "Revocation",
+                    "Tombstone",
+                    "TrustRecord",
+                    "WhitelistEntry",
+                    "utc_now",
+                ),
+                "records",
+            ),
+            "Store": "store",
+            "Batch": "tables.batches",
+            **dict.fromkeys(("Known", "Search"), "tables.overview"),
+        },
+    )
 
 __all__ = [
     "AuditEntry",

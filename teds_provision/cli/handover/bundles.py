@@ -10,7 +10,7 @@ import click
 
 from teds_provision import handover, protocol
 from teds_provision.cli.context import App, pass_app
-from teds_provision.cli.options import command, dry_run_option, link_options, yes_option
+from teds_provision.cli.options import command, dry_run_option, link_options, links_given, yes_option
 from teds_provision.cli.rendering import reporter_for
 from teds_provision.errors import BadData, PolicyRefused
 from teds_provision.files import read_limited, require_new, write_new
@@ -19,11 +19,10 @@ from teds_provision.links import LinkSettings
 if TYPE_CHECKING:
     from contextlib import AbstractContextManager
 
-    from teds_provision.handover.export_keys import ExportPlan
+    from teds_provision.handover.export_keys import Exported, ExportPlan
     from teds_provision.handover.import_keys import Imported, ImportPlan
     from teds_provision.station.station import Station
 
-_LINK_OPTIONS = ("via", "nfc", "can", "ble")
 _MEANS = {
     "copy": "A copy: both stations hold the same keys from now on, and either can pose as a node to the other.",
     "move": "A move: the keys rest here at once. Only when the other station has rotated them at its first contact is"
@@ -98,12 +97,19 @@ def export_keys(
         _require_same([plan.content for plan in plans] == [plan.content for plan in shown])
         told = _exported(plans, outputs, station)
         done = handover.export_keys.export_all(station, plans, outputs)
+    _tell_export(app, plans, outputs, told, done)
+
+
+def _tell_export(
+    app: App, plans: Sequence[ExportPlan], outputs: Sequence[Path], told: dict[str, Any], done: Sequence[Exported]
+) -> None:
     for bundle, one in zip(told["bundles"], done, strict=True):
         bundle |= {"sha256": one.sha256, "octets": one.octets, "fresh": one.fresh}
     fresh = any(one.fresh for one in done)
     told |= {"sha256": done[0].sha256, "octets": sum(one.octets for one in done), "fresh": fresh}
     again = "" if fresh else " (nothing to do, it is there already)"
-    next_step = "\nIts receipt closes the move: teds-provision handover receipt FILE.receipt" if mode == "move" else ""
+    moved = plans[0].mode == "move"
+    next_step = "\nIts receipt closes the move: teds-provision handover receipt FILE.receipt" if moved else ""
     files = ", ".join(map(str, outputs))
     app.emit(told, f"{_count(plans)} in {files}, handover {plans[0].id}{again}.{next_step}")
 
@@ -136,8 +142,7 @@ def _plan_text(plans: Sequence[ExportPlan], station: Station) -> str:
     plan, chosen = plans[0], [one for part in plans for one in part.nodes]
     lines = [f"{plan.mode.capitalize()} {_count(plans)}, to be imported by {plan.expires:%Y-%m-%d %H:%M} UTC"]
     lines += [f"  in {len(plans)} bundles"] if len(plans) > 1 else []
-    lines += [f"  {node.uuid.hex()}  epoch {key.epoch}  {node.name or ''}".rstrip() for node, key in chosen[:20]]
-    lines += [f"  … and {len(chosen) - 20} more"] if len(chosen) > 20 else []
+    lines += _first([f"  {node.uuid.hex()}  epoch {key.epoch}  {node.name or ''}".rstrip() for node, key in chosen], 20)
     lines += [f"  not {uuid.hex()}: {why}" for uuid, why in plan.skipped]
     if plan.also_held_by:
         names = ", ".join(handover.pending.peer_name(station, digits) for digits in plan.also_held_by)
@@ -146,6 +151,11 @@ def _plan_text(plans: Sequence[ExportPlan], station: Station) -> str:
     lines += [f"  to   {record.name}\n       {handover.trust.spoken(record.fingerprint)}" for record in plan.receivers]
     lines.append(f"  from {station.name}\n       {handover.trust.spoken(station.fingerprint)}")
     return "\n".join([*lines, _MEANS[plan.mode]])
+
+
+def _first(lines: list[str], most: int) -> list[str]:
+    """The first lines of a list, and how many more there are."""
+    return [*lines[:most], f"  … and {len(lines) - most} more"] if len(lines) > most else lines
 
 
 @command(
@@ -184,9 +194,7 @@ def import_keys(
     assert app is not None
     station = app.station()
     receipt = receipt or file.with_name(file.name + ".receipt")
-    octets = read_limited(file, protocol.handover.bundle.MAX_BUNDLE_OCTETS, "bundle")
-    if octets.lstrip()[:1] != b"{" or b'"ciphertext"' not in octets:
-        raise BadData(f"{file} is no handover bundle.", hint="Give the file that export-keys wrote.")
+    octets = _read_bundle(file)
     station.unlock()
     shown = handover.import_keys.plan_import(station, octets)
     state = station.version()
@@ -195,22 +203,33 @@ def import_keys(
         app.emit({**told, "receipt": None, "plan": True}, text)
         return
     if not isinstance(shown, handover.import_keys.Imported):
-        _require_receipt_place(receipt)
+        require_new(receipt)
         app.note(text)
         app.confirm(f"Take {count_of(len(shown.taken))} in?", yes=yes)
     with station.lock("import-keys", app.note):
         plan = shown if station.version() == state else handover.import_keys.plan_import(station, octets)
-        if isinstance(plan, handover.import_keys.Imported):
-            done = plan
-        else:
-            _require_same(not isinstance(shown, handover.import_keys.Imported) and plan.nodes == shown.nodes)
-            done = handover.import_keys.import_keys(station, plan)
+        done = _take_in(station, plan, shown)
         _write_receipt(receipt, done.receipt)
-    given = any(ctx.get_parameter_source(name) != click.core.ParameterSource.DEFAULT for name in _LINK_OPTIONS)
-    outcomes = _prove(app, station, done, links) if (given if prove is None else prove) else []
+    wanted = links_given(ctx) if prove is None else prove
+    outcomes = _prove(app, station, done, links) if wanted else []
     _tell_import(app, station, done, receipt, told, outcomes)
     if prove and any(outcome["why"] for outcome in outcomes):
         ctx.exit(5)
+
+
+def _read_bundle(file: Path) -> bytes:
+    octets = read_limited(file, protocol.handover.bundle.MAX_BUNDLE_OCTETS, "bundle")
+    if octets.lstrip()[:1] != b"{" or b'"ciphertext"' not in octets:
+        raise BadData(f"{file} is no handover bundle.", hint="Give the file that export-keys wrote.")
+    return octets
+
+
+def _take_in(station: Station, plan: ImportPlan | Imported, shown: ImportPlan | Imported) -> Imported:
+    """Import what was ``shown``, under the lock; nothing to do where it was taken in before."""
+    if isinstance(plan, handover.import_keys.Imported):
+        return plan
+    _require_same(not isinstance(shown, handover.import_keys.Imported) and plan.nodes == shown.nodes)
+    return handover.import_keys.import_keys(station, plan)
 
 
 def _require_same(same: bool) -> None:
@@ -222,11 +241,7 @@ def _require_same(same: bool) -> None:
 def _import_plan(station: Station, plan: ImportPlan | Imported) -> tuple[dict[str, Any], str]:
     """The result as far as it is known before anything happens, and the plan for people."""
     if isinstance(plan, handover.import_keys.Imported):
-        sender, mode, handover_id = plan.row.peers[0], plan.row.mode, plan.row.id
-        nodes = [{"uuid": uuid.hex(), "decision": "same", "why": ""} for uuid in plan.uuids]
-        nodes += [{"uuid": uuid, "decision": "refused", "why": why} for uuid, why in plan.notes.refused]
-        told = _import_result(sender, mode, handover_id, nodes, [])
-        return told, f"This bundle was taken in on {plan.row.created}; nothing is left to do."
+        return _taken_before(plan), f"This bundle was taken in on {plan.row.created}; nothing is left to do."
     bundle = plan.opened.bundle
     nodes = [{"uuid": one.node.uuid.hex(), "decision": one.decision, "why": one.why} for one in plan.nodes]
     denied = [{"uuid": one.uuid.hex(), "why": one.why} for one in plan.denied]
@@ -234,12 +249,22 @@ def _import_plan(station: Station, plan: ImportPlan | Imported) -> tuple[dict[st
     notes = {one.node.uuid.hex(): list(one.notes) for one in plan.nodes if one.notes}
     passed_over = [{"uuid": one.uuid.hex(), "why": why} for one, why in plan.passed_over]
     told |= {"notes": notes, "revocations_passed_over": passed_over}
+    return told, _import_text(station, plan, told, nodes)
+
+
+def _taken_before(done: Imported) -> dict[str, Any]:
+    nodes = [{"uuid": uuid.hex(), "decision": "same", "why": ""} for uuid in done.uuids]
+    nodes += [{"uuid": uuid, "decision": "refused", "why": why} for uuid, why in done.notes.refused]
+    return _import_result(done.row.peers[0], done.row.mode, done.row.id, nodes, [])
+
+
+def _import_text(station: Station, plan: ImportPlan, told: dict[str, Any], nodes: list[dict[str, str]]) -> str:
+    bundle = plan.opened.bundle
     lines = [f"A {bundle.mode} of {count_of(len(nodes))} from {handover.pending.peer_name(station, bundle.sender)}"]
-    lines += [f"  {node['decision']:<8} {node['uuid']}  {node['why']}".rstrip() for node in nodes[:40]]
-    lines += [f"  … and {len(nodes) - 40} more"] if len(nodes) > 40 else []
-    lines += [f"  {uuid}: {note}" for uuid, said in [*notes.items()][:40] for note in said]
-    lines += [f"  revoked  {one['uuid']}  {one['why']}" for one in denied]
-    lines += [f"  its ban of {one['uuid']} does not count: {one['why']}" for one in passed_over]
+    lines += _first([f"  {node['decision']:<8} {node['uuid']}  {node['why']}".rstrip() for node in nodes], 40)
+    lines += [f"  {uuid}: {note}" for uuid, said in [*told["notes"].items()][:40] for note in said]
+    lines += [f"  revoked  {one['uuid']}  {one['why']}" for one in told["revoked"]]
+    lines += [f"  its ban of {one['uuid']} does not count: {one['why']}" for one in told["revocations_passed_over"]]
     own, sender = handover.trust.spoken(station.fingerprint), handover.trust.spoken(bundle.sender)
     lines += [f"For comparison by voice:\n  from {sender}\n  to   {own}"]
     if not plan.ca_is_known:
@@ -251,7 +276,7 @@ def _import_plan(station: Station, plan: ImportPlan | Imported) -> tuple[dict[st
         if bundle.mode == "copy"
         else "A move: each key is rotated at the first contact; until then the sender can still use it."
     )
-    return told, "\n".join(lines)
+    return "\n".join(lines)
 
 
 def _import_result(
@@ -267,10 +292,6 @@ def _import_result(
         "decisions": {node["uuid"]: node["decision"] for node in nodes},
         "revoked": denied,
     }
-
-
-def _require_receipt_place(receipt: Path) -> None:
-    require_new(receipt)
 
 
 def _write_receipt(receipt: Path, octets: bytes) -> None:
@@ -300,15 +321,18 @@ def _tell_import(
     pending = [uuid.hex() for uuid in done.uuids if uuid.hex() not in set(proven)]
     not_met = {one["uuid"]: one["why"] for one in outcomes if one["why"]}
     told |= {"receipt": str(receipt), "fresh": done.fresh, "proven": proven, "pending": pending, "not_proven": not_met}
+    app.emit(told, _import_told(done, receipt, not_met, pending, sum(bool(one["rotated"]) for one in outcomes)))
+
+
+def _import_told(done: Imported, receipt: Path, not_met: dict[str, str], pending: list[str], rotated: int) -> str:
     lines = [f"{count_of(len(done.uuids))} taken in" + ("." if done.fresh else " before; nothing changed.")]
     lines += [f"  refused {uuid}: {why}" for uuid, why in done.notes.refused]
     lines += [f"  not met {uuid}: {why}" for uuid, why in not_met.items()]
-    rotated = sum(bool(one["rotated"]) for one in outcomes)
     lines += [f"{count_of(rotated)} rotated: the sender is locked out for certain."] if rotated else []
     if pending:
         lines.append(f"{count_of(len(pending))} not proven yet: their first contact here proves them (agree UUID).")
     lines.append(f"Receipt for the sender: {receipt}")
-    app.emit(told, "\n".join(lines))
+    return "\n".join(lines)
 
 
 def count_of(number: int) -> str:

@@ -8,16 +8,15 @@ import click
 
 from teds_provision import handover, steps, talk
 from teds_provision.cli.context import App, pass_app
-from teds_provision.cli.options import command, dry_run_option, link_options, yes_option
+from teds_provision.cli.options import command, dry_run_option, link_options, links_given, yes_option
 from teds_provision.cli.rendering import reporter_for
 from teds_provision.errors import LinkFailure, PolicyRefused
 from teds_provision.links import LinkSettings
 
 if TYPE_CHECKING:
+    from teds_provision.handover.life import TakeOver
     from teds_provision.station.station import Station
     from teds_provision.steps.reset import ResetReceipt
-
-_LINK_OPTIONS = ("via", "nfc", "can", "ble")
 
 
 @command('teds-provision revoke 8d4d --why "stolen with the arm"', "teds-provision revoke --lift 8d4d --yes")
@@ -158,17 +157,7 @@ def replace(
     station.unlock(octets)
     with station.lock("replace", app.note):
         plan = handover.life.plan_takeover(station, octets, spare, copy_calibration=copy_calibration)
-        taken = plan.new if plan.done else plan.old
-        told: dict[str, Any] = {
-            "old": octets.hex(),
-            "new": spare.hex(),
-            "name": taken.name,
-            "groups": list(taken.groups),
-            "profile": taken.profile,
-            "calibration_copied": bool(plan.calibration),
-        }
-        given = [f"{what} {value}" for what, value in (("name", taken.name), ("profile", taken.profile)) if value]
-        text = f"{spare.hex()} takes over from {octets.hex()}: {', '.join(given) or 'without name and profile'}"
+        told, text = _takeover(plan)
         if dry_run:
             app.emit({**told, "plan": True}, f"Plan: {text}.")
             return
@@ -176,11 +165,26 @@ def replace(
             app.emit({**told, "fresh": False}, "Nothing to do: it has taken over before.")
             return
         app.confirm(f"{text}?", yes=yes)
-        linked = any(ctx.get_parameter_source(name) != click.core.ParameterSource.DEFAULT for name in _LINK_OPTIONS)
-        receipt = _reset(app, station, octets, links, force=True) if linked else None
+        receipt = _reset(app, station, octets, links, force=True) if links_given(ctx) else None
         warnings = handover.life.take_over(station, plan, receipt)
     for warning in warnings:
         app.warn(warning)
     confirmed = receipt is not None
     next_step = f"Then: teds-provision provision (or sign and write) for {spare.hex()}."
     app.emit({**told, "confirmed": confirmed, "fresh": True, "warnings": list(warnings)}, f"{text}.\n{next_step}")
+
+
+def _takeover(plan: TakeOver) -> tuple[dict[str, Any], str]:
+    """What one node takes over from another, for scripts and in a sentence."""
+    taken = plan.new if plan.done else plan.old
+    told = {
+        "old": plan.old.uuid.hex(),
+        "new": plan.new.uuid.hex(),
+        "name": taken.name,
+        "groups": list(taken.groups),
+        "profile": taken.profile,
+        "calibration_copied": bool(plan.calibration),
+    }
+    given = [f"{what} {value}" for what, value in (("name", taken.name), ("profile", taken.profile)) if value]
+    text = f"{plan.new.uuid.hex()} takes over from {plan.old.uuid.hex()}"
+    return told, f"{text}: {', '.join(given) or 'without name and profile'}"

@@ -74,20 +74,29 @@ def receipt(app: App, file: Path) -> None:
     files = sorted(file.glob("*.receipt")) if file.is_dir() else [file]
     if not files:
         raise NotFound(f"There is no receipt (*.receipt) in {file}.")
-    closed, failed = [], None
     with station.lock("handover receipt", app.note):
-        for path in files:
-            try:
-                octets = read_limited(path, protocol.handover.receipt.MAX_RECEIPT_OCTETS, "receipt")
-                closed.append(handover_room.pending.close(station, octets))
-            except TedsProvisionError as error:
-                if not file.is_dir():
-                    raise
-                app.warn(f"{path.name}: {error.message}")
-                failed = failed or error
+        closed, failed = _close_all(app, station, files, go_on=file.is_dir())
     told = [_closed(one) for one in closed]
     text = "\n".join(_closed_text(station, one) for one in closed)
     app.conclude({**told[0], "receipts": told} if told else {"receipts": []}, text or None, failed)
+
+
+def _close_all(
+    app: App, station: Station, files: list[Path], *, go_on: bool
+) -> tuple[list[Closed], TedsProvisionError | None]:
+    """Close what each receipt closes; what was closed, and the first error where one ends not all (``go_on``)."""
+    closed: list[Closed] = []
+    failed: TedsProvisionError | None = None
+    for path in files:
+        try:
+            octets = read_limited(path, protocol.handover.receipt.MAX_RECEIPT_OCTETS, "receipt")
+            closed.append(handover_room.pending.close(station, octets))
+        except TedsProvisionError as error:
+            if not go_on:
+                raise
+            app.warn(f"{path.name}: {error.message}")
+            failed = failed or error
+    return closed, failed
 
 
 def _closed(done: Closed) -> dict[str, Any]:

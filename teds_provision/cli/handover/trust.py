@@ -15,6 +15,7 @@ from teds_provision.files import read_limited, write_new
 
 if TYPE_CHECKING:
     from teds_provision.handover.trust import Candidate, Removal
+    from teds_provision.station.station import Station
     from teds_provision.store import TrustRecord
 
 _FILE = click.Path(path_type=Path, dir_okay=False)
@@ -56,28 +57,41 @@ def add(
 
     Compare the fingerprint with its owner by voice. In a folder NAME.pem and NAME.cert are stations, NAME.ca.pem CAs.
     """
-    if (folder is None) == (name is None) or (name is not None and file is None):
-        raise click.UsageError("Give NAME and FILE, or --from DIR.")
+    _require_one(name, file, folder)
     station = app.station()
-    if folder is not None:
-        found = handover.trust.candidates_of(station, folder, role)
-    else:
-        assert name is not None
-        assert file is not None
-        found = [handover.trust.candidate(station, name, file, role)]
+    found = _candidates(station, name, file, folder, role)
     fresh = [one for one in found if not one.known]
     told = {"trusted": [_record(one.record) for one in found], "added": len(fresh)}
     if dry_run:
         app.emit({**told, "plan": True}, _shown(found))
         return
-    chosen = [one for one in found if one.known or _agreed(app, one, yes)]
-    if any(not one.known for one in chosen):
+    _take(app, station, [one for one in found if one.known or _agreed(app, one, yes)])
+
+
+def _require_one(name: str | None, file: Path | None, folder: Path | None) -> None:
+    if (folder is None) == (name is None) or (name is not None and file is None):
+        raise click.UsageError("Give NAME and FILE, or --from DIR.")
+
+
+def _candidates(
+    station: Station, name: str | None, file: Path | None, folder: Path | None, role: Literal["station", "ca"]
+) -> list[Candidate]:
+    """The key that the command line names, or those of the folder."""
+    if folder is not None:
+        return handover.trust.candidates_of(station, folder, role)
+    assert name is not None
+    assert file is not None
+    return [handover.trust.candidate(station, name, file, role)]
+
+
+def _take(app: App, station: Station, chosen: list[Candidate]) -> None:
+    fresh = [one.record.name for one in chosen if not one.known]
+    if fresh:
         station.unlock()  # whom this station trusts is sealed under its vault
     with station.lock("trust add", app.note):
         added = handover.trust.add(station, chosen)
     told = {"trusted": [_record(one.record) for one in chosen], "added": added}
-    names = ", ".join(one.record.name for one in chosen if not one.known)
-    app.emit(told, f"Trusted from now on: {names}." if added else "Nothing to do.")
+    app.emit(told, f"Trusted from now on: {', '.join(fresh)}." if added else "Nothing to do.")
 
 
 def _agreed(app: App, one: Candidate, yes: bool) -> bool:

@@ -7,23 +7,21 @@ import signal
 import sys
 import threading
 from collections import Counter
+from collections.abc import Iterable, Iterator
 from typing import TYPE_CHECKING, Any
 
 import click
 
+from teds_provision import store
 from teds_provision.cli.context import App, pass_app
 from teds_provision.cli.moments import moment
 from teds_provision.cli.options import command
 from teds_provision.cli.rendering import local_time, shown
 from teds_provision.errors import StoreFailure, UsageFailure
-from teds_provision.lazy import late
 
 if TYPE_CHECKING:
-    from teds_provision import store
     from teds_provision.station.station import Station
     from teds_provision.store import AuditEntry, AuditVerdict, Choice
-else:  # SQLite is not loaded for the help
-    store = late("teds_provision.store")
 
 _POLL_SECONDS = 0.3
 
@@ -64,35 +62,59 @@ def log(
     if follow:
         _follow(app, station, choice, verdict, after)
         return
-    totals = Counter[str]()
-    acts = Counter[str]()
+    entries = _Counted(audit_log.chosen(choice, after))
+    if app.json:
+        _tell_json(entries, verdict, after)
+    else:
+        narrowed = choice != store.Choice() or moment_of is not None
+        _tell_lines(app, entries, verdict, after, narrowed=narrowed)
+
+
+class _Counted:
+    """Entries one after the other, counted as they are told: a long log is never held in memory."""
+
+    def __init__(self, entries: Iterable[AuditEntry]) -> None:
+        self._from = entries
+        self.entries = self.failed = 0
+        self.acts = Counter[str]()
+
+    def __iter__(self) -> Iterator[AuditEntry]:
+        for entry in self._from:
+            self.entries += 1
+            self.failed += store.is_failure(entry.outcome)
+            self.acts[entry.act] += 1
+            yield entry
+
+
+def _tell_json(entries: _Counted, verdict: AuditVerdict, after: int) -> None:
+    """One object, written as it is read; exits 7 where the chain does not hold."""
     out = sys.stdout
-    if app.json:
-        out.write('{"entries": [')
-    for number, entry in enumerate(audit_log.chosen(choice, after)):
-        totals["entries"] += 1
-        totals["failed"] += store.is_failure(entry.outcome)
-        acts[entry.act] += 1
-        out.write((", " if number else "") + json.dumps(_as_dict(entry)) if app.json else _line(entry) + "\n")
-    told = {"entries": totals["entries"], "failed": totals["failed"], "acts": dict(acts)}
-    if app.json:
-        rest = {
-            "intact": verdict.intact,
-            "checked": {"after": after, "to": verdict.count},
-            "count": verdict.count,
-            "head": verdict.head,
-            "first_bad": verdict.first_bad,
-            "why": verdict.why,
-            "totals": told,
-        }
-        out.write("], " + json.dumps(rest)[1:] + "\n")
+    out.write('{"entries": [')
+    for number, entry in enumerate(entries):
+        out.write((", " if number else "") + json.dumps(_as_dict(entry)))
+    rest = {
+        "intact": verdict.intact,
+        "checked": {"after": after, "to": verdict.count},
+        "count": verdict.count,
+        "head": verdict.head,
+        "first_bad": verdict.first_bad,
+        "why": verdict.why,
+        "totals": {"entries": entries.entries, "failed": entries.failed, "acts": dict(entries.acts)},
+    }
+    out.write("], " + json.dumps(rest)[1:] + "\n")
     out.flush()
-    if not verdict.intact and app.json:
+    if not verdict.intact:
         raise click.exceptions.Exit(7)
+
+
+def _tell_lines(app: App, entries: _Counted, verdict: AuditVerdict, after: int, *, narrowed: bool) -> None:
+    """A line for each entry; where not all of them were asked for (``narrowed``), how many came."""
+    sys.stdout.writelines(_line(entry) + "\n" for entry in entries)
+    sys.stdout.flush()
     _require_intact(verdict)
-    by_act = ", ".join(f"{count} {name}" for name, count in acts.most_common())
-    if choice != store.Choice() or moment_of is not None:
-        app.note(f"{told['entries']} entries, {told['failed']} failed{': ' if by_act else '.'}{by_act}")
+    if narrowed:
+        by_act = ", ".join(f"{count} {name}" for name, count in entries.acts.most_common())
+        app.note(f"{entries.entries} entries, {entries.failed} failed{': ' if by_act else '.'}{by_act}")
     part = f" from entry {after + 1} on" if after else ""
     app.note(f"{verdict.count} entries, chain intact{part}, head {verdict.head[:16]}.")
 

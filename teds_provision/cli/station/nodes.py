@@ -159,29 +159,37 @@ def _remarks(node: dict[str, Any]) -> str:
     return "; ".join(remarks)
 
 
-def _one(node: dict[str, Any]) -> None:
-    address = f"0x{node['can_address']:02x}" if node["can_address"] else "none"
+def _link_keys(node: dict[str, Any]) -> list[str]:
     keys = [
         f"{key['key_id']} {key['state']}, epoch {key['epoch']}, {local_time(key['created'])}" for key in node["keys"]
     ]
-    rows = [
-        ("UUID", node["uuid"]),
-        ("name", node["name"] or ""),
-        ("profile", node["profile"] or ""),
-        ("state", node["state"] or "unseen"),
-        ("epoch", f"{node['epoch']}, sequence {node['sequence']}"),
-        ("key", (node["fingerprint"] or "not pinned yet")[:32]),
-        ("whitelist", f"yes, assurance {node['assurance']}" if node["whitelisted"] else "no"),
-        ("verdict", node["verdict"] or "never verified"),
-        ("last seen", local_time(node["last_seen"]) if node["last_seen"] else "never"),
-        ("calibration", f"due {node['due']}" if node["due"] else ""),
-        ("channels", str(node["channels"])),
-        ("CAN address", address),
-        ("groups", ", ".join(node["groups"])),
-        *(("link key", key) for key in keys or ["none"]),
-        ("rotation", node["rotation_due"] or ""),
-        ("remarks", _remarks(node)),
-    ]
-    for title, text in rows:
-        if text:
-            print(f"{title:<12} {shown(text)}")
+    return keys or ["none"]
+
+
+# Title and text of each line about one node; what is empty is left out, a list gives a line for each.
+_LINES: tuple[tuple[str, Callable[[dict[str, Any]], str | list[str]]], ...] = (
+    ("UUID", lambda node: node["uuid"]),
+    ("name", lambda node: node["name"] or ""),
+    ("profile", lambda node: node["profile"] or ""),
+    ("state", lambda node: node["state"] or "unseen"),
+    ("epoch", lambda node: f"{node['epoch']}, sequence {node['sequence']}"),
+    ("key", lambda node: (node["fingerprint"] or "not pinned yet")[:32]),
+    ("whitelist", lambda node: f"yes, assurance {node['assurance']}" if node["whitelisted"] else "no"),
+    ("verdict", lambda node: node["verdict"] or "never verified"),
+    ("last seen", lambda node: local_time(node["last_seen"]) if node["last_seen"] else "never"),
+    ("calibration", lambda node: f"due {node['due']}" if node["due"] else ""),
+    ("channels", lambda node: str(node["channels"])),
+    ("CAN address", lambda node: f"0x{node['can_address']:02x}" if node["can_address"] else "none"),
+    ("groups", lambda node: ", ".join(node["groups"])),
+    ("link key", _link_keys),
+    ("rotation", lambda node: node["rotation_due"] or ""),
+    ("remarks", _remarks),
+)
+
+
+def _one(node: dict[str, Any]) -> None:
+    for title, text_of in _LINES:
+        found = text_of(node)
+        for text in [found] if isinstance(found, str) else found:
+            if text:
+                print(f"{title:<12} {shown(text)}")
