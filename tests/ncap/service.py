@@ -122,9 +122,14 @@ def until(found: Callable[[], Any], what: str = "", seconds: float = PATIENCE) -
 
 
 def verified(service: Service, uuid: str) -> dict[str, Any]:
-    """Wait until a node was looked at, and return it."""
+    """Wait until a node is there and was looked at, and return it."""
     with service.client() as asked:
-        return dict(until(lambda: next((n for n in asked.nodes() if n["uuid"] == uuid and n["verdict"]), None), uuid))
+        return dict(
+            until(
+                lambda: next((n for n in asked.nodes() if n["uuid"] == uuid and n["verdict"] and n["present"]), None),
+                uuid,
+            )
+        )
 
 
 def virtual(service: Service, profile: str = "gripper", name: str = "hand", source: str = "sine:2") -> str:
