@@ -31,7 +31,7 @@ def sole_user(station: Station, ports: Sequence[CanPort], command: str, *, share
     with ExitStack() as stack:
         for port in ports:
             spec = port.spec
-            mark = station.measurements.source(spec.text, spec.source, command=command, shared=shared)
+            mark = station.measurements.source(spec.wire, spec.source, command=command, shared=shared)
             try:
                 stack.enter_context(mark)
             except Taken as taken:
