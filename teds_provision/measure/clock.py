@@ -128,11 +128,12 @@ class ClockMap:
     def host(self, ticks: NDArray[np.uint64]) -> NDArray[np.float64]:
         """Host time (monotonic, seconds) of ticks."""
         self._handed_out = True
-        since = ticks.astype(np.int64) - self._origin
-        left = 1.0 - (ticks.astype(np.int64) - self._refitted) / SLEW
-        slope: NDArray[Any] = self._offset + self._skew * since + self._residue * np.clip(left, 0.0, 1.0)
+        signed = ticks.astype(np.int64)
+        slope: NDArray[Any] = self._offset + self._skew * (signed - self._origin)
+        if self._residue:
+            slope += self._residue * np.clip(1.0 - (signed - self._refitted) / SLEW, 0.0, 1.0)
         # Whole nanoseconds first: a tick of months and an offset of years would lose microseconds as floats.
-        whole: NDArray[np.float64] = (ticks.astype(np.int64) + np.rint(slope).astype(np.int64)) / 1e9
+        whole: NDArray[np.float64] = (signed + np.rint(slope).astype(np.int64)) / 1e9
         return whole
 
     def host_of(self, tick: int) -> float:
