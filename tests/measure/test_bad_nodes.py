@@ -1,0 +1,223 @@
+"""What bad input gets: nodes with one fault each under one measurement, beside one without; nothing false is published.
+
+They run together, as on a bus: so each is also a disturbance for the others.
+"""
+
+from __future__ import annotations
+
+import signal
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Any
+
+import pytest
+
+from tests.e2e.desk import ANGLE
+from tests.measure.faulty_node import FAULTS
+from tests.measure.hall import FAULTY, Hall, events, of, states
+
+pytestmark = pytest.mark.link
+RATE = 20
+SCALE = 6.281440 / 65535  # rad: the calibration of these nodes
+METRES = 0.110 / 4095  # of the gripper's opening
+SECONDS = 8.0
+
+
+@dataclass
+class Seen:
+    """What the measurement said of one node."""
+
+    lines: list[dict[str, Any]]
+    end: dict[str, Any]
+
+    @property
+    def states(self) -> list[str]:
+        return states(self.lines)
+
+    @property
+    def told(self) -> str:
+        """Every reason that was given."""
+        return " | ".join(line["why"] for line in self.lines if line["event"] == "status")
+
+    @property
+    def data(self) -> list[dict[str, Any]]:
+        return of(self.lines) or of(self.lines, channel=2)
+
+    def count(self, what: str) -> int:
+        """A counter over all its streams."""
+        return sum(stream[what] for stream in self.end["streams"])
+
+
+@pytest.fixture(scope="module")
+def seen(tmp_path_factory: pytest.TempPathFactory) -> Iterator[dict[str, Seen]]:
+    hall = Hall(tmp_path_factory.mktemp("bad"), {**dict.fromkeys(FAULTS, ANGLE), "out_of_range": "gripper"})
+    try:
+        process = hall.desk.start(
+            hall.can, *(f"{fault}={hall.nodes[fault].folder}" for fault in FAULTS), program=FAULTY
+        )
+        process.wait_for('"ready": true', 60)
+        uuids = {hall.nodes[fault].uuid: fault for fault in FAULTS}
+        file = hall.folder / "bad.jsonl"
+        running = hall.begin(*uuids, "--rate", RATE, "--to", file)
+        running.wait_for('"event":"data"', 60)
+        until = time.monotonic() + SECONDS
+        while time.monotonic() < until or not _all_told(running.out):
+            running.read(0.1)
+            assert time.monotonic() < until + 60, running.out[-3000:]
+        running.signal(signal.SIGTERM)
+        outcome = running.end(60)
+        lines = events(outcome.out)
+        end = lines[-1]
+        assert end["event"] == "end", outcome
+        assert outcome.code != 0, "some of them never measured, and the exit code says so"
+        yield {
+            uuids[node["uuid"]]: Seen([line for line in lines if line.get("uuid") == node["uuid"]], node)
+            for node in end["nodes"]
+        }
+    finally:
+        hall.close()
+
+
+def _all_told(text: str) -> bool:
+    """Whether what takes its time has happened: the silent one is lost, the lying clock is told."""
+    return "No message of the node came" in text and "its clock lies" in text
+
+
+def test_every_fault_is_here_and_the_good_node_is_not_disturbed(seen: dict[str, Seen]) -> None:
+    assert set(seen) == set(FAULTS)
+    assert len(FAULTS) > 20
+    good = seen["good"]
+    assert good.states == ["waiting", "running", "ended"]
+    assert (good.count("late"), good.count("bad"), good.count("invalid")) == (0, 0, 0)
+    assert good.count("samples") >= 5 * RATE
+    assert good.count("lost") <= 0.1 * good.count("messages"), "what a busy machine costs"
+    assert "error" not in good.end
+
+
+def test_no_value_is_published_that_is_not_the_calibrated_raw_value(seen: dict[str, Seen]) -> None:
+    for fault, one in seen.items():
+        for line in one.data:
+            assert len(line["raw"]) == len(line["value"]) == len(line["valid"]) == len(line["time"])
+            for raw, value, valid in zip(line["raw"], line["value"], line["valid"], strict=True):
+                assert (value is not None) == valid, fault
+                scale = METRES if fault == "out_of_range" else SCALE
+                assert value is None or value == pytest.approx(raw * scale, abs=1e-4), fault
+
+
+def test_times_of_a_node_never_go_back_whatever_it_does(seen: dict[str, Seen]) -> None:
+    for fault, one in seen.items():
+        times = [instant for line in one.data for instant in line["time"]]
+        assert times == sorted(times), fault
+
+
+@pytest.mark.parametrize("fault", ["wrong_tag", "cut_short", "test_pattern"])
+def test_what_is_bad_is_counted_and_nothing_of_it_comes_out(seen: dict[str, Seen], fault: str) -> None:
+    one = seen[fault]
+    assert one.data == []
+    assert one.count("samples") == 0
+    if fault != "cut_short":  # a message without its end is no message: it shows as silence
+        assert one.count("bad") > RATE
+    assert "lost" in one.states, "no good message came: the node is told as lost"
+
+
+def test_a_message_that_comes_twice_counts_once(seen: dict[str, Seen]) -> None:
+    one = seen["replayed"]
+    indices = [line["index"] for line in one.data]
+    assert len(indices) == len(set(indices))
+    assert one.count("late") > RATE
+
+
+def test_gaps_are_counted_as_lost(seen: dict[str, Seen]) -> None:
+    one = seen["gaps"]
+    assert one.count("lost") == pytest.approx(one.count("messages") / 4, rel=0.4)
+    assert one.states[-1] == "ended"
+
+
+@pytest.mark.parametrize("fault", ["held_back", "swapped"])
+def test_what_comes_too_late_is_counted_as_late(seen: dict[str, Seen], fault: str) -> None:
+    one = seen[fault]
+    assert one.count("late") > RATE
+    if fault == "held_back":
+        assert one.data == []
+
+
+def test_junk_between_messages_harms_no_message(seen: dict[str, Seen]) -> None:
+    one = seen["junk"]
+    assert one.count("samples") > RATE
+    assert one.count("invalid") == 0
+    assert one.states == ["waiting", "running", "ended"]
+
+
+def test_a_node_whose_samples_run_ahead_of_its_clock_is_not_believed(seen: dict[str, Seen]) -> None:
+    one = seen["too_fast"]
+    assert one.count("bad") > RATE, "from the future"
+
+
+def test_a_node_whose_samples_fall_behind_is_not_believed(seen: dict[str, Seen]) -> None:
+    assert seen["too_slow"].count("late") > 0
+
+
+@pytest.mark.parametrize("fault", ["jumping_clock", "backward_clock"])
+def test_a_clock_that_contradicts_itself_is_told(seen: dict[str, Seen], fault: str) -> None:
+    assert "its clock lies" in seen[fault].told
+
+
+@pytest.mark.parametrize(
+    ("fault", "why"),
+    [
+        ("wrong_length", "octets a message"),
+        ("wrong_start", "begins at another time"),
+        ("clock_of_tomorrow", "begins at another time"),
+        ("refuses_claims", "another station claims"),
+    ],
+)
+def test_a_node_that_contradicts_what_was_agreed_measures_nothing(seen: dict[str, Seen], fault: str, why: str) -> None:
+    one = seen[fault]
+    assert one.data == []
+    assert why in one.told
+    assert "running" not in one.states
+    assert "error" in one.end
+
+
+def test_values_beyond_the_limits_are_null_and_the_raw_value_stays(seen: dict[str, Seen]) -> None:
+    lines = seen["out_of_range"].data
+    raws = [(raw, value) for line in lines for raw, value in zip(line["raw"], line["value"], strict=True)]
+    assert {value for raw, value in raws if raw == 65535} == {None}
+    assert any(value is not None for _, value in raws)
+    assert seen["out_of_range"].count("invalid") > 0
+
+
+def test_what_the_node_calls_invalid_has_no_value(seen: dict[str, Seen]) -> None:
+    one = seen["not_valid"]
+    assert one.data
+    assert {value for line in one.data for value in line["value"]} == {None}
+    assert one.count("invalid") == one.count("samples")
+
+
+def test_a_node_that_falls_silent_is_lost_and_told(seen: dict[str, Seen]) -> None:
+    one = seen["falls_silent"]
+    assert "lost" in one.states
+    assert "No message of the node came" in one.told
+
+
+def test_a_node_that_lost_its_sessions_is_measured_on(seen: dict[str, Seen]) -> None:
+    one = seen["forgets"]
+    assert one.states.count("running") >= 2
+    assert one.states[-1] == "ended"
+
+
+def test_a_datasheet_that_changed_under_way_ends_its_values(seen: dict[str, Seen]) -> None:
+    one = seen["another_datasheet"]
+    assert one.states.count("running") == 1
+    assert "lost" in one.states
+    assert "not authentic" in one.told
+    lost = next(place for place, line in enumerate(one.lines) if line.get("state") == "lost")
+    assert not [line for line in one.lines[lost:] if line["event"] == "data"]
+    assert one.end["error"]["code"] == "not-authentic"
+
+
+def test_random_replies_are_no_news(seen: dict[str, Seen]) -> None:
+    one = seen["babbles"]
+    assert one.data
+    assert one.states[-1] == "ended"
