@@ -17,13 +17,10 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from teds_provision.errors import LinkFailure, NodeRefused, TedsProvisionError
-from teds_provision.links.can.bus import Frame
-from teds_provision.links.can.port import CanPort
 from teds_provision.measure.acting import LEASE
 from teds_provision.measure.blocks import Block, Command
 from teds_provision.measure.clock import ClockMap
 from teds_provision.measure.trusting import Trusted, claim
-from teds_provision.protocol.operation.can_frames import DriveAddress, cut
 from teds_provision.protocol.operation.commands import write_data_set
 from teds_provision.protocol.operation.datagram import Layout
 from teds_provision.protocol.operation.driving import Driver
@@ -57,8 +54,7 @@ class Hands:
     def __init__(
         self,
         trusted: Trusted,
-        port: CanPort,
-        address: int,
+        send: Callable[[bytes], None],
         numbers: tuple[int, ...],
         *,
         dead_man: int,
@@ -68,7 +64,7 @@ class Hands:
         echo: Callable[[Block], None],
         tell: Callable[[str], None],
     ) -> None:
-        self._trusted, self._port, self._address = trusted, port, address
+        self._trusted, self._send_message = trusted, send
         self._dead_man, self._clock, self._turn, self._mapping = dead_man, clock, turn, mapping
         self._echo, self._tell = echo, tell
         self._hands = {number: _Hand(ChannelInterpreter(trusted.sheet, number)) for number in numbers}
@@ -166,9 +162,7 @@ class Hands:
         with self._mapping:
             now = self._clock.ticks_at(time.monotonic_ns())
         message = hand.driver.seal((octets,), now)
-        identifier = DriveAddress(self._address, self._port.spec.source).identifier
-        for piece in cut(message, fd=self._port.spec.fd, drive=True):
-            self._port.send(Frame(identifier, piece.data, self._port.spec.fd))
+        self._send_message(message)
 
     def _say(self, number: int, hand: _Hand, octets: bytes) -> None:
         """Echo what was applied, as a sample of the actuator's channel."""

@@ -11,8 +11,6 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
 
-import numpy as np
-
 from teds_provision.errors import LinkFailure
 from teds_provision.links.can.bus import Frame
 from teds_provision.links.can.port import CanPort
@@ -51,9 +49,11 @@ class HeardStream:
     def take(self, segment: int, frame: Frame) -> None:
         """A frame of this stream."""
         octets = self.assembly.take(segment, frame.data)
-        if octets is None:
-            return
-        at = int((frame.at or time.monotonic()) * 1e9)
+        if octets is not None:
+            self.whole(octets, int((frame.at or time.monotonic()) * 1e9))
+
+    def whole(self, octets: bytes, at: int) -> None:
+        """A whole message of this stream, which came at ``at`` (monotonic ns)."""
         with self.mapping:
             message = self.receiver.take(octets, self.clock.ticks_at(at))
             if message is not None:
@@ -74,21 +74,17 @@ class HeardStream:
         self.heard = time.monotonic()
         if message.test_pattern and message.data != self.receiver.expected(message):
             self.wrong_pattern += 1
-        with self.mapping:
-            block = self.interpreter.take(message)
-        self._deliver(block)
+        self._deliver(self._interpret(lambda: self.interpreter.take(message)))
 
     def flush(self, now: float) -> None:
         """Hand on what has waited for GATHER."""
         since = self.interpreter.waiting_since
         if since and now - since >= GATHER:
-            self.finish()
+            self._deliver(self._interpret(self.interpreter.flush))
 
     def finish(self) -> None:
         """Hand on what is left."""
-        with self.mapping:
-            block = self.interpreter.flush()
-        self._deliver(block)
+        self._deliver(self._interpret(self.interpreter.flush))
 
     def hear_out(self, counter: int) -> None:
         """Wait for the hearing thread: frames that came before Stop's reply may still lie in its queue."""
@@ -96,27 +92,28 @@ class HeardStream:
         while self.receiver.last < counter - 1 and time.monotonic() < until:
             time.sleep(0.002)
 
+    def _interpret(self, step: Callable[[], Block | None]) -> Block | None:
+        with self.mapping:
+            return step()
+
     def _deliver(self, block: Block | None) -> None:
         if block is not None:
             self.samples += block.value.size
-            if not block.test_pattern:
-                self.invalid += block.valid.size - int(np.count_nonzero(block.valid))
+            self.invalid += int((~block.valid).sum()) if not block.test_pattern else 0
             self.bound = block.clock_error
             self.deliver(block)
 
 
 class Hearing:
-    """The listening thread of one bus."""
+    """The listening thread of one link that carries data; a kind of link says in :meth:`_hear` how it hears."""
 
-    def __init__(self, port: CanPort) -> None:
-        self._port = port
-        self._own = port.spec.source
+    def __init__(self, place: str) -> None:
         self._streams: dict[tuple[int, int], HeardStream] = {}
         self._announced: dict[int, Callable[[], None]] = {}
         self._lock = threading.Lock()
         self._stop = threading.Event()
         self.lost_frames = 0
-        self._thread = threading.Thread(target=self._run, name=f"hearing {port.place}", daemon=True)
+        self._thread = threading.Thread(target=self._run, name=f"hearing {place}", daemon=True)
         self._thread.start()
 
     def register(self, node: int, stream: int, heard: HeardStream) -> None:
@@ -146,12 +143,6 @@ class Hearing:
         self._stop.set()
         self._thread.join(2.0)
 
-    def _wanted(self, frame: Frame) -> bool:
-        if frame.identifier & _MASK != _DATA:
-            return False
-        station = frame.identifier >> 13 & 7
-        return station in (0, self._own & 7)
-
     def _run(self) -> None:
         while not self._stop.is_set():
             try:
@@ -161,18 +152,42 @@ class Hearing:
                 self._stop.wait(0.5)
 
     def _hear(self) -> None:
+        """Hear until the thread is to end; raises LinkFailure."""
+        raise NotImplementedError
+
+    def _flush(self, looked: float, lost: int) -> float:
+        """Hand on, now and then, what has waited; gives when that was last done."""
+        now = time.monotonic()
+        if now - looked < SLICE:
+            return looked
+        self.lost_frames = lost
+        for heard in self._streams.values():
+            heard.flush(now)
+        return now
+
+
+class CanHearing(Hearing):
+    """The listening thread of one bus; nodes are told apart by their address."""
+
+    def __init__(self, port: CanPort) -> None:
+        self._port = port
+        self._own = port.spec.source
+        super().__init__(port.place)
+
+    def _wanted(self, frame: Frame) -> bool:
+        if frame.identifier & _MASK != _DATA:
+            return False
+        station = frame.identifier >> 13 & 7
+        return station in (0, self._own & 7)
+
+    def _hear(self) -> None:
         with self._port.bus().listen(self._wanted, most=MOST_HELD) as ear:
             looked = time.monotonic()
             while not self._stop.is_set():
                 frame = ear.get(SLICE)
                 if frame is not None:
                     self._take(frame)
-                now = time.monotonic()
-                if now - looked >= SLICE:
-                    looked = now
-                    self.lost_frames = ear.lost
-                    for heard in self._streams.values():
-                        heard.flush(now)
+                looked = self._flush(looked, ear.lost)
 
     def _take(self, frame: Frame) -> None:
         address = data_address(frame.identifier)

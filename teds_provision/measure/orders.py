@@ -95,7 +95,7 @@ class BusShare:
         used = sum(load for key, load in self.taken.items() if key != uuid)
         if sharing:
             used += self._kept(uuid, MOST_LOAD - used)
-        return BusTime(self.time.bitrate, self.time.data_bitrate, used)
+        return replace(self.time, taken=used)
 
     def want(self, uuid: bytes, load: float) -> None:
         """Say what a node would take of an empty bus, then wait (:data:`SAYING` at most) for the others to say it."""

@@ -11,7 +11,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 from teds_provision.errors import BadData, PolicyRefused
-from teds_provision.protocol.operation.budget import MOST_LOAD, bus_load, frames, share
+from teds_provision.protocol.operation.budget import BLE_OVERHEAD, MOST_LOAD, bus_load, frames, share
+from teds_provision.protocol.operation.datagram import MOST_OCTETS
 from teds_provision.protocol.operation.stream_commands import LAST_STREAM, MOST_STREAM_CHANNELS, SOON, Kind
 from teds_provision.protocol.operation.subscription import Plan, most_instants
 from teds_provision.teds.sheet import Channel
@@ -23,15 +24,30 @@ LONGEST = 10**12  # ns, the contract's
 MILLION = 10**6
 NODE_SHARE = 0.5  # of the node's own budget: room for commands between data frames
 MOST_GAP = 2_000  # µs
+AIR_MESSAGES = 160.0  # notifications a second that an adapter is trusted with, all connections together
 
 
 @dataclass(frozen=True)
 class BusTime:
-    """What a CAN bus carries: bit/s, and whether frames are FD; ``taken`` is the share of others' data frames."""
+    """What a CAN bus carries: bit/s, and whether frames are FD; ``taken`` is the share of others' data frames.
+
+    With an ``mtu`` it is a Bluetooth adapter, and a connection with that MTU.
+    """
 
     bitrate: int = 500_000
     data_bitrate: int | None = None
     taken: float = 0.0
+    mtu: int | None = None
+
+    @property
+    def link(self) -> str:
+        """Name of the kind of link."""
+        return "can" if self.mtu is None else "ble"
+
+    @property
+    def most_octets(self) -> int:
+        """Octets of the longest data message."""
+        return MOST_OCTETS if self.mtu is None else min(MOST_OCTETS, self.mtu - BLE_OVERHEAD)
 
     @property
     def fd(self) -> bool:
@@ -175,7 +191,7 @@ def _plan(
 ) -> Plan:
     widths = tuple((one.number, one.sample.octets if one.sample else 0) for one in members)
     octets = sum(width for _, width in widths)
-    most = most_instants(kind, octets)
+    most = most_instants(kind, octets, bus.most_octets)
     if most < 1:
         raise BadData(f"One instant of channels {', '.join(str(n) for n, _ in widths)} does not fit a message.")
     n = max(1, min(most, BLOCK // period)) if kind != Kind.EVENT else 1
@@ -189,13 +205,16 @@ def _plan(
 
 def _load(plan: Plan, bus: BusTime) -> float:
     n, period = plan.subscribe.n, plan.subscribe.period
+    if bus.mtu is not None:
+        return 1e9 / (n * period) / AIR_MESSAGES
     return bus_load(plan.length, n, period, bitrate=bus.bitrate, data_bitrate=bus.data_bitrate)
 
 
 def _gap(plans: Sequence[Plan], bus: BusTime) -> int | None:
     """Microseconds between the node's data frames: what spreads them and still lets all leave in time."""
     unit = sum(
-        share(frames(plan.length, link="can", fd=bus.fd), 1, plan.subscribe.n, plan.subscribe.period) for plan in plans
+        share(frames(plan.length, link=bus.link, fd=bus.fd), 1, plan.subscribe.n, plan.subscribe.period)
+        for plan in plans
     )
     if unit > MILLION:
         return None

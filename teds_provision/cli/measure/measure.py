@@ -20,7 +20,7 @@ from teds_provision.cli.measure.values import ending, over_the_bus
 from teds_provision.cli.options import command, link_options
 from teds_provision.cli.steps.build import read_file
 from teds_provision.errors import PolicyRefused, UsageFailure
-from teds_provision.links import LinkSettings, can
+from teds_provision.links import LINKS, LinkSettings, ble, can
 from teds_provision.store import Measurement
 
 if TYPE_CHECKING:
@@ -34,6 +34,7 @@ KINDS = ("periodic", "event", "free")
 @command(
     "teds-provision measure 8d4d --can socketcan:can0 --to run.csv --to run.mcap",
     "teds-provision measure hand --can socketcan:can0 --duration 60 --ros2",
+    "teds-provision measure 8d4d --ble hci0 --duration 60 --to run.csv",
     "teds-provision measure recover run.mcap",
 )
 @click.argument("what", nargs=-1, required=True, metavar="NAME|UUID …")
@@ -77,8 +78,12 @@ def measure(
         _recover(app, what[1:])
         return
     links = over_the_bus(links)
-    if links.via != "can":
-        raise UsageFailure("Streams need a bus.", hint="Name it with --can; over NFC: teds-provision sample UUID")
+    if not LINKS[links.via].capabilities.streams:
+        raise UsageFailure(
+            "Streams need a bus or the air.", hint="Name it with --can or --ble; over NFC: teds-provision sample UUID"
+        )
+    if wished["trigger"] and links.via == "ble":
+        raise UsageFailure("A trigger is a frame on a CAN bus.", hint="Over the air leave --trigger out.")
     station = app.station()
     group, uuids = _who(station, what)
     sinks = (*files, *(name for name in ("ros1", "ros2") if wished[name]), *([mqtt] if mqtt else []))
@@ -132,11 +137,13 @@ def _run(app: App, job: Job, links: LinkSettings, uuids: Sequence[bytes], durati
     station, stop = job.station, threading.Event()
     group = job.kept.group or ""
     nodes = [uuid.hex() for uuid in uuids]
-    ports = [port for port in links_room.open_ports(links) if isinstance(port, can.port.CanPort)]
+    kinds = (can.port.CanPort, ble.port.BlePort)
+    ports = [port for port in links_room.open_ports(links) if isinstance(port, kinds)]
+    buses_alone = [port for port in ports if isinstance(port, can.port.CanPort)]
     try:
         with ExitStack() as stack:
             stack.enter_context(
-                measure_room.finding.sources.sole_user(station, ports, f"measure {group or ', '.join(nodes)}")
+                measure_room.finding.sources.sole_user(station, buses_alone, f"measure {group or ', '.join(nodes)}")
             )
             watcher = stack.enter_context(measure_cli.showing.watcher_for(app, station, job.sinks, stop))
             stack.enter_context(ending(stop))

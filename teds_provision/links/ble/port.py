@@ -63,6 +63,7 @@ class BlePort:
         self._known: dict[str, Identity] = {}
         self._data: queue.Queue[DataMessage] = queue.Queue(_MOST_HELD)
         self._heard = False
+        self.lost = 0  # data messages for which nobody had time
         self._transaction = secrets.randbelow(1 << 16)
         self._lock = threading.Lock()
 
@@ -91,6 +92,23 @@ class BlePort:
             yield self._next_data
         finally:
             self._heard = False
+
+    def link(self, number: int, notice: NoticeSink | None = None) -> BleLink:
+        """The line over the connection of this number; raises NoNode where there is none."""
+        connection = next((each for each in self._connections.values() if each.number == number), None)
+        if connection is None:
+            raise NoNode("That node is not known here any more.")
+        return BleLink(self._loop, connection, self.next_transaction, self._make_room, notice or _silently)
+
+    def mtu(self, number: int) -> int:
+        """ATT MTU of a connection, 23 where it is not there."""
+        return self.link(number).mtu
+
+    def keep(self, number: int, *, streaming: bool) -> None:
+        """Whether a measurement hangs on a connection, so that it is not given up for another node."""
+        for connection in self._connections.values():
+            if connection.number == number:
+                connection.streaming = streaming
 
     # -- finding ---------------------------------------------------------------------------------------------------
 
@@ -143,9 +161,11 @@ class BlePort:
             told: set[bytes] = set()
             found = []
             for each in addresses:
+                in_use = self._is_up(each)
                 contact = self._ask(each, _anyone, notice, told)
                 if contact is not None:
-                    contact.link.close()  # there may be twenty: each is connected again when its turn comes
+                    if not in_use:  # there may be twenty: each is connected again when its turn comes
+                        contact.link.close()
                     found.append(contact)
             if found:
                 return found
@@ -222,26 +242,32 @@ class BlePort:
     ) -> Contact | None:
         """Connect and ask who it is; the connection stays where it is the one that is wanted, alone."""
         link = self._link(address, notice)
+        in_use = link.connection.is_up
         try:
             identity = Identity.decode(decode_reply(link.exchange(_IDENTIFY)).payload)
         except NoReader:
             raise
         except (LinkFailure, NodeRefused) as error:
             notice(Notice("unfinished", f"The node at {address} did not say who it is: {error.message}"))
-            link.close()
+            self._leave(link, in_use=in_use)
             return None
         except Exception:
-            link.close()
+            self._leave(link, in_use=in_use)
             raise
         self._known[address] = identity
         if not wanted(identity):
-            link.close()
+            self._leave(link, in_use=in_use)
             if identity.uuid not in told:
                 told.add(identity.uuid)
                 uuid = identity.uuid.hex().upper()
                 notice(Notice("foreign-tag", f"Node {uuid} is at {address}, but it is not the one looked for."))
             return None
         return Contact(identity, link, connection=link.connection.number, trace=self._trace)
+
+    def _leave(self, link: BleLink, *, in_use: bool) -> None:
+        """End a connection that was made for a question alone."""
+        if not in_use:
+            link.close()
 
     def _link(self, address: str, notice: NoticeSink) -> BleLink:
         with self._lock:
@@ -251,6 +277,10 @@ class BlePort:
                     self._adapter, address, self._take_data, self._trace
                 )
         return BleLink(self._loop, connection, self.next_transaction, self._make_room, notice)
+
+    def _is_up(self, address: str) -> bool:
+        connection = self._connections.get(address)
+        return connection is not None and connection.is_up
 
     def _make_room(self) -> bool:
         """End a connection on which nothing is under way; False where there is none."""
@@ -263,8 +293,10 @@ class BlePort:
 
     def _take_data(self, connection: int, octets: bytes) -> None:
         if self._heard:
-            with suppress(queue.Full):
+            try:
                 self._data.put_nowait(DataMessage(connection, octets, time.monotonic_ns()))
+            except queue.Full:
+                self.lost += 1
 
     def _next_data(self, seconds: float) -> DataMessage | None:
         try:
@@ -275,6 +307,10 @@ class BlePort:
     async def _all_down(self) -> None:
         for connection in self._connections.values():
             await connection.down()
+
+
+def _silently(_notice: Notice) -> None:
+    """Nobody looks."""
 
 
 def _anyone(_identity: Identity) -> bool:

@@ -9,21 +9,25 @@ from collections.abc import Callable, Iterable, Sequence
 from types import TracebackType
 
 from teds_provision.errors import LinkFailure
+from teds_provision.links.ble.port import BlePort
+from teds_provision.links.can.bus import Frame
 from teds_provision.links.can.port import CanPort
+from teds_provision.measure.finding.air import AirHearing, AirLookout, air_time
 from teds_provision.measure.finding.lookout import Lookout, Sighting, Sightings
-from teds_provision.measure.hearing import Hearing
+from teds_provision.measure.hearing import CanHearing, Hearing
 from teds_provision.measure.orders import BusShare
 from teds_provision.measure.planning import BusTime
+from teds_provision.protocol.messages.ble import LEAST_MTU
+from teds_provision.protocol.operation.can_frames import Assembly, DriveAddress, cut
 
 
 class Bus:
-    """One CAN bus: ``port``, who hears its data frames, how much of it is taken, who is on it."""
+    """One link that carries data: ``port``, who hears its data messages, how much of it is taken, who is on it."""
 
-    def __init__(self, port: CanPort, sightings: Sightings, *, poll: float | None) -> None:
-        self.port = port
-        self.hearing = Hearing(port)
-        self.share = BusShare(BusTime(port.spec.bitrate, port.spec.data_bitrate if port.spec.fd else None))
-        self.lookout = Lookout(port, sightings, poll=poll)
+    def __init__(
+        self, port: CanPort | BlePort, hearing: Hearing, share: BusShare, lookout: Lookout | AirLookout
+    ) -> None:
+        self.port, self.hearing, self.share, self.lookout = port, hearing, share, lookout
 
     @property
     def place(self) -> str:
@@ -35,6 +39,31 @@ class Bus:
         self.lookout.close()
         self.hearing.close()
 
+    def assembly(self, length: int) -> Assembly:
+        """What puts frames of messages of so many octets together."""
+        return Assembly(length, fd=isinstance(self.port, CanPort) and self.port.spec.fd)
+
+    def time_for(self, time: BusTime, address: int) -> BusTime:
+        """The time of this link as the node at ``address`` has it: over the air its connection has an MTU."""
+        return air_time(time, self.port.mtu(address)) if isinstance(self.port, BlePort) else time
+
+    def drive(self, address: int, message: bytes) -> None:
+        """Send a Drive message to the node at ``address``; raises LinkFailure."""
+        if isinstance(self.port, BlePort):
+            self.port.link(address).drive(message)
+            return
+        identifier = DriveAddress(address, self.port.spec.source).identifier
+        for piece in cut(message, fd=self.port.spec.fd, drive=True):
+            self.port.send(Frame(identifier, piece.data, self.port.spec.fd))
+
+
+def bus_at(port: CanPort | BlePort, sightings: Sightings, *, poll: float | None) -> Bus:
+    """The bus, or the adapter, behind a port."""
+    if isinstance(port, BlePort):
+        return Bus(port, AirHearing(port), BusShare(BusTime(mtu=LEAST_MTU)), AirLookout(port, sightings, poll=poll))
+    time = BusTime(port.spec.bitrate, port.spec.data_bitrate if port.spec.fd else None)
+    return Bus(port, CanHearing(port), BusShare(time), Lookout(port, sightings, poll=poll))
+
 
 class Buses:
     """All of them; ``with Buses(ports) as buses:`` ends their threads. The ports are the caller's to close.
@@ -45,7 +74,7 @@ class Buses:
 
     def __init__(
         self,
-        ports: Iterable[CanPort] = (),
+        ports: Iterable[CanPort | BlePort] = (),
         *,
         poll: float | None = None,
         news: Callable[[Sighting], None] = lambda _sighting: None,
@@ -65,10 +94,10 @@ class Buses:
     ) -> None:
         self.close()
 
-    def add(self, port: CanPort) -> Bus:
+    def add(self, port: CanPort | BlePort) -> Bus:
         """Hear one more bus."""
         if port.place not in self._buses:
-            self._buses[port.place] = Bus(port, self.sightings, poll=self._poll)
+            self._buses[port.place] = bus_at(port, self.sightings, poll=self._poll)
         return self._buses[port.place]
 
     def all(self) -> Sequence[Bus]:

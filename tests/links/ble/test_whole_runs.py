@@ -174,3 +174,35 @@ def test_a_node_is_neither_agreed_with_nor_pinned_over_the_air(desk: Desk, bench
     refused = bench.refuses("provision", "--profile", ANGLE, "--yes", "--via", "ble", code=6)
     assert "tap" in (refused["message"] + refused["hint"]).lower()
     assert node.flash["key"] is None
+
+
+def test_two_nodes_are_measured_over_the_air(desk: Desk, air: Air) -> None:
+    """Streams by notifications, each connection kept; one is cut in between, and comes back by itself."""
+    home = desk.folder / "home"
+    station = make_station(home)
+    for name in ("left", "right"):
+        tapped_once(station, desk.folder / name)
+    station.close()
+    radio = air([desk.folder / "left", desk.folder / "right"])
+    bench = Station(desk, home)
+    uuids = [json.loads((desk.folder / name / "flash.json").read_text())["flash"]["uuid"] for name in ("left", "right")]
+    running = bench.start("--json", "measure", *uuids, "--ble", "auto", "--rate", "100", "--duration", "8")
+    running.wait_for(f'"event":"data","uuid":"{uuids[0]}"', 40)
+    running.wait_for(f'"event":"data","uuid":"{uuids[1]}"', 40)
+    assert radio.do("counts")["held"] == 2
+    radio.do("drop", 0)
+    done = running.end(60)
+    assert done.code == 0, done
+    lines = [json.loads(line) for line in done.out.splitlines()]
+    for node in lines[-1]["nodes"]:
+        (stream,) = node["streams"]
+        assert stream["samples"] > 100, node
+        assert (stream["bad"], stream["late"]) == (0, 0), node
+    states = [line["state"] for line in lines if line["event"] == "status" and line["uuid"] == uuids[0]]
+    assert "lost" in states
+    assert "running" in states[states.index("lost") :]
+
+
+def test_no_trigger_goes_over_the_air(desk: Desk, bench: Station) -> None:
+    refused = bench.refuses("measure", "00" * 10, "--ble", "auto", "--trigger", code=2)
+    assert "CAN bus" in refused["message"]
