@@ -5,7 +5,7 @@ PYTHON ?= python3
 VENV ?= .venv
 BIN := $(VENV)/bin
 
-.PHONY: demo test lint types unit bench bench-teds bench-handover bench-measure bench-scale fuzz faults model house man sbom clean
+.PHONY: demo test test-system lint types unit bench bench-teds bench-handover bench-measure bench-scale fuzz faults model house man sbom clean
 
 demo: $(VENV)/.run
 	@$(BIN)/teds-provision demo
@@ -42,6 +42,11 @@ bench-handover: $(VENV)/.dev
 
 bench-scale: $(VENV)/.dev
 	$(BIN)/python -m benchmarks.scale
+
+# A kernel with CAN and Bluetooth in qemu, over this checkout: SocketCAN, ISO-TP, bluetoothd. Slow; never for timings.
+test-system: $(VENV)/.dev
+	@sh scripts/install-test-machine || { test -z "$$CI" && echo "Going on without: the tests are skipped."; }
+	$(BIN)/python -m pytest tests/system -m machine -rs --durations=5
 
 # Coverage-guided fuzzing of every parser of octets: RUNS inputs each (a million take about an hour and a half on one
 # core), or one of them: make fuzz TARGET=nfc RUNS=100000. atheris gets an environment of its own.
