@@ -18,7 +18,7 @@ const VIEWS = {
   log: ["Log", logView],
   station: ["Station", stationView],
 };
-const STATUS_EVERY = 3000; // ms
+const STATUS_EVERY = 2000; // ms
 
 let shown = { name: null, view: null };
 
@@ -133,7 +133,9 @@ function tapped() {
     toast("good", `Tapped: ${nameOf(node ?? { uuid })}.`, "Not opened, because you hold an actuator.");
     return;
   }
-  if (!here) location.hash = `#/nodes/${uuid}`;
+  const asked = ["waiting", "running"].includes((state.runs.get(uuid) ?? state.runs.get("next"))?.state);
+  if (asked) location.hash = `#/nodes/${uuid}/provision`;
+  else if (!here) location.hash = `#/nodes/${uuid}`;
   changed("nodes");
 }
 

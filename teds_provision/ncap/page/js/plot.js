@@ -180,9 +180,9 @@ function options(channels, colours) {
     height: 220,
     legend: { show: false },
     cursor: { show: false },
-    padding: [8, 8, 0, 0],
+    padding: [8, 24, 0, 0],
     scales: { x: { time: true, auto: false }, y: { range: padded } },
-    axes: [axis(colours, { space: 90 }), axis(colours, { size: 60, values: (_, ticks) => ticks.map(tick) })],
+    axes: [axis(colours, { space: 90, values: (_, ticks) => ticks.map(hours) }), axis(colours, { size: 60, values: (_, ticks) => ticks.map(tick) })],
     series: [
       {},
       ...channels.map((channel, index) => ({
@@ -196,6 +196,7 @@ function options(channels, colours) {
   };
 }
 
+const hours = (time) => (time === null ? "" : new Date(time * 1000).toTimeString().slice(0, 8));
 const tick = (value) => (value === null ? "" : String(Number(value.toPrecision(6))).replace("-", "\u2212"));
 
 /** A little room above and below; a course that stands still gets a frame too. */
@@ -217,9 +218,10 @@ export function curvePlot(label, xUnit, yUnit, points) {
     setting.width = width;
     setting.height = 240;
     setting.scales = { x: { time: false }, y: { range: padded } };
+    setting.axes[0].values = setting.axes[1].values;
     setting.axes[0].label = xUnit;
     setting.axes[1].label = yUnit;
-    setting.axes.forEach((one) => Object.assign(one, { labelFont: colours.font, labelSize: 20 }));
+    setting.axes.forEach((one) => Object.assign(one, { labelFont: colours.font, labelSize: 18 }));
     setting.series[1].points = { show: points.length < 60, size: 5 };
     new window.uPlot(setting, [points.map(([x]) => x), points.map(([, y]) => y)], canvas);
   });

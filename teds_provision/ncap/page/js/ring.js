@@ -30,28 +30,42 @@ export class Ring {
     return this.held ? this.time[(this.next + this.size - 1) % this.size] : NaN;
   }
 
-  /** Lowest and highest of each of `columns` equal bins from `from` to `to`, two entries a bin. Silence is null. */
+  /**
+   * Lowest and highest of each of `columns` equal bins from `from` to `to`, two entries a bin, in the order in which they
+   * came. A bin without a point is undefined, one in a silence longer than `silence` seconds, or without a value, null.
+   */
   bins(from, to, columns, silence) {
     const out = new Array(2 * columns).fill(undefined);
     const width = (to - from) / columns;
     const start = (this.next + this.size - this.held) % this.size;
     let before = NaN;
+    let column = -1;
+    let [low, high, rising] = [NaN, NaN, true];
+    const settle = () => {
+      if (column < 0) return;
+      const at = 2 * column;
+      if (Number.isNaN(low)) out[at] = out[at + 1] = null;
+      else [out[at], out[at + 1]] = rising ? [low, high] : [high, low];
+    };
     for (let step = this.after(from); step < this.held; step++) {
       const place = (start + step) % this.size;
       const time = this.time[place];
-      const column = Math.floor((time - from) / width);
-      if (column >= columns) break;
-      const value = this.value[place];
-      const at = 2 * column;
-      if (time - before > silence && at > 0 && out[at] === undefined) out[at - 1] = out[at - 1] ?? null;
+      const next = Math.floor((time - from) / width);
+      if (next >= columns) break;
+      if (next !== column) {
+        settle();
+        if (time - before > silence && next > column + 1) out[2 * next - 1] = null;
+        column = next;
+        low = high = NaN;
+      }
       before = time;
-      if (Number.isNaN(value)) {
-        if (out[at] === undefined) out[at] = out[at + 1] = null;
-      } else if (out[at] === undefined || out[at] === null) {
-        out[at] = out[at + 1] = value;
-      } else if (value < out[at]) out[at] = value;
-      else if (value > out[at + 1]) out[at + 1] = value;
+      const value = this.value[place];
+      if (Number.isNaN(value)) continue;
+      if (Number.isNaN(low)) low = high = value;
+      else if (value < low) [low, rising] = [value, false];
+      else if (value > high) [high, rising] = [value, true];
     }
+    settle();
     return out;
   }
 

@@ -19,6 +19,7 @@ export function scaleOf(wire) {
 }
 
 export const toShown = (scale, value) => (typeof value === "number" ? value * scale.factor + scale.offset : null);
+export const fromUnit = (scale, value, unit) => (unit && unit === scale.unit ? value : toShown(scale, value));
 export const toSi = (scale, value) => (value - scale.offset) / scale.factor;
 
 function channel(wire) {
@@ -36,7 +37,7 @@ function channel(wire) {
     high: ends[1],
     uncertainty: typeof wire.uncertainty === "number" ? Math.abs(wire.uncertainty * scale.factor) : null,
     last,
-    actuator: wire.actuator ? { ...wire.actuator, value: toShown(scale, wire.actuator.value) } : null,
+    actuator: wire.actuator ? { ...wire.actuator, value: fromUnit(scale, wire.actuator.value, wire.actuator.unit) } : null,
   };
 }
 
@@ -58,14 +59,13 @@ export function node(wire) {
   return {
     ...wire,
     name: wire.name ?? "",
-    link: wire.via ?? (wire.link ?? "").split(":")[0] ?? null,
-    place: wire.link ?? null,
-    seen: moment(wire.last_seen ?? wire.seen),
+    link: wire.via ?? null,
+    seen: moment(wire.last_seen),
     earlier: wire.verdict ? null : (wire.known_verdict ?? null),
-    why: wire.problem?.message ?? wire.why ?? "",
+    why: wire.problem?.message ?? "",
     cure: wire.problem?.hint ?? "",
-    groups: wire.groups ?? (wire.group ? [wire.group] : []),
-    mode: wire.measurement ? "measuring" : (wire.mode ?? null),
+    groups: wire.groups ?? [],
+    mode: wire.measurement ? "measuring" : null,
     power: power(wire.power),
     channels: (wire.channels ?? []).map(channel),
   };
@@ -74,15 +74,14 @@ export function node(wire) {
 /** The station. */
 export function status(wire) {
   const links = (wire.links ?? []).map((link) => ({
-    name: (link.place ?? link.name ?? "").replace(/^(can|nfc|ble):/, ""),
-    kind: link.via ?? link.kind ?? "can",
+    name: link.virtual ? "bus of the virtual transducers" : (link.place ?? "").replace(/^(can|nfc|ble):/, ""),
+    kind: link.virtual ? "virtual" : link.via,
     state: link.state,
-    why: link.problem?.message ?? link.why ?? link.waiting ?? "",
+    why: link.problem?.message ?? link.waiting ?? "",
     hint: link.problem?.hint ?? "",
     nodes: link.nodes ?? null,
   }));
-  const strangers = wire.strangers ?? (wire.links ?? []).reduce((sum, link) => sum + (link.strangers ?? 0), 0);
-  return { ...wire, now: moment(wire.time ?? wire.now), started: moment(wire.started), links, strangers, write: !(wire.read_only ?? wire.write === false) };
+  return { ...wire, now: moment(wire.time), started: moment(wire.started), links };
 }
 
 /** One message of /live as an event with a name. */

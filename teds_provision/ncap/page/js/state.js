@@ -102,10 +102,14 @@ const LISTS = {
   status: async () => {
     state.status = shapes.status(await get("status"));
     if (state.status.now !== null) state.offset = state.status.now - Date.now() / 1000;
+    if (state.status.measurements) {
+      state.measurements = state.status.measurements;
+      changed("measurements");
+    }
   },
   nodes: async () => {
     const { nodes } = await get("nodes");
-    state.nodes = new Map((nodes ?? []).map((wire) => [wire.uuid, settled(shapes.node(wire))]));
+    state.nodes = new Map((nodes ?? []).map((wire) => [wire.uuid, shapes.node(wire)]));
     state.loaded = true;
   },
   groups: async () => (state.groups = (await get("groups")).groups ?? []),
@@ -140,12 +144,6 @@ async function fetchOne(list) {
   if (again) await fetchOne(list);
 }
 
-/** What the node's own answer does not say: whether it is a virtual one of this station. */
-function settled(node) {
-  node.virtual = state.virtual.some((one) => one.uuid === node.uuid);
-  return node;
-}
-
 const due = new Set(); // UUIDs of nodes that changed
 
 /** Fetch one node anew, soon: events come in flocks. */
@@ -160,7 +158,7 @@ async function fetchDue() {
   if (uuids.length > 5) return refresh("nodes");
   const answers = await Promise.allSettled(uuids.map((uuid) => get(paths.node(uuid))));
   answers.forEach((answer, index) => {
-    if (answer.status === "fulfilled") state.nodes.set(uuids[index], settled(shapes.node(answer.value)));
+    if (answer.status === "fulfilled") state.nodes.set(uuids[index], shapes.node(answer.value));
     else if (answer.reason.status === 404) state.nodes.delete(uuids[index]);
   });
   return changed("nodes");
@@ -200,6 +198,7 @@ const TAKERS = {
   },
   node: (event) => {
     refreshNode(event.uuid);
+    if (["running", "lost", "refused", "waiting", "ended", "idle"].includes(event.state)) refresh("status");
     // Whoever lays a node on the reader wants to see that very node: no button is needed.
     if (event.state === "tapped") {
       state.tapped = { uuid: event.uuid, at: performance.now() };
@@ -207,6 +206,10 @@ const TAKERS = {
     }
   },
   provision: (event) => {
+    if (!state.runs.has(event.uuid) && state.runs.get("next")?.state === "waiting" && event.state === "running") {
+      state.runs.set(event.uuid, state.runs.get("next")); // the node for which "the next one" was asked has come
+      state.runs.delete("next");
+    }
     const run = state.runs.get(event.uuid) ?? { steps: [] };
     const steps = event.state === "waiting" ? [] : [...run.steps];
     if (event.step) {
@@ -220,7 +223,7 @@ const TAKERS = {
   },
   actuator: (event) => {
     const channel = state.nodes.get(event.uuid)?.channels?.find((one) => one.number === event.channel);
-    if (channel) channel.actuator = { value: shapes.toShown(channel.scale, event.value), safe: event.safe };
+    if (channel) channel.actuator = { value: shapes.fromUnit(channel.scale, event.value, event.unit), safe: event.safe };
   },
 };
 

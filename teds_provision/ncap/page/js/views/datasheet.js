@@ -52,10 +52,11 @@ export class DatasheetTab {
     fill(this.files, "Save as ", ["json", "xml", "hex"].map((form) => [h("a", { href: `api/v1/${api}?format=${form}`, download: `${this.uuid}.${form}` }, form.toUpperCase()), " "]));
     const teds = sheet.teds ?? [];
     const [tone, sign, words, why] = verdict(sheet);
-    const findings = teds.flatMap((one) => (one.findings ?? []).map((finding) => ({ ...finding, where: title(one) })));
+    const found = teds.flatMap((one) => (one.findings ?? []).map((finding) => ({ ...finding, where: title(one) })));
+    const findings = [...(sheet.guard ?? []).map((one) => ({ ...one, where: "Plausibility" })), ...found];
     fill(
       this.body,
-      h("div", { class: "sheet-verdict" }, chip(tone, sign, words), h("span", {}, why)),
+      h("div", { class: "sheet-verdict" }, chip(tone, sign, words), h("span", {}, why), sheet.read_now === false ? chip("warn", "clock", "As it was last read: the node is not on a bus now") : null),
       sheet.checks?.length ? h("details", { class: "checks", open: sheet.verdict !== "authentic" }, h("summary", {}, "Security check"), h("ul", {}, sheet.checks.map(checkLine))) : null,
       findings.length ? h("details", { class: "findings", open: findings.some((one) => one.severity === "error") }, h("summary", {}, `${count(findings.length, "finding")}`), h("ul", {}, findings.map(findingLine))) : null,
       teds.length ? null : empty("The node has no datasheet.", h("p", {}, "Write one from a file below, or ", h("a", { href: `#/nodes/${this.uuid}/provision` }, "provision it"), " from a type.")),
@@ -71,11 +72,19 @@ export class DatasheetTab {
   }
 }
 
-const title = (one) => [one.channel === 0 ? "Node" : `Channel ${one.channel}`, one.name].filter(Boolean).join(": ");
+const NAMES = {
+  MetaTEDS: "Meta-TEDS",
+  ChanTEDS: "TransducerChannel TEDS",
+  CalTEDS: "Calibration TEDS",
+  XdcrName: "Name TEDS",
+  SecurityTEDS: "Security TEDS",
+  PHYTEDS: "PHY TEDS",
+};
+const title = (one) => [one.channel === 0 ? "Node" : `Channel ${one.channel}`, NAMES[one.name] ?? one.name].filter(Boolean).join(": ");
 
 function findingLine(finding) {
   const tone = { error: "bad", warning: "warn" }[finding.severity] ?? "plain";
-  return h("li", {}, chip(tone, tone === "plain" ? "ask" : "warn", finding.severity ?? "note"), h("span", { class: "check-name" }, finding.where), h("span", {}, finding.message));
+  return h("li", {}, chip(tone, tone === "plain" ? "ask" : "warn", finding.severity ?? "note"), h("span", { class: "check-name" }, finding.where), h("span", {}, finding.message, finding.hint ? h("span", { class: "hint" }, ` ${finding.hint}`) : null));
 }
 
 function figure(curve) {
@@ -87,7 +96,7 @@ function figure(curve) {
 function tedsBlock(one, many) {
   const rows = h("tbody", {});
   (one.fields ?? []).forEach((field) => fieldRows(rows, field, 0));
-  const state_ = one.verdict && one.verdict !== "valid" ? chip("warn", "warn", one.verdict) : null;
+  const state_ = one.verdict && one.verdict !== "clean" ? chip("warn", "warn", one.verdict) : null;
   return h(
     "details",
     { open: many <= 2 },

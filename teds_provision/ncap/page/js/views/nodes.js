@@ -4,6 +4,7 @@ import { chip, empty, fill, h, icon, keyed, text } from "../dom.js";
 import { age, channelName, count, nameOf, number, verdict } from "../format.js";
 import { isStale, lastOf, now, on, state } from "../state.js";
 import { NodePanel } from "./node.js";
+import { ProvisionTab } from "./provision.js";
 
 const MARKED = 8000; // ms that a tapped node stays marked
 const SHOWN_VALUES = 3;
@@ -21,9 +22,10 @@ export function nodesView(main, rest) {
   const list = h("ul", { class: "cards" });
   const none = h("div", {});
   const detail = h("div", { class: "detail" });
-  const side = h("section", { class: "side", "aria-label": "Nodes" }, h("div", { class: "side-head" }, h("h2", {}, "Nodes"), total), search, list);
+  const side = h("section", { class: "side", "aria-label": "Nodes" }, h("div", { class: "side-head" }, h("h2", {}, "Nodes"), total), search, list, h("p", { class: "side-foot" }, h("a", { href: "#/nodes/next/provision" }, icon("nfc"), " Provision the next node that is tapped")));
   main.append(side, none, detail);
   let panel = null;
+  let next = null; // the form for whichever node is tapped next
   let chosen = rest;
 
   function matching() {
@@ -54,6 +56,17 @@ export function nodesView(main, rest) {
   }
 
   function open(nodes) {
+    if (chosen[0] === "next") {
+      if (!next) {
+        panel?.end();
+        panel = null;
+        detail.replaceChildren();
+        next = new ProvisionTab(detail, "next");
+      }
+      return;
+    }
+    next?.end();
+    next = null;
     const uuid = chosen[0] ?? nodes[0]?.uuid;
     const node = state.nodes.get(uuid);
     if (!node) {
@@ -118,6 +131,7 @@ export function nodesView(main, rest) {
       clearInterval(ticking);
       clearInterval(unmark);
       panel?.end();
+      next?.end();
     },
   };
 }
@@ -158,7 +172,7 @@ function firstSteps() {
     h(
       "ol",
       {},
-      h("li", {}, icon("nfc"), h("div", {}, h("strong", {}, "Lay a node on the NFC reader."), h("p", {}, "It opens here by itself. Nothing is to be pressed."))),
+      h("li", {}, icon("nfc"), h("div", {}, h("strong", {}, "Lay a node on the NFC reader."), h("p", {}, "It opens here by itself. Nothing is to be pressed. "), h("p", {}, h("a", { href: "#/nodes/next/provision" }, "Provision the next node that is tapped")))),
       h("li", {}, icon("can"), h("div", {}, h("strong", {}, "Or connect one to the bus."), h("p", {}, "It announces itself; Discover, above, asks every link now."))),
       h("li", {}, icon("virtual"), h("div", {}, h("strong", {}, "None at hand? "), h("a", { href: "#/virtual" }, "Make a virtual transducer"), h("p", {}, "It speaks like a board and needs no hardware."))),
     ),

@@ -35,7 +35,7 @@ export class ProvisionTab {
       h(
         "section",
         { class: "panel", "aria-label": "Provision" },
-        h("h3", {}, "Provision"),
+        h(uuid === "next" ? "h2" : "h3", {}, uuid === "next" ? "Provision the next node that is tapped" : "Provision"),
         h("p", { class: "hint" }, "Gives the node a key of this station and a signed datasheet. When a tap is needed, this page waits for it: just lay the node on the reader."),
         h("div", { class: "row" }, field("Transducer type", this.profile), field("Name", this.name), field("Calibration (if it has one)", this.calibration)),
         h("div", { class: "row" }, this.go, this.why),
@@ -73,7 +73,7 @@ export class ProvisionTab {
   follow(run) {
     const waits = run?.state === "waiting";
     if (waits && !this.waiting.firstChild) {
-      const words = run.waits_for === "tap" || !run.waits_for ? "Lay the node on the reader." : run.waits_for;
+      const words = this.uuid === "next" ? "Lay a node on the reader." : "Lay this node on the reader.";
       fill(this.waiting, icon("nfc"), h("div", {}, h("p", { class: "lead" }, words), h("p", {}, "Waiting until ", clock(run.until), " ", this.clock)), this.cancel);
       say(words);
     } else if (!waits && this.waiting.firstChild) this.waiting.replaceChildren();
@@ -88,7 +88,8 @@ export class ProvisionTab {
     if (run?.state === "done") {
       fill(this.outcome, h("p", { class: "done" }, chip("good", "good", "Provisioned"), ` ${nameOf(state.nodes.get(this.uuid))} is ready. `, h("a", { href: `#/nodes/${this.uuid}/live` }, "See its values")));
       say("Provisioned.");
-    } else if (run?.state === "failed") fill(this.outcome, trouble(run.error ?? { message: "It failed." }));
+    } else if (run?.state === "cancelled") fill(this.outcome, h("p", { class: "hint" }, "Nobody waits for a tap any more."));
+    else if (run?.state === "failed") fill(this.outcome, trouble(run.error ?? { message: "It failed." }));
     else this.outcome.replaceChildren();
   }
 
@@ -124,8 +125,8 @@ export class ProvisionTab {
 
   async end_waiting() {
     try {
-      await post(paths.provision(this.uuid), { cancel: true });
-      state.runs.delete(this.uuid);
+      const run = await post(paths.provision(this.uuid), { cancel: true });
+      state.runs.set(this.uuid, run);
       this.paint();
     } catch (error) {
       fill(this.outcome, trouble(error));

@@ -2,7 +2,7 @@
 
 import { change } from "../api.js";
 import { button, chip, empty, fill, h, icon, keyed, say, text, toast } from "../dom.js";
-import { clock, count, grouped, nameOf, short } from "../format.js";
+import { channelName, clock, count, grouped, nameOf, short } from "../format.js";
 import { on, refresh, state } from "../state.js";
 import { linkName } from "./nodes.js";
 
@@ -81,7 +81,7 @@ function nameRow(one) {
   let known = one;
   async function rename() {
     try {
-      await change("names", { uuid: known.uuid, channel: known.channel, name: entry.value.trim() });
+      await change("names", { uuid: known.uuid, channel: known.channel, name: entry.value.trim().replace(/^\/+/, "") || null });
       say("Renamed.");
       await refresh("names", "nodes");
     } catch (error) {
@@ -92,7 +92,8 @@ function nameRow(one) {
     const before = known;
     known = now;
     const node = state.nodes.get(now.uuid) ?? { uuid: now.uuid };
-    text(label, now.channel ? `${nameOf(node)}: ${now.name ?? `channel ${now.channel}`}` : nameOf(node));
+    const channel = node.channels?.find((each) => each.number === now.channel);
+    text(label, now.channel ? `${nameOf(node)}: ${channel ? channelName(channel) : `channel ${now.channel}`}` : `${nameOf(node)} (the node)`);
     entry.setAttribute("aria-label", `Topic of ${label.textContent}`);
     if (document.activeElement !== entry && (before !== now || !entry.value)) entry.value = now.topic ?? "";
     keep.disabled = state.status?.write === false || state.connection !== "live";

@@ -81,9 +81,16 @@ export class LiveTab {
       const last = lastOf(this.uuid, channel);
       const stale = isStale(last);
       const { figure, old, bar } = element.parts;
+      if (channel.kind === "actuator") {
+        const told = channel.actuator;
+        text(figure, told?.safe === false ? number(told.value, channel.uncertainty) : "–");
+        text(old, told?.safe === true ? "safe state" : "");
+        if (bar) bar.value = told?.safe === false ? told.value : channel.low;
+        continue;
+      }
       text(figure, last ? (last.value === null ? "not valid" : number(last.value, channel.uncertainty)) : "–");
       text(old, last ? (stale ? age(time - last.time) : "") : "");
-      element.classList.toggle("stale", stale && channel.kind !== "actuator");
+      element.classList.toggle("stale", stale);
       element.classList.toggle("fresh", !stale);
       if (bar) bar.value = last?.value ?? channel.low;
     }
