@@ -106,7 +106,7 @@ function tedsBlock(one, many) {
 }
 
 function fieldRows(rows, field, depth) {
-  const row = h("tr", {}, h("th", { scope: "row" }, field.name ?? `field ${field.type}`), h("td", {}, field.text ?? ""));
+  const row = h("tr", {}, h("th", { scope: "row" }, field.name ?? `field ${field.type}`), h("td", {}, field.text ?? "", field.meaning && field.meaning !== field.text ? h("span", { class: "hint" }, ` ${field.meaning}`) : null));
   row.firstChild.style.setProperty("padding-inline-start", `${0.5 + depth}rem`);
   rows.append(row);
   (field.fields ?? []).forEach((inner) => fieldRows(rows, inner, depth + 1));

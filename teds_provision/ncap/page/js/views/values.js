@@ -85,6 +85,7 @@ export class LiveTab {
         const told = channel.actuator;
         text(figure, told?.safe === false ? number(told.value, channel.uncertainty) : "–");
         text(old, told?.safe === true ? "safe state" : "");
+        element.classList.toggle("actuator-row", true);
         if (bar) bar.value = told?.safe === false ? told.value : channel.low;
         continue;
       }

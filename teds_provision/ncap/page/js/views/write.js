@@ -7,6 +7,14 @@ import { measuring, on, state } from "../state.js";
 
 const LARGEST = 900000; // octets: the station takes bodies of at most 1 MiB
 
+/** What changes, in the words of the diff's sentence: "stated uncertainty" rather than OError. */
+function labelOf(one) {
+  const end = ` ${one.before} -> ${one.after}.`;
+  if (!one.text?.endsWith(end)) return one.field;
+  const head = one.text.slice(0, -end.length);
+  return head.slice(head.lastIndexOf(": ") + 2) || one.field;
+}
+
 export class WritePanel {
   constructor(uuid, written) {
     this.uuid = uuid;
@@ -92,7 +100,7 @@ export class WritePanel {
     };
     const rows = changes.map((one) =>
       one.before || one.after
-        ? h("tr", {}, h("th", { scope: "row" }, where(one)), h("td", {}, one.label ?? one.field), h("td", { class: "before", "data-label": "now" }, one.before || "nothing"), h("td", { class: "after", "data-label": "then" }, h("span", { class: "arrow", "aria-hidden": "true" }, "→ "), one.after || "nothing"))
+        ? h("tr", {}, h("th", { scope: "row" }, where(one)), h("td", {}, labelOf(one)), h("td", { class: "before", "data-label": "now" }, one.before || "nothing"), h("td", { class: "after", "data-label": "then" }, h("span", { class: "arrow", "aria-hidden": "true" }, "→ "), one.after || "nothing"))
         : h("tr", {}, h("th", { scope: "row" }, where(one)), h("td", { colspan: "3" }, one.text)),
     );
     return h(
