@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import json
 import signal
 import socket
-from collections.abc import Iterator
+import time
+from collections.abc import Callable, Iterator
 from contextlib import closing, contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -29,7 +31,8 @@ CALIBRATIONS = {
         ),
     ),
 }
-PATIENCE = 10_000  # ms that a test waits for something to be seen
+SECONDS = 15.0
+PATIENCE = 15_000  # ms that a test waits for something to be seen
 
 
 def free_tcp_port() -> int:
@@ -48,6 +51,7 @@ class Lab:
     port: int = field(default_factory=free_tcp_port)
     daemon: Running | None = None
     nodes: dict[str, Node] = field(default_factory=dict)
+    board: Running | None = None
 
     @classmethod
     def make(cls, folder: Path) -> Lab:
@@ -93,7 +97,16 @@ class Lab:
         folders = [self.nodes[name].folder for name in names]
         running = self.desk.start("--json", "node", "run", *folders, *where, "--source", source)
         running.wait_for('"ready": true')
+        self.board = self.board or running
         return running
+
+    def moved(self, name: str) -> list[dict[str, Any]]:
+        """What the actuators of a node of the first process did, as that process told."""
+        assert self.board is not None
+        while self.board.read(0.05):
+            pass
+        lines = [json.loads(line) for line in self.board.out.splitlines() if '"actuator"' in line]
+        return [line for line in lines if line["uuid"] == self.nodes[name].uuid]
 
     def provision(self, name: str, type_: str, called: str | None = None) -> None:
         """By the command line over the bus."""
@@ -117,9 +130,24 @@ class Lab:
             return station.login_url(read_only=read_only)
 
 
+def until(what: Callable[[], object], why: str, seconds: float = SECONDS) -> None:
+    """Wait until ``what()`` is true. (The page's policy forbids the evaluation with which playwright would wait.)"""
+    end = time.monotonic() + seconds
+    while not what():
+        assert time.monotonic() < end, why
+        time.sleep(0.05)
+
+
 @contextmanager
 def opened(
-    browser: Browser, lab: Lab, *, width: int = 1280, height: int = 900, route: str = "", **more: Any
+    browser: Browser,
+    lab: Lab,
+    *,
+    width: int = 1280,
+    height: int = 900,
+    route: str = "",
+    read_only: bool = False,
+    **more: Any,
 ) -> Iterator[Page]:
     """A browser of its own, signed in. An error, a breach of its policy or a foreign address fails the test."""
     context = browser.new_context(viewport={"width": width, "height": height}, **more)
@@ -132,11 +160,14 @@ def opened(
     )
     page.on("request", lambda request: wrong.append(f"foreign: {request.url}") if lab.url not in request.url else None)
     try:
-        page.goto(lab.login())
+        page.goto(lab.login(read_only=read_only))
         if route:
             page.goto(f"{lab.url}/#/{route}")
         page.locator("#connection", has_text="Live").wait_for()
         yield page
+    except BaseException:
+        print(f"{page.url}\n{page.locator('body').inner_text()}")  # what a person would have seen
+        raise
     finally:
         context.close()
     assert not wrong, wrong

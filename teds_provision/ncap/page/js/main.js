@@ -133,7 +133,9 @@ function tapped() {
     toast("good", `Tapped: ${nameOf(node ?? { uuid })}.`, "Not opened, because you hold an actuator.");
     return;
   }
-  const asked = ["waiting", "running"].includes((state.runs.get(uuid) ?? state.runs.get("next"))?.state);
+  const run = state.runs.get(uuid) ?? state.runs.get("next");
+  // A whole provisioning may be over before this frame: whoever asked for it wants to see how it went.
+  const asked = ["waiting", "running"].includes(run?.state) || performance.now() - (run?.heard ?? -Infinity) < 3000;
   if (asked) location.hash = `#/nodes/${uuid}/provision`;
   else if (!here) location.hash = `#/nodes/${uuid}`;
   changed("nodes");

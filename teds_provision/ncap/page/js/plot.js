@@ -68,7 +68,6 @@ export class LivePlot {
     this.frames = units.map((unit) => this.frame(unit, this.channels.filter((one) => one.unit === unit), colours));
     fill(this.charts, this.frames.map((frame) => frame.element));
     this.resize();
-    window.plotFrames = this.frames; // for the tests, which look at what is drawn
   }
 
   frame(unit, channels, colours) {
@@ -150,6 +149,7 @@ export class LivePlot {
     parts.push(`drawn ${rate(this.second.frames)} times/s`, this.skipped ? `${this.skipped} drawings left out` : "no drawing left out");
     parts.push(state.dropped ? `${count(state.dropped, "point")} not received: this page was too slow` : "no point lost on the way here");
     text(this.foot, parts.join(" · "));
+    Object.assign(this.foot.dataset, { received: state.received, dropped: state.dropped, drawn: this.drawn, skipped: this.skipped });
     this.second = { at: performance.now(), frames: 0, received: state.received };
     changed("plot");
   }

@@ -218,7 +218,7 @@ const TAKERS = {
       if (place < 0) steps.push(step);
       else steps[place] = step;
     }
-    state.runs.set(event.uuid, { ...run, ...event, steps });
+    state.runs.set(event.uuid, { ...run, ...event, steps, heard: performance.now() });
     if (event.state === "done") refreshNode(event.uuid);
   },
   actuator: (event) => {

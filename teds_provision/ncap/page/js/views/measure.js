@@ -5,7 +5,7 @@ import { button, chip, empty, field, fill, h, icon, keyed, say, text, toast, tro
 import { channelName, count, nameOf, verdict } from "../format.js";
 import { LivePlot } from "../plot.js";
 import { measuring, membersOf, on, refresh, state } from "../state.js";
-import { plotHead, told } from "./values.js";
+import { plotHead, requireRate, told } from "./values.js";
 
 const MOST = 20; // channels in the plot
 
@@ -125,7 +125,10 @@ class GroupCard {
   async go() {
     const rate = this.rate.value.trim() === "" ? null : Number(this.rate.value);
     const record = this.record.value.trim();
-    await this.does(() => post("measurements", { group: this.name, rate, kind: this.kind.value, trigger: this.trigger.checked, sinks: record ? [record] : [] }), `Group ${this.name} is being measured.`);
+    await this.does(() => {
+      requireRate(membersOf({ group: this.name }), rate);
+      return post("measurements", { group: this.name, rate, kind: this.kind.value, trigger: this.trigger.checked, sinks: record ? [record] : [] });
+    }, `Group ${this.name} is being measured.`);
   }
 
   async halt() {

@@ -2,7 +2,7 @@
 
 import { paths, post } from "../api.js";
 import { button, chip, field, fill, h, icon, keyed, say, text, trouble } from "../dom.js";
-import { clock, nameOf, short } from "../format.js";
+import { clock, short } from "../format.js";
 import { measuring, now, on, state } from "../state.js";
 
 const STEPS = {
@@ -86,7 +86,7 @@ export class ProvisionTab {
     if (this.shown === run) return;
     this.shown = run;
     if (run?.state === "done") {
-      fill(this.outcome, h("p", { class: "done" }, chip("good", "good", "Provisioned"), ` ${nameOf(state.nodes.get(this.uuid))} is ready. `, h("a", { href: `#/nodes/${this.uuid}/live` }, "See its values")));
+      fill(this.outcome, h("p", { class: "done" }, chip("good", "good", "Provisioned"), " This node is ready. ", h("a", { href: `#/nodes/${this.uuid}/live` }, "See its values")));
       say("Provisioned.");
     } else if (run?.state === "cancelled") fill(this.outcome, h("p", { class: "hint" }, "Nobody waits for a tap any more."));
     else if (run?.state === "failed") fill(this.outcome, trouble(run.error ?? { message: "It failed." }));

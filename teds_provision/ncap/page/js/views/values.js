@@ -1,8 +1,8 @@
 // The live tab: values with units, actuators, measuring on and off, curves.
 
-import { paths, post, remove } from "../api.js";
+import { paths, post, Refusal, remove } from "../api.js";
 import { button, chip, empty, field, fill, h, icon, keyed, say, text, trouble } from "../dom.js";
-import { age, channelName, count, hertz, number, range, short } from "../format.js";
+import { age, channelName, count, hertz, nameOf, number, range, short } from "../format.js";
 import { LivePlot, WINDOWS } from "../plot.js";
 import { isStale, lastOf, measuring, now, on, refresh, state } from "../state.js";
 import { ActuatorPanel } from "./actuator.js";
@@ -201,6 +201,7 @@ class ModePanel {
     this.error.replaceChildren();
     const rate = this.rate.value.trim() === "" ? null : Number(this.rate.value);
     try {
+      requireRate([this.uuid], rate);
       await post("measurements", { uuids: [this.uuid], rate, kind: "periodic", trigger: false, sinks: [] });
       say("Measuring.");
       await refresh("measurements", "nodes");
@@ -222,6 +223,17 @@ class ModePanel {
 
   end() {
     this.off();
+  }
+}
+
+/** Raise where the datasheets say that a sensor is slower: it would only wait for ever. */
+export function requireRate(uuids, rate) {
+  if (rate === null) return;
+  if (!(rate > 0)) throw new Refusal(0, "usage", "The rate is no number above 0.", "Give it in hertz, or leave it empty: then it is the datasheet's.");
+  for (const uuid of uuids) {
+    const node = state.nodes.get(uuid);
+    const slow = (node?.channels ?? []).find((channel) => channel.kind === "sensor" && channel.rate && channel.rate < rate * (1 - 1e-6));
+    if (slow) throw new Refusal(0, "refused", `${channelName(slow)} of ${nameOf(node)} gives at most ${hertz(slow.rate)}.`, "Take a lower rate, or leave it empty: then each has its datasheet's.");
   }
 }
 

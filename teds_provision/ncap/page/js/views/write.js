@@ -1,7 +1,7 @@
 // Write a datasheet from a file: what would change is shown in physical units, then it is signed and written.
 
 import { change, paths } from "../api.js";
-import { button, chip, fill, h, icon, say, trouble } from "../dom.js";
+import { button, chip, field, fill, h, icon, say, trouble } from "../dom.js";
 import { channelName, count, nameOf } from "../format.js";
 import { measuring, on, state } from "../state.js";
 
@@ -64,14 +64,27 @@ export class WritePanel {
       return;
     }
     const content = await file.text();
-    const body = { format: content.trimStart().startsWith("<") ? "xml" : "json", content };
-    fill(this.result, h("p", { class: "busy-line" }, `Comparing ${file.name} with what the node has …`));
+    await this.compare(file.name, { format: content.trimStart().startsWith("<") ? "xml" : "json", content });
+  }
+
+  async compare(name, body) {
+    fill(this.result, h("p", { class: "busy-line" }, `Comparing ${name} with what the node has …`));
     try {
       const plan = await change(`${paths.teds(this.uuid)}?dry_run=1`, body, { signal: this.leaving.signal });
-      this.plan(file.name, body, plan);
+      this.plan(name, body, plan);
     } catch (error) {
-      if (error.name !== "AbortError") fill(this.result, trouble(error));
+      if (error.name === "AbortError") return;
+      if (error.hint.includes("--accept-calibration")) this.unlikely(name, body, error);
+      else fill(this.result, trouble(error));
     }
+  }
+
+  /** A calibration that looks wrong is written only with a reason, which goes into the log. */
+  unlikely(name, body, error) {
+    const reason = h("input", { type: "text", maxlength: "200", autocomplete: "off" });
+    const again = button("It is right: compare again", {}, "ask");
+    again.addEventListener("click", () => reason.value.trim() && this.compare(name, { ...body, accept_calibration: reason.value.trim() }));
+    fill(this.result, trouble({ message: error.message, hint: "Mend the file. Or, if it is right, say why: that goes into the log." }), h("div", { class: "row" }, field("Why it is right", reason), again));
   }
 
   plan(name, body, plan) {

@@ -1,0 +1,209 @@
+"""What people come for, in a real browser, with real nodes: measure, write a datasheet, provision, move an actuator."""
+
+from __future__ import annotations
+
+import json
+import re
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import pytest
+
+from .lab import Lab, opened, until
+
+if TYPE_CHECKING:
+    from playwright.sync_api import Browser, Locator, Page
+
+pytestmark = pytest.mark.system
+HOSTILE = '<img src=x onerror="document.title=1">\u202e"; DROP'
+
+
+def received(page: Page) -> int:
+    """Points that the page took in so far, as its plot tells."""
+    return int(page.locator(".plot-foot").get_attribute("data-received") or 0)
+
+
+def in_group(page: Page, name: str) -> Locator:
+    """The card of a group."""
+    return page.locator("li.group").filter(has=page.get_by_role("heading", name=name))
+
+
+def make_group(page: Page, name: str, *nodes: str) -> None:
+    page.get_by_text("New group", exact=True).click()
+    page.get_by_label("Name", exact=True).fill(name)
+    for node in nodes:
+        page.get_by_role("group", name="Nodes").get_by_role("checkbox", name=node).check()
+    page.get_by_role("button", name="Make the group").click()
+
+
+def test_from_an_empty_home_to_a_moving_plot(browser: Browser, fresh: Lab) -> None:
+    fresh.run()
+    with opened(browser, fresh) as page:
+        page.get_by_role("link", name="Make a virtual transducer").click()
+        page.get_by_label("Transducer type").select_option("accelerometer")
+        page.get_by_label("Name").fill("shaker")
+        page.get_by_role("button", name="Make it").click()
+        page.get_by_role("link", name="Nodes").click()
+        page.locator(".card", has_text="shaker").get_by_text("Authentic", exact=True).wait_for()
+        page.get_by_role("link", name="Measure").click()
+        page.get_by_text("No group yet").wait_for()
+        make_group(page, "table", "shaker")
+        page.get_by_role("button", name="Start table").click()
+        page.get_by_role("img", name="Course of acceleration x, acceleration y, acceleration z").wait_for()
+        until(lambda: received(page) > 50, "no points arrive")
+        before = received(page)
+        until(lambda: received(page) > before, "the plot stands still")
+        in_group(page, "table").get_by_text(re.compile(r"running, \d+ samples, none lost")).wait_for()
+        page.get_by_role("button", name="Pause").click()
+        page.get_by_role("button", name="Go on").wait_for()
+        page.get_by_role("button", name="Stop table").click()
+        page.get_by_role("button", name="Start table").wait_for()
+        page.get_by_role("link", name="Nodes").click()
+        page.locator("tr.stale").first.wait_for()
+        page.get_by_text("ago").first.wait_for()
+
+
+def test_a_rate_that_does_not_fit_is_refused_with_the_fastest(browser: Browser, lab: Lab) -> None:
+    with opened(browser, lab, route=f"nodes/{lab.nodes['hand'].uuid}/live") as page:
+        page.get_by_label("Rate, Hz").fill("5000")
+        page.get_by_role("button", name="Measure").click()
+        page.get_by_role("alert").filter(has_text="gives at most 100 Hz").wait_for()
+        assert page.get_by_role("button", name="Idle", pressed=True).is_visible()
+
+
+def test_an_actuator_moves_while_it_is_held_and_the_node_says_that_it_is_safe(browser: Browser, lab: Lab) -> None:
+    with opened(browser, lab, route=f"nodes/{lab.nodes['hand'].uuid}/live") as page:
+        hold = page.get_by_role("button", name="Hold to move")
+        value = page.get_by_role("spinbutton", name="Value, mm")
+        value.fill("40")
+        hold.hover()
+        page.mouse.down()
+        page.get_by_text("Moving: 39.998 mm").wait_for()
+        until(
+            lambda: any(abs(one["value"] - 0.04) < 1e-4 and not one["safe"] for one in lab.moved("hand")), "not moved"
+        )
+        began = len(lab.moved("hand"))
+        page.wait_for_timeout(1500)  # longer than what one word holds: the page goes on asking
+        assert not any(one["safe"] for one in lab.moved("hand")[began:])
+        page.mouse.up()
+        page.get_by_text("Safe: the node said so at").wait_for()
+        assert lab.moved("hand")[-1]["safe"]
+        # By keyboard.
+        page.get_by_role("slider").focus()
+        page.keyboard.press("End")
+        assert value.input_value() == "110"
+        hold.focus()
+        page.keyboard.down(" ")
+        page.get_by_text("Moving: 110").wait_for()
+        page.keyboard.up(" ")
+        page.get_by_text("Safe: the node said so at").wait_for()
+        # Beyond the limits of the datasheet.
+        value.fill("500")
+        hold.click()
+        page.get_by_role("alert").filter(has_text="beyond the limits").wait_for()
+
+
+def test_whoever_closes_the_page_lets_go_of_the_actuator(browser: Browser, lab: Lab) -> None:
+    with opened(browser, lab, route=f"nodes/{lab.nodes['hand'].uuid}/live") as page:
+        page.get_by_role("spinbutton", name="Value, mm").fill("30")
+        page.get_by_role("button", name="Hold to move").hover()
+        page.mouse.down()
+        page.get_by_text("Moving: 30.005").wait_for()
+    until(lambda: lab.moved("hand")[-1]["safe"], "still moving after the page was closed", 4)
+
+
+def test_a_datasheet_is_read_and_written_from_a_file_with_the_changes_shown_first(
+    browser: Browser, lab: Lab, tmp_path: Path
+) -> None:
+    slew = lab.nodes["slew"]
+    with opened(browser, lab, route=f"nodes/{slew.uuid}/datasheet") as page:
+        panel = page.get_by_role("region", name="Datasheet", exact=True)
+        panel.get_by_text("Signature, trust and key proof hold").wait_for()
+        panel.get_by_role("img", name="Calibration of angle").locator("canvas").wait_for()
+        panel.get_by_text("Channel 1: TransducerChannel TEDS").click()
+        assert "360 °" in panel.get_by_role("row", name="HiLimit").inner_text()
+        with page.expect_download() as download:
+            panel.get_by_role("link", name="JSON").click()
+        sheet = json.loads(Path(download.value.path()).read_text())
+        written = tmp_path / "slew.json"
+        written.write_text(json.dumps(sheet).replace('"slew"', '"crane slew"'))
+        before = slew.datasheet
+        chooser = page.get_by_label("Choose a datasheet file")
+        chooser.set_input_files(written)
+        plan = page.get_by_role("table", name="What changes, in physical units")
+        row = plan.get_by_role("row", name="crane slew")
+        row.wait_for()
+        assert row.get_by_role("cell").all_inner_texts() == ["name", "slew", "→ crane slew"]
+        assert slew.datasheet == before
+        page.get_by_role("button", name="Sign and write to").click()
+        page.get_by_text("Signed, written and verified: authentic").wait_for()
+        assert slew.datasheet != before
+        page.locator(".fields td", has_text="crane slew").wait_for(state="attached")
+        chooser.set_input_files(written)
+        page.get_by_text("nothing to change").wait_for()
+        broken = tmp_path / "broken.json"
+        broken.write_text('{"format": "teds/1", "teds": [{}]}')
+        chooser.set_input_files(broken)
+        page.get_by_role("alert").filter(has_text=re.compile("teds|TEDS")).wait_for()
+
+
+def test_provisioning_waits_for_the_tap_and_follows_it(browser: Browser, lab: Lab) -> None:
+    lab.create("oven", "temperature-sensor")
+    calibration = lab.desk.folder / "oven.csv"
+    calibration.write_text("# date: 2026-11-01\nraw,value [degC]\n0,-40\n21120,125\n")
+    with opened(browser, lab, route="nodes") as page:
+        page.get_by_role("link", name="Provision the next node that is tapped").click()
+        page.get_by_role("button", name="Provision").click()
+        page.get_by_role("alert").filter(has_text="No type is chosen").wait_for()
+        page.get_by_label("Transducer type").select_option("temperature-sensor")
+        page.get_by_label("Name").fill("oven")
+        page.get_by_label("Calibration").set_input_files(calibration)
+        page.get_by_role("button", name="Provision").click()
+        page.locator(".waiting").get_by_text("Lay a node on the reader.").wait_for()
+        page.get_by_role("button", name="Do not wait any more").click()
+        page.get_by_text("Nobody waits for a tap any more").wait_for()
+        page.get_by_role("button", name="Provision").click()
+        page.locator(".waiting").get_by_text("Lay a node on the reader.").wait_for()
+        running = lab.power("oven", nfc=True)
+        page.get_by_text("This node is ready").wait_for()
+        page.get_by_role("heading", name="oven", exact=True).wait_for()
+        steps = page.locator(".steps li")
+        assert steps.count() >= 6
+        assert {one.split("\n")[0] for one in steps.all_inner_texts()} <= {"done", "nothing to do"}
+        assert lab.nodes["oven"].uuid in page.url
+        running.close()
+
+
+def test_names_from_a_datasheet_are_text_and_nothing_else(browser: Browser, fresh: Lab) -> None:
+    fresh.run()
+    with opened(browser, fresh, route="virtual") as page:
+        page.get_by_label("Transducer type").select_option("gripper")
+        page.get_by_label("Name").fill(HOSTILE)
+        page.get_by_role("button", name="Make it").click()
+        page.get_by_role("link", name=HOSTILE).first.click()
+        page.get_by_role("heading", name=HOSTILE).wait_for()
+        page.locator(".card").get_by_text("Authentic", exact=True).wait_for()
+        title = page.title()
+        for view in ("nodes", "measure", "virtual", "log", "station"):
+            page.goto(f"{fresh.url}/#/{view}")
+            page.get_by_text(HOSTILE).first.wait_for(state="attached")
+            assert page.evaluate("document.querySelectorAll('img, iframe, object, script:not([src])').length") == 0
+        assert "1" not in title
+
+
+def test_two_browsers_see_the_same_and_one_that_may_only_read_changes_nothing(browser: Browser, lab: Lab) -> None:
+    with opened(browser, lab, route="measure") as page, opened(browser, lab, route="measure", read_only=True) as other:
+        make_group(page, "both", "hand")
+        in_group(other, "both").wait_for()
+        assert other.get_by_role("button", name="Start both").is_disabled()
+        assert other.get_by_role("button", name="Discover").is_disabled()
+        page.get_by_role("button", name="Start both").click()
+        until(lambda: received(other) > 20, "the second browser gets nothing")
+        other.goto(f"{lab.url}/#/nodes/{lab.nodes['hand'].uuid}/datasheet")
+        other.get_by_text("This browser may only read").or_(other.get_by_text("It is being measured")).first.wait_for()
+        page.get_by_role("button", name="Stop both").click()
+        page.get_by_text("More").first.click()
+        page.get_by_role("button", name="Delete group").click()
+        page.get_by_text("No group yet").wait_for()
+        other.goto(f"{lab.url}/#/measure")
+        other.get_by_text("No group yet").wait_for()
