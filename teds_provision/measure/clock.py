@@ -12,6 +12,7 @@ of the wall clock does not tear a recording.
 from __future__ import annotations
 
 import itertools
+import math
 import time
 from collections import deque
 from dataclasses import dataclass
@@ -30,6 +31,7 @@ AT_FIRST = 5  # exchanges that a station does at once: one alone may have met a 
 EXCHANGES = 64  # kept: at one each 3.3 s three and a half minutes
 WINDOW = 30_000_000_000  # ns of arrivals under the hull
 BUCKET = 50_000_000  # ns: the best arrival of each stands for it
+REFIT_AFTER = 10  # buckets
 SLEW = 1_000_000_000  # ns over which a refit's difference is let out
 SPAN_OF_A_HULL = 2_000_000_000  # ns of arrivals before they say something about skew
 SPAN_OF_EXCHANGES = 60_000_000_000  # ns of exchanges before they say more about it than the arrivals
@@ -76,9 +78,8 @@ class ClockMap:
         self._own = own_drift
         self._rate = (own_drift + NODE_DRIFT) / 1e6  # ns of doubt for each ns of age
         self._exchanges: deque[Exchange] = deque(maxlen=EXCHANGES)
-        self._arrivals: deque[tuple[int, int]] = deque()  # (tick, host - tick), the best of each bucket
-        self._bucket = -1
-        self._low, self._high, self._when = -np.inf, np.inf, 0  # what the evidence allows, at tick `_when`
+        self._hull = LowerHull()
+        self._low, self._high, self._when = -math.inf, math.inf, 0  # what the evidence allows, at tick `_when`
         self._origin = 0  # tick at which the line's offset stands
         self._offset = 0.0
         self._skew = 0.0
@@ -106,7 +107,7 @@ class ClockMap:
         else:
             if (one.drift + self._own) / 1e6 > self._rate:
                 self._rate = (one.drift + self._own) / 1e6
-                self._low, self._high = -np.inf, np.inf  # what was gathered held for a better clock
+                self._low, self._high = -math.inf, math.inf  # what was gathered held for a better clock
             low, high = self._limits(one.tick)
             if one.offset - one.error > high or one.offset + one.error < low:
                 self.lie = "two exchanges contradict each other: the node's clock was set, or runs at another speed"
@@ -120,26 +121,19 @@ class ClockMap:
     def arrival(self, tick: int, host: int) -> None:
         """Take a sample's tick and when the message that held it had come (host, monotonic ns)."""
         upper = host - tick
-        self._narrow(tick, -np.inf, upper)
-        if tick // BUCKET == self._bucket and self._arrivals:
-            if upper < self._arrivals[-1][1]:
-                self._arrivals[-1] = (tick, upper)
-            return
-        self._bucket = tick // BUCKET
-        while self._arrivals and self._arrivals[0][0] < tick - WINDOW:
-            self._arrivals.popleft()
-        self._arrivals.append((tick, upper))
-        if len(self._arrivals) % 10 == 1:
+        self._narrow(tick, -math.inf, upper)
+        if self._hull.take(tick, upper) and self._hull.count % REFIT_AFTER == 1:
             self._refit(tick)
 
     def host(self, ticks: NDArray[np.uint64]) -> NDArray[np.float64]:
         """Host time (monotonic, seconds) of ticks."""
         self._handed_out = True
-        since = ticks.astype(np.int64) - self._origin
-        left = 1.0 - (ticks.astype(np.int64) - self._refitted) / SLEW
-        slope: NDArray[Any] = self._offset + self._skew * since + self._residue * np.clip(left, 0.0, 1.0)
+        signed = ticks.astype(np.int64)
+        slope: NDArray[Any] = self._offset + self._skew * (signed - self._origin)
+        if self._residue:
+            slope += self._residue * np.clip(1.0 - (signed - self._refitted) / SLEW, 0.0, 1.0)
         # Whole nanoseconds first: a tick of months and an offset of years would lose microseconds as floats.
-        whole: NDArray[np.float64] = (ticks.astype(np.int64) + np.rint(slope).astype(np.int64)) / 1e9
+        whole: NDArray[np.float64] = (signed + np.rint(slope).astype(np.int64)) / 1e9
         return whole
 
     def host_of(self, tick: int) -> float:
@@ -161,7 +155,7 @@ class ClockMap:
         """What the node's tick may be at a host time (monotonic ns), by all evidence."""
         tick = self.tick_at(host)
         low, high = self._limits(tick)
-        if np.isinf(low) or np.isinf(high):
+        if math.isinf(low) or math.isinf(high):
             return TickBounds(0, 1 << 64)
         return TickBounds(int(host - high), int(host - low) + 1)
 
@@ -210,11 +204,11 @@ class ClockMap:
 
     def _by_arrivals(self, tick: int) -> tuple[float, float]:
         """The edge of the lower hull over the middle of the window; (offset at tick, skew)."""
-        if not self._arrivals:
+        hull = self._hull.points()
+        if not hull:
             return 0.0, 0.0
-        hull = _lower_hull(list(self._arrivals))
         if hull[-1][0] - hull[0][0] < SPAN_OF_A_HULL:
-            return float(min(upper for _, upper in self._arrivals)), 0.0
+            return float(min(upper for _, upper in hull)), 0.0
         middle = (hull[0][0] + hull[-1][0]) / 2
         for (left, low), (right, high) in itertools.pairwise(hull):
             if right >= middle:
@@ -223,15 +217,55 @@ class ClockMap:
         raise AssertionError("a hull spans its middle")
 
 
-def _lower_hull(points: list[tuple[int, int]]) -> list[tuple[int, int]]:
-    hull: list[tuple[int, int]] = []
-    for x, y in points:
-        while len(hull) > 1 and (hull[-1][1] - hull[-2][1]) * (x - hull[-2][0]) >= (y - hull[-2][1]) * (
-            hull[-1][0] - hull[-2][0]
-        ):
-            hull.pop()
-        hull.append((x, y))
-    return hull
+class LowerHull:
+    """The lower hull of arrivals (tick, host - tick) over the last WINDOW and a little more, a point at a time.
+
+    The best arrival of each BUCKET stands for it. What is too old goes a tenth of the window at a time: then the hull
+    is made anew, and not for every point. ``count`` is how many buckets there were.
+    """
+
+    def __init__(self) -> None:
+        self.count = 0
+        self._closed: deque[tuple[int, int]] = deque()
+        self._last: tuple[int, int] | None = None  # the best of the bucket that is still open
+        self._hull: list[tuple[int, int]] = []
+
+    def take(self, tick: int, upper: int) -> bool:
+        """Take an arrival; whether it begins a new bucket."""
+        if self._last is not None and tick // BUCKET <= self._last[0] // BUCKET:
+            # Of another stream it may be a little older than what came before it: then it tells nothing new.
+            if upper < self._last[1] and tick // BUCKET == self._last[0] // BUCKET:
+                self._last = (tick, upper)
+            return False
+        if self._last is not None:
+            self._closed.append(self._last)
+            _extend(self._hull, self._last)
+        if self._closed and self._closed[0][0] < tick - WINDOW - WINDOW // 10:
+            while self._closed and self._closed[0][0] < tick - WINDOW:
+                self._closed.popleft()
+            self._hull = []
+            for point in self._closed:
+                _extend(self._hull, point)
+        self._last = (tick, upper)
+        self.count += 1
+        return True
+
+    def points(self) -> list[tuple[int, int]]:
+        """The hull's corners, oldest first."""
+        hull = list(self._hull)
+        if self._last is not None:
+            _extend(hull, self._last)
+        return hull
+
+
+def _extend(hull: list[tuple[int, int]], point: tuple[int, int]) -> None:
+    """Add a point to the right of a lower hull: corners that then lie above it go."""
+    x, y = point
+    while len(hull) > 1 and (hull[-1][1] - hull[-2][1]) * (x - hull[-2][0]) >= (y - hull[-2][1]) * (
+        hull[-1][0] - hull[-2][0]
+    ):
+        hull.pop()
+    hull.append(point)
 
 
 @dataclass(frozen=True)

@@ -11,6 +11,8 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
 
+import numpy as np
+
 from teds_provision.errors import LinkFailure
 from teds_provision.links.can.bus import Frame
 from teds_provision.links.can.port import CanPort
@@ -74,17 +76,21 @@ class HeardStream:
         self.heard = time.monotonic()
         if message.test_pattern and message.data != self.receiver.expected(message):
             self.wrong_pattern += 1
-        self._deliver(self._interpret(lambda: self.interpreter.take(message)))
+        with self.mapping:
+            block = self.interpreter.take(message)
+        self._deliver(block)
 
     def flush(self, now: float) -> None:
         """Hand on what has waited for GATHER."""
         since = self.interpreter.waiting_since
         if since and now - since >= GATHER:
-            self._deliver(self._interpret(self.interpreter.flush))
+            self.finish()
 
     def finish(self) -> None:
         """Hand on what is left."""
-        self._deliver(self._interpret(self.interpreter.flush))
+        with self.mapping:
+            block = self.interpreter.flush()
+        self._deliver(block)
 
     def hear_out(self, counter: int) -> None:
         """Wait for the hearing thread: frames that came before Stop's reply may still lie in its queue."""
@@ -92,14 +98,11 @@ class HeardStream:
         while self.receiver.last < counter - 1 and time.monotonic() < until:
             time.sleep(0.002)
 
-    def _interpret(self, step: Callable[[], Block | None]) -> Block | None:
-        with self.mapping:
-            return step()
-
     def _deliver(self, block: Block | None) -> None:
         if block is not None:
             self.samples += block.value.size
-            self.invalid += int((~block.valid).sum()) if not block.test_pattern else 0
+            if not block.test_pattern:
+                self.invalid += block.valid.size - int(np.count_nonzero(block.valid))
             self.bound = block.clock_error
             self.deliver(block)
 

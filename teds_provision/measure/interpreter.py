@@ -37,6 +37,7 @@ class StreamInterpreter:
             at += width
         self._places = places
         self._row = at
+        self._steps = np.arange(plan.subscribe.n, dtype=np.uint64) * np.uint64(plan.subscribe.period)
         self._waiting: list[Message] = []
         self._since = 0.0
         present = set(plan.layout.channels)
@@ -71,11 +72,13 @@ class StreamInterpreter:
         octets = np.frombuffer(b"".join(message.data for message in messages), dtype=np.uint8)
         rows = octets.reshape(len(messages) * n, self._row)
         first = np.array([message.tick for message in messages], dtype=np.uint64)
-        steps = np.arange(n, dtype=np.uint64) * np.uint64(plan.subscribe.period)
-        ticks = (first[:, None] + steps[None, :]).ravel()
+        ticks = (first[:, None] + self._steps).ravel()
         host = self._clock.host(ticks)
-        good = np.repeat([message.valid and not message.test_pattern for message in messages], n)
-        raws, value, valid = self._values(rows, good)
+        raws, value, valid = self._values(rows)
+        told = [message.valid and not message.test_pattern for message in messages]
+        if not all(told):
+            valid = valid & np.repeat(told, n)[:, None]
+            value = np.where(valid, value, np.nan)
         bound = self._clock.bound(int(ticks[-1]))
         return Block(
             uuid=self._uuid,
@@ -93,12 +96,11 @@ class StreamInterpreter:
             run=self._run,
         )
 
-    def _values(self, rows: np.ndarray, good: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    def _values(self, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Raw values, values (NaN where not valid), and which are valid, of instants as they stand in messages."""
         if self._together is not None:
             raws = self._together.raw(rows)
-            value, valid = self._together.values(raws)
-            valid &= good[:, None]
-            return raws, np.where(valid, value, np.nan), valid
+            return raws, *self._together.values(raws)
         columns = [one.reader.raw(rows[:, place]) for one, place in zip(self._channels, self._places, strict=True)]
         by_number = dict(zip(self._plan.layout.channels, columns, strict=True))
         value = np.full((len(rows), len(columns)), np.nan)
@@ -108,7 +110,7 @@ class StreamInterpreter:
                 continue
             found = one.values(columns[k], {number: by_number[number] for number in one.others})
             value[:, k] = one.unit.to_si(found.value)  # type: ignore[arg-type]  # an array is scaled as a number is
-            valid[:, k] = found.valid & good
+            valid[:, k] = found.valid
         return _together(columns), np.where(valid, value, np.nan), valid
 
 

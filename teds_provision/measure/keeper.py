@@ -23,29 +23,27 @@ from teds_provision.errors import (
     TedsProvisionError,
 )
 from teds_provision.measure.blocks import Command, NodeReport, State
+from teds_provision.measure.carrying.streams import NodeStreams
 from teds_provision.measure.carrying.together import Together
-from teds_provision.measure.clock import AT_FIRST, ClockMap, Monotone, Wall
+from teds_provision.measure.clock import AT_FIRST, Wall
 from teds_provision.measure.finding.buses import Bus, Buses
 from teds_provision.measure.finding.lookout import Sighting
 from teds_provision.measure.hands import Hands
-from teds_provision.measure.hearing import HeardStream
-from teds_provision.measure.interpreter import StreamInterpreter
-from teds_provision.measure.orders import Events, StreamTotals, Wish
+from teds_provision.measure.orders import Events, Wish
 from teds_provision.measure.planning import BusTime, Plans, plan_node, sensors_of
-from teds_provision.measure.trusting import Trusted, claim, exchange_clock, open_trusted
+from teds_provision.measure.trusting import Trusted, claim, open_trusted
 from teds_provision.protocol.messages.frames import Reason
 from teds_provision.protocol.operation.commands import idle
-from teds_provision.protocol.operation.stream_commands import SOON, Kind, decode_stopped, stop
-from teds_provision.protocol.operation.subscription import Plan, Receiver
+from teds_provision.protocol.operation.stream_commands import SOON
 from teds_provision.station.station import Station
 from teds_provision.talk.conversation import Conversation, SessionLost
 from teds_provision.teds.sheet import Channel
 
 FIRST_PAUSE, LAST_PAUSE = 1.0, 30.0
-SILENT = 2.0  # seconds without a good message, beside two messages' time: then the node is lost
 LOOKING = 2.0  # seconds that a node which ran before is looked for, between its reports
 LOOK = 0.2  # seconds between looks at how it does
-ANNOUNCED = 1.0  # seconds between questions that announcements cause
+LOOK_FOR_DATA = 0.4  # seconds after an announcement in which data shows that it was not the node's
+ANNOUNCED = 1.0  # seconds until a node without such data is asked after it
 SLOWER = 10  # halvings of the rate while the firmware says that its shortest period is longer
 _CURED_BY_TIME = frozenset({Reason.WRONG_STATE, Reason.BUSY, Reason.BAD_TAG, 21, 22, 23})
 _FINAL = (NotAuthentic, PolicyRefused, BadData, StoreFailure)
@@ -68,20 +66,17 @@ class NodeKeeper:
         self.error: TedsProvisionError | None = None
         self.state: State = "waiting"
         self.ever_ran = False
-        self.totals: dict[int, StreamTotals] = {}
         self.trusted: Trusted | None = None
-        self.clock = ClockMap()
-        self.running: dict[int, HeardStream] = {}
+        self.streams = NodeStreams(wall, events.block)
         self.turn = threading.Lock()  # of the session: one exchange at a time
         self.ready = threading.Event()  # streams were asked for
         self.done = threading.Event()
         self._station, self._buses = station, buses
         self.bus: Bus | None = None  # where it is, once it was found
-        self._wish, self._wall, self._events, self._together = wish, wall, events, together
-        self._mapping = threading.Lock()
-        self._monotone: dict[int, Monotone] = {}
+        self._wish, self._events, self._together = wish, events, together
         self._stop = threading.Event()
-        self._anew, self._announced = threading.Event(), threading.Event()
+        self._anew = threading.Event()
+        self._announced = 0.0  # when it announced itself (time.monotonic), 0: it did not
         self._lost_at = 0.0
         self._halved = 0
         self._hands: Hands | None = None
@@ -173,8 +168,8 @@ class NodeKeeper:
     def _in_session(self, bus: Bus, sighting: Sighting) -> None:
         with Conversation(sighting.contact(), notice=lambda _notice: None) as node:
             trusted = open_trusted(self._station, node)
-            self.trusted = trusted
-            bus.hearing.on_announce(sighting.address, self._announced.set)
+            self.trusted, self._announced = trusted, 0.0
+            self._buses.sightings.on_announce(sighting, self._heard_announce)
             try:
                 self._measure(bus, trusted, sighting.address)
                 self._keep(trusted)
@@ -183,10 +178,9 @@ class NodeKeeper:
 
     def _measure(self, bus: Bus, trusted: Trusted, address: int) -> None:
         """Clock, Operate, Subscribe; every stream is heard from then on."""
-        with self._mapping:
-            self.clock = ClockMap()
+        self.streams.new_session()
         for _ in range(AT_FIRST):
-            self._tell_time(trusted)
+            self.streams.tell_time(trusted)
         actuators = self._actuators(trusted)
         channels = self._sensors(trusted.sheet.channels, actuators)
         self._claim(trusted, channels)
@@ -196,7 +190,7 @@ class NodeKeeper:
         if actuators:
             self._hands = self._hands_for(bus, trusted, actuators, address)
         notes = [plans.slowed] if plans.slowed else []
-        notes += [problem for heard in self.running.values() for problem in heard.interpreter.problems.values()]
+        notes += [problem for heard in self.streams.running.values() for problem in heard.interpreter.problems.values()]
         self.ever_ran, self.error = True, None
         self._say("running", why="; ".join(notes))
         self.ready.set()
@@ -234,9 +228,9 @@ class NodeKeeper:
             functools.partial(bus.drive, address),
             tuple(sorted(one.number for one in actuators)),
             dead_man=self._wish.dead_man,
-            clock=self.clock,
+            clock=self.streams.clock,
             turn=self.turn,
-            mapping=self._mapping,
+            mapping=self.streams.mapping,
             echo=self._events.block,
             tell=lambda why: self._say(self.state, why=why),
         )
@@ -245,7 +239,7 @@ class NodeKeeper:
         rate, share = self._wish.rate, bus.share
         if rate is None:
             share.want(self.uuid, self._plan(channels, bus.time_for(share.time, address), SOON).load)
-        start = self._together.start(self.uuid, self.clock)
+        start = self._together.start(self.uuid, self.streams.clock)
         while True:
             with share.lock:
                 time_left = bus.time_for(share.others(self.uuid, sharing=rate is None), address)
@@ -253,7 +247,7 @@ class NodeKeeper:
                 share.taken[self.uuid] = plans.load
             try:
                 for plan in plans.streams:
-                    self._stream(bus, trusted, plan, address)
+                    self.streams.subscribe(bus, trusted, plan, address, ahead=self._together.until(start))
             except NodeRefused as refusal:
                 if refusal.reason == Reason.TOO_LATE and start != SOON:
                     self._together.late(self.uuid)
@@ -262,7 +256,7 @@ class NodeKeeper:
                     raise
                 else:
                     self._halved += 1  # the firmware's shortest period is longer than the datasheet's: nobody says it
-                self._stop_streams(bus, trusted, address)
+                self.streams.stop(bus, trusted, address)
                 continue
             return plans
 
@@ -277,34 +271,6 @@ class NodeKeeper:
             slower=2**self._halved,
         )
 
-    def _stream(self, bus: Bus, trusted: Trusted, plan: Plan, address: int) -> None:
-        number = plan.subscribe.stream
-        payload = trusted.node.send(plan.command(), "to stream")
-        with self._mapping:
-            reply = plan.accept(payload, self.clock.ticks_at(time.monotonic_ns()))
-        before = self.running.get(number)
-        receiver = Receiver(
-            plan, reply, trusted.node.message_key, previous=before.receiver if before is not None else None
-        )
-        monotone = self._monotone.setdefault(number, Monotone())
-        interpreter = StreamInterpreter(trusted.sheet, plan, reply.run, self.clock, self._wall, monotone)
-        assembly = bus.assembly(plan.length)
-        heard = HeardStream(receiver, assembly, interpreter, self.clock, self._mapping, self._events.block)
-        heard.heard += self._together.until(plan.subscribe.start)
-        self.running[number] = heard
-        self.totals.setdefault(number, StreamTotals(plan.layout.channels, plan.subscribe.period / 1e9))
-        bus.hearing.register(address, number, heard)
-
-    def _tell_time(self, trusted: Trusted) -> None:
-        """One Clock: sends and waits without the map's lock, which the hearing thread needs."""
-        fresh = ClockMap()
-        exchange_clock(trusted.node, fresh)
-        with self._mapping:
-            for one in fresh.exchanges:
-                self.clock.exchange(one)
-            if fresh.lie:
-                self.clock.lie = fresh.lie
-
     def _keep(self, trusted: Trusted) -> None:
         """Clock every lease / 3 until the end, or until the node is lost."""
         told = time.monotonic()
@@ -313,42 +279,44 @@ class NodeKeeper:
         while not self._stop.is_set():
             self._anew.wait(LOOK)
             now = time.monotonic()
-            # An announcement says that the node has started anew; anyone can send one, so the node is asked.
-            announced = self._announced.is_set() and now - told >= ANNOUNCED
-            if announced or now - told >= every:
-                self._announced.clear()
+            if self._doubted(now) or now - told >= every:
                 with self.turn:
-                    self._tell_time(trusted)
+                    self.streams.tell_time(trusted)
                 told = now
-            if self.clock.lie and not lied:
+            if self.streams.clock.lie and not lied:
                 lied = True
-                self._say("running", why=f"its clock lies: {self.clock.lie}")
-            silent = self._silent(now)
+                self._say("running", why=f"its clock lies: {self.streams.clock.lie}")
+            silent = self.streams.silent(now)
             if silent:
                 raise LinkFailure(
                     f"No message of the node came for {silent:.1f} s.", hint="Check its power and the bus."
                 )
 
-    def _silent(self, now: float) -> float:
-        """Seconds of silence where that is too long; events may be silent for ever, and so may what waits."""
-        for heard in self.running.values():
-            plan = heard.receiver.plan
-            if plan.subscribe.kind == Kind.EVENT or heard.receiver.start is None:
-                continue
-            if now - heard.heard > SILENT + 3 * plan.span / 1e9:
-                return now - heard.heard
-        return 0.0
+    def _heard_announce(self) -> None:
+        self._announced = self._announced or time.monotonic()
 
-    def _stop_streams(self, bus: Bus, trusted: Trusted | None, address: int) -> None:
-        for number, heard in list(self.running.items()):
-            if trusted is not None:
-                with suppress(TedsProvisionError, SessionLost):
-                    counter = decode_stopped(trusted.node.send(stop(number), "to stop a stream"))
-                    heard.hear_out(counter)
-                    heard.receiver.finish(counter)
-            bus.hearing.forget(address, number)
-            self.totals[number].add(heard)
-        self.running.clear()
+    def _doubted(self, now: float) -> bool:
+        """Whether to ask the node because it announced itself: then it has started anew, or moved.
+
+        But anyone can send an Announce. Data that still comes with good tags says more; where none comes, the session
+        is gone, and is opened again at once.
+        """
+        since = self._announced
+        if not since:
+            return False
+        every = self.streams.every()
+        if every is not None and every < LOOK_FOR_DATA:
+            if self.streams.heard_since(since):
+                self._announced = 0.0
+            elif now - since > LOOK_FOR_DATA:
+                self._announced = 0.0
+                self._anew.set()
+                raise LinkFailure("The node has started anew, or has another address.")
+            return False
+        doubted = now - since >= ANNOUNCED
+        if doubted:
+            self._announced = 0.0
+        return doubted
 
     def _end(self, bus: Bus, trusted: Trusted, address: int) -> None:
         """Let go in order, as far as the node still answers."""
@@ -356,8 +324,8 @@ class NodeKeeper:
         if self._hands is not None:
             self._hands.close()
             self._hands = None
-        bus.hearing.on_announce(address, None)
-        self._stop_streams(bus, trusted if alive else None, address)
+        self._buses.sightings.let_announce(self.uuid)
+        self.streams.stop(bus, trusted if alive else None, address)
         with bus.share.lock:
             bus.share.taken.pop(self.uuid, None)
         if alive:
@@ -371,7 +339,7 @@ class NodeKeeper:
 
     def report(self) -> NodeReport:
         """How the node does now."""
-        sums = [past.with_run(self.running.get(number)) for number, past in self.totals.items()]
+        sums = self.streams.summed()
         errors = [one.clock_error for one in sums if one.clock_error is not None]
         return NodeReport(
             uuid=self.uuid.hex(),

@@ -121,11 +121,12 @@ class Measurement:
                     return
 
     def _until(self, now: float, duration: float | None) -> float:
-        """When ``duration`` seconds of data are over: they count from the first node's first value."""
-        if duration is None or not any(keeper.ever_ran for keeper in self.keepers):
+        """When ``duration`` seconds of data are over: they count from the first values."""
+        left = self._together.left
+        if duration is None or left is None or not any(keeper.ever_ran for keeper in self.keepers):
             return math.inf
         self.began()
-        return now + duration
+        return now + left + duration
 
     def _all_done(self) -> bool:
         return all(keeper.done.is_set() for keeper in self.keepers)
@@ -189,7 +190,7 @@ class Measurement:
         self.watcher.facts(facts)
 
     def _new_grid(self) -> Grid:
-        spans = [heard.receiver.plan.span for one in self.keepers for heard in list(one.running.values())]
+        spans = [heard.receiver.plan.span for one in self.keepers for heard in list(one.streams.running.values())]
         patience = max(spans, default=0) / 1e9 + 2 * BEAT
         sensors = [one for _, one in sorted(self._known.items()) if one.kind != "actuator"]
         return Grid(self.facts.group or "all", sensors, patience=patience)
@@ -224,7 +225,7 @@ class Measurement:
 
 def _summary(keeper: NodeKeeper) -> dict[str, Any]:
     """A node of the ``end`` event (cli.md, `measure`)."""
-    streams = [asdict(one) | {"channels": list(one.channels)} for _, one in sorted(keeper.totals.items())]
+    streams = [asdict(one) | {"channels": list(one.channels)} for _, one in sorted(keeper.streams.totals.items())]
     node: dict[str, Any] = {"uuid": keeper.uuid.hex(), "streams": streams}
     if keeper.error is not None:
         node["error"] = {"code": keeper.error.code, "message": keeper.error.message}

@@ -219,8 +219,15 @@ class Daemon:
         self._stop.wait(_DISCOVERY)
         return self.roster.nodes()
 
+    def known(self, text: str) -> str:
+        """The UUID that a path names, of a node that something is known of; raises NotFound, UsageFailure."""
+        uuid = self.resolve(text)
+        if not self.roster.known(uuid) and not self.station.nodes.is_known(bytes.fromhex(uuid)):
+            raise NotFound(f"Nothing is known of node {uuid}.", hint="See /nodes.")
+        return uuid
+
     def resolve(self, text: str) -> str:
-        """The UUID that a path names: whole, or a prefix or name as everywhere; raises NotFound, UsageFailure."""
+        """The UUID that a word names: whole, or a prefix or name as everywhere; raises NotFound, UsageFailure."""
         digits = text.lower().removeprefix("0x")
         if self.roster.known(digits):
             return digits

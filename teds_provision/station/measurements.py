@@ -15,7 +15,7 @@ from contextlib import ExitStack, contextmanager
 from dataclasses import replace
 from pathlib import Path
 
-from teds_provision.errors import NotFound, PolicyRefused, UsageFailure
+from teds_provision.errors import Frozen, NotFound, PolicyRefused, UsageFailure
 from teds_provision.station.groups import Groups
 from teds_provision.store import Store
 from teds_provision.store.lock import Mark, Taken
@@ -107,7 +107,7 @@ class Measurements:
         """The mark of who uses a source address on a bus: to be entered by ``with``, which raises Taken (7).
 
         A session belongs to a pair of addresses, and a second Open on it ends the first (operation.md section 6).
-        ``bus`` names interface and channel. Who has one short session after another takes it ``shared``.
+        ``bus`` is ``CanSpec.wire``. Who has one short session after another takes it ``shared``.
         """
         name = hashlib.sha256(f"{bus}\0{source}".encode()).hexdigest()[:16]
         return Mark(self._home / FOLDER / f"bus-{name}.lock", command=command, shared=shared)
@@ -133,11 +133,11 @@ class Measurements:
     def rename(self, uuid: bytes, channel: int, name: str | None) -> None:
         """Publish a channel (0: the node's part) under this name from the next measurement on; None: as it was made.
 
-        The caller has checked that it can be a topic. Raises PolicyRefused while the node is measured, UsageFailure
+        The caller has checked that it can be a topic. Raises Frozen while the node is measured, UsageFailure
         where another one has the name.
         """
         if self.is_running(uuid):
-            raise PolicyRefused(
+            raise Frozen(
                 f"Node {uuid.hex()} is being measured: its names stay as they are.", hint="End that measurement first."
             )
         if name is None:

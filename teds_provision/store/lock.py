@@ -128,8 +128,9 @@ class Mark:
     ) -> None:
         if self._descriptor is not None:
             with suppress(OSError):
-                if not self._shared:
-                    os.ftruncate(self._descriptor, 0)
+                if self._shared:  # the last one puts it away
+                    fcntl.flock(self._descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                os.ftruncate(self._descriptor, 0)
             os.close(self._descriptor)
             self._descriptor = None
 

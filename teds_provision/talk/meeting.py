@@ -66,7 +66,7 @@ def _require_no_measurement(station: Station, port: Port, uuid: bytes) -> None:
     spec = getattr(port, "spec", None)
     if spec is None or port.via != "can" or not station.measurements.is_running(uuid):
         return
-    if station.measurements.source(spec.text, spec.source).is_taken:
+    if station.measurements.source(spec.wire, spec.source).is_taken:
         other = 0xF2 if spec.source == 0xF1 else 0xF1
         raise StoreLocked(
             f"Node {uuid.hex()} is being measured from source address 0x{spec.source:02X}.",

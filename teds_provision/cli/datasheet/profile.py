@@ -146,25 +146,25 @@ def check(app: App, names: tuple[str, ...]) -> None:
     """Look for every mistake: file, line, field, and what is wrong. Exits 8 where there is one."""
     folders = default_folders(app.home)
     told: list[dict[str, Any]] = []
-    first: Problem | None = None
+    errors: list[Problem] = []
     for name in names:
         path = find_profile(name, folders)
         _, problems = check_profile(path, folders)
-        errors = [problem for problem in problems if problem.severity == "error"]
-        first = first or (errors[0] if errors else None)
-        found = [
-            {"file": p.where.file, "line": p.where.line, "field": p.field, "message": p.message, "severity": p.severity}
-            for p in problems
-        ]
-        told.append({"name": path.stem, "file": str(path), "ok": not errors, "problems": found})
-        for problem in problems if not app.json else ():
-            app.note(f"{problem.severity}: {problem}")
-    if first is not None:
-        count = sum(problem["severity"] == "error" for entry in told for problem in entry["problems"])
-        more = f" ({count - 1} more, all above)" if count > 1 and not app.json else ""
-        raise BadData(f"{first}{more}")
+        wrong = [problem for problem in problems if problem.severity == "error"]
+        errors += wrong
+        told.append({"name": path.stem, "file": str(path), "ok": not wrong, "problems": list(map(_problem, problems))})
+        for problem in problems:
+            app.note(f"{problem.severity}: {problem}")  # not with --json, where they stand in the object
+    if errors:
+        more = f" ({len(errors) - 1} more, all above)" if len(errors) > 1 and not app.json else ""
+        raise BadData(f"{errors[0]}{more}")
     good = ", ".join(entry["name"] for entry in told)
     app.emit({"profiles": told}, _plain(f"{good}: no mistakes."))
+
+
+def _problem(one: Problem) -> dict[str, Any]:
+    where = {"file": one.where.file, "line": one.where.line}
+    return {**where, "field": one.field, "message": one.message, "severity": one.severity}
 
 
 profile.add_command(check)

@@ -5,33 +5,24 @@ from __future__ import annotations
 import sys
 from collections.abc import Sequence
 from dataclasses import asdict
+from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING, cast
 
 import click
 
+from teds_provision import teds
+from teds_provision.cli import datasheet
 from teds_provision.cli.context import App, pass_app
 from teds_provision.cli.context import to_json as dumps
 from teds_provision.cli.options import command
 from teds_provision.errors import BadData, UsageFailure
 from teds_provision.harmless import harmless
-from teds_provision.lazy import late
 
 if TYPE_CHECKING:
-    from teds_provision.cli.datasheet import show_files, show_json, show_table
     from teds_provision.cli.datasheet.show_files import ShownFile
-    from teds_provision.teds import formats
     from teds_provision.teds.codec.model import Edition
-    from teds_provision.teds.diff import datasheets
-    from teds_provision.teds.formats import Format
-    from teds_provision.teds.guard import guard
-    from teds_provision.teds.show import plot as plots
-else:  # the help of this command needs none of them
-    show_files, show_json, show_table = (
-        late(f"teds_provision.cli.datasheet.{name}") for name in ("show_files", "show_json", "show_table")
-    )
-    formats, datasheets = late("teds_provision.teds.formats"), late("teds_provision.teds.diff.datasheets")
-    guard, plots = late("teds_provision.teds.guard.guard"), late("teds_provision.teds.show.plot")
+    from teds_provision.teds.formats import Block, Format
 
 CHOICES = ["table", "json", "xml", "hex", "ihex", "toml", "binary", "image"]
 _BAD_DATA = BadData.exit_code
@@ -67,21 +58,26 @@ def show(
 
     A file of - is standard input. Exits 0 where it could decode, 8 where not even the tuples close, 3 for no such file.
     """
-    if diff is not None and (files or plot or form not in {"table", "json"}):
-        raise UsageFailure("--diff compares two files and goes with nothing else.")
+    plain = form in {"table", "json"}
     if diff is not None:
+        _require_nothing_else(files, plot, plain)
         _diff(app, *diff, as_json=form == "json")
         return
     if not files:
         raise UsageFailure("There is nothing to show.", hint="Name a file, or - for standard input.")
-    if app.json and form not in {"table", "json"}:
+    if app.json and not plain:
         raise UsageFailure("--json and --format ask for different outputs.", hint="Leave one of them out.")
     wanted = cast("Edition", int(edition)) if edition else None
-    shown = [show_files.load(name, wanted) for name in files]
+    shown = [datasheet.show_files.load(name, wanted) for name in files]
     if plot is not None:
         _plot(app, shown, plot)
     _tell(app, shown, form)
     _judge(shown, strict)
+
+
+def _require_nothing_else(files: tuple[str, ...], plot: Path | None, plain: bool) -> None:
+    if files or plot or not plain:
+        raise UsageFailure("--diff compares two files and goes with nothing else.")
 
 
 def _tell(app: App, files: Sequence[ShownFile], form: str) -> None:
@@ -89,10 +85,10 @@ def _tell(app: App, files: Sequence[ShownFile], form: str) -> None:
         for note in file.notes:
             app.note(f"{file.name}: {note}")
     if app.json or form == "json":
-        result = show_json.to_json(files)
+        result = datasheet.show_json.to_json(files)
         print(dumps(result, indent=None if app.json else 1), flush=True)
     elif form == "table":
-        show_table.print_files(app.console(), files)
+        datasheet.show_table.print_files(app.console(), files)
     else:
         _convert(app, files, cast("Format", form))
 
@@ -101,15 +97,17 @@ def _convert(app: App, files: Sequence[ShownFile], form: Format) -> None:
     for file in files:
         if file.bundle is not None:
             raise BadData(f"{file.name} holds no TEDS that could be written as {form}.")
-        for said in file.conversions.values():
-            for finding in said:
-                if finding.severity == "error":
-                    app.warn(f"{file.name}: {finding.message}")
-    blocks = [block for file in files for block in file.blocks]
-    written = formats.write_blocks(blocks, form)
+        for finding in chain.from_iterable(file.conversions.values()):
+            if finding.severity == "error":
+                app.warn(f"{file.name}: {finding.message}")
+    _write(app, [block for file in files for block in file.blocks], form)
+
+
+def _write(app: App, blocks: Sequence[Block], form: Format) -> None:
+    written = teds.formats.write_blocks(blocks, form)
     if isinstance(written, bytes) and sys.stdout.isatty():
         raise UsageFailure("Octets are not for a terminal.", hint="Send them to a file: … --format binary > FILE")
-    for sentence in formats.lost(blocks, form):
+    for sentence in teds.formats.lost(blocks, form):
         app.warn(f"{form} cannot hold {sentence}")
     if isinstance(written, str) and sys.stdout.isatty():
         written = harmless(written)
@@ -120,21 +118,25 @@ def _convert(app: App, files: Sequence[ShownFile], form: Format) -> None:
 
 def _judge(files: Sequence[ShownFile], strict: bool) -> None:
     """Exit code after everything has been told."""
-    found = [finding for file in files for shown in file.teds for finding in shown.decoded.findings]
-    found += [finding for file in files if file.message is not None for finding in file.message.findings]
-    if any(file.malformed for file in files) or (strict and any(finding.severity == "error" for finding in found)):
+    if any(file.malformed for file in files) or (strict and any(map(_has_errors, files))):
         raise click.exceptions.Exit(_BAD_DATA)
     if strict and any(guarded.severity == "error" for file in files for guarded in file.guard):
         raise click.exceptions.Exit(_POLICY)
 
 
+def _has_errors(file: ShownFile) -> bool:
+    found = [finding for shown in file.teds for finding in shown.decoded.findings]
+    found += file.message.findings if file.message is not None else ()
+    return any(finding.severity == "error" for finding in found)
+
+
 def _diff(app: App, before: str, after: str, *, as_json: bool) -> None:
-    old, new = (show_files.placed(show_files.load(name).blocks) for name in (before, after))
-    changes = datasheets.diff_blocks(old, new)
-    judged = guard.check_calibration(new, old)
+    old, new = (datasheet.show_files.placed(datasheet.show_files.load(name).blocks) for name in (before, after))
+    changes = teds.diff.datasheets.diff_blocks(old, new)
+    judged = teds.guard.guard.check_calibration(new, old)
     result = {
         "changes": [asdict(change) for change in changes],
-        "guard": [show_files.guard_to_json(finding) for finding in judged],
+        "guard": [datasheet.show_files.guard_to_json(finding) for finding in judged],
     }
     if as_json and not app.json:
         print(dumps(result, indent=1), flush=True)
@@ -147,5 +149,5 @@ def _diff(app: App, before: str, after: str, *, as_json: bool) -> None:
 def _plot(app: App, files: Sequence[ShownFile], path: Path) -> None:
     if len(files) != 1:
         raise UsageFailure("A plot shows the calibrations of one file.", hint="Call show once for each.")
-    channels = plots.plot_blocks(show_files.placed(files[0].blocks), path)
+    channels = teds.show.plot.plot_blocks(datasheet.show_files.placed(files[0].blocks), path)
     app.note(f"Drawn in {path}: channel {', '.join(map(str, channels))}.")

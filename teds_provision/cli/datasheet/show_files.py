@@ -72,21 +72,29 @@ def load(name: str, edition: Edition | None = None) -> ShownFile:
         kind = detect(octets)
         if kind == "bundle":
             return ShownFile(name, kind, bundle=handover.bundle.peek_bundle(octets))
-        path = Path(name) if name != STDIN else None
-        blocks = read_blocks(octets, kind, path=path)
+        blocks = read_blocks(octets, kind, path=Path(name) if name != STDIN else None)
     except BadData as error:
-        if kind == "hex" and "Line 1 holds" in error.message:
-            raise BadData(
-                f"{name} holds no TEDS: it is neither binary nor hex (read as hex: {error.message[:1].lower()}"
-                f"{error.message[1:].rstrip('.')}).",
-                hint="TEDS come as binary, hex, Intel HEX, JSON, XML, an image, a profile or a bundle.",
-            ) from error
-        named = error.message.startswith(f"{name}:") or error.message.startswith(f"{name} ")
-        raise BadData(error.message if named else f"{name}: {error.message}", hint=error.hint) from error
+        raise _of_file(name, kind, error) from error
     if not blocks:
         raise BadData(f"{name} holds no TEDS.")
     if len(blocks) == 1 and is_message(blocks[0].octets):
         return ShownFile(name, kind, message=decode_message(blocks[0].octets))
+    return _described(name, kind, blocks, edition)
+
+
+def _of_file(name: str, kind: Kind | None, error: BadData) -> BadData:
+    """What is wrong with a file, with its name before it."""
+    if kind == "hex" and "Line 1 holds" in error.message:  # whatever is text and nothing else is taken for hex
+        return BadData(
+            f"{name} holds no TEDS: it is neither binary nor hex (read as hex: {error.message[:1].lower()}"
+            f"{error.message[1:].rstrip('.')}).",
+            hint="TEDS come as binary, hex, Intel HEX, JSON, XML, an image, a profile or a bundle.",
+        )
+    named = error.message.startswith((f"{name}:", f"{name} "))
+    return BadData(error.message if named else f"{name}: {error.message}", hint=error.hint)
+
+
+def _described(name: str, kind: Kind, blocks: Sequence[Block], edition: Edition | None) -> ShownFile:
     notes = ("The UUID is all zeros: a profile has none.",) if kind == "toml" else ()
     file = ShownFile(name, kind, notes=notes)
     if edition is not None:

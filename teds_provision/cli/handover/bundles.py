@@ -12,7 +12,7 @@ from teds_provision import handover, protocol
 from teds_provision.cli.context import App, pass_app
 from teds_provision.cli.options import command, dry_run_option, link_options, links_given, yes_option
 from teds_provision.cli.rendering import reporter_for
-from teds_provision.errors import BadData, PolicyRefused
+from teds_provision.errors import BadData, LinkFailure, PolicyRefused
 from teds_provision.files import read_limited, require_new, write_new
 from teds_provision.links import LinkSettings
 
@@ -210,11 +210,18 @@ def import_keys(
         plan = shown if station.version() == state else handover.import_keys.plan_import(station, octets)
         done = _take_in(station, plan, shown)
         _write_receipt(receipt, done.receipt)
-    wanted = links_given(ctx) if prove is None else prove
-    outcomes = _prove(app, station, done, links) if wanted else []
+    outcomes: list[dict[str, Any]] = []
+    if links_given(ctx) if prove is None else prove:
+        outcomes = _prove(app, station, done, links)
     _tell_import(app, station, done, receipt, told, outcomes)
-    if prove and any(outcome["why"] for outcome in outcomes):
-        ctx.exit(5)
+    if prove:
+        _require_proven(outcomes)
+
+
+def _require_proven(outcomes: list[dict[str, Any]]) -> None:
+    """Exit 5 where a node that was to be met was not."""
+    if any(outcome["why"] for outcome in outcomes):
+        raise click.exceptions.Exit(LinkFailure.exit_code)
 
 
 def _read_bundle(file: Path) -> bytes:

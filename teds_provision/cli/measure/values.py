@@ -183,7 +183,12 @@ def set_value(
     uuid = station.nodes.resolve(node)
     measure.trusting.require_whitelisted(station, uuid)
     stop = threading.Event()
-    with trusted_node(app, station, links, uuid) as trusted, ending(stop):
+    links = over_the_bus(links)
+    with (
+        measure.finding.sources.beside(station, links, f"set {uuid.hex()}"),
+        trusted_node(app, station, links, uuid) as trusted,
+        ending(stop),
+    ):
         acting = measure.acting.Acting(trusted, channel, unit=unit, dead_man=dead_man)
         acting.octets_of(value)  # the limits, before anything is claimed
         station.audit("set", uuid, "begun", channel=channel, value=value, unit=acting.unit.text)

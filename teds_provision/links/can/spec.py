@@ -20,6 +20,8 @@ OptionValue = int | float | str | bool
 
 _HINT: Final = "Write it like socketcan:can0?bitrate=500000 or udp_multicast:239.74.163.2?node=0x21."
 _RESERVED: Final = frozenset({"interface", "channel", "can_filters", "ignore_config", "config_context"})
+_HOW: Final = frozenset({"bitrate", "data_bitrate", "hop_limit", "fd", "receive_own_messages", "timing"})
+"""Options that say how a bus is used, not which one it is."""
 _TRUE: Final = frozenset({"1", "true", "yes", "on"})
 _FALSE: Final = frozenset({"0", "false", "no", "off"})
 
@@ -47,6 +49,12 @@ class CanSpec:
     def text(self) -> str:
         """Interface and channel, to name the bus in a message."""
         return f"{self.interface}:{self.channel}"
+
+    @property
+    def wire(self) -> str:
+        """What tells this bus from every other one: interface, channel, and the options that say where it is."""
+        where = sorted(f"{key}={value}" for key, value in self.options if key not in _HOW)
+        return "?".join([self.text, *(["&".join(where)] if where else [])])
 
 
 def parse_spec(text: str) -> CanSpec:

@@ -75,6 +75,13 @@ class Together:
         return max(0.0, self._at - time.monotonic())
 
     @property
+    def left(self) -> float | None:
+        """Seconds from now until the first values are taken; None where the trigger has not gone out yet."""
+        if self._trigger:
+            return 0.0 if self._triggered else None
+        return max(0.0, (self._at or 0.0) - time.monotonic())
+
+    @property
     def apart(self) -> float:
         """By how many seconds the beginnings differ, by the clocks as they are known now; 0.0 for one node."""
         moments = [clock.host_of(tick) for clock, tick in self._begun.values()]

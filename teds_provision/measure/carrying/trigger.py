@@ -37,8 +37,8 @@ def pull(together: Together, keepers: Sequence[NodeKeeper], note: Callable[[str]
         mark = _mark(keeper, trusted, *sent[keeper.bus.place], note)
         if mark is None:
             continue
-        together.begun(keeper.uuid, keeper.clock, mark)
-        for heard in list(keeper.running.values()):
+        together.begun(keeper.uuid, keeper.streams.clock, mark)
+        for heard in list(keeper.streams.running.values()):
             heard.begin(mark + START_AFTER_MARK)
 
 
@@ -72,11 +72,11 @@ def _mark(keeper: NodeKeeper, trusted: Trusted, before: int, after: int, note: C
     """
     try:
         with keeper.turn:
-            mark = exchange_clock(trusted.node, keeper.clock).mark
+            mark = exchange_clock(trusted.node, keeper.streams.clock).mark
     except (TedsProvisionError, SessionLost) as error:
         note(f"Node {keeper.uuid.hex()} did not say when it saw the trigger: {error}")
         return None
-    low, high = keeper.clock.ticks_at(before).low, keeper.clock.ticks_at(after).high
+    low, high = keeper.streams.clock.ticks_at(before).low, keeper.streams.clock.ticks_at(after).high
     if not mark or not mark_is_honest(mark, TickBounds(low, high)):
         note(f"Node {keeper.uuid.hex()} names another moment for the trigger: it is not begun.")
         keeper.stop()

@@ -25,15 +25,15 @@ from teds_provision.links.can.finding import (
 )
 from teds_provision.links.can.frame import Frame
 from teds_provision.links.can.link import conflict
-from teds_provision.links.can.port import ANNOUNCE, CanPort
+from teds_provision.links.can.port import CanPort
 from teds_provision.links.ports import Contact
+from teds_provision.protocol.announce import Announce, is_announce, uuid_crc
 from teds_provision.protocol.messages.identity import Identity
 
 POLL = 30.0  # seconds between questions to everybody, where that was asked for
 LEAST, MOST = 1.0, 30.0  # seconds between questions while somebody is missing
 ANNOUNCED = 1.0  # seconds between questions that announcements cause
 LOOK = 0.05  # seconds between looks at who waits
-_ANNOUNCE_MASK = 0x1FFFFF00
 
 
 @dataclass(frozen=True)
@@ -75,6 +75,7 @@ class Sightings:
     _seen: dict[bytes, dict[Place, Sighting]] = field(default_factory=dict)
     _wrong: dict[bytes, dict[Place, float]] = field(default_factory=dict)
     _conflicts: dict[Place, float] = field(default_factory=dict)
+    _announced: dict[bytes, tuple[Place, Callable[[], None]]] = field(default_factory=dict)
     _missing: dict[bytes, int] = field(default_factory=dict)
     _turn: threading.Condition = field(default_factory=threading.Condition)
 
@@ -93,6 +94,27 @@ class Sightings:
                 places.pop((place, address), None)
             self._turn.notify_all()
         self.note(conflict_text(address))
+
+    def on_announce(self, sighting: Sighting, tell: Callable[[], None]) -> None:
+        """Call ``tell``, which returns at once, when something announces itself as this node, or from its address."""
+        with self._turn:
+            self._announced[sighting.uuid] = ((sighting.port.place, sighting.address), tell)
+
+    def let_announce(self, uuid: bytes) -> None:
+        """Tell no more of it."""
+        with self._turn:
+            self._announced.pop(uuid, None)
+
+    def announced(self, place: str, announce: Announce) -> None:
+        """Take what a look-out heard; a hint that anyone can send."""
+        with self._turn:
+            told = [
+                tell
+                for uuid, (where, tell) in self._announced.items()
+                if where == (place, announce.address) or (where[0] == place and uuid_crc(uuid) == announce.crc)
+            ]
+        for tell in told:
+            tell()
 
     def missing(self) -> bool:
         """Whether somebody waits for a node."""
@@ -187,11 +209,11 @@ class Lookout:
 
     def _watch(self) -> None:
         """Ask, and hear announcements, until the bus fails."""
-        with self.port.bus().listen(_is_announce, most=256) as ear:
+        with self.port.bus().listen(lambda frame: is_announce(frame.identifier), most=256) as ear:
             self._ask()
             asked, pause, announced = time.monotonic(), LEAST, False
             while not self._stop.is_set():
-                announced = ear.get(LOOK) is not None or announced
+                announced = self._heard(ear.get(LOOK)) or announced
                 now = time.monotonic()
                 missing = self._sightings.missing()
                 if not missing:
@@ -206,6 +228,12 @@ class Lookout:
                 self._asked.clear()
                 self._ask()
                 asked = time.monotonic()
+
+    def _heard(self, frame: Frame | None) -> bool:
+        announce = Announce.decode(frame.identifier, frame.data) if frame is not None else None
+        if announce is not None:
+            self._sightings.announced(self.port.place, announce)
+        return announce is not None
 
     def _ask(self) -> None:
         """One question to everybody (or to ``node=`` alone); each is told of as soon as it answers."""
@@ -252,7 +280,3 @@ class Lookout:
         with self._turn:
             self._rounds += 1
             self._turn.notify_all()
-
-
-def _is_announce(frame: Frame) -> bool:
-    return frame.identifier & _ANNOUNCE_MASK == ANNOUNCE

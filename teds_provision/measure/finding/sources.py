@@ -11,10 +11,12 @@ from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 
 from teds_provision.errors import AddressConflict, StoreLocked
+from teds_provision.links import LinkSettings
 from teds_provision.links.can.frame import Frame
 from teds_provision.links.can.port import CanPort
+from teds_provision.links.can.spec import CanSpec, parse_spec
 from teds_provision.station.station import Station
-from teds_provision.store.lock import Taken
+from teds_provision.store.lock import Mark, Taken
 
 LISTENING = 0.25  # seconds in which the data of somebody else's streams to our address is heard
 SIGN_OF_LIFE = 4.0  # seconds in which whoever reads it sends something: lease / 3 is 3.3 s unless he says otherwise
@@ -22,27 +24,42 @@ _DATA, _MASK = 0x1CFF0000, 0x1FFF0000
 
 
 @contextmanager
-def sole_user(station: Station, ports: Sequence[CanPort], command: str, *, shared: bool = False) -> Iterator[None]:
-    """Use the source addresses of these ports alone; ``shared`` beside others who take them so.
+def sole_user(station: Station, ports: Sequence[CanPort], command: str) -> Iterator[None]:
+    """Use the source addresses of these ports alone.
 
     Raises StoreLocked (7) where another process of this home has one, and names it; AddressConflict (5) where another
     machine is heard to measure under it.
     """
     with ExitStack() as stack:
         for port in ports:
-            spec = port.spec
-            mark = station.measurements.source(spec.text, spec.source, command=command, shared=shared)
-            try:
-                stack.enter_context(mark)
-            except Taken as taken:
-                raise StoreLocked(
-                    f"Source address 0x{spec.source:02X} on {spec.text} is in use by {taken.holder}.",
-                    hint=f"Add source={_another(spec.source)} to --can, or end that process.",
-                ) from taken
+            mark = _enter(stack, station, port.spec, command, shared=False)
             # After a process that was killed its nodes still send to us, for a lease: nobody else is behind that.
-            if not shared and not mark.left_behind:
+            if not mark.left_behind:
                 _require_alone(port)
         yield
+
+
+@contextmanager
+def beside(station: Station, links: LinkSettings, command: str) -> Iterator[None]:
+    """Have short sessions from the source address of ``links``, beside others who do; over a reader there is none.
+
+    Raises StoreLocked (7) where a measurement has the address.
+    """
+    wheres = [place.removeprefix("can:") for place in links.places] if links.via == "can" else []
+    with ExitStack() as stack:
+        for where in wheres:
+            _enter(stack, station, parse_spec(where), command, shared=True)
+        yield
+
+
+def _enter(stack: ExitStack, station: Station, spec: CanSpec, command: str, *, shared: bool) -> Mark:
+    try:
+        return stack.enter_context(station.measurements.source(spec.wire, spec.source, command=command, shared=shared))
+    except Taken as taken:
+        raise StoreLocked(
+            f"Source address 0x{spec.source:02X} on {spec.text} is in use by {taken.holder}.",
+            hint=f"Add source={_another(spec.source)} to --can, or end that process.",
+        ) from taken
 
 
 def _another(source: int) -> str:

@@ -10,7 +10,7 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Callable, Iterator
-from contextlib import AbstractContextManager, contextmanager
+from contextlib import AbstractContextManager, ExitStack, contextmanager
 from dataclasses import dataclass, field
 from typing import Any, Final
 
@@ -52,6 +52,22 @@ class _Held:
     let_go: bool = False
 
 
+@dataclass
+class _Shared:
+    """The session of a node that is not measured, for all of its actuators that are held."""
+
+    turn: threading.RLock = field(default_factory=threading.RLock)
+    users: int = 0
+    trusted: Trusted | None = None
+    stack: ExitStack = field(default_factory=ExitStack)
+
+    @contextmanager
+    def session(self, _uuid: str) -> Iterator[Trusted | None]:
+        """One exchange at a time."""
+        with self.turn:
+            yield self.trusted
+
+
 class Holding:
     """The actuators that are held now. ``measured`` gives the session of a node that is being measured."""
 
@@ -67,6 +83,7 @@ class Holding:
         self._station, self._live, self._desk, self._turns = station, live, desk, turns
         self._measured, self._is_measured = measured, is_measured
         self._held: dict[tuple[str, int], _Held] = {}
+        self._shared: dict[str, _Shared] = {}
         self._last: dict[tuple[str, int], dict[str, Any]] = {}
         self._guard = threading.Lock()
 
@@ -158,17 +175,28 @@ class Holding:
         if self._is_measured(uuid):
             yield self._measured
             return
+        with self._guard:
+            shared = self._shared.setdefault(uuid, _Shared())
+        with shared.turn:
+            if not shared.users:
+                shared.trusted = shared.stack.enter_context(self._own_session(uuid))
+            shared.users += 1
+        try:
+            yield shared.session
+        finally:
+            with shared.turn:
+                shared.users -= 1
+                if not shared.users:
+                    shared.trusted = None
+                    shared.stack.close()
+
+    @contextmanager
+    def _own_session(self, uuid: str) -> Iterator[Trusted]:
         contact = self._desk.contact(uuid)
         if contact is None:
             raise NoNode(f"Node {uuid} is on no bus of this station.", hint="Connect it; see /nodes.")
-        with self._turns.of(uuid, "its actuator is held"), Conversation(contact, notice=_quiet) as node:
-            trusted = open_trusted(self._station, node)
-
-            @contextmanager
-            def own(_uuid: str) -> Iterator[Trusted | None]:
-                yield trusted
-
-            yield own
+        with self._turns.of(uuid, "its actuators are held"), Conversation(contact, notice=_quiet) as node:
+            yield open_trusted(self._station, node)
 
     def _hold(self, held: _Held, session: Measured) -> None:
         """Claim, feed until it is let go or nobody asks again, let go."""

@@ -56,7 +56,7 @@ class Resources:
         ]
 
     async def _node_of(self, request: Request) -> str:
-        return await asyncio.to_thread(self._daemon.resolve, request.path_params["uuid"])
+        return await asyncio.to_thread(self._daemon.known, request.path_params["uuid"])
 
     async def _nodes_of(self, texts: tuple[str, ...]) -> list[str]:
         return [await asyncio.to_thread(self._daemon.resolve, text) for text in texts]

@@ -96,11 +96,15 @@ class Together:
                 terms = self._terms[:, :, 0]
             total: Floats = np.zeros_like(numbers)
             for term in terms[::-1]:
-                total = total * distance + term
-            total = total + self._zero
+                total *= distance
+                total += term
+            total += self._zero
             if self._converts:
                 converted = (total * self._own_scale + self._own_offset - self._offset) / self._scale
                 total = np.where(self._same, total, converted)
             valid = (numbers <= self._most) & (total >= self._floor) & (total <= self._ceiling) & np.isfinite(total)
             valid &= self._usable
-            return np.where(valid, total * self._scale + self._offset, np.nan), valid
+            total = total * self._scale + self._offset
+            if not valid.all():
+                total[~valid] = np.nan
+            return total, valid

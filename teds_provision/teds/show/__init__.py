@@ -5,8 +5,9 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from datetime import UTC, datetime
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
+from teds_provision.lazy import lazy
 from teds_provision.teds.calibration.decoded import calibrated_unit
 from teds_provision.teds.codec.codes import AccessCode
 from teds_provision.teds.codec.decode import decode
@@ -20,6 +21,11 @@ from teds_provision.teds.show.values import Context, meaning_of, text_of
 from teds_provision.teds.units.units import WrittenUnit, display_unit
 
 __all__ = ["Shown", "ShownField", "describe", "finding_to_json", "shown_to_json"]
+
+if TYPE_CHECKING:
+    from teds_provision.teds.show import plot
+else:
+    __getattr__ = lazy(__name__)
 
 
 @dataclass(frozen=True)
