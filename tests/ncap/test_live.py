@@ -1,0 +1,170 @@
+"""The live channel: what a page can draw, in order, and no client that costs the others anything."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import socket
+import time
+from contextlib import ExitStack
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from websockets.sync.client import connect
+
+from teds_provision.measure.blocks import Block
+from teds_provision.ncap.live import POINTS, Listener, Live, thinned
+from tests.ncap.service import Service, until, virtual
+
+numbers = st.one_of(st.floats(-1e6, 1e6), st.just(float("nan")))
+
+
+@given(st.lists(numbers, max_size=300), st.integers(0, 40))
+def test_thinning_keeps_measured_points_in_order_and_the_extremes(values: list[float], most: int) -> None:
+    times, given_values = np.arange(len(values), dtype=float), np.array(values, dtype=float)
+    kept_times, kept = thinned(times, given_values, most)
+    assert len(kept_times) == len(kept) <= max(most, 0)
+    assert list(kept_times) == sorted(set(kept_times))
+    for moment, value in zip(kept_times, kept, strict=True):
+        assert value == given_values[int(moment)] or np.isnan(value)
+    finite = given_values[~np.isnan(given_values)]
+    if most >= 2 and len(finite):
+        assert np.nanmax(kept) == finite.max()
+        assert np.nanmin(kept) == finite.min()
+
+
+def block(first: int, count: int, period: float, channels: int = 1) -> Block:
+    rows = np.arange(first, first + count)
+    values = np.repeat(np.sin(rows * 0.1)[:, None], channels, axis=1)
+    return Block(
+        uuid="ab" * 10, stream=0, channels=tuple(range(1, channels + 1)), index=first, time=1e9 + rows * period,
+        tick=rows.astype(np.uint64), raw=values, value=values, valid=np.ones_like(values, dtype=bool),
+    )  # fmt: skip
+
+
+async def fed(live: Live, rate: float, seconds: float, channels: int = 1) -> None:
+    """Blocks as a node at this rate would give them, 20 ms each."""
+    began, given_rows = time.monotonic(), 0
+    while (past := time.monotonic() - began) < seconds:
+        due = int(past * rate) - given_rows
+        if due > 0:
+            live.block(block(given_rows, due, 1 / rate, channels))
+            given_rows += due
+        await asyncio.sleep(0.02)
+
+
+async def heard(listener: Listener, seconds: float) -> list[dict[str, Any]]:
+    found: list[dict[str, Any]] = []
+    end = asyncio.get_running_loop().time() + seconds
+    while (left := end - asyncio.get_running_loop().time()) > 0:
+        try:
+            found += [json.loads(text) for text in await asyncio.wait_for(listener.wait(), left)]
+        except TimeoutError:
+            break
+    return found
+
+
+@pytest.mark.parametrize(("rate", "least"), [(50.0, 50.0), (100.0, 95.0), (10_000.0, 60.0)])
+def test_at_most_a_hundred_points_a_second_and_slow_channels_whole(rate: float, least: float) -> None:
+    async def run() -> list[dict[str, Any]]:
+        live = Live()
+        listener, fan = live.join(), asyncio.create_task(live.run())
+        feeding = asyncio.create_task(fed(live, rate, 2.0))
+        found = await heard(listener, 2.3)
+        await feeding
+        fan.cancel()
+        return found
+
+    messages = asyncio.run(run())
+    times = [t for one in messages if one["type"] == "values" for t in one["channels"]["ab" * 10 + "/1"][0]]
+    assert times == sorted(times)
+    span = (times[-1] - times[0]) or 1.0
+    assert least * 0.9 <= len(times) / span <= POINTS * 1.15, len(times) / span
+    assert any(one["type"] == "beat" for one in messages)
+
+
+def test_a_client_that_does_not_read_costs_one_slot_and_is_told_what_it_missed() -> None:
+    async def run() -> tuple[list[dict[str, Any]], list[dict[str, Any]], int]:
+        live = Live()
+        quick, slow, fan = live.join(), live.join(), asyncio.create_task(live.run())
+        feeding = asyncio.create_task(fed(live, 100.0, 1.0))
+        found = await heard(quick, 1.2)
+        await feeding
+        for number in range(5):
+            live.event("node", uuid="x", state=str(number))
+        await asyncio.sleep(0.1)
+        late = [json.loads(text) for text in await slow.wait()]
+        fan.cancel()
+        return found, late, slow.dropped
+
+    found, late, dropped = asyncio.run(run())
+    sent = sum(one["type"] == "values" for one in found)
+    assert dropped == sent - 1, "newest wins"
+    assert [one["messages"] for one in late if one["type"] == "dropped"] == [dropped]
+    assert sum(one["type"] == "values" for one in late) == 1
+    assert [one["state"] for one in late if one["type"] == "event"] == list("01234"), "events are never thinned"
+
+
+def test_a_client_that_leaves_too_many_events_is_told_to_ask_anew() -> None:
+    async def run() -> list[dict[str, Any]]:
+        live = Live()
+        listener, fan = live.join(), asyncio.create_task(live.run())
+        await asyncio.sleep(0)
+        for number in range(300):
+            live.event("node", uuid="x", state=str(number))
+        await asyncio.sleep(0.05)
+        fan.cancel()
+        return [json.loads(text) for text in await listener.wait()]
+
+    messages = asyncio.run(run())
+    assert messages[0] == {"type": "resync"}
+    assert messages[-1]["state"] == "299"
+    assert len(messages) < 60
+
+
+@pytest.mark.link
+def test_fifty_clients_of_which_ten_never_read(service: Service) -> None:
+    uuid = virtual(service)
+    asked = service.client()
+    asked.request("POST", "/measurements", {"uuids": [uuid], "rate": 100})
+    until(lambda: asked.node(uuid)["channels"][1]["last"])
+    token = service.token("many")
+    with ExitStack() as stack:
+        for _ in range(10):
+            deaf = stack.enter_context(socket.create_connection(("127.0.0.1", service.port)))
+            deaf.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
+            deaf.sendall(
+                b"GET /api/v1/live HTTP/1.1\r\nHost: 127.0.0.1:%d\r\nConnection: Upgrade\r\nUpgrade: websocket\r\n"
+                b"Sec-WebSocket-Version: 13\r\nSec-WebSocket-Key: dGhlIHNhbXBsZSBub25jZQ==\r\n"
+                b"Authorization: Bearer %s\r\n\r\n" % (service.port, token.encode())
+            )
+        quick = [
+            stack.enter_context(
+                connect(
+                    f"ws://127.0.0.1:{service.port}/api/v1/live",
+                    additional_headers={"Authorization": f"Bearer {token}"},
+                    compression=None,
+                )
+            )
+            for _ in range(40)
+        ]
+        until(lambda: asked.status()["clients"] == 50)
+        before = asked.request("GET", "/measurements")["measurements"][0]["nodes"][0]
+        counts = [0] * len(quick)
+        end = time.monotonic() + 2.0
+        while time.monotonic() < end:
+            for number, one in enumerate(quick):
+                try:
+                    message = json.loads(one.recv(0.001))
+                except TimeoutError:
+                    continue
+                counts[number] += message["type"] == "values"
+        after = asked.request("GET", "/measurements")["measurements"][0]["nodes"][0]
+    assert min(counts) > 0, counts
+    assert after["samples"] > before["samples"]
+    assert after["lost"] == before["lost"], "nobody who reads or does not read costs the measurement anything"
+    until(lambda: asked.status()["clients"] == 0)
+    asked.request("DELETE", f"/measurements/{asked.request('GET', '/measurements')['measurements'][0]['id']}")
