@@ -48,7 +48,8 @@ async def _serve(daemon: Daemon, local: socket.socket, tcp: socket.socket | None
         loop.add_signal_handler(number, _ending(stop))
     servers = Servers()
     app = build(daemon)
-    daemon.live.told = tell
+    early: list[dict[str, Any]] = []
+    daemon.live.told = early.append  # the first line says that it is ready
 
     async def begin() -> None:
         await servers.serve(Guard(app, daemon.tokens, None), local)
@@ -60,6 +61,9 @@ async def _serve(daemon: Daemon, local: socket.socket, tcp: socket.socket | None
             daemon.url = f"{'https' if tls else 'http'}://{_shown(daemon.settings, host)}:{port}"
         socket_path = str(Path(daemon.station.home) / SOCKET)
         tell({"ready": True, "url": daemon.url, "api": f"unix:{socket_path}", "pid": os.getpid()})
+        daemon.live.told = tell
+        for event in early:
+            tell(event)
         notify("READY=1")
 
     try:

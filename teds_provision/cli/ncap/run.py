@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import importlib.util
+import sys
+import threading
 from collections.abc import Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -72,19 +75,33 @@ def run(
     settings.require_safe(wanted)
     station = app.station()
     station.unlock()  # nobody is asked for a passphrase later
-    running.run(station, wanted, lambda event: _tell(app, event))
+    running.run(station, wanted, Lines(app).tell)
 
 
-def _tell(app: App, event: dict[str, Any]) -> None:
-    if app.json:
-        print(to_json(event), flush=True)
-    elif event.get("ready"):
+class Lines:
+    """The daemon's lines: JSON on stdout, or sentences on stderr. Whoever stops reading them stops nothing."""
+
+    def __init__(self, app: App) -> None:
+        self._app = app
+        self._turn = threading.Lock()
+
+    def tell(self, event: dict[str, Any]) -> None:
+        """One line, whole, from whichever thread."""
+        with self._turn, suppress(OSError, ValueError):
+            if self._app.json:
+                sys.stdout.write(to_json(event) + "\n")
+                sys.stdout.flush()
+            else:
+                self._app.note(_sentence(event))
+
+
+def _sentence(event: dict[str, Any]) -> str:
+    if event.get("ready"):
         where = event["url"] or f"the Unix socket {event['api'].removeprefix('unix:')}"
-        app.note(f"Ready on {where}. The page with its token: teds-provision ncap open")
-    else:
-        facts = {key: value for key, value in event.items() if key not in ("event", "time", "state") and value}
-        told = ", ".join(f"{key} {_text(value)}" for key, value in facts.items())
-        app.note(f"{event['event']} {event.get('state', '')}: {told}")
+        return f"Ready on {where}. The page with its token: teds-provision ncap open"
+    facts = {key: value for key, value in event.items() if key not in ("event", "time", "state") and value}
+    told = ", ".join(f"{key} {_text(value)}" for key, value in facts.items())
+    return f"{event['event']} {event.get('state', '')}: {told}"
 
 
 def _text(value: Any) -> str:
