@@ -1,0 +1,168 @@
+"""A hall of nodes that are provisioned already: made in this process in a moment, run by processes of their own."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import sys
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from teds_provision.links import LINKS, Capabilities, Contact
+from teds_provision.node.described import create
+from teds_provision.node.virtual import VirtualNode
+from teds_provision.protocol.messages.identity import Identity
+from teds_provision.station.station import Station
+from teds_provision.steps.order import BuildOrder
+from teds_provision.steps.provision import provision
+from teds_provision.talk.conversation import Conversation
+from teds_provision.talk.progress import Silent
+from tests.e2e.desk import ANGLE, Desk, Running
+from tests.e2e.desk import Station as Commands
+from tests.workflow.bench import make_station
+
+CALIBRATIONS = {
+    ANGLE: "# date: 2026-10-01\nraw,value [degree]\n0,0\n65535,359.9\n",
+    "gripper": "# date: 2026-10-01\nraw,value,channel\n0,0,1\n4095,110,1\n0,0,2\n4095,110,2\n0,0,3\n4095,140,3\n",
+}
+FAULTY = (sys.executable, "-m", "tests.measure.faulty_node")
+
+
+@dataclass
+class NodeLink:
+    """A virtual node that lies on the reader of this process."""
+
+    node: VirtualNode
+    via: str = "nfc"
+
+    @property
+    def capabilities(self) -> Capabilities:
+        return LINKS[self.via].capabilities
+
+    def exchange(self, frame: bytes) -> bytes:
+        return self.node.request(self.via, frame, tapped=True)
+
+    def close(self) -> None:
+        self.node.lost(self.via)
+
+
+def provisioned(station: Station, folder: Path, type_: str, name: str, *, calibrate: bool = True) -> str:
+    """Make a node of this type, and provision it; its UUID."""
+    create(folder, name=name, profile=type_)
+    node = VirtualNode(folder)
+    calibration = folder / "calibration.csv"
+    calibration.write_text(CALIBRATIONS[type_])
+    contact = Contact(Identity.decode(node.identify()), NodeLink(node), tag_uid=b"\x04" + bytes(6))
+    order = BuildOrder(type_, calibration=calibration if calibrate else None, name=name)
+    with Conversation(contact, notice=lambda _notice: None) as talk:
+        done = provision(station, talk, order, accept=lambda _who: None, reporter=Silent())
+    assert done.verified.verdict == "authentic"
+    return node.tim.flash.uuid.hex()
+
+
+@dataclass
+class Placed:
+    """A node of the hall; ``process`` while it runs."""
+
+    hall: Hall
+    folder: Path
+    uuid: str
+    process: Running | None = None
+
+    def start(self, *words: object, can: str = "", fault: str = "") -> Placed:
+        """Power on: the product's node, or one with a fault."""
+        bus = can or self.hall.can
+        if fault:
+            program, given = FAULTY, [fault, bus, self.folder, *words]
+        else:
+            program, given = (), ["--json", "node", "run", self.folder, "--can", bus, "--source", "ramp:2", *words]
+        self.process = self.hall.desk.start(*given, **({"program": program} if program else {}))
+        self.process.wait_for('"ready": true')
+        return self
+
+    def kill(self) -> None:
+        """Cut its power."""
+        assert self.process is not None
+        self.process.process.kill()
+        self.process.end()
+
+    def sees(self, text: str, seconds: float = 20.0) -> None:
+        """Wait until it has said this."""
+        assert self.process is not None
+        self.process.wait_for(text, seconds)
+
+
+@dataclass
+class Hall:
+    """A station and its nodes on one bus; commands are processes."""
+
+    folder: Path
+    types: dict[str, str] = field(default_factory=lambda: {"a": ANGLE, "g": "gripper"})
+    nodes: dict[str, Placed] = field(default_factory=dict, init=False)
+
+    def __post_init__(self) -> None:
+        prepared = self.folder / "stations"
+        prepared.mkdir(parents=True)
+        self.desk = Desk(self.folder, prepared)
+        self.can = f"{self.desk.links.can}&fd=1"
+        with_keys = make_station(prepared / "bench", "bench")
+        try:
+            for name, type_ in self.types.items():
+                uuid = provisioned(with_keys, self.folder / name, type_, name)
+                self.nodes[name] = Placed(self, self.folder / name, uuid)
+        finally:
+            with_keys.close()
+        self.station: Commands = self.desk.station()
+
+    def close(self) -> None:
+        """End all that runs."""
+        self.desk.clear()
+
+    def copy(self, name: str) -> Commands:
+        """A second home with the same keys: another machine that holds a copy."""
+        shutil.copytree(self.desk.prepared / "bench", self.folder / name)
+        return Commands(self.desk, self.folder / name)
+
+    def begin(self, *words: object, can: str = "", station: Commands | None = None, **more: Any) -> Running:
+        """Begin to measure."""
+        return (station or self.station).start("--json", "measure", *words, "--can", can or self.can, **more)
+
+    def measure(self, *words: object, code: int = 0, **more: Any) -> list[dict[str, Any]]:
+        """Measure to the end; the events."""
+        outcome = self.begin(*words, **more).end(60)
+        assert outcome.code == code, outcome
+        return events(outcome.out)
+
+    def ask(self, *words: object, code: int = 0) -> Any:
+        """Another command on the bus, to its end."""
+        return self.station.ask(*words, "--can", self.can, code=code)
+
+
+def events(text: str) -> list[dict[str, Any]]:
+    """The whole lines of JSON."""
+    return [json.loads(line) for line in text.splitlines(keepends=True) if line.endswith("\n")]
+
+
+def of(lines: list[dict[str, Any]], uuid: str = "", channel: int = 1) -> list[dict[str, Any]]:
+    """Data lines of a channel."""
+    data = [line for line in lines if line["event"] == "data" and line["channel"] == channel]
+    return [line for line in data if not uuid or line["uuid"] == uuid]
+
+
+def states(lines: list[dict[str, Any]]) -> list[str]:
+    """States in the order in which they came."""
+    return [line["state"] for line in lines if line["event"] == "status" and "uuid" in line]
+
+
+def crowd(can: str, folders: list[Path], desk: Desk) -> Running:
+    """Many nodes in one process."""
+    process = desk.start("--json", "node", "run", *folders, "--can", can, "--source", "ramp:2")
+    process.wait_for('"ready": true', 60)
+    return process
+
+
+def killed(process: Running) -> None:
+    """kill -9."""
+    process.process.kill()
+    process.end()

@@ -1,0 +1,141 @@
+"""A running daemon for the tests: the program itself, asked over its sockets as anybody would."""
+
+from __future__ import annotations
+
+import http.client
+import json
+import signal
+import time
+from collections.abc import Callable
+from contextlib import suppress
+from dataclasses import dataclass, field
+from typing import Any
+from urllib.parse import urlsplit
+
+from teds_provision import client
+from tests.e2e.desk import Desk, Running, Station
+
+PATIENCE = 30.0
+
+
+@dataclass
+class Answer:
+    """What came back."""
+
+    status: int
+    headers: dict[str, str]
+    text: str
+
+    @property
+    def json(self) -> Any:
+        return json.loads(self.text)
+
+    @property
+    def code(self) -> str:
+        return str(self.json["error"]["code"])
+
+
+@dataclass
+class Service:
+    """One `ncap run` of a station, on a free port and on the desk's bus."""
+
+    desk: Desk
+    station: Station
+    words: tuple[object, ...] = ()
+    process: Running | None = None
+    url: str = ""
+    closing: list[client.Client] = field(default_factory=list)
+
+    def start(self, *more: object, **how: Any) -> Service:
+        """Start it, and wait until it says that it is ready."""
+        self.process = self.station.start(
+            "--json", "ncap", "run", "--http", "127.0.0.1:0", "--can", self.desk.links.can, *self.words, *more, **how
+        )
+        [ready, *_] = self.process.wait_for_lines(1)
+        assert ready["ready"] is True, ready
+        self.url = ready["url"]
+        return self
+
+    @property
+    def port(self) -> int:
+        found = urlsplit(self.url).port
+        assert found is not None
+        return found
+
+    def client(self, token: str | None = None) -> client.Client:
+        """By the Unix socket, or with a token by TCP."""
+        made = client.connect(self.url if token else None, token=token, home=self.station.home, timeout=PATIENCE)
+        self.closing.append(made)
+        return made
+
+    def token(self, name: str, *words: object) -> str:
+        """A new token for a script, by command."""
+        return str(self.station.ask("ncap", "token", "add", name, *words)["token"])
+
+    def raw(self, method: str, path: str, headers: dict[str, str | None] | None = None, body: Any = None) -> Answer:
+        """One request as it is said here; a header that is None is left out (Host too)."""
+        told: dict[str, str | None] = {"Host": f"127.0.0.1:{self.port}", **(headers or {})}
+        connection = http.client.HTTPConnection("127.0.0.1", self.port, timeout=PATIENCE)
+        try:
+            connection.putrequest(method, path, skip_host=True, skip_accept_encoding=True)
+            octets = body.encode() if isinstance(body, str) else body
+            if octets is not None and "Content-Length" not in told and "Transfer-Encoding" not in told:
+                told["Content-Length"] = str(len(octets))
+            for name, value in told.items():
+                if value is not None:
+                    connection.putheader(name, value)
+            connection.endheaders()
+            if octets is not None:
+                with suppress(BrokenPipeError, ConnectionResetError):  # it may answer before all of it was sent
+                    connection.send(octets)
+            answer = connection.getresponse()
+            return Answer(answer.status, {k.lower(): v for k, v in answer.getheaders()}, answer.read().decode())
+        finally:
+            connection.close()
+
+    def end(self) -> None:
+        """SIGTERM, and wait."""
+        assert self.process is not None
+        for one in self.closing:
+            one.close()
+        self.process.signal(signal.SIGTERM)
+        outcome = self.process.end()
+        assert outcome.code == 0, outcome
+        assert "Traceback" not in outcome.err, outcome.err
+
+    def kill(self) -> None:
+        """As power loss would."""
+        assert self.process is not None
+        self.process.process.kill()
+        self.process.end()
+
+
+def until(found: Callable[[], Any], what: str = "", seconds: float = PATIENCE) -> Any:
+    """Wait until ``found`` gives something true, and return it."""
+    end = time.monotonic() + seconds
+    while True:
+        value = found()
+        if value:
+            return value
+        assert time.monotonic() < end, what or f"still {value!r}"
+        time.sleep(0.05)
+
+
+def verified(service: Service, uuid: str) -> dict[str, Any]:
+    """Wait until a node is there and was looked at, and return it."""
+    with service.client() as asked:
+        return dict(
+            until(
+                lambda: next((n for n in asked.nodes() if n["uuid"] == uuid and n["verdict"] and n["present"]), None),
+                uuid,
+            )
+        )
+
+
+def virtual(service: Service, profile: str = "gripper", name: str = "hand", source: str = "sine:2") -> str:
+    """A virtual transducer of the daemon, provisioned and there."""
+    with service.client() as asked:
+        made = asked.request("POST", "/virtual", {"profile": profile, "name": name, "source": source})
+    node = verified(service, made["uuid"])
+    assert node["verdict"] == "authentic", node
+    return str(made["uuid"])

@@ -1,0 +1,263 @@
+"""What the API does, asked of a running daemon with real (virtual) nodes: by its Python client, as a script would."""
+
+from __future__ import annotations
+
+import json
+from typing import Any
+
+import pytest
+
+from teds_provision.client import ApiError, Client
+from tests.e2e.desk import ANGLE
+from tests.ncap.service import Service, until, verified, virtual
+
+pytestmark = pytest.mark.link
+
+
+@pytest.fixture(scope="module")
+def asked(service: Service) -> Client:
+    return service.client()
+
+
+@pytest.fixture(scope="module")
+def hand(service: Service) -> str:
+    """A virtual gripper of the daemon: channel 1 an actuator, 2 and 3 sensors."""
+    return virtual(service)
+
+
+def refused(asked: Client, status: int, code: str, method: str, path: str, body: Any = None) -> str:
+    with pytest.raises(ApiError) as error:
+        asked.request(method, path, body)
+    assert (error.value.status, error.value.code) == (status, code), error.value.message
+    return error.value.message + error.value.hint
+
+
+def measured(asked: Client, uuid: str) -> dict[str, Any]:
+    """Wait until values of a node come."""
+    return dict(until(lambda: (n := asked.node(uuid))["channels"][1]["last"] and n))
+
+
+def test_status_says_what_runs(service: Service, asked: Client) -> None:
+    status = asked.status()
+    assert status["station"]["name"] == "bench"
+    assert (status["detection"], status["write"], status["url"]) == ("whitelist", True, service.url)
+    until(lambda: asked.status()["links"][0]["state"] == "up")
+    assert asked.status()["links"][0]["via"] == "can"
+    assert {"sinks", "clock_error", "budget", "measurements", "strangers"} <= set(status)
+
+
+def test_a_node_has_its_verdict_with_checks_and_its_channels_with_units(asked: Client, hand: str) -> None:
+    node = asked.node("hand")
+    assert (node["uuid"], node["verdict"], node["state"], node["present"]) == (hand, "authentic", "provisioned", True)
+    assert node["virtual"] is True
+    assert {check["name"] for check in node["checks"]} >= {"signature", "session", "not revoked"}
+    assert not [check for check in node["checks"] if check["result"] == "failed"]
+    opening = node["channels"][1]
+    assert (opening["name"], opening["kind"], opening["unit"], opening["low"]) == ("opening", "sensor", "m", 0.0)
+    assert opening["high"] == pytest.approx(0.11)
+    assert opening["uncertainty"] == pytest.approx(1e-4)
+    assert opening["topic"] == "/bench/hand/opening"
+    assert asked.node(hand[:6])["uuid"] == hand
+    assert hand in {one["uuid"] for one in asked.nodes()}
+
+
+def test_the_datasheet_is_read_decoded_and_given_as_a_document(asked: Client, hand: str) -> None:
+    sheet = asked.request("GET", f"/nodes/{hand}/teds")
+    assert sheet["verdict"] == "authentic"
+    assert {"MetaTEDS", "XdcrName", "CalTEDS"} <= {one["name"] for one in sheet["teds"]}
+    curve = next(one for one in sheet["curves"] if one["channel"] == 2)
+    assert curve["points"][0] == pytest.approx([0, 0])
+    assert curve["points"][-1][1] == pytest.approx(0.11, rel=1e-3)
+    assert asked.request("GET", f"/nodes/{hand}/teds?format=xml").startswith("<?xml")
+    assert asked.request("GET", f"/nodes/{hand}/teds?format=json")["format"] == "teds/1"
+    assert asked.request("GET", f"/nodes/{hand}/teds?format=hex").startswith("#")
+    refused(asked, 422, "usage", "GET", f"/nodes/{hand}/teds?format=pdf")
+
+
+def test_a_datasheet_is_written_after_its_diff_was_shown(asked: Client, hand: str) -> None:
+    document = asked.request("GET", f"/nodes/{hand}/teds?format=xml")
+    changed = document.replace(">gripper<", ">left hand<").replace(">hand<", ">left hand<")
+    assert changed != document
+    plan = asked.request("PUT", f"/nodes/{hand}/teds?dry_run=1", {"content": changed, "format": "xml"})
+    assert [one["after"] for one in plan["changes"]] == ['"left hand"'] or "left hand" in plan["changes"][0]["text"]
+    assert asked.request("PUT", f"/nodes/{hand}/teds?dry_run=1", {"content": document})["changes"] == []
+    before = asked.node(hand)["sequence"]
+    done = asked.request("PUT", f"/nodes/{hand}/teds", {"content": changed})
+    assert done["verdict"] == "authentic"
+    assert [step["result"] for step in done["steps"]] == ["done"] * 4
+    assert asked.node(hand)["sequence"] == before + 1
+    back = asked.request("PUT", f"/nodes/{hand}/teds", {"content": document})
+    assert back["verdict"] == "authentic"
+
+
+def test_a_datasheet_that_is_damaged_of_another_node_or_none_is_refused(asked: Client, hand: str) -> None:
+    document = asked.request("GET", f"/nodes/{hand}/teds?format=xml")
+    path = f"/nodes/{hand}/teds"
+    refused(asked, 422, "bad-data", "PUT", path, {"content": "<nonsense/>"})
+    refused(asked, 422, "bad-data", "PUT", path, {"content": ""})
+    refused(
+        asked, 422, "bad-data", "PUT", path, {"content": '<!DOCTYPE x [<!ENTITY y SYSTEM "file:///etc/passwd">]><x/>'}
+    )
+    other = document.replace(hand, "11" * 10)
+    assert "11" * 10 in refused(asked, 422, "bad-data", "PUT", path, {"content": other})
+    refused(asked, 422, "usage", "PUT", path, {})
+
+
+def test_a_measurement_gives_values_freezes_its_nodes_and_ends(service: Service, asked: Client, hand: str) -> None:
+    asked.request("POST", "/groups", {"name": "robot", "uuids": [hand]})
+    made = asked.request("POST", "/measurements", {"group": "robot", "rate": 50, "sinks": ["run.csv"]})
+    node = measured(asked, hand)
+    document = asked.request("GET", f"/nodes/{hand}/teds?format=xml")
+    assert node["measurement"] == made["id"]
+    assert 0 <= node["channels"][1]["last"]["value"] <= 0.11
+    assert node["channels"][1]["last"]["age"] < 2
+    for method, path, body in (
+        ("PUT", f"/nodes/{hand}/teds", {"content": document}),
+        ("PUT", "/groups/robot", {"uuids": []}),
+        ("DELETE", "/groups/robot", None),
+        ("PUT", "/names", {"uuid": hand, "channel": 2, "name": "other"}),
+        ("DELETE", f"/virtual/{hand}", None),
+    ):
+        refused(asked, 409, "frozen", method, path, body)
+    assert "measured already" in refused(asked, 423, "node-busy", "POST", "/measurements", {"uuids": [hand]})
+    assert asked.request("GET", f"/nodes/{hand}/teds")["verdict"] == "authentic", "reading goes on meanwhile"
+    [one] = asked.request("GET", "/measurements")["measurements"]
+    assert (one["state"], one["rate"], one["nodes"][0]["state"]) == ("running", 50, "running")
+    until(lambda: asked.request("GET", "/measurements")["measurements"][0]["nodes"][0]["samples"] > 0)
+    asked.request("DELETE", f"/measurements/{made['id']}")
+    assert asked.request("GET", "/measurements")["measurements"] == []
+    file = service.station.home / "recordings" / "run.csv"
+    assert [str(file)] == one["files"]
+    assert len([line for line in file.read_text().splitlines() if not line.startswith("#")]) > 10
+    refused(asked, 404, "not-found", "DELETE", "/measurements/nothing")
+    asked.request("DELETE", "/groups/robot")
+    until(lambda: asked.node(hand)["measurement"] is None)
+
+
+def test_a_measurement_that_cannot_be_is_refused(asked: Client, hand: str) -> None:
+    for body in (
+        {},
+        {"group": "x", "uuids": [hand]},
+        {"uuids": [hand], "sinks": ["/etc/passwd.csv"]},
+        {"uuids": [hand], "sinks": ["../up.csv"]},
+        {"uuids": [hand], "sinks": ["exec:rm"]},
+        {"uuids": [hand], "rate": -1},
+        {"uuids": [hand], "rate": "fast"},
+        {"uuids": [hand], "kind": "wild"},
+        {"uuids": [hand], "channels": [0]},
+        {"uuids": "all"},
+    ):
+        refused(asked, 422, "usage", "POST", "/measurements", body)
+    refused(asked, 404, "not-found", "POST", "/measurements", {"group": "nobody"})
+    assert asked.request("GET", "/measurements")["measurements"] == []
+
+
+def test_an_actuator_moves_within_its_limits_and_is_let_go(asked: Client, hand: str) -> None:
+    path = f"/nodes/{hand}/channels/1"
+    done = asked.request("PUT", path, {"value": 40, "unit": "mm", "hold": 20})
+    assert done["applied"]["value"] == pytest.approx(40, abs=0.1)
+    assert done["safe"] is False
+    assert asked.node(hand)["channels"][0]["actuator"]["safe"] is False
+    on = asked.request("PUT", path, {"value": 0.05, "hold": 20})
+    assert (on["applied"]["unit"], on["applied"]["value"]) == ("m", pytest.approx(0.05, abs=1e-4))
+    refused(asked, 422, "bad-data", "PUT", f"/nodes/{hand}/channels/2", {"value": 1})
+    refused(asked, 422, "bad-data", "PUT", f"/nodes/{hand}/channels/9", {"value": 1})
+    assert asked.node(hand)["channels"][0]["actuator"]["safe"] is False, "another channel's refusal ends nothing"
+    assert asked.request("PUT", path, {"hold": 0})["safe"] is True
+    assert asked.node(hand)["channels"][0]["actuator"]["safe"] is True
+    assert "0.11" in refused(asked, 422, "refused", "PUT", path, {"value": 5, "hold": 1})
+    refused(asked, 422, "bad-data", "PUT", path, {"value": 1, "unit": "kg"})
+    refused(asked, 422, "usage", "PUT", path, {"value": 1, "hold": 1e9})
+    refused(asked, 422, "usage", "PUT", path, {})
+    log = asked.request("GET", "/log?limit=200")
+    assert log["intact"] is True
+    assert {"set", "virtual", "provision"} & {entry["act"] for entry in log["entries"]}
+
+
+def test_an_actuator_that_nobody_asks_for_again_is_safe_soon(asked: Client, hand: str) -> None:
+    asked.request("PUT", f"/nodes/{hand}/channels/1", {"value": 0.02, "hold": 0.4})
+    until(lambda: asked.node(hand)["channels"][0]["actuator"]["safe"] is True, seconds=5)
+
+
+def test_names_are_given_kept_and_taken_back(asked: Client, hand: str) -> None:
+    row = {"uuid": hand, "channel": 2, "name": "left/opening"}
+    names = asked.request("PUT", "/names", row)["names"]
+    assert {"uuid": hand, "channel": 2, "name": "left/opening", "topic": "/left/opening"} in names
+    assert asked.node(hand)["channels"][1]["topic"] == "/left/opening"
+    refused(asked, 422, "usage", "PUT", "/names", {**row, "channel": 3})
+    refused(asked, 422, "usage", "PUT", "/names", {**row, "name": "1/2"})
+    asked.request("PUT", "/names", {**row, "name": None})
+    assert asked.node(hand)["channels"][1]["topic"] == "/bench/hand/opening"
+
+
+def test_groups_are_made_changed_and_deleted(asked: Client, hand: str) -> None:
+    made = asked.request("POST", "/groups", {"name": "all", "uuids": ["hand", "22" * 10]})
+    assert made["groups"] == [{"name": "all", "uuids": sorted([hand, "22" * 10]), "measuring": False}]
+    assert asked.request("PUT", "/groups/all", {"uuids": [hand]})["groups"][0]["uuids"] == [hand]
+    assert asked.node(hand)["groups"] == ["all"]
+    refused(asked, 422, "usage", "POST", "/groups", {"name": "abcd", "uuids": []})
+    refused(asked, 404, "not-found", "PUT", "/groups/none", {"uuids": []})
+    assert asked.request("DELETE", "/groups/all")["groups"] == []
+    refused(asked, 404, "not-found", "DELETE", "/groups/all")
+
+
+def test_a_virtual_transducer_is_made_from_a_document_under_a_uuid_of_its_own(
+    service: Service, asked: Client, hand: str
+) -> None:
+    document = asked.request("GET", f"/nodes/{hand}/teds?format=xml")
+    refused(asked, 422, "usage", "POST", "/virtual", {"content": document, "source": "noise"})
+    copy = document.replace(f"<octets>{hand}</octets>", f"<octets>{'00' * 10}</octets>")
+    made = asked.request("POST", "/virtual", {"content": copy, "name": "copy", "source": "ramp:1"})
+    node = verified(service, made["uuid"])
+    assert (node["verdict"], node["virtual"], len(node["channels"])) == ("authentic", True, 3)
+    assert {one["name"] for one in asked.request("GET", "/virtual")["virtual"]} == {"hand", "copy"}
+    asked.request("DELETE", f"/virtual/{made['uuid']}")
+    until(lambda: asked.node(made["uuid"])["present"] is False)
+    refused(asked, 404, "not-found", "DELETE", f"/virtual/{made['uuid']}")
+    refused(asked, 422, "usage", "POST", "/virtual", {"profile": "gripper", "source": "exec:true"})
+    refused(asked, 422, "usage", "POST", "/virtual", {"source": "noise"})
+    refused(asked, 404, "not-found", "POST", "/virtual", {"profile": "no-such-type", "source": "noise"})
+
+
+def test_detection_decides_who_is_shown(service: Service, asked: Client) -> None:
+    node = service.desk.node("stranger", called="stranger").start(nfc=False, can=True)
+    until(lambda: asked.status()["strangers"] == 1)
+    assert node.uuid not in {one["uuid"] for one in asked.nodes()}
+    assert service.station.ask("ncap", "detection", "transparent") == {"detection": "transparent"}
+    seen = verified(service, node.uuid)
+    assert (seen["verdict"], seen["state"], seen["whitelisted"]) == ("unsigned", "factory", False)
+    assert asked.request("PUT", "/detection", {"mode": "whitelist"}) == {"mode": "whitelist"}
+    until(lambda: asked.status()["strangers"] == 1)
+    done = asked.request("POST", f"/nodes/{node.uuid}/provision", {"profile": ANGLE, "name": "angle"})
+    assert (done["state"], done["waits_for"]) == ("waiting", "tap"), "what is only a count is not met on the bus"
+    assert asked.request("POST", f"/nodes/{node.uuid}/provision", {"cancel": True})["state"] == "cancelled"
+    asked.request("PUT", "/detection", {"mode": "transparent"})
+    verified(service, node.uuid)
+    asked.request("POST", f"/nodes/{node.uuid}/provision", {"profile": ANGLE, "name": "angle"})
+    run = until(lambda: (r := asked.request("GET", f"/nodes/{node.uuid}/provision"))["state"] != "running" and r)
+    assert (run["state"], run["verdict"]) == ("done", "authentic"), run
+    assert [step["name"] for step in run["steps"]] == [
+        "identify",
+        "whitelist",
+        "agree",
+        "build",
+        "sign",
+        "write",
+        "verify",
+    ]
+    assert asked.node("angle")["whitelisted"] is True
+    asked.request("PUT", "/detection", {"mode": "whitelist"})
+    assert verified(service, node.uuid)["verdict"] == "authentic"
+    refused(asked, 404, "not-found", "POST", f"/nodes/{node.uuid}/provision", {"profile": "no-such-type"})
+
+
+def test_the_command_line_sees_what_the_daemon_did_and_the_daemon_what_it_did(
+    service: Service, asked: Client, hand: str
+) -> None:
+    assert hand in json.dumps(service.station.ask("nodes", "hand"))
+    service.station.ask("group", "create", "made-beside", hand)
+    until(lambda: asked.request("GET", "/groups")["groups"])
+    until(lambda: asked.node(hand)["groups"] == ["made-beside"])
+    told = service.station.ask("ncap", "status")
+    assert hand in {node["uuid"] for node in told["nodes"]}
+    service.station.ask("group", "delete", "made-beside")

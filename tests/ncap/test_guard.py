@@ -1,0 +1,244 @@
+"""Who may: every refusal of api.md, asked of a running daemon; and what it never gives away."""
+
+from __future__ import annotations
+
+import json
+import os
+import socket
+import stat
+import subprocess
+import threading
+import time
+from pathlib import Path
+from typing import Any
+
+import pytest
+from websockets.exceptions import InvalidStatus
+from websockets.sync.client import connect
+
+from tests.e2e.desk import PASSPHRASE, Desk
+from tests.ncap.service import Answer, Service, virtual
+
+pytestmark = pytest.mark.link
+JSON = {"Content-Type": "application/json"}
+
+
+@pytest.fixture(scope="module")
+def bearer(service: Service) -> dict[str, str | None]:
+    return {"Authorization": f"Bearer {service.token('script')}"}
+
+
+def cookie_of(service: Service) -> str:
+    """A browser that was let in by `ncap open`."""
+    path = service.station.ask("ncap", "open")["url"].removeprefix(service.url)
+    answer = service.raw("GET", path)
+    assert answer.status == 303, answer
+    return answer.headers["set-cookie"].partition(";")[0]
+
+
+def refusals(port: int) -> list[tuple[str, str, str, dict[str, str | None], Any, int, str]]:
+    """What is asked (with a good token unless it says otherwise), and how it is refused."""
+    other = f"http://127.0.0.1:{port + 1}"
+    put, status = "/api/v1/detection", "/api/v1/status"
+    body = json.dumps({"mode": "whitelist"})
+    long = json.dumps({"mode": "x" * (1 << 20)})
+    return [
+        ("no token", "GET", status, {"Authorization": None}, None, 401, "no-token"),
+        ("wrong token", "GET", status, {"Authorization": "Bearer nonsense"}, None, 401, "wrong-token"),
+        ("wrong cookie", "GET", status, {"Authorization": None, "Cookie": f"ncap-{port}=x"}, None, 401, "wrong-token"),
+        ("the page without a token", "GET", "/", {"Authorization": None}, None, 401, "no-token"),
+        ("a used or foreign login", "GET", "/login?token=abc", {"Authorization": None}, None, 401, "wrong-token"),
+        ("foreign Host", "GET", status, {"Host": "evil.example"}, None, 421, "foreign-host"),
+        ("a name that ends like ours", "GET", status, {"Host": f"127.evil.com:{port}"}, None, 421, "foreign-host"),
+        ("our address at another port", "GET", status, {"Host": f"127.0.0.1:{port + 1}"}, None, 421, "foreign-host"),
+        ("no Host", "GET", status, {"Host": ""}, None, 421, "foreign-host"),
+        ("foreign Origin", "GET", status, {"Origin": "https://evil.example"}, None, 403, "foreign-origin"),
+        ("another local port", "GET", status, {"Origin": other}, None, 403, "foreign-origin"),
+        ("Origin null", "GET", status, {"Origin": "null"}, None, 403, "foreign-origin"),
+        ("https for http", "GET", status, {"Origin": f"https://127.0.0.1:{port}"}, None, 403, "foreign-origin"),
+        ("cross-site", "GET", status, {"Sec-Fetch-Site": "cross-site"}, None, 403, "foreign-origin"),
+        ("same-site, another port", "GET", status, {"Sec-Fetch-Site": "same-site"}, None, 403, "foreign-origin"),
+        ("a form", "PUT", put, {"Content-Type": "application/x-www-form-urlencoded"}, "mode=x", 415, "not-json"),
+        ("text", "POST", "/api/v1/discover", {"Content-Type": "text/plain"}, "{}", 415, "not-json"),
+        ("no type", "PUT", put, {}, body, 415, "not-json"),
+        ("DELETE with a form", "DELETE", "/api/v1/measurements/x", {}, "a=b", 415, "not-json"),
+        ("too long", "PUT", put, JSON, long, 413, "too-large"),
+        ("too long, said", "PUT", put, {**JSON, "Content-Length": str(1 << 40)}, b"", 413, "too-large"),
+        ("a mode that is none", "PUT", put, JSON, '{"mode": "all"}', 422, "usage"),
+        ("no JSON", "PUT", put, JSON, "{", 422, "usage"),
+        ("no object", "PUT", put, JSON, "[1]", 422, "usage"),
+        ("a member too many", "PUT", put, JSON, '{"mode": "whitelist", "x": 1}', 422, "usage"),
+        ("no such node", "GET", "/api/v1/nodes/ffffffffffffffffffff", {}, None, 404, "not-found"),
+        ("no such resource", "GET", "/api/v1/secrets", {}, None, 404, "not-found"),
+        ("not for this resource", "PUT", "/api/v1/nodes", JSON, "{}", 405, "usage"),
+        ("a login link over the net", "POST", "/api/v1/login-link", JSON, "{}", 422, "refused"),
+    ]  # fmt: skip
+
+
+def test_every_refusal_of_the_contract(service: Service, bearer: dict[str, str | None]) -> None:
+    wrong = []
+    for what, method, path, headers, body, status, code in refusals(service.port):
+        answer = service.raw(method, path, {**bearer, **headers}, body)
+        if (answer.status, answer.code) != (status, code):
+            wrong.append((what, answer.status, answer.text[:200]))
+        assert set(answer.json["error"]) == {"code", "message", "hint"}, what
+        assert "default-src 'none'" in answer.headers["content-security-policy"], what
+        assert answer.headers["x-content-type-options"] == "nosniff", what
+    assert not wrong
+    assert service.raw("GET", "/api/v1/status", {**bearer, "host": "evil.example"}).status == 400, "two Hosts"
+
+
+def test_a_body_without_a_length_is_cut_off_all_the_same(service: Service, bearer: dict[str, str | None]) -> None:
+    chunk = b"10000\r\n" + b"x" * 65536 + b"\r\n"
+    headers = {**bearer, **JSON, "Transfer-Encoding": "chunked"}
+    answer = service.raw("PUT", "/api/v1/detection", headers, chunk * 17 + b"0\r\n\r\n")
+    assert (answer.status, answer.code) == (413, "too-large")
+
+
+def test_a_read_only_token_reads_and_changes_nothing(service: Service) -> None:
+    bearer = {"Authorization": f"Bearer {service.token('reader', '--read-only')}"}
+    assert service.raw("GET", "/api/v1/status", bearer).json["write"] is False
+    for method, path in (
+        ("PUT", "/api/v1/detection"),
+        ("POST", "/api/v1/discover"),
+        ("POST", "/api/v1/groups"),
+        ("DELETE", "/api/v1/measurements/x"),
+        ("PUT", "/api/v1/nodes/00/channels/1"),
+        ("POST", "/api/v1/virtual"),
+    ):
+        answer = service.raw(method, path, {**bearer, **JSON}, "{}")
+        assert (answer.status, answer.code) == (403, "read-only"), (method, path)
+
+
+def test_a_token_that_is_removed_is_refused_at_once(service: Service) -> None:
+    bearer = {"Authorization": f"Bearer {service.token('guest')}"}
+    assert service.raw("GET", "/api/v1/status", bearer).status == 200
+    service.station.ask("ncap", "token", "remove", "guest")
+    assert service.raw("GET", "/api/v1/status", bearer).status == 401
+
+
+def test_the_login_works_once_and_leaves_a_cookie_that_scripts_cannot_read(service: Service) -> None:
+    url = service.station.ask("ncap", "open")["url"]
+    path = url.removeprefix(service.url)
+    first = service.raw("GET", path)
+    assert (first.status, first.headers["location"]) == (303, "/")
+    cookie = first.headers["set-cookie"]
+    for word in (f"ncap-{service.port}=", "HttpOnly", "SameSite=Strict", "Path=/"):
+        assert word in cookie
+    assert service.raw("GET", path).status == 401, "the token of the URL works once"
+    mine = {"Cookie": cookie.partition(";")[0], "Sec-Fetch-Site": "same-origin"}
+    assert service.raw("GET", "/api/v1/status", mine).json["write"] is True
+    stranger = {**mine, "Origin": "http://evil.example"}
+    assert service.raw("PUT", "/api/v1/detection", {**stranger, **JSON}, '{"mode": "transparent"}').status == 403
+
+
+def websocket(service: Service, headers: dict[str, str], origin: str | None = None) -> Any:
+    return connect(
+        f"ws://127.0.0.1:{service.port}/api/v1/live", additional_headers=headers, origin=origin, compression=None
+    )  # type: ignore[arg-type]
+
+
+def test_a_websocket_is_held_against_the_same_list(service: Service, bearer: dict[str, str]) -> None:
+    mine = {"Cookie": cookie_of(service)}
+    own = f"http://127.0.0.1:{service.port}"
+    for what, headers, origin, status in (
+        ("no token", {}, own, 401),
+        ("foreign Origin with a good cookie", mine, "http://evil.example", 403),
+        ("another local port", mine, f"http://127.0.0.1:{service.port + 1}", 403),
+        ("a cookie without an Origin", mine, None, 403),
+        ("cross-site", {**mine, "Sec-Fetch-Site": "cross-site"}, own, 403),
+    ):
+        with pytest.raises(InvalidStatus) as refused, websocket(service, headers, origin):
+            pass
+        assert refused.value.response.status_code == status, what
+    for headers, origin in ((mine, own), (bearer, None)):
+        with websocket(service, headers, origin) as live:
+            assert json.loads(live.recv(5))["type"] == "hello"
+
+
+def test_ten_wrong_tokens_are_slowed_down_and_a_right_one_never(
+    service: Service, bearer: dict[str, str | None]
+) -> None:
+    wrong = {"Authorization": "Bearer guess"}
+    answers = [service.raw("GET", "/api/v1/status", wrong) for _ in range(11)]
+    assert (answers[-1].status, answers[-1].headers["retry-after"]) == (429, "60")
+    slow: list[Answer] = []
+    guessing = threading.Thread(target=lambda: slow.append(service.raw("GET", "/api/v1/status", wrong)))
+    began = time.monotonic()
+    guessing.start()
+    assert service.raw("GET", "/api/v1/status", bearer).status == 200
+    guessing.join()
+    assert slow[0].status == 429
+    assert time.monotonic() - began >= 0.9
+
+
+def test_only_this_user_reaches_the_socket_and_the_tokens_are_kept_as_digests(service: Service) -> None:
+    home = service.station.home
+    assert stat.S_IMODE(os.stat(home / "ncap.sock").st_mode) == 0o600
+    assert stat.S_ISSOCK(os.stat(home / "ncap.sock").st_mode)
+    token = service.token("kept")
+    kept = home / "ncap-tokens.json"
+    assert stat.S_IMODE(kept.stat().st_mode) == 0o600
+    assert token not in kept.read_text()
+    assert "kept" in json.dumps(service.station.ask("ncap", "token", "list"))
+    assert service.station.refuses("ncap", "token", "add", "kept", code=2)
+    assert service.station.refuses("ncap", "token", "remove", "nobody", code=3)
+
+
+def test_no_answer_holds_a_secret(service: Service, bearer: dict[str, str | None]) -> None:
+    uuid = virtual(service)
+    flash = next((service.station.home / "virtual").glob("*/flash.json"))
+    document = json.loads(flash.read_text())
+    secrets = {PASSPHRASE, str(document["key"]), str(document["flash"]["key"]), str(bearer["Authorization"])[7:]}
+    secrets |= {
+        one for one in _strings(json.loads((service.station.home / "ncap-tokens.json").read_text())) if len(one) == 64
+    }
+    paths = ["status", "nodes", f"nodes/{uuid}", f"nodes/{uuid}/teds", "groups", "measurements", "names", "virtual",
+             "log", "profiles", "detection"]  # fmt: skip
+    for path in paths:
+        answer = service.raw("GET", f"/api/v1/{path}", bearer)
+        assert answer.status == 200, (path, answer.text)
+        assert not [secret for secret in secrets if secret and secret in answer.text], path
+    assert service.process is not None
+    assert not [secret for secret in secrets if secret in service.process.out + service.process.err]
+
+
+def _strings(value: Any) -> set[str]:
+    if isinstance(value, dict):
+        return set().union(*map(_strings, value.values()))
+    if isinstance(value, list):
+        return set().union(*map(_strings, value))
+    return {value} if isinstance(value, str) else set()
+
+
+def test_another_host_needs_tls_and_a_name(desk: Desk, tmp_path: Path) -> None:
+    station = desk.station()
+    certificate, key = tmp_path / "cert.pem", tmp_path / "key.pem"
+    subprocess.run(
+        ["openssl", "req", "-x509", "-newkey", "ec", "-pkeyopt", "ec_paramgen_curve:prime256v1", "-nodes", "-days", "2",
+         "-subj", "/CN=localhost", "-addext", "subjectAltName=DNS:localhost", "-keyout", str(key),
+         "-out", str(certificate)],
+        check=True, capture_output=True,
+    )  # fmt: skip
+    tls = ["--tls-cert", certificate, "--tls-key", key]
+    refused = station.refuses("ncap", "run", "--http", "0.0.0.0:0", code=2)
+    assert "--tls-cert" in refused["hint"]
+    assert "--http-allow" in station.refuses("ncap", "run", "--http", "0.0.0.0:0", *tls, code=2)["hint"]
+    assert "together" in station.refuses("ncap", "run", "--http", "127.0.0.1:0", *tls[:2], code=2)["message"]
+    token = station.ask("ncap", "token", "add", "tls")["token"]
+    running = station.start("--json", "ncap", "run", "--http", "127.0.0.1:0", *tls)
+    [ready] = running.wait_for_lines(1)
+    assert ready["url"].startswith("https://127.0.0.1:")
+    port = ready["url"].rpartition(":")[2]
+    import ssl
+    import urllib.request
+
+    context = ssl.create_default_context(cafile=str(certificate))
+    request = urllib.request.Request(
+        f"https://localhost:{port}/api/v1/status", headers={"Authorization": f"Bearer {token}"}
+    )
+    with urllib.request.urlopen(request, context=context, timeout=10) as answer:
+        assert answer.status == 200
+    with socket.create_connection(("127.0.0.1", int(port)), 5) as plain:
+        plain.sendall(b"GET / HTTP/1.1\r\nHost: localhost\r\n\r\n")
+        assert not plain.recv(100).startswith(b"HTTP/1.1 200")
