@@ -14,7 +14,7 @@ OPTIONS: Final[dict[str, frozenset[str]]] = {
     "trust ca sign": frozenset({"output", "yes", "dry-run"}),
     "trust remove": frozenset({"yes", "dry-run"}),
     "profile new": frozenset({"extends", "output", "dry-run"}),
-    "doctor": frozenset({"nfc", "can"}),
+    "doctor": frozenset({"nfc", "can", "ble"}),
     "provision": frozenset({"profile", "calibration", "no-calibration", "name", "accept-calibration", "watch", "batch", "report", "all", "yes", "dry-run", "via", "nfc", "can", "ble", "timeout", "trace"}),
     "identify": frozenset({"watch", "add", "via", "nfc", "can", "ble", "timeout", "trace"}),
     "whitelist add": frozenset({"fingerprint", "name", "dry-run"}),

@@ -37,6 +37,7 @@ class Place:
     home: Path
     nfc: str | None = None
     can: str | None = None
+    ble: str | None = None
     workspace: Path = field(default_factory=Path.cwd)
     system: Path = Path("/")
     environment: Mapping[str, str] = field(default_factory=lambda: os.environ)
@@ -52,7 +53,7 @@ class Place:
 
 Look = Callable[[Place], Iterator[Finding]]
 CHECKS: Final[dict[str, tuple[Room, Look]]] = {}
-_MODULES: Final = ("machine", "links", "station", "fleet")
+_MODULES: Final = ("machine", "links", "bluetooth", "station", "fleet")
 
 
 def check(name: str, room: Room) -> Callable[[Look], Look]:

@@ -22,8 +22,9 @@ _STYLES = {"ok": "green", "warning": "yellow", "failed": "bold red", "skipped": 
 @command("teds-provision doctor", "teds-provision doctor --nfc udp:localhost:54321 --can udp_multicast:239.74.163.2")
 @click.option("--nfc", metavar="PATH", help="Also open this reader: usb, tty:USB0:pn532, udp:localhost:54321.")
 @click.option("--can", metavar="INTERFACE:CHANNEL", help="Also open this bus: socketcan:can0, …")
+@click.option("--ble", metavar="ADAPTER", help="Also demand this Bluetooth adapter: auto, hci0.")
 @pass_app
-def doctor(app: App, nfc: str | None, can: str | None) -> None:
+def doctor(app: App, nfc: str | None, can: str | None, ble: str | None) -> None:
     """Look at Python, libraries, readers, buses, clock, keyring, vault and store; name cause and cure of each trouble.
 
     Opens no reader and no bus unless it is named, and asks for no passphrase; with --passphrase-fd the seals
@@ -33,7 +34,8 @@ def doctor(app: App, nfc: str | None, can: str | None) -> None:
     group = click.get_current_context().find_root().command
     settings = known_settings(group) if isinstance(group, click.Group) else None
     ask = app.ask_secret if app.has_passphrase else None
-    found = list(doctor_room.doctor.examine(doctor_room.doctor.Place(app.home, nfc, can, settings=settings, ask=ask)))
+    place = doctor_room.doctor.Place(app.home, nfc, can, ble, settings=settings, ask=ask)
+    found = list(doctor_room.doctor.examine(place))
     findings = [finding for _, finding in found]
     checks = [{"name": one.name, "result": one.result, "why": one.why, "fix": one.fix} for one in findings]
     code = doctor_room.doctor.exit_code(found)

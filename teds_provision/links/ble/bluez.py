@@ -1,0 +1,92 @@
+"""What bluetoothd says of its adapters, asked over D-Bus without opening anything; for the doctor."""
+
+from __future__ import annotations
+
+import asyncio
+from dataclasses import dataclass
+from typing import Any, Final
+
+from teds_provision.errors import NoReader
+from teds_provision.links.ble import troubles
+
+_SECONDS: Final = 5.0
+_ADAPTER, _DEVICE = "org.bluez.Adapter1", "org.bluez.Device1"
+
+
+@dataclass(frozen=True)
+class AdapterFacts:
+    """One adapter: switched on, able to connect to nodes, and how many connections it holds now, whoever made them."""
+
+    name: str
+    address: str
+    powered: bool
+    central: bool
+    held: int
+
+
+def adapters(bus_address: str | None = None) -> list[AdapterFacts]:
+    """Every adapter that bluetoothd has; ``bus_address`` None: the system's bus.
+
+    Raises NoReader where there is no system bus, bluetoothd does not run, or what asks for it is not installed.
+    """
+    try:
+        import dbus_fast  # noqa: F401
+    except ImportError:
+        raise troubles.missing_bleak() from None
+    try:
+        return asyncio.run(asyncio.wait_for(_adapters(bus_address), _SECONDS))
+    except NoReader:
+        raise
+    except TimeoutError:
+        raise NoReader("bluetoothd does not answer.", hint="sudo systemctl restart bluetooth") from None
+    except Exception as error:
+        trouble = troubles.adapter_trouble(error, "this machine")
+        raise trouble or NoReader(f"bluetoothd cannot be asked: {error}.", hint=troubles.SERVICE_HINT) from error
+
+
+async def _adapters(bus_address: str | None) -> list[AdapterFacts]:
+    from dbus_fast import BusType
+    from dbus_fast.aio import MessageBus
+
+    bus = await MessageBus(bus_address=bus_address, bus_type=BusType.SYSTEM).connect()
+    try:
+        (owned,) = await _call(bus, "org.freedesktop.DBus", "org.freedesktop.DBus", "NameHasOwner", "org.bluez")
+        if not owned:
+            raise NoReader("The Bluetooth service (bluetoothd) does not run.", hint=troubles.SERVICE_HINT)
+        (objects,) = await _call(bus, "org.bluez", "org.freedesktop.DBus.ObjectManager", "GetManagedObjects")
+    finally:
+        bus.disconnect()
+    found = []
+    for path, interfaces in sorted(objects.items()):
+        properties = interfaces.get(_ADAPTER)
+        if properties is not None:
+            said = {name: value.value for name, value in properties.items()}
+            held = sum(_is_held(other, path) for other in objects.values())
+            central = "central" in said.get("Roles", ["central"])
+            found.append(AdapterFacts(path.rpartition("/")[2], said["Address"], bool(said["Powered"]), central, held))
+    return found
+
+
+def _is_held(interfaces: dict[str, Any], adapter: str) -> bool:
+    device = interfaces.get(_DEVICE)
+    return device is not None and device["Adapter"].value == adapter and bool(device["Connected"].value)
+
+
+async def _call(bus: Any, service: str, interface: str, member: str, *words: str) -> list[Any]:
+    from dbus_fast import Message, MessageType
+    from dbus_fast.errors import DBusError
+
+    path = "/org/freedesktop/DBus" if service == "org.freedesktop.DBus" else "/"
+    reply = await bus.call(
+        Message(
+            destination=service,
+            path=path,
+            interface=interface,
+            member=member,
+            signature="s" * len(words),
+            body=list(words),
+        )
+    )
+    if reply.message_type == MessageType.ERROR:
+        raise DBusError(reply.error_name, str(reply.body))
+    return list(reply.body)
