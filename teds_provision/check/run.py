@@ -61,8 +61,7 @@ class _Run:
         self._checks: dict[str, Checked] = {}
 
     def all(self) -> Report:
-        state = self._probe.identity().state
-        ours = state != NodeState.FACTORY
+        ours = self._probe.identity().state != NodeState.FACTORY
         if ours:
             self._take_up()
         elif self._factory:
@@ -71,19 +70,23 @@ class _Run:
         if ours:
             self._stage(Stage.KEYED)
             self._stage(Stage.SESSION)
-        why = (self._reset() if self._factory else _ONLY_FACTORY) if ours else ""
-        if why:
-            for stage in Stage:
-                self._skip(stage, why)
-        else:
-            self._stage(Stage.FACTORY)
-        if self._factory and not why:
-            self._key_and_back(sessions_too=not ours)
+        self._in_factory_state(ours)
         for stage in Stage:
             held = stage in (Stage.KEYED, Stage.SESSION) and not self._factory
             self._skip(stage, _NEEDS_KEY if held else _NEEDS_FACTORY)
         checks = tuple(self._checks[each.name] for each in _ordered())
         return Report(self._node.uuid, checks)
+
+    def _in_factory_state(self, ours: bool) -> None:
+        """Rules of factory state, and of the way from there to a key and back; a node of ours is reset for them."""
+        why = (self._reset() if self._factory else _ONLY_FACTORY) if ours else ""
+        if why:
+            for stage in Stage:
+                self._skip(stage, why)
+            return
+        self._stage(Stage.FACTORY)
+        if self._factory:
+            self._key_and_back(sessions_too=not ours)
 
     # -- stages ----------------------------------------------------------------------------------------------------
 

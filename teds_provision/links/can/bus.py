@@ -82,18 +82,8 @@ class Bus:
 
         Waits ``seconds`` at most, and returns None before for what is no such frame.
         """
-        import can
-
-        try:
-            message = self._bus.recv(timeout=max(0.0, seconds))
-        except can.CanOperationError as error:
-            if "unpack" in str(error):  # udp_multicast: someone sent a datagram that is no CAN frame
-                return None
-            self._failed("cannot be read", error)
-        except (can.CanError, OSError, ValueError) as error:
-            self._failed("cannot be read", error)
+        message = self._next(seconds)
         if message is None:
-            self._check_alive()
             return None
         if message.is_error_frame:
             if message.arbitration_id & _BUS_OFF:
@@ -107,6 +97,21 @@ class Bus:
         if self._trace is not None:
             self._trace.frame("can", "in", frame.data, identifier=frame.identifier, fd=frame.fd, at=frame.at)
         return frame
+
+    def _next(self, seconds: float) -> can.Message | None:
+        import can
+
+        try:
+            message = self._bus.recv(timeout=max(0.0, seconds))
+        except can.CanOperationError as error:
+            if "unpack" in str(error):  # udp_multicast: someone sent a datagram that is no CAN frame
+                return None
+            self._failed("cannot be read", error)
+        except (can.CanError, OSError, ValueError) as error:
+            self._failed("cannot be read", error)
+        if message is None:
+            self._check_alive()
+        return message
 
     def wait(self, seconds: float, wake: socket.socket) -> None:
         """Sleep until there may be a frame to receive, ``wake`` can be read, or ``seconds`` are over.
@@ -170,14 +175,7 @@ def _open(spec: CanSpec) -> can.BusABC:
 
     for name in ("can", "isotp"):
         logging.getLogger(name).setLevel(logging.CRITICAL)
-    options: dict[str, Any] = dict(spec.options)
-    if spec.interface == "udp_multicast" or spec.fd:
-        options["fd"] = spec.fd
-    if spec.interface == "socketcand":
-        if spec.fd:
-            raise UsageFailure("socketcand carries classic CAN only.", hint="Leave fd=1 out.")
-        options = {"host": "127.0.0.1", "port": _SOCKETCAND_PORT, "tcp_tune": True} | options
-        _probe(spec, options)
+    options = _options(spec)
     try:
         bus = _opened(spec, options)
     except can.CanInterfaceNotImplementedError as error:
@@ -186,22 +184,41 @@ def _open(spec: CanSpec) -> can.BusABC:
             hint=f"python-can knows {', '.join(sorted(can.VALID_INTERFACES))}.",
         ) from error
     except Exception as error:  # back ends raise what their driver, serial port or library raises
-        if spec.interface == "socketcan" and _number(error) == errno.EAFNOSUPPORT:
-            raise NoReader(
-                "This kernel has no CAN.",
-                hint="Load it (sudo modprobe can_raw), or go over the network: socketcand:can0?host=….",
-            ) from error
-        if spec.interface == "socketcan" and _number(error) == errno.ENODEV:
-            raise NoReader(
-                f"There is no CAN interface {spec.channel}.", hint="See which are there: ip -brief link show type can."
-            ) from error
-        raise NoReader(f"The CAN bus {spec.text} does not open: {_reason(error)}.", hint=_cure(spec)) from error
+        raise _not_opened(spec, error) from error
     if spec.interface == "udp_multicast":
         _this_group_alone(bus)
         _room_for_a_flood(bus)
     if spec.interface == "socketcan":
         bus.set_filters([{"can_id": value, "can_mask": mask, "extended": True} for value, mask in _OURS])
     return bus
+
+
+def _options(spec: CanSpec) -> dict[str, Any]:
+    """What python-can is given to open the bus; a socketcand server is asked whether it is there."""
+    options: dict[str, Any] = dict(spec.options)
+    if spec.interface == "udp_multicast" or spec.fd:
+        options["fd"] = spec.fd
+    if spec.interface == "socketcand":
+        if spec.fd:
+            raise UsageFailure("socketcand carries classic CAN only.", hint="Leave fd=1 out.")
+        options = {"host": "127.0.0.1", "port": _SOCKETCAND_PORT, "tcp_tune": True} | options
+        _probe(spec, options)
+    return options
+
+
+def _not_opened(spec: CanSpec, error: Exception) -> NoReader:
+    """Why a bus does not open, and the cure."""
+    number = _number(error) if spec.interface == "socketcan" else None
+    if number == errno.EAFNOSUPPORT:
+        return NoReader(
+            "This kernel has no CAN.",
+            hint="Load it (sudo modprobe can_raw), or go over the network: socketcand:can0?host=….",
+        )
+    if number == errno.ENODEV:
+        return NoReader(
+            f"There is no CAN interface {spec.channel}.", hint="See which are there: ip -brief link show type can."
+        )
+    return NoReader(f"The CAN bus {spec.text} does not open: {_reason(error)}.", hint=_cure(spec))
 
 
 def _opened(spec: CanSpec, options: dict[str, Any]) -> can.BusABC:

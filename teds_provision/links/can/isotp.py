@@ -202,11 +202,19 @@ def _tolerable(data: bytes) -> bytes | None:
     if kind == _SINGLE:
         return data if read_single(data) is not None else None
     if kind == _FIRST:
-        length = (data[0] & 0xF) << 8 | data[1]
-        return data if len(data) >= 8 and (length > 7 or length == 0) else None
+        return _tolerable_first(data)
     if kind == _CONSECUTIVE:
         return data
-    if kind == _FLOW and len(data) >= 3 and data[0] & 0xF <= 2:
-        reserved = 0x80 <= data[2] <= 0xF0 or data[2] >= 0xFA
-        return data[:2] + (b"\x7f" if reserved else data[2:3]) + data[3:]
-    return None
+    return _tolerable_flow(data) if kind == _FLOW else None
+
+
+def _tolerable_first(data: bytes) -> bytes | None:
+    length = (data[0] & 0xF) << 8 | data[1]
+    return data if len(data) >= 8 and (length > 7 or length == 0) else None
+
+
+def _tolerable_flow(data: bytes) -> bytes | None:
+    if len(data) < 3 or data[0] & 0xF > 2:
+        return None
+    reserved = 0x80 <= data[2] <= 0xF0 or data[2] >= 0xFA
+    return data[:2] + (b"\x7f" if reserved else data[2:3]) + data[3:]

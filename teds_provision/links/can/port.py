@@ -116,9 +116,9 @@ class CanPort:
         told: set[bytes] = set()
         notice(Notice("waiting", f"Looking for the node on {self.spec.text}.", seconds))
         if self.spec.node is None and address is not None and 1 <= address <= LAST_NODE:
-            identity = self.identify(address, seconds=_GUESS_SECONDS)  # no random wait, unlike a question to everyone
-            if identity is not None and wanted(identity):
-                return self._contact(address, identity)
+            guessed = self._guess(address, wanted)
+            if guessed is not None:
+                return guessed
         while (left := until - time.monotonic()) > 0:
             round_ends = time.monotonic() + min(_ROUND_SECONDS, left)
             if self.spec.node is not None:
@@ -128,9 +128,17 @@ class CanPort:
             if contact is not None:
                 return contact
             time.sleep(max(0.0, round_ends - time.monotonic()))
+        raise self._nobody(seconds, told)
+
+    def _guess(self, address: int, wanted: Callable[[Identity], bool]) -> Contact | None:
+        """Ask where the node was last: there is no random wait, unlike after a question to everyone."""
+        identity = self.identify(address, seconds=_GUESS_SECONDS)
+        return self._contact(address, identity) if identity is not None and wanted(identity) else None
+
+    def _nobody(self, seconds: float, told: set[bytes]) -> NoNode:
         where = f"at 0x{self.spec.node:02X} on {self.spec.text}" if self.spec.node else f"on {self.spec.text}"
         others = f"; others did: {', '.join(sorted(uuid.hex() for uuid in told))}" if told else ""
-        raise NoNode(
+        return NoNode(
             f"No such node answered {where} within {seconds:g} s{others}.",
             hint="Check its power, the bit rate and the address; teds-provision identify --via can lists who answers.",
         )

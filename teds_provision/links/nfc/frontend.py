@@ -122,7 +122,17 @@ def _the_only_one() -> str:
 
 def _explained(path: str, error: Exception, vendor: int = 0, product: int = 0) -> NoReader:
     code = error.errno if isinstance(error, OSError) else None
-    if code == errno.EACCES and vendor:
+    if code == errno.EACCES:
+        return _forbidden(path, vendor, product)
+    if code == errno.EBUSY and vendor:
+        return _held(path, vendor, product)
+    if code in (errno.ENODEV, errno.ENOENT):
+        return _absent(path)
+    return NoReader(f"The reader {path} cannot be opened: {error}.", hint="Unplug it, plug it in again.")
+
+
+def _forbidden(path: str, vendor: int, product: int) -> NoReader:
+    if vendor:
         rule = (
             f'SUBSYSTEM=="usb", ATTRS{{idVendor}}=="{vendor:04x}", ATTRS{{idProduct}}=="{product:04x}", '
             'TAG+="uaccess", GROUP="plugdev", MODE="0660"'
@@ -131,26 +141,26 @@ def _explained(path: str, error: Exception, vendor: int = 0, product: int = 0) -
             f"This user may not open the reader {path}.",
             hint=f"Put this line into /etc/udev/rules.d/70-nfc.rules and plug the reader in again: {rule}",
         )
-    if code == errno.EBUSY and vendor:
-        driver = _kernel_driver(vendor, product)
-        return NoReader(
-            f"The reader {path} is held by {driver or 'another program'}.",
-            hint=f"sudo modprobe -r {driver}; echo blacklist {driver} | sudo tee /etc/modprobe.d/nfc-blacklist.conf"
-            if driver
-            else "pcscd claims many readers: use it (--nfc pcsc), or stop it: sudo systemctl stop pcscd.socket pcscd.",
-        )
-    if code == errno.EACCES:
-        return NoReader(
-            f"This user may not open {path}.", hint="Serial ports: sudo adduser $USER dialout, log in again."
-        )
-    if code in (errno.ENODEV, errno.ENOENT) and path.startswith("tty"):
+    return NoReader(f"This user may not open {path}.", hint="Serial ports: sudo adduser $USER dialout, log in again.")
+
+
+def _held(path: str, vendor: int, product: int) -> NoReader:
+    driver = _kernel_driver(vendor, product)
+    return NoReader(
+        f"The reader {path} is held by {driver or 'another program'}.",
+        hint=f"sudo modprobe -r {driver}; echo blacklist {driver} | sudo tee /etc/modprobe.d/nfc-blacklist.conf"
+        if driver
+        else "pcscd claims many readers: use it (--nfc pcsc), or stop it: sudo systemctl stop pcscd.socket pcscd.",
+    )
+
+
+def _absent(path: str) -> NoReader:
+    if path.startswith("tty"):
         return NoReader(
             f"No NFC reader answers on the serial line {path}.",
             hint="Look which line is there (ls /dev/ttyUSB* /dev/ttyACM*), and write it like tty:USB0:pn532.",
         )
-    if code in (errno.ENODEV, errno.ENOENT):
-        return NoReader(f"No NFC reader was found on {path}.", hint=_candidates())
-    return NoReader(f"The reader {path} cannot be opened: {error}.", hint="Unplug it, plug it in again.")
+    return NoReader(f"No NFC reader was found on {path}.", hint=_candidates())
 
 
 def _kernel_driver(vendor: int, product: int) -> str:

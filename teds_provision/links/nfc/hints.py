@@ -94,19 +94,21 @@ def status(payload: bytes) -> Fields:
 
 
 def _status_fields(payload: bytes) -> Iterator[tuple[str, int]]:
+    announced = payload[0] if payload else 0
     octets = iter(payload[1:])
     second = 0
-    for bit, name, signed in _STATUS_FIELDS:
-        if payload[:1] and payload[0] & bit:
-            octet = next(octets, None)
-            if octet is None:
-                return
-            second = octet if name == "second_control" else second
-            if name != "battery_percent" or octet <= 100:
-                yield name, octet - 256 if signed and octet > 127 else octet
-    for bit, name in _SECOND_FIELDS:
-        if second & bit and (octet := next(octets, None)) is not None:
-            yield name, octet
+    for name, signed in [(name, signed) for bit, name, signed in _STATUS_FIELDS if announced & bit]:
+        octet = next(octets, None)
+        if octet is None:
+            return
+        second = octet if name == "second_control" else second
+        if name != "battery_percent" or octet <= 100:
+            yield name, _signed(octet) if signed else octet
+    yield from zip([name for bit, name in _SECOND_FIELDS if second & bit], octets, strict=False)
+
+
+def _signed(octet: int) -> int:
+    return octet - 256 if octet > 127 else octet
 
 
 def control(payload: bytes) -> Fields:
@@ -120,7 +122,7 @@ def control(payload: bytes) -> Fields:
         "power_wanted": int(request >> 6 == 1),
         "duration_ms": _milliseconds(request >> 1),
         "information_wanted": request & 1,
-        "power_step": step - 256 if step > 127 else step,
+        "power_step": _signed(step),
         "driver": driver >> 6,
     }
     if flags >> 3 & 3 == 1 and percent <= 100:

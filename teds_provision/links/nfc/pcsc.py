@@ -117,7 +117,7 @@ class PcscReader:
 
 def _chosen(wanted: str) -> str:
     found = names() if wanted else contactless(names())
-    fitting = [name for name in found if wanted == name] or [name for name in found if wanted.lower() in name.lower()]
+    fitting = [wanted] if wanted in found else [name for name in found if wanted.lower() in name.lower()]
     if len(fitting) == 1:
         return fitting[0]
     listed = ", ".join(fitting or found)

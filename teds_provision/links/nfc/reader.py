@@ -118,7 +118,7 @@ class NfcPort:
         while not stop.is_set():
             seen = self._look(notice, stop)
             same = isinstance(seen, Visit) and seen.identity.uuid == here
-            if here is not None and not same and (seen is not None or time.monotonic() - gone_at > _DEBOUNCE):
+            if here is not None and not same and _has_left(seen, gone_at):
                 notice(_left(here))
                 notice(waiting)
                 here = None
@@ -336,6 +336,11 @@ def _tell(seen: Visit | Foreign, told: str, notice: NoticeSink) -> str:
         if text != told:
             notice(Notice("waiting", text))
     return text
+
+
+def _has_left(seen: Visit | Foreign | None, gone_at: float) -> bool:
+    """Whether a node that does not answer is gone: something else lies there, or nothing for longer than it bounces."""
+    return seen is not None or time.monotonic() - gone_at > _DEBOUNCE
 
 
 def _left(uuid: bytes) -> Notice:

@@ -70,16 +70,16 @@ class Board:
         self._facts = kinds
         self.channels: Mapping[int, ChannelHardware] = {n: _facts(channel) for n, channel in kinds.items()}
         self.converters = {number: Converter(sheet, channel) for number, channel in kinds.items()}
-        stated = sheet.meta.self_test_time
-        self._test_seconds = min(max(stated, _SELF_TEST), _LONGEST_SELF_TEST) if math.isfinite(stated) else _SELF_TEST
-        self._seen: dict[int, Reading | None] = {
-            n: None for n, facts in self.channels.items() if facts.kind is Kind.EVENT_SENSOR
-        }
+        self._test_seconds = _self_test_seconds(sheet.meta.self_test_time)
+        self._seen: dict[int, Reading | None] = dict.fromkeys(self._event_sensors())
         self._testing: dict[int, int] = {}
         self._safe_state = {n: self._lowest(n) for n, facts in self.channels.items() if facts.actuator}
         self._bounds = {number: self._raw_limits(number) for number in self._safe_state}
         self._set_points = dict(self._safe_state)
         self.source = sources.make_source(source, self.places, tell)
+
+    def _event_sensors(self) -> list[int]:
+        return [n for n, facts in self.channels.items() if facts.kind is Kind.EVENT_SENSOR]
 
     @property
     def places(self) -> list[Place]:
@@ -212,6 +212,10 @@ class Board:
     def power(self) -> Power:
         """Battery and charge; without a battery nothing is known."""
         return self.battery.power() if self.battery is not None else Power()
+
+
+def _self_test_seconds(stated: float) -> float:
+    return min(max(stated, _SELF_TEST), _LONGEST_SELF_TEST) if math.isfinite(stated) else _SELF_TEST
 
 
 def _facts(channel: Channel) -> ChannelHardware:

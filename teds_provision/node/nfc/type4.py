@@ -16,6 +16,7 @@ SAK: Final = 0x20
 _NDEF_APPLICATION = bytes.fromhex("D2760000850101")
 _CC_FILE, _NDEF_FILE = b"\xe1\x03", b"\xe1\x04"
 _FSD = (16, 24, 32, 40, 48, 64, 96, 128, 256)
+_SELECT, _READ_BINARY, _UPDATE_BINARY = 0xA4, 0xB0, 0xD6
 _LONGEST_APDU = 261  # a longer chain is cut, and so refused
 _WTX: Final = b"\xf2\x01"  # S(WTX), one more frame waiting time
 _OK, _WRONG_LENGTH, _NO_FILE, _NOT_ALLOWED = b"\x90\x00", b"\x67\x00", b"\x6a\x82", b"\x69\x86"
@@ -77,21 +78,23 @@ class NdefApplication:
         """
         if len(apdu) < 4:
             return _WRONG_LENGTH
-        instruction, p1, p2 = apdu[1], apdu[2], apdu[3]
-        if instruction == 0xA4 and p1 == 4:
+        instruction = apdu[1]
+        if instruction == _SELECT and apdu[2] == 4:
             return self._select_application(_data(apdu), seconds)
         if not self._open:
             return _NOT_ALLOWED
-        if instruction == 0xA4:
-            data = _data(apdu)
-            self._file = data if data in (_CC_FILE, _NDEF_FILE) else b""
-            return _OK if self._file else _NO_FILE
-        if instruction == 0xB0 and self._file:
-            octets = self._memory.read(self._file, p1 << 8 | p2, (apdu[4] or 256) if len(apdu) == 5 else 256)
+        if instruction == _SELECT:
+            return self._select_file(_data(apdu))
+        if instruction == _READ_BINARY and self._file:
+            octets = self._memory.read(self._file, _offset(apdu), (apdu[4] or 256) if len(apdu) == 5 else 256)
             return _WRONG_OFFSET if octets is None else octets + _OK
-        if instruction == 0xD6 and self._file == _NDEF_FILE:
-            return _OK if self._memory.write(p1 << 8 | p2, _data(apdu)) else _NO_SPACE
+        if instruction == _UPDATE_BINARY and self._file == _NDEF_FILE:
+            return _OK if self._memory.write(_offset(apdu), _data(apdu)) else _NO_SPACE
         return _NO_COMMAND
+
+    def _select_file(self, name: bytes) -> bytes:
+        self._file = name if name in (_CC_FILE, _NDEF_FILE) else b""
+        return _OK if self._file else _NO_FILE
 
     def _select_application(self, name: bytes, seconds: float) -> bytes | None:
         if name != _NDEF_APPLICATION:
@@ -100,6 +103,10 @@ class NdefApplication:
             return None
         self._open, self._file = True, b""
         return _OK
+
+
+def _offset(apdu: bytes) -> int:
+    return apdu[2] << 8 | apdu[3]
 
 
 def _data(apdu: bytes) -> bytes:
@@ -131,18 +138,21 @@ class IsoDepTag:
         if pcb & 0xF6 == 0xB2:  # R(NAK): our last block again, or "I heard nothing"
             return self._last if pcb & 1 == self._number and self._last else bytes((0xA2 | self._number,))
         if pcb & 0xF6 == 0xA2:  # R(ACK): the next part of a chain
-            if pcb & 1 == self._number:
-                return self._last or None
-            if not self._parts:
-                return None
-            self._number ^= 1
-            return self._part()
+            return self._acknowledged(pcb & 1)
         if pcb & 0xF7 == 0xF2 and self._pending is not None:
             return self._run(self._pending)
         if pcb & 0xF7 == 0xC2:
             self.deselected = True
             return bytes((pcb,))
         return None
+
+    def _acknowledged(self, number: int) -> bytes | None:
+        if number == self._number:
+            return self._last or None
+        if not self._parts:
+            return None
+        self._number ^= 1
+        return self._part()
 
     def _information_block(self, pcb: int, octets: bytes) -> bytes:
         self._number ^= 1

@@ -18,7 +18,7 @@ import sys
 import threading
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import IO, Final
+from typing import IO, Final, TypeGuard
 
 from teds_provision.errors import NoReader, UsageFailure
 from teds_provision.node.sources.base import Drive, Place, Reading, Tell
@@ -105,7 +105,7 @@ class Lines:
         if time is None and not self._needs_time and self._last is None:
             change()
             return ""
-        if isinstance(time, bool) or not isinstance(time, int | float) or not _finite(time) or time < 0:
+        if not _is_seconds(time):
             return '"t" is no number of seconds from 0 on'
         if self._last is None:  # where the node's clock is further already, this one goes on from there
             self._drive.own_clock()
@@ -115,6 +115,10 @@ class Lines:
         self._last = float(time)
         self._drive.advance(self._offset + time, change)
         return ""
+
+
+def _is_seconds(time: object) -> TypeGuard[float]:
+    return isinstance(time, int | float) and not isinstance(time, bool) and _finite(time) and time >= 0
 
 
 def _finite(number: float) -> bool:

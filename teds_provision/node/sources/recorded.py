@@ -10,7 +10,7 @@ from __future__ import annotations
 import bisect
 import csv
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Final
 
@@ -60,17 +60,23 @@ def read(path: Path, places: Sequence[Place], tell: Tell) -> Recorded:
     lines = _lines(path)
     fields = list(csv.reader(line for _, line in lines))
     header = [name.strip() for name in fields[0]]
-    columns = _columns(path, header, {place.name: place.number for place in places if place.name})
+    columns = _columns(path, header, places)
     at = next(index for index, name in enumerate(header) if name.lower() in _TIME_NAMES)
     times: list[float] = []
     readings: dict[int, list[Reading | None]] = {number: [] for number, _, _ in columns}
-    for (line, _), row in zip(lines[1:], fields[1:], strict=True):
-        if len(row) != len(header):
-            raise BadData(f"{path}, line {line}: {len(row)} fields, the first line names {len(header)}.")
+    for line, row in _rows(path, lines, fields):
         times.append(_time(path, line, row[at], times))
         for number, index, raw in columns:
             readings[number].append(_reading(_number(path, line, row[index]), raw=raw))
     return Recorded(places, [time - times[0] for time in times], readings, tell)
+
+
+def _rows(path: Path, lines: list[tuple[int, str]], fields: list[list[str]]) -> Iterator[tuple[int, list[str]]]:
+    """Each row with the number of its line; every one has as many fields as the first line names."""
+    for (line, _), row in zip(lines[1:], fields[1:], strict=True):
+        if len(row) != len(fields[0]):
+            raise BadData(f"{path}, line {line}: {len(row)} fields, the first line names {len(fields[0])}.")
+        yield line, row
 
 
 def _lines(path: Path) -> list[tuple[int, str]]:
@@ -98,8 +104,9 @@ def _reading(number: float | None, *, raw: bool) -> Reading | None:
     return Reading(raw=number) if raw else Reading(value=number)
 
 
-def _columns(path: Path, header: list[str], numbers: dict[str, int]) -> list[tuple[int, int, bool]]:
+def _columns(path: Path, header: list[str], places: Sequence[Place]) -> list[tuple[int, int, bool]]:
     """(channel, column, raw) of each column that names a channel."""
+    numbers = {place.name: place.number for place in places if place.name}
     found: list[tuple[int, int, bool]] = []
     if not any(name.lower() in _TIME_NAMES for name in header):
         raise BadData(f"{path}: no column is named t.", hint="First line: t,NAME,NAME …")
