@@ -18,6 +18,8 @@ from teds_provision.cli import terminal
 from teds_provision.cli.configuration import home_of
 from teds_provision.errors import PolicyRefused, StoreFailure, TedsProvisionError, UsageFailure, WrongPassphrase
 from teds_provision.harmless import harmless, harmless_json
+from teds_provision.protocol.fingerprints import read_fingerprint, same_key
+from teds_provision.station.label import read_label
 
 if TYPE_CHECKING:
     from rich.console import Console, RenderableType
@@ -159,6 +161,24 @@ class App:
         """Ask a person, yes or no; nothing that a node or a file brought steers the terminal."""
         self.live_line()
         return click.confirm(harmless(question), err=True)
+
+    def ask_for_key(self, question: str, fingerprint: str) -> bool:
+        """Ask a person whether a key counts: yes, no, or its digits (32 to 64, or a scanned label), held against it."""
+        self.live_line()
+        while True:
+            said = click.prompt(
+                f"{harmless(question)} (or its digits) [y/N]", default="n", show_default=False, err=True
+            ).strip()
+            if said.lower() in ("y", "yes", "n", "no"):
+                return said.lower().startswith("y")
+            label = read_label(said)
+            digits = label[1] if label is not None else read_fingerprint(said)
+            if digits is not None and not same_key(digits, fingerprint):
+                print("These are the digits of another key.", file=sys.stderr, flush=True)
+                return False
+            if digits is not None:
+                return True
+            print("Answer y or n, or give 32 to 64 digits of the fingerprint.", file=sys.stderr, flush=True)
 
     @property
     def has_passphrase(self) -> bool:

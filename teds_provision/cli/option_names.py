@@ -9,7 +9,7 @@ from typing import Final
 OPTIONS: Final[dict[str, frozenset[str]]] = {
     "": frozenset({"home", "json", "verbose", "quiet", "debug", "no-input", "passphrase-fd", "version"}),
     "init": frozenset({"name", "keystore", "request", "certificate", "yes"}),
-    "trust add": frozenset({"from", "role", "yes", "dry-run"}),
+    "trust add": frozenset({"from", "role", "fingerprint", "yes", "dry-run"}),
     "trust ca drop": frozenset({"yes"}),
     "trust ca sign": frozenset({"output", "yes", "dry-run"}),
     "trust remove": frozenset({"yes", "dry-run"}),

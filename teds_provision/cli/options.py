@@ -10,6 +10,7 @@ import click
 
 from teds_provision.cli.tracing import tracing
 from teds_provision.links import LinkSettings
+from teds_provision.protocol.fingerprints import read_fingerprint
 
 Function = TypeVar("Function", bound=Callable[..., Any])
 
@@ -119,6 +120,18 @@ def links_given(ctx: click.Context) -> bool:
     return any(
         ctx.get_parameter_source(name) != click.core.ParameterSource.DEFAULT for name in ("via", "nfc", "can", "ble")
     )
+
+
+def fingerprint_option(says: str) -> Callable[[Function], Function]:
+    """Add --fingerprint: 32 to 64 hex digits, given as they are read out (blanks, colons)."""
+
+    def read(_ctx: click.Context, _parameter: click.Parameter, text: str | None) -> str | None:
+        digits = None if text is None else read_fingerprint(text)
+        if text is not None and digits is None:
+            raise click.BadParameter("a fingerprint is 64 hex digits; the first 32 or more of them will do.")
+        return digits
+
+    return click.option("--fingerprint", "-f", callback=read, metavar="F", help=says)
 
 
 def yes_option(function: Function) -> Function:

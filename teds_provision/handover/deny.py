@@ -8,6 +8,7 @@ any UUID could take other people's nodes out of service.
 
 from __future__ import annotations
 
+from teds_provision.protocol.fingerprints import same_key
 from teds_provision.protocol.handover.bundle import Bundle
 from teds_provision.protocol.handover.payload import time_text
 from teds_provision.protocol.handover.revocation import Revocation as Statement
@@ -24,7 +25,7 @@ def why_not(station: Station, statement: Statement, bundle: Bundle) -> str:
     key = _key_of(station, statement.uuid, bundle)
     if key is None:
         return "nothing is known of this node here"
-    if statement.fingerprint not in (None, key):
+    if statement.fingerprint is not None and not same_key(statement.fingerprint, key):
         return f"it names the key {str(statement.fingerprint)[:32]}, and the node here has another"
     if not _has_authority(station, statement) and not (brought is not None and statement.sender == bundle.sender):
         return f"station {statement.sender[:32]} has no authority over this node"

@@ -16,6 +16,7 @@ from teds_provision.errors import NotAuthentic, PolicyRefused
 from teds_provision.handover.deny import deny_all, why_not
 from teds_provision.handover.pending import IMPORTED, Notes, digest_of
 from teds_provision.protocol.agreement import key_id
+from teds_provision.protocol.fingerprints import is_whole, same_key
 from teds_provision.protocol.handover.bundle import Bundle, BundledNode, OpenedBundle, check_times, open_bundle
 from teds_provision.protocol.handover.payload import time_text
 from teds_provision.protocol.handover.receipt import Receipt, RefusedNode, seal_receipt
@@ -217,12 +218,12 @@ class _Judge:
         """Why the node itself is not taken, "" for nothing."""
         pin = self.pins.get(node.uuid)
         key, why = self.denied.get(node.uuid, (None, ""))
-        if why and key in (None, fingerprint(node.node_key)):
+        if why and (key is None or same_key(key, fingerprint(node.node_key))):
             return f"it is revoked: {why}"
         tombstone = self.tombstones.get(node.uuid)
         if tombstone is not None and (self.sender != tombstone.to_fingerprint or self.mode != "move"):
             return f"it was moved to station {tombstone.to_fingerprint[:32]}, which alone can move it back"
-        if pin is not None and pin != fingerprint(node.node_key):
+        if pin is not None and not same_key(pin, fingerprint(node.node_key)):
             return "this UUID is known here with another node key"
         return ""
 
@@ -341,7 +342,7 @@ class _Arrivals:
         pin, digits = self.pins.get(node.uuid), fingerprint(node.node_key)
         if pin is None:
             return WhitelistEntry(node.uuid, digits, self.now, "import", one.name)
-        return None if pin.fingerprint is not None else replace(pin, fingerprint=digits, assurance="import")
+        return None if is_whole(pin.fingerprint) else replace(pin, fingerprint=digits, assurance="import")
 
     def _node(self, one: PlannedNode) -> NodeRecord:
         """What is known of the node from now on; not its epoch and sequence, which a session has to tell."""

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 
 from teds_provision.errors import BadData, NotFound, UsageFailure
 from teds_provision.handover.deny import deny
+from teds_provision.protocol.fingerprints import is_whole
 from teds_provision.protocol.handover.payload import is_label
 from teds_provision.protocol.handover.revocation import seal_revocation
 from teds_provision.station.station import Station
@@ -44,7 +45,9 @@ def revoke(station: Station, uuid: bytes, why: str) -> Revoked:
     if present is None:
         now = datetime.now(UTC)
         key = station.vault.identity()
-        statement = seal_revocation(key, uuid=uuid, node=station.pins.pinned(uuid), why=why, created=now)
+        pinned = station.pins.pinned(uuid)
+        banned = pinned if is_whole(pinned) else None  # a statement names a whole fingerprint, or every key of the UUID
+        statement = seal_revocation(key, uuid=uuid, node=banned, why=why, created=now)
     with station.transaction():
         if statement is not None:
             deny(station, statement, key=statement.fingerprint)

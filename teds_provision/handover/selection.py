@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 from teds_provision.errors import NotFound, PolicyRefused
 from teds_provision.handover.pending import OPEN, Notes
+from teds_provision.protocol.fingerprints import same_key
 from teds_provision.protocol.handover.bundle import Mode
 from teds_provision.protocol.keys import fingerprint
 from teds_provision.station.station import Station
@@ -103,7 +104,7 @@ class Selection:
             return "it is out of service"
         if node is None or node.point is None:
             return "its public key is not known"
-        if self.pins.get(uuid) != fingerprint(node.point):
+        if not same_key(self.pins.get(uuid, ""), fingerprint(node.point)):
             return "the key that it showed last is not the one that it is pinned to"
         return ""
 

@@ -15,6 +15,7 @@ from cryptography.hazmat.primitives import hashes
 from cryptography.hazmat.primitives.kdf.hkdf import HKDF
 
 from teds_provision.errors import BadData, Garbled, NotAuthentic, OtherKey, PolicyRefused
+from teds_provision.protocol.fingerprints import same_key
 from teds_provision.protocol.keys import (
     PrivateKey,
     SoftwareKey,
@@ -139,7 +140,7 @@ class StationAgreement:
         nonce, offered, tag, teds = reply[:16], int.from_bytes(reply[16:20], "big"), reply[20:36], reply[36:]
         shown = security.decode(teds)
         node = shown.node_key
-        if pinned is not None and fingerprint(node) != pinned:
+        if pinned is not None and not same_key(pinned, fingerprint(node)):
             raise other_key(pinned, node)
         if node in (self._credentials.key.point, self._one_time.point) or not is_point(node):
             raise NotAuthentic("The node's public key is not a valid point, or is this station's own.")

@@ -6,6 +6,7 @@ from collections.abc import Iterable, Iterator
 from typing import TYPE_CHECKING
 
 from teds_provision.lazy import late
+from teds_provision.protocol.fingerprints import is_whole, same_key
 from teds_provision.station.node_keys import NodeKeys
 from teds_provision.station.seals import Seals
 from teds_provision.store import NodeRecord, Store, WhitelistEntry
@@ -28,15 +29,19 @@ class Pins:
         self._seals = seals
 
     def pinned(self, uuid: bytes) -> str | None:
-        """Fingerprint of the key that this UUID has to show, None where none is known yet."""
+        """Fingerprint of the key that this UUID has to show, None where none is known yet.
+
+        Its first 32 digits or more where a person gave no more and the node was not met since.
+        """
         entry = self.entry(uuid)
-        if entry is not None and entry.fingerprint is not None:
-            return entry.fingerprint
+        pin = entry.fingerprint if entry is not None else None
+        if is_whole(pin):
+            return pin
         node = self._store.node(uuid)
         if node is None or node.point is None:
-            return None
+            return pin
         self._seals.check_point(node)
-        return keys.fingerprint(node.point)
+        return _wholer(pin, keys.fingerprint(node.point))
 
     def all(self, nodes: Iterable[NodeRecord] | None = None) -> dict[bytes, str]:
         """Fingerprint of every pinned UUID; ``nodes`` are all of the store where they have been read already."""
@@ -45,12 +50,15 @@ class Pins:
             if node.point is not None:
                 self._seals.check_point(node)
                 pins[node.uuid] = keys.fingerprint(node.point)
-        return pins | {entry.uuid: entry.fingerprint for entry in self.whitelist() if entry.fingerprint is not None}
+        for entry in self.whitelist():
+            if entry.fingerprint is not None:
+                pins[entry.uuid] = _wholer(entry.fingerprint, pins.get(entry.uuid))
+        return pins
 
     def check(self, uuid: bytes, point: bytes) -> None:
         """Raise OtherKey where this UUID is known with another key than ``point``."""
         pinned = self.pinned(uuid)
-        if pinned is not None and pinned != keys.fingerprint(point):
+        if pinned is not None and not same_key(pinned, keys.fingerprint(point)):
             self._store.audit.append(
                 "identify", uuid, "other key", {"shown": keys.fingerprint(point), "pinned": pinned}
             )
@@ -105,7 +113,7 @@ class Pins:
     def epoch_to_exceed(self, uuid: bytes, pinned: str | None) -> int:
         """Epoch that an agreement must exceed: the active key's, but 0 for a board that it was not agreed with."""
         former = self._keys.former(uuid)
-        return 0 if former and pinned and former != pinned else self._keys.active_epoch(uuid)
+        return 0 if former and pinned and not same_key(former, pinned) else self._keys.active_epoch(uuid)
 
     def is_unsettled(self, uuid: bytes) -> bool:
         """Whether the link keys that are held may belong to a board that was replaced since."""
@@ -114,3 +122,10 @@ class Pins:
     def settled(self, uuid: bytes) -> None:
         """A session is open: the key in use belongs to the board that lies there."""
         self._keys.set_former(uuid, None)
+
+
+def _wholer(pin: str | None, seen: str | None) -> str:
+    """The pin of the whitelist goes before the key that was seen, unless it is the beginning of that one."""
+    if pin is None or (seen is not None and same_key(pin, seen)):
+        return seen or ""
+    return pin

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 
 from teds_provision.errors import NotWhitelisted, PolicyRefused
 from teds_provision.lazy import late
+from teds_provision.protocol.fingerprints import same_key
 from teds_provision.station.identity import Identity
 from teds_provision.station.node_keys import NodeKeys
 from teds_provision.station.pins import Pins
@@ -113,7 +114,7 @@ class Policy:
     def denied(self, uuid: bytes, key: str | None) -> Revocation | None:
         """Why a node with this key (fingerprint, None: not known) is denied; a ban of another key is none."""
         entry = self.revocation(uuid)
-        return None if entry is None or (key and entry.fingerprint not in (None, key)) else entry
+        return None if entry is None or (key and entry.fingerprint and not same_key(entry.fingerprint, key)) else entry
 
     def tombstones(self) -> list[Tombstone]:
         """Every node that was given away, by UUID."""

@@ -9,6 +9,7 @@ from dataclasses import dataclass, replace
 
 from teds_provision.errors import BadData, NodeRefused, NoKeyring, NotAuthentic, WrongPassphrase
 from teds_provision.harmless import printable
+from teds_provision.protocol.fingerprints import is_whole
 from teds_provision.protocol.keys import fingerprint, is_point, node_key_message, prove_message, verify
 from teds_provision.protocol.messages.frames import Function, security_command
 from teds_provision.protocol.messages.identity import NodeState
@@ -66,20 +67,31 @@ def identify(
     who = examine(station, node)
     expect(who)
     entry = who.whitelisted
-    pinned = entry is not None and entry.fingerprint is not None
-    point = {"point": who.point} if node.tapped or pinned else {}
-    pins_now = node.tapped and entry is not None and not pinned and _opened(station)
+    listed = entry is not None and entry.fingerprint is not None
+    point = {"point": who.point} if node.tapped or listed else {}
+    pinned = _pinned_now(station, who) if node.tapped or listed else None
     with station.durable("identify"):
         station.nodes.remember(node.uuid, last_seen=utc_now(), **point)
-        if pins_now and entry is not None:
-            # an entry that was made without a fingerprint is pinned by its first tap (profile, section 2)
-            entry = replace(entry, fingerprint=who.fingerprint, assurance="tap")
-            who = replace(who, whitelisted=entry)
-            station.pins.put(entry)
-            station.audit("whitelist", node.uuid, "pinned", fingerprint=who.fingerprint, assurance="tap")
+        if pinned is not None:
+            who = replace(who, whitelisted=pinned)
+            station.pins.put(pinned)
+            told = {"fingerprint": pinned.fingerprint, "assurance": pinned.assurance}
+            station.audit("whitelist", node.uuid, "pinned", **told)
         if known_key(station, node.uuid) != who.point:
             station.nodes.keep_datasheet(Image(node.uuid, {SECURITY: who.security_teds}))
     return who
+
+
+def _pinned_now(station: Station, who: Identified) -> WhitelistEntry | None:
+    """The node's entry with its whole fingerprint, None where it has that already, or nobody opens the vault.
+
+    An entry that was made without one is pinned by its first tap (profile, section 2); one that was made with the first
+    digits gets the others by the first contact, whatever the link.
+    """
+    entry = who.whitelisted
+    if entry is None or is_whole(entry.fingerprint) or not _opened(station):
+        return None
+    return replace(entry, fingerprint=who.fingerprint, assurance=entry.assurance if entry.fingerprint else "tap")
 
 
 def _opened(station: Station) -> bool:

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from typing import Protocol
 
 from teds_provision.protocol.agreement import other_key
+from teds_provision.protocol.fingerprints import same_key
 from teds_provision.protocol.keys import fingerprint
 from teds_provision.station.station import Station
 from teds_provision.store import Revocation, WhitelistEntry
@@ -58,7 +59,7 @@ class _Pins:
 
     def check(self, uuid: bytes, point: bytes) -> None:
         pinned = self.by_uuid.get(uuid)
-        if pinned is not None and pinned != fingerprint(point):
+        if pinned is not None and not same_key(pinned, fingerprint(point)):
             raise other_key(pinned, point)
 
     def entry(self, uuid: bytes) -> WhitelistEntry | None:

@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from teds_provision.errors import OtherKey, PolicyRefused, UsageFailure
+from teds_provision.protocol.fingerprints import same_key
 from teds_provision.station.station import Station
 from teds_provision.steps.whitelist_files import FIELDS, FORMATS, Listed
 from teds_provision.store import WhitelistEntry
@@ -44,7 +45,7 @@ def plan_addition(station: Station, listed: Sequence[Listed]) -> Plan:
     for entry in listed:
         known = present.get(entry.uuid)
         pin = pinned.get(entry.uuid)
-        if entry.fingerprint is not None and pin not in (None, entry.fingerprint):
+        if entry.fingerprint is not None and pin is not None and not same_key(pin, entry.fingerprint):
             conflicts.append((entry, str(pin)))
             continue
         wanted = _merged(known, entry)
@@ -73,9 +74,10 @@ def _merged(known: WhitelistEntry | None, entry: Listed) -> WhitelistEntry:
         assurance = "uuid" if entry.fingerprint is None else "import"
         return WhitelistEntry(entry.uuid, entry.fingerprint, assurance=assurance, name=entry.name)  # type: ignore[arg-type]
     gains = known.fingerprint is None and entry.fingerprint is not None
+    pin = max(known.fingerprint or "", entry.fingerprint or "", key=len) or None
     return replace(
         known,
-        fingerprint=known.fingerprint or entry.fingerprint,
+        fingerprint=pin,
         assurance="import" if gains and known.assurance == "uuid" else known.assurance,
         name=known.name or entry.name,
     )
@@ -90,7 +92,7 @@ def _refuse_revoked(uuids: list[bytes], why: dict[bytes, str]) -> None:
 def _refuse_conflicts(conflicts: list[tuple[Listed, str]]) -> None:
     if conflicts:
         shown = "; ".join(
-            f"{entry.uuid.hex()} is pinned to the key {pin[:16]}, not {str(entry.fingerprint)[:16]}"
+            f"{entry.uuid.hex()} is pinned to the key {pin[:32]}, not {str(entry.fingerprint)[:32]}"
             for entry, pin in conflicts[:_SHOWN]
         )
         first = conflicts[0][0].uuid.hex()

@@ -18,6 +18,7 @@ from typing import Any, Final
 from teds_provision.errors import BadData
 from teds_provision.files import read_limited
 from teds_provision.limits import load_json
+from teds_provision.protocol.fingerprints import read_fingerprint, same_key
 from teds_provision.store.records import UUID_OCTETS
 
 MAX_FILE_OCTETS: Final = 64 * 1024 * 1024
@@ -66,7 +67,7 @@ class _Reading:
         before = len(self.mistakes)
         uuid = self._digits(line, "uuid", values.get("uuid", ""), _UUID_DIGITS)
         print_text = values.get("fingerprint", "").strip()
-        pin = self._digits(line, "fingerprint", print_text, 64) if print_text else None
+        pin = self._fingerprint(line, print_text) if print_text else None
         name = values.get("name", "").strip() or None
         if not _is_name(name):
             self.wrong(line, "name", _NAME_RULE)
@@ -81,13 +82,20 @@ class _Reading:
         self.wrong(line, what, f"{length} hex digits are needed, here is {shown}")
         return None
 
+    def _fingerprint(self, line: int, text: str) -> str | None:
+        digits = read_fingerprint(text)
+        if digits is None:
+            self.wrong(line, "fingerprint", f"32 to 64 hex digits are needed, here is {text[:80]!a}")
+        return digits
+
     def _join(self, entry: Listed) -> None:
         known = self.entries.get(entry.uuid)
-        if known is not None and known.fingerprint and entry.fingerprint not in (None, known.fingerprint):
+        pins = [one.fingerprint for one in (known, entry) if one is not None and one.fingerprint]
+        if known is not None and len(pins) == 2 and not same_key(*pins):
             self.wrong(entry.line, "fingerprint", f"the same UUID has another key in line {known.line}")
             return
         if known is not None:
-            entry = Listed(known.line, known.uuid, known.fingerprint or entry.fingerprint, known.name or entry.name)
+            entry = Listed(known.line, known.uuid, max(pins, key=len, default=None), known.name or entry.name)
         self.entries[entry.uuid] = entry
 
 

@@ -6,6 +6,7 @@ from teds_provision.links.can.isotp import FUNCTIONAL, addresses, read_single
 from teds_provision.protocol.announce import Announce
 from teds_provision.protocol.operation.can_frames import TRIGGER, data_address, drive_address
 
+_NONE = "no frame of ISO 15765-2"
 _FLOWS = ("go on", "wait", "overflow")
 
 
@@ -40,6 +41,8 @@ def _transport(data: bytes) -> str:
         return f"first frame, transaction {data[2]}, {length - 1} octets" if length else "first frame, long form"
     if kind == 2:
         return f"consecutive frame {low}"
-    if kind == 3 and low < len(_FLOWS) and len(data) >= 3:
-        return f"flow control: {_FLOWS[low]}, block {data[1]}, gap {data[2]}"
-    return "no frame of ISO 15765-2"
+    return _flow(data, low) if kind == 3 and len(data) >= 3 else _NONE
+
+
+def _flow(data: bytes, status: int) -> str:
+    return f"flow control: {_FLOWS[status]}, block {data[1]}, gap {data[2]}" if status < len(_FLOWS) else _NONE

@@ -14,13 +14,18 @@ def nfc_words(octets: bytes, direction: Direction) -> str:
     """What a frame is, as far as one frame says it (a Type 2 page and a block may begin alike). Never raises."""
     if not octets:
         return "empty"
+    return (_asked(octets) if direction == "out" else _answered(octets)) or _of_iso_dep(octets, direction)
+
+
+def _answered(octets: bytes) -> str:
     head, size = octets[0], len(octets)
-    if direction == "out" and (known := _asked(octets)):
-        return known
-    if direction == "in" and size == 1:
+    if size == 1:
         return "ACK" if head & 0xF == 0xA else f"NAK {head & 0xF:x}"
-    if direction == "in" and size == _ANSWER_OCTETS and head & 0xE2 != 0x02:
-        return "16 octets of a Type 2 tag"
+    return "16 octets of a Type 2 tag" if size == _ANSWER_OCTETS and head & 0xE2 != 0x02 else ""
+
+
+def _of_iso_dep(octets: bytes, direction: Direction) -> str:
+    head, size = octets[0], len(octets)
     if head & 0xE2 == 0x02:
         return _block(octets, direction)
     if head & 0xE6 == 0xA2:

@@ -66,25 +66,31 @@ def is_pcapng(octets: bytes) -> bool:
 
 def read_pcapng(octets: bytes) -> Iterator[Record]:
     """Every packet of a link type that is known here; a last block that was cut short is left out. Raises BadData."""
-    order, at = "<", 0
     interfaces: list[tuple[int, float]] = []
-    while at + 12 <= len(octets):
-        if octets[at : at + 4] == _SECTION.to_bytes(4, "big"):
-            order = "<" if octets[at + 8 : at + 12] == struct.pack("<I", _ORDER) else ">"
-            interfaces = []
-        kind, length = struct.unpack_from(f"{order}II", octets, at)
-        if length < 12 or length % 4:
-            raise BadData(f"The pcapng block at octet {at} says it has {length} octets.")
-        if at + length > len(octets):
-            return
-        body = octets[at + 8 : at + length - 4]
+    for at, order, kind, body in _blocks(octets):
         try:
-            if kind == _INTERFACE:
+            if kind == _SECTION:
+                interfaces = []
+            elif kind == _INTERFACE:
                 interfaces.append(_interface(order, body))
             elif kind == _PACKET and (record := _record(order, body, interfaces)) is not None:
                 yield record
         except (struct.error, IndexError, ValueError) as error:
             raise BadData(f"The pcapng block at octet {at} does not parse: {error}.") from error
+
+
+def _blocks(octets: bytes) -> Iterator[tuple[int, str, int, bytes]]:
+    """Place, order of octets ("<" or ">"), type and body of each whole block."""
+    order, at = "<", 0
+    while at + 12 <= len(octets):
+        if octets[at : at + 4] == _SECTION.to_bytes(4, "big"):
+            order = "<" if octets[at + 8 : at + 12] == struct.pack("<I", _ORDER) else ">"
+        kind, length = struct.unpack_from(f"{order}II", octets, at)
+        if length < 12 or length % 4:
+            raise BadData(f"The pcapng block at octet {at} says it has {length} octets.")
+        if at + length > len(octets):
+            return
+        yield at, order, kind, octets[at + 8 : at + length - 4]
         at += length
 
 

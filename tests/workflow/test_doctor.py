@@ -88,7 +88,19 @@ def test_the_registry_holds_every_check(place: Place) -> None:
     list(examine(place))
     machine = ["python", "libraries", "argon2id", "libusb", "clock"]
     links = ["nfc readers", "pc/sc", "serial ports", "nfc loopback", "nfc", "can interfaces", "can loopback", "can"]
-    station = ["home", "disk", "store", "keyring", "vault", "keys folder", "store file", "nodes", "seals", "config"]
+    station = [
+        "home",
+        "disk",
+        "store",
+        "keyring",
+        "vault",
+        "unlock",
+        "keys folder",
+        "store file",
+        "nodes",
+        "seals",
+        "config",
+    ]
     assert sorted(CHECKS) == sorted(machine + links + station)
 
 

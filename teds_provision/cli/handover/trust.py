@@ -10,8 +10,10 @@ import click
 from teds_provision import handover, protocol
 from teds_provision.cli.context import App, pass_app
 from teds_provision.cli.handover.bundles import count_of
-from teds_provision.cli.options import COMMAND_SETTINGS, dry_run_option, examples, yes_option
+from teds_provision.cli.options import COMMAND_SETTINGS, dry_run_option, examples, fingerprint_option, yes_option
+from teds_provision.errors import OtherKey
 from teds_provision.files import read_limited, write_new
+from teds_provision.protocol.fingerprints import same_key
 
 if TYPE_CHECKING:
     from teds_provision.handover.trust import Candidate, Removal
@@ -41,6 +43,9 @@ def trust() -> None:
 @click.argument("file", type=_FILE, required=False)
 @click.option("--from", "folder", type=click.Path(path_type=Path), metavar="DIR", help="Every key of a folder.")
 @click.option("--role", type=click.Choice(["station", "ca"]), default="station", show_default=True, help="Whose key.")
+@fingerprint_option(
+    "Trust it without a question where its fingerprint begins so: 32 to 64 digits, as its owner reads them."
+)
 @yes_option
 @dry_run_option
 @pass_app
@@ -50,6 +55,7 @@ def add(
     file: Path | None,
     folder: Path | None,
     role: Literal["station", "ca"],
+    fingerprint: str | None,
     yes: bool,
     dry_run: bool,
 ) -> None:
@@ -57,41 +63,49 @@ def add(
 
     Compare the fingerprint with its owner by voice. In a folder NAME.pem and NAME.cert are stations, NAME.ca.pem CAs.
     """
-    _require_one(name, file, folder)
     station = app.station()
-    found = _candidates(station, name, file, folder, role)
+    found = _candidates(station, name, file, folder, role, fingerprint)
     fresh = [one for one in found if not one.known]
     told = {"trusted": [_record(one.record) for one in found], "added": len(fresh)}
     if dry_run:
         app.emit({**told, "plan": True}, _shown(found))
         return
-    _take(app, station, [one for one in found if one.known or _agreed(app, one, yes)])
+    _add(app, station, [one for one in found if one.known or _agreed(app, one, yes or fingerprint is not None)])
 
 
-def _require_one(name: str | None, file: Path | None, folder: Path | None) -> None:
-    if (folder is None) == (name is None) or (name is not None and file is None):
-        raise click.UsageError("Give NAME and FILE, or --from DIR.")
-
-
-def _candidates(
-    station: Station, name: str | None, file: Path | None, folder: Path | None, role: Literal["station", "ca"]
-) -> list[Candidate]:
-    """The key that the command line names, or those of the folder."""
-    if folder is not None:
-        return handover.trust.candidates_of(station, folder, role)
-    assert name is not None
-    assert file is not None
-    return [handover.trust.candidate(station, name, file, role)]
-
-
-def _take(app: App, station: Station, chosen: list[Candidate]) -> None:
-    fresh = [one.record.name for one in chosen if not one.known]
+def _add(app: App, station: Station, chosen: list[Candidate]) -> None:
+    fresh = [one for one in chosen if not one.known]
     if fresh:
         station.unlock()  # whom this station trusts is sealed under its vault
     with station.lock("trust add", app.note):
         added = handover.trust.add(station, chosen)
     told = {"trusted": [_record(one.record) for one in chosen], "added": added}
-    app.emit(told, f"Trusted from now on: {', '.join(fresh)}." if added else "Nothing to do.")
+    names = ", ".join(one.record.name for one in fresh)
+    app.emit(told, f"Trusted from now on: {names}." if added else "Nothing to do.")
+
+
+def _candidates(
+    station: Station,
+    name: str | None,
+    file: Path | None,
+    folder: Path | None,
+    role: Literal["station", "ca"],
+    fingerprint: str | None,
+) -> list[Candidate]:
+    """The keys that are meant: NAME and FILE, held against ``fingerprint`` where one is given, or all of a folder."""
+    if folder is not None and (name is not None or fingerprint is not None):
+        raise click.UsageError("--from DIR goes with no NAME and no --fingerprint.")
+    if folder is not None:
+        return handover.trust.candidates_of(station, folder, role)
+    if name is None or file is None:
+        raise click.UsageError("Give NAME and FILE, or --from DIR.")
+    found = handover.trust.candidate(station, name, file, role)
+    if fingerprint is not None and not same_key(fingerprint, found.record.fingerprint):
+        raise OtherKey(
+            f"{file} holds the key {found.record.fingerprint[:32]}, not {fingerprint[:32]}.",
+            hint="Nothing was changed. Compare with its owner again.",
+        )
+    return [found]
 
 
 def _agreed(app: App, one: Candidate, yes: bool) -> bool:
@@ -100,7 +114,7 @@ def _agreed(app: App, one: Candidate, yes: bool) -> bool:
     if yes or not app.interactive:
         app.confirm("", yes=yes)
         return True
-    return click.confirm(f"Trust the {one.record.role} {one.record.name!r}?", err=True)
+    return app.ask_for_key(f"Trust the {one.record.role} {one.record.name!r}?", one.record.fingerprint)
 
 
 def _shown(found: list[Candidate]) -> str:

@@ -136,7 +136,9 @@ def _questions(app: App, yes: bool, *, strangers: bool = True) -> Questions:
                 hint=f"Add --yes, or: teds-provision whitelist add {who.uuid.hex()} --fingerprint {who.fingerprint}",
             )
         with turn:
-            if not app.ask(f"Whitelist node {who.uuid.hex()} with key {who.fingerprint[:32]}?"):
+            if not app.ask_for_key(
+                f"Whitelist node {who.uuid.hex()} with key {who.fingerprint[:32]}?", who.fingerprint
+            ):
                 raise many.board.Declined(
                     f"You said no: node {who.uuid.hex()} was not whitelisted, nothing was changed."
                 )

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 import sys
 from itertools import chain
 from pathlib import Path
@@ -12,9 +11,10 @@ import click
 
 from teds_provision import steps
 from teds_provision.cli.context import App, pass_app
-from teds_provision.cli.options import COMMAND_SETTINGS, dry_run_option, examples, yes_option
+from teds_provision.cli.options import COMMAND_SETTINGS, dry_run_option, examples, fingerprint_option, yes_option
 from teds_provision.cli.rendering import print_json_list, shown
 from teds_provision.cli.steps.build import write_file
+from teds_provision.protocol.fingerprints import same_key
 from teds_provision.station.label import read_label
 
 if TYPE_CHECKING:
@@ -37,24 +37,13 @@ def whitelist() -> None:
     """
 
 
-def _fingerprint(_ctx: click.Context, _parameter: click.Parameter, text: str | None) -> str | None:
-    if text is None:
-        return None
-    digits = re.sub(r"[\s:]", "", text).lower().removeprefix("0x")
-    if not re.fullmatch("[0-9a-f]{64}", digits):
-        raise click.BadParameter("a fingerprint is 64 hex digits.")
-    return digits
-
-
 @whitelist.command(
     context_settings=COMMAND_SETTINGS,
     short_help="Whitelist one node.",
     epilog=examples("teds-provision whitelist add 8d4d9da65281f7000000 --name finger-1"),
 )
 @click.argument("uuid", metavar="UUID|LABEL")
-@click.option(
-    "--fingerprint", "-f", callback=_fingerprint, metavar="F", help="Fingerprint of the node's key, 64 hex digits."
-)
+@fingerprint_option("Fingerprint of the node's key: its first 32 to 64 digits.")
 @click.option("--name", help="What people call it.")
 @dry_run_option
 @pass_app
@@ -67,7 +56,7 @@ def add(app: App, uuid: str, fingerprint: str | None, name: str | None, dry_run:
     scanned = read_label(uuid)
     octets = station.nodes.resolve(uuid) if scanned is None else scanned[0]
     if scanned is not None:
-        if fingerprint not in (None, scanned[1]):
+        if fingerprint is not None and not same_key(fingerprint, scanned[1]):
             raise click.BadParameter("the label names another key.", param_hint="--fingerprint")
         fingerprint = scanned[1]
     steps.whitelist_files.require_name(name)
@@ -102,7 +91,7 @@ def remove(app: App, uuid: str, yes: bool, dry_run: bool) -> None:
     if entry is None and not steps.whitelist.is_pinned(station, octets):
         text = f"{told} is not on the whitelist (nothing to do)."
     elif dry_run:
-        text = f"Plan: take {told} off the whitelist, forget its key {(pinned or 'that it showed')[:16]}."
+        text = f"Plan: take {told} off the whitelist, forget its key {(pinned or 'that it showed')[:32]}."
     else:
         app.confirm(f"Take {told} off the whitelist and forget its pinned key?", yes=yes)
         station.unlock()

@@ -1,0 +1,27 @@
+"""Fingerprints as people give them: 64 hex digits, or the first 32 and more of them. No cryptography is loaded here."""
+
+from __future__ import annotations
+
+import re
+from typing import Final
+
+DIGITS: Final = 64
+LEAST_DIGITS: Final = 32
+"""128 bits: nobody finds a second key whose fingerprint begins so."""
+
+
+def read_fingerprint(text: str) -> str | None:
+    """The digits in lower case, without blanks, colons, dashes and 0x; None unless there are 32 to 64."""
+    digits = re.sub(r"[\s:-]", "", text).lower().removeprefix("0x")
+    return digits if re.fullmatch(f"[0-9a-f]{{{LEAST_DIGITS},{DIGITS}}}", digits) else None
+
+
+def same_key(one: str, other: str) -> bool:
+    """Whether two fingerprints, each whole or its first digits, are of the same key."""
+    short, long = sorted((one, other), key=len)
+    return len(short) >= LEAST_DIGITS and long.startswith(short)
+
+
+def is_whole(fingerprint: str | None) -> bool:
+    """Whether all 64 digits are known."""
+    return fingerprint is not None and len(fingerprint) == DIGITS
