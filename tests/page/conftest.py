@@ -1,6 +1,5 @@
 from __future__ import annotations
 
-import shutil
 from collections.abc import Iterator
 from typing import TYPE_CHECKING
 
@@ -8,22 +7,17 @@ import pytest
 
 from tests.e2e.desk import ANGLE
 
-from .lab import GRIPPER, Lab
+from .lab import GRIPPER, QUIET, Lab, chromium
 
 if TYPE_CHECKING:
     from playwright.sync_api import Browser
-
-QUIET = (
-    "--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run", "--disable-background-networking",
-    "--disable-component-update", "--disable-sync", "--disable-dev-shm-usage", "--enable-precise-memory-info",
-)  # fmt: skip
 
 
 # Of this package, not of the session: while playwright runs, its thread has an event loop, and other tests want theirs.
 @pytest.fixture(scope="package")
 def browser() -> Iterator[Browser]:
     """One chromium for all tests of the page."""
-    found = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
+    found = chromium()
     if found is None:
         pytest.skip("no chromium here: scripts/install-test-packages installs it")
     api = pytest.importorskip("playwright.sync_api", reason="playwright is not installed (pip install playwright)")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 import signal
 import socket
 import time
@@ -19,6 +20,10 @@ from tests.workflow.bench import PASSPHRASE, make_station
 if TYPE_CHECKING:
     from playwright.sync_api import Browser, Page
 
+QUIET = (
+    "--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run", "--disable-background-networking",
+    "--disable-component-update", "--disable-sync", "--disable-dev-shm-usage",
+)  # fmt: skip
 GRIPPER = "gripper"
 CALIBRATIONS = {
     ANGLE: ("csv", "# date: 2026-11-01\nraw,value [degree]\n0,0\n65535,360\n"),
@@ -33,6 +38,11 @@ CALIBRATIONS = {
 }
 SECONDS = 15.0
 PATIENCE = 15_000  # ms that a test waits for something to be seen
+
+
+def chromium() -> str | None:
+    """The browser of this system."""
+    return shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
 
 
 def free_tcp_port() -> int:

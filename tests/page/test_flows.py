@@ -140,7 +140,7 @@ def test_a_datasheet_is_read_and_written_from_a_file_with_the_changes_shown_firs
         assert slew.datasheet != before
         page.locator(".fields td", has_text="crane slew").wait_for(state="attached")
         chooser.set_input_files(written)
-        page.get_by_text("nothing to change").wait_for()
+        page.get_by_role("heading", name="nothing to change").wait_for()
         broken = tmp_path / "broken.json"
         broken.write_text('{"format": "teds/1", "teds": [{}]}')
         chooser.set_input_files(broken)

@@ -95,7 +95,7 @@ export class LivePlot {
   resize() {
     for (const frame of this.frames) {
       const width = Math.floor(frame.canvas.clientWidth);
-      if (width > 0) frame.chart.setSize({ width, height: this.frames.length > 2 ? 150 : 220 });
+      if (width > 0) frame.chart.setSize({ width, height: heightOf(this.frames.length) });
     }
   }
 
@@ -167,6 +167,7 @@ export class LivePlot {
   }
 }
 
+const heightOf = (frames) => [0, 320, 220][frames] ?? 160;
 const dash = (index) => DASHES[Math.floor(index / COLOURS) % DASHES.length];
 
 function axis(colours, extra) {

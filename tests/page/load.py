@@ -1,0 +1,122 @@
+"""20 channels at 100 Hz in a real browser: does its memory grow, does it lose points or drawings without saying so?
+
+``python -m tests.page.load --seconds 60`` is the long form; the suite runs a short one.
+"""
+
+from __future__ import annotations
+
+import argparse
+import shutil
+import sys
+import tempfile
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from teds_provision import client
+
+from .lab import QUIET, Lab, chromium, opened, until
+
+if TYPE_CHECKING:
+    from playwright.sync_api import Browser, CDPSession, Page
+
+RATE = 100
+SHOWN = 20
+CHANNELS = 24
+LOOKS = 6
+
+
+@dataclass(frozen=True)
+class Load:
+    """What was seen: seconds, octets of the heap after a collection at each look, points, drawings."""
+
+    seconds: float
+    heap: tuple[int, ...]
+    received: int  # points that the page took in
+    dropped: int  # messages that it was too slow for, as it tells
+    drawn: int
+    left_out: int  # drawings, as it tells
+    sampled: int  # by the station, of all channels that it measures
+    lost: int  # between node and station
+
+    @property
+    def grown(self) -> int:
+        """Octets from the second look to the last: by the second one all code is compiled and all buffers are there."""
+        return self.heap[-1] - self.heap[1]
+
+    def __str__(self) -> str:
+        heap = ", ".join(f"{octets / 1e6:.2f}" for octets in self.heap)
+        return (
+            f"{self.seconds:.1f} s, {CHANNELS} channels, {SHOWN} drawn: {self.received} of {self.sampled} points came "
+            f"({self.dropped} messages dropped, as the page tells; {self.lost} points lost before the station), "
+            f"drawn {self.drawn / self.seconds:.1f} times/s ({self.left_out} left out, as it tells), heap {heap} MB"
+        )
+
+
+def run(browser: Browser, lab: Lab, seconds: float) -> Load:
+    """Two tactile fingers of 12 channels each, measured at RATE, twenty of them drawn."""
+    with client.connect(home=lab.station.home) as station:
+        asked = [{"profile": "tactile-finger-sensor", "name": name, "source": "sine:3"} for name in ("index", "thumb")]
+        uuids = [station.request("POST", "/virtual", one)["uuid"] for one in asked]
+        until(lambda: all(station.node(uuid)["verdict"] == "authentic" for uuid in uuids), "not provisioned", 30)
+        with opened(browser, lab, route="measure") as page:
+            kept = station.request("POST", "/measurements", {"uuids": uuids, "rate": RATE})["id"]
+            until(lambda: told(page)["received"] > RATE * SHOWN, "no points arrive", 30)
+            devtools = page.context.new_cdp_session(page)
+            began, heaps = time.monotonic(), []
+            for _ in range(LOOKS):
+                heaps.append(heap(devtools))
+                time.sleep(seconds / (LOOKS - 1))
+            heaps.append(heap(devtools))
+            sampled, lost = samples(station)
+            station.request("DELETE", f"/measurements/{kept}", {})
+            page.wait_for_timeout(1500)  # the page tells of itself once a second
+            said, took = told(page), time.monotonic() - began
+    return Load(took, tuple(heaps), said["received"], said["dropped"], said["drawn"], said["skipped"], sampled, lost)
+
+
+def told(page: Page) -> dict[str, int]:
+    """What the plot says of itself, once a second."""
+    dataset = page.locator(".plot-foot").evaluate("foot => ({...foot.dataset})")
+    return {name: int(dataset.get(name, 0)) for name in ("received", "dropped", "drawn", "skipped")}
+
+
+def heap(devtools: CDPSession) -> int:
+    """Octets of the page's JavaScript after a collection."""
+    devtools.send("HeapProfiler.collectGarbage")
+    return int(devtools.send("Runtime.getHeapUsage")["usedSize"])
+
+
+def samples(station: client.Client) -> tuple[int, int]:
+    """Samples taken and lost so far."""
+    nodes = [node for one in station.request("GET", "/measurements")["measurements"] for node in one["nodes"]]
+    return sum(node.get("samples", 0) for node in nodes), sum(node.get("lost", 0) for node in nodes)
+
+
+def main() -> int:
+    """The command."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--seconds", type=float, default=60.0)
+    seconds = parser.parse_args().seconds
+    from playwright.sync_api import sync_playwright
+
+    found = chromium()
+    if found is None:
+        sys.exit("No chromium here: scripts/install-test-packages installs it.")
+    folder = Path(tempfile.mkdtemp(prefix="page-load-"))
+    lab = Lab.make(folder)
+    try:
+        with sync_playwright() as playwright:
+            browser = playwright.chromium.launch(executable_path=found, args=list(QUIET))
+            lab.run()
+            print(run(browser, lab, seconds))
+            browser.close()
+    finally:
+        lab.desk.clear()
+        shutil.rmtree(folder, ignore_errors=True)
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

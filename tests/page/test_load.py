@@ -1,0 +1,26 @@
+"""Twenty channels at 100 Hz for some seconds; ``python -m tests.page.load`` does it for a minute."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import pytest
+
+from .lab import Lab
+from .load import run
+
+if TYPE_CHECKING:
+    from playwright.sync_api import Browser
+
+pytestmark = pytest.mark.system
+
+
+def test_twenty_channels_at_100_hz_lose_nothing_that_is_not_told_and_need_no_more_memory(
+    browser: Browser, fresh: Lab
+) -> None:
+    fresh.run()
+    seen = run(browser, fresh, 8)
+    assert seen.grown < 3_000_000, seen
+    assert seen.drawn > 0, seen
+    if seen.dropped == 0:
+        assert seen.received > 0.95 * seen.sampled, seen
