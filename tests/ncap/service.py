@@ -12,7 +12,10 @@ from dataclasses import dataclass, field
 from typing import Any
 from urllib.parse import urlsplit
 
+import jsonschema
+
 from teds_provision import client
+from teds_provision.ncap.web.openapi import document
 from tests.e2e.desk import Desk, Running, Station
 
 PATIENCE = 30.0
@@ -33,6 +36,42 @@ class Answer:
     @property
     def code(self) -> str:
         return str(self.json["error"]["code"])
+
+
+class Described(client.Client):
+    """A client whose every answer must be what openapi.json says of it."""
+
+    def _ask(self, method: str, path: str, body: str | None) -> tuple[int, str, bytes]:
+        status, kind, octets = super()._ask(method, path, body)
+        described(method, path, status, kind, octets)
+        return status, kind, octets
+
+
+DOCUMENT = document()
+ANSWERED: set[tuple[str, str, int]] = set()
+
+
+def described(method: str, path: str, status: int, kind: str, octets: bytes) -> None:
+    """Fail where an answer is not what the API's description says."""
+    template = next((one for one in DOCUMENT["paths"] if _matches(one, path.partition("?")[0])), None)
+    if template is None or method.lower() not in DOCUMENT["paths"][template]:
+        assert status in (404, 405), (method, path, status)
+        return
+    answers = DOCUMENT["paths"][template][method.lower()]["responses"]
+    assert str(status) in answers, f"{method} {path} answers {status}, which nobody described"
+    ANSWERED.add((method, template, status))
+    if not kind.startswith("application/json") or "format=" in path:
+        return
+    answer = answers[str(status)]
+    if "$ref" in answer:
+        answer = DOCUMENT["components"]["responses"][answer["$ref"].rpartition("/")[2]]
+    schema = answer["content"]["application/json"]["schema"]
+    jsonschema.Draft202012Validator({**schema, "components": DOCUMENT["components"]}).validate(json.loads(octets))
+
+
+def _matches(template: str, path: str) -> bool:
+    parts, given = template.split("/"), path.split("/")
+    return len(parts) == len(given) and all(a == b or a.startswith("{") for a, b in zip(parts, given, strict=True))
 
 
 @dataclass
@@ -63,8 +102,8 @@ class Service:
         return found
 
     def client(self, token: str | None = None) -> client.Client:
-        """By the Unix socket, or with a token by TCP."""
-        made = client.connect(self.url if token else None, token=token, home=self.station.home, timeout=PATIENCE)
+        """By the Unix socket, or with a token by TCP; every answer is held against the API's own description."""
+        made = Described(self.url if token else None, token=token, home=self.station.home, timeout=PATIENCE)
         self.closing.append(made)
         return made
 

@@ -74,6 +74,7 @@ class Body:
         octets = await request.body()
         try:
             value = json.loads(octets) if octets else {}
+            json.dumps(value, ensure_ascii=False).encode()  # half a character pair is no text
         except (ValueError, RecursionError) as error:
             raise UsageFailure("The body is no JSON.") from error
         if not isinstance(value, dict):
@@ -110,9 +111,9 @@ class Body:
             raise UsageFailure(f"{name!r} has to be from {least:g} to {most:g}, not {value}.")
         return None if value is None else float(value)
 
-    def texts(self, name: str) -> tuple[str, ...]:
-        """A list of texts, () where it is absent."""
-        value = self.take(name, list, [])
+    def texts(self, name: str, *, needed: bool = False) -> tuple[str, ...]:
+        """A list of texts; () where it is absent, unless it is needed."""
+        value = self.need(name, list) if needed else self.take(name, list, [])
         if not all(isinstance(one, str) for one in value):
             raise UsageFailure(f"{name!r} has to be a list of texts.")
         return tuple(value)

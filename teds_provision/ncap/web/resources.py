@@ -16,6 +16,7 @@ from teds_provision.ncap.daemon import Daemon
 from teds_provision.ncap.nodes.holding import LONGEST
 from teds_provision.ncap.web.answers import Body
 from teds_provision.ncap.web.guard import CALLER, Caller
+from teds_provision.ncap.web.openapi import document
 from teds_provision.store import Choice, is_failure
 from teds_provision.teds.profile import default_folders, list_profiles, listed
 
@@ -44,7 +45,7 @@ class Resources:
             Route("/nodes/{uuid}/provision", self.provision, methods=["GET", "POST"]),
             Route("/nodes/{uuid}/channels/{number:int}", self.channel, methods=["PUT"]),
             Route("/groups", self.groups, methods=["GET", "POST"]),
-            Route("/groups/{name}", self.group, methods=["PUT", "DELETE"]),
+            Route("/groups/{name:path}", self.group, methods=["PUT", "DELETE"]),
             Route("/measurements", self.measurements, methods=["GET", "POST"]),
             Route("/measurements/{id}", self.measurement, methods=["DELETE"]),
             Route("/names", self.names, methods=["GET", "PUT"]),
@@ -53,6 +54,7 @@ class Resources:
             Route("/profiles", self.profiles),
             Route("/log", self.log),
             Route("/login-link", self.login_link, methods=["POST"]),
+            Route("/openapi.json", self.openapi),
         ]
 
     async def _node_of(self, request: Request) -> str:
@@ -120,6 +122,10 @@ class Resources:
             for one in log.chosen(choice, after)
         ]
         return {"entries": entries, "intact": verdict.intact, "why": verdict.why}
+
+    async def openapi(self, _request: Request) -> Response:
+        """GET /openapi.json."""
+        return JSONResponse(document())
 
     async def login_link(self, request: Request) -> Response:
         """POST /login-link: the page's address with a token that works once; over the Unix socket alone."""
@@ -222,7 +228,7 @@ class Resources:
             await asyncio.to_thread(self._daemon.drop_group, name)
         else:
             body = await Body.of(request)
-            uuids = await self._nodes_of(tuple(body.need("uuids", list)))
+            uuids = await self._nodes_of(body.texts("uuids", needed=True))
             body.done()
             await asyncio.to_thread(self._daemon.change_group, name, uuids)
         return JSONResponse({"groups": await asyncio.to_thread(self._daemon.groups)})

@@ -1,0 +1,90 @@
+"""The description of the API: a right OpenAPI document, of exactly the routes that there are."""
+
+from __future__ import annotations
+
+import re
+from typing import Any, cast
+from urllib.parse import quote
+
+import jsonschema
+import pytest
+
+from teds_provision.client import ApiError, Client
+from teds_provision.ncap.daemon import Daemon
+from teds_provision.ncap.web.openapi import OPERATIONS, document
+from teds_provision.ncap.web.resources import Resources
+from teds_provision.ncap.web.schemas import SCHEMAS
+from tests.ncap.service import Service
+
+
+def test_every_route_is_described_and_nothing_else() -> None:
+    routes = Resources(cast("Daemon", None)).routes()
+    there = {
+        (method, re.sub(r":\w+}", "}", route.path))
+        for route in routes
+        for method in (route.methods or set()) - {"HEAD"}
+    }
+    assert there == {(one.method, one.path) for one in OPERATIONS}
+
+
+def test_every_schema_is_one_and_every_reference_leads_somewhere() -> None:
+    for schema in SCHEMAS.values():
+        jsonschema.Draft202012Validator.check_schema(schema)
+    described = document()
+
+    def walk(value: Any) -> None:
+        if isinstance(value, dict):
+            if "$ref" in value:
+                where = described
+                for part in value["$ref"].removeprefix("#/").split("/"):
+                    where = where[part]
+            for inner in value.values():
+                walk(inner)
+        elif isinstance(value, list):
+            for inner in value:
+                walk(inner)
+
+    walk(described)
+    names = [one["operationId"] for path in described["paths"].values() for one in path.values()]
+    assert len(names) == len(set(names))
+
+
+def test_it_is_a_valid_openapi_document() -> None:
+    validator = pytest.importorskip("openapi_spec_validator", reason="pip install openapi-spec-validator")
+    validator.validate(document())
+
+
+def _status(asked: Client, method: str, path: str, body: Any) -> int:
+    try:
+        asked.request(method, path, body)
+    except ApiError as error:
+        return error.status
+    return 200
+
+
+@pytest.mark.link
+def test_the_running_daemon_gives_it(service: Service) -> None:
+    with service.client() as asked:
+        assert asked.request("GET", "/openapi.json") == document()
+
+
+@pytest.mark.link
+def test_bodies_made_from_the_description_never_break_the_daemon(service: Service) -> None:
+    """What fits a described body, and what does not, gets an answer that is described: never a bug."""
+    odd: list[Any] = [None, "", "x" * 5000, -1, 1e400, 10**30, True, [], [[]], {}, {"a": 1}, "\u0000", "\ud83d", "../x"]
+    with service.client() as asked:
+        for one in OPERATIONS:
+            if one.body is None or one.path == "/login-link":
+                continue
+            path = one.path.replace("{number}", "1")
+            path = re.sub(r"{\w+}", "nobody", path)
+            names = list(one.body.get("properties", {})) or ["x"]
+            for name in names:
+                for value in odd:
+                    status = _status(asked, one.method, path, {name: value})
+                    assert status in (200, 201, 202, 404, 422), (one.method, path, name, value)
+        groups = asked.request("GET", "/groups")["groups"]
+        for group in groups:
+            asked.request("DELETE", f"/groups/{quote(group['name'], safe='')}")
+        for made in asked.request("GET", "/virtual")["virtual"]:
+            asked.request("DELETE", f"/virtual/{made['uuid']}")
