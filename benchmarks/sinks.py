@@ -90,8 +90,8 @@ from cyclonedds.topic import Topic
 from cyclonedds.qos import Policy, Qos
 from cyclonedds.util import duration
 from cyclonedds.core import ReadCondition, SampleState, WaitSet
-from teds_provision.measure.sinks.ros2 import THIS_MACHINE
-from teds_provision.measure.sinks.ros2_types import JointState
+from teds_provision.measure.sinks.ros.ros2 import THIS_MACHINE
+from teds_provision.measure.sinks.ros.ros2_types import JointState
 kept = Domain({domain}, THIS_MACHINE)
 who = DomainParticipant({domain})
 qos = Qos(Policy.Reliability.Reliable(duration(milliseconds=100)), Policy.History.KeepLast(100),

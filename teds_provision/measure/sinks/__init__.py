@@ -16,8 +16,8 @@ from teds_provision.measure.sinks.base import CommandTaker, Sink, ThreadedSink, 
 from teds_provision.measure.sinks.jsonl import JsonLinesSink
 from teds_provision.measure.sinks.mcap import McapSink
 from teds_provision.measure.sinks.mqtt import MqttSink
-from teds_provision.measure.sinks.ros1 import Ros1Sink
-from teds_provision.measure.sinks.ros2 import Ros2Sink
+from teds_provision.measure.sinks.ros.ros1 import Ros1Sink
+from teds_provision.measure.sinks.ros.ros2 import Ros2Sink
 from teds_provision.measure.sinks.text import TextSink
 
 __all__ = ["CommandTaker", "Sink", "ThreadedSink", "as_sink_failure", "open_sink"]

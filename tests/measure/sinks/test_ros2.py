@@ -20,7 +20,7 @@ from rosbags.typesys import Stores, get_typestore
 from teds_provision.errors import UsageFailure
 from teds_provision.measure.blocks import Command, GroupRows
 from teds_provision.measure.sinks import open_sink
-from teds_provision.measure.sinks.ros2_types import HUMBLE_GRAPH, TYPE_HASHES
+from teds_provision.measure.sinks.ros.ros2_types import HUMBLE_GRAPH, TYPE_HASHES
 from teds_provision.teds.units.units import parse_units
 from tests.measure.sinks.parts import ANGLE, ARM, FORCE, HAND, STATION, block
 

@@ -21,10 +21,10 @@ from pathlib import Path
 
 from teds_provision.errors import TedsProvisionError
 from teds_provision.measure.blocks import Block, ChannelFacts, GroupRows, StationFacts
-from teds_provision.measure.sinks import ros1_child
 from teds_provision.measure.sinks.base import CommandTaker, Item
 from teds_provision.measure.sinks.live import DIAGNOSTICS, JOINT_STATE, STRING, Status, TopicSink
 from teds_provision.measure.sinks.meaning import Meaning
+from teds_provision.measure.sinks.ros import ros1_child
 
 PYTHON = "/usr/bin/python3"
 NODE = "teds_provision"
