@@ -17,7 +17,8 @@ import numpy as np
 import pytest
 
 from teds_provision.measure.blocks import Command, GroupRows, NodeReport
-from teds_provision.measure.sinks import open_sink, ros1_child
+from teds_provision.measure.sinks import open_sink
+from teds_provision.measure.sinks.ros import ros1_child
 from teds_provision.measure.sinks.ros.ros1 import Ros1Sink
 from teds_provision.teds.units.units import parse_units
 from tests.measure.sinks.parts import ANGLE, ARM, FORCE, HAND, STATION, block

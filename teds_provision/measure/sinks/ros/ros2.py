@@ -68,7 +68,7 @@ class Ros2Sink(TopicSink):
             from cyclonedds.domain import Domain, DomainParticipant
             from cyclonedds.qos import Policy, Qos
 
-            from teds_provision.measure.sinks import ros2_types
+            from teds_provision.measure.sinks.ros import ros2_types
         except ImportError:
             raise TedsProvisionError(
                 "ROS 2 needs the package cyclonedds.", hint="Install it: pip install 'teds-provision[ros2]'"
