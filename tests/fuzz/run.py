@@ -10,7 +10,7 @@ import sys
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[2]
-LIMITS = ["-rss_limit_mb=1024", "-max_len=4096", "-timeout=10"]
+LIMITS = ["-rss_limit_mb=1024", "-timeout=10"]
 
 
 def main() -> None:
@@ -35,7 +35,9 @@ def main() -> None:
     places = [str(found), *([str(corpus)] if corpus.is_dir() else [])]
     artifacts = f"-artifact_prefix={ROOT / 'build'}/{name}-"
     dictionary = [f"-dict={words}"] if target.words else []
-    atheris.Setup([sys.argv[0], *LIMITS, artifacts, *dictionary, *options, *places], target.check)
+    atheris.Setup(
+        [sys.argv[0], *LIMITS, f"-max_len={target.longest}", artifacts, *dictionary, *options, *places], target.check
+    )
     atheris.Fuzz()
 
 

@@ -7,6 +7,7 @@ begin with stand in ``seeds``; what fuzzing found stands in ``corpus/<target>``.
 from __future__ import annotations
 
 import json
+import logging
 import struct
 from collections.abc import Callable, Iterable
 from contextlib import suppress
@@ -33,6 +34,7 @@ class Target:
     check: Callable[[bytes], None]
     seeds: Callable[[], Iterable[bytes]]
     words: tuple[str, ...] = ()
+    longest: int = 4096  # octets of an input: what is too short to hold another case only costs time
 
     def kept(self) -> list[bytes]:
         """Seeds, and every input that is kept in the repository."""
@@ -261,6 +263,7 @@ def check_can(data: bytes) -> None:
     from teds_provision.links.can.bus import Frame
     from teds_provision.links.can.gathering import Gathering
 
+    logging.getLogger("isotp").setLevel(logging.CRITICAL)
     gathering, sent = Gathering(0xF1, 7), []
     pair = isotp.Pair(0xF1, 0x21, sent.append)
     at = 0
@@ -524,19 +527,19 @@ _XML = ("<", "/>", "</", "<!DOCTYPE", "<![CDATA[", "&#0;", "uuid=", "<teds", "<f
 TARGETS = {
     target.name: target
     for target in (
-        Target("teds", check_teds, lambda: [b"\1\3\4\0\1\1\1"]),
-        Target("sheet", check_sheet, sheet_seeds),
+        Target("teds", check_teds, lambda: [b"\1\3\4\0\1\1\1"], longest=1024),
+        Target("sheet", check_sheet, sheet_seeds, longest=1024),
         Target("security", check_security, security_seeds),
         Target("frames", check_frames, frame_seeds),
         Target("operation", check_operation, lambda: [bytes(8), bytes(20), b"\0" + bytes(26)]),
         Target("nfc", check_nfc, nfc_seeds, ("Tp", "Ts", "Te", "urn:nfc:sn:")),
-        Target("can", check_can, can_seeds),
+        Target("can", check_can, can_seeds, longest=1024),
         Target("bundle", check_bundle, bundle_seeds, (*_JSON, "protected", "recipients", "nodes", "alg", "kid")),
         Target("receipt", check_receipt, receipt_seeds, (*_JSON, "imported", "refused", "format", ".")),
         Target("backup", check_backup, backup_seeds, (*_JSON, "schema", "tables")),
         Target("whitelist", check_whitelist, whitelist_seeds, (*_JSON, *_XML, "whitelist", "fingerprint", ";", "\t")),
         Target("calibration", check_calibration, calibration_seeds, (*_JSON, *_TOML, "# unit:", "method", "all")),
-        Target("profile", check_profile, profile_seeds, _TOML),
+        Target("profile", check_profile, profile_seeds, _TOML, longest=2048),
         Target("image", check_image, image_seeds, (*_JSON, *_XML, ":00000001FF", "# channel 1 access code 3")),
         Target("units", check_units, unit_seeds, ("**", "^", "·", "/", "deg", "count", ">=", "<=", "rate", "²")),
     )

@@ -187,7 +187,12 @@ def _parameters(fd: bool) -> dict[str, Any]:
         "rx_flowcontrol_timeout": _TIMEOUT_MS,
         "rx_consecutive_frame_timeout": _TIMEOUT_MS,
         "wftmax": 255,
+        "wait_func": _not_waited_for,  # the library tries it out, and so would sleep for each pair that is made
     }
+
+
+def _not_waited_for(_seconds: float) -> None:
+    """Only the library's own thread waits; we have none."""
 
 
 def _tolerable(data: bytes) -> bytes | None:

@@ -9,7 +9,6 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import Final
 
 from teds_provision.errors import BadData
@@ -33,7 +32,7 @@ from teds_provision.teds.profile.keys import (
     Key,
     Kind,
 )
-from teds_provision.teds.profile.load import load_profile
+from teds_provision.teds.profile.load import load_profile, parse_profile
 from teds_provision.teds.profile.model import Profile
 from teds_provision.teds.profile.reader import Problems
 from teds_provision.teds.profile.source import parse
@@ -49,12 +48,7 @@ Placed = dict[tuple[int, int], bytes]
 
 def read_profile(text: str, path: Path | None = None) -> list[Block]:
     """TEDS that a profile gives for a node with UUID 0; raises BadData and NotFound as the profile loader does."""
-    if path is not None:
-        return profile_blocks(load_profile(path))
-    with TemporaryDirectory() as folder:
-        lone = Path(folder) / "profile.toml"
-        lone.write_text(text, encoding="utf-8")
-        return profile_blocks(load_profile(lone))
+    return profile_blocks(parse_profile(text) if path is None else load_profile(path))
 
 
 def profile_blocks(profile: Profile) -> list[Block]:

@@ -63,6 +63,21 @@ def load_profile(name_or_path: str | Path, folders: Sequence[Path] | None = None
     return profile
 
 
+def parse_profile(text: str, name: str = "profile") -> Profile:
+    """A profile from text that stands in no file; what it extends is looked for in the default folders.
+
+    Raises NotFound and BadData as ``load_profile`` does; ``name`` is the file that messages show.
+    """
+    path = Path(f"{name}.toml")
+    table, lineage = _laid_over(parse(text, path.name), path, default_folders(), ())
+    problems = Problems()
+    profile = interpret(table, name, path.name, lineage, problems)
+    problems.raise_errors(name)
+    if profile is None:  # no error and no profile cannot be
+        raise BadData(f"The profile {name} cannot be read.")
+    return profile
+
+
 def passed_over(name: str, folders: Sequence[Path]) -> tuple[str, ...]:
     """Sentences about files of that name which were not taken, because a folder before theirs has one."""
     if _NAME.match(name) is None or name.endswith(".toml"):
@@ -132,16 +147,20 @@ def list_profiles(folders: Sequence[Path] | None = None) -> list[Listed]:
 
 
 def _merged(path: Path, folders: Sequence[Path], chain: tuple[Path, ...]) -> tuple[Table, tuple[str, ...]]:
-    """Table of a profile laid over those it extends, and their names from this one up."""
-    resolved = path.resolve()
-    table = parse(read_text(path), str(path))
+    """Table of a profile's file laid over those it extends, and their names from this one up."""
+    return _laid_over(parse(read_text(path), str(path)), path, folders, (*chain, path.resolve()))
+
+
+def _laid_over(
+    table: Table, path: Path, folders: Sequence[Path], chain: tuple[Path, ...]
+) -> tuple[Table, tuple[str, ...]]:
+    """The same of a table that is read already; ``chain`` are the files so far, its own included."""
     entry = table.entries.get("extends")
     if entry is None:
         return table, (path.stem,)
     where = entry.where
     if isinstance(entry, Table) or not isinstance(entry.value, str):
         raise BadData(f'{where}: extends: the name of one profile is expected, like extends = "smart-sensor".')
-    chain = (*chain, resolved)
     base = _base(entry.value, where, path, folders, chain)
     if len(chain) > MAXIMUM_DEPTH:
         raise BadData(f"{where}: extends: more than {MAXIMUM_DEPTH} profiles extend each other.")
