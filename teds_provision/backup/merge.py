@@ -35,6 +35,7 @@ class Merge:
         self._keys()
         self._images()
         self._trust()
+        self._decisions()
         self._facts()
         self._marks()
 
@@ -164,6 +165,21 @@ class Merge:
                 continue
             self.live.put_trust(record)
             self.back[f"trust in {record.role} {record.name}"] += 1
+
+    def _decisions(self) -> None:
+        """CAs whose trust a person ended, and bans that one lifted.
+
+        What an older copy has and this store lacks may have been taken back since.
+        """
+        ended, lifted = self.live.ended_cas(), self.live.lifted()
+        for ca, mac in self.copy.ended_cas().items():
+            if ca not in ended and not self.older:
+                self.live.end_ca(ca, mac)
+                self.back["CAs whose trust has ended"] += 1
+        for statement, mac in self.copy.lifted().items():
+            if statement not in lifted and self.newer:
+                self.live.put_lifted(statement, mac)
+                self.back["bans lifted"] += 1
 
     def _facts(self) -> None:
         """Facts of the station that init had not reached here, and certificates; the keystore is this machine's."""

@@ -53,6 +53,7 @@ def lift(station: Station, uuid: bytes) -> bool:
     entry = station.policy.revocation(uuid)
     if entry is None:
         return False
+    station.unlock()
     with station.transaction():
         station.policy.lift(uuid)
         station.audit("revoke", uuid, "lifted", why=entry.why)

@@ -60,17 +60,19 @@ class Policy:
         The last one counts no more once trust in those who brought it has ended (:meth:`end_ca`).
         """
         cas = [self._identity.ca, *(record.point for record in self.trusted("ca"))]
-        if uuid is None or (kept := self._keys.ca_of(uuid)) in cas or keys.fingerprint(kept) in self._store.ended_cas():
+        if uuid is None or (kept := self._keys.ca_of(uuid)) in cas or not self.counts(kept):
             return cas
         return [*cas, kept]
 
     def counts(self, ca: bytes) -> bool:
         """Whether trust in a CA has not been ended."""
-        return keys.fingerprint(ca) not in self._store.ended_cas()
+        ended, name = self._store.ended_cas(), keys.fingerprint(ca)
+        return name not in ended or not self._seals.noted("ended ca", name, ended[name])
 
     def end_ca(self, ca: bytes) -> None:
         """Have a CA that came in a bundle count no more for the nodes that keep it."""
-        self._store.end_ca(keys.fingerprint(ca))
+        name = keys.fingerprint(ca)
+        self._store.end_ca(name, self._seals.note("ended ca", name))
 
     def renew_ca(self, ca: bytes) -> None:
         """Have a CA count again for the nodes that keep it: a person took in a bundle that names it."""
@@ -99,17 +101,20 @@ class Policy:
         self._store.put_revocation(revocation)
 
     def lift(self, uuid: bytes) -> bool:
-        """Take a node off the deny list, and remember that this statement counts no more; False if it was not on it."""
+        """Take a node off the deny list (the vault opens): that statement counts no more; False if it was not on it."""
         entry = self.revocation(uuid)
         if entry is None:
             return False
+        self._seals.require()
         with self._store.transaction():
-            self._store.put_lifted(_digest(entry.statement))
+            statement = _digest(entry.statement)
+            self._store.put_lifted(statement, self._seals.note("lifted", statement))
             return self._store.remove_revocation(uuid)
 
     def was_lifted(self, statement: str) -> bool:
         """Whether a person has lifted the ban of this very statement here."""
-        return self._store.was_lifted(_digest(statement))
+        lifted, name = self._store.lifted(), _digest(statement)
+        return name in lifted and self._seals.noted("lifted", name, lifted[name])
 
     def denied(self, uuid: bytes, key: str | None) -> Revocation | None:
         """Why a node with this key (fingerprint, None: not known) is denied; a ban of another key is none."""

@@ -1,4 +1,4 @@
-"""Seals (MACs) over the rows that decide whom this station believes: its own key and CA, trust, pins, CAs of nodes.
+"""Seals (MACs) over the rows that decide whom this station believes: own key and CA, trust, pins, CAs of nodes, bans.
 
 Whoever can write the store's file can change rows in it, but makes no seal: HMAC-SHA-256 (RFC 2104), cut to 16 octets,
 under a key of 32 octets that the vault wraps. A seal binds a row's kind and values to this store. When the vault opens,
@@ -26,6 +26,7 @@ if TYPE_CHECKING:
 SEAL_OCTETS = 16
 _KEY_OCTETS = 32
 _SHOWN = 5
+_DIGITS = 16
 _Values = tuple[str | bytes | None, ...]
 
 
@@ -74,6 +75,10 @@ class Seals:
         """The seal of the CA that a node keeps."""
         return self._mac("ca", uuid, ca)
 
+    def note(self, kind: str, name: str) -> bytes:
+        """The seal of a person's decision: ``lifted`` (a ban), ``ended ca`` (trust in a CA out of a bundle)."""
+        return self._mac(kind, name)
+
     # -- checking --------------------------------------------------------------------------------------------------
 
     def check_entry(self, entry: WhitelistEntry | None) -> WhitelistEntry | None:
@@ -98,6 +103,10 @@ class Seals:
         """Whether a trusted key counts: its seal holds, or the vault is closed and nobody can say."""
         return not self.active or record.name not in self.broken_trust
 
+    def noted(self, kind: str, name: str, mac: bytes | None) -> bool:
+        """Whether a person's decision counts: its seal holds, or the vault is closed and nobody can say."""
+        return not self.active or self._holds(mac, kind, name)
+
     def all_broken(self) -> Iterator[str]:
         """Name every row whose seal does not hold (the vault is open), for doctor."""
         for name, mac, kind, values in self._sealed_rows():
@@ -119,6 +128,13 @@ class Seals:
         for uuid, marks in self._store.all_marks().items():
             if marks.ca is not None:
                 yield f"the CA of node {uuid.hex()}", marks.ca_mac, "ca", (uuid, marks.ca)
+        yield from self._decisions()
+
+    def _decisions(self) -> Iterator[tuple[str, bytes | None, str, _Values]]:
+        for statement, mac in self._store.lifted().items():
+            yield f"the lifting of ban {statement[:_DIGITS]}", mac, "lifted", (statement,)
+        for ca, mac in self._store.ended_cas().items():
+            yield f"the end of trust in CA {ca[:_DIGITS]}", mac, "ended ca", (ca,)
 
     # -- when the vault opens --------------------------------------------------------------------------------------
 
@@ -146,6 +162,9 @@ class Seals:
         if self.broken_trust:
             names = ", ".join(self.broken_trust[:_SHOWN])
             self._tell(f"Trust in {names} was changed by another program than this one and does not count.")
+        strange = [name for name, mac, kind, values in self._decisions() if not self._holds(mac, kind, *values)]
+        if strange:
+            self._tell(f"Another program than this one noted {', '.join(strange[:_SHOWN])}: it does not count.")
 
     def _take_over(self, facts: Facts, vault: Vault) -> None:
         key = os.urandom(_KEY_OCTETS)

@@ -11,7 +11,7 @@ from teds_provision.protocol.messages.identity import NodeState
 from teds_provision.station.station import NodeKey, Station
 from teds_provision.steps.identify import Identified
 from teds_provision.steps.read import read_identity
-from teds_provision.store import KeyRecord, WhitelistEntry
+from teds_provision.store import KeyRecord, WhitelistEntry, utc_now
 from teds_provision.talk.conversation import Conversation, SessionLost
 
 _BEGINNINGS = 5
@@ -122,10 +122,14 @@ def require_session(station: Station, node: Conversation) -> NodeKey:
 
 
 def unknown_key(uuid: bytes) -> PolicyRefused:
-    """The error for a node that knows none of the keys held here: the operator decides, never the tool."""
+    """The error where every key held here was answered with "unknown key" (16), which anyone on the link can say.
+
+    The operator decides what that means, never the tool (profile, section 2).
+    """
     return PolicyRefused(
-        f"Node {uuid.hex()} knows none of the keys that this station holds for it.",
-        hint=f"Another station may have rotated it, or it was reset. To take it: tap it, agree {uuid.hex()} --rotate.",
+        f"No session with node {uuid.hex()}: the answer heard is that it knows none of the keys that are held here. "
+        "Nobody signed that answer, so it proves nothing.",
+        hint=f"Try at the reader. Was it reset, or rotated elsewhere? Then tap it: agree {uuid.hex()} --rotate.",
     )
 
 
@@ -293,6 +297,7 @@ def _agree_anew(
             sequence=identity.sequence,
             state=int(identity.state),
             can_address=identity.can_address,
+            last_seen=utc_now(),
         )
         station.keys.rotated(uuid)
         station.pins.settled(uuid)

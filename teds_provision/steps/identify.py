@@ -60,18 +60,23 @@ def identify(
     """Read UUID and key, demand the proof, and hold both against what this station knows.
 
     Raises OtherKey (a known UUID with another key), NotAuthentic, BadData, LinkFailure. A tap pins the key that it
-    brought; over a bus, where anyone can call itself by any UUID, only a whitelisted key is kept. State, epoch and
-    address of a plain Identify are hints: they change nothing in the store, a session does. ``expect`` is asked before
-    anything is recorded, and raises where another node was meant.
+    brought; over a bus, where anyone can call itself by any UUID, only a whitelisted key is kept, and ``last_seen``
+    moves only where the key that signed is known. State, epoch and address of a plain Identify are hints: they change
+    nothing in the store, a session does. ``expect`` is asked before anything is recorded, and raises where another
+    node was meant.
     """
     who = examine(station, node)
     expect(who)
     entry = who.whitelisted
     listed = entry is not None and entry.fingerprint is not None
-    point = {"point": who.point} if node.tapped or listed else {}
+    known = station.nodes.get(node.uuid)
+    facts: dict[str, object] = {"point": who.point} if node.tapped or listed else {}
+    if facts or (known is not None and known.point == who.point):
+        facts["last_seen"] = utc_now()  # its own key signed a moment ago; any other key may be anybody's
     pinned = _pinned_now(station, who) if node.tapped or listed else None
     with station.durable("identify"):
-        station.nodes.remember(node.uuid, last_seen=utc_now(), **point)
+        if facts:
+            station.nodes.remember(node.uuid, **facts)
         if pinned is not None:
             who = replace(who, whitelisted=pinned)
             station.pins.put(pinned)

@@ -138,16 +138,21 @@ def session(opened: str, why: str) -> Check:
     return Check(_SESSION, "skipped", "no key of this node is held here")
 
 
+def unproven(uuid: bytes, why: str) -> Unproven:
+    """The error (exit 5) where a key of the node is held and neither a session nor its signature vouches for it."""
+    return Unproven(
+        f"Nothing is proven of node {uuid.hex()}: {why}.",
+        hint="Whoever answered may have recorded this. Try at the reader; to take a node over: agree --rotate.",
+    )
+
+
 def require_authentic(verified: Verified) -> None:
     """Raise NotAuthentic (exit 4), or Unproven (5), unless the verdict is ``authentic``; names the first failure."""
     if verified.verdict == "authentic":
         return
     failed = {check.name: check for check in reversed(verified.checks) if check.result == "failed"}
     if verified.verdict == "unproven":
-        raise Unproven(
-            f"Nothing is proven of node {verified.uuid.hex()}: {failed[_SESSION].why}.",
-            hint="Whoever answered may have recorded this. Try at the reader; to take a node over: agree --rotate.",
-        )
+        raise unproven(verified.uuid, failed[_SESSION].why)
     told = next((failed[name] for name in _FRESHNESS if name in failed), next(iter(reversed(failed.values()))))
     raise NotAuthentic(f"The datasheet is {verified.verdict}: {told.why or told.name}.")
 

@@ -13,6 +13,7 @@ from teds_provision.steps.identify import Identified, prove
 from teds_provision.steps.read import read_identity, read_image
 from teds_provision.steps.reset import proof_of_reset
 from teds_provision.steps.verify import Check, Verified, known_of, possession, session, verify_image
+from teds_provision.store import utc_now
 from teds_provision.talk.conversation import Conversation
 from teds_provision.teds.codec.codes import AccessCode
 from teds_provision.teds.image import Image
@@ -28,17 +29,25 @@ class Looked:
 
 def look_at_node(station: Station, node: Conversation, who: Identified) -> Looked:
     """Open a session where a key is held, read every TEDS and judge them; raises LinkFailure and what a read raises."""
-    why = ""
+    why = open_or_say_why(station, node)
+    image = read_image(node)
+    return Looked(image, verify_node(station, node, image, who.point, why=why))
+
+
+def open_or_say_why(station: Station, node: Conversation) -> str:
+    """Open a session where a key is held; why there is none although one is held, else an empty text.
+
+    Raises LinkFailure, and NodeRefused for a refusal in the session.
+    """
     try:
         held = session_if_keyed(station, node)
     except NodeRefused as refusal:
         if node.sealed:
             raise
-        held, why = None, refusal.message.rstrip(".")
-    if held is None and not why and station.keys.held(node.uuid) and station.policy.tombstone(node.uuid) is None:
-        why = "the node opens no session under any key that is held here"
-    image = read_image(node)
-    return Looked(image, verify_node(station, node, image, who.point, why=why))
+        return refusal.message.rstrip(".")
+    if held is None and station.keys.held(node.uuid) and station.policy.tombstone(node.uuid) is None:
+        return "the node opens no session under any key that is held here"
+    return ""
 
 
 def verify_node(station: Station, node: Conversation, image: Image, point: bytes, *, why: str = "") -> Verified:
@@ -49,7 +58,7 @@ def verify_node(station: Station, node: Conversation, image: Image, point: bytes
     identity = (node.proven or read_identity(node)) if node.sealed else None
     checks: list[Check] = verify_image(station, image, known=known_of(station, node.uuid, identity))
     checks.append(possession(lambda: prove(node, point)))
-    checks.append(_vouched(node, point, why))
+    checks.append(vouched(node, point, why))
     verified = Verified(node.uuid, tuple(checks))
     if verified.verdict == "unproven" or checks[-1].result == "failed":
         station.audit("verify", node.uuid, verified.verdict, why=why)
@@ -78,12 +87,16 @@ def _facts(image: Image, verified: Verified, identity: Identity | None) -> dict[
             "epoch": identity.epoch,
             "sequence": identity.sequence,
             "can_address": identity.can_address,
+            "last_seen": utc_now(),
         }
     return facts
 
 
-def _vouched(node: Conversation, point: bytes, why: str) -> Check:
-    """Whether the node itself is known to have said this: in a session, or by its signature that it was reset."""
+def vouched(node: Conversation, point: bytes, why: str) -> Check:
+    """Whether the node itself is known to have said this: in a session, or by its signature that it was reset.
+
+    ``why`` is what :func:`open_or_say_why` said; the check has failed where a key is held and neither came about.
+    """
     if node.sealed:
         return session("opened under the key that is held here", "")
     if why and node.identity.state == NodeState.FACTORY:

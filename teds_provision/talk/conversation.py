@@ -53,7 +53,7 @@ _MEANING = {
 _CURE = {
     Reason.UNTRUSTED_STATION: "Have this station signed by that CA, or reset the node by hand (button held 5 s).",
     Reason.NOT_PERMITTED: "Tap the node on the NFC reader (--via nfc), or reset it by hand.",
-    Reason.UNKNOWN_KEY: "Another station may have rotated the key. To take the node back: tap it, agree UUID --rotate.",
+    Reason.UNKNOWN_KEY: "Try at the reader. If another station rotated the key: tap it, agree UUID --rotate.",
     Reason.STALE_SEQUENCE: "Sign again against the node: sign UUID --read-node.",
     Reason.WRONG_EPOCH: "Sign again after the key agreement: sign UUID --read-node.",
     Reason.TOO_LARGE: "Use a smaller calibration table, or a node with more flash.",
@@ -64,16 +64,15 @@ _CURE = {
 }
 
 
-def refused(reason: int | None, doing: str) -> NodeRefused:
-    """The error for a node's refusal while ``doing`` something; unauthenticated refusals are hints, nothing more."""
+def refused(reason: int | None, doing: str, *, sealed: bool = False) -> NodeRefused:
+    """The error for a refusal of ``doing`` something; outside a session (not ``sealed``) it is a hint, and says so."""
+    heard = "The node refused" if sealed else "Heard, not proven: the node refuses"
     try:
         known = Reason(reason if reason is not None else 0)
     except ValueError:
-        return NodeRefused(f"The node refused {doing} without a known reason ({reason}).", reason=reason or 0)
+        return NodeRefused(f"{heard} {doing} without a known reason ({reason}).", reason=reason or 0)
     return NodeRefused(
-        f"The node refused {doing}: {_MEANING[known]} (reason {int(known)}).",
-        reason=int(known),
-        hint=_CURE.get(known, ""),
+        f"{heard} {doing}: {_MEANING[known]} (reason {int(known)}).", reason=int(known), hint=_CURE.get(known, "")
     )
 
 
@@ -206,7 +205,7 @@ class Conversation:
             raise SessionLost(error) from error
         self.contact.note("in", outer.encode(), answered(command, inner), sealed=True, opened=inner.encode())
         if not inner.ok:
-            raise refused(inner.reason, doing)
+            raise refused(inner.reason, doing, sealed=True)
         return inner.payload
 
     def ask(self, command: Command, doing: str) -> bytes:

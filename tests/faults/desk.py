@@ -5,31 +5,38 @@ from __future__ import annotations
 import itertools
 import json
 import os
+import random
 import re
 import shutil
+import socket
 import threading
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 
 from teds_provision.station.station import initialise
 from teds_provision.vault.passphrase import THROWAWAY
 from tests.cli.shell import clean_environment
-from tests.e2e.desk import Links, free_port
+from tests.e2e.desk import Links
 from tests.faults.acts import NEXT, UUID
 from tests.faults.zygote import FIRST_FD, Child, Zygote
 
 PASSPHRASE = "correct horse battery"
 READY = 60.0
-_groups = itertools.count()
+_LOWEST, _PORTS = 10_000, 22_000  # below those that the system deals out
+_numbers = itertools.count(random.SystemRandom().randrange(_PORTS))
 
 
 def own_links() -> Links:
-    """A reader and a bus that no other trial has: the bus has a multicast group of its own."""
-    number = next(_groups)
-    group = f"239.74.{164 + number // 250 % 32}.{1 + number % 250}"
-    return Links(f"udp:localhost:{free_port()}", f"udp_multicast:{group}?port={free_port()}")
+    """A reader and a bus that no other trial of this process has: ports in their order, each bus its own group."""
+    while True:
+        number = next(_numbers) % _PORTS
+        reader, bus = _LOWEST + number, _LOWEST + (number + _PORTS // 2) % _PORTS
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe, suppress(OSError):
+            probe.bind(("127.0.0.1", reader))
+            group = f"239.74.{164 + number // 250}.{1 + number % 250}"
+            return Links(f"udp:localhost:{reader}", f"udp_multicast:{group}?port={bus}")
 
 
 @dataclass(frozen=True)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import shutil
 import sqlite3
 from collections.abc import Callable, Iterator
@@ -16,7 +17,7 @@ from teds_provision.handover.selection import ExportOrder
 from teds_provision.protocol.keys import SoftwareKey, fingerprint
 from teds_provision.station.rewrap import rewrap
 from teds_provision.station.station import Station, initialise
-from teds_provision.store import TrustRecord, WhitelistEntry
+from teds_provision.store import Revocation, TrustRecord, WhitelistEntry
 from teds_provision.vault import forget_vaults, passphrase
 
 from .test_migration import MADE, PASSPHRASE
@@ -121,6 +122,38 @@ def test_planted_trust_does_not_count(home: Path, opened: Open) -> None:
     station = opened()
     station.unlock()
     assert OTHER not in station.policy.trusted_cas()
+
+
+def test_a_planted_end_of_trust_and_a_planted_lifting_do_not_count(home: Path, opened: Open) -> None:
+    statement = hashlib.sha256(b"a ban").hexdigest()
+    behind_its_back(
+        home,
+        f"INSERT INTO ended_cas VALUES('{fingerprint(OTHER)}', 't', zeroblob(16))",
+        f"INSERT INTO lifted VALUES('{statement}', 't', NULL)",
+    )
+    said: list[str] = []
+    station = opened(said)
+    station.unlock()
+    assert station.policy.counts(OTHER)
+    assert not station.policy.was_lifted("a ban")
+    assert [sentence for sentence in said if "noted" in sentence and fingerprint(OTHER)[:16] in sentence]
+    assert len(list(station.seals.all_broken())) == 2
+
+
+def test_an_end_of_trust_and_a_lifting_that_a_person_made_hold(opened: Open) -> None:
+    station = opened()
+    station.unlock()
+    station.policy.end_ca(OTHER)
+    station.policy.deny(Revocation(NODE, None, "lost", "a ban", "2026-11-21T00:00:00Z"))
+    assert station.policy.lift(NODE)
+    station.close()
+    said: list[str] = []
+    station = opened(said)
+    station.unlock()
+    assert not station.policy.counts(OTHER)
+    assert station.policy.was_lifted("a ban")
+    assert not said
+    assert not list(station.seals.all_broken())
 
 
 @pytest.mark.parametrize(

@@ -12,7 +12,7 @@ from dataclasses import dataclass, field, replace
 
 import pytest
 
-from teds_provision.errors import AddressConflict, NodeRefused, NotAuthentic, Unproven
+from teds_provision.errors import AddressConflict, NodeRefused, NotAuthentic, PolicyRefused, Unproven
 from teds_provision.links import Contact, LinkSettings
 from teds_provision.links.ports import CAN, Capabilities
 from teds_provision.protocol.messages.frames import (
@@ -21,14 +21,18 @@ from teds_provision.protocol.messages.frames import (
     Reason,
     Reply,
     refusal,
+    security_command,
 )
 from teds_provision.protocol.messages.identity import Identity, NodeState
 from teds_provision.station.station import Station
+from teds_provision.steps.agree import require_session
 from teds_provision.steps.identify import identify
 from teds_provision.steps.reset import proof_of_reset
 from teds_provision.steps.verify import Verified, require_authentic
 from teds_provision.steps.verify_node import look_at_node
-from teds_provision.steps.visits.at_node import verify_at
+from teds_provision.steps.visits.at_node import ReadDone, read_at, verify_at
+from teds_provision.steps.visits.visit import Visit
+from teds_provision.store import WhitelistEntry
 from teds_provision.talk.conversation import Conversation, refused
 from teds_provision.talk.meeting import refuse_twins
 from teds_provision.teds.image import SECURITY, Image
@@ -189,3 +193,71 @@ def test_a_refused_challenge_where_a_key_is_held_is_unproven_not_an_error(
     stranger = bytes(9) + b"\1"
     with pytest.raises(NodeRefused):
         verify_at(station, LinkSettings(), stranger.hex(), Silent())
+
+
+def test_read_where_a_key_is_held_needs_a_session_or_a_proof_of_reset(
+    station: Station, board: Board, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    recorded = run(station, board).image
+
+    def met(node: Conversation) -> None:
+        @contextmanager
+        def at(*_: object, **__: object) -> Iterator[Visit]:
+            with node:
+                yield Visit(station, node, identify(station, node))
+
+        monkeypatch.setattr("teds_provision.steps.visits.at_node.at_node", at)
+
+    def read() -> ReadDone:
+        return read_at(station, LinkSettings(), board.uuid.hex(), Silent())
+
+    attacker = Attacker(board, recorded)
+    met(Conversation(Contact(attacker.identity, attacker, address=FORGED_ADDRESS), notice=lambda notice: None))
+    forged = read()
+    assert (forged.image, type(forged.error)) == (recorded, Unproven)
+    met(talk(board))
+    assert read().error is None, "in a session"
+    board.tim.reset_by_hand()
+    met(talk(board))
+    assert read().error is None, "its signature shows that it was reset"
+
+
+def test_a_key_that_nobody_knows_does_not_move_last_seen_over_a_bus(station: Station, board: Board) -> None:
+    """Whoever answers on a bus may sign with a key of his own as long as the UUID is pinned to none."""
+    station.pins.put(WhitelistEntry(board.uuid, None))
+    with talk(board, MemoryLink(board, via="can")) as node:
+        identify(station, node)
+    assert station.nodes.get(board.uuid) is None
+    with talk(board) as node:
+        identify(station, node)
+    tapped = station.nodes.get(board.uuid)
+    assert tapped is not None
+    assert tapped.last_seen is not None
+
+
+def test_a_session_moves_last_seen(station: Station, board: Board) -> None:
+    run(station, board)
+    station.nodes.remember(board.uuid, last_seen="2020-01-01T00:00:00Z")
+    with talk(board, MemoryLink(board, via="can")) as node:
+        look_at_node(station, node, identify(station, node))
+    known = station.nodes.get(board.uuid)
+    assert known is not None
+    assert str(known.last_seen) > "2026"
+
+
+def test_a_refusal_outside_a_session_is_told_as_heard_and_not_proven(station: Station, board: Board) -> None:
+    run(station, board)
+    board.flash.state = replace(board.flash.state, key=bytes(16))
+    board.power_on()
+    with talk(board) as node, pytest.raises(PolicyRefused, match="proves nothing"):
+        require_session(station, node)
+    with talk(board) as node, pytest.raises(NodeRefused, match="Heard, not proven"):
+        node.plain(security_command(Function.CLOSE), "to close")
+
+
+def test_a_refusal_in_a_session_is_the_nodes_own_word(station: Station, board: Board) -> None:
+    run(station, board)
+    with talk(board) as node:
+        require_session(station, node)
+        with pytest.raises(NodeRefused, match="The node refused to do the unknown"):
+            node.send(security_command(99), "to do the unknown")

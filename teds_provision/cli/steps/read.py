@@ -23,11 +23,16 @@ from teds_provision.steps import visits
 @link_options
 @pass_app
 def read(app: App, uuid: str, output: Path | None, links: LinkSettings) -> None:
-    """Read every TEDS of a node, over a session where this station holds its key; look at it with show."""
+    """Read every TEDS of a node, over a session where this station holds its key; look at it with show.
+
+    Where a key is held and no session came about, nothing is proven: what was heard is shown, no file is written,
+    and the exit code is 5.
+    """
     done = visits.at_node.read_at(app.station(), links, uuid, reporter_for(app))
-    if not done.proven:
-        app.warn("Nothing here is proven: the node opened no session under the key that is held for it.")
     text = done.image.to_json()
+    if done.error is not None:
+        app.conclude({**json.loads(text), "verdict": "unproven"}, text.rstrip("\n"), done.error)
+        return
     if output is not None:
         write_file(output, text)
     total = sum(map(len, done.image.blocks.values()))

@@ -6,17 +6,17 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
-from teds_provision.errors import BadData, NodeRefused, NotFound, PolicyRefused, TedsProvisionError
+from teds_provision.errors import BadData, NodeRefused, NotFound, PolicyRefused, TedsProvisionError, Unproven
 from teds_provision.links import LINKS, LinkSettings
 from teds_provision.station.station import Station
 from teds_provision.steps.address import set_address
-from teds_provision.steps.agree import Agreed, agree, session_if_keyed
+from teds_provision.steps.agree import Agreed, agree
 from teds_provision.steps.order import guard, own_name
 from teds_provision.steps.read import read_image
 from teds_provision.steps.reset import ResetReceipt, reset_node
 from teds_provision.steps.sign import known_image
-from teds_provision.steps.verify import Verified, require_authentic, session, verify_image
-from teds_provision.steps.verify_node import look_at_node
+from teds_provision.steps.verify import Verified, require_authentic, session, unproven, verify_image
+from teds_provision.steps.verify_node import look_at_node, open_or_say_why, vouched
 from teds_provision.steps.visits.visit import at_node, node_or_image, read_image_file
 from teds_provision.steps.write import Written, write
 from teds_provision.talk.progress import Reporter
@@ -79,24 +79,24 @@ def set_address_at(
 
 @dataclass(frozen=True)
 class ReadDone:
-    """Every TEDS of a node. ``proven``: read in a session, or no key is held here that could have opened one."""
+    """Every TEDS of a node; ``error`` is Unproven where a key is held here and nothing shows who said it."""
 
     image: Image
-    proven: bool
+    error: Unproven | None
 
 
 def read_at(station: Station, links: LinkSettings, node: str, reporter: Reporter) -> ReadDone:
     """Read every TEDS of the node that ``node`` names, in a session where this station holds its key."""
     uuid = station.nodes.resolve(node)
     with at_node(station, links.after_agreeing(), uuid, reporter) as visit:
-        session_if_keyed(station, visit.node)
+        why = open_or_say_why(station, visit.node)
         image = read_image(visit.node)
+        check = vouched(visit.node, visit.who.point, why)
         verdict = Verified(uuid, tuple(verify_image(station, image))).verdict
         if visit.node.sealed and verdict != "not authentic":
             with station.durable("read"):
                 station.nodes.keep_datasheet(image)
-        given_away = station.policy.tombstone(uuid) is not None
-        return ReadDone(image, visit.node.sealed or given_away or not station.keys.held(uuid))
+        return ReadDone(image, unproven(uuid, check.why) if check.result == "failed" else None)
 
 
 def reset_at(station: Station, links: LinkSettings, uuid: bytes, reporter: Reporter) -> ResetReceipt:

@@ -148,21 +148,21 @@ class HandoverTables:
         """Deny a node no more; False if it was not denied."""
         return self._database.change("DELETE FROM revocations WHERE uuid = ?", (uuid,)) > 0
 
-    def was_lifted(self, statement: str) -> bool:
-        """Say whether a ban was lifted by a person; ``statement`` is the SHA-256 of its signed text."""
-        return self._database.one("SELECT 1 FROM lifted WHERE statement = ?", (statement,)) is not None
+    def lifted(self) -> dict[str, bytes | None]:
+        """Bans that a person lifted, as the SHA-256 of their signed text, and the seal of each."""
+        return dict(self._database.execute("SELECT statement, mac FROM lifted"))
 
-    def put_lifted(self, statement: str) -> None:
+    def put_lifted(self, statement: str, mac: bytes | None) -> None:
         """Note that a person lifted a ban."""
-        self._database.execute("INSERT OR REPLACE INTO lifted VALUES(?, ?)", (statement, utc_now()))
+        self._database.execute("INSERT OR REPLACE INTO lifted VALUES(?, ?, ?)", (statement, utc_now(), mac))
 
-    def ended_cas(self) -> set[str]:
-        """Return the CAs (fingerprints) that came in bundles and count no more."""
-        return {str(ca) for (ca,) in self._database.execute("SELECT ca FROM ended_cas")}
+    def ended_cas(self) -> dict[str, bytes | None]:
+        """CAs (fingerprints) that came in bundles and count no more, and the seal of each."""
+        return dict(self._database.execute("SELECT ca, mac FROM ended_cas"))
 
-    def end_ca(self, ca: str) -> None:
+    def end_ca(self, ca: str, mac: bytes | None) -> None:
         """Have a CA (fingerprint) count no more for the nodes that keep it."""
-        self._database.execute("INSERT OR REPLACE INTO ended_cas VALUES(?, ?)", (ca, utc_now()))
+        self._database.execute("INSERT OR REPLACE INTO ended_cas VALUES(?, ?, ?)", (ca, utc_now(), mac))
 
     def renew_ca(self, ca: str) -> None:
         """Have a CA (fingerprint) count again: a person trusts it, or took in a bundle that names it."""
