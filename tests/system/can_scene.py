@@ -37,7 +37,7 @@ def provision(bench: Bench, node: dict[str, Any], where: str) -> dict[str, Any]:
         *("provision", "--profile", ANGLE, "--calibration", table, "--name", node["name"]),
         *("--via", "can", "--can", at, "--yes"),
     )
-    return {"code": done.code, "verdict": done.json.get("verdict"), "err": done.err[-300:]}
+    return {"code": done.code, "verdict": done.json.get("verdict"), "said": (done.out + done.err)[-600:]}
 
 
 def measure(bench: Bench, node: dict[str, Any], where: str, seconds: float) -> dict[str, Any]:
@@ -51,7 +51,7 @@ def measure(bench: Bench, node: dict[str, Any], where: str, seconds: float) -> d
         "bad": sum(stream["bad"] for stream in streams),
         "events": len(events),
         "states": [line["state"] for line in done.lines if line["event"] == "node"],
-        "err": done.err[-500:],
+        "said": (done.out + done.err)[-800:],
     }
 
 
@@ -161,7 +161,8 @@ def main() -> None:
         nodes.append({**made, "name": name, "folder": folder})
     with process(*program("node", "run", *(node["folder"] for node in nodes), "--can", FD, "--json")) as running:
         assert running.stdout is not None
-        running.stdout.readline()
+        ready = running.stdout.readline()
+        look("ready", lambda: {"said": ready[:300]})
         threading.Thread(target=running.stdout.read, daemon=True).start()
         look("provision", lambda: provision(bench, nodes[0], CAN))
         look("provision-fd", lambda: provision(bench, nodes[1], FD))

@@ -65,8 +65,17 @@ class Machine:
             "-virtfs",
             "local,path=/,mount_tag=root,security_model=none,readonly=on,multidevs=remap",
         ]
-        done = subprocess.run(words, stdin=subprocess.DEVNULL, capture_output=True, timeout=_LIMIT_SECONDS, check=False)
-        self.output = (done.stdout + done.stderr).decode(errors="replace").replace("\r", "")
+        console = folder / "console"
+        with console.open("wb") as file:
+            subprocess.run(
+                words,
+                stdin=subprocess.DEVNULL,
+                stdout=file,
+                stderr=subprocess.STDOUT,
+                timeout=_LIMIT_SECONDS,
+                check=False,
+            )
+        self.output = console.read_text(errors="replace").replace("\r", "")
         for line in self.output.splitlines():
             if line.startswith(MARK):
                 told = json.loads(line.removeprefix(MARK))

@@ -88,6 +88,7 @@ def test_the_registry_holds_every_check(place: Place) -> None:
     list(examine(place))
     machine = ["python", "libraries", "argon2id", "libusb", "clock"]
     links = ["nfc readers", "pc/sc", "serial ports", "nfc loopback", "nfc", "can interfaces", "can loopback", "can"]
+    links += ["bluetooth switches", "bluetooth"]
     station = [
         "home",
         "disk",
