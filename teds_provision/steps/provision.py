@@ -25,6 +25,7 @@ from teds_provision.steps.verify_node import verify_node
 from teds_provision.steps.write import Written, write
 from teds_provision.store import Draft, WhitelistEntry
 from teds_provision.store.records import Assurance
+from teds_provision.talk.charge import Low, wait_for_charge
 from teds_provision.talk.conversation import Conversation
 from teds_provision.talk.onward import Onward, stay
 from teds_provision.talk.progress import DONE, NOTHING, Reporter, StepResult, Steps
@@ -57,14 +58,15 @@ def provision(
     reporter: Reporter,
     confirm: Confirm = nobody,
     onward: Onward = stay,
+    low: Low = wait_for_charge,
 ) -> Provisioned:
     """Bring one node from wherever it stands to a verified datasheet; raises at the first step that fails.
 
     ``accept`` is asked before an unknown node is whitelisted, ``confirm`` before a datasheet changes in what the order
-    does not name. ``onward`` takes the conversation to another link once the key is agreed on. A failure stands in the
-    audit log with the step that it happened in.
+    does not name, ``low`` before a node with a low battery is written. ``onward`` takes the conversation to another
+    link once the key is agreed on. A failure stands in the audit log with the step that it happened in.
     """
-    run = _Run(station, node, order, accept, confirm, reporter, onward)
+    run = _Run(station, node, order, accept, confirm, reporter, onward, low)
     try:
         with station.turn(node.uuid):
             return run.run()
@@ -84,10 +86,11 @@ class _Run:
         confirm: Confirm,
         reporter: Reporter,
         onward: Onward,
+        low: Low,
     ) -> None:
         self.station, self.node, self.order = station, node, order
         self.accept, self.confirm, self.reporter = accept, confirm, reporter
-        self.steps, self.onward = Steps(reporter), onward
+        self.steps, self.onward, self.low = Steps(reporter), onward, low
 
     def run(self) -> Provisioned:
         who = self._identify()
@@ -184,6 +187,7 @@ class _Run:
                 present=present,
                 progress=self.reporter.written,
                 facts={fact: value for fact, value in facts.items() if value is not None},
+                low=self.low,
             )
             step.result = DONE if written.octets else NOTHING
             step.detail = f"{written.octets} octets" if written.octets else ""

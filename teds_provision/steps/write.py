@@ -14,6 +14,7 @@ from teds_provision.protocol.messages.identity import Identity, NodeState
 from teds_provision.station.station import Station
 from teds_provision.steps.read import Survey, read_block, read_identity, read_image
 from teds_provision.steps.sign import known_image, node_keys_of, sign
+from teds_provision.talk.charge import Low, require_charge, wait_for_charge
 from teds_provision.talk.conversation import Conversation, SessionLost
 from teds_provision.teds.codec import security
 from teds_provision.teds.codec.security import SecurityTeds
@@ -46,14 +47,15 @@ def write(
     progress: Progress | None = None,
     facts: Mapping[str, object] = MappingProxyType({}),
     jump: bool = False,
+    low: Low = wait_for_charge,
 ) -> Written:
     """Bring a signed image onto the node, inside the open session, and prove by reading that it is there.
 
     ``present`` is what the node was read to hold in this session: blocks that are the same are not sent again.
     ``facts`` are remembered of the node once it is written. Raises NodeRefused with the node's reason, PolicyRefused
     where the image is older than what the node has, or so far ahead that more than one step of 65,536 would be needed
-    and no person said so (``jump``): that uses up the sequence of the node for good. NotAuthentic where the read-back
-    differs.
+    and no person said so (``jump``): that uses up the sequence of the node for good; where ``low`` is not content with
+    the node's charge. NotAuthentic where the read-back differs.
     """
     started = time.monotonic()
     signed = security.decode(image.blocks[SECURITY])
@@ -66,6 +68,7 @@ def write(
             return Written(0, time.monotonic() - started, has)
     identity = node.proven or read_identity(node)
     _require_newer(signed, identity, jump=jump)
+    require_charge(node, low)
     octets = 0
     for step in range(identity.sequence + SEQUENCE_WINDOW, signed.sequence, SEQUENCE_WINDOW):
         keys = node_keys_of(image.uuid, image.blocks[SECURITY])

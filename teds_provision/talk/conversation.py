@@ -93,6 +93,8 @@ class Conversation:
         self.uuid = contact.identity.uuid
         self.proven: Identity | None = None
         """What Identify said in the session that is open, None where it was not asked yet."""
+        self.charging = contact.charging
+        """What its initial NFC message said of its charge, also where the conversation went on over another link."""
         self._notice = notice
         self._key: bytes | None = None
         self._session: StationSession | None = None

@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import pytest
 
 from .machine import Machine, why_not
+from .results import result
 
 pytestmark = [pytest.mark.machine, pytest.mark.timeout(1500), pytest.mark.skipif(bool(why_not()), reason=why_not())]
 FULL_IDENTIFY = "18DBFFF1#"
@@ -15,13 +14,6 @@ FULL_IDENTIFY = "18DBFFF1#"
 @pytest.fixture(scope="module")
 def scene(tmp_path_factory: pytest.TempPathFactory) -> Machine:
     return Machine("can_scene", ("vcan", "can_raw", "can_isotp"), tmp_path_factory.mktemp("machine"))
-
-
-def result(scene: Machine, name: str) -> dict[str, Any]:
-    assert name in scene.results, scene.output[-6000:]
-    found = scene.results[name]
-    assert "error" not in found, found
-    return found
 
 
 @pytest.mark.parametrize("name", ["provision", "provision-fd"])

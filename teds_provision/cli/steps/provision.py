@@ -154,7 +154,11 @@ def _questions(app: App, yes: bool, *, strangers: bool = True) -> Questions:
             if not app.ask("Write it?"):
                 raise many.board.Declined(f"You said no: node {uuid.hex()} keeps its datasheet.")
 
-    return many.boards.Questions(accept, confirm if app.interactive else None)
+    def low(question: str) -> None:
+        with turn:
+            app.confirm(question, yes=yes)
+
+    return many.boards.Questions(accept, confirm if app.interactive else None, low)
 
 
 # -- telling -----------------------------------------------------------------------------------------------------------

@@ -68,6 +68,7 @@ def write(
         file=image,
         dry_run=dry_run,
         jump=confirm if sequence_jump else None,
+        low=confirm,
     )
     node, written = done.image.uuid.hex(), done.written
     if written is None:

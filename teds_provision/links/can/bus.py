@@ -48,7 +48,10 @@ class Bus:
         self._bus = _open(spec)
         self._descriptor = _descriptor(self._bus)
         self._pacer = Pacer(spec.bitrate, spec.data_bitrate) if spec.pace else None
-        self._echoes = Echoes() if spec.interface == "udp_multicast" else None
+        # SocketCAN marks every frame of this machine as sent here, also those of other programs: nodes beside us
+        self._marks_own = spec.interface != "socketcan"
+        gives_back = not self._marks_own and "receive_own_messages" in dict(spec.options)
+        self._echoes = Echoes() if spec.interface == "udp_multicast" or gives_back else None
 
     @property
     def busy_seconds(self) -> float:
@@ -89,7 +92,7 @@ class Bus:
             if message.arbitration_id & _BUS_OFF:
                 self._bus_off()
             return None
-        if message.is_remote_frame or not message.is_extended_id or not message.is_rx:
+        if message.is_remote_frame or not message.is_extended_id or (self._marks_own and not message.is_rx):
             return None
         frame = Frame(message.arbitration_id, bytes(message.data), message.is_fd, _arrival(message.timestamp))
         if self._echoes and self._echoes.take(frame):

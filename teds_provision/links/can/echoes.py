@@ -1,4 +1,4 @@
-"""Our own frames, given back by an interface that cannot tell them from those of others (udp_multicast).
+"""Our own frames, given back by an interface that cannot tell them from those of others: udp_multicast, SocketCAN.
 
 A frame is taken for our own once for each time that it was sent, within three seconds.
 """

@@ -23,6 +23,7 @@ from teds_provision.steps.many.sheet import Row, read_sheet
 from teds_provision.steps.order import BuildOrder, Prepared, for_several, named_for, prepare
 from teds_provision.steps.provision import Accept, Provisioned, provision
 from teds_provision.steps.read import survey
+from teds_provision.talk.charge import Low, wait_for_charge
 from teds_provision.talk.conversation import Conversation, SessionLost
 from teds_provision.talk.meeting import meet, refuse_twins
 from teds_provision.talk.onward import onward
@@ -55,10 +56,14 @@ class Request:
 
 @dataclass(frozen=True)
 class Questions:
-    """Who is asked: before an unknown node is whitelisted, and before what nobody named is written (None: nobody)."""
+    """Who is asked: before an unknown node is whitelisted, and before what nobody named is written (None: nobody).
+
+    ``low``: before a node with a low battery is written.
+    """
 
     accept: Accept
     confirm: Confirm | None
+    low: Low = wait_for_charge
 
 
 @dataclass(frozen=True)
@@ -238,6 +243,7 @@ class Boards:
             reporter=self._reporter,
             confirm=questions.confirm or nobody,
             onward=onward(self._links, self._reporter.notice),
+            low=questions.low,
         )
 
     def _for(self, who: Identified) -> Prepared:

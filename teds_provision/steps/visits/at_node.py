@@ -19,6 +19,7 @@ from teds_provision.steps.verify import Verified, require_authentic, session, un
 from teds_provision.steps.verify_node import look_at_node, open_or_say_why, vouched
 from teds_provision.steps.visits.visit import at_node, node_or_image, read_image_file
 from teds_provision.steps.write import Written, write
+from teds_provision.talk.charge import Low, wait_for_charge
 from teds_provision.talk.progress import Reporter
 from teds_provision.teds.image import Image
 
@@ -186,10 +187,12 @@ def write_at(
     file: Path | None,
     dry_run: bool = False,
     jump: Callable[[str], object] | None = None,
+    low: Low = wait_for_charge,
 ) -> WriteDone:
     """Write a signed image to the node that ``node`` names: of a file, else the draft, else what it was read to have.
 
-    ``jump`` is asked before a sequence far ahead of the node's is written, and raises for a no; None: it is refused.
+    ``jump`` is asked before a sequence far ahead of the node's is written, and raises for a no; None: it is refused;
+    ``low`` before a node with a low battery is written.
     Raises NotFound (nothing built), BadData (not signed), PolicyRefused (another node's image), as ``write`` does.
     """
     uuid = station.nodes.resolve(node)
@@ -201,5 +204,6 @@ def write_at(
         jump("The sequence of this node is then used up that far, for good. Write it?")
     with at_node(station, links.after_agreeing(), uuid, reporter) as visit:
         visit.session()
-        written = write(station, visit.node, wanted, progress=reporter.written, facts=facts, jump=jump is not None)
+        far = jump is not None
+        written = write(station, visit.node, wanted, progress=reporter.written, facts=facts, jump=far, low=low)
         return WriteDone(wanted, written)

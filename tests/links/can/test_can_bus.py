@@ -54,3 +54,37 @@ def test_a_datagram_that_is_no_frame_is_passed_over(group: str) -> None:
 def test_socketcand_has_no_fd() -> None:
     with pytest.raises(UsageFailure, match="classic"):
         Bus(parse_spec("socketcand:can0?fd=1"))
+
+
+@pytest.mark.parametrize(("text", "heard"), [("socketcan:vcan0", True), ("socketcan:vcan0?receive_own_messages=1", True),
+                                             ("virtual:test", False)])  # fmt: skip
+def test_on_socketcan_programs_of_one_machine_hear_each_other(
+    monkeypatch: pytest.MonkeyPatch, text: str, heard: bool
+) -> None:
+    """The kernel marks what any program of this machine sent; python-can makes is_rx False of that."""
+    import can
+
+    class Kernel:
+        state = can.BusState.ACTIVE
+
+        def __init__(self) -> None:
+            self.frames: list[can.Message] = []
+
+        def recv(self, timeout: float) -> can.Message | None:
+            return self.frames.pop(0) if self.frames else None
+
+        def send(self, message: can.Message, timeout: float) -> None:
+            if "own" in text:
+                self.frames.append(message)
+
+        def shutdown(self) -> None:
+            pass
+
+    kernel = Kernel()
+    monkeypatch.setattr("teds_provision.links.can.bus._open", lambda _spec: kernel)
+    bus = Bus(parse_spec(text))
+    bus.send(Frame(0x18DA21F1, b"own"))
+    assert bus.receive(0) is None, "what this very program sent is no news"
+    kernel.frames.append(can.Message(arbitration_id=0x18DAF121, data=b"other", is_rx=False))
+    assert (bus.receive(0) is not None) == heard
+    bus.close()

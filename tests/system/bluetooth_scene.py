@@ -1,0 +1,99 @@
+"""Real bluetoothd over the kernel's Bluetooth: a virtual controller on /dev/vhci, two nodes in the air."""
+
+from __future__ import annotations
+
+import json
+import os
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+from teds_provision.links.ble.bluez import adapters
+from teds_provision.station.station import Station
+from tests.e2e.desk import ANGLE
+from tests.links.ble.radio import CONFIG
+from tests.links.ble.test_whole_runs import tapped_once
+from tests.system.inside import FOLDER, Bench, look, process, sh
+from tests.workflow.bench import PASSPHRASE
+
+BUS = Path("/run/dbus/system_bus_socket")
+
+
+class Air:
+    """The process of the nodes."""
+
+    def __init__(self, running: Any) -> None:
+        self._running = running
+
+    def say(self, words: Any) -> Any:
+        """One line there, one back."""
+        self._running.stdin.write(json.dumps(words) + "\n")
+        self._running.stdin.flush()
+        return json.loads(self._running.stdout.readline())
+
+
+def provision(bench: Bench, *words: object) -> dict[str, Any]:
+    began = time.monotonic()
+    done = bench.run("provision", "--profile", ANGLE, "--yes", "--via", "ble", *words, "--timeout", "120")
+    said = json.loads(done.out) if done.out else {}
+    steps = {step["name"]: step["result"] for step in said.get("steps", [])}
+    return {
+        "code": done.code,
+        "verdict": said.get("verdict"),
+        "uuid": said.get("uuid"),
+        "steps": steps,
+        "took": round(time.monotonic() - began, 1),
+        "said": (done.out + done.err)[-600:],
+    }
+
+
+def power_on() -> dict[str, Any]:
+    """bluetoothd starts with the adapter off."""
+    until = time.monotonic() + 60
+    said = ""
+    while time.monotonic() < until:
+        said = sh("bluetoothctl", "power", "on")
+        found = adapters()
+        if found and found[0].powered:
+            return {"adapters": [[each.name, each.powered, each.central] for each in found]}
+        time.sleep(1)
+    return {"error": f"the adapter does not come up: {said}"}
+
+
+def main() -> None:
+    """Play the scene."""
+    config = FOLDER / "bus.conf"
+    config.write_text(CONFIG.format(path=BUS))
+    bench = Bench()
+    nodes = [FOLDER / "left", FOLDER / "right"]
+    with Station.open(bench.home, ask=lambda _prompt, _confirm: PASSPHRASE) as station:
+        for node in nodes:
+            tapped_once(station, node)
+    uuids = [json.loads((node / "flash.json").read_text())["flash"]["uuid"] for node in nodes]
+    os.environ["DBUS_SYSTEM_BUS_ADDRESS"] = f"unix:path={BUS}"
+    with (
+        process("dbus-daemon", f"--config-file={config}", "--nofork", "--nopidfile"),
+        process(sys.executable, "-m", "tests.links.ble.air") as running,
+    ):
+        air = Air(running)
+        addresses = air.say({"nodes": [str(node) for node in nodes], "vhci": True})["nodes"]
+        with process("/usr/libexec/bluetooth/bluetoothd", "-n"):
+            look("power", power_on)
+            look("first", lambda: provision(bench, "--ble", f"hci0?address={addresses[0]}"))
+            look("again", lambda: provision(bench, "--name", "left", uuids[0], "--ble", "auto"))
+            air.say(["cut", 1, 20])
+            look("reconnect", lambda: provision(bench, "--name", "right", "--ble", f"hci0?address={addresses[1]}"))
+            look("both", lambda: identify(bench, uuids))
+            look("uuids", lambda: {"uuids": uuids})
+
+
+def identify(bench: Bench, uuids: list[str]) -> dict[str, Any]:
+    done = bench.run("identify", "--via", "ble", "--timeout", "120")
+    said = json.loads(done.out)
+    found = sorted(node["uuid"] for node in said.get("nodes", [said]))
+    return {"code": done.code, "found": found, "expected": sorted(uuids)}
+
+
+if __name__ == "__main__":
+    main()
