@@ -56,8 +56,10 @@ def test_socketcand_has_no_fd() -> None:
         Bus(parse_spec("socketcand:can0?fd=1"))
 
 
-@pytest.mark.parametrize(("text", "heard"), [("socketcan:vcan0", True), ("socketcan:vcan0?receive_own_messages=1", True),
-                                             ("virtual:test", False)])  # fmt: skip
+@pytest.mark.parametrize(
+    ("text", "heard"),
+    [("socketcan:vcan0", True), ("socketcan:vcan0?receive_own_messages=1", True), ("virtual:test", False)],
+)
 def test_on_socketcan_programs_of_one_machine_hear_each_other(
     monkeypatch: pytest.MonkeyPatch, text: str, heard: bool
 ) -> None:
