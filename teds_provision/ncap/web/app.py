@@ -18,7 +18,9 @@ from starlette.websockets import WebSocket, WebSocketDisconnect
 from teds_provision.errors import NotFound, TedsProvisionError
 from teds_provision.ncap.daemon import Daemon
 from teds_provision.ncap.live import Listener
+from teds_provision.ncap.web import metrics
 from teds_provision.ncap.web.answers import answer_bug, answer_error, answer_refusal
+from teds_provision.ncap.web.clause12 import Clause12
 from teds_provision.ncap.web.guard import Refusal
 from teds_provision.ncap.web.resources import Resources
 
@@ -39,6 +41,10 @@ def build(daemon: Daemon) -> Starlette:
             ],
         ),
     ]
+    if daemon.settings.metrics:
+        routes.append(metrics.route(daemon))
+    if daemon.settings.clause_12:
+        routes += Clause12(daemon).routes()
     if PAGE.is_dir():
         routes.append(Mount("/", _Page(directory=PAGE, html=True)))
     handlers: dict[Any, Any] = {
