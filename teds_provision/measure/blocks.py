@@ -48,6 +48,7 @@ class ChannelFacts:
     fingerprint: str = ""  # SHA-256 of the signed datasheet, 64 hex digits; empty where it is unsigned
     sample_form: str = ""  # of the raw value: uint16, float32 …
     period: float | None = None  # seconds between samples as measured; None for events
+    unsigned: bool = False  # nobody has signed the datasheet: there are raw values alone
     quantity: str = ""  # what the profile or the name calls it, e.g. "relative humidity"; empty where nobody said
 
     @property

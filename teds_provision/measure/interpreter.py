@@ -23,10 +23,12 @@ from teds_provision.teds.sheet import Sheet
 class StreamInterpreter:
     """Messages of one run in, blocks out. ``problems`` says of which channels there are raw values only, and why.
 
-    Used by one thread.
+    ``raw_only`` is a reason for which no channel has values. Used by one thread.
     """
 
-    def __init__(self, sheet: Sheet, plan: Plan, run: int, clock: ClockMap, wall: Wall, monotone: Monotone) -> None:
+    def __init__(
+        self, sheet: Sheet, plan: Plan, run: int, clock: ClockMap, wall: Wall, monotone: Monotone, *, raw_only: str = ""
+    ) -> None:
         self._plan, self._run, self._clock, self._wall = plan, run, clock, wall
         self._uuid = sheet.uuid.hex()
         self._monotone = monotone
@@ -41,7 +43,8 @@ class StreamInterpreter:
         self._waiting: list[Message] = []
         self._since = 0.0
         present = set(plan.layout.channels)
-        self.problems = {one.channel.number: _why_raw(one, present) for one in self._channels if _why_raw(one, present)}
+        why = {one.channel.number: raw_only or _why_raw(one, present) for one in self._channels}
+        self.problems = {number: reason for number, reason in why.items() if reason}
 
         usable = [one.channel.number not in self.problems for one in self._channels]
         self._together = Together.of(self._channels, usable)

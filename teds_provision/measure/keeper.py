@@ -125,6 +125,8 @@ class NodeKeeper:
             self._say("ended")
         finally:
             self._together.gone(self.uuid)
+            if self._wish.require is not None:
+                self._wish.require.gone(self.uuid)
             for bus in self._buses.all():
                 bus.share.gone(self.uuid)
             self.done.set()
@@ -167,7 +169,9 @@ class NodeKeeper:
 
     def _in_session(self, bus: Bus, sighting: Sighting) -> None:
         with Conversation(sighting.contact(), notice=lambda _notice: None) as node:
-            trusted = open_trusted(self._station, node)
+            trusted = open_trusted(self._station, node, unsigned=self._wish.unsigned)
+            if self._wish.require is not None:
+                self._wish.require.offer(self.uuid, trusted.sheet, self._stop)
             self.trusted, self._announced = trusted, 0.0
             self._buses.sightings.on_announce(sighting, self._heard_announce)
             try:
@@ -181,7 +185,7 @@ class NodeKeeper:
         self.streams.new_session()
         for _ in range(AT_FIRST):
             self.streams.tell_time(trusted)
-        actuators = self._actuators(trusted)
+        actuators = [] if trusted.unsigned else self._actuators(trusted)
         channels = self._sensors(trusted.sheet.channels, actuators)
         self._claim(trusted, channels)
         plans = self._subscribe(bus, trusted, channels, address) if channels else Plans((), 0.0)

@@ -8,6 +8,7 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field, replace
 
 from teds_provision.measure.blocks import Block, ChannelFacts, NodeReport
+from teds_provision.measure.carrying.judging import Judging
 from teds_provision.measure.hearing import HeardStream
 from teds_provision.measure.planning import BusTime
 from teds_provision.protocol.operation.budget import MOST_LOAD
@@ -32,6 +33,8 @@ class Wish:
     actuators: bool = False  # whether set points may come for actuators of nodes on the whitelist
     dead_man: int = DEAD_MAN
     patient: bool = False  # whether a node is waited for, and tried again, for ever: no refusal is final
+    unsigned: bool = False  # whether raw values of a node are wanted whose datasheet nobody has signed
+    require: Judging | None = None
 
 
 @dataclass

@@ -87,6 +87,8 @@ class Measurement:
                 sink.close()
             raise
         self.buses.expect(self.uuids)
+        if self.wish.require is not None:
+            self.wish.require.expect(self.uuids)
         events = Events(self._block, self._describe, self._report)
         self.keepers = [
             NodeKeeper(self.station, self.buses, uuid, self.wish, self._wall, events, self._together)

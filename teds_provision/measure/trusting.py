@@ -32,12 +32,14 @@ class Trusted:
     """A node in a session, with a datasheet that was verified just now.
 
     ``digest`` is what Operate takes (16 octets), ``fingerprint`` the SHA-256 of the Security TEDS in hex.
+    ``unsigned``: nobody has signed the datasheet; there are raw values alone, and nothing is moved.
     """
 
     node: Conversation
     sheet: Sheet
     fingerprint: str
     name: str
+    unsigned: bool = False
 
     @property
     def uuid(self) -> str:
@@ -51,6 +53,9 @@ class Trusted:
 
     def facts(self, channel: Channel, period: float | None) -> ChannelFacts:
         """What goes with every value of a channel that gives one every ``period`` seconds."""
+        if self.unsigned:  # a name to tell channels apart; nothing else that the node says of itself is repeated
+            kind = facts_of(self.sheet, channel, name=self.name, fingerprint="", period=period).kind
+            return ChannelFacts(self.uuid, self.name, channel.number, channel.name, kind, period=period, unsigned=True)
         return facts_of(self.sheet, channel, name=self.name, fingerprint=self.fingerprint, period=period)
 
     def channel(self, number: int) -> Channel:
@@ -62,8 +67,8 @@ class Trusted:
         return found
 
 
-def open_trusted(station: Station, node: Conversation) -> Trusted:
-    """Open a session and verify the datasheet.
+def open_trusted(station: Station, node: Conversation, *, unsigned: bool = False) -> Trusted:
+    """Open a session and verify the datasheet; ``unsigned`` also takes one that nobody has signed yet.
 
     Raises PolicyRefused (no key, banned), NotAuthentic and Unproven (the datasheet), LinkFailure.
     """
@@ -74,12 +79,15 @@ def open_trusted(station: Station, node: Conversation) -> Trusted:
     image = kept if kept is not None and kept.security == octets else read_image(node)
     checks = verify_image(station, image, known=known_of(station, node.uuid, identity))
     checks.append(session("opened under the key that is held here", ""))
-    require_authentic(Verified(node.uuid, tuple(checks)))
-    if image is not kept:
+    verified = Verified(node.uuid, tuple(checks))
+    bare = unsigned and verified.verdict == "unsigned"
+    if not bare:
+        require_authentic(verified)
+    if image is not kept and not bare:
         station.nodes.keep_datasheet(image)
     record = station.nodes.get(node.uuid)
     name = record.name if record is not None and record.name else ""
-    return Trusted(node, Sheet.of(image), hashlib.sha256(octets).hexdigest(), name)
+    return Trusted(node, Sheet.of(image), hashlib.sha256(octets).hexdigest(), name, bare)
 
 
 def require_whitelisted(station: Station, uuid: bytes) -> None:

@@ -14,8 +14,11 @@ from teds_provision.node.described import create
 from teds_provision.node.virtual import VirtualNode
 from teds_provision.protocol.messages.identity import Identity
 from teds_provision.station.station import Station
+from teds_provision.steps.agree import agree
+from teds_provision.steps.identify import identify
 from teds_provision.steps.order import BuildOrder
 from teds_provision.steps.provision import provision
+from teds_provision.store import WhitelistEntry, utc_now
 from teds_provision.talk.conversation import Conversation
 from teds_provision.talk.progress import Silent
 from tests.e2e.desk import ANGLE, Desk, Running
@@ -47,15 +50,20 @@ class NodeLink:
         self.node.lost(self.via)
 
 
-def provisioned(station: Station, folder: Path, type_: str, name: str, *, calibrate: bool = True) -> str:
-    """Make a node of this type, and provision it; its UUID."""
+def provisioned(station: Station, folder: Path, type_: str, name: str) -> str:
+    """Make a node of this type, and provision it; its UUID. ``keyed:TYPE`` gets a key, and no datasheet is signed."""
+    keyed, type_ = type_.startswith("keyed:"), type_.removeprefix("keyed:")
     create(folder, name=name, profile=type_)
     node = VirtualNode(folder)
     calibration = folder / "calibration.csv"
     calibration.write_text(CALIBRATIONS[type_])
     contact = Contact(Identity.decode(node.identify()), NodeLink(node), tag_uid=b"\x04" + bytes(6))
-    order = BuildOrder(type_, calibration=calibration if calibrate else None, name=name)
+    order = BuildOrder(type_, calibration=calibration, name=name)
     with Conversation(contact, notice=lambda _notice: None) as talk:
+        if keyed:
+            who = identify(station, talk)
+            agree(station, talk, who, newcomer=WhitelistEntry(talk.uuid, who.fingerprint, utc_now(), "tap", name))
+            return talk.uuid.hex()
         done = provision(station, talk, order, accept=lambda _who: None, reporter=Silent())
     assert done.verified.verdict == "authentic"
     return node.tim.flash.uuid.hex()

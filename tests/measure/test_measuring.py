@@ -268,9 +268,12 @@ def test_a_node_that_is_not_there_is_5_after_the_time_allowed(bench: Bench, tmp_
 def test_what_a_task_requires_is_judged_before_anything_is_measured(bench: Bench, tmp_path: Path) -> None:
     file = tmp_path / "task.toml"
     file.write_text('[angle]\nrange = ">= 720 deg"\n')
-    told = bench.ask("measure", bench.angle.uuid, "--duration", 1, "--require", file, code=6)
+    lines = bench.measure(bench.angle.uuid, "--duration", 1, "--require", file, code=6)
+    told = lines[-1]
     assert told["fits"][0]["uuid"] == bench.angle.uuid
     assert "360" in told["fits"][0]["why"]
+    assert told["error"]["code"] == "refused"
+    assert not data(lines)
 
 
 def test_measuring_over_nfc_says_what_to_do(station_home: Station) -> None:

@@ -19,12 +19,13 @@ from teds_provision.cli.context import App, pass_app
 from teds_provision.cli.measure.values import ending, over_the_bus
 from teds_provision.cli.options import command, link_options
 from teds_provision.cli.steps.build import read_file
-from teds_provision.errors import PolicyRefused, UsageFailure
+from teds_provision.errors import UsageFailure
 from teds_provision.links import LINKS, LinkSettings, ble, can
 from teds_provision.store import Measurement
 
 if TYPE_CHECKING:
     from teds_provision.measure.carrying.job import Job
+    from teds_provision.measure.carrying.judging import Judging
     from teds_provision.measure.runner import Ended
     from teds_provision.station.station import Station
 
@@ -46,6 +47,7 @@ KINDS = ("periodic", "event", "free")
 @click.option("--kind", type=click.Choice(KINDS), help="How the node samples; without it as each channel is.")
 @click.option("--trigger", is_flag=True, help="Begin on all nodes at one moment, by one frame.")
 @click.option("--test-pattern", is_flag=True, help="Stream the test pattern and check it: no measurement.")
+@click.option("--unsigned", is_flag=True, help="Also raw values of nodes whose datasheet nobody has signed, marked.")
 @click.option("--to", "files", multiple=True, metavar="FILE", help="Record: .csv, .txt, .mcap, .jsonl.")
 @click.option("--ros1", is_flag=True, help="Publish to ROS 1 (ROS_MASTER_URI).")
 @click.option("--ros2", is_flag=True, help="Publish to ROS 2 (ROS_DOMAIN_ID), on this machine.")
@@ -101,15 +103,24 @@ def measure(
         sinks=tuple(measure_room.carrying.job.whole_path(spec) for spec in sinks),
         lasting=False,
     )
-    wish = measure_room.orders.Wish(test_pattern=wished["test_pattern"], timeout=links.timeout)
-    if group and duration is None and not wish.test_pattern:
+    wish = measure_room.orders.Wish(
+        test_pattern=wished["test_pattern"],
+        timeout=links.timeout,
+        unsigned=wished["unsigned"],
+        require=None if require is None else _judging(require),
+    )
+    if group and duration is None and not wish.test_pattern and not wish.unsigned:
         kept = _carried_on(app, station, kept)
     job = measure_room.carrying.job.Job(station, kept, wish=wish)
     for uuid in uuids:
         station.unlock(uuid)
-    if require is not None:
-        _require(app, station, uuids, require)
-    _tell_end(app, _run(app, job, links, uuids, duration))
+    _tell_end(app, _run(app, job, links, uuids, duration), wish.require)
+
+
+def _judging(file: Path) -> Judging:
+    """What the task needs of the datasheets."""
+    text = read_file(file).decode(errors="replace")
+    return measure_room.carrying.judging.Judging(teds.fits.parse_require(text, str(file)))
 
 
 def _who(station: Station, what: Sequence[str]) -> tuple[str, list[bytes]]:
@@ -158,8 +169,10 @@ def _run(app: App, job: Job, links: LinkSettings, uuids: Sequence[bytes], durati
     return ended
 
 
-def _tell_end(app: App, ended: Ended) -> None:
+def _tell_end(app: App, ended: Ended, require: Judging | None) -> None:
     result: dict[str, Any] = {"event": "end", "nodes": ended.nodes, "files": ended.files}
+    if require is not None:
+        result["fits"] = require.fits
     if ended.apart:
         result["began_apart"] = ended.apart
     lines = []
@@ -168,32 +181,9 @@ def _tell_end(app: App, ended: Ended) -> None:
             lost = f", lost {stream['lost']}, late {stream['late']}, bad {stream['bad']}"
             lines.append(f"{node['uuid']}: {stream['samples']} values in {stream['messages']} messages{lost}")
     lines += [f"Written: {name}" for name in ended.files]
+    if require is not None and ended.error is not None:
+        lines += [str(fit["why"]) for fit in require.fits if fit["result"] != "passed"]
     app.conclude(result, "\n".join(lines) or "Nothing was measured.", ended.error)
-
-
-def _require(app: App, station: Station, uuids: Sequence[bytes], file: Path) -> None:
-    """Judge the datasheets as this station knows them against what the task needs; raises PolicyRefused (6)."""
-    requirements = teds.fits.parse_require(read_file(file).decode(errors="replace"), str(file))
-    sheets = {}
-    for uuid in uuids:
-        image = station.nodes.datasheet(uuid)
-        if image is not None:
-            sheets[uuid] = teds.sheet.Sheet.of(image)
-    fits: list[dict[str, object]] = []
-    unmet: list[str] = []
-    for requirement in requirements:
-        found = []
-        for uuid, sheet in sheets.items():
-            for fit in teds.fits.judge(requirement, sheet):
-                found.append(fit)
-                fits.append({"uuid": uuid.hex(), "channel": fit.channel, "result": fit.result, "why": fit.why})
-        if not teds.fits.met(requirement, found):
-            unmet.append(requirement.subject)
-    if unmet:
-        error = PolicyRefused(
-            f"The datasheets do not suffice for: {', '.join(unmet)}.", hint="See the reasons: nodes --fits, or --json."
-        )
-        app.conclude({"fits": fits}, "\n".join(str(fit["why"]) for fit in fits), error)
 
 
 def _recover(app: App, files: Sequence[str]) -> None:

@@ -5,6 +5,6 @@ from typing import TYPE_CHECKING
 from teds_provision.lazy import lazy
 
 if TYPE_CHECKING:
-    from teds_provision.measure.carrying import job, streams, together, trigger
+    from teds_provision.measure.carrying import job, judging, streams, together, trigger
 else:
     __getattr__ = lazy(__name__)

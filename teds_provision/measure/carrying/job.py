@@ -79,7 +79,7 @@ class Job:
         uuids = self.station.measurements.nodes_of(self.kept)
         name = self.kept.group or ", ".join(uuid.hex()[:8] for uuid in uuids[:3])
         with self.station.measurements.running(uuids, group=self.kept.group, what=f"measure {name}"):
-            if self.kept.group is not None and not self.wish.test_pattern:
+            if self.kept.group is not None and not self.wish.test_pattern and not self.wish.unsigned:
                 self.kept = self.station.measurements.begin(self.kept)
             if duration is None and self.kept.ends is not None:
                 duration = max(0.1, self.kept.ends - time.time())

@@ -19,6 +19,7 @@ from teds_provision.protocol.operation.stream_commands import Kind, decode_stopp
 from teds_provision.protocol.operation.subscription import Plan, Receiver
 from teds_provision.talk.conversation import SessionLost
 
+UNSIGNED = "nobody has signed the datasheet: raw values alone"
 SILENT = 2.0  # seconds without a good message, beside three messages' time: then the node is lost
 
 
@@ -62,7 +63,15 @@ class NodeStreams:
             plan, reply, trusted.node.message_key, previous=before.receiver if before is not None else None
         )
         monotone = self._monotone.setdefault(number, Monotone())
-        interpreter = StreamInterpreter(trusted.sheet, plan, reply.run, self.clock, self._wall, monotone)
+        interpreter = StreamInterpreter(
+            trusted.sheet,
+            plan,
+            reply.run,
+            self.clock,
+            self._wall,
+            monotone,
+            raw_only=UNSIGNED if trusted.unsigned else "",
+        )
         assembly = bus.assembly(plan.length)
         heard = HeardStream(receiver, assembly, interpreter, self.clock, self.mapping, self._deliver)
         heard.heard += ahead

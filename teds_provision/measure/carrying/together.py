@@ -14,7 +14,7 @@ from collections.abc import Iterable
 from teds_provision.measure.clock import ClockMap
 from teds_provision.protocol.operation.stream_commands import SOON, WAITS
 
-WAITING = 1.0  # seconds that the first node waits for the others
+WAITING = 2.0  # seconds that the first node waits for the others
 TOGETHER = 15.0  # seconds that a trigger waits for all nodes, from the first one that is ready
 AHEAD, AHEAD_EACH = 0.25, 0.04  # seconds from the choice of a start time to it, and more for each node
 

@@ -61,6 +61,8 @@ def data_lines(block: Block, facts: Mapping[tuple[str, int], ChannelFacts]) -> I
         }
         if block.test_pattern:
             line["test_pattern"] = True
+        if known is not None and known.unsigned:
+            line["unsigned"] = True
         yield line
 
 

@@ -123,7 +123,8 @@ class TextSink(FileSink):
         for number in block.channels:
             place = self._columns[block.uuid, number]
             cells[place], cells[width + place] = value, raw
-        note = "test pattern" if block.test_pattern else ""
+        unsigned = any(self.facts[block.uuid, number].unsigned for number in block.channels)
+        note = "test pattern" if block.test_pattern else "unsigned datasheet" if unsigned else ""
         return self._comma.join([time, block.uuid, index, error, note, *cells]) + "\n"
 
     def _slow_rows(self, block: Block) -> str:

@@ -1,0 +1,70 @@
+"""Which datasheet counts: the one that was verified in the session; raw values of an unsigned one where asked for."""
+
+from __future__ import annotations
+
+import csv
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from tests.e2e.desk import ANGLE
+from tests.measure.hall import Hall, of, states
+
+pytestmark = pytest.mark.link
+
+
+@pytest.fixture(scope="module")
+def hall(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Hall]:
+    made = Hall(tmp_path_factory.mktemp("hall"), {"a": ANGLE, "g": "gripper", "u": f"keyed:{ANGLE}"})
+    try:
+        for node in made.nodes.values():
+            node.start()
+        yield made
+    finally:
+        made.close()
+
+
+def test_a_group_whose_datasheets_suffice_together_is_measured(hall: Hall, tmp_path: Path) -> None:
+    file = tmp_path / "task.toml"
+    file.write_text('[angle]\nrange = ">= 300 deg"\n\n["grip force"]\nrange = ">= 100 N"\n')
+    uuids = [hall.nodes[name].uuid for name in "ag"]
+    lines = hall.measure(*uuids, "--rate", 10, "--duration", 1, "--require", file)
+    assert of(lines, hall.nodes["a"].uuid)
+    assert {fit["result"] for fit in lines[-1]["fits"] if fit["channel"] is not None} == {"passed"}
+
+
+def test_a_requirement_that_one_of_them_lacks_stops_all_before_anything_is_claimed(hall: Hall, tmp_path: Path) -> None:
+    file = tmp_path / "task.toml"
+    file.write_text('["grip force"]\nrange = ">= 5 kN"\n')
+    uuids = [hall.nodes[name].uuid for name in "ag"]
+    lines = hall.measure(*uuids, "--rate", 10, "--duration", 1, "--require", file, code=6)
+    assert not [line for line in lines if line["event"] == "data"]
+    assert set(states(lines)) == {"waiting", "refused"}
+    assert "grip force" in lines[-1]["error"]["message"]
+    assert any(fit["result"] == "failed" for fit in lines[-1]["fits"])
+    for uuid in uuids:
+        assert hall.ask("mode", uuid)["mode"] == "configuration"
+
+
+def test_raw_values_of_an_unsigned_datasheet_come_only_where_asked_for_and_are_marked(hall: Hall) -> None:
+    uuid, file = hall.nodes["u"].uuid, hall.folder / "unsigned.csv"
+    lines = hall.measure(uuid, "--rate", 20, "--duration", 1, code=4)
+    assert not of(lines)
+    assert lines[-1]["error"]["code"] == "not-authentic"
+    lines = hall.measure(uuid, "--rate", 20, "--duration", 1, "--unsigned", "--to", file)
+    assert of(lines)
+    for line in of(lines):
+        assert line["unsigned"] is True
+        assert set(line["value"]) == {None}
+        assert set(line["valid"]) == {False}
+        assert line["unit"] == ""
+        assert line["uncertainty"] is None
+    assert len({raw for line in of(lines) for raw in line["raw"]}) > 1
+    assert any("nobody has signed the datasheet" in line.get("why", "") for line in lines)
+    text = file.read_text().splitlines()
+    rows = list(csv.DictReader(line for line in text if not line.startswith("#")))
+    assert {row["note"] for row in rows} == {"unsigned datasheet"}
+    assert any('"unsigned": true' in line for line in text if line.startswith("# channel"))
+    signed = of(hall.measure(hall.nodes["a"].uuid, "--rate", 20, "--duration", 1, "--unsigned"))
+    assert all("unsigned" not in line and None not in line["value"] for line in signed)
