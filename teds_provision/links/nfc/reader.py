@@ -9,6 +9,7 @@ import secrets
 import threading
 import time
 from collections.abc import Callable, Iterator
+from typing import TypeGuard
 
 from teds_provision.errors import Garbled, LinkFailure, NodeSilent, NoNode, NoReader
 from teds_provision.links.nfc.frontend import AUTO, Reader, open_reader
@@ -118,12 +119,12 @@ class NfcPort:
         while not stop.is_set():
             seen = self._look(notice, stop)
             same = isinstance(seen, Visit) and seen.identity.uuid == here
-            if here is not None and not same and _has_left(seen, gone_at):
+            if not same and _has_left(here, seen, gone_at):
                 notice(_left(here))
                 notice(waiting)
                 here = None
             if seen is None:
-                stop.wait(_SHORT_PAUSE if time.monotonic() - gone_at < _CHANGING else _PAUSE)
+                stop.wait(_pause(gone_at))
                 continue
             if isinstance(seen, Foreign):
                 told = _tell(seen, told, notice)
@@ -338,9 +339,14 @@ def _tell(seen: Visit | Foreign, told: str, notice: NoticeSink) -> str:
     return text
 
 
-def _has_left(seen: Visit | Foreign | None, gone_at: float) -> bool:
-    """Whether a node that does not answer is gone: something else lies there, or nothing for longer than it bounces."""
-    return seen is not None or time.monotonic() - gone_at > _DEBOUNCE
+def _pause(gone_at: float) -> float:
+    """Seconds until the next look: short where nodes are being changed, so that none is waited for."""
+    return _SHORT_PAUSE if time.monotonic() - gone_at < _CHANGING else _PAUSE
+
+
+def _has_left(here: bytes | None, seen: Visit | Foreign | None, gone_at: float) -> TypeGuard[bytes]:
+    """Whether the node ``here``, which is not ``seen``, is gone: something else lies there, or nothing for a while."""
+    return here is not None and (seen is not None or time.monotonic() - gone_at > _DEBOUNCE)
 
 
 def _left(uuid: bytes) -> Notice:

@@ -78,19 +78,24 @@ class NdefApplication:
         """
         if len(apdu) < 4:
             return _WRONG_LENGTH
-        instruction = apdu[1]
-        if instruction == _SELECT and apdu[2] == 4:
+        if apdu[1] == _SELECT and apdu[2] == 4:
             return self._select_application(_data(apdu), seconds)
-        if not self._open:
-            return _NOT_ALLOWED
+        return self._in_application(apdu) if self._open else _NOT_ALLOWED
+
+    def _in_application(self, apdu: bytes) -> bytes:
+        """Files, once the application is selected."""
+        instruction = apdu[1]
         if instruction == _SELECT:
             return self._select_file(_data(apdu))
         if instruction == _READ_BINARY and self._file:
-            octets = self._memory.read(self._file, _offset(apdu), (apdu[4] or 256) if len(apdu) == 5 else 256)
-            return _WRONG_OFFSET if octets is None else octets + _OK
+            return self._read_binary(apdu)
         if instruction == _UPDATE_BINARY and self._file == _NDEF_FILE:
             return _OK if self._memory.write(_offset(apdu), _data(apdu)) else _NO_SPACE
         return _NO_COMMAND
+
+    def _read_binary(self, apdu: bytes) -> bytes:
+        octets = self._memory.read(self._file, _offset(apdu), (apdu[4] or 256) if len(apdu) == 5 else 256)
+        return _WRONG_OFFSET if octets is None else octets + _OK
 
     def _select_file(self, name: bytes) -> bytes:
         self._file = name if name in (_CC_FILE, _NDEF_FILE) else b""
