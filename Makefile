@@ -5,7 +5,7 @@ PYTHON ?= python3
 VENV ?= .venv
 BIN := $(VENV)/bin
 
-.PHONY: demo test test-system lint types unit bench bench-teds bench-handover bench-measure bench-scale fuzz faults model house man sbom clean
+.PHONY: demo test test-system lint types unit bench bench-teds bench-handover bench-measure bench-scale fuzz faults model house man vectors-c sbom clean
 
 demo: $(VENV)/.run
 	@$(BIN)/teds-provision demo
@@ -64,6 +64,10 @@ faults: $(VENV)/.dev
 # What follows from the command line's own definitions: option names, docs/configuration.md, the man page.
 man: $(VENV)/.dev
 	$(BIN)/python scripts/options.py
+
+# The vectors for firmware as C constants, in build/vectors-c (docs/vectors.md).
+vectors-c: $(VENV)/.made
+	$(BIN)/python -m tests.vectors.c_arrays build/vectors-c
 
 # The figures of the house: circles, late imports, complexity, drawers, lines.
 house: $(VENV)/.dev
