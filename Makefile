@@ -5,10 +5,18 @@ PYTHON ?= python3
 VENV ?= .venv
 BIN := $(VENV)/bin
 
-.PHONY: demo test test-system lint types unit bench bench-teds bench-handover bench-measure bench-scale fuzz faults model house man vectors-c sbom clean
+.PHONY: demo demo-page page-picture test test-system lint types unit bench bench-teds bench-handover bench-measure bench-scale fuzz faults model house man vectors-c sbom clean
 
 demo: $(VENV)/.run
 	@$(BIN)/teds-provision demo
+
+# A base station that runs, with its page, two virtual sensors and a virtual gripper; ends with Ctrl-C.
+demo-page: $(VENV)/.page
+	@$(BIN)/teds-provision demo --page
+
+# The picture of the page in README: made from demo --page, by the chromium of this system.
+page-picture: $(VENV)/.dev
+	$(BIN)/python -m tests.page.picture docs/page.png
 
 test: $(VENV)/.dev
 	@sh scripts/install-test-packages || { test -z "$$CI" && echo "Going on without them: the tests marked system are skipped."; }
@@ -90,6 +98,11 @@ $(VENV)/.run: $(VENV)/.made pyproject.toml
 	@echo "Installing teds-provision …"
 	@$(BIN)/python -m pip install --quiet --editable .
 	@touch $@
+
+$(VENV)/.page: $(VENV)/.made pyproject.toml
+	@echo "Installing teds-provision with its page …"
+	@$(BIN)/python -m pip install --quiet --editable '.[ncap]'
+	@touch $@ $(VENV)/.run
 
 $(VENV)/.dev: $(VENV)/.made pyproject.toml
 	@echo "Installing teds-provision and what its tests need …"

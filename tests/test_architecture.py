@@ -41,7 +41,7 @@ ARROWS = {
     "check": _BELOW_TALK | {"talk", "steps"},
     "backup": {"station", "vault", "store", "protocol", "teds"},
     "doctor": {"station", "links", "vault", "store", "protocol", "teds"},
-    "demo": _BELOW_TALK | {"talk", "steps", "handover", "measure"},
+    "demo": _BELOW_TALK | {"talk", "steps", "handover", "measure", "client"},
     "cli": _BELOW_TALK
     | {"talk", "steps", "handover", "backup", "doctor", "demo", "node", "measure", "check", "ncap", "client"}
     | {"trace"},

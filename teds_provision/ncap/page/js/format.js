@@ -2,7 +2,7 @@
 
 /** Digits after the point so that the uncertainty has two figures; without one, five figures in all. */
 function places(value, uncertainty) {
-  if (uncertainty > 0) return Math.min(9, Math.max(0, 1 - Math.floor(Math.log10(uncertainty))));
+  if (uncertainty > 0) return Math.min(9, Math.max(0, 1 - Math.floor(Math.log10(uncertainty) + 1e-6)));
   const size = Math.abs(value);
   return size >= 1e5 || size === 0 ? 0 : Math.min(9, Math.max(0, 4 - Math.floor(Math.log10(size))));
 }

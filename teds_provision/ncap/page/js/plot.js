@@ -183,7 +183,7 @@ function options(channels, colours) {
     cursor: { show: false },
     padding: [8, 24, 0, 0],
     scales: { x: { time: true, auto: false }, y: { range: padded } },
-    axes: [axis(colours, { space: 90, values: (_, ticks) => ticks.map(hours) }), axis(colours, { size: 60, values: (_, ticks) => ticks.map(tick) })],
+    axes: [axis(colours, { space: 90, size: 30, values: (_, ticks) => ticks.map(hours) }), axis(colours, { size: 60, values: (_, ticks) => ticks.map(tick) })],
     series: [
       {},
       ...channels.map((channel, index) => ({
@@ -220,6 +220,7 @@ export function curvePlot(label, xUnit, yUnit, points) {
     setting.height = 240;
     setting.scales = { x: { time: false }, y: { range: padded } };
     setting.axes[0].values = setting.axes[1].values;
+    setting.axes[0].size = 36;
     setting.axes[0].label = xUnit;
     setting.axes[1].label = yUnit;
     setting.axes.forEach((one) => Object.assign(one, { labelFont: colours.font, labelSize: 18 }));

@@ -26,7 +26,7 @@ export class ActuatorPanel {
     const channel = this.channel;
     const name = channelName(channel);
     this.limits = h("p", { class: "hint" });
-    this.sliderField = field(`${name}: set point`, this.slider);
+    this.sliderField = field("Set point", this.slider);
     this.element = h(
       "section",
       { class: "panel actuator", "aria-label": `Actuator ${name}` },

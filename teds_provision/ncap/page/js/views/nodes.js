@@ -122,9 +122,10 @@ export function nodesView(main, rest) {
   paint();
   return {
     go(next) {
+      const other = chosen[0] !== next[0];
       chosen = next;
       paint();
-      if (next[0]) detail.scrollIntoView?.({ block: "nearest" });
+      if (other) window.scrollTo(0, 0);
     },
     end() {
       ends.forEach((end) => end());

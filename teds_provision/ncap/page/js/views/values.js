@@ -138,7 +138,7 @@ function facts(element, channel) {
 function calibrated(channel) {
   if (!channel.calibrated) return h("span", { class: "hint" }, "no calibration");
   if (channel.overdue) return chip("warn", "warn", `${channel.calibrated}, was due ${channel.due}`);
-  return `${channel.calibrated}${channel.due ? `, due ${channel.due}` : ""}`;
+  return h("span", { class: "dates" }, h("span", {}, channel.calibrated), channel.due ? [" ", h("span", { class: "hint" }, `due ${channel.due}`)] : null);
 }
 
 /** Title of a plot with its window and a pause. */
@@ -172,7 +172,7 @@ class ModePanel {
     this.state = h("p", { class: "state" });
     this.error = h("div", {});
     const both = h("div", { class: "switch", role: "group", "aria-label": "What this node does" }, this.idle, this.run);
-    this.element = h("section", { class: "panel mode", "aria-label": "Configure" }, h("h3", {}, "Configure"), h("div", { class: "row" }, both, field("Rate, Hz", this.rate), this.state), this.error);
+    this.element = h("section", { class: "panel mode", "aria-label": "Configure" }, h("div", { class: "row" }, h("h3", {}, "Configure"), both, field("Rate, Hz", this.rate), this.state), this.error);
     this.off = on("status connection measurements", () => this.paint());
   }
 

@@ -1,0 +1,139 @@
+"""The demo with a page: a base station that runs, three virtual transducers that it made, a group that is measured.
+
+The station is the real one (``ncap run`` in a process of its own), its home is thrown away, and it is reached on
+127.0.0.1 alone. A fourth node waits beside the simulated reader: powering it is a tap.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import secrets
+import shutil
+import socket
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Iterator
+from contextlib import closing, contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final
+
+from teds_provision import client, vault
+from teds_provision.errors import LinkFailure, TedsProvisionError
+from teds_provision.station.station import initialise
+
+RATE: Final = 50.0
+GROUP: Final = "crane"
+NODES: Final = (
+    ("magnetic-angular-position-sensor", "slew angle", "sine:8"),
+    ("accelerometer", "boom", "sine:3"),
+    ("gripper", "hand", "sine:5"),
+)
+_TAPPED: Final = "temperature-sensor"
+_READY: Final = 30.0  # seconds, on a loaded machine
+_ENDING: Final = 15.0
+
+
+@dataclass(frozen=True)
+class PageDemo:
+    """What runs: the page's address with a token that works once, the home, and the command that lays a node down."""
+
+    url: str
+    home: Path
+    tap: str
+
+
+@contextmanager
+def page_demo(say: Callable[[str], None], http: str | None = None) -> Iterator[PageDemo]:
+    """Run it for the length of the block; the folder is gone afterwards. Raises what its commands raise."""
+    folder = Path(tempfile.mkdtemp(prefix="teds-provision-page-"))
+    try:
+        home, secret, nfc = folder / "home", secrets.token_hex(16), f"udp:127.0.0.1:{_free(socket.SOCK_DGRAM)}"
+        say("A base station with keys of its own, in a folder that is thrown away.")
+        station, _ = initialise(
+            home, name="bench", keystore="file", ask=lambda prompt, confirm: secret, costs=vault.passphrase.THROWAWAY
+        )
+        station.close()
+        where = http or f"127.0.0.1:{_free(socket.SOCK_STREAM)}"
+        with _daemon(home, secret, "--http", where, "--nfc", nfc), client.connect(home=home) as api:
+            say("Three virtual transducers: made, provisioned and verified by the station, then measured as one group.")
+            _measured(api)
+            tapped = folder / "oven"
+            _run("node", "create", str(tapped), "--profile", _TAPPED, "--name", "oven")
+            yield PageDemo(api.login_url(), home, f"teds-provision node run {tapped} --nfc {nfc}")
+    finally:
+        shutil.rmtree(folder, ignore_errors=True)
+
+
+def _measured(api: client.Client) -> None:
+    uuids = []
+    for profile, name, source in NODES:
+        made = api.request("POST", "/virtual", {"profile": profile, "name": name, "source": source})
+        uuids.append(made["uuid"])
+    until = time.monotonic() + _READY
+    while any(api.node(uuid)["verdict"] != "authentic" for uuid in uuids):
+        if time.monotonic() > until:
+            raise LinkFailure(f"The virtual transducers were not ready within {_READY:.0f} s.", hint="Try again.")
+        time.sleep(0.2)
+    api.request("POST", "/groups", {"name": GROUP, "uuids": uuids})
+    api.request("POST", "/measurements", {"group": GROUP, "rate": RATE})
+
+
+@contextmanager
+def _daemon(home: Path, secret: str, *options: str) -> Iterator[None]:
+    read, write = os.pipe()
+    os.write(write, f"{secret}\n".encode())
+    os.close(write)
+    command = [sys.executable, "-m", "teds_provision", "--home", str(home), "--json", "--passphrase-fd", str(read)]
+    with (home / "events").open("w+b") as events:  # a file: nobody reads what comes after the first line
+        try:
+            process = subprocess.Popen(
+                [*command, "ncap", "run", *options],
+                stdin=subprocess.DEVNULL, stdout=events, stderr=subprocess.DEVNULL, pass_fds=(read,),
+                process_group=0,  # Ctrl-C is for this process, which ends the station in order
+            )  # fmt: skip
+        finally:
+            os.close(read)
+        try:
+            _wait_until_ready(process, home / "events")
+            yield
+        finally:
+            process.terminate()
+            try:
+                process.wait(_ENDING)
+            except subprocess.TimeoutExpired:
+                process.kill()
+                process.wait()
+
+
+def _wait_until_ready(process: subprocess.Popen[bytes], events: Path) -> None:
+    until = time.monotonic() + _READY
+    while b"\n" not in (first := events.read_bytes()) and process.poll() is None and time.monotonic() < until:
+        time.sleep(0.05)
+    if b'"ready"' not in first:
+        raise _failure(first)
+
+
+def _run(*words: str) -> None:
+    command = [sys.executable, "-m", "teds_provision", "--json", *words]
+    done = subprocess.run(command, capture_output=True, check=False)
+    if done.returncode:
+        raise _failure(done.stdout)
+
+
+def _failure(said: bytes) -> TedsProvisionError:
+    """The error of a process of ours, from its line of JSON."""
+    try:
+        error: dict[str, Any] = json.loads(said)["error"]
+        return TedsProvisionError(str(error["message"]), hint=str(error["hint"]))
+    except (ValueError, KeyError, TypeError):
+        return TedsProvisionError("The base station of the demo did not start.")
+
+
+def _free(kind: socket.SocketKind) -> int:
+    with closing(socket.socket(socket.AF_INET, kind)) as probe:
+        probe.bind(("127.0.0.1", 0))
+        return int(probe.getsockname()[1])
