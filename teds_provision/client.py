@@ -17,6 +17,7 @@ import os
 import socket
 import ssl
 from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Final
@@ -163,6 +164,21 @@ class Client:
     def login_url(self, *, read_only: bool = False) -> str:
         """The page's address with a token that works once; over the Unix socket alone."""
         return str(self.request("POST", "/login-link", {"read_only": read_only})["url"])
+
+    @contextmanager
+    def readers(self) -> Iterator[bool]:
+        """Have the readers of the base station for the length of the block; False where it does not run."""
+        connection = _UnixConnection(self._home / SOCKET, self._timeout)
+        try:
+            connection.request("GET", f"{API}/lend")
+            answer = connection.getresponse()
+            lent = answer.status == 200 and answer.readline() == b"lent\n"
+        except (LinkFailure, OSError, http.client.HTTPException):
+            lent = False
+        try:
+            yield lent
+        finally:
+            connection.close()
 
     def live(self) -> Iterator[dict[str, Any]]:
         """What happens now: ``hello``, then values, events and beats, until the connection ends.

@@ -2,17 +2,27 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import click
 
+from teds_provision.cli.context import App
 from teds_provision.cli.tracing import tracing
+from teds_provision.lazy import late
 from teds_provision.links import LinkSettings
 from teds_provision.protocol.fingerprints import read_fingerprint
 
+if TYPE_CHECKING:
+    from teds_provision import client
+else:  # HTTP: only where a base station runs
+    client = late("teds_provision.client")
+
 Function = TypeVar("Function", bound=Callable[..., Any])
+
+_SOCKET = "ncap.sock"  # client.SOCKET, which is loaded where it is there
 
 COMMAND_SETTINGS: dict[str, Any] = {"auto_envvar_prefix": "TEDS_PROVISION"}
 """context_settings of every command: each option also reads TEDS_PROVISION_<NAME>."""
@@ -50,6 +60,17 @@ class Seconds(click.FloatRange):
         return super().convert(value, param, ctx)
 
 
+@contextmanager
+def readers_for(via: str) -> Iterator[None]:
+    """A running base station (`ncap run`) of this home lends its readers to a command that wants one."""
+    app = App.current
+    if via != "nfc" or app is None or not (app.home / _SOCKET).exists():
+        yield
+        return
+    with client.connect(home=app.home).readers():
+        yield
+
+
 def link_options(function: Function) -> Function:
     """Add --via, --nfc and --can (several for some commands), --ble, --timeout, --trace; gives ``links``."""
     from functools import wraps
@@ -66,7 +87,7 @@ def link_options(function: Function) -> Function:
         **rest: Any,
     ) -> Any:
         named = can[0] if len(can) == 1 else can or None
-        with tracing(trace) as opened:
+        with tracing(trace) as opened, readers_for(via):
             return function(*args, links=LinkSettings(via, nfc or None, named, ble, timeout, opened), **rest)
 
     options = [

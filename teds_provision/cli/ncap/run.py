@@ -45,12 +45,14 @@ _FILE = click.Path(path_type=Path, dir_okay=False, exists=True)
 @click.option("--http-1451", "clause_12", is_flag=True, help="Serve the paths of IEEE 1451.0 clause 12, read only.")
 @click.option("--nfc", multiple=True, metavar="PATH", help="A reader: auto, usb, udp:localhost:54321; several times.")
 @click.option("--can", multiple=True, metavar="INTERFACE:CHANNEL", help="A bus: socketcan:can0; several times.")
+@click.option("--ble", multiple=True, metavar="ADAPTER", help="Bluetooth: auto, hci0; several times.")
 @pass_app
 def run(
     app: App,
     /,
     nfc: Sequence[str],
     can: Sequence[str],
+    ble: Sequence[str],
     http: str | None,
     ros1: bool,
     ros2: bool,
@@ -65,6 +67,7 @@ def run(
     if missing:
         raise UsageFailure(f"ncap run needs {', '.join(missing)}.", hint="Install: pip install 'teds-provision[ncap]'")
     places = [settings.with_own_source(f"can:{one}") for one in can] + [f"nfc:{one}" for one in nfc]
+    places += [f"ble:{one}" for one in ble]
     sinks = [*(["ros1"] if ros1 else []), *(["ros2"] if ros2 else []), *([mqtt] if mqtt else [])]
     wanted = settings.Settings(
         places=tuple(dict.fromkeys(places)),

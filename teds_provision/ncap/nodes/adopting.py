@@ -44,7 +44,11 @@ class Adopting:
             verified = self._virtual(node, uuid)
             self._note(uuid, verified=time.time(), verdict=verified)
             return True
-        if self._adopts() and self._station.policy.tombstone(node.uuid) is None:
+        if (
+            self._adopts()
+            and node.contact.link.capabilities.wired
+            and self._station.policy.tombstone(node.uuid) is None
+        ):
             who = identify(self._station, node)
             entry = None if who.whitelisted is not None else newcomer(self._station, node, who)
             with self._station.turn(node.uuid):

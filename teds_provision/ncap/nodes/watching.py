@@ -6,6 +6,7 @@ the tap is served there and then, because the node may be taken away.
 
 from __future__ import annotations
 
+import logging
 import threading
 import time
 from collections.abc import Callable
@@ -16,10 +17,12 @@ from typing import Any, Final, Protocol
 
 from teds_provision.errors import Frozen, LinkFailure, NodeBusy, TedsProvisionError
 from teds_provision.links import Contact, Notice, Port
+from teds_provision.links.ble.port import BlePort
 from teds_provision.links.can.port import CanPort
 from teds_provision.links.opening import open_place
 from teds_provision.measure.finding.buses import Buses
 from teds_provision.measure.finding.lookout import Sighting
+from teds_provision.measure.finding.sources import sole_user
 from teds_provision.ncap.live import Live
 from teds_provision.ncap.nodes.looking import Look, as_problem, is_listed, look
 from teds_provision.ncap.nodes.roster import Roster, check_lines
@@ -27,11 +30,14 @@ from teds_provision.ncap.nodes.turns import Turns
 from teds_provision.station.station import Station
 from teds_provision.talk.conversation import Conversation, SessionLost
 
+_log = logging.getLogger(__name__)
 WORKERS: Final = 4
 FIRST_PAUSE, LAST_PAUSE = 1.0, 30.0
 LOOK_AGAIN: Final = 30.0  # seconds until a node that could not be looked at is looked at again
 POLL, POLL_PER_NODE = 2.0, 0.05  # seconds between questions to everybody: 5 % of a bus however many there are
+POLL_AIR: Final = 15.0
 GONE_POLLS: Final = 2.5
+LENDING: Final = 10.0
 LOOK: Final = 0.5
 
 
@@ -78,6 +84,8 @@ class Watch:
         self._workers = ThreadPoolExecutor(WORKERS, thread_name_prefix=f"look {place[:20]}")
         self._pending: set[str] = set()
         self._guard = threading.Lock()
+        self._borrowers: set[int] = set()
+        self._free = threading.Event()
         self._thread = threading.Thread(target=self._run, name=f"watch {place}", daemon=True)
 
     def start(self) -> None:
@@ -109,29 +117,43 @@ class Watch:
             try:
                 if self.port is None:
                     self.port = open_place(self.place)
+                    pause = FIRST_PAUSE
                 self._say("up")
-                pause = FIRST_PAUSE
                 self._watch(self.port)
             except TedsProvisionError as error:
-                self._say("down", error)
-                self._roster.forget_place(self.place)
-                self._close()
+                self._down(error)
+            except Exception:  # noqa: BLE001 - a bug here must not end the watch on a link for good
+                _log.exception("The watch on %s failed; it begins anew.", self.place)
+                self._down(TedsProvisionError("Unexpected failure of the watch on this link.", hint="See the log."))
+            if self.port is None:
                 self._stop.wait(pause)
                 pause = min(2 * pause, LAST_PAUSE)
+
+    def _down(self, error: TedsProvisionError) -> None:
+        self._say("down", error)
+        self._roster.forget_place(self.place)
+        self._close()
 
     def _watch(self, port: Port) -> None:
         """See who comes until the link fails or the daemon ends."""
         if isinstance(port, CanPort):
-            self._watch_bus(port)
-            return
+            with sole_user(self._station, [port], "ncap run"):
+                self._watch_bus(port, POLL)
+        elif isinstance(port, BlePort):
+            self._watch_bus(port, POLL_AIR)
+        else:
+            self._watch_reader(port)
+
+    def _watch_reader(self, port: Port) -> None:
         while not self._stop.is_set():
             self._anew.clear()
             for contact in port.watch(stop=self._anew, notice=self._notice):
                 self._came(contact)
-            if not self._stop.is_set():
-                self._live.event("link", place=self.place, state="asking")
+            if self._borrowers:
+                self._lend()
+                return
 
-    def _watch_bus(self, port: CanPort) -> None:
+    def _watch_bus(self, port: CanPort | BlePort, poll: float) -> None:
         """The look-out tells of who answers (:meth:`saw`); here is seen who does not any more, and whether it works."""
         bus = self._buses.add(port)
         while not self._stop.is_set():
@@ -142,7 +164,7 @@ class Watch:
                     bus.lookout.discover()
             failure = bus.lookout.failure
             self._say("up" if failure is None else "down", failure)
-            every = max(POLL, POLL_PER_NODE * len(self._known))
+            every = max(poll, POLL_PER_NODE * len(self._known))
             bus.lookout.poll(every)
             self._see_who_left(GONE_POLLS * every + 1.0)
             self._anew.wait(LOOK)
@@ -167,6 +189,31 @@ class Watch:
                 continue
             self._known.pop(uuid, None)
             self._notice(Notice("node-left", f"Node {uuid} does not answer any more.", uuid=last.uuid))
+
+    # -- a reader is one command's at a time ---------------------------------------------------------------------------
+
+    def borrow(self, who: object) -> bool:
+        """Lend the reader to a command of this machine until it is given back; False where this is no reader."""
+        if not self.place.startswith("nfc:"):
+            return False
+        self._borrowers.add(id(who))
+        self._anew.set()
+        self._free.wait(LENDING)
+        return True
+
+    def give_back(self, who: object) -> None:
+        """The command has ended."""
+        self._borrowers.discard(id(who))
+
+    def _lend(self) -> None:
+        """Close the reader for as long as somebody has it."""
+        self._close()
+        self._roster.forget_place(self.place)
+        self._say("lent")
+        self._free.set()
+        while self._borrowers and not self._stop.wait(0.1):
+            pass
+        self._free.clear()
 
     def _close(self) -> None:
         port, self.port = self.port, None
@@ -237,6 +284,11 @@ class Watch:
             self._roster.note(uuid, "problem", problem=as_problem(lost.cause))
         except TedsProvisionError as error:
             self._roster.note(uuid, "problem", problem=as_problem(error))
+        except Exception:  # noqa: BLE001 - a worker has nobody else who would tell of it
+            _log.exception("Looking at node %s failed.", uuid)
+            self._roster.note(
+                uuid, "problem", problem=as_problem(TedsProvisionError("Unexpected failure: see the log."))
+            )
         finally:
             with self._guard:
                 self._pending.discard(uuid)

@@ -109,6 +109,8 @@ OPERATIONS: Final = (
     ),
     Operation("POST", "/login-link", "The page's address with a token that works once (Unix socket alone).",
               members("url", url=text()), members(closed=True, read_only=FLAG)),
+    Operation("GET", "/lend", "Have the readers for as long as the answer goes on (Unix socket alone).", text(),
+              document=True),
     Operation("GET", "/openapi.json", "This description.", members("openapi info paths")),
 )  # fmt: skip
 

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Awaitable, Callable
+from collections.abc import AsyncIterator, Awaitable, Callable
 from datetime import datetime
 from typing import Any, Final
 
 from starlette.requests import Request
-from starlette.responses import JSONResponse, Response
+from starlette.responses import JSONResponse, Response, StreamingResponse
 from starlette.routing import Route
 
 from teds_provision.errors import NotFound, PolicyRefused, UsageFailure
@@ -25,6 +25,7 @@ _KINDS: Final = ("periodic", "event", "free")
 _MOST_ENTRIES: Final = 10_000
 _FASTEST: Final = 1e6
 _LARGEST: Final = 1e300
+_LENT_LOOK: Final = 0.5
 
 
 class Resources:
@@ -55,6 +56,7 @@ class Resources:
             Route("/log", self.log),
             Route("/login-link", self.login_link, methods=["POST"]),
             Route("/openapi.json", self.openapi),
+            Route("/lend", self.lend),
         ]
 
     async def _node_of(self, request: Request) -> str:
@@ -136,6 +138,27 @@ class Resources:
         if caller.kind != "socket":
             raise PolicyRefused("A link to log in is given on the machine alone.", hint="teds-provision ncap open")
         return JSONResponse({"url": self._daemon.login_url(read_only=read_only)})
+
+    async def lend(self, request: Request) -> Response:
+        """GET /lend: the readers are the caller's for as long as this answer is not ended; over the socket alone."""
+        caller: Caller = request.scope[CALLER]
+        if caller.kind != "socket":
+            raise PolicyRefused("Readers are lent on this machine alone.")
+        watches = list(self._daemon.watches)
+
+        async def lent() -> AsyncIterator[str]:
+            try:
+                for watch in watches:
+                    await asyncio.to_thread(watch.borrow, request)
+                yield "lent\n"
+                while True:  # a client that has gone is seen when it is written to
+                    await asyncio.sleep(_LENT_LOOK)
+                    yield ".\n"
+            finally:
+                for watch in watches:
+                    watch.give_back(request)
+
+        return StreamingResponse(lent(), media_type="text/plain")
 
     # -- nodes -------------------------------------------------------------------------------------------------------
 

@@ -162,7 +162,7 @@ SCHEMAS: Final[dict[str, Schema]] = {
         place=text(),
         via=text(),
         virtual=FLAG,
-        state=text(enum=["opening", "up", "down"]),
+        state=text(enum=["opening", "up", "down", "lent"]),
         problem=or_null(ref("Problem")),
         waiting=maybe("string"),
         since=TIME,

@@ -1,0 +1,80 @@
+"""Taps: a provisioning that waits for one and is followed live; a tap that nobody asked for; a reader that is lent."""
+
+from __future__ import annotations
+
+import threading
+from typing import Any
+
+import pytest
+
+from tests.e2e.desk import ANGLE, Desk
+from tests.ncap.service import Service, until
+
+pytestmark = pytest.mark.link
+
+
+def test_a_provisioning_waits_for_the_tap_and_every_step_is_told(desk: Desk) -> None:
+    service = Service(desk, desk.station()).start("--nfc", desk.links.nfc)
+    node = desk.node("board", called="board")
+    events: list[dict[str, Any]] = []
+    with service.client() as asked:
+        until(lambda: [link["state"] for link in asked.status()["links"]] == ["up", "up"])
+        listening = service.client()
+
+        def follow() -> None:
+            for message in listening.live():
+                events.append(message)
+                if message.get("event") == "provision" and message["state"] in ("done", "failed"):
+                    return
+
+        following = threading.Thread(target=follow, daemon=True)
+        following.start()
+        until(lambda: events)
+        asked_for = asked.request("POST", f"/nodes/{node.uuid}/provision", {"profile": ANGLE, "name": "crane"})
+        assert (asked_for["state"], asked_for["waits_for"]) == ("waiting", "tap")
+        node.start()
+        following.join(30)
+        told = [one for one in events if one.get("event") == "provision"]
+        assert told[0]["state"] == "waiting"
+        done = [one["step"] for one in told if one.get("result") in ("done", "nothing to do")]
+        assert done == ["identify", "whitelist", "agree", "build", "sign", "write", "verify"]
+        assert told[-1]["state"] == "done", told[-1]
+        tapped = next(one for one in events if one.get("event") == "node" and one["state"] == "tapped")
+        assert tapped["uuid"] == node.uuid
+        found = asked.node(node.uuid)
+        assert (found["name"], found["verdict"], found["via"]) == ("crane", "authentic", "nfc")
+        node.stop()
+        until(lambda: not asked.node(node.uuid)["present"])
+        node.start()  # a tap that nobody asked for anything: it is looked at
+        until(lambda: asked.node(node.uuid)["present"])
+    service.end()
+
+
+def test_the_next_board_that_is_tapped_is_provisioned_whichever_it_is(desk: Desk) -> None:
+    service = Service(desk, desk.station()).start("--nfc", desk.links.nfc)
+    with service.client() as asked:
+        asked.request("POST", "/nodes/next/provision", {"profile": ANGLE, "name": "next one"})
+        node = desk.node("board").start()
+        run = until(lambda: service_run(asked, node.uuid))
+        assert (run["state"], run["verdict"]) == ("done", "authentic"), run
+    service.end()
+
+
+def service_run(asked: Any, uuid: str) -> Any:
+    found = next((one for one in asked.nodes() if one["uuid"] == uuid), None)
+    if found is None or found["verdict"] != "authentic":
+        return None
+    run = asked.request("GET", f"/nodes/{uuid}/provision")
+    return run if run["state"] in ("done", "failed") else None
+
+
+def test_a_command_borrows_the_reader_and_gives_it_back(desk: Desk) -> None:
+    service = Service(desk, desk.station()).start("--nfc", desk.links.nfc)
+    node = desk.node("board").start()
+    with service.client() as asked:
+        until(lambda: asked.status()["links"][1]["state"] == "up")
+        done = service.station.provision("nfc", "--profile", ANGLE)
+        assert (done["uuid"], done["verdict"]) == (node.uuid, "authentic")
+        until(lambda: asked.status()["links"][1]["state"] == "up")
+        until(lambda: asked.node(node.uuid)["verdict"] == "authentic")
+    service.end()
