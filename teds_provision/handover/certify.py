@@ -11,13 +11,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from teds_provision import vault as vaults
 from teds_provision.errors import BadData, NotAuthentic, NotFound, PolicyRefused
 from teds_provision.protocol.handover.jwk import point_of, public_jwk
 from teds_provision.protocol.handover.strict_json import decode_base64url, dump, encode_base64url, load_object
-from teds_provision.protocol.keys import PrivateKey, fingerprint, station_key_message, verify
+from teds_provision.protocol.keys import PrivateKey, SoftwareKey, fingerprint, station_key_message, verify
 from teds_provision.station.station import Station
 from teds_provision.store import Store, StoreLock
-from teds_provision.vault import create_vault
 
 if TYPE_CHECKING:
     from teds_provision.vault import Ask, Vault
@@ -114,7 +114,7 @@ def ask_for_certificate(home: Path, *, name: str | None, keystore: str | None, a
         if station.identity.is_complete():
             return make_request(station.name, station.vault.identity())
         if station.identity.requested is None:
-            vault, why = create_vault(home, store.id, keystore, ask, with_ca=False)
+            vault, why = vaults.create_vault(home, store.id, keystore, ask, with_ca=False)
             where = keystore if keystore and keystore.startswith("pkcs11:") else vault.kind
             station.adopt(vault)
             with station.transaction():
@@ -200,10 +200,7 @@ def drop_ca(station: Station) -> bool:
 
 def import_ca(station: Station, vault: Vault, path: Path, passphrase: str) -> None:
     """Bring the CA key back; raises WrongPassphrase, NotFound, VaultFailure, PolicyRefused (another CA's key)."""
-    from teds_provision.protocol.keys import SoftwareKey
-    from teds_provision.vault.ca_file import read_ca
-
-    if SoftwareKey.from_secret(read_ca(path, passphrase)).point != station.ca:
+    if SoftwareKey.from_secret(vaults.ca_file.read_ca(path, passphrase)).point != station.ca:
         raise PolicyRefused(f"{path} holds another CA key than that of this station ({fingerprint(station.ca)[:16]}).")
     vault.import_ca(path, passphrase)
     station.audit("ca", None, "imported", ca=fingerprint(station.ca))

@@ -25,6 +25,7 @@ from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from teds_provision import vault as vaults
 from teds_provision.errors import NotFound
 from teds_provision.lazy import late
 from teds_provision.station.groups import Groups
@@ -241,8 +242,6 @@ def initialise(
 
     Each part is durable before the next begins, so that an interrupted init is carried on by the same command.
     """
-    from teds_provision.vault import create_vault
-
     station = Station(Store.open(home, create=True), ask)
     if station.identity.is_complete():
         return station, station.identity.keystore_why
@@ -252,7 +251,7 @@ def initialise(
         if station.identity.requested is not None:
             raise not_certified()
         more = {} if costs is None else {"costs": costs}
-        vault, why = create_vault(home, station.id, keystore, ask, **more)  # type: ignore[arg-type]
+        vault, why = vaults.create_vault(home, station.id, keystore, ask, **more)  # type: ignore[arg-type]
         key, ca = vault.identity(), vault.ca()
         if ca is None:
             raise NotFound("The vault holds no CA key.", hint="Choose another keystore, or bring the CA key back.")

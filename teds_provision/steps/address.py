@@ -6,6 +6,7 @@ from teds_provision.errors import Garbled
 from teds_provision.protocol.messages.frames import Function, security_command
 from teds_provision.station.station import Station
 from teds_provision.steps.agree import open_session
+from teds_provision.steps.read import read_identity
 from teds_provision.talk.conversation import Conversation, SessionLost
 
 
@@ -33,6 +34,4 @@ def set_address(station: Station, node: Conversation, address: int) -> bool:
 
 
 def _address_of(node: Conversation) -> int:
-    from teds_provision.steps.read import read_identity
-
     return read_identity(node).can_address

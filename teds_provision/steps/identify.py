@@ -7,6 +7,7 @@ from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass, replace
 
+from teds_provision import teds
 from teds_provision.errors import BadData, NodeRefused, NoKeyring, NotAuthentic, WrongPassphrase
 from teds_provision.harmless import printable
 from teds_provision.protocol.fingerprints import is_whole
@@ -149,8 +150,6 @@ class Description:
 
 def describe(node: Conversation) -> Description:
     """Read name and number of channels from Meta-TEDS and XdcrName, where the node has them; nothing is verified."""
-    from teds_provision import teds
-
     name: str | None = None
     channels = 0
     for block in ((0, AccessCode.META), (0, AccessCode.NAME)):

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Final
 from teds_provision import teds
 from teds_provision.errors import BadData, NotFound, PolicyRefused, UsageFailure
 from teds_provision.harmless import printable
+from teds_provision.lazy import late
 from teds_provision.station.station import Station
 from teds_provision.teds.codec.codes import AccessCode
 from teds_provision.teds.image import Image
@@ -17,10 +18,14 @@ from teds_provision.teds.profile.load import default_folders, load_profile, pass
 from teds_provision.teds.sheet import Sheet
 
 if TYPE_CHECKING:
+    from teds_provision.teds import calibration
     from teds_provision.teds.calibration import Calibration
+    from teds_provision.teds.guard import guard as guarding
     from teds_provision.teds.guard.guard import GuardFinding
     from teds_provision.teds.image import BlockId
     from teds_provision.teds.profile import BuiltDatasheet, Profile
+else:  # numpy: not for a datasheet without calibration
+    calibration, guarding = late("teds_provision.teds.calibration"), late("teds_provision.teds.guard.guard")
 
 NAME_OCTETS: Final = 120
 """The longest name of a node, as UTF-8: what wire, labels and lists have room for."""
@@ -239,10 +244,8 @@ def guard(
     """
     if not _is_calibrated(image, has):
         return ()
-    from teds_provision.teds.guard.guard import check_calibration  # numpy: not for a datasheet without calibration
-
     old = has.unsigned_blocks() if has is not None else None
-    findings = check_calibration(image.unsigned_blocks(), old, profile, calibrations=calibrations)
+    findings = guarding.check_calibration(image.unsigned_blocks(), old, profile, calibrations=calibrations)
     errors = [_said(finding) for finding in findings if finding.severity == "error"]
     if errors and accepted is None:
         more = f" (and {len(errors) - 1} more)" if len(errors) > 1 else ""
@@ -328,9 +331,7 @@ def _load(station: Station, wanted: str) -> Profile:
 def _from_file(order: BuildOrder, profile: Profile) -> Mapping[int, Calibration] | None:
     if order.calibration is None:
         return None
-    from teds_provision.teds.calibration import load_calibrations  # numpy, for the fit
-
-    return load_calibrations(order.calibration, profile)
+    return calibration.load_calibrations(order.calibration, profile)
 
 
 def _made(

@@ -221,14 +221,18 @@ def _between(uuid: bytes, meta: Meta, channels: list[Channel]) -> Iterator[Sheet
         message = f"The Meta-TEDS counts {meta.channels} channels; {len(described)} are described."
         yield SheetFinding(0, AccessCode.META, "warning", "channels", message)
     for channel in channels:
-        if channel.calibration_problem:
-            yield SheetFinding(
-                channel.number, AccessCode.CALIBRATION, "warning", "calibration", channel.calibration_problem
-            )
-        if not channel.described:
-            message = "There is a calibration, and nothing that describes the channel."
-            yield SheetFinding(channel.number, AccessCode.CALIBRATION, "warning", "undescribed", message)
+        yield from _of_calibration(channel)
     yield from _same_names(described)
+
+
+def _of_calibration(channel: Channel) -> Iterator[SheetFinding]:
+    if channel.calibration_problem:
+        yield SheetFinding(
+            channel.number, AccessCode.CALIBRATION, "warning", "calibration", channel.calibration_problem
+        )
+    if not channel.described:
+        message = "There is a calibration, and nothing that describes the channel."
+        yield SheetFinding(channel.number, AccessCode.CALIBRATION, "warning", "undescribed", message)
 
 
 def _same_names(channels: list[Channel]) -> Iterator[SheetFinding]:

@@ -3,12 +3,20 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from teds_provision.errors import UsageFailure, VaultFailure, WrongPassphrase
+from teds_provision.lazy import late
 from teds_provision.vault.agent import asking
 from teds_provision.vault.base import Ask, Vault
 from teds_provision.vault.hardening import harden
 from teds_provision.vault.passphrase import PRODUCT, Costs
+
+if TYPE_CHECKING:
+    from teds_provision.vault import file_vault, keyring_vault, pkcs11
+else:  # a station has one of them, and argon2, keyring and python-pkcs11 are heavy
+    file_vault, keyring_vault = late("teds_provision.vault.file_vault"), late("teds_provision.vault.keyring_vault")
+    pkcs11 = late("teds_provision.vault.pkcs11")
 
 _opened: dict[tuple[Path, str, str], Vault] = {}
 
@@ -66,52 +74,41 @@ def _create(
     *,
     with_ca: bool,
 ) -> tuple[Vault, str]:
-    from teds_provision.vault.file_vault import FILE_NAME, FileVault
-    from teds_provision.vault.keyring_vault import KeyringVault
-
     if keystore is not None and keystore.startswith("pkcs11:"):
-        from teds_provision.vault.pkcs11 import Pkcs11Vault
-
-        return Pkcs11Vault.create(
+        return pkcs11.Pkcs11Vault.create(
             home, store_id, keystore, ask, restored=restored, with_ca=with_ca
         ), "the token was asked for"
     if keystore == "keyring":
-        return KeyringVault.create(store_id, restored=restored), "the keyring was asked for"
+        return keyring_vault.KeyringVault.create(store_id, restored=restored), "the keyring was asked for"
     if keystore == "file":
-        vault = FileVault.create(home, store_id, ask, costs=costs, restored=restored)
+        vault = file_vault.FileVault.create(home, store_id, ask, costs=costs, restored=restored)
         return vault, "the passphrase file was asked for"
     if keystore is not None:
         raise UsageFailure(f"There is no keystore {keystore!r}.", hint="Give keyring, file or pkcs11:URI.")
-    if (home / FILE_NAME).exists():
-        vault = FileVault.create(home, store_id, ask, restored=restored)
+    if (home / file_vault.FILE_NAME).exists():
+        vault = file_vault.FileVault.create(home, store_id, ask, restored=restored)
         return vault, "the passphrase file is already there"
     try:
-        return KeyringVault.create(store_id, restored=restored), "a keyring works here"
+        return keyring_vault.KeyringVault.create(store_id, restored=restored), "a keyring works here"
     except VaultFailure as failure:
         why = f"no keyring can be used: {failure.message}"
-    return FileVault.create(home, store_id, ask, costs=costs, restored=restored), why
+    return file_vault.FileVault.create(home, store_id, ask, costs=costs, restored=restored), why
 
 
 def _open(home: Path, store_id: str, keystore: str, ask: Ask, *, agent: bool) -> Vault:
     if keystore == "file":
-        from teds_provision.vault.file_vault import FileVault
-
-        return FileVault.open(home, store_id, ask, held=asking.held(home, "file") if agent else None)
+        return file_vault.FileVault.open(home, store_id, ask, held=asking.held(home, "file") if agent else None)
     if keystore == "keyring":
-        from teds_provision.vault.keyring_vault import KeyringVault
-
-        return KeyringVault.open(store_id)
+        return keyring_vault.KeyringVault.open(store_id)
     if keystore.startswith("pkcs11:"):
-        from teds_provision.vault.pkcs11 import Pkcs11Vault
-
         pin = asking.held(home, "pkcs11") if agent else None
         if pin is not None:
             try:
-                return Pkcs11Vault.open(home, store_id, keystore, _holding(pin, ask))
+                return pkcs11.Pkcs11Vault.open(home, store_id, keystore, _holding(pin, ask))
             except WrongPassphrase:  # the PIN is another one by now: a second try could lock the token
                 asking.lock(home)
                 raise
-        return Pkcs11Vault.open(home, store_id, keystore, ask)
+        return pkcs11.Pkcs11Vault.open(home, store_id, keystore, ask)
     raise UsageFailure(f"There is no keystore {keystore!r}.", hint="Give keyring, file or pkcs11:URI.")
 
 

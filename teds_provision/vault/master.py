@@ -15,6 +15,7 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 from teds_provision.errors import VaultFailure
+from teds_provision.protocol.keys import SoftwareKey
 
 MASTER_OCTETS = 32
 _SECRET_OCTETS = 32
@@ -87,8 +88,6 @@ class Material:
     @classmethod
     def generate(cls) -> Material:
         """Make a station key, a CA key and a master key."""
-        from teds_provision.protocol.keys import SoftwareKey
-
         return cls(SoftwareKey.generate().secret(), SoftwareKey.generate().secret(), MasterKeys.generate())
 
     def with_ca(self, secret: bytes | None) -> Material:

@@ -4,10 +4,17 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from teds_provision.errors import VaultFailure
+from teds_provision.lazy import late
 from teds_provision.protocol.keys import PrivateKey, SoftwareKey, fingerprint
 from teds_provision.vault.master import MasterKeys, Material
+
+if TYPE_CHECKING:
+    from teds_provision.vault import ca_file
+else:  # PKCS #8: for the commands of the CA key alone
+    ca_file = late("teds_provision.vault.ca_file")
 
 
 class SoftwareVault(ABC):
@@ -47,11 +54,9 @@ class SoftwareVault(ABC):
 
         Raises VaultFailure: no CA key here, weak passphrase, the file exists or cannot be written.
         """
-        from teds_provision.vault.ca_file import write_ca
-
         if self._material.ca is None:
             raise VaultFailure("This vault holds no CA key.", hint="It was exported and dropped, or never made here.")
-        write_ca(path, self._material.ca, passphrase)
+        ca_file.write_ca(path, self._material.ca, passphrase)
 
     def drop_ca(self) -> bool:
         """Take the CA key out of the vault for good; False if there is none. Export it first."""
@@ -65,9 +70,7 @@ class SoftwareVault(ABC):
 
         Raises WrongPassphrase, VaultFailure (not such a file, or another CA key is here), NotFound.
         """
-        from teds_provision.vault.ca_file import read_ca
-
-        secret = read_ca(path, passphrase)
+        secret = ca_file.read_ca(path, passphrase)
         if self._material.ca not in (None, secret):
             raise VaultFailure("This vault holds another CA key.", hint="Export and drop that one first.")
         if self._material.ca is None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Final
 
-from teds_provision.protocol.operation.can_frames import frames_of
+from teds_provision.protocol.operation.can_frames import FD_OCTETS, fd_length, frames_of
 
 MILLION: Final = 10**6
 MOST_LOAD: Final = 0.6
@@ -58,8 +58,6 @@ def bus_load(
         bits = whole * classic_bits(_FULL_OCTETS, worst=worst) + (classic_bits(rest, worst=worst) if rest else 0)
         seconds = bits / bitrate
     else:
-        from teds_provision.protocol.operation.can_frames import FD_OCTETS, fd_length
-
         whole, rest = divmod(length, FD_OCTETS)
         seconds = whole * fd_seconds(FD_OCTETS, bitrate, data_bitrate, worst=worst)
         seconds += fd_seconds(fd_length(rest), bitrate, data_bitrate, worst=worst) if rest else 0.0

@@ -8,6 +8,7 @@ import re
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from difflib import get_close_matches
+from itertools import count, takewhile
 from typing import Final
 
 from teds_provision.errors import BadData
@@ -150,23 +151,34 @@ def _header(table: CsvTable, number: int, cells: list[str]) -> _Columns | None:
     """Columns that a header names; None where the first line is data."""
     if all(map(_is_number, cells)):
         return None
-    parts = [_UNIT.match(cell) for cell in cells]
-    names = [match[1].lower() if match else "" for match in parts]
-    units = [(match[2] or match[3]) if match else None for match in parts]
+    heads = [_name_and_unit(cell) for cell in cells]
+    names = [name for name, _ in heads]
     channel = next((at for at, name in enumerate(names) if name in CHANNEL), None)
-    rest = [at for at in range(len(names)) if at != channel]
     if {"from", "to"} <= set(names):
         return _segment_columns(table, number, names, channel)
+    raw, value = _pair_columns(table, number, names, channel)
+    unit = heads[value][1]
+    if unit:
+        table.unit = (unit, number)
+    return _Columns(("raw", "value"), (raw, value), channel)
+
+
+def _name_and_unit(cell: str) -> tuple[str, str | None]:
+    """``Torque [N·m]`` or ``Torque (N·m)``: the name in small letters, and the unit."""
+    match = _UNIT.match(cell)
+    return (match[1].lower(), match[2] or match[3]) if match else ("", None)
+
+
+def _pair_columns(table: CsvTable, number: int, names: list[str], channel: int | None) -> tuple[int, int]:
+    """Places of raw value and value: the raw one by its name, else the first."""
+    rest = [at for at in range(len(names)) if at != channel]
     if len(rest) != 2:
         raise BadData(
             f"{table.file}:{number}: the header names {len(rest)} columns besides the channel; "
             "raw value and value are two."
         )
     raw = next((at for at in rest if names[at] in RAW), rest[0])
-    value = next(at for at in rest if at != raw)
-    if units[value]:
-        table.unit = (units[value], number)
-    return _Columns(("raw", "value"), (raw, value), channel)
+    return raw, next(at for at in rest if at != raw)
 
 
 def _is_number(cell: str) -> bool:
@@ -178,20 +190,22 @@ def _is_number(cell: str) -> bool:
 
 
 def _segment_columns(table: CsvTable, number: int, names: list[str], channel: int | None) -> _Columns:
-    degree = 0
-    while f"c{degree}" in names:
-        degree += 1
-    wanted = (*SEGMENT, *(f"c{power}" for power in range(degree)))
-    extra = [name for at, name in enumerate(names) if name not in wanted and at != channel]
-    missing = [name for name in (*SEGMENT, "c0") if name not in names]
-    twice = [name for name in wanted if names.count(name) > 1]
-    if twice:
-        raise BadData(f'{table.file}:{number}: the column "{twice[0]}" is there twice.')
-    if extra or missing:
-        what = f'"{extra[0]}" is no column' if extra else f'the column "{missing[0]}" is missing'
-        raise BadData(f"{table.file}:{number}: {what}: a table of segments has from, to, offset, c0, c1 and so on.")
+    wanted = (*SEGMENT, *takewhile(names.__contains__, (f"c{power}" for power in count())))
+    twice = next((name for name in wanted if names.count(name) > 1), None)
+    if twice is not None:
+        raise BadData(f'{table.file}:{number}: the column "{twice}" is there twice.')
+    wrong = _wrong_columns(names if channel is None else names[:channel] + names[channel + 1 :], wanted)
+    if wrong:
+        raise BadData(f"{table.file}:{number}: {wrong}: a table of segments has from, to, offset, c0, c1 and so on.")
     table.segments = True
     return _Columns(wanted, tuple(names.index(name) for name in wanted), channel)
+
+
+def _wrong_columns(names: list[str], wanted: tuple[str, ...]) -> str:
+    for name in names:
+        if name not in wanted:
+            return f'"{name}" is no column'
+    return next((f'the column "{name}" is missing' for name in (*SEGMENT, "c0") if name not in names), "")
 
 
 def _row(table: CsvTable, number: int, cells: list[str], columns: _Columns, decimal_comma: bool) -> Row:

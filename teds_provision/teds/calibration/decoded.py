@@ -28,12 +28,11 @@ def from_decoded(
             f"The Calibration TEDS of channel {number} has no inputs and coefficients that are understood here.",
             hint="Its field numbers are not those of docs/teds.md; the octets are kept as they are.",
         )
-    method = _top(decoded, "Method")
     return Calibration(
         inputs[0].channel if channel is None else channel,
-        METHODS[method] if isinstance(method, int) and method < len(METHODS) else _guess(inputs),
+        _method(_top(decoded, "Method")) or _guess(inputs),
         inputs,
-        tuple(float(value) for value in coefficients),
+        tuple(map(float, coefficients)),
         unit=calibrated_unit(decoded, units or Units()),
         zero_offset=_number(decoded, "ZeroOffset") or 0.0,
         low_limit=_number(decoded, "LowLimit"),
@@ -45,6 +44,10 @@ def from_decoded(
         monotone=_monotone(_top(decoded, "Monotone")),
         raw_range=_raw_range(_top(decoded, "RawRange")),
     )
+
+
+def _method(code: object) -> Method | None:
+    return METHODS[code] if isinstance(code, int) and code < len(METHODS) else None
 
 
 def _monotone(code: object) -> Monotone | None:
@@ -114,6 +117,11 @@ def _seconds(value: object) -> float | None:
     if not isinstance(value, TimeInstance):
         return None
     return value.seconds + value.nanoseconds * 1e-9
+
+
+def is_sound(calibration: Calibration) -> bool:
+    """Whether it can be computed: every number of it is a number, and the boundaries of its segments ascend."""
+    return is_finite(calibration) and all(part.ascending for part in calibration.inputs)
 
 
 def is_finite(calibration: Calibration) -> bool:

@@ -128,13 +128,18 @@ def _order(table: Table, file: str) -> Order:
     return order
 
 
+def _only_channel(order: Order, profile: Profile) -> ChannelProfile:
+    """The one channel that wants a calibration, or the one that there is."""
+    wanting = [channel for channel in profile.channels if channel.calibration.required] or profile.channels
+    if len(wanting) != 1:
+        raise order.wrong("channel", f"{profile.name} has {len(profile.channels)} channels: say which one this is for.")
+    return wanting[0]
+
+
 def _channels(order: Order, profile: Profile) -> list[ChannelProfile]:
     value = order.get("channel")
     if value is None:
-        wanting = [channel for channel in profile.channels if channel.calibration.required] or list(profile.channels)
-        if len(wanting) == 1:
-            return wanting
-        raise order.wrong("channel", f"{profile.name} has {len(profile.channels)} channels: say which one this is for.")
+        return [_only_channel(order, profile)]
     if isinstance(value, str) and value.strip() == "all":
         return list(profile.channels)
     match = _CHANNELS.match(str(value).strip()) if not isinstance(value, bool) else None

@@ -96,12 +96,7 @@ def fit(
             part, coefficients = _polynomial(pairs, 1, about=0.0)
         case "polynomial":
             wanted = min(3, distinct - 1) if degree is None else degree
-            if not 1 <= wanted <= MAXIMUM_DEGREE:
-                raise BadData(f"The degree of a polynomial goes from 1 to {MAXIMUM_DEGREE}, not {wanted}.")
-            if distinct <= wanted:
-                raise BadData(
-                    f"A polynomial of degree {wanted} needs {wanted + 1} different inputs; there are {distinct}."
-                )
+            _require_degree(wanted, distinct)
             xs = [x for x, _ in pairs]
             part, coefficients = _polynomial(pairs, wanted, about=(min(xs) + max(xs)) / 2)
         case "table":
@@ -112,6 +107,13 @@ def fit(
     if not curve.ascending:
         raise BadData("Two inputs of the calibration lie so close together that a Float32 cannot tell them apart.")
     return Calibration(channel, method, (curve,), coefficients, points=tuple(points), actuator=actuator)
+
+
+def _require_degree(degree: int, inputs: int) -> None:
+    if not 1 <= degree <= MAXIMUM_DEGREE:
+        raise BadData(f"The degree of a polynomial goes from 1 to {MAXIMUM_DEGREE}, not {degree}.")
+    if inputs <= degree:
+        raise BadData(f"A polynomial of degree {degree} needs {degree + 1} different inputs; there are {inputs}.")
 
 
 _Part = tuple[int, tuple[float, ...], tuple[float, ...]]

@@ -137,10 +137,11 @@ class ChannelInterpreter:
             return self._stated(values)
         if self.channel.actuator:
             return self._curve(self._stated(values))
-        missing = [number for number in self.others if number not in (others or {})]
-        if missing:
-            raise BadData(f"Channel {self.channel.number} is compensated by channel {missing[0]}, which is not given.")
-        more = [self._readers[n].numbers((others or {})[n])[0] for n in self.inputs if n != self.channel.number]
+        given = others or {}
+        for number in self.others:
+            if number not in given:
+                raise BadData(f"Channel {self.channel.number} is compensated by channel {number}, which is not given.")
+        more = [self._readers[n].numbers(given[n])[0] for n in self.inputs if n != self.channel.number]
         return self._inverse(self._stated(values), more)
 
     def beyond(self, value: float) -> str:

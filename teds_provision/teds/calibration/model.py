@@ -139,9 +139,7 @@ class Calibration:
         out = []
         if self.date > now + timedelta(days=1):
             out.append(f"the calibration date {self.date:%Y-%m-%d} lies in the future.")
-        due = self.due
-        if due is None and demanded_interval:
-            due = replace(self, interval=demanded_interval).due
+        due = self._due_by(demanded_interval)
         if due is not None and due < now:
             late = (now - due).days
             out.append(f"the calibration of {self.date:%Y-%m-%d} was due again on {due:%Y-%m-%d}, {late} days ago.")
@@ -149,6 +147,12 @@ class Calibration:
             asked, given = demanded_interval / 86_400, self.interval / 86_400
             out.append(f"its interval of {given:.0f} days is longer than the {asked:.0f} days that its type asks for.")
         return out
+
+    def _due_by(self, demanded_interval: float | None) -> datetime | None:
+        """When the next calibration is due, by the interval that its type asks for where it states none itself."""
+        if self.due is None and demanded_interval:
+            return replace(self, interval=demanded_interval).due
+        return self.due
 
     def fields(self, edition: Edition = 2007) -> list[tuple[str, object]]:
         """Fields of the Calibration TEDS (access code 5) by name, ready to be composed."""

@@ -71,11 +71,8 @@ def calibration_of(order: Order, channel: ChannelProfile) -> Calibration:
         if error.message.startswith(f"{order.file}:"):
             raise
         raise order.wrong("", error.message) from error
-    stated = _uncertainty(order, unit)
-    low, high = order.number("low-limit"), order.number("high-limit")
-    if low is not None and high is not None and low >= high:
-        raise order.wrong("low-limit", "it must be below the high limit.")
-    known = [value for value in (stated, _misfit(curve)) if value]
+    known = [value for value in (_uncertainty(order, unit), _misfit(curve)) if value]
+    low, high = _limits(order)
     by = order.get("by")
     return replace(
         curve,
@@ -90,6 +87,13 @@ def calibration_of(order: Order, channel: ChannelProfile) -> Calibration:
         monotone=channel.calibration.monotone,
         raw_range=channel.calibration.raw_range,
     )
+
+
+def _limits(order: Order) -> tuple[float | None, float | None]:
+    low, high = order.number("low-limit"), order.number("high-limit")
+    if low is not None and high is not None and low >= high:
+        raise order.wrong("low-limit", "it must be below the high limit.")
+    return low, high
 
 
 def _misfit(curve: Calibration) -> float | None:
@@ -111,15 +115,19 @@ def _curve(order: Order, channel: ChannelProfile) -> Calibration:
         case ["inputs", "coefficients"]:
             return _multinomial(order, channel, method)
         case ["slope"]:
-            pair = (order.number("intercept") or 0.0, order.number("slope") or 0.0)
-            part = CalibrationInput(channel.number, 1, _ends(order, channel), (0.0,))
-            return Calibration(channel.number, method or "linear", (part,), pair, actuator=channel.type == 1)
+            return _line(order, channel, method)
         case ["coefficients"]:
             return _ready(order, channel, method, degree)
         case []:
             raise order.wrong("", "there is nothing to calibrate with: points, coefficients, or slope and intercept.")
         case _:
             raise order.wrong(sources[0], f"only one of {', '.join(sources)} can be the calibration.")
+
+
+def _line(order: Order, channel: ChannelProfile, method: Method | None) -> Calibration:
+    pair = (order.number("intercept") or 0.0, order.number("slope") or 0.0)
+    part = CalibrationInput(channel.number, 1, _ends(order, channel), (0.0,))
+    return Calibration(channel.number, method or "linear", (part,), pair, actuator=channel.type == 1)
 
 
 def _fitted(order: Order, channel: ChannelProfile, method: Method | None, degree: int | None) -> Calibration:
@@ -152,13 +160,7 @@ def _points(order: Order) -> list[tuple[float, float]]:
 
 
 def _segments(order: Order, channel: ChannelProfile, method: Method | None) -> Calibration:
-    value, line = order.values["segments"]
-    rows = value if isinstance(value, list) else []
-    for number, (above, below) in enumerate(pairwise(rows)):
-        if above[1] != below[0]:
-            raise BadData(
-                f"{order.file}:{line + number + 1}: from: the segment does not begin where the last one ends."
-            )
+    rows = _connected(order)
     boundaries = (*(row[0] for row in rows), rows[-1][1])
     degree = len(rows[0]) - 4
     part = CalibrationInput(channel.number, degree, boundaries, tuple(row[2] for row in rows))
@@ -166,6 +168,18 @@ def _segments(order: Order, channel: ChannelProfile, method: Method | None) -> C
     chosen: Method = method or ("steps" if degree == 0 else "polynomial" if degree > 1 else "table")
     coefficients = tuple(number for row in rows for number in row[3:])
     return Calibration(channel.number, chosen, (part,), coefficients, actuator=channel.type == 1)
+
+
+def _connected(order: Order) -> list[tuple[float, ...]]:
+    """Rows of the table of segments (from, to, offset, C0, C1 …), each of which begins where the last one ends."""
+    value, line = order.values["segments"]
+    rows = value if isinstance(value, list) else []
+    for number, (above, below) in enumerate(pairwise(rows)):
+        if above[1] != below[0]:
+            raise BadData(
+                f"{order.file}:{line + number + 1}: from: the segment does not begin where the last one ends."
+            )
+    return rows
 
 
 def _ready(order: Order, channel: ChannelProfile, method: Method | None, degree: int | None) -> Calibration:

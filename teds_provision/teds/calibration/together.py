@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 from teds_provision.teds.calibration.interpreter import ChannelInterpreter
+from teds_provision.teds.calibration.model import Calibration
 from teds_provision.teds.calibration.samples import DataModel
 
 if TYPE_CHECKING:
@@ -29,27 +30,7 @@ class Together:
     """Channels side by side; make one with :meth:`of`. Values are in SI units, NaN where not valid."""
 
     def __init__(self, channels: Sequence[ChannelInterpreter], usable: Sequence[bool]) -> None:
-        count = len(channels)
-        curves = [one.channel.calibration for one in channels]
-        parts = [None if curve is None else curve.inputs[0] for curve in curves]
-        segments = max((part.segments for part in parts if part is not None), default=1)
-        degree = max((part.degree for part in parts if part is not None), default=1)
-        self._inner = np.full((count, segments - 1), np.inf)
-        self._offsets = np.zeros((count, segments))
-        self._terms = np.zeros((degree + 1, count, segments))
-        self._zero = np.zeros(count)
-        self._own_scale, self._own_offset = np.ones(count), np.zeros(count)
-        for row, (curve, part) in enumerate(zip(curves, parts, strict=True)):
-            if curve is None or part is None:
-                self._terms[1, row, :] = 1.0
-                continue
-            own = part.segments
-            self._inner[row, : own - 1] = part.boundaries[1:-1]
-            self._offsets[row, :own] = part.offsets
-            table = np.asarray(curve.coefficients, dtype=np.float64).reshape(own, part.degree + 1)
-            self._terms[: part.degree + 1, row, :own] = table.T
-            self._zero[row] = curve.zero_offset
-            self._own_scale[row], self._own_offset[row] = curve.unit.scale, curve.unit.offset
+        self._lay_curves([one.channel.calibration for one in channels])
         self._scale = np.array([one.unit.scale for one in channels])
         self._offset = np.array([one.unit.offset for one in channels])
         self._same = np.array([one.shown_as_computed for one in channels])
@@ -59,7 +40,34 @@ class Together:
         self._floor, self._ceiling = (np.array(ends) for ends in zip(*(one.accepted for one in channels), strict=True))
         self._usable = np.array(usable)
         self._width = channels[0].octets
-        self._columns = np.arange(count)
+        self._columns = np.arange(len(channels))
+
+    def _lay_curves(self, curves: Sequence[Calibration | None]) -> None:
+        """The curves as one table; a channel without one gives its raw values (one segment, C = [0, 1])."""
+        parts = [curve.inputs[0] for curve in curves if curve is not None]
+        segments = max((part.segments for part in parts), default=1)
+        degree = max((part.degree for part in parts), default=1)
+        count = len(curves)
+        self._inner = np.full((count, segments - 1), np.inf)
+        self._offsets = np.zeros((count, segments))
+        self._terms = np.zeros((degree + 1, count, segments))
+        self._zero = np.zeros(count)
+        self._own_scale, self._own_offset = np.ones(count), np.zeros(count)
+        for row, curve in enumerate(curves):
+            if curve is None:
+                self._terms[1, row, :] = 1.0
+            else:
+                self._lay_curve(row, curve)
+
+    def _lay_curve(self, row: int, curve: Calibration) -> None:
+        part = curve.inputs[0]
+        own = part.segments
+        self._inner[row, : own - 1] = part.boundaries[1:-1]
+        self._offsets[row, :own] = part.offsets
+        table = np.asarray(curve.coefficients, dtype=np.float64).reshape(own, part.degree + 1)
+        self._terms[: part.degree + 1, row, :own] = table.T
+        self._zero[row] = curve.zero_offset
+        self._own_scale[row], self._own_offset[row] = curve.unit.scale, curve.unit.offset
 
     @classmethod
     def of(cls, channels: Sequence[ChannelInterpreter], usable: Sequence[bool]) -> Together | None:
@@ -67,15 +75,7 @@ class Together:
         widths = {one.octets for one in channels}
         if len(widths) != 1 or max(widths) > _WORD:
             return None
-        for one in channels:
-            calibration = one.channel.calibration
-            if one.reader.form.model != DataModel.UNSIGNED or one.channel.actuator or one.others:
-                return None
-            if calibration is not None and (
-                len(calibration.inputs) != 1 or calibration.inputs[0].segments > _MOST_SEGMENTS
-            ):
-                return None
-        return cls(channels, usable)
+        return cls(channels, usable) if all(map(_can_stand_beside, channels)) else None
 
     def raw(self, rows: NDArray[np.uint8]) -> NDArray[np.uint64]:
         """Raw values, instants × channels, of instants as they stand in a message."""
@@ -108,3 +108,11 @@ class Together:
             if not valid.all():
                 total[~valid] = np.nan
             return total, valid
+
+
+def _can_stand_beside(one: ChannelInterpreter) -> bool:
+    """A sensor of unsigned integers with a curve over its own raw value, of not too many segments, or none."""
+    if one.reader.form.model != DataModel.UNSIGNED or one.channel.actuator or one.others:
+        return False
+    curve = one.channel.calibration
+    return curve is None or (len(curve.inputs) == 1 and curve.inputs[0].segments <= _MOST_SEGMENTS)

@@ -16,11 +16,12 @@ from teds_provision.teds.codec.frame_checks import MAX_TUPLES, Head
 from teds_provision.teds.codec.model import Decoded, Field, Severity, Value, Verdict
 from teds_provision.teds.codec.plausibility import check
 from teds_provision.teds.codec.recognition import shape_of, verdict_of
-from teds_provision.teds.codec.tables import MANUFACTURER, TEXT_BASED, FieldSpec, Table, name_of
+from teds_provision.teds.codec.tables import MANUFACTURER, TEXT_BASED, FieldSpec, name_of
 from teds_provision.teds.codec.text import split_text
 from teds_provision.teds.codec.values import READERS, is_packed_units, units_of
 
 SUB_SUM: Final = 12
+_ELEMENT_OCTETS: Final = {"f32[]": 4, "u16[]": 2}
 
 
 def decode(octets: bytes, *, strict: bool = False) -> Decoded:
@@ -71,19 +72,15 @@ class _Walk(Head):
     def block(self, start: int, end: int) -> tuple[Field, ...]:
         """Walk the data block; the first tuple of type 3 is the TEDSID."""
         spec_of: Mapping[int, FieldSpec] = self.table.by_type if self.table is not None else {}
-        text_based = self.table is not None and self.table.access_code in TEXT_BASED
         fields: list[Field] = []
         seen: set[int] = set()
-        at, last, width, octets = start, 0, self.width, self.octets
-        tedsid_at = self.tedsid_at
+        at, last, octets, tedsid_at = start, 0, self.octets, self.tedsid_at
         while at < end:
             kind = octets[at]
             is_tedsid = at == tedsid_at
-            body = at + 2 if is_tedsid else at + 1 + width
-            size = octets[at + 1] if body == at + 2 and body <= end else int.from_bytes(octets[at + 1 : body], "big")
-            stop = body + size
+            body, stop = self.extent(at, end, 1 if is_tedsid else self.width)
             if stop > end or self.left <= 0:
-                self.stopped(kind, at, body, size, end, fields)
+                self.stopped(kind, at, body, stop - body, end, fields)
                 break
             self.left -= 1
             raw = octets[body:stop]
@@ -95,17 +92,28 @@ class _Walk(Head):
                     self.order(kind, last, spec, at, seen)
                 last = kind
                 seen.add(kind)
-                if spec is None or spec.children or not (spec.any_length or len(raw) in spec.octets):
-                    fields.append(self.special(kind, spec, raw, at, body))
-                else:
-                    fields.append(Field(kind, spec.name, READERS[spec.kind](raw), raw, at))
+                fields.append(self.field(kind, spec, raw, at, body))
             at = stop
-            if text_based and kind == SUB_SUM:
+            if kind == SUB_SUM and self.text_based():
                 self.text_area(fields, at, end)
                 break
-        if self.table is not None and not self.table.required <= seen:
-            self.missing(self.table, seen, start)
+        self.missing(seen, start)
         return tuple(fields)
+
+    def text_based(self) -> bool:
+        return self.table is not None and self.table.access_code in TEXT_BASED
+
+    def extent(self, at: int, end: int, width: int) -> tuple[int, int]:
+        """Where the value of the tuple at ``at`` begins and ends; its Length has ``width`` octets."""
+        body = at + 1 + width
+        if width == 1 and body <= end:
+            return body, body + self.octets[at + 1]
+        return body, body + int.from_bytes(self.octets[at + 1 : body], "big")
+
+    def field(self, kind: int, spec: FieldSpec | None, raw: bytes, at: int, body: int) -> Field:
+        if spec is None or spec.children or not (spec.any_length or len(raw) in spec.octets):
+            return self.special(kind, spec, raw, at, body)
+        return Field(kind, spec.name, READERS[spec.kind](raw), raw, at)
 
     def stopped(self, kind: int, at: int, body: int, size: int, end: int, fields: list[Field]) -> None:
         """The walk cannot go on: a tuple runs past the end, or there are too many."""
@@ -132,7 +140,10 @@ class _Walk(Head):
             message = f"The field {kind} {name} stands behind {last}."
             self.find("warning", "order", message, at, name, "ascending types", f"{kind} behind {last}")
 
-    def missing(self, known: Table, seen: set[int], start: int) -> None:
+    def missing(self, seen: set[int], start: int) -> None:
+        known = self.table
+        if known is None or known.required <= seen:
+            return
         present = {known.aliases[kind].name for kind in seen if kind in known.aliases}
         for kind in sorted(known.required - seen):
             name = known.by_type[kind].name
@@ -158,13 +169,17 @@ class _Walk(Head):
             wanted = 16 if self.edition == 2024 else 10
             if size != wanted:
                 self.length(spec, size, (wanted,), body, "error")
-        elif kind in {"f32[]", "u16[]"} and size % (4 if kind == "f32[]" else 2):
-            self.length(spec, size, ("a multiple of 4" if kind == "f32[]" else "a multiple of 2",), body, "error")
+        elif kind in _ELEMENT_OCTETS and size % _ELEMENT_OCTETS[kind]:
+            self.length(spec, size, (f"a multiple of {_ELEMENT_OCTETS[kind]}",), body, "error")
         elif spec.octets and size not in spec.octets:
-            tolerated = size in spec.also or not self.firm()
-            self.length(spec, size, spec.octets, body, "warning" if tolerated else "error")
-            return int.from_bytes(raw, "big") if kind in {"u8", "u16", "u32"} and 0 < size <= 8 else None
+            return self.wrong_length(spec, raw, body)
         return READERS[kind](raw)
+
+    def wrong_length(self, spec: FieldSpec, raw: bytes, body: int) -> Value:
+        """An integer of another width is still one; of anything else no value comes."""
+        tolerated = len(raw) in spec.also or not self.firm()
+        self.length(spec, len(raw), spec.octets, body, "warning" if tolerated else "error")
+        return int.from_bytes(raw, "big") if spec.kind in {"u8", "u16", "u32"} and 0 < len(raw) <= 8 else None
 
     def firm(self) -> bool:
         """Whether a wrong length is an error: not where the table is unverified or the class belongs to somebody."""
@@ -234,12 +249,9 @@ class _Walk(Head):
         at = start
         while at < end:
             kind = octets[at]
-            body = at + 1 + width
-            size = octets[at + 1] if body == at + 2 <= end else int.from_bytes(octets[at + 1 : body], "big")
-            stop = body + size
+            body, stop = self.extent(at, end, width)
             if body > end or stop > end or self.left <= 0:
-                what = "too many tuples" if self.left <= 0 else f"a tuple of type {kind} that runs past the end"
-                self.find("error", "nested", f"{parent.name} holds {what}.", at, parent.name, end - at, stop - at)
+                self.nested_stopped(parent, kind, at, end - at, stop - at)
                 break
             self.left -= 1
             raw = octets[body:stop]
@@ -251,10 +263,17 @@ class _Walk(Head):
             seen.add(kind)
             at = stop
         if not parent.required <= seen:
-            for kind in sorted(parent.required - seen):
-                name = by_type[kind].name
-                self.find("warning", "missing", f"{parent.name} holds no {name}.", start, name, "present", "")
+            self.nested_missing(parent, seen, start)
         return tuple(fields)
+
+    def nested_stopped(self, parent: FieldSpec, kind: int, at: int, left: int, needed: int) -> None:
+        what = "too many tuples" if self.left <= 0 else f"a tuple of type {kind} that runs past the end"
+        self.find("error", "nested", f"{parent.name} holds {what}.", at, parent.name, left, needed)
+
+    def nested_missing(self, parent: FieldSpec, seen: set[int], start: int) -> None:
+        for kind in sorted(parent.required - seen):
+            name = parent.by_type[kind].name
+            self.find("warning", "missing", f"{parent.name} holds no {name}.", start, name, "present", "")
 
     def nested_special(
         self, parent: FieldSpec, kind: int, spec: FieldSpec | None, raw: bytes, at: int, body: int, again: bool

@@ -76,9 +76,7 @@ class _Conversion:
             return self.tedsid(part, composer.width)
         spec = rows.get(part.type)
         if spec is None or not part.name:
-            if part.type >= 128 or self.table.verified:
-                self.say("note", "kept", f"The field {part.type} is unknown; its octets are kept as they are.", part)
-            return composer.tuple(part.type, part.raw)
+            return self.unknown(part, composer)
         if spec.kind == "uuid":
             return self.identifier(part, composer)
         if spec.kind == "units":
@@ -88,6 +86,11 @@ class _Conversion:
         if part.children:
             inner = b"".join(self.part(child, spec.by_type, composer) for child in part.children)
             return composer.tuple(part.type, inner)
+        return composer.tuple(part.type, part.raw)
+
+    def unknown(self, part: Field, composer: Composer) -> bytes:
+        if part.type >= 128 or self.table.verified:
+            self.say("note", "kept", f"The field {part.type} is unknown; its octets are kept as they are.", part)
         return composer.tuple(part.type, part.raw)
 
     def identifier(self, part: Field, composer: Composer) -> bytes:
@@ -119,11 +122,8 @@ class _Conversion:
 
     def text(self, composer: Composer) -> bytes:
         """Text-based TEDS: the directory is written anew where it describes the texts; else all is kept behind it."""
-        entries = [part for part in self.decoded.fields if part.name == "DirBlock"]
-        standard = {"TEDSID", "NumLang", "DirBlock", "SubSum"}
-        plain = all(part.name in standard for part in self.decoded.fields)
-        plain = plain and self.decoded.fields[0].name == "TEDSID"
-        if plain and len(entries) == len(self.decoded.text) and entries:
+        entries = self.directory()
+        if entries:
             pairs: list[tuple[str, object]] = [
                 ("Text", {"Text": text, **_directory(entry)})
                 for entry, text in zip(entries, self.decoded.text, strict=True)
@@ -137,6 +137,15 @@ class _Conversion:
         old = recompose(self.decoded)
         block = old[4:-2] if self.decoded.framed else old
         return self.framed(self.tedsid(first, composer.width) + block[2 + len(first.raw) :])
+
+    def directory(self) -> list[Field]:
+        """One entry for each text; none where the directory does not describe them, or holds more than it should."""
+        fields = self.decoded.fields
+        standard = {"TEDSID", "NumLang", "DirBlock", "SubSum"}
+        if fields[0].name != "TEDSID" or any(part.name not in standard for part in fields):
+            return []
+        entries = [part for part in fields if part.name == "DirBlock"]
+        return entries if len(entries) == len(self.decoded.text) else []
 
 
 def _directory(entry: Field) -> dict[str, object]:

@@ -48,15 +48,11 @@ def _values(fields: Iterable[Field], spec_of: Callable[[int], FieldSpec | None],
             if not _TINY <= abs(value) <= _HUGE:  # NaN, infinite, tiny, zero
                 _float(field, find)
         elif value.__class__ is int:
-            spec = spec_of(field.type) or table.inner.get(field.type)
-            if spec is not None and spec.enumeration and (value not in spec.enumeration or spec.weak):
-                _enumeration(field, spec, find)
-        elif value.__class__ is Units:
-            _interpretation(field, find)
-        elif value.__class__ is TimeInstance:
-            _time(field, find)
-        elif value.__class__ is str or value.__class__ is bytes:
-            _text(field, spec_of(field.type), find)
+            _integer(field, spec_of(field.type) or table.inner.get(field.type), find)
+        else:
+            look = _LOOK.get(value.__class__)
+            if look is not None:
+                look(field, spec_of(field.type), find)
 
 
 def _float(field: Field, find: Find) -> None:
@@ -82,8 +78,8 @@ def _float(field: Field, find: Find) -> None:
             find("warning", "swapped", message, field.offset, field.name, f"{other:.5g}", f"{value:.5g}")
 
 
-def _enumeration(field: Field, spec: FieldSpec, find: Find) -> None:
-    if not isinstance(field.value, int):
+def _integer(field: Field, spec: FieldSpec | None, find: Find) -> None:
+    if spec is None or not spec.enumeration or not isinstance(field.value, int):
         return
     if field.value in spec.weak:
         name = spec.enumeration[field.value]
@@ -96,7 +92,7 @@ def _enumeration(field: Field, spec: FieldSpec, find: Find) -> None:
         find(severity, "enumeration", message, field.offset, field.name, known, field.value)
 
 
-def _interpretation(field: Field, find: Find) -> None:
+def _interpretation(field: Field, _spec: FieldSpec | None, find: Find) -> None:
     units = field.value
     if not isinstance(units, Units):
         return
@@ -108,7 +104,7 @@ def _interpretation(field: Field, find: Find) -> None:
         find("warning", "units", message, field.offset, field.name, "no exponents", "some")
 
 
-def _time(field: Field, find: Find) -> None:
+def _time(field: Field, _spec: FieldSpec | None, find: Find) -> None:
     if isinstance(field.value, TimeInstance) and field.value.nanoseconds > 999_999_999:
         message = f"{field.name} has {field.value.nanoseconds} nanoseconds, a second or more."
         find("warning", "time", message, field.offset, field.name, "<= 999999999", field.value.nanoseconds)
@@ -123,23 +119,18 @@ def _text(field: Field, spec: FieldSpec | None, find: Find) -> None:
         find("warning", "text", f"{field.name} ends in NUL.", field.offset, field.name, "no NUL", "NUL")
 
 
+_LOOK: Final[dict[type, Callable[[Field, FieldSpec | None, Find], None]]] = {
+    Units: _interpretation,
+    TimeInstance: _time,
+    str: _text,
+    bytes: _text,
+}
+
+
 def _limits(fields: tuple[Field, ...], find: Find) -> None:
-    low = high = None
-    for field in fields:
-        if field.name == "LowLimit":
-            low = field
-        elif field.name == "HiLimit":
-            high = field
-        elif field.name == "OError" and isinstance(field.value, float) and field.value < 0:
-            find(
-                "warning",
-                "negative",
-                "The uncertainty OError is negative.",
-                field.offset,
-                "OError",
-                ">= 0",
-                field.value,
-            )
+    _uncertainty(fields, find)
+    by_name = {field.name: field for field in fields}
+    low, high = by_name.get("LowLimit"), by_name.get("HiLimit")
     if low is None or high is None or not isinstance(low.value, float) or not isinstance(high.value, float):
         return
     if low.value > high.value:
@@ -147,21 +138,33 @@ def _limits(fields: tuple[Field, ...], find: Find) -> None:
         find("error", "limits", message, low.offset, "LowLimit", f"<= {high.value:g}", f"{low.value:g}")
 
 
+def _uncertainty(fields: tuple[Field, ...], find: Find) -> None:
+    for field in fields:
+        if field.name == "OError" and isinstance(field.value, float) and field.value < 0:
+            message = "The uncertainty OError is negative."
+            find("warning", "negative", message, field.offset, "OError", ">= 0", field.value)
+
+
 def _sample(fields: tuple[Field, ...], find: Find) -> None:
     for field in fields:
         if field.type == 31:
             _sampling(field, find)
-        if field.type != 18:
-            continue
-        parts = {child.type: child.value for child in field.children}
-        model, octets, bits = parts.get(40), parts.get(41), parts.get(42)
-        low, high = _MODEL_OCTETS.get(model, (0, 255)) if isinstance(model, int) else (0, 255)
-        if isinstance(octets, int) and not low <= octets <= high:
-            message = f"Sample has {octets} octets; data model {model!r} takes {low} to {high}."
-            find("warning", "sample", message, field.offset, "ModLenth", f"{low} to {high}", octets)
-        elif isinstance(octets, int) and isinstance(bits, int) and model in (0, 3, 5, 6) and bits > 8 * octets:
-            message = f"Sample claims {bits} significant bits in {octets} octets."
-            find("warning", "sample", message, field.offset, "SigBits", f"<= {8 * octets}", bits)
+        elif field.type == 18:
+            _sample_form(field, find)
+
+
+def _sample_form(field: Field, find: Find) -> None:
+    parts = {child.type: child.value for child in field.children}
+    model, octets, bits = parts.get(40), parts.get(41), parts.get(42)
+    low, high = _MODEL_OCTETS.get(model, (0, 255)) if isinstance(model, int) else (0, 255)
+    if not isinstance(octets, int):
+        return
+    if not low <= octets <= high:
+        message = f"Sample has {octets} octets; data model {model!r} takes {low} to {high}."
+        find("warning", "sample", message, field.offset, "ModLenth", f"{low} to {high}", octets)
+    elif isinstance(bits, int) and model in (0, 3, 5, 6) and bits > 8 * octets:
+        message = f"Sample claims {bits} significant bits in {octets} octets."
+        find("warning", "sample", message, field.offset, "SigBits", f"<= {8 * octets}", bits)
 
 
 def _level(fields: tuple[Field, ...], find: Find) -> None:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Final
 
 from teds_provision.errors import BadData
 from teds_provision.lazy import late
-from teds_provision.teds.calibration.decoded import from_decoded, is_finite
+from teds_provision.teds.calibration.decoded import from_decoded, is_sound
 from teds_provision.teds.calibration.describe import kind_of
 from teds_provision.teds.calibration.model import Calibration
 from teds_provision.teds.codec.codes import AccessCode
@@ -57,8 +57,7 @@ def _calibration(channel: int, blocks: Mapping[BlockId, bytes], own: Channel) ->
         found = from_decoded(decoded, channel=channel, units=own.units, actuator=own.actuator)
     except BadData:
         return None
-    sound = is_finite(found) and all(part.ascending for part in found.inputs)
-    return found if sound else None
+    return found if is_sound(found) else None
 
 
 def _parts(was: Curve, curve: Curve) -> list[str]:
@@ -74,14 +73,16 @@ def _parts(was: Curve, curve: Curve) -> list[str]:
     low, high = (float(np.median(np.take(difference, end, axis=curve.main))) for end in (0, -1))
     at = int(np.argmax(np.abs(difference)))
     worst = float(difference.flat[at])
-    if abs(low) > curve.noise:
-        parts.append(f"at the low end {_signed(curve, low)}")
-    if abs(high) > curve.noise:
-        parts.append(f"at full scale {_signed(curve, high)}")
+    ends = (("at the low end", low), ("at full scale", high))
+    parts += [f"{where} {_signed(curve, change)}" for where, change in ends if abs(change) > curve.noise]
     if abs(worst) > 1.01 * max(abs(low), abs(high)):
-        own = curve.inputs_at(at)[curve.main]
-        parts.append(f"at most {_signed(curve, worst)} (at {'' if curve.channel.actuator else 'raw '}{own:.8g})")
+        parts.append(f"at most {_signed(curve, worst)} (at {_place(curve, at)})")
     return parts or [f"at most {_signed(curve, worst)}"]
+
+
+def _place(curve: Curve, at: int) -> str:
+    own = curve.inputs_at(at)[curve.main]
+    return f"{own:.8g}" if curve.channel.actuator else f"raw {own:.8g}"
 
 
 def _gain(was: Curve, curve: Curve) -> float | None:

@@ -99,18 +99,13 @@ def _block(key: BlockId, where: str, old: Mapping[BlockId, bytes], new: Mapping[
                 found = True
                 yield Change(channel, access_code, "curve", "", "", f"{where}: {text}.")
     contexts = _context(channel, old), _context(channel, new)
-    ones, others = _flat(before), _flat(after)
-    for path in dict.fromkeys((*ones, *others)):
-        one, other = ones.get(path), others.get(path)
-        name = path[-1][0]
-        if path[0][0] in skip or (one is not None and other is not None and one.raw == other.raw):
+    for path, one, other in _differing(_flat(before), _flat(after)):
+        if path[0][0] in skip:
             continue
         found = True
-        was, now = (
-            _shown(field, access_code, path, context) if field else ""
-            for field, context in zip((one, other), contexts, strict=True)
-        )
-        yield Change(channel, access_code, name, was, now, _sentence(where, path, was, now))
+        was = _shown(one, access_code, path, contexts[0]) if one else ""
+        now = _shown(other, access_code, path, contexts[1]) if other else ""
+        yield Change(channel, access_code, path[-1][0], was, now, _sentence(where, path, was, now))
     if not found:
         yield Change(
             channel, access_code, "", "", "", f"{where}: {_label(access_code)}: the same content, other octets."
@@ -118,6 +113,16 @@ def _block(key: BlockId, where: str, old: Mapping[BlockId, bytes], new: Mapping[
 
 
 _Path = tuple[tuple[str, int], ...]
+
+
+def _differing(
+    ones: Mapping[_Path, Field], others: Mapping[_Path, Field]
+) -> Iterator[tuple[_Path, Field | None, Field | None]]:
+    """Leaves that are not octet for octet the same in both; None where one side lacks it."""
+    for path in dict.fromkeys((*ones, *others)):
+        one, other = ones.get(path), others.get(path)
+        if one is None or other is None or one.raw != other.raw:
+            yield path, one, other
 
 
 def _flat(decoded: Decoded) -> dict[_Path, Field]:

@@ -126,15 +126,10 @@ def _channel(teds: Decoded, name: str, number: int) -> Iterator[str]:
         yield f"name = {_quoted(name)}"
     channel = channel_from(teds)
     if channel.units_stated:
-        yield f"unit = {_quoted(spell(channel.units))}"
-        shown = display_unit(channel.units)
-        if shown.scale != 1 or shown.offset:
-            yield f"display-unit = {_quoted(shown.text.replace('°C', 'degC').replace('°', 'degree'))}"
+        yield from _units(channel.units)
     yield from _keys(CHANNEL_KEYS, teds.fields)
-    key = channel.calibration_key
-    if key is not None:
-        word = next((word for word, code in CALIBRATION_KEYS.items() if code == key), None)
-        yield f"calibration-key = {key if word is None else _quoted(word)}"
+    if channel.calibration_key is not None:
+        yield f"calibration-key = {_word_or_number(CALIBRATION_KEYS, channel.calibration_key)}"
     sample = teds.field("Sample")
     if sample is not None:
         yield f"sample = {{ {', '.join(_keys(SAMPLE_KEYS, sample.children))} }}"
@@ -144,10 +139,25 @@ def _channel(teds: Decoded, name: str, number: int) -> Iterator[str]:
     data_set = teds.field("DataSet")
     if data_set is not None:
         yield from ("", f"[channel.{number}.data-set]")
-        units = next((part.value for part in data_set.children if part.name == "SUnits"), None)
-        if isinstance(units, Units):
-            yield f"unit = {_quoted(spell(units))}"
-        yield from _keys(DATA_SET_KEYS, data_set.children)
+        yield from _data_set(data_set)
+
+
+def _units(units: Units) -> Iterator[str]:
+    yield f"unit = {_quoted(spell(units))}"
+    shown = display_unit(units)
+    if shown.scale != 1 or shown.offset:
+        yield f"display-unit = {_quoted(shown.text.replace('°C', 'degC').replace('°', 'degree'))}"
+
+
+def _data_set(field: Field) -> Iterator[str]:
+    units = next((part.value for part in field.children if part.name == "SUnits"), None)
+    if isinstance(units, Units):
+        yield f"unit = {_quoted(spell(units))}"
+    yield from _keys(DATA_SET_KEYS, field.children)
+
+
+def _word_or_number(words: Mapping[str, int], number: int) -> str:
+    return next((_quoted(word) for word, code in words.items() if code == number), str(number))
 
 
 def _sampling(field: Field) -> Iterator[str]:
@@ -183,8 +193,7 @@ def _value(key: Key, value: object) -> str | None:
     if key.kind is Kind.FLAG:
         return {0: "false", 1: "true"}.get(value) if isinstance(value, int) else None
     if key.kind is Kind.CHOICE:
-        word = next((word for word, code in key.choices.items() if code == value), None)
-        return _quoted(word) if word is not None else str(value) if isinstance(value, int) else None
+        return _word_or_number(key.choices, value) if isinstance(value, int) else None
     return _number(value) if _finite(value) else None
 
 

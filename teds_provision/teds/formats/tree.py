@@ -142,11 +142,14 @@ def _entry(field: Field, known: Mapping[int, FieldSpec]) -> Entry:
     if not field.name or value is None or isinstance(value, bytes):
         return Entry(field.type, field.name, "octets", field.raw)
     kind = _kind(value)
+    return Entry(field.type, field.name, kind, _shortest_of(kind, value))
+
+
+def _shortest_of(kind: Kind, value: EntryValue) -> EntryValue:
+    """The value with each float in it in the fewest digits."""
     if isinstance(value, float):
-        value = shortest(value)
-    elif kind == "numbers" and isinstance(value, tuple):
-        value = tuple(map(shortest, value))
-    return Entry(field.type, field.name, kind, value)
+        return shortest(value)
+    return tuple(map(shortest, value)) if kind == "numbers" and isinstance(value, tuple) else value
 
 
 def shortest(value: float) -> float:

@@ -94,9 +94,7 @@ class _Judge:
         try:
             calibration = self._calibration(decoded, self.new)
         except BadData as error:
-            ours = decoded.field("CalInput") is not None or decoded.field("Coefs") is not None
-            code, severity = ("inconsistent", "error") if ours else ("unknown", "warning")
-            yield GuardFinding(self.number, code, f"{error.message} It was not checked.", severity)  # type: ignore[arg-type]
+            yield self._not_understood(decoded, error)
             return
         damage = list(self._damage(calibration))
         yield from damage
@@ -105,6 +103,13 @@ class _Judge:
         if self.now is not None:
             for text in calibration.date_warnings(self.now):
                 yield GuardFinding(self.number, "overdue", text, "warning")
+
+    def _not_understood(self, decoded: Decoded, error: BadData) -> GuardFinding:
+        """An error where the fields are ours; else somebody else's form, of which nothing can be said."""
+        text = f"{error.message} It was not checked."
+        if decoded.field("CalInput") is None and decoded.field("Coefs") is None:
+            return GuardFinding(self.number, "unknown", text, "warning")
+        return self._error("inconsistent", text)
 
     def _error(self, code: str, message: str) -> GuardFinding:
         return GuardFinding(self.number, code, message)

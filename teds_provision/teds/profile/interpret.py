@@ -167,6 +167,10 @@ def _selections(section: Section) -> dict[int, Table]:
                 section.error(key, f"channel numbers go from 1 to {MAXIMUM_CHANNEL}, the lower one first.")
                 continue
             selections.append((range(low, high + 1), entry))
+    return _laid_over(everywhere, selections)
+
+
+def _laid_over(everywhere: Table | None, selections: list[tuple[range, Table]]) -> dict[int, Table]:
     tables: dict[int, Table] = {}
     for numbers, table in sorted(selections, key=lambda one: -len(one[0])):
         for number in numbers:
@@ -305,16 +309,7 @@ def _demand(section: Section, unit: WrittenUnit | None) -> CalibrationDemand:
     if method and method not in METHODS:
         part.error("method", f'"{method}" is no method; {", ".join(METHODS)} are.')
     degree = part.read(Key("degree", "", Kind.U8, "degree of the polynomial"))
-    interval = part.item("interval")
-    seconds = None
-    if interval is not None:
-        try:
-            seconds = parse_seconds(interval)
-        except BadData as error:
-            part.error("interval", f"{error.message} {error.hint}")
-        if seconds is not None and not 0 < seconds < 2**32:
-            part.error("interval", f"{interval!r} is not a time that a TEDS can hold.")
-            seconds = None
+    seconds = _interval(part)
     part.unit = unit
     deviation = part.read(Key("standard-deviation", "", Kind.NUMBER, "standard deviation in the channel's unit"))
     demand = CalibrationDemand(
@@ -329,6 +324,22 @@ def _demand(section: Section, unit: WrittenUnit | None) -> CalibrationDemand:
     )
     part.finish()
     return demand
+
+
+def _interval(part: Section) -> float | None:
+    """Seconds between calibrations, None where it is not stated or wrong."""
+    interval = part.item("interval")
+    if interval is None:
+        return None
+    try:
+        seconds = parse_seconds(interval)
+    except BadData as error:
+        part.error("interval", f"{error.message} {error.hint}")
+        return None
+    if 0 < seconds < 2**32:
+        return seconds
+    part.error("interval", f"{interval!r} is not a time that a TEDS can hold.")
+    return None
 
 
 def _monotone(part: Section) -> Monotone | None:
@@ -356,7 +367,7 @@ def _raw_range(part: Section) -> tuple[float, float] | None:
 
 
 def _check_channel(section: Section, channel: ChannelProfile) -> None:
-    low, high = (channel.fields.get(name) for name in ("LowLimit", "HiLimit"))
+    low, high = channel.fields.get("LowLimit"), channel.fields.get("HiLimit")
     if isinstance(low, float) and isinstance(high, float) and low >= high:
         section.error("low-limit", "the low limit must be below the high limit.")
     demand = channel.calibration

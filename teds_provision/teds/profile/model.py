@@ -166,17 +166,7 @@ def _build(
     now: datetime | None,
 ) -> BuiltDatasheet:
     """See :meth:`Profile.build`."""
-    if profile.abstract:
-        raise BadData(
-            f"The profile {profile.name} is only a base for others.",
-            hint="Use a profile that extends it; see profile list.",
-        )
-    for number in calibration:
-        if profile.channel(number) is None:
-            raise BadData(
-                f"The calibration is for channel {number}; {profile.name} has channels 1 to {len(profile.channels)}.",
-                hint="Give the calibration of this type, or --no-calibration to drop the one that the node has.",
-            )
+    _require_buildable(profile, calibration)
     warnings: list[str] = []
     uuid = _uuid(uuid, edition, warnings)
     meta = (("UUID", uuid), *profile.meta, ("MaxChan", len(profile.channels)))
@@ -199,6 +189,20 @@ def _build(
         block = (("Text", {"LangCode": text.language, "Text": text.text}),)
         blocks[text.channel, text.access_code] = compose(text.access_code, block, edition=edition)
     return BuiltDatasheet(dict(sorted(blocks.items())), tuple(warnings))
+
+
+def _require_buildable(profile: Profile, calibration: Mapping[int, Calibration]) -> None:
+    if profile.abstract:
+        raise BadData(
+            f"The profile {profile.name} is only a base for others.",
+            hint="Use a profile that extends it; see profile list.",
+        )
+    for number in calibration:
+        if profile.channel(number) is None:
+            raise BadData(
+                f"The calibration is for channel {number}; {profile.name} has channels 1 to {len(profile.channels)}.",
+                hint="Give the calibration of this type, or --no-calibration to drop the one that the node has.",
+            )
 
 
 def _uuid(uuid: bytes, edition: Edition, warnings: list[str]) -> bytes:

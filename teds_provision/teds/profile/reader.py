@@ -207,9 +207,7 @@ class Section:
             case Kind.NUMBER:
                 return finite(_number(value))
             case Kind.FLAG:
-                if not isinstance(value, bool):
-                    raise _Wrong(f"true or false is expected, not {_shown(value)}.")
-                return int(value)
+                return _flag(value)
             case Kind.CHOICE:
                 return _choice(key, value)
             case Kind.CHOICES:
@@ -234,6 +232,12 @@ def finite(value: float) -> float:
     if not math.isfinite(value) or abs(value) > FLOAT32_MAXIMUM:
         raise _Wrong(f"{value} does not fit a Float32.")
     return value
+
+
+def _flag(value: object) -> int:
+    if not isinstance(value, bool):
+        raise _Wrong(f"true or false is expected, not {_shown(value)}.")
+    return int(value)
 
 
 def _not_negative(value: float) -> float:

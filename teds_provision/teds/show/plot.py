@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any, Final
 from teds_provision.errors import BadData, TedsProvisionError, UsageFailure
 from teds_provision.files import SHARED, write_whole
 from teds_provision.lazy import late
-from teds_provision.teds.calibration.decoded import is_finite
+from teds_provision.teds.calibration.decoded import is_sound
 from teds_provision.teds.calibration.describe import kind_of
 from teds_provision.teds.calibration.fitting import residuals
 from teds_provision.teds.calibration.model import Calibration
@@ -81,9 +81,7 @@ def _panels(
 ) -> list[_Panel]:
     panels = []
     for number, calibration in Sheet.of_blocks(blocks).calibrations.items():
-        if channel is not None and number != channel:
-            continue
-        if not is_finite(calibration) or not all(part.ascending for part in calibration.inputs):
+        if channel not in (None, number) or not is_sound(calibration):
             continue
         own = channel_of(number, blocks, profile)
         if profile is None and calibration.raw_range:

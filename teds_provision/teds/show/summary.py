@@ -83,14 +83,7 @@ def _security(decoded: Decoded, context: Context) -> Iterator[Line]:
     ours = decoded.field(_PROFILE_VERSION) is not None
     if not ours:
         yield "kind", "somebody else's Security TEDS (no field 105): shown, never trusted"
-    for name, label in (("NodePublicKey", "node"), ("BaseStationPublicKey", "station")):
-        field = decoded.field(name)
-        point = read_key(field.raw).point if field is not None else None
-        if point is not None:
-            yield (
-                f"{label} key",
-                f"fingerprint {fingerprint(point)[:FINGERPRINT_DIGITS]} (a hint, not an anchor of trust)",
-            )
+    yield from _keys(decoded)
     signature = decoded.field("Signature")
     when = decoded.get("LastModified")
     signed = f"claims to be signed, {instant(when)}" if isinstance(when, TimeInstance) else "claims to be signed"
@@ -101,6 +94,15 @@ def _security(decoded: Decoded, context: Context) -> Iterator[Line]:
             yield field_word, str(number)
     if ours and context.beside:
         yield from _form(decoded)
+
+
+def _keys(decoded: Decoded) -> Iterator[Line]:
+    for name, label in (("NodePublicKey", "node"), ("BaseStationPublicKey", "station")):
+        field = decoded.field(name)
+        point = read_key(field.raw).point if field is not None else None
+        if point is not None:
+            digits = fingerprint(point)[:FINGERPRINT_DIGITS]
+            yield f"{label} key", f"fingerprint {digits} (a hint, not an anchor of trust)"
 
 
 def _form(decoded: Decoded) -> Iterator[Line]:

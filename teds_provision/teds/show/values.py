@@ -61,14 +61,14 @@ def text_of(field: Field, context: Context, spec: FieldSpec | None) -> str:
         case Units() as units:
             return name_of_units(units)
         case TimeInstance() as moment:
-            return span(moment) if kind == "duration" else instant(moment)
+            return _moment(moment, kind)
         case float(number):
             return _number(field, number, context, spec)
         case tuple(numbers):
             return _list(numbers)
         case _ if kind == "key":
             return key(field)
-        case _ if kind == "block id" and len(field.raw) == 35:
+        case _ if _is_signed_block(field, kind):
             return signed_block(field.raw, context.beside)
         case str(text):
             return text
@@ -76,6 +76,14 @@ def text_of(field: Field, context: Context, spec: FieldSpec | None) -> str:
             return _integer(number, spec)
         case _:
             return hexadecimal(field.raw)
+
+
+def _moment(value: TimeInstance, kind: str) -> str:
+    return span(value) if kind == "duration" else instant(value)
+
+
+def _is_signed_block(field: Field, kind: str) -> bool:
+    return kind == "block id" and len(field.raw) == 35
 
 
 def _list(numbers: tuple[int, ...] | tuple[float, ...]) -> str:

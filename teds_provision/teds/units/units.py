@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from difflib import get_close_matches
 from fractions import Fraction
@@ -224,6 +224,17 @@ def _product(units: Units) -> str:
     return f"{above or '1'}/{below[0] if len(below) == 1 else '(' + '·'.join(below) + ')'}"
 
 
+# Interpretation of physical units (IEEE 1451.0-2007, table of the field): as a unit is shown, as plain numbers are.
+_INTERPRETATIONS: Final = {
+    0: ("{0}", ""),
+    1: ("{0}/{0}", "ratio"),
+    2: ("log10({0})", "log10(1)"),
+    3: ("log10({0}/{0})", "log10(ratio)"),
+    4: ("digital", "digital"),
+    5: ("arbitrary", "arbitrary"),
+}
+
+
 def format_units(units: Units) -> str:
     """Name of the SI unit as people write it: ``rad``, ``N``, ``m/s²``; ``""`` for plain numbers (counts).
 
@@ -234,21 +245,10 @@ def format_units(units: Units) -> str:
     name = NAME_OF.get(plain) or _product(plain)
     if units.extension not in (0, 128):
         name = f"{name} (unit extension TEDS {units.extension})".strip()
-    match units.interpretation:
-        case 0:
-            return name
-        case 1:
-            return f"{name}/{name}" if name else "ratio"
-        case 2:
-            return f"log10({name or '1'})"
-        case 3:
-            return f"log10({name}/{name})" if name else "log10(ratio)"
-        case 4:
-            return "digital"
-        case 5:
-            return "arbitrary"
-        case other:
-            return f"interpretation {other} (reserved) {name}".strip()
+    if units.interpretation not in _INTERPRETATIONS:
+        return f"interpretation {units.interpretation} (reserved) {name}".strip()
+    of_unit, of_numbers = _INTERPRETATIONS[units.interpretation]
+    return of_unit.format(name) if name else of_numbers
 
 
 def name_of_units(units: Units) -> str:
@@ -322,6 +322,16 @@ _TIMES: Final = {
 }
 
 
+def _quantity(value: object) -> tuple[float, str]:
+    """The number and the unit of ``"100 us"``."""
+    match = _QUANTITY.match(value) if isinstance(value, str) else None
+    if match is None:
+        raise BadData(
+            f"{value!r} is not a time.", hint='Write a number of seconds, or a text like "100 us" or "1 year".'
+        )
+    return float(match[1]), match[2]
+
+
 def parse_seconds(value: object) -> float:
     """Seconds of ``"100 us"``, ``"1 year"`` (365.2425 days), ``"10 kHz"`` (its period) or a bare number of seconds.
 
@@ -329,12 +339,7 @@ def parse_seconds(value: object) -> float:
     """
     if isinstance(value, (int, float)) and not isinstance(value, bool) and abs(value) < 1e300:
         return float(value)
-    match = _QUANTITY.match(value) if isinstance(value, str) else None
-    if match is None:
-        raise BadData(
-            f"{value!r} is not a time.", hint='Write a number of seconds, or a text like "100 us" or "1 year".'
-        )
-    number, text = float(match[1]), match[2]
+    number, text = _quantity(value)
     if not text or text in _TIMES:
         return number * _TIMES.get(text, 1.0)
     unit = parse_unit(text)
@@ -354,17 +359,22 @@ def short_unit(text: str) -> str:
 
 def recognize(units: Units, scale: float, offset: float) -> WrittenUnit:
     """Unit of these exponents that converts into SI this way; one without a usual name is called after its scale."""
-
-    def close(one: float, other: float) -> bool:
-        return math.isclose(one, other, rel_tol=1e-6, abs_tol=1e-30)
-
-    if close(scale, 1.0) and offset == 0:
+    if _close(scale, 1.0) and offset == 0:
         return WrittenUnit(format_units(units), units)
-    for texts, name, its_scale, its_offset in ROWS:
-        if NAMED[name] == units and close(scale, its_scale) and close(offset, its_offset):
-            return WrittenUnit(_SHORT.get(texts.split()[0], texts.split()[0]), units, its_scale, its_offset)
-    for texts, special, its_scale, its_offset in SPECIAL_ROWS:
-        if special == units and close(scale, its_scale) and close(offset, its_offset):
-            return WrittenUnit(texts.split()[0], units, its_scale, its_offset)
+    for text, of, its_scale, its_offset in _usual_units():
+        if of == units and _close(scale, its_scale) and _close(offset, its_offset):
+            return WrittenUnit(text, units, its_scale, its_offset)
     name = f"× {scale:.7g} {format_units(units)}".strip()
     return WrittenUnit(f"({name} + {offset:.7g})" if offset else f"({name})", units, scale, offset)
+
+
+def _close(one: float, other: float) -> bool:
+    return math.isclose(one, other, rel_tol=1e-6, abs_tol=1e-30)
+
+
+def _usual_units() -> Iterator[tuple[str, Units, float, float]]:
+    """Sign, exponents, scale and offset of every unit that has a usual name."""
+    for texts, name, scale, offset in ROWS:
+        yield short_unit(texts.split()[0]), NAMED[name], scale, offset
+    for texts, special, scale, offset in SPECIAL_ROWS:
+        yield texts.split()[0], special, scale, offset

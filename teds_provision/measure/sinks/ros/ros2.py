@@ -16,6 +16,7 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 from teds_provision.errors import TedsProvisionError, UsageFailure
+from teds_provision.lazy import late
 from teds_provision.measure.blocks import StationFacts
 from teds_provision.measure.sinks.base import CommandTaker
 from teds_provision.measure.sinks.live import DIAGNOSTICS, JOINT_STATE, STRING, Status, TopicSink
@@ -23,6 +24,9 @@ from teds_provision.measure.sinks.meaning import Meaning
 
 if TYPE_CHECKING:
     from teds_provision.measure.blocks import ChannelFacts
+    from teds_provision.measure.sinks.ros import ros2_types
+else:  # cyclonedds: an extra
+    ros2_types = late("teds_provision.measure.sinks.ros.ros2_types")
 
 GRAPH = "rmw_dds_common/ParticipantEntitiesInfo"
 NODE = "teds_provision"
@@ -67,8 +71,6 @@ class Ros2Sink(TopicSink):
             from cyclonedds.core import DDSException
             from cyclonedds.domain import Domain, DomainParticipant
             from cyclonedds.qos import Policy, Qos
-
-            from teds_provision.measure.sinks.ros import ros2_types
         except ImportError:
             raise TedsProvisionError(
                 "ROS 2 needs the package cyclonedds.", hint="Install it: pip install 'teds-provision[ros2]'"
