@@ -132,10 +132,8 @@ class Station:
 
     def _opened(self) -> Vault:
         if self._vault is None:
-            from teds_provision.vault import open_vault  # argon2 and the keyrings: not for commands that only list
-
             keystore = self.identity.keystore
-            self.adopt(open_vault(self.home, self.id, keystore, self._ask, agent=self.use_agent))
+            self.adopt(vaults.open_vault(self.home, self.id, keystore, self._ask, agent=self.use_agent))
         assert self._vault is not None
         return self._vault
 

@@ -112,6 +112,12 @@ class FileSink(ThreadedSink):
         except OSError as error:
             raise as_sink_failure(error, self.name) from error
 
+    def _news(self, facts: tuple[ChannelFacts, ...]) -> tuple[ChannelFacts, ...]:
+        """Keep the facts; gives those that are new or other than before."""
+        changed = tuple(one for one in facts if self.facts.get(one.key) != one)
+        self.facts.update((one.key, one) for one in changed)
+        return changed
+
     def _next_part(self) -> Part:
         for number in range(1, PARTS):
             path = self._path if number == 1 else self._path.with_suffix(f".{number}{self._path.suffix}")

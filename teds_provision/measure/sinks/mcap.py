@@ -101,9 +101,7 @@ class McapSink(FileSink):
         elif isinstance(item, NodeReport):
             self._report(item)
         elif isinstance(item, tuple):
-            changed = tuple(one for one in item if self.facts.get(one.key) != one)
-            self.facts.update((one.key, one) for one in changed)
-            self._describe(changed)
+            self._describe(self._news(item))
         self._look(time.monotonic())
 
     def _idle(self, now: float) -> None:
@@ -122,18 +120,13 @@ class McapSink(FileSink):
             return
         self._names.learn(facts)
         for one in facts:
-            pairs = {
-                name: value if isinstance(value, str) else json.dumps(value)
-                for name, value in facts_as_json(one).items()
-            }
-            self._out.metadata("channel", pairs)
-        for uuid in dict.fromkeys(one.uuid for one in facts):
+            self._out.metadata("channel", _as_texts(facts_as_json(one)))
+        uuids = dict.fromkeys(one.uuid for one in facts)
+        for uuid in uuids:
             every = [facts_as_json(one) for one in self.facts.values() if one.uuid == uuid]
             self._string(self._names.of_node(uuid, "teds"), json.dumps({"uuid": uuid, "channels": every}), time.time())
         # A stream's topic carries facts in its metadata, so changed ones need a topic record of their own.
-        self._streams = {
-            key: value for key, value in self._streams.items() if key[0] not in {one.uuid for one in facts}
-        }
+        self._streams = {key: value for key, value in self._streams.items() if key[0] not in uuids}
 
     def _string(self, topic: str, words: str, at: float) -> None:
         if topic not in self._strings:
@@ -199,6 +192,11 @@ class McapSink(FileSink):
             writer, self._writer = self._writer, None
             writer.finish()
         super()._close_part()
+
+
+def _as_texts(facts: dict[str, Any]) -> dict[str, str]:
+    """Metadata of MCAP are texts: what is none stands as JSON."""
+    return {name: value if isinstance(value, str) else json.dumps(value) for name, value in facts.items()}
 
 
 def _layout(channels: int, integral: bool) -> np.dtype[Any]:

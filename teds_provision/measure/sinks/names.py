@@ -50,17 +50,10 @@ class Topics:
     def learn(self, facts: Iterable[ChannelFacts]) -> None:
         """Facts of channels; names of those that were known stay unless a namesake came."""
         self._facts.update((one.key, one) for one in facts)
-        slugs = {one.uuid: slug(one.node) for one in self._facts.values()}
-        namesakes, alike = Counter(slugs.values()), Counter(uuid[:8] for uuid in slugs)
-        self._nodes = {}
-        for uuid, own in slugs.items():
-            short = uuid[:8] if alike[uuid[:8]] == 1 else uuid
-            self._nodes[uuid] = f"n{short}" if not own else own if namesakes[own] == 1 else f"{own}_{short}"
-        self._channels = {key: slug(one.name) or f"ch{one.number}" for key, one in self._facts.items()}
-        taken = Counter((uuid, own) for (uuid, _), own in self._channels.items())
-        for (uuid, number), own in list(self._channels.items()):
-            if taken[uuid, own] > 1:
-                self._channels[uuid, number] = f"{own}_{number}"
+        self._nodes = _names_of_nodes({one.uuid: slug(one.node) for one in self._facts.values()})
+        self._channels = _names_of_channels(
+            {key: slug(one.name) or f"ch{one.number}" for key, one in self._facts.items()}
+        )
 
     def node(self, uuid: str) -> str:
         """Part of the node: ``arm``, ``n8d4d9da6``."""
@@ -79,3 +72,19 @@ class Topics:
     def of_group(self, group: str) -> str:
         """The array of a group: ``/bench/hand``; of a measurement without one ``/bench/all``."""
         return f"/{self.station}/{slug(group) or 'all'}"
+
+
+def _names_of_nodes(own: dict[str, str]) -> dict[str, str]:
+    """Names by UUID, of what each node is called itself: two of one name get the digits of their UUID behind it."""
+    namesakes, alike = Counter(own.values()), Counter(uuid[:8] for uuid in own)
+    names = {}
+    for uuid, name in own.items():
+        short = uuid[:8] if alike[uuid[:8]] == 1 else uuid
+        names[uuid] = f"n{short}" if not name else name if namesakes[name] == 1 else f"{name}_{short}"
+    return names
+
+
+def _names_of_channels(own: dict[tuple[str, int], str]) -> dict[tuple[str, int], str]:
+    """Names by node and number: two of one name in one node get their number behind it."""
+    taken = Counter((uuid, name) for (uuid, _), name in own.items())
+    return {key: f"{name}_{key[1]}" if taken[key[0], name] > 1 else name for key, name in own.items()}

@@ -66,36 +66,17 @@ def _recover(file: BinaryIO, path: Path) -> Recovered:
     if file.read(len(MAGIC)) != MAGIC:
         raise BadData(f"{path} is no MCAP file.", hint="A text or JSON-line recording needs no recovery.")
     size = os.fstat(file.fileno()).st_size
-    summary = Summary()
-    end = len(MAGIC)
-    pending: _Pending | None = None
+    whole_part = _WholePart()
     whole = False
     for code, offset, content in _records(file, size):
         if code == DATA_END:
             file.seek(-len(MAGIC), os.SEEK_END)
             whole = file.read(len(MAGIC)) == MAGIC
             break
-        if code == MESSAGE_INDEX:
-            if pending is None:
-                break
-            pending.index(content, offset, len(content) + HEAD.size)
-        else:
-            if pending is not None:
-                summary.chunk_indexes.append(pending.record())
-            pending = None
-            if code == CHUNK:
-                pending = _whole_chunk(content, offset, summary)
-                if pending is None:
-                    break
-            elif code in (SCHEMA, CHANNEL, MESSAGE):
-                _count(code, content, summary)
-            elif code == METADATA:
-                name = content[4 : 4 + int.from_bytes(content[:4], "little")]
-                index = struct.pack("<QQ", offset, len(content) + HEAD.size) + text(name.decode(errors="replace"))
-                summary.metadata_indexes.append(record(METADATA_INDEX, index))
-        end = offset + HEAD.size + len(content)
-    if pending is not None:
-        summary.chunk_indexes.append(pending.record())
+        if not whole_part.take(code, offset, content):
+            break
+    whole_part.close_chunk()
+    summary, end = whole_part.summary, whole_part.end
     messages = sum(summary.counts.values())
     until = summary.last / 1e9 if messages else None
     if whole:
@@ -106,6 +87,45 @@ def _recover(file: BinaryIO, path: Path) -> Recovered:
     file.flush()
     os.fsync(file.fileno())
     return Recovered(messages, until, False, size - end)
+
+
+class _WholePart:
+    """What of a file stands whole: ``summary`` of its records, ``end`` where the next one would begin."""
+
+    def __init__(self) -> None:
+        self.summary = Summary()
+        self.end = len(MAGIC)
+        self._pending: _Pending | None = None
+
+    def take(self, code: int, offset: int, content: bytes) -> bool:
+        """Take a whole record into the summary; False for one that is of no use, nor is what follows it."""
+        if code == MESSAGE_INDEX:
+            if self._pending is None:
+                return False
+            self._pending.index(content, offset, len(content) + HEAD.size)
+        else:
+            self.close_chunk()
+            if code == CHUNK:
+                self._pending = _whole_chunk(content, offset, self.summary)
+                if self._pending is None:
+                    return False
+            elif code == METADATA:
+                self._metadata(offset, content)
+            else:
+                _count(code, content, self.summary)
+        self.end = offset + HEAD.size + len(content)
+        return True
+
+    def close_chunk(self) -> None:
+        """No message index of the last chunk follows any more."""
+        if self._pending is not None:
+            self.summary.chunk_indexes.append(self._pending.record())
+        self._pending = None
+
+    def _metadata(self, offset: int, content: bytes) -> None:
+        name = content[4 : 4 + int.from_bytes(content[:4], "little")]
+        index = struct.pack("<QQ", offset, len(content) + HEAD.size) + text(name.decode(errors="replace"))
+        self.summary.metadata_indexes.append(record(METADATA_INDEX, index))
 
 
 def _records(file: BinaryIO, size: int) -> Iterator[tuple[int, int, bytes]]:

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import json
 import re
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -39,9 +40,7 @@ class TextSink(FileSink):
         if isinstance(item, Block):
             self._block(item)
         elif isinstance(item, tuple):
-            changed = [one for one in item if self.facts.get(one.key) != one]
-            self.facts.update((one.key, one) for one in changed)
-            if changed and self._columns:
+            if self._news(item) and self._columns:
                 self._new_part()
         elif isinstance(item, NodeReport) and item.state != "running" and self._columns:
             self._line(f"# {iso(item.time)} {item.uuid} {item.state}: {printable(item.why)}")
@@ -67,10 +66,7 @@ class TextSink(FileSink):
             self._line("# TEST PATTERN: no line of this file is a measurement")
         for one in known:
             self._line("# channel: " + json.dumps(facts_as_json(one)))
-        heads = ["time", "uuid", "index", "clock_error", "note"]
-        heads += [f"{one.node or one.uuid}/{one.label}{f' [{one.unit}]' if one.unit else ''}" for one in known]
-        heads += [f"{one.node or one.uuid}/{one.label} raw" for one in known]
-        self._line(self._comma.join(self._cell(head) for head in heads))
+        self._line(self._comma.join(map(self._cell, _heads(known))))
 
     def _cell(self, text: str) -> str:
         """A name from a datasheet as a cell: quoted where needed, never a formula of a spreadsheet."""
@@ -141,6 +137,12 @@ class TextSink(FileSink):
             raws = [one.hex() if isinstance(one, bytes) else str(one) for one in raw[k].tolist()]
             rows.append(template % (instant, block.index + k, error, *values, *raws))
         return "".join(rows)
+
+
+def _heads(known: Sequence[ChannelFacts]) -> list[str]:
+    names = [f"{one.node or one.uuid}/{one.label}" for one in known]
+    values = [f"{name} [{one.unit}]" if one.unit else name for name, one in zip(names, known, strict=True)]
+    return ["time", "uuid", "index", "clock_error", "note", *values, *(f"{name} raw" for name in names)]
 
 
 def _order(block: Block) -> list[int]:
