@@ -26,7 +26,7 @@ import numpy as np
 
 from teds_provision.measure.blocks import Block, ChannelFacts, GroupRows, StationFacts
 from teds_provision.measure.sinks import open_sink
-from teds_provision.measure.sinks.recover import recover
+from teds_provision.measure.sinks.mcap.recover import recover
 
 STREAMS, CHANNELS, RATE = 40, 500, 100
 STATION = StationFacts("bench", group="all")

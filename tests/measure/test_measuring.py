@@ -13,7 +13,7 @@ from typing import Any
 import pytest
 from mcap.reader import make_reader
 
-from teds_provision.measure.sinks.recover import recover
+from teds_provision.measure.sinks.mcap.recover import recover
 from tests.e2e.desk import ANGLE, Desk, Node, Station
 from tests.workflow.bench import make_station
 

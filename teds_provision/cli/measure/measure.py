@@ -190,7 +190,7 @@ def _recover(app: App, files: Sequence[str]) -> None:
     if len(files) != 1:
         raise UsageFailure("Name one recording.", hint="teds-provision measure recover FILE.mcap")
 
-    done = measure_room.sinks.recover.recover(Path(files[0]))
+    done = measure_room.sinks.mcap.recover.recover(Path(files[0]))
     until = measure_room.sinks.lines.iso(done.until) if done.until is not None else None
     told = "is whole" if done.was_whole else f"made whole ({done.cut} octets of a torn end cut off)"
     app.emit(

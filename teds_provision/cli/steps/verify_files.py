@@ -10,10 +10,10 @@ import click
 
 from teds_provision.cli.context import App
 from teds_provision.harmless import printable
-from teds_provision.steps.verify_files import Totals, image_files, verify_files
+from teds_provision.steps.many.verify_files import Totals, image_files, verify_files
 
 if TYPE_CHECKING:
-    from teds_provision.steps.verify_files import FileVerdict
+    from teds_provision.steps.many.verify_files import FileVerdict
 
 
 def are_files(what: Sequence[str]) -> bool:

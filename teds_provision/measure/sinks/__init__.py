@@ -14,7 +14,7 @@ from teds_provision.errors import UsageFailure
 from teds_provision.lazy import lazy
 from teds_provision.measure.sinks.base import CommandTaker, Sink, ThreadedSink, as_sink_failure
 from teds_provision.measure.sinks.jsonl import JsonLinesSink
-from teds_provision.measure.sinks.mcap import McapSink
+from teds_provision.measure.sinks.mcap.recording import McapSink
 from teds_provision.measure.sinks.mqtt import MqttSink
 from teds_provision.measure.sinks.ros.ros1 import Ros1Sink
 from teds_provision.measure.sinks.ros.ros2 import Ros2Sink
@@ -23,7 +23,7 @@ from teds_provision.measure.sinks.text import TextSink
 __all__ = ["CommandTaker", "Sink", "ThreadedSink", "as_sink_failure", "open_sink"]
 
 if TYPE_CHECKING:
-    from teds_provision.measure.sinks import lines, recover
+    from teds_provision.measure.sinks import lines, mcap
 else:
     __getattr__ = lazy(__name__)
 

@@ -25,8 +25,8 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from teds_provision.errors import BadData, NotFound, TedsProvisionError, UsageFailure
 from teds_provision.measure.blocks import Block, ChannelFacts, NodeReport, StationFacts
 from teds_provision.measure.sinks import open_sink
-from teds_provision.measure.sinks.mcap import SAMPLES, TYPE
-from teds_provision.measure.sinks.recover import recover
+from teds_provision.measure.sinks.mcap.recording import SAMPLES, TYPE
+from teds_provision.measure.sinks.mcap.recover import recover
 from tests.measure.sinks.parts import ANGLE, ARM, FORCE, HAND, STATION, block, blocks
 
 

@@ -16,7 +16,7 @@ from typing import BinaryIO
 
 from teds_provision.errors import BadData, NotFound
 from teds_provision.measure.sinks.base import as_sink_failure
-from teds_provision.measure.sinks.mcap_file import (
+from teds_provision.measure.sinks.mcap.writer import (
     CHANNEL,
     CHUNK,
     CHUNK_HEAD,

@@ -1,7 +1,7 @@
 """The MCAP container (version 0 of its specification), written by whole chunks.
 
 A writer of our own because a chunk must close by the clock, and because a block of samples becomes octets at once
-instead of message by message. sinks.recover makes a file whole that was cut.
+instead of message by message. The module recover makes a file whole that was cut.
 """
 
 from __future__ import annotations
@@ -91,7 +91,7 @@ class McapWriter:
     """Writes through ``put(octets)``, one call for each chunk with its indexes; the caller owns the file.
 
     ``add_messages`` takes messages that are encoded already, whole records one behind the other, so that a block of
-    samples can be made at once (see sinks.mcap). A chunk closes by ``close_chunk``; the caller knows size and age.
+    samples can be made at once. A chunk closes by ``close_chunk``; the caller knows its size and age.
     """
 
     def __init__(self, put: Callable[[bytes], None], *, profile: str, library: str) -> None:

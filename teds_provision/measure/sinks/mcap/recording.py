@@ -21,7 +21,7 @@ from teds_provision.measure.blocks import Block, ChannelFacts, NodeReport
 from teds_provision.measure.sinks.base import Item
 from teds_provision.measure.sinks.files import FLUSH, FileSink
 from teds_provision.measure.sinks.lines import facts_as_json, iso
-from teds_provision.measure.sinks.mcap_file import MESSAGE, MESSAGE_HEAD, McapWriter
+from teds_provision.measure.sinks.mcap.writer import MESSAGE, MESSAGE_HEAD, McapWriter
 from teds_provision.measure.sinks.names import Topics
 
 CHUNK_OCTETS = 1 << 16
