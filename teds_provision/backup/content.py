@@ -2,12 +2,29 @@
 
 from __future__ import annotations
 
+import hashlib
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from types import TracebackType
+from typing import Any, Final
 
-from teds_provision.protocol.keys import fingerprint
+from teds_provision import __version__
+from teds_provision.errors import BadData
+from teds_provision.protocol.handover.strict_json import dump, load_object
+from teds_provision.protocol.keys import fingerprint, is_point
 from teds_provision.store import Store
+
+_TEXTS: Final = ("store", "station", "point", "name", "created", "keystore", "material")
+
+
+def digest_of(document: dict[str, Any]) -> str:
+    """What stands as ``sha256`` in the clear part of a file: over all the rest of it."""
+    return hashlib.sha256(dump(document)).hexdigest()
+
+
+def context_of(clear: dict[str, Any], form: str) -> bytes:
+    """What the sealed part of a file is bound to: the format, and what stands in the clear."""
+    return form.encode() + b"\0" + dump(clear)
 
 
 @dataclass(frozen=True)
@@ -33,6 +50,26 @@ class Head:
     def in_token(self) -> bool:
         """Whether the station's key lies in a token."""
         return self.keystore.startswith("pkcs11")
+
+    def line(self, form: str) -> bytes:
+        """The head as a line of JSON, for a file of that format (``teds-backup/2``)."""
+        texts = {name: getattr(self, name) for name in _TEXTS}
+        return dump({"format": form, **texts, "point": self.point.hex(), "version": __version__}) + b"\n"
+
+    @staticmethod
+    def read(line: bytes, form: str) -> Head:
+        """The head that a line says; raises BadData: another format, a text that is missing, no point of P-256."""
+        members = load_object(line, "The head of the backup")
+        if members.get("format") != form or not all(isinstance(members.get(name), str) for name in _TEXTS):
+            raise BadData("The head of the backup is not of this version.")
+        try:
+            point = bytes.fromhex(members["point"])
+        except ValueError:
+            point = b""
+        if not is_point(point):
+            raise BadData("The backup names no valid station key.")
+        values = (members[name] for name in ("name", "created", "keystore", "material"))
+        return Head(members["store"], point, *values)
 
     def age_days(self, now: datetime | None = None) -> int:
         """How many whole days ago it was made; negative for a time in the future, 0 where the time cannot be read."""

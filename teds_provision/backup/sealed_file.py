@@ -18,15 +18,13 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Any, BinaryIO, Final
 
-from teds_provision import __version__
 from teds_provision.backup import version_1
 from teds_provision.backup.chunks import KEY_OCTETS, ChunkReader, ChunkWriter
-from teds_provision.backup.content import Content, Head
+from teds_provision.backup.content import Content, Head, context_of, digest_of
 from teds_provision.errors import BadData, NotAuthentic, NotFound, PolicyRefused
 from teds_provision.protocol.handover import jose
 from teds_provision.protocol.handover.strict_json import dump, load_object
-from teds_provision.protocol.keys import SIGNATURE_OCTETS, PrivateKey, fingerprint, is_point, verify
-from teds_provision.store import Store
+from teds_provision.protocol.keys import SIGNATURE_OCTETS, PrivateKey, fingerprint, verify
 from teds_provision.store.dump import load as load_rows
 from teds_provision.store.snapshot import load as load_database
 from teds_provision.vault import passphrase as sealing
@@ -38,7 +36,6 @@ MAX_OCTETS: Final = 16 << 30
 _LABEL: Final = b"TEDS1 backup\0"
 _MAX_HEAD_OCTETS: Final = 64 * 1024
 _MAX_LINE_OCTETS: Final = 256 * 1024
-_TEXTS: Final = ("store", "station", "point", "name", "created", "keystore", "material")
 _CLEAR: Final = ("format", "store", "station", "created")
 
 
@@ -57,7 +54,7 @@ class Sealer:
         if self._recovery is not None:
             return load_object(jose.encrypt(key, [self._recovery], cty=KEY_TYPE), "The sealed key")
         assert self._passphrase is not None
-        return sealing.seal(self._passphrase, key, context=_context(clear), costs=self._costs)
+        return sealing.seal(self._passphrase, key, context=context_of(clear, FORMAT), costs=self._costs)
 
 
 def write(out: BinaryIO, head: Head, rows: Iterable[bytes], signer: PrivateKey, sealer: Sealer) -> bytes:
@@ -65,11 +62,11 @@ def write(out: BinaryIO, head: Head, rows: Iterable[bytes], signer: PrivateKey, 
     key = os.urandom(KEY_OCTETS)
     clear = {"format": FORMAT, "store": head.store, "station": head.station, "created": head.created}
     document = {**clear, "key": sealer.wrap(key, clear)}
-    line = dump({**document, "sha256": _digest(document)}) + b"\n"
+    line = dump({**document, "sha256": digest_of(document)}) + b"\n"
     out.write(line)
     bound = hashlib.sha256(line).digest()
     chunks = ChunkWriter(out, key, bound)
-    chunks.write(dump(_members(head)) + b"\n")
+    chunks.write(head.line(FORMAT))
     for octets in rows:
         chunks.write(octets)
     chunks.write(signer.sign(_LABEL + bound + chunks.digest.digest()))
@@ -107,7 +104,7 @@ class SealedFile:
         if self._head is None:
             return _of_version_1(version_1.open_with_passphrase(version_1.read(self.path), passphrase))
         clear = self._checked_head()
-        key, _ = sealing.unseal(passphrase, self._head["key"], context=_context(clear))
+        key, _ = sealing.unseal(passphrase, self._head["key"], context=context_of(clear, FORMAT))
         return self.open_with_content_key(key)
 
     def open_with_key(self, key: PrivateKey) -> Content:
@@ -139,13 +136,13 @@ class SealedFile:
         """The members in the clear, held against their digest."""
         assert self._head is not None
         document = {name: value for name, value in self._head.items() if name != "sha256"}
-        if self._head.get("sha256") != _digest(document):
+        if self._head.get("sha256") != digest_of(document):
             raise NotAuthentic("The backup was damaged or changed: its digest does not fit.", hint="Take another copy.")
         return {name: self._head.get(name) for name in _CLEAR}
 
 
 def _content(chunks: ChunkReader, bound: bytes, clear: dict[str, Any]) -> Content:
-    head = _head_of(chunks.read_line(_MAX_HEAD_OCTETS))
+    head = Head.read(chunks.read_line(_MAX_HEAD_OCTETS), FORMAT)
     if (head.store, head.station, head.created) != (clear["store"], clear["station"], clear["created"]):
         raise NotAuthentic("The backup says outside that it is of another station than it is inside.")
     copy = load_rows(chunks)
@@ -154,52 +151,12 @@ def _content(chunks: ChunkReader, bound: bytes, clear: dict[str, Any]) -> Conten
         if not verify(head.point, signed, chunks.read(SIGNATURE_OCTETS)):
             raise NotAuthentic("The backup is not signed by the station that it names.")
         chunks.require_end()
-        return _with(head, copy)
+        return Content(**vars(head), copy=copy)
     except BaseException:
         copy.close()
         raise
 
 
-def _with(head: Head, copy: Store) -> Content:
-    return Content(**vars(head), copy=copy)
-
-
 def _of_version_1(old: version_1.Content) -> Content:
-    head = Head(old.store, old.point, old.name, old.created, old.keystore, old.material)
-    return _with(head, load_database(old.database))
-
-
-def _members(head: Head) -> dict[str, str]:
-    return {
-        "format": FORMAT,
-        "store": head.store,
-        "station": head.station,
-        "point": head.point.hex(),
-        "name": head.name,
-        "created": head.created,
-        "keystore": head.keystore,
-        "material": head.material,
-        "version": __version__,
-    }
-
-
-def _head_of(line: bytes) -> Head:
-    members = load_object(line, "The head of the backup")
-    if members.get("format") != FORMAT or not all(isinstance(members.get(name), str) for name in _TEXTS):
-        raise BadData("The head of the backup is not of this version.")
-    try:
-        point = bytes.fromhex(members["point"])
-    except ValueError:
-        point = b""
-    if not is_point(point):
-        raise BadData("The backup names no valid station key.")
-    values = (members[name] for name in ("name", "created", "keystore", "material"))
-    return Head(members["store"], point, *values)
-
-
-def _digest(document: dict[str, Any]) -> str:
-    return hashlib.sha256(dump(document)).hexdigest()
-
-
-def _context(clear: dict[str, Any]) -> bytes:
-    return FORMAT.encode() + b"\0" + dump(clear)
+    head = {name: value for name, value in vars(old).items() if name != "database"}
+    return Content(**head, copy=load_database(old.database))

@@ -1,4 +1,4 @@
-"""The sealed file of ``backup``: what stands in it, and what opening it checks.
+"""The sealed file of ``backup`` as version 0.1 made it, which still opens: what stands in it, and what is checked.
 
 Inside, whatever seals it: a compact JWS (ES256) by the station itself, ``typ`` ``teds-backup+jws``, over one line of
 JSON (station, store, date, the vault's secret material) and the octets of the database after it. Outside, either
@@ -10,54 +10,28 @@ JSON (station, store, date, the vault's secret material) and the octets of the d
 
 from __future__ import annotations
 
-import hashlib
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Final
 
-from teds_provision import __version__
+from teds_provision.backup.content import Head, context_of, digest_of
 from teds_provision.errors import BadData, NotAuthentic, NotFound, PolicyRefused
 from teds_provision.protocol.handover import jose
-from teds_provision.protocol.handover.strict_json import decode_base64url, dump, load_object
-from teds_provision.protocol.keys import PrivateKey, fingerprint, is_point
+from teds_provision.protocol.handover.strict_json import decode_base64url, load_object
+from teds_provision.protocol.keys import PrivateKey, fingerprint
 from teds_provision.vault import passphrase as sealing
 
 FORMAT: Final = "teds-backup/1"
 MAX_OCTETS: Final = 512 * 1024 * 1024
 TYP: Final = "teds-backup+jws"
 _MAX_HEAD_OCTETS: Final = 64 * 1024
-_TEXTS: Final = ("store", "station", "point", "name", "created", "keystore", "material")
 
 
 @dataclass(frozen=True)
-class Content:
-    """What a backup holds. ``material`` is all that the vault keeps secret; for a token, only what it has sealed."""
+class Content(Head):
+    """What a backup of version 1 holds: its head, and the octets of the database."""
 
-    store: str
-    point: bytes
-    name: str
-    created: str
-    keystore: str
-    material: str = field(repr=False)
-    database: bytes = field(repr=False)
-
-    @property
-    def station(self) -> str:
-        """Fingerprint of the station."""
-        return fingerprint(self.point)
-
-
-def seal_to_passphrase(content: Content, key: PrivateKey, passphrase: str, costs: sealing.Costs) -> bytes:
-    """Return the file; raises VaultFailure where the passphrase is too weak to be one."""
-    clear = {"format": FORMAT, "store": content.store, "station": content.station, "created": content.created}
-    sealed = sealing.seal(passphrase, _signed(content, key), context=_context(clear), costs=costs)
-    document = {**clear, "sealed": sealed}
-    return dump({**document, "sha256": _digest(document)}) + b"\n"
-
-
-def seal_to_key(content: Content, key: PrivateKey, recovery: bytes) -> bytes:
-    """Return the file for the 65-octet point of a recovery key."""
-    return jose.encrypt(_signed(content, key), [recovery], cty=TYP) + b"\n"
+    database: bytes = field(repr=False, kw_only=True)
 
 
 def read(path: Path) -> bytes:
@@ -86,13 +60,13 @@ def open_with_passphrase(octets: bytes, passphrase: str) -> Content:
     """Open a file; raises BadData, NotAuthentic (damaged or changed), WrongPassphrase, VaultFailure."""
     document = _document(octets)
     digest = document.pop("sha256", None)
-    if digest != _digest(document):
+    if digest != digest_of(document):
         raise NotAuthentic("The backup was damaged or changed: its digest does not fit.", hint="Take another copy.")
     clear = {name: document.get(name) for name in ("format", "store", "station", "created")}
     sealed = document.get("sealed")
     if not isinstance(sealed, dict):
         raise BadData("The backup has no sealed part.")
-    inner, _ = sealing.unseal(passphrase, sealed, context=_context(clear))
+    inner, _ = sealing.unseal(passphrase, sealed, context=context_of(clear, FORMAT))
     content = _verified(inner)
     if (content.store, content.station) != (clear["store"], clear["station"]):
         raise NotAuthentic("The backup says outside that it is of another station than it is inside.")
@@ -106,21 +80,6 @@ def open_with_key(octets: bytes, key: PrivateKey) -> Content:
         shown = ", ".join(kid[:16] for kid in recipients)
         raise PolicyRefused(f"The backup is sealed to the recovery key {shown}, not to this one.")
     return _verified(jose.decrypt(octets, key, cty=TYP, max_octets=MAX_OCTETS))
-
-
-def _signed(content: Content, key: PrivateKey) -> bytes:
-    head = {
-        "format": FORMAT,
-        "store": content.store,
-        "station": content.station,
-        "point": content.point.hex(),
-        "name": content.name,
-        "created": content.created,
-        "keystore": content.keystore,
-        "material": content.material,
-        "version": __version__,
-    }
-    return jose.sign_compact(dump(head) + b"\n" + content.database, key, typ=TYP)
 
 
 def _verified(inner: bytes) -> Content:
@@ -138,18 +97,8 @@ def _parsed(payload: bytes) -> Content:
     end = payload.find(b"\n", 0, _MAX_HEAD_OCTETS)
     if end < 0:
         raise BadData("The content of the backup has no head.")
-    head = load_object(payload[:end], "The head of the backup")
-    if head.get("format") != FORMAT or not all(isinstance(head.get(name), str) for name in _TEXTS):
-        raise BadData("The head of the backup is not of this version.")
-    try:
-        point = bytes.fromhex(head["point"])
-    except ValueError:
-        point = b""
-    if not is_point(point):
-        raise BadData("The backup names no valid station key.")
-    return Content(
-        head["store"], point, head["name"], head["created"], head["keystore"], head["material"], payload[end + 1 :]
-    )
+    head = Head.read(payload[:end], FORMAT)
+    return Content(**vars(head), database=payload[end + 1 :])
 
 
 def _document(octets: bytes) -> dict[str, Any]:
@@ -162,11 +111,3 @@ def _document(octets: bytes) -> dict[str, Any]:
 def _check_start(octets: bytes) -> None:
     if octets.lstrip()[:1] != b"{":
         raise BadData("This is not a backup.", hint="Give the file that teds-provision backup wrote.")
-
-
-def _digest(document: dict[str, Any]) -> str:
-    return hashlib.sha256(dump(document)).hexdigest()
-
-
-def _context(clear: dict[str, Any]) -> bytes:
-    return FORMAT.encode() + b"\0" + dump(clear)

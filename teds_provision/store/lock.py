@@ -14,10 +14,12 @@ import json
 import os
 import struct
 import time
+from abc import ABC, abstractmethod
 from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
 from types import TracebackType
+from typing import Self
 
 from teds_provision.errors import NodeBusy, StoreLocked
 from teds_provision.store.database import as_store_failure
@@ -29,30 +31,17 @@ _FIRST_POLL_SECONDS = 0.001
 _POLL_SECONDS = 0.05
 
 
-class StoreLock:
-    """``with StoreLock(home, command="provision"):`` holds the store of ``home`` for one command.
+class _HeldFile(ABC):
+    """A file that is locked for as long as the ``with`` lasts."""
 
-    Waits up to ``wait`` seconds; ``notice`` is told once, in one sentence, whom it waits for. Raises StoreLocked after
-    that, StoreFailure where the file cannot be made. Not re-entrant: take it once, at the outside.
-    """
-
-    def __init__(
-        self, home: Path, *, command: str, wait: float = 10.0, notice: Callable[[str], object] | None = None
-    ) -> None:
-        self._path = home / FILE_NAME
-        self._command = command
-        self._wait = wait
-        self._notice = notice
+    def __init__(self, path: Path) -> None:
+        self._path = path
         self._descriptor: int | None = None
 
-    def __enter__(self) -> StoreLock:
-        try:
-            descriptor = os.open(self._path, os.O_CREAT | os.O_RDWR | os.O_NOFOLLOW, 0o600)
-        except OSError as error:
-            raise as_store_failure(error, self._path) from error
+    def __enter__(self) -> Self:
+        descriptor = self._open()
         try:
             self._acquire(descriptor)
-            _sign(descriptor, self._command)
         except BaseException:
             os.close(descriptor)
             raise
@@ -63,12 +52,48 @@ class StoreLock:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         if self._descriptor is not None:
+            descriptor, self._descriptor = self._descriptor, None
             with suppress(OSError):
-                os.ftruncate(self._descriptor, 0)
-            os.close(self._descriptor)
-            self._descriptor = None
+                self._release(descriptor)
+            os.close(descriptor)
+
+    def _open(self) -> int:
+        try:
+            return os.open(self._path, os.O_CREAT | os.O_RDWR | os.O_NOFOLLOW | os.O_CLOEXEC, 0o600)
+        except OSError as error:
+            raise as_store_failure(error, self._path) from error
+
+    @abstractmethod
+    def _acquire(self, descriptor: int) -> None:
+        """Lock the open file, or raise."""
+
+    def _release(self, descriptor: int) -> None:  # noqa: B027  a node's turn leaves nothing behind
+        """What is to be done before the file is closed, which unlocks it."""
+
+
+class StoreLock(_HeldFile):
+    """``with StoreLock(home, command="provision"):`` holds the store of ``home`` for one command.
+
+    Waits up to ``wait`` seconds; ``notice`` is told once, in one sentence, whom it waits for. Raises StoreLocked after
+    that, StoreFailure where the file cannot be made. Not re-entrant: take it once, at the outside.
+    """
+
+    def __init__(
+        self, home: Path, *, command: str, wait: float = 10.0, notice: Callable[[str], object] | None = None
+    ) -> None:
+        super().__init__(home / FILE_NAME)
+        self._command = command
+        self._wait = wait
+        self._notice = notice
+
+    def _release(self, descriptor: int) -> None:
+        os.ftruncate(descriptor, 0)
 
     def _acquire(self, descriptor: int) -> None:
+        self._lock(descriptor)
+        _sign(descriptor, self._command)
+
+    def _lock(self, descriptor: int) -> None:
         until = time.monotonic() + self._wait
         told, pause = False, _FIRST_POLL_SECONDS
         while True:
@@ -90,7 +115,7 @@ class StoreLock:
             pause = min(2 * pause, _POLL_SECONDS)  # a durable step of another command takes milliseconds
 
 
-class Mark:
+class Mark(_HeldFile):
     """``with Mark(path, command="measure hand") as mark:`` something is taken, for as long as this process lives.
 
     Does not wait: raises :class:`Taken`, which names the holder. Several may hold it together where each takes it as
@@ -99,40 +124,30 @@ class Mark:
     """
 
     def __init__(self, path: Path, *, command: str, shared: bool = False) -> None:
-        self._path, self._command, self._shared = path, command, shared
-        self._descriptor: int | None = None
+        super().__init__(path)
+        self._command, self._shared = command, shared
         self.left_behind = False
 
-    def __enter__(self) -> Mark:
+    def _open(self) -> int:
         try:
             self._path.parent.mkdir(mode=0o700, exist_ok=True)
-            descriptor = os.open(self._path, os.O_CREAT | os.O_RDWR | os.O_NOFOLLOW | os.O_CLOEXEC, 0o600)
         except OSError as error:
             raise as_store_failure(error, self._path) from error
+        return super()._open()
+
+    def _acquire(self, descriptor: int) -> None:
         try:
             fcntl.flock(descriptor, (fcntl.LOCK_SH if self._shared else fcntl.LOCK_EX) | fcntl.LOCK_NB)
-            self.left_behind = bool(os.pread(descriptor, 1, 0))
         except BlockingIOError:
             holder = _holder(descriptor)
-            os.close(descriptor)
             raise Taken(f"It is held by {holder}.", holder) from None
-        except BaseException:
-            os.close(descriptor)
-            raise
+        self.left_behind = bool(os.pread(descriptor, 1, 0))
         _sign(descriptor, self._command)
-        self._descriptor = descriptor
-        return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        if self._descriptor is not None:
-            with suppress(OSError):
-                if self._shared:  # the last one puts it away
-                    fcntl.flock(self._descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-                os.ftruncate(self._descriptor, 0)
-            os.close(self._descriptor)
-            self._descriptor = None
+    def _release(self, descriptor: int) -> None:
+        if self._shared:  # the last one puts it away
+            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        os.ftruncate(descriptor, 0)
 
     @property
     def is_taken(self) -> bool:
@@ -173,7 +188,7 @@ def _holder(descriptor: int) -> str:
         return "another process"
 
 
-class NodeTurn:
+class NodeTurn(_HeldFile):
     """``with NodeTurn(home, uuid):`` one command works on this node of the store, the next one waits for it.
 
     One octet of a file is locked, at a place that the UUID names (two nodes may share one: then they take turns, no
@@ -183,28 +198,8 @@ class NodeTurn:
     def __init__(
         self, home: Path, uuid: bytes, *, wait: float = 60.0, notice: Callable[[str], object] | None = None
     ) -> None:
-        self._path, self._uuid, self._wait, self._notice = home / TURNS_NAME, uuid, wait, notice
-        self._descriptor: int | None = None
-
-    def __enter__(self) -> NodeTurn:
-        try:
-            descriptor = os.open(self._path, os.O_CREAT | os.O_RDWR | os.O_NOFOLLOW | os.O_CLOEXEC, 0o600)
-        except OSError as error:
-            raise as_store_failure(error, self._path) from error
-        try:
-            self._acquire(descriptor)
-        except BaseException:
-            os.close(descriptor)
-            raise
-        self._descriptor = descriptor
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        if self._descriptor is not None:
-            os.close(self._descriptor)
-            self._descriptor = None
+        super().__init__(home / TURNS_NAME)
+        self._uuid, self._wait, self._notice = uuid, wait, notice
 
     def _acquire(self, descriptor: int) -> None:
         place = int.from_bytes(hashlib.sha256(self._uuid).digest()[:6], "big")

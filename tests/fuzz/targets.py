@@ -376,7 +376,7 @@ def receipt_seeds() -> Iterable[bytes]:
 
 def check_backup(data: bytes) -> None:
     """A backup: its sealed chunks, its head, and the dump of rows behind right seals."""
-    from teds_provision.backup import chunks, sealed_file, version_1
+    from teds_provision.backup import chunks, content, sealed_file, version_1
     from teds_provision.store.dump import load
 
     if not data:
@@ -386,7 +386,7 @@ def check_backup(data: bytes) -> None:
         reader = chunks.ChunkReader(BytesIO(body), bytes(32), b"")
         reads(lambda: reader.read(len(body)), reader.require_end)
     elif kind == 1:
-        reads(lambda: sealed_file._head_of(body))
+        reads(lambda: content.Head.read(body, sealed_file.FORMAT))
     elif kind == 2:
         reads(
             lambda: version_1._parsed(body),
