@@ -15,6 +15,7 @@ from teds_provision.station.station import Station
 from teds_provision.teds.codec.codes import AccessCode
 from teds_provision.teds.image import Image
 from teds_provision.teds.profile.load import default_folders, load_profile, passed_over
+from teds_provision.teds.profile.reader import NAME_OCTETS
 from teds_provision.teds.sheet import Sheet
 
 if TYPE_CHECKING:
@@ -27,8 +28,6 @@ if TYPE_CHECKING:
 else:  # numpy: not for a datasheet without calibration
     calibration, guarding = late("teds_provision.teds.calibration"), late("teds_provision.teds.guard.guard")
 
-NAME_OCTETS: Final = 120
-"""The longest name of a node, as UTF-8: what wire, labels and lists have room for."""
 _UUID, _COUNT = "{uuid}", "{n}"
 _NOBODY: Final = bytes(10)
 

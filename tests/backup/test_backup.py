@@ -170,7 +170,7 @@ def test_who_recomputes_the_digest_still_needs_the_passphrase(station: Station, 
     document = json.loads(line)
     document.pop("sha256")
     document["created"] = "2030-01-01T00:00:00Z"
-    forged = backup_file.dump({**document, "sha256": backup_file._digest(document)})
+    forged = backup_file.dump({**document, "sha256": backup_file.digest_of(document)})
     with pytest.raises(WrongPassphrase):
         opened_octets(tmp_path, forged + b"\n" + chunks)
 

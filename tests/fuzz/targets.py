@@ -405,11 +405,10 @@ def check_backup(data: bytes) -> None:
 def backup_seeds() -> Iterable[bytes]:
     from teds_provision.backup import sealed_file
     from teds_provision.backup.content import Head
-    from teds_provision.protocol.handover.strict_json import dump
     from teds_provision.store.schema import SCHEMA_VERSION
 
     head = Head("0" * 32, _key(1).point, "x", "2026-11-21T00:00:00Z", "file", "{}")
-    yield b"\1" + dump(sealed_file._members(head))
+    yield b"\1" + head.line(sealed_file.FORMAT)
     tables = {"whitelist": ["uuid", "fingerprint"], "setting": ["name", "value"]}
     row = struct.pack(">BI", 0, 20) + b"\3" + struct.pack(">I", 10) + bytes(10) + b"\0"
     yield b"\3" + json.dumps({"schema": SCHEMA_VERSION, "tables": tables}).encode() + b"\n" + row + b"\xff" + bytes(4)

@@ -40,7 +40,7 @@ from teds_provision.teds.units.units import display_unit, format_units, parse_un
 
 NO_UUID: Final = bytes(10)
 _PLACES: Final[Mapping[int, int]] = {AccessCode.META: 0, AccessCode.NAME: 0, AccessCode.PHY: 0}
-_KINDS: Final = {code: kind for kind, code in TEXT_CLASSES.items()}
+_KINDS: Final[dict[int, str]] = {code: kind for kind, code in TEXT_CLASSES.items()}
 _SPELLING: Final = ("rad", "sr", "m", "kg", "s", "A", "K", "mol", "cd")
 
 Placed = dict[tuple[int, int], bytes]

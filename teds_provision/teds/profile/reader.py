@@ -15,6 +15,8 @@ from teds_provision.teds.units.units import WrittenUnit, parse_seconds, parse_un
 _LIMITS = {Kind.U8: 0xFF, Kind.U16: 0xFFFF, Kind.U32: 0xFFFF_FFFF}
 _SHOWN = 60  # characters of a wrong value that a message shows
 FLOAT32_MAXIMUM = 3.4028234663852886e38
+NAME_OCTETS = 120
+"""The longest name, as UTF-8: what wire, labels and lists have room for."""
 
 
 @dataclass(frozen=True)
@@ -176,6 +178,13 @@ class Section:
         """Field name and value of every key that is there."""
         values = [(key.field, self.read(key)) for key in keys]
         return tuple((name, value) for name, value in values if value is not None)
+
+    def name(self, key: str, default: str = "") -> str:
+        """A text of at most :data:`NAME_OCTETS`."""
+        name = self.text(key, default)
+        if len(name.encode()) > NAME_OCTETS:
+            self.error(key, f"a name has at most {NAME_OCTETS} octets, this one {len(name.encode())}.")
+        return name
 
     def finish(self, also: Sequence[str] = ()) -> None:
         """Refuse the keys nobody asked for, suggesting the nearest."""

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 
-from teds_provision.teds.profile.interpret import METHODS, TEXT_CLASSES
+from teds_provision.teds.calibration.model import METHODS
+from teds_provision.teds.profile.interpret import TEXT_CLASSES
 from teds_provision.teds.profile.keys import (
     CALIBRATION_KEYS,
     CHANNEL_KEYS,
