@@ -129,10 +129,6 @@ class Policy:
         """Where a node was given, None if it was not."""
         return self._store.tombstone(uuid)
 
-    def give_away(self, tombstone: Tombstone) -> None:
-        """Note that a node was given away: its key rests here."""
-        self._store.put_tombstone(tombstone)
-
     def take_back(self, uuids: Iterable[bytes]) -> None:
         """Take the tombstones of these nodes away."""
         self._store.remove_tombstones(uuids)

@@ -7,7 +7,7 @@ import time
 from collections.abc import Callable
 from types import TracebackType
 
-from teds_provision.errors import Garbled, LinkFailure, NodeRefused, NodeSilent, NotAuthentic, TedsProvisionError
+from teds_provision.errors import Garbled, LinkFailure, NodeRefused, NodeSilent, TedsProvisionError
 from teds_provision.links import Contact, Notice
 from teds_provision.links.ports import NoticeSink
 from teds_provision.protocol.messages.frames import Command, Function, Reason, Reply, decode_reply, security_command
@@ -260,8 +260,3 @@ class Conversation:
 
 def _nothing() -> None:
     """There is nothing to release."""
-
-
-def wrong_reply(what: str) -> NotAuthentic:
-    """The error for a sealed or signed answer that does not say what it must."""
-    return NotAuthentic(f"The node's answer to {what} is wrong.")

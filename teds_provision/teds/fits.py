@@ -11,7 +11,7 @@ from __future__ import annotations
 import math
 import re
 import tomllib
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from datetime import datetime
 from difflib import get_close_matches
@@ -324,12 +324,3 @@ def _entry(what: str, value: object, quantity: str) -> Term:
 
 
 _DOWN: Final = ("uncertainty", "low")
-
-
-def judge_all(
-    requirements: Iterable[Requirement], sheet: Sheet, now: datetime | None = None
-) -> Iterator[tuple[Requirement, Fit]]:
-    """Every requirement against a datasheet, line by line."""
-    for requirement in requirements:
-        for fit in judge(requirement, sheet, now):
-            yield requirement, fit

@@ -35,7 +35,7 @@ while True:
     with store.transaction():
         store.put_node(NodeRecord(node, sequence=number, epoch=number))
         store.add_key(KeyRecord(node, number, key_id, "pending", number, b"w" * 49))
-        store.promote_key(node, key_id)
+        store.activate_key(node, key_id)
         store.audit.append("write", node, "done", {"number": number})
     print(number, flush=True)
 """

@@ -72,9 +72,8 @@ def test_a_tombstone_says_where_a_node_went(store: Store) -> None:
     store.put_tombstone(stone)
     assert store.tombstone(NODE) == stone
     assert store.tombstones() == [stone]
-    assert store.remove_tombstone(NODE)
+    store.remove_tombstones([NODE])
     assert store.tombstone(NODE) is None
-    assert not store.remove_tombstone(NODE)
 
 
 def test_holders_are_listed_per_node_and_in_all(store: Store) -> None:

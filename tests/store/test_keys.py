@@ -27,26 +27,26 @@ def test_the_newest_pending_key_is_tried_first_and_the_active_one_last(store: St
     assert numbers(store) == [3, 2, 1]
 
 
-def test_a_good_open_promotes_one_key_and_deletes_the_others(store: Store) -> None:
+def test_a_good_open_makes_one_key_active_and_deletes_the_active_one_before(store: Store) -> None:
     for key in (a_key(1, "active"), a_key(2), a_key(3), a_key(9, uuid=OTHER)):
         store.add_key(key)
-    store.promote_key(NODE, f"{2:016x}")
-    assert [(key.epoch, key.state) for key in store.keys(NODE)] == [(2, "active")]
+    store.activate_key(NODE, f"{2:016x}")
+    assert [(key.epoch, key.state) for key in store.keys(NODE)] == [(3, "pending"), (2, "active")]
     assert numbers(store, OTHER) == [9]
 
 
 def test_promoting_again_changes_nothing(store: Store) -> None:
     store.add_key(a_key(1))
-    store.promote_key(NODE, f"{1:016x}")
+    store.activate_key(NODE, f"{1:016x}")
     before = store.keys(NODE)
-    store.promote_key(NODE, f"{1:016x}")
+    store.activate_key(NODE, f"{1:016x}")
     assert store.keys(NODE) == before
 
 
 def test_promoting_an_unknown_key_deletes_nothing(store: Store) -> None:
     store.add_key(a_key(1, "active"))
     with pytest.raises(NotFound):
-        store.promote_key(NODE, "f" * 16)
+        store.activate_key(NODE, "f" * 16)
     assert numbers(store) == [1]
 
 

@@ -17,7 +17,7 @@ from cryptography.hazmat.primitives.kdf.hkdf import HKDFExpand
 
 TAG_OCTETS: Final = 8
 COUNTER_OCTETS: Final = 4
-OVERHEAD: Final = COUNTER_OCTETS + 1 + TAG_OCTETS
+
 """Counter, flags and tag."""
 MOST_OCTETS: Final = 240
 LAST_COUNTER: Final = 0xFFFFFFFF

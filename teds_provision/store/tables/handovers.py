@@ -108,10 +108,6 @@ class HandoverTables:
             (tombstone.uuid, tombstone.to_fingerprint, tombstone.handover_id, tombstone.created),
         )
 
-    def remove_tombstone(self, uuid: bytes) -> bool:
-        """Take a tombstone away (an undone move); False if there is none."""
-        return self._database.change("DELETE FROM tombstones WHERE uuid = ?", (uuid,)) > 0
-
     def holders(self, uuid: bytes | None = None) -> list[Holder]:
         """Return who else holds keys: of this node, or of all."""
         statement = "SELECT * FROM holders WHERE ? IS NULL OR uuid = ? ORDER BY uuid, since, fingerprint"

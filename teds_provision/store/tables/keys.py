@@ -70,17 +70,6 @@ class KeyTables:
         """Have no pending key of a node count as agreed on here: a rotation became due after it was made."""
         self._database.execute("UPDATE keys SET source = 'import' WHERE uuid = ? AND state = 'pending'", (uuid,))
 
-    def promote_key(self, uuid: bytes, key_id: str) -> None:
-        """Make this key the active one and delete all others of the node, in one transaction.
-
-        To be called only when an Open under it has shown a good node tag. Raises NotFound for an unknown key.
-        """
-        with self._database.transaction():
-            if not self._database.one("SELECT 1 FROM keys WHERE uuid = ? AND key_id = ?", (uuid, key_id)):
-                raise NotFound(f"The store has no key {key_id} of node {uuid.hex()}.")
-            self._database.execute("DELETE FROM keys WHERE uuid = ? AND key_id <> ?", (uuid, key_id))
-            self._database.execute("UPDATE keys SET state = 'active' WHERE uuid = ? AND state <> 'active'", (uuid,))
-
     def remove_keys(self, uuid: bytes) -> int:
         """Delete every key of a node (decommission); returns how many there were."""
         return self._database.change("DELETE FROM keys WHERE uuid = ?", (uuid,))

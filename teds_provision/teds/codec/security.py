@@ -29,7 +29,7 @@ _BASE64 = {100: 64, 101: 65, 102: 64, 103: 65, 104: 64}
 _OCTETS = dict.fromkeys(_U8, 1) | dict.fromkeys(_BASE64, 88) | {6: 8, 106: 4, 107: 4}
 _KNOWN = {1, 2, 3, 4, 5, 6, *range(100, 111)}
 INITIAL_FIELDS: Final = frozenset({1, 2, 3, 4, 5, 6, 101, 102, 105, 106, 107, 109, 110})
-SIGNED_FIELDS: Final = INITIAL_FIELDS | {100, 103, 104}
+
 
 CA_OCTETS = 64
 CA_NAME_OCTETS = 47
