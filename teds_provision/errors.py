@@ -115,7 +115,7 @@ class Frozen(PolicyRefused):
 
 
 class NodeRefused(PolicyRefused):
-    """The node refused a command; ``reason`` is the u8 of security-teds.md section 4."""
+    """The node refused a command; ``reason`` is the u8 of profile.md, "Reasons"."""
 
     code = "node-refused"
 

@@ -1,4 +1,4 @@
-"""One CA for several stations: a station asks for its signature, the CA's keeper gives it (profile section 2).
+"""One CA for several stations: a station asks, the CA's keeper signs (profile.md, "Keys and trust").
 
 Two small JSON files travel, neither secret. The *request*: name, public key, and the station's own signature over
 ``"TEDS1 station request" ‖ 00 ‖ P(station) ‖ name``, so that nobody asks in another's name. The *certificate*: the

@@ -1,4 +1,4 @@
-"""``export-keys``: node keys into a sealed bundle for other stations (profile section 6).
+"""``export-keys``: node keys into a sealed bundle for other stations (profile.md, "Handover between base stations").
 
 What a killed run leaves behind: a move's tombstones and its row are durable before any file exists, so the key rests
 whatever happens; the same command then seals the same move again, under the same id.

@@ -1,4 +1,4 @@
-"""``import-keys``: take node keys over from a trusted station (profile section 6).
+"""``import-keys``: take node keys over from a trusted station (profile.md, "Handover between base stations").
 
 Everything is checked before anything is kept, and one transaction keeps all of it: keys as pending, whitelist, nodes,
 the CA's signature over this station, the deny list and the receipt. The same bundle again gives the same receipt.

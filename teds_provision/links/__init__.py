@@ -1,4 +1,4 @@
-"""Links: the ways on which a command frame travels to a node and its reply comes back (spec: docs/profile, "wire").
+"""Links: the ways on which a command frame travels to a node and its reply back (profile.md, "NFC", "CAN", "BLE").
 
 A :class:`Port` is the reader or the bus; it finds nodes. A :class:`Contact` is one node found on it, with the
 :class:`Link` that carries one command frame and its one reply at a time. Everything above this package is the same

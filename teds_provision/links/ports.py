@@ -101,8 +101,8 @@ class Link(Protocol):
     def exchange(self, frame: bytes) -> bytes:
         """Send one whole command frame and return the whole reply frame that belongs to it.
 
-        Repeats as wire.md allows (at most twice, within 15 s). Raises NodeSilent, Garbled, AddressConflict or
-        another LinkFailure; never returns a reply of another transaction.
+        Repeats as profile.md, "Repetition", allows (at most twice, within 15 s). Raises NodeSilent, Garbled,
+        AddressConflict or another LinkFailure; never returns a reply of another transaction.
         """
 
     def close(self) -> None:

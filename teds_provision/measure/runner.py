@@ -45,7 +45,7 @@ class Watcher:
 
 @dataclass(frozen=True)
 class Ended:
-    """How a measurement ended: the ``end`` event (cli.md), and the worst error of a node or sink, None for none."""
+    """How a measurement ended: the ``end`` event of ``measure --json``, and the worst error, None for none."""
 
     nodes: list[dict[str, Any]]
     files: list[str]
@@ -226,7 +226,7 @@ class Measurement:
 
 
 def _summary(keeper: NodeKeeper) -> dict[str, Any]:
-    """A node of the ``end`` event (cli.md, `measure`)."""
+    """A node of the ``end`` event of ``measure --json``."""
     streams = [asdict(one) | {"channels": list(one.channels)} for _, one in sorted(keeper.streams.totals.items())]
     node: dict[str, Any] = {"uuid": keeper.uuid.hex(), "streams": streams}
     if keeper.error is not None:
@@ -235,6 +235,6 @@ def _summary(keeper: NodeKeeper) -> dict[str, Any]:
 
 
 def _rank(error: TedsProvisionError) -> int:
-    """Not authentic before refused before the link before the rest (cli.md, `measure`)."""
+    """Not authentic before refused before the link before the rest."""
     order = (4, 6, 5)
     return order.index(error.exit_code) if error.exit_code in order else len(order)

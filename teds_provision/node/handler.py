@@ -25,7 +25,7 @@ class NodeHandler(Protocol):
         """Return the node's present CAN address, 1 to 239."""
 
     def take_can_address(self, address: int) -> None:
-        """Have another CAN address until the restart: another node claimed this one (profile: wire, "Claim")."""
+        """Have another CAN address until the restart: another node claimed this one (profile.md, "CAN")."""
 
     def actuator_claimed(self) -> bool:
         """Whether a session claims an actuator, so that the node keeps its CAN address whoever claims it."""

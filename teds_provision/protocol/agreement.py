@@ -1,4 +1,4 @@
-"""Key agreement: Request, Confirm, and the link key they give (profile section 3).
+"""Key agreement: Request, Confirm, and the link key they give (profile.md, "Key agreement").
 
 NIST SP 800-56A rev. 3 scheme C(1e, 2s, ECC CDH) with bilateral key confirmation; HKDF of RFC 5869. Pure: no I/O, both
 roles. Python cannot wipe memory reliably; Z and OKM live in local names only and are dropped on return.

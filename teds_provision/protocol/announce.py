@@ -1,4 +1,4 @@
-"""Announce on CAN, and how nodes that meet on one address sort themselves out (profile: wire, "CAN"). Pure.
+"""Announce on CAN, and how nodes that meet on one address sort themselves out (profile.md, "CAN"). Pure.
 
 An Announce says "here I am, in this state, and this is the CRC-32 of my UUID". Where two nodes have one address, the
 one with the smaller CRC keeps it, the other takes the next address from which it has heard nothing.
@@ -34,7 +34,7 @@ def uuid_crc(uuid: bytes) -> int:
 
 
 def default_can_address(uuid: bytes) -> int:
-    """A node's own default address: 1 + CRC-32(UUID) mod 239 (profile: wire, 128.10)."""
+    """A node's own default address: 1 + CRC-32(UUID) mod 239 (profile.md, "CAN")."""
     return 1 + uuid_crc(uuid) % LAST_ADDRESS
 
 

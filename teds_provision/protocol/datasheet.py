@@ -1,4 +1,4 @@
-"""The signed datasheet: making field 100, and the checks that node and reader share (profile sections 1 and 5)."""
+"""The signed datasheet: field 100, and the checks that node and reader share (profile.md, "The Security TEDS")."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""P-256 keys: points, fingerprints, the profile's signatures and ECDH (security-teds profile, introduction; SEC 1).
+"""P-256 keys: points, fingerprints, the profile's signatures and ECDH (profile.md, "Notation"; SEC 1).
 
 A private key is anything that can sign and agree: a key in software, in the OS keyring or in a token. Everything above
 uses :class:`PrivateKey` alone.

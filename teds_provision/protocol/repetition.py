@@ -1,4 +1,4 @@
-"""Repetition on a link: an octet-equal request gets its stored reply, nothing is run twice (wire.md, "Repetition").
+"""Repetition on a link: an octet-equal request gets its stored reply, nothing is run twice (profile.md, "Repetition").
 
 The node keeps, for each link, the last request and its reply for 20 s. Commands that change nothing (Identify, Prove,
 List, Query, Read, outside Sealed) are always run anew.

@@ -1,4 +1,4 @@
-"""Sessions under a link key: Open, Sealed, counters (profile section 4, SessionSuite 2). Pure, both roles.
+"""Sessions under a link key: Open, Sealed, counters (profile.md, "Sessions"). Pure, both roles.
 
 Open makes session keys from one-time P-256 keys of both sides, so K alone, stolen later, opens no recorded session.
 AES-128-CCM of RFC 3610 with a 16-octet tag, PKCS #7 padding, HKDF and HMAC as in the key agreement. Python cannot wipe

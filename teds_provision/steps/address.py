@@ -1,4 +1,4 @@
-"""Set CAN address (128.10): plainly by tap, or in a session (profile: wire)."""
+"""Set CAN address (128.10): plainly by tap, or in a session (profile.md, "CAN")."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Step 3: agree on a link key, or find that one is agreed (profile section 3). Lost messages heal here."""
+"""Step 3: agree on a link key, or find that one is agreed (profile.md, "Key agreement"). Lost messages heal here."""
 
 from __future__ import annotations
 

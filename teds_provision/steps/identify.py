@@ -91,7 +91,7 @@ def identify(
 def _pinned_now(station: Station, who: Identified) -> WhitelistEntry | None:
     """The node's entry with its whole fingerprint, None where it has that already, or nobody opens the vault.
 
-    An entry that was made without one is pinned by its first tap (profile, section 2); one that was made with the first
+    An entry that was made without one is pinned by its first tap (profile.md, "Keys and trust"); one that was made with the first
     digits gets the others by the first contact, whatever the link.
     """
     entry = who.whitelisted

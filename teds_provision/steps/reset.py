@@ -1,4 +1,4 @@
-"""Reset: a node back to factory state, and its signature under that (profile section 4, 128.9)."""
+"""Reset: a node back to factory state, and its signature under that (profile.md, "Reset")."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Step 5: sign a datasheet, or find that the existing signature still says the same (profile section 1)."""
+"""Step 5: sign a datasheet, or find that the signature still says the same (profile.md, "The Security TEDS")."""
 
 from __future__ import annotations
 

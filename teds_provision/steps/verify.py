@@ -1,4 +1,4 @@
-"""Step 7: everything that the profile demands of a datasheet, check by check (profile section 1)."""
+"""Step 7: everything that the profile demands of a datasheet, check by check (profile.md, "The Security TEDS")."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ class Verified:
     """All checks and the one verdict. ``scope`` says what was judged: a node, or an image file alone.
 
     ``unsigned``: nothing is wrong but that nobody signed (all of) it. ``unproven``: a key of the node is held and no
-    session came about, so that whoever answered may have recorded what it served (contract: cli.md, "Rules").
+    session came about, so that whoever answered may have recorded what it served.
     """
 
     uuid: bytes

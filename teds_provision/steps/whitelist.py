@@ -1,7 +1,7 @@
 """The whitelist: which nodes may be keyed and written, each by UUID and by the fingerprint of its key.
 
-A pinned key is never replaced by a command that adds; the entry has to be removed first (profile: security-teds.md
-section 2).
+A pinned key is never replaced by a command that adds; the entry has to be removed first (profile.md,
+"Keys and trust").
 """
 
 from __future__ import annotations

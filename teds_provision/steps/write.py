@@ -1,4 +1,4 @@
-"""Step 6: stage every TEDS, commit, read back, compare (profile section 5)."""
+"""Step 6: stage every TEDS, commit, read back, compare (profile.md, "Writing to flash")."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What the store keeps, as frozen values: one class per table (profile: security-teds.md sections 1, 2, 3 and 6).
+"""What the store keeps, as frozen values: one class per table (store.md; profile.md).
 
 UUIDs are 10 octets, fingerprints 64 hex digits, points 65 octets (SEC 1 uncompressed), times ISO 8601 in UTC.
 """
@@ -74,7 +74,7 @@ class NodeRecord:
 
 @dataclass(frozen=True)
 class KeyRecord:
-    """One link key of one node, wrapped by the vault; ``key_id`` is 16 hex digits (security-teds.md section 4).
+    """One link key of one node, wrapped by the vault; ``key_id`` is 16 hex digits (profile.md, "Key agreement").
 
     ``slot`` tells apart keys of one node and epoch (see ``Store.next_slot``); ``seq`` is given by the store and grows.
     """

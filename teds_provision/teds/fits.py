@@ -1,7 +1,7 @@
 """Whether a datasheet suffices for a task: ``angle >= 360 deg, uncertainty <= 1 deg, rate >= 1 kHz``.
 
 A requirement names a quantity (or a channel) and bounds on it; it is judged against the channels of a :class:`Sheet`
-(cli.md, ``nodes --fits`` and ``measure --require``). The quantity itself, ``low`` and ``high`` look at the range: with
+(``nodes --fits``, ``measure --require``). The quantity itself, ``low`` and ``high`` look at the range: with
 ``>=`` it must reach up to the value, with ``<=`` down to it. ``range`` is its width, ``uncertainty`` the worst case
 (``%`` of the width, or in the unit), ``rate`` the highest sampling rate. A full turn reaches every angle.
 """

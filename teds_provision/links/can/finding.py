@@ -19,7 +19,7 @@ from teds_provision.protocol.messages.identity import Identity
 IDENTIFY: Final = security_command(Function.IDENTIFY).encode()
 SILENCE_SECONDS: Final = 0.3
 LONGEST_SECONDS: Final = 3.0
-"""A station listens until 300 ms of silence, 3 s at most (profile: wire, "CAN")."""
+"""A station listens until 300 ms of silence, 3 s at most (profile.md, "CAN")."""
 
 AskOne = Callable[[int], Identity | None]
 """Ask one address who is there: None where nobody answers in a way that can be read; raises AddressConflict."""

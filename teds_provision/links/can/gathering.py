@@ -18,7 +18,7 @@ class Gathering:
     """One functional Identify of station ``own``: ``answers`` by node address, without the transaction octet.
 
     ``conflicts`` are addresses under which two nodes answered: two first frames within this Identify, two different
-    whole answers, or consecutive frames out of sequence (profile: wire, "CAN"). A frame that was lost looks the same,
+    whole answers, or consecutive frames out of sequence (profile.md, "CAN"). A frame that was lost looks the same,
     so whoever asks looks again before it says so. ``clashes`` are those where it is sure: two different beginnings.
     """
 

@@ -1,4 +1,4 @@
-"""One node's line on CAN: a request, its reply, and what is done about frames that were lost (profile: wire, "CAN")."""
+"""One node's line on CAN: a request, its reply, and what is done about frames that were lost (profile.md, "CAN")."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from teds_provision.links.ports import CAN, Capabilities
 REPLY_SECONDS: Final = 5.0
 REPEAT_SECONDS: Final = 15.0
 TRIES: Final = 3
-"""A reply is awaited 5 s; a request is repeated at most twice, within 15 s (profile: wire)."""
+"""A reply is awaited 5 s; a request is repeated at most twice, within 15 s (profile.md, "Repetition")."""
 _SHARES: Final = (0.3, 0.7, 1.0)
 _LOSSY_SHARES: Final = (0.06, 0.24, 1.0)
 """Parts of the 5 s after which a request goes out again, on a bus that loses nothing and on one that lost a frame in

@@ -30,7 +30,7 @@ from teds_provision.links.ports import CAN, Capabilities, Contact, Notice, Notic
 from teds_provision.protocol.messages.identity import Identity
 
 ANNOUNCE: Final = 0x1CFF0000
-"""Identifier of an Announce, its node in the last octet (profile: wire, "CAN")."""
+"""Identifier of an Announce, its node in the last octet (profile.md, "CAN")."""
 _HELLO_SECONDS: Final = 1.0
 _GUESS_SECONDS: Final = 0.1
 """The wait for who may be at the address where a node is thought to be; everyone is asked after it."""

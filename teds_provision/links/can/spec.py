@@ -10,7 +10,7 @@ from teds_provision.errors import UsageFailure
 
 FIRST_STATION: Final = 0xF1
 LAST_STATION: Final = 0xF7
-"""Addresses of base stations (profile: wire, "CAN")."""
+"""Addresses of base stations (profile.md, "CAN")."""
 LAST_NODE: Final = 0xEF
 """Nodes have 0x01 to 0xEF."""
 DEFAULT_BITRATE: Final = 500_000

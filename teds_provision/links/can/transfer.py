@@ -74,7 +74,7 @@ class Reassembly:
 
 
 def flow(peer: int, own: int, status: int, *, fd: bool) -> Frame:
-    """A flow control frame to ``peer``: 16 frames a block, no gap (profile: wire, "CAN")."""
+    """A flow control frame to ``peer``: 16 frames a block, no gap (profile.md, "CAN")."""
     return Frame(physical_id(peer, own), padded(bytes([status, BLOCK_SIZE, 0]), fd=fd), fd)
 
 

@@ -1,4 +1,4 @@
-"""WLC and Bluetooth LE out-of-band records of an initial message (wire.md, "BLE"; operation.md, section 7).
+"""WLC and Bluetooth LE out-of-band records of an initial message (profile.md, "BLE"; operation.md section 7).
 
 Layouts as several public stacks agree on them; the texts of NFC Forum and Bluetooth SIG were not at hand. Whatever
 comes is read without an error: what is cut off or out of range is left out. Pure; imports no NFC library.

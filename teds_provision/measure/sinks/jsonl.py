@@ -1,4 +1,4 @@
-"""JSON lines: the first says who measures what, then the events of ``measure --json`` (cli.md), one line each."""
+"""JSON lines: the first says who measures what, then the events of ``measure --json``, one line each."""
 
 from __future__ import annotations
 

@@ -38,7 +38,7 @@ def facts_as_json(facts: ChannelFacts) -> dict[str, Any]:
 
 
 def data_lines(block: Block, facts: Mapping[tuple[str, int], ChannelFacts]) -> Iterator[dict[str, Any]]:
-    """One ``data`` event for each channel of a block (cli.md, `measure`); an invalid value is null, never NaN."""
+    """One ``data`` event for each channel of a block (``measure --json``); an invalid value is null, never NaN."""
     times = [round(instant, 6) for instant in block.time.tolist()]
     for column, number in enumerate(block.channels):
         known = facts.get((block.uuid, number))

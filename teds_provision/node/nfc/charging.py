@@ -1,7 +1,7 @@
 """What the initial NFC message of a node says beside the profile's records: charge, and where it is in the air.
 
-Records of NFC Forum WLC 2.0 as open sources read them (wire.md; the layouts are those of operation.md section 7 and of
-what sold tags show): ``WLCCAP`` stands first, ``WLCSTAI`` after it, both in static mode, so that the mailbox stays
+Records of NFC Forum WLC 2.0 as open sources read them (the layouts are those of operation.md section 7 and of what
+sold tags show): ``WLCCAP`` stands first, ``WLCSTAI`` after it, both in static mode, so that the mailbox stays
 TNEP's. All of it is a hint.
 """
 

@@ -1,4 +1,6 @@
-"""The handover bundle: node keys from one base station to others (profile section 6). Pure: no store, no files.
+"""The handover bundle: node keys from one base station to others. Pure: no store, no files.
+
+The format is that of profile.md, "Handover between base stations".
 
 :func:`seal_bundle` makes one, :func:`open_bundle` checks all that can be checked without a store, :func:`peek_bundle`
 reads what stands in the clear. What remains for whoever holds the store: a known UUID with another node key, an epoch

@@ -1,4 +1,6 @@
-"""Reading the members of a signed payload: each with its type, its range and its own complaint (profile section 6).
+"""Reading the members of a signed payload: each with its type, its range and its own complaint.
+
+The payloads are those of profile.md, "Handover between base stations".
 
 Members that are not known are passed over: the signature covers them, and a later format may add some. Members that
 are known are read strictly. Text for people must be printable, so that a name cannot steer a terminal.

@@ -1,4 +1,4 @@
-"""The signed receipt of a handover (profile section 6): it tells the sender of a bundle what became of it.
+"""The signed receipt of a handover: it tells the sender of a bundle what became of it.
 
 Compact JWS, ``typ`` ``teds-receipt+jws``. ``from`` is the station that took the keys in and signs, ``to`` the one that
 sent the bundle: a receipt is a message of its own.

@@ -23,7 +23,7 @@ _INTEGERS: Final = {"u8": 1, "u16": 2, "u32": 4, "bool": 1}
 _FIXED: Final = {**_INTEGERS, "f32": 4, "uuid": 16, "time": 10, "duration": 8}
 
 TAGS: Final = {1: 1, 2: 2, 3: 4, 4: 4, 5: 8, 8: 1, 9: 8, 10: 8}
-"""Octets of the fixed-size type codes of tagged arguments (ieee-1451.0.md section 5); all others vary."""
+"""Octets of the fixed-size type codes of tagged arguments (teds.md, "Data types"); all others vary."""
 _HIGHEST_TAG: Final = 21
 _TAG_OF: Final = {"u8": {1, 8}, "u16": {2}, "u32": {3}, "bool": {8, 1}, "f32": {4}}
 

@@ -1,4 +1,4 @@
-"""Commands and replies over BLE: cut into frames and put together (profile: wire, "BLE"). Pure, both roles.
+"""Commands and replies over BLE: cut into frames and put together (profile.md, "BLE"). Pure, both roles.
 
 A frame is ``transaction u16 ‖ total u16 ‖ offset u16 ‖ piece``. A station writes them with response, a node notifies
 them, in order; data messages go another way (``protocol.operation.can_frames``).

@@ -1,4 +1,4 @@
-"""Command and reply frames of IEEE 1451.0-2007 (ieee-1451.0.md section 7.1), and the profile's own class 128."""
+"""Command and reply frames of IEEE 1451.0-2007 (profile.md, "Command frames"), and the profile's own class 128."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ COMMON, OPERATE, EITHER, SECURITY = 1, 3, 4, 128
 
 
 class Function(IntEnum):
-    """Functions of class 128 (profile sections 3 and 4; 12 to 20: operation.md)."""
+    """Functions of class 128 (profile.md, "Command frames"; 12 to 20: operation.md)."""
 
     REQUEST = 1
     CONFIRM = 2
@@ -40,7 +40,7 @@ class Function(IntEnum):
 
 
 class TedsFunction(IntEnum):
-    """Functions of class 1 that deal with TEDS (ieee-1451.0.md section 7.3)."""
+    """Functions of class 1 that deal with TEDS (profile.md, "Writing to flash")."""
 
     QUERY = 1
     READ = 2
@@ -49,7 +49,7 @@ class TedsFunction(IntEnum):
 
 
 class Reason(IntEnum):
-    """Why a node refused: the u8 of a reply with status 0 (profile section 4)."""
+    """Why a node refused: the u8 of a reply with status 0 (profile.md, "Reasons")."""
 
     UNKNOWN_COMMAND = 1
     WRONG_STATE = 2
@@ -157,7 +157,7 @@ def update_teds(channel: int, access_code: int) -> Command:
 
 
 class Attribute(IntEnum):
-    """Bits of the attributes octet of a Query TEDS reply (ieee-1451.0.md section 7.4)."""
+    """Bits of the attributes octet of a Query TEDS reply (profile.md, "Writing to flash")."""
 
     READ_ONLY = 0x01
     NOT_AVAILABLE = 0x02

@@ -1,4 +1,4 @@
-"""Identify (128.7): what a node says of itself to anyone, unauthenticated (profile: wire, "Identify")."""
+"""Identify (128.7): what a node says of itself to anyone, unauthenticated (profile.md, "Identify, Prove, List")."""
 
 from __future__ import annotations
 

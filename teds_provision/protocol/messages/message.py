@@ -1,7 +1,7 @@
 """Messages between NCAP and TIM (2007) and between application and NCAP (2024): octets to names, and back.
 
 :func:`decode_message` never raises, whatever the octets; what is wrong or guessed stands in ``findings``. Of the two
-payload schools of the 2007 commands both are read, only plain concatenation is written (ieee-1451.0.md section 7.5).
+payload schools of the 2007 commands both are read, only plain concatenation is written (formats.md, "Messages").
 """
 
 from __future__ import annotations

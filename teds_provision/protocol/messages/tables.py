@@ -5,8 +5,8 @@ are), ``uuid`` (16 octets), ``text`` (up to a NUL), ``time`` (TimeInstance of th
 ``duration`` (8 octets), ``teds`` (a whole TEDS), ``octets`` (the rest), ``blocks`` (channel u16 and access code u8,
 repeated), ``u16s texts uuids`` (as many as the ``count`` before says).
 
-Sources: ieee-1451.0.md sections 7.3, 7.4 and 7.7; class 128 is the security profile's. Classes 4 to 7 of the 2007
-commands rest on one public implementation, the layouts of announcements and departures of 2024 too.
+What is read of them: formats.md, "Messages"; class 128 is the security profile's. Classes 4 to 7 of the 2007 commands
+rest on one public implementation, the layouts of announcements and departures of 2024 too.
 """
 
 from __future__ import annotations
@@ -187,7 +187,7 @@ STATUS_BITS: Final = (
     "corrections disabled",
     "consumables exhausted",
 )
-"""Bits of the status registers, from memory and unconfirmed (ieee-1451.0.md section 7.6)."""
+"""Bits of the status registers, from memory and unconfirmed."""
 
 ERROR_SOURCES: Final = ("local .0", "local .X", "remote .X", "remote .0", "application", "?", "?", "?")
 ERRORS: Final = (

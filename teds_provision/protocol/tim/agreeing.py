@@ -1,4 +1,4 @@
-"""The node's half of the key agreement: Request, Confirm, and what lies in RAM between them (profile section 3)."""
+"""The node's half of the agreement: Request, Confirm, what lies in RAM meanwhile (profile.md, "Key agreement")."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The node's sessions: Open, Sealed, lives and ends, on every link (profile section 4).
+"""The node's sessions: Open, Sealed, lives and ends, on every link (profile.md, "Sessions").
 
 A link has at most one session and one half-open Open; all links together have room for so many of each.
 """

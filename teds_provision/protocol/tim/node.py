@@ -1,4 +1,4 @@
-"""One node: routing of commands, and those that need little (profile section 4)."""
+"""One node: routing of commands, and those that need little (profile.md, "Which command when")."""
 
 from __future__ import annotations
 
@@ -123,7 +123,7 @@ class Tim:
         return self._flash.can_address if self._taken_address is None else self._taken_address
 
     def take_can_address(self, address: int) -> None:
-        """Move to another CAN address because another node claimed this one (profile: wire, "Claim")."""
+        """Move to another CAN address because another node claimed this one (profile.md, "CAN")."""
         self._taken_address = address
 
     def handle(

@@ -1,4 +1,4 @@
-"""State and permission of every command: the table of profile section 4, and what claims forbid (operation.md 1, 2).
+"""Which command may be run when: the table of profile.md, "Which command when", and what claims forbid (operation.md).
 
 The first question that a node asks of a command; lengths and everything else come after it.
 """

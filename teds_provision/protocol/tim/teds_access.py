@@ -1,4 +1,4 @@
-"""TEDS access on the node: Query, Read, Write, Update (profile section 5, ieee-1451.0.md section 7.4). Pure."""
+"""TEDS access on the node: Query, Read, Write, Update (profile.md, "Writing to flash"). Pure."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Whether the datasheets that this station knows suffice for a task (cli.md: ``--fits``, ``--require``)."""
+"""Whether the datasheets that this station knows suffice for a task (``--fits``, ``--require``)."""
 
 from __future__ import annotations
 

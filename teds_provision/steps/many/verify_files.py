@@ -1,4 +1,4 @@
-"""Many images at once: each judged as ``verify IMAGE`` judges one, on every core (cli.md, ``verify FILES…|DIR``)."""
+"""Many images at once: each judged as ``verify IMAGE`` judges one, on every core (``verify FILES…|DIR``)."""
 
 from __future__ import annotations
 

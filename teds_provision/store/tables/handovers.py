@@ -1,4 +1,4 @@
-"""Who is trusted, and what was handed over (profile: security-teds.md sections 2 and 6)."""
+"""Who is trusted, and what was handed over (profile.md, "Handover between base stations")."""
 
 from __future__ import annotations
 

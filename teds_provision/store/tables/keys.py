@@ -1,4 +1,4 @@
-"""The wrapped link keys: pending ones beside the active one (profile: security-teds.md section 3, loss-table)."""
+"""The wrapped link keys: pending ones beside the active one (profile.md, "Key agreement")."""
 
 from __future__ import annotations
 

@@ -1,7 +1,7 @@
 """The general calibration of IEEE 1451: a segmented multinomial over one or several inputs.
 
 ``Y = Σi … Σp C[i, …, p] · (X1 - H1)^i · … · (Xn - Hn)^p`` with a coefficient set for every cell of the grid that the
-segment boundaries of the inputs span (ieee-1451.0.md section 6; the formula is certain, the field numbers are not).
+segment boundaries of the inputs span (teds.md, "5 CalTEDS"; the formula is certain, the field numbers are not).
 Coefficients stand cell after cell, the last input running fastest, and within a cell exponent after exponent, again the
 last input fastest; a value on a boundary belongs to the upper segment (both from memory); outside the outer boundaries
 the end segment holds and the result is flagged.

@@ -1,4 +1,4 @@
-"""Octets of samples to raw numbers and back, in blocks (ieee-1451.0.md section 4.2; operation.md section 2).
+"""Octets of samples to raw numbers and back, in blocks (teds.md, "3 ChanTEDS"; operation.md section 2).
 
 A block is a number of samples of one channel, each ModLenth octets, most significant octet first. Integers stand
 right-justified, floats are IEEE 754, a fraction has its point before the first bit.

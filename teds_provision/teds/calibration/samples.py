@@ -1,6 +1,6 @@
 """What one sample of a channel is: its data model, octets and bits, and the raw numbers that they can give.
 
-DatModel, ModLenth and SigBits are fields 40 to 42 of the TransducerChannel TEDS (ieee-1451.0.md section 4.2). Turning
+DatModel, ModLenth and SigBits are fields 40 to 42 of the TransducerChannel TEDS (teds.md, "3 ChanTEDS"). Turning
 octets into numbers in blocks is :mod:`teds_provision.teds.calibration.reading`.
 """
 

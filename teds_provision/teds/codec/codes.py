@@ -1,4 +1,4 @@
-"""Access codes of the TEDS, the numbers by which a node's TEDS are asked for (ieee-1451.0.md section 3)."""
+"""Access codes of the TEDS, the numbers by which a node's TEDS are asked for (teds.md, "Access codes")."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ TEXT_BASED: Final = frozenset(
         AccessCode.UNITS_EXTENSION,
     }
 )
-"""Classes whose content is text behind a directory (ieee-1451.0.md section 4.6)."""
+"""Classes whose content is text behind a directory (teds.md, "Text-based TEDS (2, 4, 6, 10, 11, 14, 15)")."""
 ONLY_2024: Final = frozenset({AccessCode.SECURITY_2024, AccessCode.TIME_SYNC})
 MANUFACTURER: Final = 128
 """First type and first access code of the manufacturers' range."""

@@ -1,4 +1,4 @@
-"""Octets -> values and findings; nothing that comes in can raise anything here (ieee-1451.0.md sections 1 to 6).
+"""Octets -> values and findings; nothing that comes in can raise anything here (teds.md, "Frame, tuples, verdicts").
 
 Memory stays in proportion to the octets: a TEDS is refused beyond ``MAX_OCTETS``, a walk stops at ``MAX_TUPLES``, and
 structures nest only as deep as the field tables do (four levels).

@@ -1,4 +1,4 @@
-"""The general structure of every TEDS: Length ‖ data block of tuples ‖ Checksum (ieee-1451.0.md section 1).
+"""The general structure of every TEDS: Length ‖ data block of tuples ‖ Checksum (teds.md, "Frame, tuples, verdicts").
 
 Everything is big-endian. ``Length`` counts the data block and the two checksum octets. The checksum is a plain sum and
 no security measure: it cannot see exchanged octets.
@@ -74,7 +74,7 @@ def raw_tuple(kind: int, value: bytes, *, width: int = 1) -> bytes:
 def teds_class(block: bytes) -> int | None:
     """Class (access code) that the TEDSID of a data block names, None where there is no readable TEDSID.
 
-    The TEDSID is 4 octets in the 2007 form and 5 in the 2024 form (ieee-1451.0.md section 2).
+    The TEDSID is 4 octets in the 2007 form and 5 in the 2024 form (teds.md, "Frame, tuples, verdicts").
     """
     if len(block) < 6 or block[0] != TEDSID:
         return None

@@ -45,7 +45,7 @@ class Units:
     """Physical units (types 12, 46): interpretation 0 to 5 and exponents of rad, sr, m, kg, s, A, K, mol, cd.
 
     Exponents are multiples of 1/2; on the wire each is 2 × exponent + 128. ``extension`` is the access code of a Units
-    Extension TEDS, 0 for none (ieee-1451.0.md section 4.3).
+    Extension TEDS, 0 for none (teds.md, "Data types").
     """
 
     interpretation: int = 0
@@ -77,7 +77,7 @@ UNIT_PARTS: Final = (
 
 @dataclass(frozen=True)
 class TimeInstance:
-    """Seconds and nanoseconds since 1970-01-01, sign of the whole value apart (ieee-1451.0.md section 5)."""
+    """Seconds and nanoseconds since 1970-01-01, sign of the whole value apart (teds.md, "Data types")."""
 
     seconds: int
     nanoseconds: int = 0

@@ -18,6 +18,9 @@ Find = Callable[..., None]
 PROFILE_VERSION: Final = 105
 # Octets that one sample of these data models must have; the other models take any number in their range.
 _MODEL_OCTETS: Final = {1: (4, 4), 2: (8, 8), 0: (0, 8), 7: (8, 8), 5: (9, 255), 6: (9, 255)}
+# Field numbers of the TransducerChannel TEDS (docs/teds.md): the sample's form, and how it may be sampled.
+_SAMPLE, _DATA_MODEL, _MODEL_LENGTH, _SIGNIFICANT_BITS = 18, 40, 41, 42
+_SAMPLING, _SAMPLING_MODES, _DEFAULT_MODE = 31, 48, 49
 _TINY, _HUGE, _PLAUSIBLE = 1e-30, 1e300, (1e-9, 1e12)
 
 
@@ -147,15 +150,15 @@ def _uncertainty(fields: tuple[Field, ...], find: Find) -> None:
 
 def _sample(fields: tuple[Field, ...], find: Find) -> None:
     for field in fields:
-        if field.type == 31:
+        if field.type == _SAMPLING:
             _sampling(field, find)
-        elif field.type == 18:
+        elif field.type == _SAMPLE:
             _sample_form(field, find)
 
 
 def _sample_form(field: Field, find: Find) -> None:
     parts = {child.type: child.value for child in field.children}
-    model, octets, bits = parts.get(40), parts.get(41), parts.get(42)
+    model, octets, bits = parts.get(_DATA_MODEL), parts.get(_MODEL_LENGTH), parts.get(_SIGNIFICANT_BITS)
     low, high = _MODEL_OCTETS.get(model, (0, 255)) if isinstance(model, int) else (0, 255)
     if not isinstance(octets, int):
         return
@@ -177,7 +180,7 @@ def _level(fields: tuple[Field, ...], find: Find) -> None:
 def _sampling(field: Field, find: Find) -> None:
     """SDefault is one bit of the mask in some sources, the number 1 to 5 of a mode in others: either will do."""
     parts = {child.type: child.value for child in field.children}
-    modes, default = parts.get(48), parts.get(49)
+    modes, default = parts.get(_SAMPLING_MODES), parts.get(_DEFAULT_MODE)
     if not isinstance(modes, int) or not isinstance(default, int) or 1 <= default <= 5:
         return
     if default not in (8, 16) or not default & modes:

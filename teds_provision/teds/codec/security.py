@@ -1,4 +1,4 @@
-"""The Security TEDS of the profile: canonical form, fields, and what its signature covers (profile section 1).
+"""The Security TEDS of the profile: canonical form, fields, what is signed (profile.md, "The Security TEDS").
 
 Pure octets: no cryptography here. Signing and verifying is ``protocol.datasheet``. Access code 128 (ours); the Security
 TEDS of the 2024 edition (access code 16) is another thing.

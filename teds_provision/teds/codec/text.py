@@ -1,4 +1,6 @@
-"""Text-based TEDS: a directory of languages in tuples, then the texts outside of any tuple (ieee-1451.0.md 4.6).
+"""Text-based TEDS: a directory of languages in tuples, then the texts outside of any tuple.
+
+See teds.md, "Text-based TEDS (2, 4, 6, 10, 11, 14, 15)".
 
 Two points are open in every source: what ``Offset`` counts from and over what ``SubSum`` is taken. We write Offset from
 the first octet of the TEDS (its Length), SubSum as the TEDS checksum over the tuples before it, and ``Length`` as the

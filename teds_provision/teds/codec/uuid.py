@@ -1,4 +1,4 @@
-"""The UUID of a Meta-TEDS taken apart: place, year and time (ieee-1451.0.md section 5).
+"""The UUID of a Meta-TEDS taken apart: place, year and time (teds.md, "Data types").
 
 2007, 10 octets: north 1 bit, latitude 20 bits in arc seconds, east 1, longitude 20, manufacturer 4, year 12, time 22
 bits in units of 10 s since the start of that year (TAI). 2024, 16 octets: location 48 bits (1 + 23 + 1 + 23),

@@ -1,4 +1,4 @@
-"""Octets <-> values for every data type of the field tables (ieee-1451.0.md section 5); big-endian throughout."""
+"""Octets <-> values for every data type of the field tables (teds.md, "Data types"); big-endian throughout."""
 
 from __future__ import annotations
 

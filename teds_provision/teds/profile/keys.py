@@ -1,7 +1,7 @@
 """The keys of a profile: one table from the words of the file to the fields of the TEDS.
 
 The reader, the template of ``profile new`` and docs/profiles.md all follow these tables. Field names and enumerations
-are those of ieee-1451.0.md sections 4.1, 4.2 and 4.5.
+are those of teds.md, "1 MetaTEDS", "3 ChanTEDS" and "13 PHYTEDS (IEEE 1451.5, family 5)".
 """
 
 from __future__ import annotations

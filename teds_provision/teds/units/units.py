@@ -1,4 +1,4 @@
-"""Units as people write them, and the standard's exponents of SI units (ieee-1451.0.md section 4.3).
+"""Units as people write them, and the standard's exponents of SI units (teds.md, "Data types").
 
 ``parse_unit("degC")`` gives the exponents that go into a TEDS together with scale and offset into SI;
 ``format_units`` gives the way back. The units people use every day stand in a table here, so that building a datasheet

@@ -1,4 +1,4 @@
-"""Field tables of every TEDS class, one per access code, open to inspection (ieee-1451.0.md sections 3 and 4).
+"""Field tables of every TEDS class, one per access code, open to inspection (teds.md, "Access codes").
 
 The rows stand in ``standard`` (Meta, TransducerChannel, names), ``phy_text_security`` (PHY, text-based, security) and
 the data file ``calibration_fields.toml``, whose numbers nobody has checked against the standard.
@@ -29,7 +29,9 @@ def table(access_code: int) -> Table:
     if access_code == AccessCode.CALIBRATION:
         return calibration_table()
     if access_code in TEXT_BASED:
-        return Table(access_code, name, phy_text_security.TEXT, source="ieee-1451.0.md section 4.6")
+        return Table(
+            access_code, name, phy_text_security.TEXT, source='teds.md, "Text-based TEDS (2, 4, 6, 10, 11, 14, 15)"'
+        )
     entry = standard.TABLES.get(access_code) or phy_text_security.TABLES.get(access_code)
     if entry is None:
         return Table(access_code, name, verified=False)

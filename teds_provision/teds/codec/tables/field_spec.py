@@ -1,4 +1,4 @@
-"""What a field table is made of, and the names of the TEDS classes (ieee-1451.0.md sections 3 and 4)."""
+"""What a field table is made of, and the names of the TEDS classes (teds.md, "Access codes")."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Rows of the PHY TEDS (1451.5), the text-based TEDS and both Security TEDS (ieee-1451.0.md 4.5, 4.6 and 9)."""
+"""Rows of the PHY TEDS (1451.5), the text-based TEDS and both Security TEDS (teds.md, "Access codes")."""
 
 from __future__ import annotations
 
@@ -120,10 +120,10 @@ SECURITY: Final = (
 )
 
 TABLES: Final[dict[int, dict[str, Any]]] = {
-    AccessCode.PHY: {"rows": PHY, "family": 5, "source": "ieee-1451.0.md section 4.5"},
-    AccessCode.SECURITY_2024: {"rows": LEVEL, "verified": False, "source": "ieee-1451.0.md section 9.3"},
+    AccessCode.PHY: {"rows": PHY, "family": 5, "source": 'teds.md, "13 PHYTEDS (IEEE 1451.5, family 5)"'},
+    AccessCode.SECURITY_2024: {"rows": LEVEL, "verified": False, "source": 'teds.md, "16 SecurityTEDS2024"'},
     AccessCode.SECURITY: {
         "rows": SECURITY,
-        "source": "Mitterer et al. 2023, Table 1; security profile section 1 from 105 on",
+        "source": 'Mitterer et al. 2023, Table 1; from 105 on the security profile, "The Security TEDS"',
     },
 }

@@ -1,4 +1,4 @@
-"""Rows of the Meta-TEDS, the TransducerChannel TEDS and the transducer name TEDS (ieee-1451.0.md 4.1 to 4.4)."""
+"""Rows of the Meta-TEDS, the TransducerChannel TEDS and the transducer name TEDS (teds.md, "Access codes")."""
 
 from __future__ import annotations
 
@@ -172,7 +172,7 @@ NAME_ALIASES: Final = {
 }
 
 TABLES: Final[dict[int, dict[str, Any]]] = {
-    AccessCode.META: {"rows": META, "source": "ieee-1451.0.md section 4.1"},
-    AccessCode.CHANNEL: {"rows": CHANNEL, "source": "ieee-1451.0.md section 4.2"},
-    AccessCode.NAME: {"rows": NAME, "aliases": NAME_ALIASES, "source": "ieee-1451.0.md section 4.4"},
+    AccessCode.META: {"rows": META, "source": 'teds.md, "1 MetaTEDS"'},
+    AccessCode.CHANNEL: {"rows": CHANNEL, "source": 'teds.md, "3 ChanTEDS"'},
+    AccessCode.NAME: {"rows": NAME, "aliases": NAME_ALIASES, "source": 'teds.md, "12 XdcrName"'},
 }
