@@ -64,7 +64,7 @@ class Measuring(Protocol):
 
 
 class InTheAir(NodeHandler, Measuring, Protocol):
-    """What a node's BLE asks beside (wire, "BLE")."""
+    """What a node's BLE asks beside (profile.md, "BLE")."""
 
     def in_factory_state(self) -> bool:
         """Whether the node holds no key."""

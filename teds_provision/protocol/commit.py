@@ -1,4 +1,4 @@
-"""Verification before the commit: Update TEDS of access code 128, in the order of the profile (section 5)."""
+"""Verification before the commit: Update TEDS of access code 128, in their order (profile.md, "Writing to flash")."""
 
 from __future__ import annotations
 

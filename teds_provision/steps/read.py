@@ -23,7 +23,7 @@ from teds_provision.teds.image import SECURITY, BlockId, Image
 
 LARGEST_TEDS = 1 << 20
 LARGEST_SECURITY = 4094 - 78
-"""A Security TEDS fits into the sealed reply to Request, a frame of at most 4094 octets (wire, "maxMessage")."""
+"""It fits into the sealed reply to Request, a frame of at most 4094 octets (profile.md, "Command frames")."""
 LARGEST_IMAGE = 4 << 20
 _NOISY_READS = 4
 READING_SECONDS = 300.0

@@ -1,4 +1,4 @@
-"""Tap first, air after: a node that was agreed with at the reader is gone on with over BLE (wire, "BLE").
+"""Tap first, air after: a node that was agreed with at the reader is gone on with over BLE (profile.md, "BLE").
 
 It may lie there or be carried away meanwhile. The tap has named its address; its key says that it is the one.
 """

@@ -151,14 +151,14 @@ def any_mac(board: Board, octets: bytes, reference: Next) -> bytes:
 
 
 def any_counter(board: Board, octets: bytes, reference: Next) -> bytes:
-    session = board.tim._lines.on("nfc")
+    session = board.tim._sessions.on("nfc")
     if session is not None and _is(octets, Function.SEALED):
         session.counter = -1
     return reference(octets)
 
 
 def close_is_ignored(board: Board, octets: bytes, reference: Next) -> bytes:
-    line = board.tim._lines._lines.get("nfc")
+    line = board.tim._sessions._links.get("nfc")
     session = line.session if line is not None else None
     reply = reference(octets)
     if session is not None and line is not None and line.session is None:

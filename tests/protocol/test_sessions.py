@@ -81,7 +81,7 @@ def test_c_is_one_for_all_links_and_new_at_each_start() -> None:
 
 def test_the_counter_runs_over_without_harm() -> None:
     desk = Desk().agree()
-    desk.tim._lines._opens = (1 << 64) - 1
+    desk.tim._sessions._opens = (1 << 64) - 1
     _, frame = opening(desk)
     assert desk.plain(frame).ok
     assert desk.plain(security_command(Function.OPEN)).payload == bytes(8)
@@ -96,7 +96,7 @@ def test_a_stranger_costs_no_point_arithmetic() -> None:
         made.append(SoftwareKey.generate())
         return made[-1]
 
-    desk.tim._lines._one_time = one_time
+    desk.tim._sessions._one_time = one_time
     point = SoftwareKey(31).point
     for payload in (bytes(89), key_id(desk.key) + point + bytes(16), key_id(desk.key) + OFF_CURVE + bytes(16)):
         assert not desk.plain(security_command(Function.OPEN, payload)).ok
@@ -132,7 +132,7 @@ def test_both_sides_have_one_key_for_data_messages_and_it_is_new_with_each_open(
     assert desk.session is not None
     first = desk.session.message_key
     assert len(first) == 32
-    line = desk.tim._lines._lines["nfc"]
+    line = desk.tim._sessions._links["nfc"]
     assert line.half_open is not None
     assert line.half_open.message_key == first
     desk.open()

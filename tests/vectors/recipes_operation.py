@@ -59,7 +59,7 @@ class OperationScene:
         self.sessions: list[dict[str, Any]] = []
         self.bench = Bench(**limits)
         self.start = self.bench.hardware.tick
-        self.bench.tim._lines._opens = int.from_bytes(octets(name, "c")[:8], "big")
+        self.bench.tim._sessions._opens = int.from_bytes(octets(name, "c")[:8], "big")
         for link in links or (F1,):
             self.open(link)
         self.told = len(self.bench.hardware.log)
@@ -68,7 +68,7 @@ class OperationScene:
         """Open a session on a link, with one-time keys that follow from the entry's name."""
         number = len(self.sessions)
         station, node = (named_key(self.name, number, side) for side in ("Es", "En"))
-        self.bench.tim._lines._one_time = lambda: node
+        self.bench.tim._sessions._one_time = lambda: node
         session = StationSession(K, UUID, one_time=station)
         counter = self.bench.plain(session.ask(), link).payload
         session.accept(self.bench.plain(session.open(counter), link).payload)

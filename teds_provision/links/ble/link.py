@@ -15,7 +15,7 @@ from teds_provision.links.ports import BLE, Capabilities, Notice, NoticeSink
 REPLY_SECONDS: Final = 5.0
 REPEAT_SECONDS: Final = 15.0
 TRIES: Final = 3
-"""A request is repeated at most twice, within 15 s (wire, "Repetition")."""
+"""A request is repeated at most twice, within 15 s (profile.md, "Repetition")."""
 _FIRST_PAUSE: Final = 0.3
 
 

@@ -1,4 +1,4 @@
-"""The payload record and its pieces: a command frame and its reply, cut to what one NDEF message holds (wire, "NFC").
+"""The payload record and its pieces: a command frame and its reply, cut to one NDEF message each (profile.md, "NFC").
 
 ``version u8 = 1 ‖ flags u8 ‖ transaction u16 ‖ total u16 ‖ offset u16 ‖ CRC-32 u32 ‖ body``, big endian; the CRC-32
 (IEEE 802.3) covers the 8 octets before it and the body. :class:`Requester` is the station's half of one transaction,
@@ -18,7 +18,7 @@ from teds_provision.links.nfc.tnep import TIM_TYPE
 _HEAD = struct.Struct(">BBHHH")
 _ANSWER, _MORE = 1, 2
 _PIECE_HEAD = _HEAD.size + 4  # 12 octets before the body
-LONGEST_FRAME = 4094  # octets: the largest maxMessage (wire, "maxMessage")
+LONGEST_FRAME = 4094  # octets: the largest maxMessage (profile.md, "Command frames")
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,4 @@
-"""The station's half of TNEP: write a message, wait, read until the node has put its answer (wire, "NFC").
+"""The station's half of TNEP: write a message, wait, read until the node has put its answer (profile.md, "NFC").
 
 Works on anything that reads and writes an NDEF message (:class:`Mailbox`), so that it runs in memory as well.
 """

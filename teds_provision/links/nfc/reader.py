@@ -1,4 +1,4 @@
-"""NFC as a port: waits for taps on a reader and carries command frames to the node that lies there (wire, "NFC").
+"""NFC as a port: waits for taps on a reader and carries command frames to the node that lies there (profile.md, "NFC").
 
 nfcpy's ``connect`` is not used: it swallows OSError and Ctrl-C. One thread senses, activates and exchanges.
 """

@@ -1,4 +1,4 @@
-"""NFC Forum TNEP 1.0, as much of it as the profile uses: its three records and its waiting time (wire, "NFC").
+"""NFC Forum TNEP 1.0, as much of it as the profile uses: its three records and its waiting time (profile.md, "NFC").
 
 Layouts and constants after three public implementations (nRF Connect SDK, Multipaz, SpruceID isomdl); the text of the
 specification itself was not at hand. Pure; imports no NFC library.

@@ -1,4 +1,4 @@
-"""A node as a Bluetooth LE peripheral: its GATT service, its connections, when it advertises (wire, "BLE").
+"""A node as a Bluetooth LE peripheral: its GATT service, its connections, when it advertises (profile.md, "BLE").
 
 Runs in the loop of whoever made it, over any controller that bumble can talk to; commands run in a crew of threads.
 """

@@ -1,4 +1,4 @@
-"""The node's half of TNEP: initial message, service selection, answers (wire, "NFC").
+"""The node's half of TNEP: initial message, service selection, answers (profile.md, "NFC").
 
 The frames' thread only empties the mailbox and hands the message over; a worker thread runs the command, however slow,
 and puts the answer, unless the reader wrote again or the field went in between.

@@ -1,4 +1,4 @@
-"""Data, Drive and trigger frames on CAN, data messages on BLE: identifiers, cutting, putting together (section 6).
+"""Data, Drive and trigger frames on CAN, data messages on BLE: identifiers, cutting (operation.md section 6).
 
 Data: ``0x1CFF‖S‖node``, S = low 3 bits of the station · 32 + stream · 8 + segment; all octets are message.
 Drive: ``0x18EF‖node‖station``, the first octet is the segment. Trigger: ``0x18FF00‖station``, data T.

@@ -1,4 +1,4 @@
-"""A stream as the station sees it: what it asks for, what it accepts, which messages it believes (section 3 and 4).
+"""A stream as the station sees it: what it asks for, which messages it believes (operation.md sections 3 and 4).
 
 :class:`Plan` builds Subscribe and checks its reply; :class:`Receiver` opens messages, drops what section 3 says and
 counts each cause apart. No clock of its own: the caller hands in the bounds of the node's present tick.

@@ -5,10 +5,10 @@ the hardware are injected. One :class:`Tim` serves all links of a node.
 
 ==============  ======================================================================================================
 ``node``        :class:`Tim`: routing, Identify, Prove, Reset, List
-``permission``  the table of states and permissions (section 4), and what claims forbid
-``lines``       Open, Sealed, the lives of sessions
-``agreeing``    Request and Confirm (section 3)
-``teds_access`` Query, Read, Write, Update (section 5); the commit is ``protocol.commit``
+``permission``  which command may be run when, and what claims forbid
+``sessions``    Open, Sealed, the lives of sessions
+``agreeing``    Request and Confirm
+``teds_access`` Query, Read, Write, Update; the commit is ``protocol.commit``
 ``origin``      where a command came from
 ==============  ======================================================================================================
 

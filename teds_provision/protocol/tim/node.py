@@ -28,9 +28,9 @@ from teds_provision.protocol.operation.role import Inner, OperationRole
 from teds_provision.protocol.operation.streams import DataFrame
 from teds_provision.protocol.session import LAST_COUNTER, NodeSession, OneTime
 from teds_provision.protocol.tim.agreeing import Agreeing
-from teds_provision.protocol.tim.lines import Lines
 from teds_provision.protocol.tim.origin import Origin
 from teds_provision.protocol.tim.permission import Permission
+from teds_provision.protocol.tim.sessions import Sessions
 from teds_provision.protocol.tim.teds_access import TedsAccess
 
 CHALLENGE_OCTETS: Final = 32
@@ -67,7 +67,7 @@ class Tim:
         self._ending: list[Callable[[], None]] = []
         self._teds = TedsAccess(self.max_message, self.max_teds, self.verify)
         self._agreeing = Agreeing(self.key, self.clock, self.random, self.verify)
-        self._lines = Lines(
+        self._sessions = Sessions(
             self.clock,
             self.random,
             self.one_time,
@@ -87,7 +87,7 @@ class Tim:
             )
         self._permission = Permission(
             lambda: self._flash.state == NodeState.FACTORY,
-            self._lines.any_on,
+            self._sessions.any_on,
             self.clock,
             self._role,
             self.quick_points,
@@ -142,7 +142,7 @@ class Tim:
 
     def link_lost(self, link: str) -> None:
         """Loss of the field or link: its session, half-open Open and pending agreement go."""
-        self._lines.lose(link)
+        self._sessions.lose(link)
         self._agreeing.forget(link)
 
     def reset_by_hand(self) -> None:
@@ -154,7 +154,7 @@ class Tim:
 
     def reply_left(self, link: str) -> None:
         """The reply to the last command of this link has left: what its session streams may follow."""
-        session = self._lines.on(link)
+        session = self._sessions.on(link)
         if self._role is not None and session is not None:
             self._role.streams.reply_left(session)
 
@@ -193,13 +193,13 @@ class Tim:
 
     def trigger(self, link: str, token: bytes, tick: int) -> None:
         """A trigger frame of the station of this link; ``tick`` is that of the frame's end."""
-        session = self._lines.on(link)
+        session = self._sessions.on(link)
         if self._role is not None and session is not None and len(token) == TOKEN_OCTETS:
             self._role.streams.trigger(session, token, tick)
 
     def drive(self, link: str, octets: bytes) -> None:
         """A Drive frame from CAN, or a whole Drive message from BLE (without its first octet)."""
-        session = self._lines.on(link)
+        session = self._sessions.on(link)
         if self._role is None or session is None:
             return
         self._role.poll()
@@ -210,13 +210,13 @@ class Tim:
 
     def unheard(self, link: str) -> None:
         """The station of this link has disabled data messages there (BLE): its streams end."""
-        session = self._lines.on(link)
+        session = self._sessions.on(link)
         if self._role is not None and session is not None:
             self._role.streams.unheard(session)
 
     def in_session(self, link: str) -> bool:
         """Whether a session is open on this link."""
-        return self._lines.on(link) is not None
+        return self._sessions.on(link) is not None
 
     def actuator_claimed(self) -> bool:
         """Whether a session claims an actuator."""
@@ -262,7 +262,7 @@ class Tim:
         return b""
 
     def _open(self, payload: bytes, origin: Origin) -> bytes:
-        return self._lines.open(payload, origin.link, self._flash)
+        return self._sessions.open(payload, origin.link, self._flash)
 
     def _close(self, payload: bytes, origin: Origin) -> bytes:
         _length(payload, 0)
@@ -286,7 +286,7 @@ class Tim:
 
     def _sealed(self, payload: bytes, origin: Origin) -> bytes:
         self.poll()  # a lease that ran out before this frame came is over: the frame does not revive it
-        taken = self._lines.take(payload, origin.link)
+        taken = self._sessions.take(payload, origin.link)
         if not taken.room:
             return taken.session.seal(taken.counter, refusal(Reason.NO_ROOM).encode())
         sealed_from = replace(origin, session=taken.session)
@@ -297,14 +297,14 @@ class Tim:
     def _end_with_reply(self, origin: Origin) -> None:
         session = origin.session
         assert session is not None
-        self._ending.append(lambda: self._lines.end(origin.link, session))
+        self._ending.append(lambda: self._sessions.end(origin.link, session))
 
     def _session_ended(self, session: NodeSession) -> None:
         if self._role is not None:
             self._role.session_ended(session)
 
     def _end_everything(self) -> None:
-        self._lines.end_all()
+        self._sessions.end_all()
         self._agreeing.forget()
 
     # -- the rest --------------------------------------------------------------------------------------------------

@@ -40,8 +40,8 @@ def times() -> dict[int, int]:
 def test_the_node_answers_and_streams_as_published(fd: bool) -> None:
     bench, told = Bench(), KAT["open"]
     drawn = iter([SoftwareKey(int(told["En"]["d"], 16))])
-    bench.tim._lines._opens = int(told["c"], 16)
-    bench.tim._lines._one_time = lambda: next(drawn)
+    bench.tim._sessions._opens = int(told["c"], 16)
+    bench.tim._sessions._one_time = lambda: next(drawn)
     bench.ports["can:f1"] = Port("can", "can", 0xF1, fd=fd)
     session = StationSession(K, UUID, one_time=SoftwareKey(int(told["Es"]["d"], 16)))
     opened = bench.tim.handle(bytes.fromhex(told["open_frame"]), link="can:f1", tapped=False)
@@ -73,7 +73,7 @@ def test_the_node_answers_and_streams_as_published(fd: bool) -> None:
         if entry["name"].startswith("Stop 0: self-test"):
             bench.hardware.tests.clear()
         assert reply.hex() == entry["reply"], entry["name"]
-    assert bench.tim._lines.on("can:f1").message_key == MESSAGE_KEY  # type: ignore[union-attr]
+    assert bench.tim._sessions.on("can:f1").message_key == MESSAGE_KEY  # type: ignore[union-attr]
 
     form = "can_fd" if fd else "can"
     published = [can_frame(text) for stream in KAT["streams"] for m in stream["messages"] for text in m[form]]

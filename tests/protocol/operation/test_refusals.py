@@ -89,7 +89,7 @@ def test_operate_in_the_order_of_section_1() -> None:
         "can:f2",
     )
     assert bench.tim._role is not None
-    claimed = bench.tim._role.claims.of(bench.tim._lines.on("can:f2"))  # type: ignore[arg-type]
+    claimed = bench.tim._role.claims.of(bench.tim._sessions.on("can:f2"))  # type: ignore[arg-type]
     assert claimed == {3, 5}
 
 
@@ -354,7 +354,7 @@ def test_stop_drive_and_arm() -> None:
 
 def test_runs_are_used_up_after_65535() -> None:
     bench = Bench().open().operate(1, 4)
-    session = bench.tim._lines.on("can:f1")
+    session = bench.tim._sessions.on("can:f1")
     assert bench.tim._role is not None
     assert session is not None
     bench.tim._role.streams._of(session).run = 65_534

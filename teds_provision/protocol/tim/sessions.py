@@ -30,7 +30,7 @@ IDLE_SECONDS: Final = 600.0
 
 
 @dataclass
-class _Line:
+class _Link:
     """One link: at most one session and one half-open Open."""
 
     session: NodeSession | None = None
@@ -47,7 +47,7 @@ class Taken(NamedTuple):
     room: bool = True
 
 
-class Lines:
+class Sessions:
     """Sessions by link. ``claims`` says whether a session has a claim, ``ended`` is told of each that is over.
 
     ``room`` is how many sessions, and how many half-open Opens, there may be over all links, at least two.
@@ -66,7 +66,7 @@ class Lines:
         self._clock, self._one_time, self._room, self._claims, self._ended = clock, one_time, room, claims, ended
         # c of Open: random at the start, so that no mac from before a restart is good again
         self._opens = int.from_bytes(random(COUNTER_OCTETS), "big")
-        self._lines: dict[str, _Line] = {}
+        self._links: dict[str, _Link] = {}
 
     def open(self, payload: bytes, link: str, flash: Flash) -> bytes:
         """Open: c for an empty payload, else the checks in their order and a new half-open Open on this link."""
@@ -85,25 +85,25 @@ class Lines:
         if not good_point(station, flash.node_key):
             raise Refused(Reason.BAD_POINT)
         made = NodeSession(key, flash.uuid, station, self._one_time())
-        line = self._lines.setdefault(link, _Line())
-        line.half_open, line.half_open_at = made, self._clock()
-        half_open = [each for each in self._lines.values() if each.half_open is not None]
+        held = self._links.setdefault(link, _Link())
+        held.half_open, held.half_open_at = made, self._clock()
+        half_open = [each for each in self._links.values() if each.half_open is not None]
         if len(half_open) > self._room:
             min(half_open, key=lambda each: each.half_open_at).half_open = None
         return made.reply
 
     def any_on(self, link: str) -> bool:
         """Whether a session or half-open Open of this link lives; drops those whose time is over."""
-        line = self._lines.get(link)
-        if line is None:
+        held = self._links.get(link)
+        if held is None:
             return False
-        self._drop_old(line)
-        return line.session is not None or line.half_open is not None
+        self._drop_old(held)
+        return held.session is not None or held.half_open is not None
 
     def on(self, link: str) -> NodeSession | None:
         """The session of a link."""
-        line = self._lines.get(link)
-        return line.session if line is not None else None
+        held = self._links.get(link)
+        return held.session if held is not None else None
 
     def take(self, payload: bytes, link: str) -> Taken:
         """A Sealed frame: tried under the session, then under the half-open Open. Raises Refused; changes nothing then.
@@ -112,8 +112,8 @@ class Lines:
         """
         if len(payload) < SEALED_HEAD_OCTETS + BLOCK_OCTETS:
             raise Refused(Reason.BAD_FORM)
-        line = self._lines[link]
-        for session in (line.session, line.half_open):
+        held = self._links[link]
+        for session in (held.session, held.half_open):
             inner = session.unseal(payload) if session is not None else None
             if session is not None and inner is not None:
                 break
@@ -122,50 +122,50 @@ class Lines:
         counter = int.from_bytes(payload[:4], "big")
         if counter <= session.counter:
             raise Refused(Reason.REPLAY)
-        if session is line.half_open:
-            line.half_open = None
-            if not self._make_room(line):
+        if session is held.half_open:
+            held.half_open = None
+            if not self._make_room(held):
                 return Taken(session, counter, inner, room=False)
-            self._end(line)
-            line.session = session
+            self._end(held)
+            held.session = session
         session.counter, session.good_at = counter, self._clock()
         return Taken(session, counter, inner)
 
     def end(self, link: str, session: NodeSession) -> None:
         """End this session, if it still is the one of its link."""
-        line = self._lines.get(link)
-        if line is not None and line.session is session:
-            self._end(line)
+        held = self._links.get(link)
+        if held is not None and held.session is session:
+            self._end(held)
 
     def lose(self, link: str) -> None:
         """Loss of the field or link."""
-        line = self._lines.pop(link, None)
-        if line is not None:
-            self._end(line)
+        held = self._links.pop(link, None)
+        if held is not None:
+            self._end(held)
 
     def end_all(self) -> None:
         """End every session and half-open Open on every link."""
-        lines, self._lines = self._lines, {}
-        for line in lines.values():
-            self._end(line)
+        links, self._links = self._links, {}
+        for held in links.values():
+            self._end(held)
 
     # -- the inside ------------------------------------------------------------------------------------------------
 
-    def _end(self, line: _Line) -> None:
-        session, line.session = line.session, None
+    def _end(self, held: _Link) -> None:
+        session, held.session = held.session, None
         if session is not None:
             self._ended(session)
 
-    def _drop_old(self, line: _Line) -> None:
+    def _drop_old(self, held: _Link) -> None:
         now = self._clock()
-        if line.session is not None and now - line.session.good_at >= IDLE_SECONDS:
-            self._end(line)
-        if line.half_open is not None and now - line.half_open_at >= HALF_OPEN_SECONDS:
-            line.half_open = None
+        if held.session is not None and now - held.session.good_at >= IDLE_SECONDS:
+            self._end(held)
+        if held.half_open is not None and now - held.half_open_at >= HALF_OPEN_SECONDS:
+            held.half_open = None
 
-    def _make_room(self, line: _Line) -> bool:
+    def _make_room(self, held: _Link) -> bool:
         """Room for one more session: where there is none, that without a claim goes which was silent longest."""
-        others = [each for each in self._lines.values() if each is not line]
+        others = [each for each in self._links.values() if each is not held]
         for each in others:
             self._drop_old(each)
         living = [(each, each.session) for each in others if each.session is not None]
