@@ -91,8 +91,8 @@ def identify(
 def _pinned_now(station: Station, who: Identified) -> WhitelistEntry | None:
     """The node's entry with its whole fingerprint, None where it has that already, or nobody opens the vault.
 
-    An entry that was made without one is pinned by its first tap (profile.md, "Keys and trust"); one that was made with the first
-    digits gets the others by the first contact, whatever the link.
+    An entry that was made without one is pinned by its first tap (profile.md, "Keys and trust"); one that was made with
+    the first digits gets the others by the first contact, whatever the link.
     """
     entry = who.whitelisted
     if entry is None or is_whole(entry.fingerprint) or not _opened(station):

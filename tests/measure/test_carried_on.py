@@ -13,7 +13,7 @@ import pytest
 
 from teds_provision.links.can.frame import Frame
 from teds_provision.links.can.port import CanPort
-from teds_provision.measure.sinks.recover import recover
+from teds_provision.measure.sinks.mcap.recover import recover
 from tests.e2e.desk import ANGLE, free_port
 from tests.measure.hall import Hall, events, killed, of, states
 
