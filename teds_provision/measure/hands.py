@@ -21,6 +21,7 @@ from teds_provision.measure.acting import LEASE
 from teds_provision.measure.blocks import Block, Command
 from teds_provision.measure.clock import ClockMap
 from teds_provision.measure.trusting import Trusted, claim
+from teds_provision.protocol.messages.frames import Reason
 from teds_provision.protocol.operation.commands import write_data_set
 from teds_provision.protocol.operation.datagram import Layout
 from teds_provision.protocol.operation.driving import Driver
@@ -37,6 +38,7 @@ ECHO = 255  # number of the "stream" in which applied set points are echoed; nod
 class _Hand:
     interpreter: ChannelInterpreter
     claimed_until: float = 0.0
+    answered: float = 0.0  # when the node last said that it took a value
     count: int = 0
     came: deque[float] = field(default_factory=lambda: deque(maxlen=WATCHED))
     driver: Driver | None = None
@@ -131,27 +133,33 @@ class Hands:
         if now >= hand.claimed_until:
             self._claim(number, hand)
         alone = sum(1 for one in self._hands.values() if one.claimed_until > now) <= 1
-        if hand.fast and alone:
+        if not (hand.fast and alone):
+            hand.driver = None
+        # Nobody answers a Drive message, so now and then a value goes by command: a node that was cut off says so.
+        if hand.fast and alone and now - hand.answered < self._dead_man / 2000:
             self._drive(number, hand, octets)
         else:
-            hand.driver = None
-            try:
-                self._trusted.node.send(write_data_set(number, octets), "to set the actuator")
-            except NodeRefused as refusal:
-                hand.claimed_until = 0.0
-                if refusal.reason != 2:
-                    raise
-                # Its dead-man has run out meanwhile, by the node's clock: the way back is a new Operate.
-                self._claim(number, hand)
-                self._trusted.node.send(write_data_set(number, octets), "to set the actuator")
+            self._set(number, hand, octets)
+            hand.answered = time.monotonic()
         hand.claimed_until = time.monotonic() + self._dead_man / 1000
+
+    def _set(self, number: int, hand: _Hand, octets: bytes) -> None:
+        try:
+            self._trusted.node.send(write_data_set(number, octets), "to set the actuator")
+        except NodeRefused as refusal:
+            hand.claimed_until = 0.0
+            if refusal.reason != Reason.WRONG_STATE:
+                raise
+            # Its dead-man has run out meanwhile, by the node's clock: the way back is a new Operate.
+            self._claim(number, hand)
+            self._trusted.node.send(write_data_set(number, octets), "to set the actuator")
 
     def _claim(self, number: int, hand: _Hand) -> None:
         hand.driver = None
         try:
             claim(self._trusted, number, lease=LEASE, dead_man=self._dead_man)
         except NodeRefused as refusal:
-            if refusal.reason != 2:  # it is claimed by this session still
+            if refusal.reason != Reason.WRONG_STATE:  # it is claimed by this session still
                 raise
 
     def _drive(self, number: int, hand: _Hand, octets: bytes) -> None:
