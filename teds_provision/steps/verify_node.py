@@ -14,7 +14,7 @@ from teds_provision.steps.read import read_identity, read_image
 from teds_provision.steps.reset import proof_of_reset
 from teds_provision.steps.verify import Check, Verified, known_of, possession, session, verify_image
 from teds_provision.store import utc_now
-from teds_provision.talk.conversation import Conversation
+from teds_provision.talk.conversation import HEARD, Conversation
 from teds_provision.teds.codec.codes import AccessCode
 from teds_provision.teds.image import Image
 
@@ -44,7 +44,7 @@ def open_or_say_why(station: Station, node: Conversation) -> str:
     except NodeRefused as refusal:
         if node.sealed:
             raise
-        return refusal.message.rstrip(".")
+        return refusal.message.removeprefix(HEARD).rstrip(".")
     if held is None and station.keys.held(node.uuid) and station.policy.tombstone(node.uuid) is None:
         return "the node opens no session under any key that is held here"
     return ""

@@ -64,9 +64,13 @@ _CURE = {
 }
 
 
+HEARD = "Heard, not proven: "
+"""What a refusal outside a session begins with: anyone on the link may have sent it."""
+
+
 def refused(reason: int | None, doing: str, *, sealed: bool = False) -> NodeRefused:
     """The error for a refusal of ``doing`` something; outside a session (not ``sealed``) it is a hint, and says so."""
-    heard = "The node refused" if sealed else "Heard, not proven: the node refuses"
+    heard = "The node refused" if sealed else f"{HEARD}the node refuses"
     try:
         known = Reason(reason if reason is not None else 0)
     except ValueError:

@@ -20,6 +20,7 @@ from teds_provision.steps.verify_node import look_at_node, open_or_say_why, vouc
 from teds_provision.steps.visits.visit import at_node, node_or_image, read_image_file
 from teds_provision.steps.write import Written, write
 from teds_provision.talk.charge import Low, wait_for_charge
+from teds_provision.talk.conversation import HEARD
 from teds_provision.talk.progress import Reporter
 from teds_provision.teds.image import Image
 
@@ -138,7 +139,8 @@ def verify_at(
             if in_session or not station.keys.held(found) or station.policy.tombstone(found) is not None:
                 raise
             station.audit("verify", found, "unproven", why=refusal.message)
-            image, verified = Image(found, {}), Verified(found, (session("", refusal.message.rstrip(".")),))
+            why = refusal.message.removeprefix(HEARD).rstrip(".")
+            image, verified = Image(found, {}), Verified(found, (session("", why),))
     try:
         require_authentic(verified)
         return VerifyDone(verified, guard(station, image, None, accept_calibration), None)

@@ -1,0 +1,40 @@
+"""The lock of a token: nobody keeps another user out of it by making its folder first (issue 7, L12)."""
+
+from __future__ import annotations
+
+import os
+import stat
+from pathlib import Path
+
+import pytest
+
+from teds_provision.errors import VaultFailure
+from teds_provision.vault import pkcs11_lock
+
+
+@pytest.fixture
+def cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """The home's .cache, where there is no /run/user of this user."""
+    monkeypatch.setenv("HOME", str(tmp_path))
+    monkeypatch.setattr(os, "access", lambda path, mode: False)
+    return tmp_path / ".cache"
+
+
+def test_the_lock_lies_in_a_private_folder_of_this_user_alone(cache: Path) -> None:
+    with pkcs11_lock.exclusive("/lib/module.so"):
+        (folder,) = cache.iterdir()
+        assert stat.S_IMODE(folder.stat().st_mode) == 0o700
+
+
+@pytest.mark.parametrize("planted", ["link", "open to others"])
+def test_a_folder_that_was_planted_is_refused(cache: Path, tmp_path: Path, planted: str) -> None:
+    folder = cache / f"teds-provision-{os.getuid()}"
+    cache.mkdir()
+    if planted == "link":
+        (tmp_path / "elsewhere").mkdir(mode=0o700)
+        folder.symlink_to(tmp_path / "elsewhere")
+    else:
+        folder.mkdir()
+        folder.chmod(0o777)
+    with pytest.raises(VaultFailure, match="cannot be used"), pkcs11_lock.exclusive("/lib/module.so"):
+        pass
