@@ -50,6 +50,7 @@ class ChannelFacts:
     period: float | None = None  # seconds between samples as measured; None for events
     unsigned: bool = False  # nobody has signed the datasheet: there are raw values alone
     quantity: str = ""  # what the profile or the name calls it, e.g. "relative humidity"; empty where nobody said
+    vector: tuple[int, ...] = ()  # channels of the vector group that it is in, axis by axis; empty where in none
 
     @property
     def key(self) -> tuple[str, int]:

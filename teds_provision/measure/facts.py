@@ -36,6 +36,7 @@ def facts_of(sheet: Sheet, channel: Channel, *, name: str, fingerprint: str, per
         fingerprint=fingerprint,
         sample_form=channel.sample.name if channel.sample else "",
         period=None if channel.kind == Kind.EVENT_SENSOR else period,
+        vector=next((group for group in sheet.meta.vectors if channel.number in group), ()),
     )
 
 

@@ -68,7 +68,8 @@ class SheetFinding:
 class Meta:
     """The node as a whole: Meta-TEDS and its name. Times in seconds, NaN where not stated.
 
-    ``uuid`` has 10 octets (2007) or 16 (2024), ``channels`` is MaxChan; None where not stated.
+    ``uuid`` has 10 octets (2007) or 16 (2024), ``channels`` is MaxChan; None where not stated. ``vectors`` are the
+    members of each vector group, in their order.
     """
 
     uuid: bytes | None = None
@@ -77,6 +78,7 @@ class Meta:
     operation_timeout: float = NOT_STATED
     slow_access_timeout: float = NOT_STATED
     self_test_time: float = NOT_STATED
+    vectors: tuple[tuple[int, ...], ...] = ()
 
 
 @dataclass(frozen=True)
@@ -180,7 +182,10 @@ class _Reader:
             uuid if isinstance(uuid, bytes) else None,
             self.name(0),
             channels if isinstance(channels, int) else None,
-            *(number_of(teds, name) for name in ("OholdOff", "SHoldOff", "TestTime")),
+            number_of(teds, "OholdOff"),
+            number_of(teds, "SHoldOff"),
+            number_of(teds, "TestTime"),
+            vectors=tuple(_vectors(teds)),
         )
 
     def sheet(self) -> Sheet:
@@ -202,6 +207,14 @@ class _Reader:
             if teds.access_code not in (code, None):
                 message = f"This stands where {name_of(code)} belongs; its TEDSID says {teds.name}."
                 yield SheetFinding(channel, code, "error", "class", message)
+
+
+def _vectors(meta: Decoded) -> Iterator[tuple[int, ...]]:
+    """Members of every VGroup that can be read."""
+    for group in meta.fields:
+        for part in group.children if group.name == "VGroup" else ():
+            if part.name == "MemList" and isinstance(part.value, tuple | list):
+                yield tuple(number for number in part.value if isinstance(number, int))
 
 
 _OF_CHANNELS: Final = (AccessCode.CHANNEL, AccessCode.CALIBRATION)

@@ -32,6 +32,7 @@ def plain(value: Any) -> Any:
 def facts_as_json(facts: ChannelFacts) -> dict[str, Any]:
     """Facts of a channel for a header or a metadata message: what is not known is left out."""
     fields = {field.name: getattr(facts, field.name) for field in dataclasses.fields(facts) if field.name != "units"}
+    fields["vector"] = list(facts.vector) or None
     return {
         name: plain(value) for name, value in fields.items() if value is not None and value is not False and value != ""
     }

@@ -9,6 +9,7 @@ messages per second and says when that is more than what one process bears.
 | ``/<station>/<group>`` | sensor_msgs/JointState (name, position = value) | each row of the grid |
 | ``/<station>/<group>/age`` | sensor_msgs/JointState (name, position = age in seconds) | each row |
 | ``/<station>/<node>/<channel>`` | by :mod:`meaning` | at the scalar rate |
+| ``/<station>/<node>/imu`` and the like | by :mod:`vectors` | at the scalar rate |
 | ``/<station>/<node>/teds`` | std_msgs/String, JSON, latched | when the facts are known |
 | ``/<station>/<node>/<channel>/cmd`` | std_msgs/Float64, subscribed | actuators only |
 | ``/diagnostics`` | diagnostic_msgs/DiagnosticArray | once a second |
@@ -20,7 +21,7 @@ import json
 import math
 import time
 from abc import abstractmethod
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -30,6 +31,7 @@ from teds_provision.measure.sinks.base import CommandTaker, Item, ThreadedSink
 from teds_provision.measure.sinks.lines import facts_as_json
 from teds_provision.measure.sinks.meaning import VARIANCE_NOTE, Meaning, meaning_of, variance_of
 from teds_provision.measure.sinks.names import Topics
+from teds_provision.measure.sinks.vectors import Compound, FieldValue, compounds_of, is_range
 
 BUDGET = 5000  # messages a second that one process bears (docs/ros.md)
 ROWS = 1000  # rows a second of an array, at most; a recorder takes all of them
@@ -53,6 +55,7 @@ class _Scalars:
     """Scalar topics of one stream, and when they are due."""
 
     channels: list[tuple[int, str, Meaning, float]]  # column, topic, meaning, variance
+    compounds: list[tuple[str, Compound]]  # topic, message
     frame: str
     due: float = 0.0
 
@@ -83,6 +86,10 @@ class TopicSink(ThreadedSink):
     @abstractmethod
     def _scalar(self, topic: str, meaning: Meaning, stamp: float, frame: str, value: float, variance: float) -> None:
         """One value by its meaning."""
+
+    @abstractmethod
+    def _fields(self, topic: str, kind: str, stamp: float, frame: str, fields: Mapping[str, FieldValue]) -> None:
+        """One message of type ``kind`` with a header, its fields by path (``magnetic_field.x``)."""
 
     @abstractmethod
     def _latched(self, topic: str, words: str) -> None:
@@ -176,14 +183,25 @@ class TopicSink(ThreadedSink):
             if math.isfinite(value):
                 self._scalar(topic, meaning, stamp, scalars.frame, meaning.field_value(value), variance)
                 self._went(1)
+        values = dict(zip(block.channels, block.value[-1].tolist(), strict=True)) if scalars.compounds else {}
+        for topic, compound in scalars.compounds:
+            fields = compound.fields(values)
+            if fields is not None:
+                self._fields(topic, compound.type, stamp, scalars.frame, fields)
+                self._went(len(compound.parts))
 
     def _scalars_of(self, block: Block) -> _Scalars:
         channels = []
-        for column, number in enumerate(block.channels):
-            facts = self._facts.get((block.uuid, number), ChannelFacts(block.uuid, "", number, ""))
-            topic = self._topics.channel(block.uuid, number)
-            channels.append((column, topic, meaning_of(facts), variance_of(facts)))
-        return _Scalars(channels, self._station.frame_ids.get(block.uuid, ""))
+        known = [self._facts.get((block.uuid, n), ChannelFacts(block.uuid, "", n, "")) for n in block.channels]
+        for column, facts in enumerate(known):
+            if not is_range(facts):
+                topic = self._topics.channel(block.uuid, facts.number)
+                channels.append((column, topic, meaning_of(facts), variance_of(facts)))
+        compounds = [(self._compound_topic(block.uuid, one), one) for one in compounds_of(known)]
+        return _Scalars(channels, compounds, self._station.frame_ids.get(block.uuid, ""))
+
+    def _compound_topic(self, uuid: str, one: Compound) -> str:
+        return self._topics.of_node(uuid, one.name) if one.name else self._topics.channel(uuid, one.parts[0][1])
 
     def _rows(self, rows: GroupRows) -> None:
         if rows.test_pattern:

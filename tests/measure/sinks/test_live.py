@@ -5,8 +5,9 @@ from __future__ import annotations
 import json
 import re
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -18,6 +19,7 @@ from teds_provision.measure.blocks import Block, ChannelFacts, Command, GroupRow
 from teds_provision.measure.sinks.live import ERROR, OK, WARN, Status, TopicSink
 from teds_provision.measure.sinks.meaning import Meaning, meaning_of, variance_of
 from teds_provision.measure.sinks.names import Topics, slug
+from teds_provision.measure.sinks.vectors import FieldValue, compounds_of, is_range
 from teds_provision.teds.units.units import parse_units
 from tests.measure.sinks.parts import ANGLE, ARM, FORCE, HAND, STATION, block
 
@@ -86,6 +88,53 @@ def test_a_temperature_goes_out_in_degrees_celsius_with_its_variance() -> None:
     assert variance_of(replace(facts, uncertainty=None)) == 0.0, "0 means unknown"
 
 
+def axes(unit: str, first: int, **more: Any) -> list[ChannelFacts]:
+    """Three channels that the Meta-TEDS calls one vector."""
+    members = (first, first + 1, first + 2)
+    return [
+        ChannelFacts(ARM, "arm", n, f"c{n}", units=parse_units(unit), uncertainty=0.3, vector=members, **more)
+        for n in members
+    ]
+
+
+def test_a_vector_group_is_one_message_where_its_unit_says_what_it_is() -> None:
+    def kinds(*facts: ChannelFacts) -> list[tuple[str, str]]:
+        return [(one.type, one.name) for one in compounds_of(facts)]
+
+    assert kinds(*axes("T", 1)) == [("sensor_msgs/MagneticField", "magnetic_field")]
+    assert kinds(*axes("m/s^2", 1)) == [("sensor_msgs/Imu", "imu")]
+    assert kinds(*axes("m/s^2", 1), *axes("rad/s", 4)) == [("sensor_msgs/Imu", "imu")]
+    assert kinds(*axes("m/s^2", 1), *axes("m/s^2", 4)) == [("sensor_msgs/Imu", "imu_1"), ("sensor_msgs/Imu", "imu_4")]
+    assert kinds(*axes("N", 1), *axes("N m", 4)) == [("geometry_msgs/WrenchStamped", "wrench")]
+    assert kinds(*axes("N", 1)) == [], "a force alone is no wrench"
+    assert kinds(*axes("degC", 1)) == [], "three temperatures are no vector that ROS has a message for"
+    assert kinds(*axes("T", 1)[:2]) == [], "an axis is not in the stream"
+    assert kinds(*(replace(one, vector=()) for one in axes("T", 1))) == [], "nobody said that they are one vector"
+    assert kinds(*axes("T", 1)[:2], *axes("m/s^2", 1)[2:]) == [], "axes of two units"
+    assert kinds(*axes("m/s^2", 1, kind="actuator")) == []
+
+
+def test_half_a_vector_is_none() -> None:
+    [imu] = compounds_of(axes("m/s^2", 1))
+    assert imu.fields({1: 1.0, 2: float("nan"), 3: 3.0}) is None
+    fields = imu.fields({1: 1.0, 2: 2.0, 3: 3.0})
+    assert fields is not None
+    assert fields["linear_acceleration.y"] == 2.0
+    assert fields["angular_velocity_covariance"] == fields["orientation_covariance"] == [-1.0, *[0.0] * 8]
+
+
+def test_a_range_finder_is_one_by_name_and_has_no_plain_number_beside() -> None:
+    facts = ChannelFacts(ARM, "arm", 1, "range finder", units=parse_units("m"), low=0.5, high=8.0)
+    assert is_range(facts)
+    assert not is_range(replace(facts, name="height"))
+    assert not is_range(replace(facts, units=parse_units("s")))
+    sink = carried([block([[10]])], facts=[facts])
+    assert sink.scalars == []
+    [(topic, kind, fields)] = sink.compounds
+    assert (topic, kind) == ("/bench/arm/range_finder", "sensor_msgs/Range")
+    assert (fields["range"], fields["min_range"], fields["max_range"]) == (1.0, 0.5, 8.0)
+
+
 class Carrier(TopicSink):
     """Keeps what went out."""
 
@@ -93,6 +142,7 @@ class Carrier(TopicSink):
         super().__init__("carrier", None if commands is None else commands.append)
         self.arrays: list[tuple[str, float, list[str], list[float]]] = []
         self.scalars: list[tuple[str, str, float, float]] = []
+        self.compounds: list[tuple[str, str, Mapping[str, FieldValue]]] = []
         self.words: dict[str, str] = {}
         self.parameters: dict[str, object] = {}
         self.listens: list[tuple[str, str, int]] = []
@@ -103,6 +153,9 @@ class Carrier(TopicSink):
 
     def _scalar(self, topic: str, meaning: Meaning, stamp: float, frame: str, value: float, variance: float) -> None:
         self.scalars.append((topic, meaning.type, value, variance))
+
+    def _fields(self, topic: str, kind: str, stamp: float, frame: str, fields: Mapping[str, FieldValue]) -> None:
+        self.compounds.append((topic, kind, fields))
 
     def _latched(self, topic: str, words: str) -> None:
         self.words[topic] = words

@@ -144,6 +144,34 @@ def test_debians_tools_see_topics_values_metadata_and_parameters(master: Master)
     assert sink.stats.error == ""
 
 
+def test_a_vector_and_a_wrench_are_messages_of_their_own(master: Master) -> None:
+    forces = [
+        replace(ANGLE, number=n, name=f"f{n}", units=parse_units("N" if n < 4 else "N m"), vector=members)
+        for members in ((1, 2, 3), (4, 5, 6))
+        for n in members
+    ]
+    master.start()
+    sink = ros1(master)
+    sink.open(forces, STATION)
+    until(lambda: sink.stats.state == "running")
+    topic, words = "/bench/arm/wrench", ["/usr/bin/python3", "/usr/bin/rostopic", "echo", "-n", "1"]
+    echo = subprocess.Popen([*words, topic], env=master.environment, stdout=subprocess.PIPE, text=True)
+    k = 0
+    while echo.poll() is None:
+        k += 1
+        assert k < 1200
+        sink.write(block([[10, 20, 30, 40, 50, 60]], channels=(1, 2, 3, 4, 5, 6), index=k, start=time.time()))
+        time.sleep(0.05)
+    assert echo.stdout is not None
+    told = echo.stdout.read()
+    echo.stdout.close()
+    sink.close()
+    assert "force:" in told
+    assert "torque:" in told
+    assert "x: 4.0" in told
+    assert sink.stats.error == ""
+
+
 def test_a_command_topic_moves_an_actuator(master: Master) -> None:
     master.start()
     came: queue.Queue[Command] = queue.Queue()

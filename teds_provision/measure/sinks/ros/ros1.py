@@ -15,7 +15,7 @@ import signal
 import subprocess
 import threading
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
 
@@ -25,6 +25,7 @@ from teds_provision.measure.sinks.base import CommandTaker, Item
 from teds_provision.measure.sinks.live import DIAGNOSTICS, JOINT_STATE, STRING, Status, TopicSink
 from teds_provision.measure.sinks.meaning import Meaning
 from teds_provision.measure.sinks.ros import ros1_child
+from teds_provision.measure.sinks.vectors import FieldValue
 
 PYTHON = "/usr/bin/python3"
 NODE = "teds_provision"
@@ -179,6 +180,9 @@ class Ros1Sink(TopicSink):
     def _scalar(self, topic: str, meaning: Meaning, stamp: float, frame: str, value: float, variance: float) -> None:
         number = self._number(topic, meaning.type)
         self._send(op="value", id=number, t=stamp, field=meaning.field, frame=frame, v=value, var=variance)
+
+    def _fields(self, topic: str, kind: str, stamp: float, frame: str, fields: Mapping[str, FieldValue]) -> None:
+        self._send(op="compound", id=self._number(topic, kind), t=stamp, frame=frame, v=dict(fields))
 
     def _latched(self, topic: str, words: str) -> None:
         self._send(op="text", id=self._number(topic, STRING, latch=True), v=words)

@@ -112,6 +112,21 @@ class Bridge:
             message.variance = line["var"]
         publisher.publish(message)
 
+    def compound(self, line: dict[str, Any]) -> None:
+        """A message of several values, its fields by path; what this distribution's type has not is left out."""
+        publisher, kind = self.publishers[line["id"]]
+        message = kind()
+        message.header.stamp = self.stamp(line["t"])
+        message.header.frame_id = line["frame"]
+        for path, value in line["v"].items():
+            *way, last = path.split(".")
+            part = message
+            for name in way:
+                part = getattr(part, name)
+            if hasattr(part, last):
+                setattr(part, last, value)
+        publisher.publish(message)
+
     def text(self, line: dict[str, Any]) -> None:
         """Words."""
         publisher, kind = self.publishers[line["id"]]

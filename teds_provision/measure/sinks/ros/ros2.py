@@ -12,7 +12,7 @@ from __future__ import annotations
 import os
 import threading
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 from teds_provision.errors import TedsProvisionError, UsageFailure
@@ -21,6 +21,7 @@ from teds_provision.measure.blocks import StationFacts
 from teds_provision.measure.sinks.base import CommandTaker
 from teds_provision.measure.sinks.live import DIAGNOSTICS, JOINT_STATE, STRING, Status, TopicSink
 from teds_provision.measure.sinks.meaning import Meaning
+from teds_provision.measure.sinks.vectors import FieldValue
 
 if TYPE_CHECKING:
     from teds_provision.measure.blocks import ChannelFacts
@@ -91,9 +92,9 @@ class Ros2Sink(TopicSink):
         from cyclonedds.qos import Policy, Qos
         from cyclonedds.util import duration
 
-        code = self._types.TYPE_HASHES[kind]
-        if kind == GRAPH and self._distribution == "humble":
-            code = self._types.HUMBLE_GRAPH
+        humble = self._distribution == "humble"
+        code = self._types.HUMBLE_HASHES.get(kind) if humble else None
+        code = code or self._types.TYPE_HASHES[kind]
         return Qos(
             Policy.Reliability.Reliable(duration(milliseconds=BLOCKING_MS)),
             Policy.Durability.TransientLocal if latched else Policy.Durability.Volatile,
@@ -105,10 +106,12 @@ class Ros2Sink(TopicSink):
     def _topic(self, kind: str, name: str) -> Any:
         from cyclonedds.topic import Topic
 
-        type_ = self._types.TYPES[kind]
-        if kind == GRAPH and self._distribution == "humble":
-            type_ = self._types.HumbleParticipantEntitiesInfo
-        return Topic(self._participant, name, type_)
+        return Topic(self._participant, name, self._type(kind))
+
+    def _type(self, kind: str) -> Any:
+        """The type of ``package/Type`` in this distribution."""
+        of_humble = self._types.HUMBLE_TYPES.get(kind) if self._distribution == "humble" else None
+        return of_humble or self._types.TYPES[kind]
 
     def _new_writer(self, kind: str, name: str, *, latched: bool = False) -> Any:
         from cyclonedds.pub import DataWriter
@@ -166,6 +169,17 @@ class Ros2Sink(TopicSink):
         type_ = self._types.TYPES[meaning.type]
         message = type_(self._header(stamp, frame), value, variance) if meaning.variance else type_(value)
         self._write(self._writer(topic, meaning.type), message, 1)
+
+    def _fields(self, topic: str, kind: str, stamp: float, frame: str, fields: Mapping[str, FieldValue]) -> None:
+        message = self._type(kind)(self._header(stamp, frame))
+        for path, value in fields.items():
+            *way, last = path.split(".")
+            part = message
+            for name in way:
+                part = getattr(part, name)
+            if hasattr(part, last):  # Range has a variance from Jazzy on
+                setattr(part, last, value)
+        self._write(self._writer(topic, kind), message, sum(isinstance(value, float) for value in fields.values()))
 
     def _latched(self, topic: str, words: str) -> None:
         self._write(self._writer(topic, STRING, latched=True), self._types.String(words), 0)

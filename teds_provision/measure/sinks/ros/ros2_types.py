@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from typing import Final
 
 from cyclonedds.idl import IdlStruct
-from cyclonedds.idl.types import array, float64, int32, sequence, uint8, uint32
+from cyclonedds.idl.types import array, float32, float64, int32, sequence, uint8, uint32
 
 TYPE_HASHES: Final = {
     "std_msgs/String": "df668c740482bbd48fb39d76a70dfd4bd59db1288021743503259e948f6b1a18",
@@ -17,11 +17,18 @@ TYPE_HASHES: Final = {
     "sensor_msgs/FluidPressure": "22dfb2b145a0bd5a31a1ac3882a1b32148b51d9b2f3bab250290d66f3595bc32",
     "sensor_msgs/RelativeHumidity": "8687c99b4fb393cb2e545e407b5ea7fd0b5d8960bcd849a0f86c544740138839",
     "sensor_msgs/Illuminance": "b954b25f452fcf81a91c9c2a7e3b3fd85c4c873d452aecb3cfd8fd1da732a22d",
+    "sensor_msgs/MagneticField": "e80f32f56a20486c9923008fc1a1db07bbb273cbbf6a5b3bfa00835ee00e4dff",
+    "sensor_msgs/Imu": "7d9a00ff131080897a5ec7e26e315954b8eae3353c3f995c55faf71574000b5b",
+    "geometry_msgs/WrenchStamped": "8dc3deaf06b2ab281f9f9a742a8961c328ca7cec16e3fd6586d3a5c83fa78f77",
+    "sensor_msgs/Range": "b42b62562e93cbfe9d42b82fe5994dfa3d63d7d5c90a317981703f7388adff3a",
     "diagnostic_msgs/DiagnosticArray": "5a8a36efb05fb25070fa0fb3810290c0e6cd4862b54a8fb975a1ee8dc55a333e",
     "rmw_dds_common/ParticipantEntitiesInfo": "e725f4a506958c79f95dd693b965722c57b19cd18e7eff984f49561b93dc985d",
 }
-"""RIHS01 hashes of the definitions, the same from Humble to Lyrical but for the last one (Humble has HUMBLE_GRAPH)."""
-HUMBLE_GRAPH: Final = "2b40df2d2f4d5cd690221a503f406fe3673efcc4151a9f049b4d3569ecf5c4e4"
+"""RIHS01 hashes of the definitions (REP 2016), the same from Humble to Lyrical but for those in HUMBLE_HASHES."""
+HUMBLE_HASHES: Final = {
+    "rmw_dds_common/ParticipantEntitiesInfo": "2b40df2d2f4d5cd690221a503f406fe3673efcc4151a9f049b4d3569ecf5c4e4",
+    "sensor_msgs/Range": "9430b1915b94d4268ff903679e8ecd09b6a67d331bd028738ec1eeb592891ebd",
+}
 
 
 @dataclass
@@ -99,6 +106,92 @@ class Illuminance(IdlStruct, typename="sensor_msgs::msg::dds_::Illuminance_"):
     header: Header = field(default_factory=Header)
     illuminance: float64 = 0.0
     variance: float64 = 0.0
+
+
+@dataclass
+class Vector3(IdlStruct, typename="geometry_msgs::msg::dds_::Vector3_"):
+    """geometry_msgs/Vector3."""
+
+    x: float64 = 0.0
+    y: float64 = 0.0
+    z: float64 = 0.0
+
+
+@dataclass
+class Quaternion(IdlStruct, typename="geometry_msgs::msg::dds_::Quaternion_"):
+    """geometry_msgs/Quaternion."""
+
+    x: float64 = 0.0
+    y: float64 = 0.0
+    z: float64 = 0.0
+    w: float64 = 1.0
+
+
+def _zeros() -> list[float]:
+    return [0.0] * 9
+
+
+@dataclass
+class MagneticField(IdlStruct, typename="sensor_msgs::msg::dds_::MagneticField_"):
+    """sensor_msgs/MagneticField, T."""
+
+    header: Header = field(default_factory=Header)
+    magnetic_field: Vector3 = field(default_factory=Vector3)
+    magnetic_field_covariance: array[float64, 9] = field(default_factory=_zeros)
+
+
+@dataclass
+class Imu(IdlStruct, typename="sensor_msgs::msg::dds_::Imu_"):
+    """sensor_msgs/Imu, rad/s and m/s²."""
+
+    header: Header = field(default_factory=Header)
+    orientation: Quaternion = field(default_factory=Quaternion)
+    orientation_covariance: array[float64, 9] = field(default_factory=_zeros)
+    angular_velocity: Vector3 = field(default_factory=Vector3)
+    angular_velocity_covariance: array[float64, 9] = field(default_factory=_zeros)
+    linear_acceleration: Vector3 = field(default_factory=Vector3)
+    linear_acceleration_covariance: array[float64, 9] = field(default_factory=_zeros)
+
+
+@dataclass
+class Wrench(IdlStruct, typename="geometry_msgs::msg::dds_::Wrench_"):
+    """geometry_msgs/Wrench, N and N·m."""
+
+    force: Vector3 = field(default_factory=Vector3)
+    torque: Vector3 = field(default_factory=Vector3)
+
+
+@dataclass
+class WrenchStamped(IdlStruct, typename="geometry_msgs::msg::dds_::WrenchStamped_"):
+    """geometry_msgs/WrenchStamped."""
+
+    header: Header = field(default_factory=Header)
+    wrench: Wrench = field(default_factory=Wrench)
+
+
+@dataclass
+class Range(IdlStruct, typename="sensor_msgs::msg::dds_::Range_"):
+    """sensor_msgs/Range, m, as from Jazzy on."""
+
+    header: Header = field(default_factory=Header)
+    radiation_type: uint8 = 0
+    field_of_view: float32 = 0.0
+    min_range: float32 = 0.0
+    max_range: float32 = 0.0
+    range: float32 = 0.0
+    variance: float32 = 0.0
+
+
+@dataclass
+class HumbleRange(IdlStruct, typename="sensor_msgs::msg::dds_::Range_"):
+    """As Range, without the variance, of Humble."""
+
+    header: Header = field(default_factory=Header)
+    radiation_type: uint8 = 0
+    field_of_view: float32 = 0.0
+    min_range: float32 = 0.0
+    max_range: float32 = 0.0
+    range: float32 = 0.0
 
 
 @dataclass
@@ -186,6 +279,14 @@ TYPES: Final = {
     "sensor_msgs/FluidPressure": FluidPressure,
     "sensor_msgs/RelativeHumidity": RelativeHumidity,
     "sensor_msgs/Illuminance": Illuminance,
+    "sensor_msgs/MagneticField": MagneticField,
+    "sensor_msgs/Imu": Imu,
+    "geometry_msgs/WrenchStamped": WrenchStamped,
+    "sensor_msgs/Range": Range,
     "diagnostic_msgs/DiagnosticArray": DiagnosticArray,
     "rmw_dds_common/ParticipantEntitiesInfo": ParticipantEntitiesInfo,
+}
+HUMBLE_TYPES: Final = {
+    "rmw_dds_common/ParticipantEntitiesInfo": HumbleParticipantEntitiesInfo,
+    "sensor_msgs/Range": HumbleRange,
 }

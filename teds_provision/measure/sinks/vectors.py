@@ -1,0 +1,136 @@
+"""Messages of several channels: a vector group of the Meta-TEDS whose unit says what it is, and range finders.
+
+| channels | message | topic |
+|---|---|---|
+| three of T | sensor_msgs/MagneticField | ``/<station>/<node>/magnetic_field`` |
+| three of m/s², three of rad/s, or both | sensor_msgs/Imu | ``…/imu`` |
+| three of N and three of N·m | geometry_msgs/WrenchStamped | ``…/wrench`` |
+| one in m of what is called a range finder | sensor_msgs/Range | the channel's own |
+
+The members of a vector group (Meta-TEDS, VGroup) are its axes x, y, z in their order. What is not measured is said as
+sensor_msgs asks: the first element of its covariance is -1. A covariance of 0 is unknown.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field
+from typing import Final
+
+from teds_provision.measure.blocks import ChannelFacts
+from teds_provision.measure.sinks.meaning import variance_of
+from teds_provision.teds.units.names import units_of
+
+FieldValue = float | int | list[float]
+AXES: Final = ("x", "y", "z")
+_FIELD = units_of(kilograms=1, seconds=-2, amperes=-1)
+_ACCELERATION = units_of(meters=1, seconds=-2)
+_RATE = units_of(radians=1, seconds=-1)
+_FORCE = units_of(meters=1, kilograms=1, seconds=-2)
+_TORQUE = units_of(meters=2, kilograms=1, seconds=-2)
+_LENGTH = units_of(meters=1)
+_RANGE_WORDS = ("range finder", "rangefinder", "distance sensor")
+_NOT_MEASURED: Final = [-1.0, *[0.0] * 8]
+_INFRARED: Final = 1
+
+
+@dataclass(frozen=True)
+class Compound:
+    """One message: its type (ROS 1 spelling), the end of its topic ("" for the channel's own), and where values go.
+
+    ``parts`` are (path of the field, channel number), ``fixed`` the other fields by path.
+    """
+
+    type: str
+    name: str
+    parts: tuple[tuple[str, int], ...]
+    fixed: Mapping[str, FieldValue] = field(default_factory=dict)
+
+    def fields(self, values: Mapping[int, float]) -> dict[str, FieldValue] | None:
+        """All fields by path; None where a value is missing or not finite: half a vector is none."""
+        found: dict[str, FieldValue] = dict(self.fixed)
+        for path, number in self.parts:
+            value = values.get(number, math.nan)
+            if not math.isfinite(value):
+                return None
+            found[path] = value
+        return found
+
+
+def compounds_of(facts: Iterable[ChannelFacts]) -> list[Compound]:
+    """The messages that the channels of one stream of one node make together."""
+    sensors = {one.number: one for one in facts if one.kind == "sensor"}
+    groups = {one.vector: [sensors[n] for n in one.vector] for one in sensors.values() if _is_whole(one, sensors)}
+    by_unit: dict[object, list[list[ChannelFacts]]] = {}
+    for axes in groups.values():
+        if len({one.units for one in axes}) == 1:
+            by_unit.setdefault(axes[0].units, []).append(axes)
+    found = [_magnetic(axes) for axes in by_unit.get(_FIELD, [])]
+    found += _imus(by_unit.get(_ACCELERATION, []), by_unit.get(_RATE, []))
+    pairs = zip(by_unit.get(_FORCE, []), by_unit.get(_TORQUE, []), strict=False)
+    found += [
+        Compound("geometry_msgs/WrenchStamped", "wrench", (*_paths("wrench.force", f), *_paths("wrench.torque", t)))
+        for f, t in pairs
+    ]
+    return [*_told_apart(found), *(_range(one) for one in sensors.values() if is_range(one))]
+
+
+def is_range(facts: ChannelFacts) -> bool:
+    """Whether a channel is a range finder: by its unit and what the profile or its name calls it."""
+    words = f"{facts.quantity} {facts.name}".lower().replace("_", " ").replace("-", " ")
+    return facts.kind == "sensor" and facts.units == _LENGTH and any(one in words for one in _RANGE_WORDS)
+
+
+def _is_whole(one: ChannelFacts, sensors: Mapping[int, ChannelFacts]) -> bool:
+    return len(one.vector) == len(AXES) and all(number in sensors for number in one.vector)
+
+
+def _paths(field_name: str, axes: list[ChannelFacts]) -> tuple[tuple[str, int], ...]:
+    return tuple((f"{field_name}.{axis}", one.number) for axis, one in zip(AXES, axes, strict=True))
+
+
+def _covariance(axes: list[ChannelFacts]) -> list[float]:
+    """Row by row; only the diagonal is known."""
+    found = [0.0] * 9
+    for k, one in enumerate(axes):
+        found[4 * k] = variance_of(one)
+    return found
+
+
+def _magnetic(axes: list[ChannelFacts]) -> Compound:
+    fixed: dict[str, FieldValue] = {"magnetic_field_covariance": _covariance(axes)}
+    return Compound("sensor_msgs/MagneticField", "magnetic_field", _paths("magnetic_field", axes), fixed)
+
+
+def _imus(accelerations: list[list[ChannelFacts]], rates: list[list[ChannelFacts]]) -> list[Compound]:
+    found = []
+    for k in range(max(len(accelerations), len(rates))):
+        parts: tuple[tuple[str, int], ...] = ()
+        fixed: dict[str, FieldValue] = {"orientation_covariance": _NOT_MEASURED, "orientation.w": 1.0}
+        for name, groups in (("linear_acceleration", accelerations), ("angular_velocity", rates)):
+            axes = groups[k] if k < len(groups) else None
+            fixed[f"{name}_covariance"] = _NOT_MEASURED if axes is None else _covariance(axes)
+            parts += () if axes is None else _paths(name, axes)
+        found.append(Compound("sensor_msgs/Imu", "imu", parts, fixed))
+    return found
+
+
+def _range(one: ChannelFacts) -> Compound:
+    """The angle of its cone is not in a datasheet: 0."""
+    fixed: dict[str, FieldValue] = {
+        "radiation_type": _INFRARED,
+        "min_range": 0.0 if one.low is None else one.low,
+        "max_range": math.inf if one.high is None else one.high,
+        "variance": variance_of(one),
+    }
+    return Compound("sensor_msgs/Range", "", (("range", one.number),), fixed)
+
+
+def _told_apart(found: list[Compound]) -> list[Compound]:
+    """Two of one kind get the number of their first channel behind the name."""
+    names = [one.name for one in found]
+    return [
+        one if names.count(one.name) == 1 else Compound(one.type, f"{one.name}_{one.parts[0][1]}", one.parts, one.fixed)
+        for one in found
+    ]
