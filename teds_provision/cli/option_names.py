@@ -46,6 +46,8 @@ OPTIONS: Final[dict[str, frozenset[str]]] = {
     "group create": frozenset({"dry-run"}),
     "group delete": frozenset({"dry-run"}),
     "group remove": frozenset({"dry-run"}),
+    "names reset": frozenset({"dry-run"}),
+    "names set": frozenset({"dry-run"}),
     "export-keys": frozenset({"to", "all", "mode", "output", "expires", "ca", "yes", "dry-run"}),
     "import-keys": frozenset({"prove", "receipt", "yes", "dry-run", "via", "nfc", "can", "ble", "timeout", "trace"}),
     "handover undo": frozenset({"yes", "dry-run"}),

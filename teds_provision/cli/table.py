@@ -56,6 +56,7 @@ SECTIONS: Final[dict[str, dict[str, Entry]]] = {
         "mode": Entry("measure.values", "mode", "What a node claims and does."),
         "ncap": Entry("ncap.group", "ncap", "The base station as a service, with a page: run, status, open, token."),
         "group": Entry("measure.group", "group", "Measurement groups: create, add, remove, delete, list."),
+        "names": Entry("measure.names", "names", "Topics under which channels are published: list, set, reset."),
     },
     "A key's life": {
         "export-keys": Entry(
@@ -80,6 +81,6 @@ SECTIONS: Final[dict[str, dict[str, Entry]]] = {
 
 COMMANDS: Final = {name: entry for section in SECTIONS.values() for name, entry in section.items()}
 GROUPS: Final = frozenset(
-    {"draft", "vault", "group", "trace", "trust", "config", "profile", "whitelist", "handover", "node", "ncap"}
+    {"draft", "vault", "group", "trace", "trust", "config", "profile", "whitelist", "handover", "node", "ncap", "names"}
 )
 """The commands that have commands of their own."""

@@ -145,12 +145,10 @@ class Job:
                 self.station.measurements.keep(self.kept)
 
     def _facts(self) -> StationFacts:
-        names = {(uuid.hex(), channel): name for (uuid, channel), name in self.station.measurements.names.items()}
-        return StationFacts(
-            names.pop((STATION.hex(), 0), self.station.name),
+        return replace(
+            station_facts(self.station),
             group=self.kept.group or "",
             started=time.time(),
-            names=names,
             scalar_rate=self.kept.scalar_rate,
             test_pattern=self.wish.test_pattern,
         )
@@ -171,3 +169,9 @@ def wish_of(kept: Kept, more: Wish) -> Wish:
         actuators=kept.actuators,
         dead_man=kept.dead_man,
     )
+
+
+def station_facts(station: Station) -> StationFacts:
+    """What the sinks are told of the station: its name, and the names that somebody chose."""
+    names = {(uuid.hex(), channel): name for (uuid, channel), name in station.measurements.names.items()}
+    return StationFacts(names.pop((STATION.hex(), 0), station.name), names=names)

@@ -1,0 +1,126 @@
+"""``names``: under which topics channels are published (ROS, MQTT, recordings)."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from teds_provision import measure, teds
+from teds_provision.cli.context import App, pass_app
+from teds_provision.cli.options import COMMAND_SETTINGS, command, dry_run_option, examples
+from teds_provision.errors import NotFound, UsageFailure
+from teds_provision.station.measurements import STATION
+
+if TYPE_CHECKING:
+    from teds_provision.measure.blocks import ChannelFacts
+    from teds_provision.station.station import Station
+
+
+@click.group(
+    context_settings=COMMAND_SETTINGS,
+    epilog=examples("teds-provision names list", "teds-provision names set 8d4d 1 crane/slew_angle"),
+)
+def names() -> None:
+    """Topics of channels: /STATION/NODE/CHANNEL, unless somebody chose others. Frozen while a node is measured."""
+
+
+@names.command("list", context_settings=COMMAND_SETTINGS, epilog=examples("teds-provision names list"))
+@pass_app
+def list_names(app: App) -> None:
+    """List the topic of every channel whose datasheet is known here."""
+    _tell(app, app.station())
+
+
+@command(
+    "teds-provision names set 8d4d 1 crane/slew_angle",
+    "teds-provision names set 8d4d 0 slew",
+    "teds-provision names set station 0 crane_7",
+    name="set",
+)
+@click.argument("node", metavar="UUID|station")
+@click.argument("channel", type=click.IntRange(0, 255))
+@click.argument("name")
+@dry_run_option
+@pass_app
+def set_name(app: App, node: str, channel: int, name: str, *, dry_run: bool) -> None:
+    """Publish a channel under NAME; channel 0 is the node's (or the station's) part of its topics."""
+    station = app.station()
+    uuid = _who(station, node)
+    chosen = name.strip("/")
+    if not measure.sinks.names.is_topic(chosen) or (not channel and "/" in chosen):
+        raise UsageFailure(
+            f"{name!r} cannot be the name of a topic.",
+            hint="Use letters, digits and single _, beginning with a letter; / between parts of a channel's.",
+        )
+    _require_channel(station, uuid, channel)
+    if not dry_run:
+        _change(app, station, uuid, channel, chosen)
+    _tell(app, station)
+
+
+@command("teds-provision names reset 8d4d 1", name="reset")
+@click.argument("node", metavar="UUID|station")
+@click.argument("channel", type=click.IntRange(0, 255))
+@dry_run_option
+@pass_app
+def reset_name(app: App, node: str, channel: int, *, dry_run: bool) -> None:
+    """Publish a channel (0: the node's part) under the name that is made for it again."""
+    station = app.station()
+    uuid = _who(station, node)
+    if not dry_run:
+        _change(app, station, uuid, channel, None)
+    _tell(app, station)
+
+
+def _who(station: Station, node: str) -> bytes:
+    return STATION if node == "station" else station.nodes.resolve(node)
+
+
+def _require_channel(station: Station, uuid: bytes, channel: int) -> None:
+    known = [number for key, number, _ in _channels(station) if key == uuid]
+    if channel and (uuid == STATION or (known and channel not in known)):
+        has = ", ".join(map(str, known)) or "none"
+        raise NotFound(f"There is no channel {channel} of {uuid.hex()}.", hint=f"Its datasheet has {has}.")
+
+
+def _change(app: App, station: Station, uuid: bytes, channel: int, name: str | None) -> None:
+    with station.lock("names", app.note), station.transaction():
+        station.measurements.rename(uuid, channel, name)
+        station.audit("rename", None if uuid == STATION else uuid, "done", channel=channel, name=name)
+
+
+def _channels(station: Station) -> list[tuple[bytes, int, ChannelFacts]]:
+    """Every channel of a datasheet that is kept here, with what makes its name."""
+    found = []
+    for record in station.nodes.all():
+        image = station.nodes.datasheet(record.uuid)
+        if image is None:
+            continue
+        for one in teds.sheet.Sheet.of(image).channels:
+            facts = measure.blocks.ChannelFacts(record.uuid.hex(), record.name or "", one.number, one.name)
+            found.append((record.uuid, one.number, facts))
+    return found
+
+
+def _tell(app: App, station: Station) -> None:
+    chosen = station.measurements.names
+    facts = measure.carrying.job.station_facts(station)
+    topics = measure.sinks.names.Topics(facts)
+    channels = _channels(station)
+    topics.learn(one for _, _, one in channels)
+    told: list[dict[str, Any]] = [
+        {
+            "uuid": uuid.hex(),
+            "channel": number,
+            "topic": topics.channel(uuid.hex(), number),
+            "chosen": (uuid, number) in chosen or (uuid, 0) in chosen,
+        }
+        for uuid, number, _ in channels
+    ]
+    lines = [f"{one['uuid']} {one['channel']}: {one['topic']}{' (chosen)' if one['chosen'] else ''}" for one in told]
+    app.emit({"station": topics.station, "names": told}, "\n".join(lines) or "No datasheet is known here yet.")
+
+
+for one in (set_name, reset_name):
+    names.add_command(one)

@@ -1,0 +1,70 @@
+"""Topics that somebody chose: by command, unique, frozen while they are measured, and found in the recording."""
+
+from __future__ import annotations
+
+import signal
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from mcap.reader import make_reader
+
+from tests.e2e.desk import ANGLE
+from tests.measure.hall import Hall
+
+pytestmark = pytest.mark.link
+
+
+@pytest.fixture(scope="module")
+def hall(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Hall]:
+    made = Hall(tmp_path_factory.mktemp("hall"), {"a": ANGLE, "g": "gripper"})
+    try:
+        made.nodes["a"].start()
+        yield made
+    finally:
+        made.close()
+
+
+def topics(hall: Hall) -> dict[tuple[str, int], str]:
+    told = hall.station.ask("names", "list")
+    return {(one["uuid"], one["channel"]): one["topic"] for one in told["names"]}
+
+
+def test_topics_are_listed_chosen_and_made_again(hall: Hall) -> None:
+    a, g = hall.nodes["a"].uuid, hall.nodes["g"].uuid
+    made = {(a, 1): "/bench/a/angle", (g, 1): "/bench/g/opening_set_point", (g, 2): "/bench/g/opening"}
+    assert made.items() <= topics(hall).items()
+    for words in ((a, 1, "crane/slew"), (g, 0, "hand"), ("station", 0, "crane_7")):
+        hall.station.ask("names", "set", *words)
+    chosen = topics(hall)
+    assert (chosen[a, 1], chosen[g, 2]) == ("/crane/slew", "/crane_7/hand/opening")
+    assert hall.station.ask("names", "set", a, 1, "other", "--dry-run")
+    assert topics(hall) == chosen
+    for words in ((a, 1), (g, 0), ("station", 0)):
+        hall.station.ask("names", "reset", *words)
+    assert made.items() <= topics(hall).items()
+
+
+def test_what_cannot_be_a_topic_is_refused(hall: Hall) -> None:
+    a, g = hall.nodes["a"].uuid, hall.nodes["g"].uuid
+    for wrong in ("1st", "a__b", "a b", "end_", "", "a//b"):
+        hall.station.refuses("names", "set", a, 1, wrong, code=2)
+    hall.station.refuses("names", "set", a, 0, "two/parts", code=2)
+    hall.station.refuses("names", "set", a, 9, "nothing", code=3)
+    hall.station.ask("names", "set", a, 1, "one")
+    assert "already" in hall.station.refuses("names", "set", g, 1, "one", code=2)["message"]
+    hall.station.ask("names", "reset", a, 1)
+
+
+def test_a_chosen_name_is_in_the_recording_and_stays_while_it_is_measured(hall: Hall, tmp_path: Path) -> None:
+    a, file = hall.nodes["a"].uuid, tmp_path / "run.mcap"
+    hall.station.ask("names", "set", a, 0, "slew")
+    running = hall.begin(a, "--rate", 20, "--to", file)
+    running.wait_for('"event":"data"')
+    assert hall.station.refuses("names", "set", a, 0, "other", code=6)["code"] == "frozen"
+    running.signal(signal.SIGTERM)
+    assert running.end().code == 0
+    with file.open("rb") as octets:
+        found = {channel.topic for _, channel, _ in make_reader(octets).iter_messages()}
+    assert any(topic.startswith("/bench/slew/") for topic in found), found
+    hall.station.ask("names", "reset", a, 0)
