@@ -22,9 +22,10 @@ class Names:
         self._station, self._roster, self._live, self._is_measured = station, roster, live, is_measured
         self._guard = threading.Lock()
         self._topics: Topics | None = None
+        self._made_of = -1  # the roster's count of changes
 
     def forget(self) -> None:
-        """A node, a datasheet or a name has changed: make them anew when somebody asks."""
+        """A chosen name has changed: make them anew when somebody asks. Nodes and datasheets are followed anyway."""
         with self._guard:
             self._topics = None
 
@@ -61,8 +62,9 @@ class Names:
         self._live.event("names", state="changed", uuid=uuid, channel=channel)
 
     def _now(self) -> Topics:
+        changes = self._roster.changes
         with self._guard:
-            topics = self._topics
+            topics = self._topics if self._made_of == changes else None
         if topics is not None:
             return topics
         names = {(uuid.hex(), channel): name for (uuid, channel), name in self._station.measurements.names.items()}
@@ -75,5 +77,5 @@ class Names:
         ]
         topics.learn(facts)
         with self._guard:
-            self._topics = topics
+            self._topics, self._made_of = topics, changes
         return topics

@@ -190,6 +190,14 @@ def test_names_are_given_kept_and_taken_back(asked: Client, hand: str) -> None:
     assert asked.node(hand)["channels"][1]["topic"] == "/bench/hand/opening"
 
 
+def test_a_node_that_comes_later_is_published_under_its_own_name(service: Service, asked: Client, hand: str) -> None:
+    asked.request("GET", "/names")  # made while the node is unknown
+    late = virtual(service, "accelerometer", "late comer")
+    topics = [one["topic"] for one in asked.request("GET", "/names")["names"] if one["uuid"] == late]
+    assert topics == ["late_comer", *(f"/bench/late_comer/acceleration_{axis}" for axis in "xyz")]
+    asked.request("DELETE", f"/virtual/{late}", {})
+
+
 def test_groups_are_made_changed_and_deleted(asked: Client, hand: str) -> None:
     made = asked.request("POST", "/groups", {"name": "all", "uuids": ["hand", "22" * 10]})
     assert made["groups"] == [{"name": "all", "uuids": sorted([hand, "22" * 10]), "measuring": False}]

@@ -55,6 +55,7 @@ class Roster:
         self._seen: dict[str, Seen] = {}
         self._rows: dict[str, dict[str, Any]] = {}
         self._channels: dict[str, tuple[str, list[dict[str, Any]]]] = {}
+        self.changes = 0  # grows with each change of a node's name or datasheet
         self._strangers: dict[str, set[str]] = {}
 
     # -- the store ---------------------------------------------------------------------------------------------------
@@ -68,6 +69,7 @@ class Roster:
         )
         rows = {row["uuid"]: row for row in inventory(self._station, wanted)}
         with self._lock:
+            self.changes += 1
             if uuids is None:
                 self._rows = rows
             else:
@@ -83,12 +85,14 @@ class Roster:
         image = self._station.nodes.datasheet(bytes.fromhex(uuid))
         channels = [channel_facts(one) for one in Sheet.of(image).channels] if image is not None else []
         with self._lock:
+            self.changes += 1
             self._channels[uuid] = digest, channels
         return channels
 
     def show_sheet(self, uuid: str, sheet: Sheet | None) -> None:
         """Show the channels of a datasheet that was read just now; None: those of the one that is kept."""
         with self._lock:
+            self.changes += 1
             if sheet is None:
                 self._channels.pop(uuid, None)
             else:
