@@ -123,14 +123,23 @@ async function find() {
   }
 }
 
+/** What a person is at that must not be taken from under the hands; "" where nothing is. */
+function occupied() {
+  if (document.querySelector("[data-held]")) return "you hold an actuator";
+  const at = document.activeElement;
+  const typing = at?.matches?.("main input:not([type=checkbox], [type=range], [type=file])") && at.value !== at.defaultValue;
+  return typing ? "you are writing" : "";
+}
+
 /** A tap opens that very node and marks it, wherever the person was: no button is needed. */
 function tapped() {
   const { uuid } = state.tapped;
   const node = state.nodes.get(uuid);
   say(`Tapped: ${nameOf(node ?? { uuid })}.`);
   const here = location.hash.startsWith(`#/nodes/${uuid}`);
-  if (document.querySelector("[data-held]")) {
-    toast("good", `Tapped: ${nameOf(node ?? { uuid })}.`, "Not opened, because you hold an actuator.");
+  const busy = occupied();
+  if (busy) {
+    toast("good", `Tapped: ${nameOf(node ?? { uuid })}.`, `Not opened, because ${busy}. It is marked under Nodes.`);
     return;
   }
   const run = state.runs.get(uuid) ?? state.runs.get("next");

@@ -147,7 +147,7 @@ export class LivePlot {
     const rate = (each) => Math.round((each * 1000) / since);
     const parts = [count(this.channels.length, "channel"), `${rate(state.received - this.second.received)} points/s`];
     parts.push(`drawn ${rate(this.second.frames)} times/s`, this.skipped ? `${this.skipped} drawings left out` : "no drawing left out");
-    parts.push(state.dropped ? `${count(state.dropped, "point")} not received: this page was too slow` : "no point lost on the way here");
+    parts.push(state.dropped ? `${count(state.dropped, "message")} of values left out: this page was too slow` : "none lost on the way here");
     text(this.foot, parts.join(" · "));
     Object.assign(this.foot.dataset, { received: state.received, dropped: state.dropped, drawn: this.drawn, skipped: this.skipped });
     this.second = { at: performance.now(), frames: 0, received: state.received };

@@ -1,6 +1,6 @@
 // Groups, what is measured, and the moving plot.
 
-import { paths, post, remove } from "../api.js";
+import { change, paths, post, remove } from "../api.js";
 import { button, chip, empty, field, fill, h, icon, keyed, say, text, toast, trouble } from "../dom.js";
 import { channelName, count, nameOf, verdict } from "../format.js";
 import { LivePlot } from "../plot.js";
@@ -87,9 +87,11 @@ class GroupCard {
     this.record = h("input", { type: "text", placeholder: "run.csv", autocomplete: "off" });
     this.start = button("Start", { class: "main", onclick: () => this.start.busy(() => this.go()) }, "play");
     this.stop = button("Stop", { onclick: () => this.stop.busy(() => this.halt()) }, "stop");
+    this.others = h("fieldset", { class: "members" }, h("legend", {}, "Members"), h("div", { class: "ticks" }));
+    this.keep = button("Keep these members", { onclick: () => this.keep.busy(() => this.remember()) });
     this.drop = button("Delete group", { class: "quiet" });
     this.drop.addEventListener("click", () => this.drop.busy(() => this.away()));
-    this.more = h("details", { class: "more" }, h("summary", {}, "More"), h("div", { class: "row" }, field("Kind", this.kind), h("label", { class: "tick" }, this.trigger, h("span", {}, "Begin together, by trigger")), field("Record to", this.record, "A file in the station's record folder: .csv, .txt, .mcap, .jsonl.")), h("div", { class: "row" }, this.drop));
+    this.more = h("details", { class: "more" }, h("summary", {}, "More"), h("div", { class: "row" }, field("Kind", this.kind), h("label", { class: "tick" }, this.trigger, h("span", {}, "Begin together, by trigger")), field("Record to", this.record, "A file in the station's record folder: .csv, .txt, .mcap, .jsonl.")), this.others, h("div", { class: "row" }, this.keep, this.drop));
     this.error = h("div", {});
     this.element = h("li", { class: "panel group" }, h("div", { class: "panel-head" }, h("h4", {}, name), this.state), this.members, h("div", { class: "row" }, field("Rate, Hz", this.rate), this.start, this.stop), this.more, this.error);
     this.element.card = this;
@@ -116,10 +118,31 @@ class GroupCard {
     this.stop.hidden = !one;
     if (this.start.getAttribute("aria-busy") !== "true") this.start.disabled = !may || !(group.uuids ?? []).length;
     if (this.stop.getAttribute("aria-busy") !== "true") this.stop.disabled = !may;
+    this.paintMembers(group, !may || Boolean(one));
     this.drop.disabled = !may || Boolean(one);
     this.rate.disabled = this.kind.disabled = this.trigger.disabled = this.record.disabled = Boolean(one);
     if (one?.error && this.errorShown !== one.error.message) fill(this.error, trouble(one.error));
     this.errorShown = one?.error?.message;
+  }
+
+  /** Nodes to tick, those of the group ticked; left alone while somebody ticks. */
+  paintMembers(group, frozen) {
+    const nodes = [...state.nodes.values()].filter((node) => node.whitelisted !== false);
+    const told = JSON.stringify([group.uuids, nodes.map((node) => [node.uuid, node.name]), frozen]);
+    if (this.toldMembers === told) return;
+    this.toldMembers = told;
+    fill(this.others.lastChild, nodes.map((node) => {
+      const row = tick(node);
+      text(row.querySelector("span"), nameOf(node));
+      Object.assign(row.firstChild, { checked: group.uuids.includes(node.uuid), disabled: frozen });
+      return row;
+    }));
+    this.keep.disabled = frozen;
+  }
+
+  async remember() {
+    const uuids = [...this.others.querySelectorAll("input:checked")].map((box) => box.value);
+    await this.does(() => change(paths.group(this.name), { uuids }), `Group ${this.name} has ${count(uuids.length, "member")}.`);
   }
 
   async go() {

@@ -33,8 +33,11 @@ export function nodesView(main, rest) {
     return [...state.nodes.values()].filter((node) => !words || nameOf(node).toLowerCase().includes(words) || node.uuid.includes(words)).sort(order);
   }
 
+  let first = null; // UUID of the node on top: open where none is chosen
+
   function paint() {
     const nodes = matching();
+    first = nodes[0]?.uuid;
     const any = state.nodes.size > 0;
     side.hidden = !any;
     search.hidden = state.nodes.size < SEARCH_FROM && !search.value;
@@ -42,7 +45,7 @@ export function nodesView(main, rest) {
     text(total, `${count(state.nodes.size, "node")}${strangers ? `, ${strangers} more not on the whitelist` : ""}`);
     keyed(list, nodes, (node) => node.uuid, card, update);
     main.classList.toggle("one-open", Boolean(chosen[0]) && any);
-    open(nodes);
+    open();
     if (any || chosen[0]) none.replaceChildren();
     else if (!none.firstChild || none.dataset.loaded !== String(state.loaded)) {
       none.dataset.loaded = String(state.loaded);
@@ -55,7 +58,7 @@ export function nodesView(main, rest) {
     }
   }
 
-  function open(nodes) {
+  function open() {
     if (chosen[0] === "next") {
       if (!next) {
         panel?.end();
@@ -67,7 +70,7 @@ export function nodesView(main, rest) {
     }
     next?.end();
     next = null;
-    const uuid = chosen[0] ?? nodes[0]?.uuid;
+    const uuid = chosen[0] ?? first;
     const node = state.nodes.get(uuid);
     if (!node) {
       panel?.end();
@@ -85,7 +88,7 @@ export function nodesView(main, rest) {
   }
 
   function update(element, node) {
-    const current = (chosen[0] ?? (matching()[0]?.uuid)) === node.uuid;
+    const current = (chosen[0] ?? first) === node.uuid;
     if (current) element.firstChild.setAttribute("aria-current", "true");
     else element.firstChild.removeAttribute("aria-current");
     element.classList.toggle("tapped", state.tapped?.uuid === node.uuid && performance.now() - state.tapped.at < MARKED);
