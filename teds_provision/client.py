@@ -161,6 +161,51 @@ class Client:
         """One node, by UUID, prefix or name."""
         return dict(self.request("GET", f"/nodes/{quote(node, safe='')}"))
 
+    def teds(self, node: str) -> dict[str, Any]:
+        """A node's datasheet, decoded and checked."""
+        return dict(self.request("GET", f"/nodes/{quote(node, safe='')}/teds"))
+
+    def write_teds(self, node: str, document: str, *, dry_run: bool = False) -> dict[str, Any]:
+        """Write what a document (XML, JSON, hex) says; ``dry_run``: only what that would change."""
+        query = "?dry_run=1" if dry_run else ""
+        return dict(self.request("PUT", f"/nodes/{quote(node, safe='')}/teds{query}", {"content": document}))
+
+    def provision(self, node: str = "next", **order: str | None) -> dict[str, Any]:
+        """Provision a node, or the next that is tapped; ``order``: profile, name, calibration, calibration_name."""
+        return dict(self.request("POST", f"/nodes/{quote(node, safe='')}/provision", order))
+
+    def groups(self) -> list[dict[str, Any]]:
+        """The measurement groups."""
+        return list(self.request("GET", "/groups")["groups"])
+
+    def measurements(self) -> list[dict[str, Any]]:
+        """What is measured."""
+        return list(self.request("GET", "/measurements")["measurements"])
+
+    def measure(self, *nodes: str, **asked: Any) -> dict[str, Any]:
+        """Measure nodes from now on; ``asked``: group (in place of nodes), rate, kind, trigger, channels, sinks."""
+        return dict(self.request("POST", "/measurements", {**({"uuids": list(nodes)} if nodes else {}), **asked}))
+
+    def end_measurement(self, measurement_id: str) -> None:
+        """End one and forget it."""
+        self.request("DELETE", f"/measurements/{quote(measurement_id, safe='')}")
+
+    def set(
+        self, node: str, channel: int, value: float, *, unit: str | None = None, hold: float | None = None
+    ) -> dict[str, Any]:
+        """Set an actuator and hold it for ``hold`` seconds (1 where none are said); set it again to hold it on."""
+        body = {"value": value, "unit": unit, "hold": hold}
+        return dict(self.request("PUT", f"/nodes/{quote(node, safe='')}/channels/{channel}", body))
+
+    def let_go(self, node: str, channel: int) -> bool | None:
+        """Let an actuator go; whether the node said that it is safe, None where it did not say."""
+        safe = self.request("PUT", f"/nodes/{quote(node, safe='')}/channels/{channel}", {"hold": 0})["safe"]
+        return None if safe is None else bool(safe)
+
+    def log(self, last: int = 200) -> list[dict[str, Any]]:
+        """The newest entries of the audit log."""
+        return list(self.request("GET", f"/log?limit={last}")["entries"])
+
     def login_url(self, *, read_only: bool = False) -> str:
         """The page's address with a token that works once; over the Unix socket alone."""
         return str(self.request("POST", "/login-link", {"read_only": read_only})["url"])

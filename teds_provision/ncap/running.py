@@ -47,6 +47,7 @@ async def _serve(daemon: Daemon, local: socket.socket, tcp: socket.socket | None
     for number in (signal.SIGTERM, signal.SIGINT):
         loop.add_signal_handler(number, _ending(stop))
     servers = Servers()
+    watchdog = asyncio.create_task(_watchdog())
     app = build(daemon)
     early: list[dict[str, Any]] = []
     daemon.live.told = early.append  # the first line says that it is ready
@@ -72,6 +73,7 @@ async def _serve(daemon: Daemon, local: socket.socket, tcp: socket.socket | None
             notify("STOPPING=1")
             await servers.stop()
     finally:
+        watchdog.cancel()
         await servers.stop()
 
 
@@ -90,6 +92,14 @@ def _ending(stop: asyncio.Event) -> Callable[[], None]:
         stop.set()
 
     return end
+
+
+async def _watchdog() -> None:
+    """Tell systemd that the loop lives, twice in the time that WATCHDOG_USEC allows."""
+    allowed = os.environ.get("WATCHDOG_USEC", "")
+    while allowed.isdecimal() and int(allowed) > 0:
+        notify("WATCHDOG=1")
+        await asyncio.sleep(int(allowed) / 2e6)
 
 
 def notify(state: str) -> None:

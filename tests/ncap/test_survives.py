@@ -3,8 +3,12 @@
 from __future__ import annotations
 
 import json
+import shutil
+import socket
+import subprocess
 import time
 from collections.abc import Iterator
+from contextlib import suppress
 from datetime import datetime
 from pathlib import Path
 from typing import Any
@@ -12,7 +16,7 @@ from typing import Any
 import pytest
 
 from teds_provision.store import Store
-from tests.e2e.desk import ANGLE, Desk, Node, limited
+from tests.e2e.desk import ANGLE, Desk, Node, clean_environment, limited
 from tests.ncap.service import Service, until, verified, virtual
 
 pytestmark = pytest.mark.link
@@ -224,3 +228,37 @@ def test_an_actuator_is_safe_when_the_daemon_ends_and_when_it_is_killed(desk: De
         service.end()
     entries = service.station.ask("log", "--act", "set")["entries"]
     assert (entries[-1]["outcome"], entries[-1]["detail"]["safe"]) == ("done", True)
+
+
+def test_systemd_hears_when_it_is_ready_that_it_lives_and_when_it_ends(desk: Desk) -> None:
+    where = desk.folder / "notify"
+    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as systemd:
+        systemd.bind(str(where))
+        systemd.settimeout(30)
+        environment = clean_environment() | {"NOTIFY_SOCKET": str(where), "WATCHDOG_USEC": "200000"}
+        service = Service(desk, desk.station()).start(environment=environment)
+        heard = {systemd.recv(100) for _ in range(4)}
+        assert {b"READY=1", b"WATCHDOG=1"} <= heard
+        service.end()
+        systemd.setblocking(False)
+        rest = b""
+        with suppress(BlockingIOError):
+            while True:
+                rest += systemd.recv(100)
+        assert b"STOPPING=1" in rest
+
+
+@pytest.mark.skipif(shutil.which("systemd-analyze") is None, reason="systemd is not installed")
+def test_the_unit_that_is_shipped_is_sound_and_hardened(tmp_path: Path) -> None:
+    unit = Path(__file__).parent.parent.parent / "service" / "teds-provision-ncap.service"
+    if not unit.exists():
+        pytest.skip("the unit is not part of this installation")
+    copy = tmp_path / unit.name
+    copy.write_text(unit.read_text().replace("/usr/bin/teds-provision", "/bin/true"))
+    verified = subprocess.run(["systemd-analyze", "verify", str(copy)], capture_output=True, text=True, check=False)
+    assert (verified.returncode, verified.stderr) == (0, "")
+    judged = subprocess.run(
+        ["systemd-analyze", "security", "--offline=true", "--threshold=20", str(copy)],
+        capture_output=True, text=True, check=False,
+    )  # fmt: skip
+    assert judged.returncode == 0, judged.stdout.splitlines()[-1]
