@@ -85,7 +85,7 @@ def test_a_datasheet_is_written_after_its_diff_was_shown(asked: Client, hand: st
     done = asked.request("PUT", f"/nodes/{hand}/teds", {"content": changed})
     assert done["verdict"] == "authentic"
     assert [step["result"] for step in done["steps"]] == ["done"] * 4
-    assert asked.node(hand)["sequence"] == before + 1
+    assert (asked.node(hand)["sequence"], asked.node(hand)["name"]) == (before + 1, "left hand")
     back = asked.request("PUT", f"/nodes/{hand}/teds", {"content": document})
     assert back["verdict"] == "authentic"
 

@@ -13,7 +13,7 @@ from teds_provision.errors import BadData
 from teds_provision.protocol.datasheet import can_be_stored, passes_own_check
 from teds_provision.station.station import Station
 from teds_provision.steps.agree import require_session
-from teds_provision.steps.order import guard
+from teds_provision.steps.order import guard, own_name
 from teds_provision.steps.read import Survey, survey
 from teds_provision.steps.sign import known_node_keys, sign
 from teds_provision.steps.verify import Verified, require_authentic
@@ -107,7 +107,10 @@ def write_sheet(
         step.result = NOTHING if signed.reused else DONE
         step.detail = f"sequence {signed.sequence}"
     with steps.step("write") as step:
-        written = write(station, node, signed.image, present=present, progress=reporter.written)
+        record = station.nodes.get(node.uuid)
+        name = own_name(station, signed.image, record.profile if record is not None else None)
+        facts = {} if name is None else {"name": name}
+        written = write(station, node, signed.image, present=present, progress=reporter.written, facts=facts)
         step.result = DONE if written.octets else NOTHING
         step.detail = f"{written.octets} octets" if written.octets else ""
     with steps.step("verify") as step:
