@@ -44,6 +44,7 @@ bench-teds: $(VENV)/.dev
 bench-measure: $(VENV)/.dev
 	$(BIN)/python -m benchmarks.measure
 	$(BIN)/python -m benchmarks.sinks
+	$(BIN)/python -m benchmarks.sensor
 
 bench-handover: $(VENV)/.dev
 	$(BIN)/python -m benchmarks.handover
