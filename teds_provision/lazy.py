@@ -16,10 +16,12 @@ This module stands below every room and imports nothing of ours.
 
 from __future__ import annotations
 
+import shlex
 import sys
 from collections.abc import Callable, Mapping
 from importlib import import_module
 from importlib.util import find_spec
+from pathlib import Path
 from types import MappingProxyType
 from typing import Final
 
@@ -55,6 +57,15 @@ class _Late:
         value: object = getattr(import_module(self.__dict__["_module"]), name)
         self.__dict__[name] = value
         return value
+
+
+def how_to_install(*packages: str) -> str:
+    """The command that puts packages beside this tool, where it is: pipx keeps it apart, else this Python's own pip."""
+    names = " ".join(packages)
+    parts = Path(sys.prefix).parts
+    if "pipx" in parts and "venvs" in parts:
+        return f"Install it: pipx inject {parts[-1]} {names}"
+    return f"Install it: {shlex.quote(sys.executable)} -m pip install {names}"
 
 
 def late(module: str) -> object:

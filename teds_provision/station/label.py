@@ -14,7 +14,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
 from teds_provision import files
-from teds_provision.errors import NotFound, UsageFailure
+from teds_provision.errors import NotFound, TedsProvisionError, UsageFailure
+from teds_provision.lazy import how_to_install
 
 if TYPE_CHECKING:
     from teds_provision.station.station import Station
@@ -25,7 +26,6 @@ _LENGTH = len(PREFIX) + 1 + _UUID_DIGITS + 1 + _FINGERPRINT_DIGITS
 _FRENCH: Final = str.maketrans({**dict(zip("à&é\"'(-è_ç", "0123456789", strict=True)), "Q": "A", "q": "a"})
 """What a French layout makes of the digits and of A when a scanner presses the keys of a US keyboard."""
 _MODULE, _QUIET = 8, 4
-_INSTALL: Final = "Install it: pip install 'teds-provision[label]'"
 
 
 @dataclass(frozen=True)
@@ -76,7 +76,10 @@ def read_label(text: str) -> tuple[bytes, str] | None:
 
 
 def write_label(label: Label, path: Path) -> None:
-    """Write the label as SVG or PNG, by the suffix; raises UsageFailure (another one; no segno, no Pillow)."""
+    """Write the label as SVG or PNG, by the suffix; raises UsageFailure (another one).
+
+    Raises TedsProvisionError where segno, or for a PNG Pillow, is missing.
+    """
     suffix = path.suffix.lower()
     if suffix not in (".svg", ".png"):
         raise UsageFailure(f"A label is written as .svg or .png, not {path.name}.", hint="Name it LABEL.svg.")
@@ -89,7 +92,7 @@ def _modules(text: str) -> list[list[bool]]:
     try:
         import segno
     except ImportError as error:
-        raise UsageFailure("Labels need segno, which is not installed.", hint=_INSTALL) from error
+        raise TedsProvisionError("Labels need segno, which is not installed.", hint=how_to_install("segno")) from error
     code = segno.make(text, micro=False, error="m", boost_error=True)
     return [[bool(module) for module in row] for row in code.matrix]
 
@@ -115,7 +118,9 @@ def _png(label: Label, rows: list[list[bool]]) -> bytes:
     try:
         from PIL import Image, ImageDraw, ImageFont
     except ImportError as error:
-        raise UsageFailure("A PNG needs Pillow, which is not installed.", hint=_INSTALL) from error
+        raise TedsProvisionError(
+            "A PNG needs Pillow, which is not installed.", hint=how_to_install("pillow")
+        ) from error
     side = (len(rows) + 2 * _QUIET) * _MODULE
     font = ImageFont.load_default(4 * _MODULE)
     width = side + _QUIET * _MODULE + int(max(font.getlength(line) for line in label.lines))

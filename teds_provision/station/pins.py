@@ -103,9 +103,9 @@ class Pins:
         self._seals.require()
         entry, node = self._store.whitelisted(uuid), self._store.node(uuid)  # whatever it is: it is forgotten
         pinned = entry.fingerprint if entry is not None else None
-        if pinned is None and node is not None and node.point is not None:
-            pinned = keys.fingerprint(node.point)
-        if pinned is not None:
+        if not is_whole(pinned) and node is not None and node.point is not None:
+            pinned = _wholer(pinned, keys.fingerprint(node.point))
+        if pinned is not None and is_whole(pinned):  # with a board that was never met no key was agreed
             self._keys.set_former(uuid, pinned)
             self._store.drop_draft(uuid)  # it may hold the old board's calibration
         self._store.unpin_node(uuid)

@@ -234,7 +234,13 @@ def not_certified() -> NotFound:
 
 
 def initialise(
-    home: Path, *, name: str | None, keystore: str | None, ask: Ask, costs: object | None = None
+    home: Path,
+    *,
+    name: str | None,
+    keystore: str | None,
+    ask: Ask,
+    costs: object | None = None,
+    tell: Callable[[str], object] = lambda text: None,
 ) -> tuple[Station, str]:
     """Make the station key and the CA key, or open what an earlier run made; returns it and why this keystore.
 
@@ -249,7 +255,7 @@ def initialise(
         if station.identity.requested is not None:
             raise not_certified()
         more = {} if costs is None else {"costs": costs}
-        vault, why = vaults.create_vault(home, station.id, keystore, ask, **more)  # type: ignore[arg-type]
+        vault, why = vaults.create_vault(home, station.id, keystore, ask, tell=tell, **more)  # type: ignore[arg-type]
         key, ca = vault.identity(), vault.ca()
         if ca is None:
             raise NotFound("The vault holds no CA key.", hint="Choose another keystore, or bring the CA key back.")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -30,15 +31,29 @@ def create_vault(
     costs: Costs = PRODUCT,
     restored: str | None = None,
     with_ca: bool = True,
+    tell: Callable[[str], object] = lambda text: None,
 ) -> tuple[Vault, str]:
     """Make the vault of a station, or open the one that an earlier run made; return it and why it was chosen.
+
+    ``tell`` hears why, where and how long before anybody is asked for a new passphrase.
 
     ``keystore`` is ``keyring``, ``file``, ``pkcs11:…`` (RFC 7512) or None: then the keyring if one works (proven by a
     set, a read back and a delete), else a passphrase file. ``costs`` are those of a new passphrase file, ``restored``
     the secret material of a backup; ``with_ca`` False makes no CA key. Raises VaultFailure (leaves too), UsageFailure.
     """
     harden()
-    vault, why = _create(home, store_id, keystore, ask, costs, restored, with_ca=with_ca)
+
+    def asked(prompt: str, confirm: bool) -> str:
+        if confirm:
+            tell(
+                f"The keys of this station are about to be made and sealed in {home / 'vault.json'} under a passphrase"
+                f"{'' if keystore else ', as no keyring can be used here'}. Commands that use a key ask for it, "
+                "or once: teds-provision unlock. Without it only a backup helps. At least 8 characters; four random "
+                "words are good. Sealing takes about a second."
+            )
+        return ask(prompt, confirm)
+
+    vault, why = _create(home, store_id, keystore, asked, costs, restored, with_ca=with_ca)
     if not with_ca and restored is None:
         vault.drop_ca()  # one that was made a moment ago and never used
     _opened[home.resolve(), store_id, keystore if keystore and vault.kind == "pkcs11" else vault.kind] = vault

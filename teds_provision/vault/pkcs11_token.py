@@ -12,6 +12,7 @@ from collections.abc import Callable
 from typing import TYPE_CHECKING, Any, TypeVar
 
 from teds_provision.errors import BadData, VaultFailure, WrongPassphrase
+from teds_provision.lazy import how_to_install
 from teds_provision.protocol.keys import fingerprint, normalise_signature, public_key
 from teds_provision.vault.base import Ask
 from teds_provision.vault.pkcs11_uri import Pkcs11Uri
@@ -22,7 +23,6 @@ if TYPE_CHECKING:
 
 Result = TypeVar("Result")
 
-_INSTALL = "Run: pip install 'teds-provision[pkcs11]'"
 _RETRY_SECONDS = 0.2
 _POINT_DER = b"\x04\x41"  # OCTET STRING of 65 octets
 _X_OCTETS = 32
@@ -219,7 +219,9 @@ def find_token(uri: Pkcs11Uri) -> Token:
     try:
         import pkcs11
     except ImportError as error:
-        raise VaultFailure("Keys in a token need the package python-pkcs11.", hint=_INSTALL) from error
+        raise VaultFailure(
+            "Keys in a token need the package python-pkcs11.", hint=how_to_install("python-pkcs11")
+        ) from error
     try:
         library = guarded(lambda: pkcs11.lib(uri.module_path))
         tokens = guarded(lambda: [token for token in library.get_tokens() if _fits(uri, token)])

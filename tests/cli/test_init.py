@@ -8,9 +8,10 @@ from pathlib import Path
 
 import pytest
 
+from teds_provision.lazy import how_to_install
 from teds_provision.protocol.keys import fingerprint, from_pem
 
-from .shell import clean_environment, spawn
+from .shell import call, clean_environment, spawn
 
 WORDS = "four random words here"
 
@@ -94,3 +95,18 @@ def test_two_inits_at_once_make_one_station(tmp_path: Path) -> None:
     first, second = (process.communicate(timeout=60)[0] for process in both)
     assert [process.returncode for process in both] == [0, 0]
     assert first == second
+
+
+def test_why_where_and_how_long_is_said_before_anybody_is_asked(tmp_path: Path) -> None:
+    done = call(tmp_path / "new", "init", "--keystore", "file")
+    assert done.code == 0, done
+    told = done.err
+    assert str(tmp_path / "new" / "vault.json") in told
+    assert all(word in told for word in ("about a second", "8 characters", "backup"))
+    assert "about to be made" not in call(tmp_path / "new", "init").err
+
+
+def test_the_cure_for_a_missing_package_fits_where_the_program_is(monkeypatch: pytest.MonkeyPatch) -> None:
+    assert how_to_install("matplotlib") == f"Install it: {sys.executable} -m pip install matplotlib"
+    monkeypatch.setattr(sys, "prefix", "/home/anna/.local/share/pipx/venvs/teds-provision")
+    assert how_to_install("segno", "pillow") == "Install it: pipx inject teds-provision segno pillow"

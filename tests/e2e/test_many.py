@@ -86,3 +86,12 @@ def test_two_owners_race_for_a_new_node_and_one_has_it(desk: Desk, delay: str) -
     said = owners[1 - won].refuses("provision", "--profile", ANGLE, "--yes", *desk.links.over("can"), code=6)
     assert said["code"] in ("node-refused", "refused")  # the latter where it holds the key of its unconfirmed attempt
     assert node.octets == flash
+
+
+def test_a_bus_on_which_no_node_is_ours_is_no_success(station: Station, bus: list[Node]) -> None:
+    """--all, and nothing whitelisted: 6 with the nodes and the cure, and not "0 passed"."""
+    done = station.run("--json", "provision", "--all", "--yes", "-p", ANGLE, *station.desk.links.over("can"))
+    assert done.code == 6, done
+    assert all(uuid in done.out for uuid in UUIDS)
+    assert "whitelist add" in done.out
+    assert all(node.flash["key"] is None for node in bus)

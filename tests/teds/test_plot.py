@@ -112,4 +112,14 @@ except TedsProvisionError as error:
     told = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, cwd=tmp_path).stdout
     assert "matplotlib" in told
     assert told.startswith("1 ")
-    assert "pip install matplotlib" in told
+    assert f"{sys.executable} -m pip install matplotlib" in told
+
+
+def test_a_picture_names_the_node(tmp_path: Path) -> None:
+    named = load_profile("magnetic-angular-position-sensor", [shipped_profiles()])
+    calibrations = read_calibrations("0,0\n65535,360\n", "x.csv", named)
+    blocks = named.build(UUID, calibration=calibrations, name="crane slew angle").blocks
+    plot_blocks(blocks, tmp_path / "x.svg")
+    drawn = (tmp_path / "x.svg").read_text()
+    assert "crane slew angle" in drawn
+    assert UUID.hex() in drawn

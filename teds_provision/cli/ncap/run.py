@@ -15,7 +15,7 @@ import click
 from teds_provision.cli.context import App, pass_app, to_json
 from teds_provision.cli.options import command
 from teds_provision.errors import UsageFailure
-from teds_provision.lazy import late
+from teds_provision.lazy import how_to_install, late
 
 if TYPE_CHECKING:
     from teds_provision.ncap import running, settings
@@ -65,7 +65,7 @@ def run(
     """
     missing = [name for name in _NEEDED if importlib.util.find_spec(name) is None]
     if missing:
-        raise UsageFailure(f"ncap run needs {', '.join(missing)}.", hint="Install: pip install 'teds-provision[ncap]'")
+        raise UsageFailure(f"ncap run needs {', '.join(missing)}.", hint=how_to_install(*missing))
     places = [settings.with_own_source(f"can:{one}") for one in can] + [f"nfc:{one}" for one in nfc]
     places += [f"ble:{one}" for one in ble]
     sinks = [*(["ros1"] if ros1 else []), *(["ros2"] if ros2 else []), *([mqtt] if mqtt else [])]

@@ -53,7 +53,9 @@ def init(
         why = "this station was certified"
         station = app.station()
     else:
-        station, why = station_room.station.initialise(app.home, name=name, keystore=keystore, ask=app.ask_secret)
+        station, why = station_room.station.initialise(
+            app.home, name=name, keystore=keystore, ask=app.ask_secret, tell=app.note
+        )
         app.closing(station.close)
         _require_same(station, name, keystore)
     ca = protocol.keys.fingerprint(station.ca)

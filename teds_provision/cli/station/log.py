@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import json
+import shutil
 import signal
 import sys
 import threading
 from collections import Counter
 from collections.abc import Iterable, Iterator
+from textwrap import wrap
 from typing import TYPE_CHECKING, Any
 
 import click
@@ -23,6 +25,7 @@ if TYPE_CHECKING:
     from teds_provision.station.station import Station
     from teds_provision.store import AuditEntry, AuditVerdict, Choice
 
+_INDENT = " " * 7
 _POLL_SECONDS = 0.3
 
 
@@ -154,8 +157,17 @@ def _as_dict(entry: AuditEntry) -> dict[str, Any]:
 
 
 def _line(entry: AuditEntry) -> str:
+    """One line; on a terminal as many as its width asks for, when and what before who and details."""
     node = entry.uuid.hex() if entry.uuid else "-"
     detail = ", ".join(f"{key} {_short(value)}" for key, value in entry.detail.items() if value is not None)
+    if sys.stdout.isatty():
+        what = f"{entry.seq:>5}  {local_time(entry.at)}  {entry.act:<10} {node:<20}  {entry.outcome}"
+        width = max(40, shutil.get_terminal_size().columns)
+        rows = [
+            *wrap(shown(what), width, subsequent_indent=_INDENT, drop_whitespace=False),
+            *wrap(shown(f"{entry.who}  {detail}".rstrip()), width, initial_indent=_INDENT, subsequent_indent=_INDENT),
+        ]
+        return "\n".join(row.rstrip() for row in rows)
     line = f"{entry.seq:>5}  {local_time(entry.at)}  {entry.who}  {entry.act:<10} {node:<20}  {entry.outcome}"
     return shown(f"{line}  {detail}".rstrip())
 

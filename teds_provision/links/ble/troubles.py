@@ -8,6 +8,7 @@ from __future__ import annotations
 from typing import Final
 
 from teds_provision.errors import LinkFailure, NodeSilent, NoReader
+from teds_provision.lazy import how_to_install
 
 SERVICE_HINT: Final = "sudo systemctl start bluetooth (package bluez); teds-provision doctor looks closer."
 POWER_HINT: Final = "bluetoothctl power on; where that is refused: rfkill unblock bluetooth."
@@ -24,7 +25,7 @@ _NO_SERVICE: Final = ("org.freedesktop.DBus.Error.ServiceUnknown", "org.freedesk
 
 def missing_bleak() -> NoReader:
     """The error where bleak is not installed."""
-    return NoReader("BLE needs bleak, which is not installed.", hint="pip install 'teds-provision[ble]'")
+    return NoReader("BLE needs bleak, which is not installed.", hint=how_to_install("bleak"))
 
 
 def is_full(error: BaseException) -> bool:

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from typing import Any, Final
 
 from teds_provision.errors import NoReader, UsageFailure
+from teds_provision.lazy import how_to_install
 from teds_provision.links.nfc.library import Type2TagCommandError, Type4ATag, nfc
 from teds_provision.links.nfc.tag import FieldLost, ReaderLost, ReaderTag, Type2, Type4Ndef
 from teds_provision.links.ports import Trace
@@ -29,7 +30,7 @@ def _scard() -> Any:
     except ImportError as error:
         raise NoReader(
             "PC/SC readers need the package pyscard, which is not installed.",
-            hint="pip install 'teds-provision[pcsc]'; where it must be built: sudo apt install swig libpcsclite-dev.",
+            hint=f"{how_to_install('pyscard')} (it is built: sudo apt install swig libpcsclite-dev first).",
         ) from error
     return smartcard.scard
 

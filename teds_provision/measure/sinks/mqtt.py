@@ -20,6 +20,7 @@ from urllib.parse import parse_qs, urlsplit
 
 from teds_provision import __version__
 from teds_provision.errors import TedsProvisionError, UsageFailure
+from teds_provision.lazy import how_to_install
 from teds_provision.measure.blocks import Block, ChannelFacts, NodeReport, StationFacts
 from teds_provision.measure.sinks.base import CommandTaker, Item, ThreadedSink
 from teds_provision.measure.sinks.lines import status_line
@@ -66,9 +67,7 @@ class MqttSink(ThreadedSink):
             import paho.mqtt.client as paho
             from paho.mqtt.enums import CallbackAPIVersion
         except ImportError:
-            raise TedsProvisionError(
-                "MQTT needs the package paho-mqtt.", hint="Install it: pip install 'teds-provision[mqtt]'"
-            ) from None
+            raise TedsProvisionError("MQTT needs the package paho-mqtt.", hint=how_to_install("paho-mqtt")) from None
         self._station, self._topics = station, Topics(station)
         self._learn(facts)
         client = paho.Client(CallbackAPIVersion.VERSION2)

@@ -13,6 +13,7 @@ from contextlib import suppress
 from typing import Any, Final, TypeVar
 
 from teds_provision.errors import LinkFailure, NoReader, UsageFailure
+from teds_provision.lazy import how_to_install
 from teds_provision.links.hints import BleAddress
 from teds_provision.node.ble.address import StaticAddress
 from teds_provision.node.ble.peripheral import Peripheral
@@ -33,7 +34,7 @@ class BleServer:
         except ImportError:
             raise UsageFailure(
                 "A node's BLE needs bumble, which is not installed.",
-                hint="pip install 'teds-provision[ble-node]'",
+                hint=how_to_install("bumble"),
             ) from None
         self._transport, self._node, self._address = transport, node, address
         self._loop = asyncio.new_event_loop()

@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Final
 
-from teds_provision.errors import OtherKey, PolicyRefused, TedsProvisionError, UsageFailure
+from teds_provision.errors import NotWhitelisted, OtherKey, PolicyRefused, TedsProvisionError, UsageFailure
 from teds_provision.links import Contact, LinkSettings, open_port
 from teds_provision.protocol.messages.identity import NodeState
 from teds_provision.station.station import Station
@@ -31,6 +31,7 @@ from teds_provision.talk.progress import Reporter
 from teds_provision.talk.watching import Patience, watch_nodes
 
 _TOKEN_WORKERS: Final = 1
+_SHOWN: Final = 5
 """A token takes one command at a time."""
 
 
@@ -185,6 +186,8 @@ class Boards:
                 raise UsageFailure("--all is for a bus: a reader sees one node.", hint="Use --watch, tap after tap.")
             found = refuse_twins(port.everyone(seconds=self._links.timeout, notice=self._reporter.notice))
             contacts = [contact for contact in found if self._is_meant(contact)]
+            if not contacts:
+                self._require_known(found)
             token = self._station.identity.keystore.startswith("pkcs11:")
             workers = max(1, min(_TOKEN_WORKERS if token else port.capabilities.at_once, len(contacts)))
             with ThreadPoolExecutor(workers, thread_name_prefix="node") as pool:
@@ -199,6 +202,17 @@ class Boards:
                         future.cancel()
         finally:
             port.close()
+
+    def _require_known(self, found: list[Contact]) -> None:
+        """Raise NotWhitelisted where none of the nodes that answered is one of ours: nothing done is not all done."""
+        if self.progress is not None or any(self._station.pins.entry(one.identity.uuid) is not None for one in found):
+            return
+        uuids = [one.identity.uuid.hex() for one in found]
+        raise NotWhitelisted(
+            f"{len(uuids)} node{'s' if len(uuids) > 1 else ''} answered, and none is on the whitelist: "
+            f"{', '.join(uuids[:_SHOWN])}{', …' if len(uuids) > _SHOWN else ''}.",
+            hint=f"Add them (teds-provision whitelist add {uuids[0]}), or name them in a sheet: --batch FILE.",
+        )
 
     def _is_meant(self, contact: Contact) -> bool:
         """On the whitelist or in the sheet, and not finished yet; said for those that are neither."""

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 from teds_provision.errors import BadData, TedsProvisionError, UsageFailure
 from teds_provision.files import SHARED, write_whole
-from teds_provision.lazy import late
+from teds_provision.lazy import how_to_install, late
 from teds_provision.teds.calibration.decoded import is_sound
 from teds_provision.teds.calibration.describe import kind_of
 from teds_provision.teds.calibration.fitting import residuals
@@ -62,7 +62,7 @@ def plot_blocks(
         raise BadData(f"There is no calibration of {which} that can be drawn.")
     if len(panels) > MAXIMUM_PANELS:
         raise UsageFailure(f"{len(panels)} channels do not fit one picture.", hint="Choose one channel.")
-    write_whole(path, _picture(panels, kind), mode=SHARED, failure=UsageFailure)
+    write_whole(path, _picture(panels, kind, _node(blocks)), mode=SHARED, failure=UsageFailure)
     return tuple(panel.curve.channel.number for panel in panels)
 
 
@@ -97,20 +97,28 @@ def _name(number: int, blocks: Mapping[BlockId, bytes]) -> str:
     return f"channel {number}: {name}" if name else f"channel {number}"
 
 
-def _picture(panels: list[_Panel], kind: str) -> bytes:
+def _node(blocks: Mapping[BlockId, bytes]) -> str:
+    """The node's name and UUID, as far as its Meta-TEDS and name say them."""
+    sheet = Sheet.of_blocks(blocks)
+    return "  ".join(part for part in (sheet.meta.name, sheet.uuid.hex()) if part)
+
+
+def _picture(panels: list[_Panel], kind: str, title: str) -> bytes:
     try:
         import matplotlib as mpl
         from matplotlib.figure import Figure
     except ImportError as error:
         raise TedsProvisionError(
             "Pictures need matplotlib, which is not installed.",
-            hint="Install it into the environment of this tool: pip install matplotlib.",
+            hint=how_to_install("matplotlib"),
         ) from error
     columns = min(COLUMNS, len(panels))
     rows = math.ceil(len(panels) / columns)
     settings: Any = {"svg.hashsalt": "teds-provision", "svg.fonttype": "none", "text.parse_math": False, "font.size": 9}
     with mpl.rc_context(settings):
         figure = Figure(figsize=(max(7.0, 5.2 * columns), 5.4 * rows), layout="constrained", dpi=110)
+        if title:
+            figure.suptitle(title, fontsize=11)
         grid: Any = figure.subfigures(rows, columns, squeeze=False)
         for number, panel in enumerate(panels):
             _draw(grid[number // columns][number % columns], panel)

@@ -16,7 +16,7 @@ from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 from teds_provision.errors import TedsProvisionError, UsageFailure
-from teds_provision.lazy import late
+from teds_provision.lazy import how_to_install, late
 from teds_provision.measure.blocks import StationFacts
 from teds_provision.measure.sinks.base import CommandTaker
 from teds_provision.measure.sinks.live import DIAGNOSTICS, JOINT_STATE, STRING, Status, TopicSink
@@ -73,9 +73,7 @@ class Ros2Sink(TopicSink):
             from cyclonedds.domain import Domain, DomainParticipant
             from cyclonedds.qos import Policy, Qos
         except ImportError:
-            raise TedsProvisionError(
-                "ROS 2 needs the package cyclonedds.", hint="Install it: pip install 'teds-provision[ros2]'"
-            ) from None
+            raise TedsProvisionError("ROS 2 needs the package cyclonedds.", hint=how_to_install("cyclonedds")) from None
         self._types = ros2_types
         try:
             if "CYCLONEDDS_URI" not in os.environ and self._domain not in _domains:
