@@ -45,6 +45,7 @@ bench-measure: $(VENV)/.dev
 	$(BIN)/python -m benchmarks.measure
 	$(BIN)/python -m benchmarks.sinks
 	$(BIN)/python -m benchmarks.sensor
+	$(BIN)/python -m benchmarks.measure_time
 
 bench-handover: $(VENV)/.dev
 	$(BIN)/python -m benchmarks.handover

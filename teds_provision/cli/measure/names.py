@@ -44,7 +44,10 @@ def list_names(app: App) -> None:
 @dry_run_option
 @pass_app
 def set_name(app: App, node: str, channel: int, name: str, *, dry_run: bool) -> None:
-    """Publish a channel under NAME; channel 0 is the node's (or the station's) part of its topics."""
+    """Publish a channel under NAME.
+
+    Channel 0 is the node's, or the station's, part of its topics.
+    """
     station = app.station()
     uuid = _who(station, node)
     chosen = name.strip("/")
@@ -65,7 +68,10 @@ def set_name(app: App, node: str, channel: int, name: str, *, dry_run: bool) -> 
 @dry_run_option
 @pass_app
 def reset_name(app: App, node: str, channel: int, *, dry_run: bool) -> None:
-    """Publish a channel (0: the node's part) under the name that is made for it again."""
+    """Publish a channel under the name made for it.
+
+    Channel 0 is the node's, or the station's, part of its topics.
+    """
     station = app.station()
     uuid = _who(station, node)
     if not dry_run:

@@ -7,6 +7,7 @@ its start, when somebody is missing (after 1 s, doubling to 30 s), at most once 
 
 from __future__ import annotations
 
+import math
 import threading
 import time
 from collections.abc import Callable
@@ -33,6 +34,7 @@ from teds_provision.protocol.messages.identity import Identity
 POLL = 30.0  # seconds between questions to everybody, where that was asked for
 LEAST, MOST = 1.0, 30.0  # seconds between questions while somebody is missing
 ANNOUNCED = 1.0  # seconds between questions that announcements cause
+AWAITED = 0.25  # the same, where something announces itself as a node that is missing
 LOOK = 0.05  # seconds between looks at who waits
 
 
@@ -115,6 +117,11 @@ class Sightings:
             ]
         for tell in told:
             tell()
+
+    def awaits(self, announce: Announce) -> bool:
+        """Whether somebody waits for the node that this says it is."""
+        with self._turn:
+            return any(uuid_crc(uuid) == announce.crc for uuid in self._missing)
 
     def missing(self) -> bool:
         """Whether somebody waits for a node."""
@@ -211,29 +218,31 @@ class Lookout:
         """Ask, and hear announcements, until the bus fails."""
         with self.port.bus().listen(lambda frame: is_announce(frame.identifier), most=256) as ear:
             self._ask()
-            asked, pause, announced = time.monotonic(), LEAST, False
+            asked, pause, soon = time.monotonic(), LEAST, math.inf
             while not self._stop.is_set():
-                announced = self._heard(ear.get(LOOK)) or announced
+                soon = min(soon, self._heard(ear.get(LOOK)))
                 now = time.monotonic()
                 missing = self._sightings.missing()
                 if not missing:
                     pause = LEAST
-                if self._asked.is_set() or (announced and now - asked >= ANNOUNCED):
+                if self._asked.is_set() or now - asked >= soon:
                     pause = LEAST
                 elif not (missing and now - asked >= pause) and not (self._poll and now - asked >= self._poll):
                     continue
                 else:
                     pause = min(2 * pause, MOST)
-                announced = False
+                soon = math.inf
                 self._asked.clear()
                 self._ask()
                 asked = time.monotonic()
 
-    def _heard(self, frame: Frame | None) -> bool:
+    def _heard(self, frame: Frame | None) -> float:
+        """Seconds after the last question at which everybody is asked because of this frame."""
         announce = Announce.decode(frame.identifier, frame.data) if frame is not None else None
-        if announce is not None:
-            self._sightings.announced(self.port.place, announce)
-        return announce is not None
+        if announce is None:
+            return math.inf
+        self._sightings.announced(self.port.place, announce)
+        return AWAITED if self._sightings.awaits(announce) else ANNOUNCED
 
     def _ask(self) -> None:
         """One question to everybody (or to ``node=`` alone); each is told of as soon as it answers."""
