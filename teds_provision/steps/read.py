@@ -34,8 +34,8 @@ def read_block(node: Conversation, block: BlockId, *, until: float | None = None
     """Read one TEDS, segment by segment, as long as its Length says (or as the node has octets).
 
     Outside a session, where no tag tells noise from a bad TEDS, one whose checksum is wrong is read again: what comes
-    twice alike is what the node has. ``until`` is a monotonic time. Raises NodeRefused (18: no such TEDS), Garbled,
-    BadData for a Length beyond 1 MiB (of a Security TEDS, 4016 octets).
+    twice alike is what the node has. ``until`` is a monotonic time. Raises NodeRefused (18: no such TEDS) and,
+    for a Length beyond 1 MiB (of a Security TEDS, 4016 octets), BadData in a session, Garbled outside one.
     """
     octets = _read_once(node, block, until)
     for _ in range(_NOISY_READS):
@@ -69,7 +69,8 @@ def _read_once(node: Conversation, block: BlockId, until: float | None) -> bytes
         if not segment or len(octets) >= total:
             return bytes(octets)
         if total > largest:
-            raise BadData(f"TEDS {block[1]} of channel {block[0]} claims {total} octets; {largest} is the most read.")
+            said = f"TEDS {block[1]} of channel {block[0]} claims {total} octets; {largest} is the most read."
+            raise BadData(said) if node.sealed else Garbled(f"{said} Nobody vouches for that: it came in no session.")
 
 
 def _read_segment(node: Conversation, block: BlockId, offset: int) -> bytes:

@@ -69,6 +69,17 @@ def test_an_open_is_good_once_and_counts() -> None:
     assert int.from_bytes(after, "big") == int.from_bytes(before, "big") + 1
 
 
+def test_a_recorded_reply_is_not_taken_for_the_reply_to_a_later_command() -> None:
+    """Its tag is right, under the counter that it names: only that it is not the one asked for tells."""
+    desk = Desk().agree().open()
+    assert desk.session is not None
+    recorded = desk.plain(desk.session.seal(IDENTIFY)).payload
+    desk.session.unseal(recorded)
+    desk.session.seal(IDENTIFY)
+    with pytest.raises(NotAuthentic, match="does not belong to the command"):
+        desk.session.unseal(recorded)
+
+
 def test_c_is_one_for_all_links_and_new_at_each_start() -> None:
     desk = Desk().agree()
     _, frame = opening(desk)

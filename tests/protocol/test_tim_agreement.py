@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import pytest
 
+from teds_provision.errors import NotAuthentic, OtherKey, PolicyRefused
 from teds_provision.protocol.agreement import AgreedKey, Credentials, RequestPayload, StationAgreement
-from teds_provision.protocol.keys import GROUP_ORDER, SoftwareKey, station_key_message
+from teds_provision.protocol.keys import GROUP_ORDER, SoftwareKey, fingerprint, node_key_message, station_key_message
 from teds_provision.protocol.messages.frames import Function, Reason, Reply, refusal, security_command
 from teds_provision.protocol.messages.identity import NodeState
 
@@ -155,3 +158,34 @@ def test_a_flash_that_fails_gets_11_and_keeps_the_old_state() -> None:
     desk.memory.fail = True
     assert desk.plain(agreed.confirm) == refusal(Reason.FLASH_FAILURE)
     assert desk.flash.state == NodeState.FACTORY
+
+
+@pytest.mark.parametrize(("held", "taken"), [(0, True), (1, False), (2, False)])
+def test_the_station_refuses_an_epoch_that_is_not_greater_than_that_of_its_key(held: int, taken: bool) -> None:
+    desk = Desk()
+    agreement = StationAgreement(CREDENTIALS, UUID)
+    reply = desk.plain(agreement.request()).payload  # offers epoch 1
+    if taken:
+        assert agreement.accept(reply, pinned=None, epoch=held).epoch == 1
+    else:
+        with pytest.raises(PolicyRefused, match=f"offers key epoch 1; this station already holds epoch {held}"):
+            agreement.accept(reply, pinned=None, epoch=held)
+
+
+def test_the_station_refuses_another_key_than_the_pinned_one_in_the_agreement_itself() -> None:
+    """What was identified a moment ago need not be what answers the Request."""
+    desk = Desk()
+    agreement = StationAgreement(CREDENTIALS, UUID)
+    reply = desk.plain(agreement.request()).payload
+    with pytest.raises(OtherKey):
+        agreement.accept(reply, pinned=fingerprint(SoftwareKey(17).point), epoch=0)
+
+
+def test_the_station_refuses_a_key_that_is_not_signed_for_this_uuid_in_the_agreement_itself() -> None:
+    desk = Desk()
+    elsewhere = NODE.sign(node_key_message(bytes(10), NODE.point))
+    desk.memory.state = replace(desk.flash, node_key_signature=elsewhere)
+    desk.restart()
+    agreement = StationAgreement(CREDENTIALS, UUID)
+    with pytest.raises(NotAuthentic, match="field 102"):
+        agreement.accept(desk.plain(agreement.request()).payload, pinned=None, epoch=0)
