@@ -5,7 +5,7 @@ PYTHON ?= python3
 VENV ?= .venv
 BIN := $(VENV)/bin
 
-.PHONY: demo demo-page page-picture test test-system lint types unit bench bench-teds bench-handover bench-measure bench-scale fuzz faults model house man vectors-c sbom clean
+.PHONY: demo demo-page page-picture test test-system lint types unit bench bench-teds bench-handover bench-measure bench-ncap bench-scale fuzz faults model house man vectors-c sbom clean
 
 demo: $(VENV)/.run
 	@$(BIN)/teds-provision demo
@@ -46,6 +46,11 @@ bench-measure: $(VENV)/.dev
 	$(BIN)/python -m benchmarks.sinks
 	$(BIN)/python -m benchmarks.sensor
 	$(BIN)/python -m benchmarks.measure_time
+
+# The base station under load; SECONDS=3600 is the soak.
+SECONDS ?= 20
+bench-ncap: $(VENV)/.dev
+	$(BIN)/python -m benchmarks.ncap --seconds $(SECONDS)
 
 bench-handover: $(VENV)/.dev
 	$(BIN)/python -m benchmarks.handover
