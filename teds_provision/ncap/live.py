@@ -19,6 +19,7 @@ from itertools import pairwise
 from typing import TYPE_CHECKING, Any, Final
 
 from teds_provision.lazy import late
+from teds_provision.measure.sinks.lines import plain
 
 if TYPE_CHECKING:
     import numpy as np
@@ -205,7 +206,7 @@ class Live:
                 one.values.append(np.where(block.valid[:, column], block.value[:, column], np.nan))
                 touched.add(key)
                 value = float(block.value[-1, column]) if block.valid[-1, column] else None
-                self._last[key] = Last(value, block.raw[-1, column].item(), float(block.time[-1]))
+                self._last[key] = Last(value, plain(block.raw[-1:, column].tolist()[0]), float(block.time[-1]))
         return touched
 
 

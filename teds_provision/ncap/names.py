@@ -28,6 +28,7 @@ class Names:
         """A chosen name has changed: make them anew when somebody asks. Nodes and datasheets are followed anyway."""
         with self._guard:
             self._topics = None
+        self._roster.touch()
 
     def topic(self, uuid: str, channel: int) -> str:
         """Whole topic of a channel."""

@@ -7,6 +7,7 @@ import json
 import socket
 import time
 from contextlib import ExitStack
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -123,6 +124,17 @@ def test_a_client_that_leaves_too_many_events_is_told_to_ask_anew() -> None:
     assert messages[0] == {"type": "resync"}
     assert messages[-1]["state"] == "299"
     assert len(messages) < 60
+
+
+def test_the_last_value_can_be_told_whatever_the_raw_value_is() -> None:
+    live = Live()
+    for raw, told in ((np.array([[2**70]], dtype=object), 2**70), (np.array([[np.nan]]), None), (np.array([[7]]), 7)):
+        one = replace(block(0, 1, 0.01), raw=raw, value=np.array([[np.nan]]), valid=np.array([[False]]))
+        live._put_aside([one])
+        last = live.last("ab" * 10, 1)
+        assert last is not None
+        assert (last.value, last.raw) == (None, told)
+        json.dumps([last.value, last.raw], allow_nan=False)
 
 
 @pytest.mark.link

@@ -5,6 +5,7 @@ The rows of the store and the datasheets are read when something changed, not wh
 
 from __future__ import annotations
 
+import json
 import math
 import threading
 import time
@@ -41,6 +42,7 @@ class Seen:
     measurement: str | None = None
     report: dict[str, Any] | None = None
     busy: str = ""
+    version: int = 0  # grows with each change here
 
 
 class Roster:
@@ -57,6 +59,7 @@ class Roster:
         self._channels: dict[str, tuple[str, list[dict[str, Any]]]] = {}
         self.changes = 0  # grows with each change of a node's name or datasheet
         self._strangers: dict[str, set[str]] = {}
+        self._texts: dict[str, tuple[tuple[int, int], str]] = {}
 
     # -- the store ---------------------------------------------------------------------------------------------------
 
@@ -104,6 +107,7 @@ class Roster:
         """Change what is known of a node; with ``state`` every client is told (``came``, ``left``, ``verified`` …)."""
         with self._lock:
             seen = self._seen.setdefault(uuid, Seen())
+            seen.version += 1
             for name, value in facts.items():
                 setattr(seen, name, value)
         if state is not None:
@@ -166,6 +170,29 @@ class Roster:
     def nodes(self, most: int = MOST_SHOWN) -> list[dict[str, Any]]:
         """The first ``most`` of them; those that are there come first."""
         return [self.node(uuid) for uuid in self.uuids()[:most]]
+
+    def nodes_text(self, most: int = MOST_SHOWN) -> str:
+        """The answer of GET /nodes as JSON; what did not change since is not put together again."""
+        return f'{{"nodes":[{",".join(map(self._text, self.uuids()[:most]))}]}}'
+
+    def _text(self, uuid: str) -> str:
+        with self._lock:
+            seen = self._seen.get(uuid)
+            key = (self.changes, seen.version if seen is not None else 0)
+            known = self._texts.get(uuid)
+        if known is not None and known[0] == key:
+            return known[1]
+        node = self.node(uuid)
+        text = json.dumps(node, ensure_ascii=False, allow_nan=False, separators=(",", ":"))
+        if all(one["last"] is None and one["actuator"] is None for one in node["channels"]):  # else it ages
+            with self._lock:
+                self._texts[uuid] = key, text
+        return text
+
+    def touch(self) -> None:
+        """Something that is shown of every node has changed (names of topics)."""
+        with self._lock:
+            self.changes += 1
 
     def node(self, uuid: str) -> dict[str, Any]:
         """One node: api.md, `/nodes/UUID`."""

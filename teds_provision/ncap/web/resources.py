@@ -164,7 +164,7 @@ class Resources:
 
     async def nodes(self, _request: Request) -> Response:
         """GET /nodes."""
-        return JSONResponse({"nodes": await asyncio.to_thread(self._daemon.roster.nodes)})
+        return Response(await asyncio.to_thread(self._daemon.roster.nodes_text), media_type="application/json")
 
     async def node(self, request: Request) -> Response:
         """GET /nodes/UUID."""
