@@ -34,7 +34,7 @@ def lab(tmp_path_factory: pytest.TempPathFactory, browser: Browser) -> Iterator[
     try:
         lab.create("slew", ANGLE)
         lab.create("hand", GRIPPER)
-        lab.power("slew", "hand")
+        lab.power("slew", "hand", more=("--battery", "80"))
         lab.provision("slew", ANGLE)
         lab.provision("hand", GRIPPER)
         lab.run()

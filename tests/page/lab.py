@@ -101,11 +101,11 @@ class Lab:
         node = self.nodes[name] = Node(self.desk, folder, made.json["uuid"])
         return node
 
-    def power(self, *names: str, nfc: bool = False, source: str = "ramp:2") -> Running:
+    def power(self, *names: str, nfc: bool = False, source: str = "ramp:2", more: tuple[str, ...] = ()) -> Running:
         """Power nodes on the bus, in one process; ``nfc``: on the reader instead (one node)."""
         where = ["--nfc", self.desk.links.nfc] if nfc else ["--can", self.can]
         folders = [self.nodes[name].folder for name in names]
-        running = self.desk.start("--json", "node", "run", *folders, *where, "--source", source)
+        running = self.desk.start("--json", "node", "run", *folders, *where, "--source", source, *more)
         running.wait_for('"ready": true')
         self.board = self.board or running
         return running

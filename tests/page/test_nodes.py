@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import signal
 import time
 from typing import TYPE_CHECKING
@@ -25,6 +26,7 @@ def test_nodes_are_shown_with_verdict_link_and_channels(browser: Browser, lab: L
             card = nodes.get_by_role("link", name=name)
             card.get_by_text("Authentic", exact=True).wait_for()
             assert "CAN" in card.inner_text()
+            assert re.search(r"(80|79) %", card.inner_text()), card.inner_text()
         nodes.get_by_role("link", name="hand").click()
         page.get_by_role("heading", name="hand", exact=True).wait_for()
         rows = page.get_by_role("table", name="Channels and their last values")
@@ -50,6 +52,7 @@ def test_an_empty_home_says_what_to_do_next_and_a_tap_opens_the_node(browser: Br
         assert fresh.nodes["oven"].uuid in page.url
         page.get_by_role("status").filter(has_text="Tapped").first.wait_for(state="attached")
         page.locator(".card.tapped").wait_for()
+        page.get_by_role("link", name="provision it first").wait_for()
 
 
 def test_a_node_that_leaves_is_shown_as_away(browser: Browser, fresh: Lab) -> None:
@@ -77,6 +80,18 @@ def test_detection_is_switched_and_seen_by_the_command_line(browser: Browser, la
         page.get_by_role("button", name="Discover").click()
         page.get_by_text("nodes answered").wait_for()
     running.close()
+
+
+def test_a_browser_whose_token_was_removed_is_told_how_to_sign_in(browser: Browser, fresh: Lab) -> None:
+    fresh.run()
+    with opened(browser, fresh) as page:
+        fresh.ask("ncap", "token", "remove", "browser")
+        fresh.end(signal.SIGKILL)
+        fresh.run()
+        page.locator("#connection", has_text="Signed out").wait_for()
+        page.get_by_role("alert").get_by_text("teds-provision ncap open").wait_for()
+        page.goto(fresh.login())
+        page.locator("#connection", has_text="Live").wait_for()
 
 
 @pytest.mark.parametrize("how", [signal.SIGKILL, signal.SIGSTOP], ids=["killed", "frozen"])

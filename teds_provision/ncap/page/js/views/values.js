@@ -40,13 +40,24 @@ export class LiveTab {
     const channels = this.node.channels ?? [];
     this.table.hidden = !channels.length;
     if (channels.length) this.none.replaceChildren();
-    else if (!this.none.firstChild) fill(this.none, empty("No channels are known.", h("p", {}, "Its datasheet was not read yet, or it has none. "), h("p", {}, h("a", { href: `#/nodes/${this.uuid}/datasheet` }, "Read or write its datasheet"), " or ", h("a", { href: `#/nodes/${this.uuid}/provision` }, "provision it"), ".")));
+    else this.nothing(this.node.whitelisted === false);
     keyed(this.rows, channels, (one) => `${one.number}`, row, (element, one) => facts(element, one));
     const movable = channels.filter((channel) => channel.kind === "actuator");
     keyed(this.actuators, movable, (one) => one.number, (one) => this.actuator(one), (_, one) => this.panels.get(one.number).paint());
     this.mode.paint();
     this.course(channels.filter((channel) => channel.kind !== "actuator"));
     this.values();
+  }
+
+  /** No channels: a stranger is provisioned, a node of ours gets its datasheet read. */
+  nothing(stranger) {
+    if (this.none.dataset.stranger === String(stranger) && this.none.firstChild) return;
+    this.none.dataset.stranger = String(stranger);
+    const [datasheet, provision] = ["datasheet", "provision"].map((tab) => `#/nodes/${this.uuid}/${tab}`);
+    const words = stranger
+      ? [h("p", {}, "This station does not know this node: it is not on the whitelist, so nothing of it is opened."), h("p", {}, h("a", { class: "action", href: provision }, "Provision this node"))]
+      : [h("p", {}, "Its datasheet was not read yet, or it has none."), h("p", {}, h("a", { class: "action", href: datasheet }, "Read or write its datasheet")), h("p", {}, h("a", { href: provision }, "Provision it anew"))];
+    fill(this.none, empty(stranger ? "Not on the whitelist" : "No channels are known", words));
   }
 
   actuator(channel) {
@@ -192,7 +203,9 @@ class ModePanel {
     this.idle.disabled = !may || !own;
     this.run.disabled = !may || Boolean(one) || !sensors || node?.whitelisted === false;
     this.rate.disabled = Boolean(one);
-    if (!one) fill(this.state, sensors ? (node?.whitelisted === false ? "Not on the whitelist: provision it first." : "Idle.") : "No sensor to measure.");
+    const stranger = node?.whitelisted === false;
+    if (!one && stranger) fill(this.state, "Not on the whitelist: ", h("a", { href: `#/nodes/${this.uuid}/provision` }, "provision it first"), ".");
+    else if (!one) fill(this.state, sensors ? "Idle." : "No sensor to measure.");
     else if (one.group) fill(this.state, "Measured with group ", h("a", { href: "#/measure" }, one.group), ": stop it there.");
     else fill(this.state, told(one, this.uuid));
   }
