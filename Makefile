@@ -5,7 +5,7 @@ PYTHON ?= python3
 VENV ?= .venv
 BIN := $(VENV)/bin
 
-.PHONY: demo demo-page page-picture test test-system lint types unit bench bench-teds bench-handover bench-measure bench-ncap bench-scale fuzz faults model house man vectors-c sbom clean
+.PHONY: demo demo-page page-picture test test-system lint types unit bench bench-teds bench-handover bench-measure bench-ncap bench-scale fuzz faults model house man coverage api test-other vectors-c sbom clean
 
 demo: $(VENV)/.run
 	@$(BIN)/teds-provision demo
@@ -83,6 +83,25 @@ man: $(VENV)/.dev
 # The vectors for firmware as C constants, in build/vectors-c (docs/vectors.md).
 vectors-c: $(VENV)/.made
 	$(BIN)/python -m tests.vectors.c_arrays build/vectors-c
+
+# Branch coverage of the suite, processes that it starts counted; the floor stands in pyproject.toml. TESTS names a part.
+coverage: $(VENV)/.dev
+	@mkdir -p build
+	$(BIN)/python -m coverage erase
+	$(BIN)/python -m coverage run -m pytest -n 2 --dist worksteal $(TESTS)
+	$(BIN)/python -m coverage combine --quiet
+	$(BIN)/python -m coverage report --skip-covered --sort=cover
+	$(BIN)/python -m coverage html --quiet && echo "build/coverage/index.html"
+
+# Pages of every public name, from the docstrings.
+api: $(VENV)/.dev
+	@$(BIN)/python -c 'import pdoc' 2>/dev/null || $(BIN)/python -m pip install --quiet --editable '.[api]'
+	$(BIN)/python -m pdoc --docformat restructuredtext --output-directory build/api teds_provision
+	@echo "build/api/teds_provision.html"
+
+# The suite on another Python, in an environment of its own: make test-other PYTHON=python3.13
+test-other:
+	@$(MAKE) --no-print-directory unit VENV=.venv-$$($(PYTHON) -c 'import sys; print("%d.%d" % sys.version_info[:2])')
 
 # The figures of the house: circles, late imports, complexity, drawers, lines.
 house: $(VENV)/.dev
