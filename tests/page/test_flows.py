@@ -15,7 +15,8 @@ if TYPE_CHECKING:
     from playwright.sync_api import Browser, Locator, Page
 
 pytestmark = pytest.mark.system
-HOSTILE = '<img src=x onerror="document.title=1">\u202e"; DROP'
+HOSTILE = '<img src=x onerror="document.title=1">"; DROP'
+TURNED = "\u202egrab\u200b"  # what turns the direction of writing, and what nobody sees
 
 
 def received(page: Page) -> int:
@@ -178,10 +179,10 @@ def test_names_from_a_datasheet_are_text_and_nothing_else(browser: Browser, fres
     fresh.run()
     with opened(browser, fresh, route="virtual") as page:
         page.get_by_label("Transducer type").select_option("gripper")
-        page.get_by_label("Name").fill(HOSTILE)
+        page.get_by_label("Name").fill(HOSTILE + TURNED)
         page.get_by_role("button", name="Make it").click()
         page.get_by_role("link", name=HOSTILE).first.click()
-        page.get_by_role("heading", name=HOSTILE).wait_for()
+        page.get_by_role("heading", name=f"{HOSTILE}\ufffdgrab\ufffd", exact=True).wait_for()
         page.locator(".card").get_by_text("Authentic", exact=True).wait_for()
         title = page.title()
         for view in ("nodes", "measure", "virtual", "log", "station"):

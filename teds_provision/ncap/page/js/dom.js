@@ -1,5 +1,10 @@
 // Elements, icons, lists. Text goes in by textContent alone: names of nodes and channels are hostile.
 
+const UNSEEN = /[\p{Cc}\p{Cf}\p{Cn}\p{Co}\p{Zl}\p{Zp}]/gu;
+
+/** Text that others wrote, without what nobody sees: U+202E turns what people read, a zero-width letter makes two names look like one. */
+const seen = (words) => String(words).replace(UNSEEN, "\ufffd");
+
 const SVG = "http://www.w3.org/2000/svg";
 
 /** An element: `h("p", {class: "note"}, "text", child)`. Functions under on… are listeners; null children are left out. */
@@ -14,14 +19,14 @@ function set(element, name, value) {
   if (value === null || value === undefined || value === false) return;
   if (name.startsWith("on")) element.addEventListener(name.slice(2), value);
   else if (name === "value" || name === "checked" || name === "disabled" || name === "selected") element[name] = value;
-  else element.setAttribute(name, value === true ? "" : String(value));
+  else element.setAttribute(name, value === true ? "" : seen(value));
 }
 
 /** Append children: elements, text, arrays of both. */
 export function put(element, ...children) {
   for (const child of children.flat(Infinity)) {
     if (child === null || child === undefined || child === false) continue;
-    element.append(child instanceof Node ? child : document.createTextNode(String(child)));
+    element.append(child instanceof Node ? child : document.createTextNode(seen(child)));
   }
   return element;
 }
@@ -34,7 +39,8 @@ export function fill(element, ...children) {
 
 /** Set text only where it changed: a browser then paints nothing. */
 export function text(element, words) {
-  if (element.textContent !== words) element.textContent = words;
+  const shown = seen(words);
+  if (element.textContent !== shown) element.textContent = shown;
   return element;
 }
 

@@ -23,8 +23,8 @@ const STATUS_EVERY = 2000; // ms
 let shown = { name: null, view: null };
 
 function route() {
-  const [name, ...rest] = location.hash.replace(/^#\/?/, "").split("/").map(decodeURIComponent);
-  return VIEWS[name] ? { name, rest } : { name: "nodes", rest: [] };
+  const [name, ...rest] = location.hash.replace(/^#\/?/, "").split("/"); // views and hex digits: nothing to decode
+  return Object.hasOwn(VIEWS, name) ? { name, rest } : { name: "nodes", rest: [] };
 }
 
 function show() {

@@ -117,7 +117,7 @@ export class ActuatorPanel {
       } catch (error) {
         refused = error;
       }
-      if (this.holding && !refused) await new Promise((go) => setTimeout(go, Math.max(0, AGAIN - (performance.now() - began))));
+      if (this.holding && !refused) await this.pause(AGAIN - (performance.now() - began));
     }
     this.sending = false;
     if (refused) {
@@ -125,6 +125,14 @@ export class ActuatorPanel {
       fill(this.error, trouble(refused));
     }
     await this.safe(refused);
+  }
+
+  /** Wait, but no longer than the button is held. */
+  pause(milliseconds) {
+    return new Promise((go) => {
+      this.wake = go;
+      setTimeout(go, Math.max(0, milliseconds));
+    });
   }
 
   release(leaving = false) {
@@ -139,6 +147,7 @@ export class ActuatorPanel {
     this.button.setAttribute("aria-pressed", "false");
     text(this.words, "Hold to move");
     this.stopping = true;
+    this.wake?.();
     this.paint();
   }
 

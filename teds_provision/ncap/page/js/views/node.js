@@ -55,7 +55,7 @@ export class NodePanel {
   }
 
   tab(name) {
-    const known = TABS[name] ? name : "live";
+    const known = Object.hasOwn(TABS, name) ? name : "live";
     for (const link of this.tabs.children) {
       if (link.dataset.tab === known) link.setAttribute("aria-current", "page");
       else link.removeAttribute("aria-current");
