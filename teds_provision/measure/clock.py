@@ -241,14 +241,17 @@ class LowerHull:
             self._closed.append(self._last)
             _extend(self._hull, self._last)
         if self._closed and self._closed[0][0] < tick - WINDOW - WINDOW // 10:
-            while self._closed and self._closed[0][0] < tick - WINDOW:
-                self._closed.popleft()
-            self._hull = []
-            for point in self._closed:
-                _extend(self._hull, point)
+            self._forget(tick - WINDOW)
         self._last = (tick, upper)
         self.count += 1
         return True
+
+    def _forget(self, before: int) -> None:
+        while self._closed and self._closed[0][0] < before:
+            self._closed.popleft()
+        self._hull = []
+        for point in self._closed:
+            _extend(self._hull, point)
 
     def points(self) -> list[tuple[int, int]]:
         """The hull's corners, oldest first."""

@@ -174,6 +174,25 @@ class Sightings:
         )
 
 
+class _Pace:
+    """When everybody is asked again: ``asked`` is when they were last, ``_pause`` how long it is till the next time."""
+
+    def __init__(self) -> None:
+        self.asked = time.monotonic()
+        self._pause = LEAST
+
+    def is_due(self, since: float, *, wanted: bool, missing: bool, poll: float | None) -> bool:
+        """Whether to ask now, ``since`` seconds after the last time: somebody wants it, is missing, or polls."""
+        if wanted or not missing:
+            self._pause = LEAST
+        if wanted:
+            return True
+        if (missing and since >= self._pause) or (poll and since >= poll):
+            self._pause = min(2 * self._pause, MOST)
+            return True
+        return False
+
+
 class Lookout:
     """The look-out on one bus, a thread until :meth:`close`."""
 
@@ -218,23 +237,16 @@ class Lookout:
         """Ask, and hear announcements, until the bus fails."""
         with self.port.bus().listen(lambda frame: is_announce(frame.identifier), most=256) as ear:
             self._ask()
-            asked, pause, soon = time.monotonic(), LEAST, math.inf
+            pace, soon = _Pace(), math.inf
             while not self._stop.is_set():
                 soon = min(soon, self._heard(ear.get(LOOK)))
-                now = time.monotonic()
-                missing = self._sightings.missing()
-                if not missing:
-                    pause = LEAST
-                if self._asked.is_set() or now - asked >= soon:
-                    pause = LEAST
-                elif not (missing and now - asked >= pause) and not (self._poll and now - asked >= self._poll):
-                    continue
-                else:
-                    pause = min(2 * pause, MOST)
-                soon = math.inf
-                self._asked.clear()
-                self._ask()
-                asked = time.monotonic()
+                since = time.monotonic() - pace.asked
+                wanted = self._asked.is_set() or since >= soon
+                if pace.is_due(since, wanted=wanted, missing=bool(self._sightings.missing()), poll=self._poll):
+                    soon = math.inf
+                    self._asked.clear()
+                    self._ask()
+                    pace.asked = time.monotonic()
 
     def _heard(self, frame: Frame | None) -> float:
         """Seconds after the last question at which everybody is asked because of this frame."""
