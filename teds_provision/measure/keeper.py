@@ -185,11 +185,11 @@ class NodeKeeper:
         self.streams.new_session()
         for _ in range(AT_FIRST):
             self.streams.tell_time(trusted)
-        actuators = [] if trusted.unsigned else self._actuators(trusted)
+        actuators = self._actuators(trusted)
         channels = self._sensors(trusted.sheet.channels, actuators)
         self._claim(trusted, channels)
         plans = self._subscribe(bus, trusted, channels, address) if channels else Plans((), 0.0)
-        periods = {number: p.subscribe.period / 1e9 for p in plans.streams for number in p.layout.channels}
+        periods = plans.periods()
         self._events.facts([trusted.facts(one, periods.get(one.number)) for one in (*channels, *actuators)])
         if actuators:
             self._hands = self._hands_for(bus, trusted, actuators, address)
@@ -200,8 +200,8 @@ class NodeKeeper:
         self.ready.set()
 
     def _actuators(self, trusted: Trusted) -> list[Channel]:
-        """Actuators that set points may come for: of a node on the whitelist, with a way from values to raw."""
-        if not self._wish.actuators or self._station.pins.entry(self.uuid) is None:
+        """Actuators that set points may come for: of a signed datasheet on the whitelist, with a way to raw values."""
+        if trusted.unsigned or not self._wish.actuators or self._station.pins.entry(self.uuid) is None:
             return []
         wanted = self._wish.channels
         return [

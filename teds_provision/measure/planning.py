@@ -63,6 +63,10 @@ class Plans:
     load: float
     slowed: str = ""
 
+    def periods(self) -> dict[int, float]:
+        """Seconds between the samples of each channel."""
+        return {number: one.subscribe.period / 1e9 for one in self.streams for number in one.layout.channels}
+
 
 def plan_node(
     channels: Sequence[Channel],

@@ -42,27 +42,27 @@ def data_lines(block: Block, facts: Mapping[tuple[str, int], ChannelFacts]) -> I
     """One ``data`` event for each channel of a block (``measure --json``); an invalid value is null, never NaN."""
     times = [round(instant, 6) for instant in block.time.tolist()]
     for column, number in enumerate(block.channels):
-        known = facts.get((block.uuid, number))
+        known = facts.get((block.uuid, number)) or ChannelFacts(block.uuid, "", number, "")
         valid = block.valid[:, column].tolist()
         values = block.value[:, column].tolist()
         line: dict[str, Any] = {
             "event": "data",
             "uuid": block.uuid,
             "channel": number,
-            "name": known.name if known else "",
-            "unit": known.unit if known else "",
+            "name": known.name,
+            "unit": known.unit,
             "index": block.index,
             "time": times,
             "raw": [plain(one) for one in block.raw[:, column].tolist()],
             "value": [plain(one) if good else None for one, good in zip(values, valid, strict=True)],
-            "uncertainty": known.uncertainty if known else None,
+            "uncertainty": known.uncertainty,
             "valid": valid,
             "clock_error": block.clock_error,
             "age": round(block.age, 6),
         }
         if block.test_pattern:
             line["test_pattern"] = True
-        if known is not None and known.unsigned:
+        if known.unsigned:
             line["unsigned"] = True
         yield line
 
