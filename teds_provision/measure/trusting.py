@@ -1,9 +1,4 @@
-"""A session with a node whose datasheet stands: what has to hold before a value of it counts (operation.md section 1).
-
-The node's Security TEDS is read in the session. Where it is octet for octet the one that this station has verified and
-kept, the rest need not be read again: it names the digest of every other TEDS. Everything is judged anew all the same,
-for trust, bans and pins may have changed since.
-"""
+"""A session with a node whose datasheet stands: what must hold before a value of it counts (operation.md section 1)."""
 
 from __future__ import annotations
 
@@ -20,10 +15,9 @@ from teds_provision.protocol.operation.commands import Operate, Operation
 from teds_provision.protocol.operation.stream_commands import CLOCK, Clock
 from teds_provision.station.station import Station
 from teds_provision.steps.agree import require_session
-from teds_provision.steps.read import read_block, read_identity, read_image
-from teds_provision.steps.verify import Verified, known_of, require_authentic, session, verify_image
+from teds_provision.steps.verify import require_authentic
+from teds_provision.steps.verify_node import look_in_session
 from teds_provision.talk.conversation import Conversation
-from teds_provision.teds.image import SECURITY
 from teds_provision.teds.sheet import Channel, Sheet
 
 
@@ -73,21 +67,16 @@ def open_trusted(station: Station, node: Conversation, *, unsigned: bool = False
     Raises PolicyRefused (no key, banned), NotAuthentic and Unproven (the datasheet), LinkFailure.
     """
     require_session(station, node)
-    identity = read_identity(node)
-    octets = read_block(node, SECURITY)
-    kept = station.nodes.datasheet(node.uuid)
-    image = kept if kept is not None and kept.security == octets else read_image(node)
-    checks = verify_image(station, image, known=known_of(station, node.uuid, identity))
-    checks.append(session("opened under the key that is held here", ""))
-    verified = Verified(node.uuid, tuple(checks))
-    bare = unsigned and verified.verdict == "unsigned"
+    looked = look_in_session(station, node)
+    image = looked.image
+    bare = unsigned and looked.verified.verdict == "unsigned"
     if not bare:
-        require_authentic(verified)
-    if image is not kept and not bare:
+        require_authentic(looked.verified)
+    if looked.read and not bare:
         station.nodes.keep_datasheet(image)
     record = station.nodes.get(node.uuid)
     name = record.name if record is not None and record.name else ""
-    return Trusted(node, Sheet.of(image), hashlib.sha256(octets).hexdigest(), name, bare)
+    return Trusted(node, Sheet.of(image), hashlib.sha256(image.security or b"").hexdigest(), name, bare)
 
 
 def require_whitelisted(station: Station, uuid: bytes) -> None:

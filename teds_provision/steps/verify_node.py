@@ -10,21 +10,22 @@ from teds_provision.protocol.messages.identity import Identity, NodeState
 from teds_provision.station.station import Station
 from teds_provision.steps.agree import session_if_keyed
 from teds_provision.steps.identify import Identified, prove
-from teds_provision.steps.read import read_identity, read_image
+from teds_provision.steps.read import read_block, read_identity, read_image
 from teds_provision.steps.reset import proof_of_reset
 from teds_provision.steps.verify import Check, Verified, known_of, possession, session, verify_image
 from teds_provision.store import utc_now
 from teds_provision.talk.conversation import HEARD, Conversation
 from teds_provision.teds.codec.codes import AccessCode
-from teds_provision.teds.image import Image
+from teds_provision.teds.image import SECURITY, Image
 
 
 @dataclass(frozen=True)
 class Looked:
-    """A node's TEDS as they were read, and what they are worth."""
+    """A node's TEDS, and what they are worth; ``read`` False: they are those that were kept from an earlier reading."""
 
     image: Image
     verified: Verified
+    read: bool = True
 
 
 def look_at_node(station: Station, node: Conversation, who: Identified) -> Looked:
@@ -32,6 +33,22 @@ def look_at_node(station: Station, node: Conversation, who: Identified) -> Looke
     why = open_or_say_why(station, node)
     image = read_image(node)
     return Looked(image, verify_node(station, node, image, who.point, why=why))
+
+
+def look_in_session(station: Station, node: Conversation) -> Looked:
+    """Judge the TEDS of a node in the session that is open. Raises LinkFailure, NodeRefused; records nothing.
+
+    Where its Security TEDS is octet for octet the one that was kept, the rest need not be read again: it names the
+    digest of every other TEDS. Everything is judged anew all the same: trust, bans and pins may have changed since.
+    """
+    identity = read_identity(node)
+    octets = read_block(node, SECURITY)
+    kept = station.nodes.datasheet(node.uuid)
+    known = kept is not None and kept.security == octets
+    image = kept if kept is not None and known else read_image(node)
+    checks = verify_image(station, image, known=known_of(station, node.uuid, identity))
+    checks.append(session("opened under the key that is held here", ""))
+    return Looked(image, Verified(node.uuid, tuple(checks)), read=not known)
 
 
 def open_or_say_why(station: Station, node: Conversation) -> str:

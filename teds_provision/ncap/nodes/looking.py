@@ -16,8 +16,9 @@ from teds_provision.protocol.operation.commands import POWER, Power, PowerFlag
 from teds_provision.station.station import Station
 from teds_provision.steps.agree import session_if_keyed
 from teds_provision.steps.identify import Identified, identify
-from teds_provision.steps.read import list_blocks, read_block, read_identity, read_image
+from teds_provision.steps.read import list_blocks, read_block
 from teds_provision.steps.verify import Verified, known_of, session, verify_image
+from teds_provision.steps.verify_node import look_in_session
 from teds_provision.talk.conversation import Conversation
 from teds_provision.teds.image import SECURITY, Image
 from teds_provision.teds.sheet import Sheet
@@ -53,17 +54,12 @@ def look(station: Station, node: Conversation) -> Look:
 
 
 def _in_session(station: Station, node: Conversation) -> Look | None:
-    """In a session, as before a measurement: octets that were verified before are not read again, only judged anew."""
+    """In a session, as before a measurement."""
     if session_if_keyed(station, node) is None:
         return None
-    identity = read_identity(node)
-    octets = read_block(node, SECURITY)
-    kept = station.nodes.datasheet(node.uuid)
-    image = kept if kept is not None and kept.security == octets else read_image(node)
-    checks = verify_image(station, image, known=known_of(station, node.uuid, identity))
-    checks.append(session("opened under the key that is held here", ""))
-    verified = Verified(node.uuid, tuple(checks))
-    if verified.verdict != "not authentic" and image is not kept:
+    looked = look_in_session(station, node)
+    image, verified = looked.image, looked.verified
+    if verified.verdict != "not authentic" and looked.read:
         with station.durable("verify"):
             station.nodes.keep_datasheet(image)
     return Look(verified, Sheet.of(image) if verified.verdict == "not authentic" else None, power_of(node))
