@@ -158,6 +158,11 @@ def of(lines: list[dict[str, Any]], uuid: str = "", channel: int = 1) -> list[di
     return [line for line in data if not uuid or line["uuid"] == uuid]
 
 
+def ran(lines: list[dict[str, Any]]) -> list[str]:
+    """The states without those of waiting, which nobody sees of a node that runs at once."""
+    return [state for state in states(lines) if state != "waiting"]
+
+
 def states(lines: list[dict[str, Any]]) -> list[str]:
     """States in the order in which they came."""
     return [line["state"] for line in lines if line["event"] == "status" and "uuid" in line]
