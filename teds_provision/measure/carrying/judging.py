@@ -1,4 +1,4 @@
-"""Whether the datasheets that were verified in the sessions suffice for the task (`measure --require`, cli.md).
+"""Whether the datasheets that were verified in the sessions suffice for the task (`measure --require`).
 
 A requirement may be met by any node of the group, so each node waits until the others have shown their datasheets
 (:data:`WAITING` at most), before anything is claimed. A node that comes back with another datasheet is judged anew.
