@@ -156,6 +156,10 @@ class Seals:
                 ["the station's own key or CA"],
                 "Move store.sqlite3 away, then restore a backup: teds-provision restore FILE",
             )
+        self._look_at_trust()
+
+    def _look_at_trust(self) -> None:
+        """Find, and tell, what another program wrote of whom this station believes: none of it counts."""
         self.broken_trust = tuple(
             record.name for record in self._store.trusted() if not self._holds(record.mac, "trust", *_trust(record))
         )

@@ -69,12 +69,9 @@ def identify(
     who = examine(station, node)
     expect(who)
     entry = who.whitelisted
-    listed = entry is not None and entry.fingerprint is not None
-    known = station.nodes.get(node.uuid)
-    facts: dict[str, object] = {"point": who.point} if node.tapped or listed else {}
-    if facts or (known is not None and known.point == who.point):
-        facts["last_seen"] = utc_now()  # its own key signed a moment ago; any other key may be anybody's
-    pinned = _pinned_now(station, who) if node.tapped or listed else None
+    counts = node.tapped or (entry is not None and entry.fingerprint is not None)
+    facts = _facts(station, who, counts=counts)
+    pinned = _pinned_now(station, who) if counts else None
     with station.durable("identify"):
         if facts:
             station.nodes.remember(node.uuid, **facts)
@@ -86,6 +83,15 @@ def identify(
         if known_key(station, node.uuid) != who.point:
             station.nodes.keep_datasheet(Image(node.uuid, {SECURITY: who.security_teds}))
     return who
+
+
+def _facts(station: Station, who: Identified, *, counts: bool) -> dict[str, object]:
+    """What is remembered of a node that proved its key; ``counts``: by tap, or under a key that is whitelisted."""
+    facts: dict[str, object] = {"point": who.point} if counts else {}
+    known = station.nodes.get(who.uuid)
+    if counts or (known is not None and known.point == who.point):
+        facts["last_seen"] = utc_now()  # its own key signed a moment ago; any other key may be anybody's
+    return facts
 
 
 def _pinned_now(station: Station, who: Identified) -> WhitelistEntry | None:

@@ -177,6 +177,10 @@ class TopicSink(ThreadedSink):
             return
         # The next beat, not "now + period": else each delay would slow the topic down for good.
         scalars.due = scalars.due + 1 / rate if now < scalars.due + 1 / rate else now + 1 / rate
+        self._publish(block, scalars)
+
+    def _publish(self, block: Block, scalars: _Scalars) -> None:
+        """The last instant of a block: each channel that stands alone, and what several make together."""
         stamp = float(block.time[-1])
         for column, topic, meaning, variance in scalars.channels:
             value = float(block.value[-1, column])

@@ -61,11 +61,7 @@ class Compound:
 def compounds_of(facts: Iterable[ChannelFacts]) -> list[Compound]:
     """The messages that the channels of one stream of one node make together."""
     sensors = {one.number: one for one in facts if one.kind == "sensor"}
-    groups = {one.vector: [sensors[n] for n in one.vector] for one in sensors.values() if _is_whole(one, sensors)}
-    by_unit: dict[object, list[list[ChannelFacts]]] = {}
-    for axes in groups.values():
-        if len({one.units for one in axes}) == 1:
-            by_unit.setdefault(axes[0].units, []).append(axes)
+    by_unit = _vectors(sensors)
     found = [_magnetic(axes) for axes in by_unit.get(_FIELD, [])]
     found += _imus(by_unit.get(_ACCELERATION, []), by_unit.get(_RATE, []))
     pairs = zip(by_unit.get(_FORCE, []), by_unit.get(_TORQUE, []), strict=False)
@@ -74,6 +70,16 @@ def compounds_of(facts: Iterable[ChannelFacts]) -> list[Compound]:
         for f, t in pairs
     ]
     return [*_told_apart(found), *(_range(one) for one in sensors.values() if is_range(one))]
+
+
+def _vectors(sensors: Mapping[int, ChannelFacts]) -> dict[object, list[list[ChannelFacts]]]:
+    """Axes of each whole vector whose axes are of one unit, by that unit."""
+    groups = {one.vector: [sensors[n] for n in one.vector] for one in sensors.values() if _is_whole(one, sensors)}
+    by_unit: dict[object, list[list[ChannelFacts]]] = {}
+    for axes in groups.values():
+        if len({one.units for one in axes}) == 1:
+            by_unit.setdefault(axes[0].units, []).append(axes)
+    return by_unit
 
 
 def is_range(facts: ChannelFacts) -> bool:
