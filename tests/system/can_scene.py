@@ -41,16 +41,17 @@ def provision(bench: Bench, node: dict[str, Any], where: str) -> dict[str, Any]:
 
 
 def measure(bench: Bench, node: dict[str, Any], where: str, seconds: float) -> dict[str, Any]:
-    done = bench.run("measure", node["uuid"], "--can", where, "--rate", "50", "--duration", seconds)
-    events = [line for line in done.lines if line["event"] == "data"]
-    streams = done.lines[-1]["nodes"][0]["streams"] if done.lines else []
+    done = bench.run("measure", node["uuid"], "--can", where, "--rate", "10", "--duration", seconds)
+    events = [line for line in done.lines if line.get("event") == "data"]
+    ended = done.lines[-1].get("nodes", [{"streams": []}])
+    streams = ended[0]["streams"]
     return {
         "code": done.code,
         "samples": sum(stream["samples"] for stream in streams),
         "lost": sum(stream["lost"] for stream in streams),
         "bad": sum(stream["bad"] for stream in streams),
         "events": len(events),
-        "states": [line["state"] for line in done.lines if line["event"] == "node"],
+        "states": [line["state"] for line in done.lines if line.get("event") == "status"],
         "said": (done.out + done.err)[-800:],
     }
 
@@ -169,7 +170,7 @@ def main() -> None:
         look("candump", lambda: candump(nodes[0]))
         look("kernel-station", lambda: kernel_asks_our_node(nodes[0]))
         look("kernel-node", our_station_asks_the_kernel)
-        look("measure-fd", lambda: measure(bench, nodes[1], FD, 10))
+        look("measure-fd", lambda: measure(bench, nodes[1], FD, 15))
         look("two-stations", lambda: two_stations(bench, nodes[0]))
         look("down-and-up", lambda: link_goes_down_and_comes_back(bench, nodes[0]))
         look("bus-off", lambda: bus_off_is_reported(bench, nodes[0]))

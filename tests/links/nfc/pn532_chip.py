@@ -2,7 +2,9 @@
 
 ``python -m tests.links.nfc.pn532_chip NAME udp:localhost:PORT`` makes the link /dev/NAME (nfcpy looks there alone), and
 relays InCommunicateThru to the node over nfcpy's udp frames. Prints ``ready``; ends on SIGTERM, and prints then how
-many host commands came. A SIGUSR1 swallows the next answer, as a serial line does that loses a character.
+many host commands came. With ``--pace`` the line and the chip take their time, and it prints what was counted as JSON:
+commands, octets on the line, the seconds that those take, seconds in the air at least. A SIGUSR1 swallows the next
+answer, as a serial line does that loses a character.
 
 What is real: nfcpy's driver and transport, the tty, the frames. What is not: the chip, the radio.
 """
@@ -11,11 +13,13 @@ from __future__ import annotations
 
 import collections
 import contextlib
+import json
 import os
 import pty
 import select
 import signal
 import sys
+import time
 import tty
 from pathlib import Path
 from typing import Any
@@ -26,6 +30,10 @@ from teds_provision.links.nfc.udp import ReaderDevice, address_of
 ACK = bytes.fromhex("0000ff00ff00")
 _TX_MODE, _RX_MODE, _FIFO = 0x6302, 0x6303, 0x6339
 _SENS_REQ = 0x26
+_BAUD = (9600, 19200, 38400, 57600, 115200, 230400, 460800, 921600, 1288000)
+_COMMAND_SECONDS = 0.001
+"""An assumption: how long the chip thinks about a command."""
+_OCTET_IN_THE_AIR = 9 * 128 / 13.56e6
 
 
 class Chip:
@@ -33,6 +41,8 @@ class Chip:
 
     def __init__(self, path: str) -> None:
         self.commands: collections.Counter[int] = collections.Counter()
+        self.baud = 115_200
+        self.air = 0.0
         self._registers: dict[int, int] = {_FIFO: _SENS_REQ}
         self._path = path
         self._device: Any = None
@@ -105,6 +115,7 @@ class Chip:
             return b"\x01"
         except nfc.clf.CommunicationError:
             return b"\x02"
+        self.air += (len(data) + len(answer)) * _OCTET_IN_THE_AIR
         if not self._registers[_RX_MODE] & 0x80 and len(answer) > 1:  # the host checks the CRC itself
             answer = bytes(nfc.clf.device.Device.add_crc_a(bytearray(answer)))
         return b"\0" + answer
@@ -113,8 +124,9 @@ class Chip:
 class Line:
     """The serial line: host frames in, acknowledge and answer out."""
 
-    def __init__(self, name: str, chip: Chip) -> None:
-        self.chip = chip
+    def __init__(self, name: str, chip: Chip, *, pace: bool = False) -> None:
+        self.chip, self._pace = chip, pace
+        self.octets, self.seconds = 0, 0.0
         self.stop = self.swallow = False
         self._master, slave = pty.openpty()
         tty.setraw(slave)
@@ -126,7 +138,9 @@ class Line:
     def serve(self) -> None:
         while not self.stop:
             if select.select([self._master], [], [], 0.1)[0]:
-                self._held += os.read(self._master, 4096)
+                came = os.read(self._master, 4096)
+                self._take_time(len(came))
+                self._held += came
                 while self._frame():
                     pass
         self._link.unlink(missing_ok=True)
@@ -151,12 +165,26 @@ class Line:
         return True
 
     def _answer(self, body: bytes) -> None:
-        os.write(self._master, ACK)
+        self._write(ACK)
+        self._take_time(0, _COMMAND_SECONDS)
         answer = self.chip.run(body[1], body[2:])
         if self.swallow and body[1] == 0x42:
             self.swallow = False
             return
-        os.write(self._master, _framed(b"\x7f" if answer is None else bytes((0xD5, body[1] + 1)) + answer))
+        self._write(_framed(b"\x7f" if answer is None else bytes((0xD5, body[1] + 1)) + answer))
+        if body[1] == 0x10 and body[2] < len(_BAUD):  # SetSerialBaudRate counts from the next command on
+            self.chip.baud = _BAUD[body[2]]
+
+    def _write(self, octets: bytes) -> None:
+        self._take_time(len(octets))
+        os.write(self._master, octets)
+
+    def _take_time(self, octets: int, more: float = 0.0) -> None:
+        seconds = octets * 10 / self.chip.baud + more
+        self.octets += octets
+        self.seconds += seconds
+        if self._pace:
+            time.sleep(seconds)
 
 
 def _words(data: bytes, size: int) -> list[int]:
@@ -171,13 +199,15 @@ def _framed(body: bytes) -> bytes:
 
 
 def main() -> None:
-    line = Line(sys.argv[1], Chip(sys.argv[2]))
+    pace = "--pace" in sys.argv
+    line = Line(sys.argv[1], Chip(sys.argv[2]), pace=pace)
     signal.signal(signal.SIGTERM, lambda *_: setattr(line, "stop", True))
     signal.signal(signal.SIGUSR1, lambda *_: setattr(line, "swallow", True))
     print("ready", flush=True)
     with contextlib.suppress(OSError):
         line.serve()
-    print(sum(line.chip.commands.values()), flush=True)
+    commands = sum(line.chip.commands.values())
+    print(json.dumps([commands, line.octets, line.seconds, line.chip.air]) if pace else commands, flush=True)
 
 
 if __name__ == "__main__":
