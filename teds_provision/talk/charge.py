@@ -43,7 +43,7 @@ def _percent(node: Conversation) -> int | None:
     if node.tapped or node.wired or not node.sealed:
         return None
     try:
-        power = Power.decode(node.send(POWER, "to tell its charge"))
+        power = Power.decode(node.ask(POWER, "to tell its charge"))
     except (NodeRefused, BadData):
         return None  # it has no battery, or does not measure
     return power.level if power.flags & PowerFlag.BATTERY else None

@@ -67,9 +67,10 @@ def main() -> None:
     config.write_text(CONFIG.format(path=BUS))
     bench = Bench()
     nodes = [FOLDER / "left", FOLDER / "right"]
-    with Station.open(bench.home, ask=lambda _prompt, _confirm: PASSPHRASE) as station:
-        for node in nodes:
-            tapped_once(station, node)
+    station = Station.open(bench.home, ask=lambda _prompt, _confirm: PASSPHRASE)
+    for node in nodes:
+        tapped_once(station, node)
+    station.close()
     uuids = [json.loads((node / "flash.json").read_text())["flash"]["uuid"] for node in nodes]
     os.environ["DBUS_SYSTEM_BUS_ADDRESS"] = f"unix:path={BUS}"
     with (

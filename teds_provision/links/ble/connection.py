@@ -29,6 +29,10 @@ class ConnectionLost(Exception):
     """The connection ended, or did not come about, for a reason of the air: it is tried again."""
 
 
+class NotConnected(ConnectionLost):
+    """No connection came about: nothing was sent."""
+
+
 class Connection:
     """The connection to the node at ``address``; ``number`` tells it apart in this process.
 
@@ -45,6 +49,8 @@ class Connection:
         self.streaming = False
         """A measurement hangs on it: it is not given up for another node."""
         self.asking = False
+        self.was_up = False
+        """Whether it ever came about: then one that ended is worth patience."""
         self._client: BleakClient | None = None
         self._news: asyncio.Queue[bytes | None] = asyncio.Queue()
         self._turn = asyncio.Lock()
@@ -85,7 +91,10 @@ class Connection:
             return
         async with self._adapter.connecting:
             if not self.is_up:
-                await self._connect()
+                try:
+                    await self._connect()
+                except ConnectionLost as lost:
+                    raise NotConnected(str(lost)) from lost
 
     async def down(self) -> None:
         """Disconnect; never raises."""
@@ -115,6 +124,7 @@ class Connection:
                     hint="Its firmware is wrong, or a cache: sudo rm -r /var/lib/bluetooth/*/cache, restart bluetooth.",
                 )
         self._adapter.held.add(self)
+        self.was_up = True
 
     async def _client_with_service(self) -> bool:
         """Connect, and subscribe; False where the node's service is not there."""
@@ -139,7 +149,7 @@ class Connection:
             except Exception as error:
                 self._client = None
                 self._adapter.forget(self.address)
-                if troubles.is_full(error):
+                if troubles.is_full(error, self._adapter.held):
                     raise troubles.too_many(len(self._adapter.held), self._adapter.spec.text) from error
                 if not troubles.is_gone(error) or attempt == _FORGOTTEN_TRIES - 1:
                     raise ConnectionLost(_why(error)) from error

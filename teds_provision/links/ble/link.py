@@ -6,9 +6,8 @@ import time
 from collections.abc import Callable
 from typing import Final
 
-from teds_provision.errors import LinkFailure
 from teds_provision.links.ble import troubles
-from teds_provision.links.ble.connection import Connection, ConnectionLost
+from teds_provision.links.ble.connection import Connection, ConnectionLost, NotConnected
 from teds_provision.links.ble.loop import Loop
 from teds_provision.links.ports import BLE, Capabilities, Notice, NoticeSink
 
@@ -16,7 +15,7 @@ REPLY_SECONDS: Final = 5.0
 REPEAT_SECONDS: Final = 15.0
 TRIES: Final = 3
 """A request is repeated at most twice, within 15 s (profile.md, "Repetition")."""
-_FIRST_PAUSE: Final = 0.3
+_FIRST_PAUSE, _LAST_PAUSE = 0.3, 2.0
 
 
 class BleLink:
@@ -72,21 +71,20 @@ class BleLink:
 
     def _ask(self, frame: bytes, transaction: int) -> bytes:
         began, last = time.monotonic(), None
-        tries = rooms = 0
+        tries, pause = 0, _FIRST_PAUSE
         while tries < TRIES and time.monotonic() - began < REPEAT_SECONDS:
-            if tries:
-                time.sleep(_FIRST_PAUSE * 2 ** (tries - 1))
             try:
                 return self._loop.run(self.connection.exchange(transaction, frame, REPLY_SECONDS))
             except ConnectionLost as lost:
                 last = lost
+                # nothing was sent where no connection came about: an adapter that is still busy is no try
+                tries += not (isinstance(lost, NotConnected) and self.connection.was_up)
                 self._notice(Notice("retry", f"BLE: {str(lost).rstrip('.')}. Connecting again"))
+                time.sleep(pause)
+                pause = min(2 * pause, _LAST_PAUSE)
             except TimeoutError:
-                last = None
-            except LinkFailure as failure:
-                if not troubles.is_full(failure.__cause__ or failure) or not self._make_room():
+                last, tries = None, tries + 1
+            except troubles.TooMany:
+                if not self._make_room():
                     raise
-                rooms += 1
-                continue
-            tries += 1
         raise troubles.silent(self.connection.address, last)

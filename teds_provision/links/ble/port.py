@@ -19,10 +19,11 @@ from teds_provision.links.ble.adapter import Adapter
 from teds_provision.links.ble.connection import Connection
 from teds_provision.links.ble.link import BleLink
 from teds_provision.links.ble.loop import Loop
+from teds_provision.links.ble.remembered import Remembered, cache_file
 from teds_provision.links.ble.spec import parse_spec
 from teds_provision.links.ports import BLE, Capabilities, Contact, Notice, NoticeSink, Trace
 from teds_provision.protocol.messages.frames import Function, decode_reply, security_command
-from teds_provision.protocol.messages.identity import Identity
+from teds_provision.protocol.messages.identity import Identity, NodeState
 
 _IDENTIFY: Final = security_command(Function.IDENTIFY).encode()
 _ROUND_SECONDS: Final = 2.0
@@ -30,6 +31,9 @@ _SILENCE_SECONDS: Final = 1.5
 """Nobody new for so long: everyone was seen. Nodes advertise every 0.1 to 1 s."""
 _LONGEST_SECONDS: Final = 8.0
 _GONE_SECONDS: Final = 10.0
+_GUESS_SECONDS: Final = 2.0
+_MOST_GUESSES: Final = 3
+_NOBODY: Final = Identity(bytes(10), NodeState.FACTORY, 0, 0, 1024, 0)
 _REOPEN_SECONDS: Final = 1.0
 _MOST_HELD: Final = 20_000
 
@@ -60,9 +64,9 @@ class BlePort:
         self._loop = Loop()
         self._adapter = Adapter(self.spec)
         self._connections: dict[str, Connection] = {}
-        self._known: dict[str, Identity] = {}
+        self._known = Remembered(cache_file())
         self._data: queue.Queue[DataMessage] = queue.Queue(_MOST_HELD)
-        self._heard = False
+        self._heard = self._closed = False
         self.lost = 0  # data messages for which nobody had time
         self._transaction = secrets.randbelow(1 << 16)
         self._lock = threading.Lock()
@@ -80,6 +84,11 @@ class BlePort:
 
     def close(self) -> None:
         """End every connection; never raises."""
+        with self._lock:
+            closed, self._closed = self._closed, True
+        if closed:
+            return
+        self._known.save()
         with suppress(Exception):
             self._loop.run(self._all_down())
         self._loop.stop()
@@ -119,27 +128,17 @@ class BlePort:
 
         Raises NoNode after ``seconds``, NoReader where Bluetooth cannot be used.
         """
-        return self._find(wanted, seconds, notice)
-
-    def find_at(
-        self, address: str, wanted: Callable[[Identity], bool], *, seconds: float, notice: NoticeSink
-    ) -> Contact:
-        """As :meth:`find`, where a tap has named the address: that one first."""
-        return self._find(wanted, seconds, notice, first=address)
-
-    def _find(
-        self, wanted: Callable[[Identity], bool], seconds: float, notice: NoticeSink, first: str | None = None
-    ) -> Contact:
         where = f"at {self.spec.address} " if self.spec.address else ""
         notice(Notice("waiting", f"Looking for the node {where}over BLE ({self.spec.text}).", seconds))
         until = time.monotonic() + seconds
         told: set[bytes] = set()
         asked: dict[str, float] = {}
-        for known in self._guesses(wanted, first):
-            contact = self._ask(known, wanted, notice, told)
-            asked[known] = time.monotonic()
-            if contact is not None:
-                return contact
+        for known in self._guesses(wanted):
+            if self._is_up(known) or self._advertises(known):
+                contact = self._ask(known, wanted, notice, told)
+                asked[known] = time.monotonic()
+                if contact is not None:
+                    return contact
         while (left := until - time.monotonic()) > 0:
             for address_seen in self._advertising(min(left, _ROUND_SECONDS), asked):
                 asked[address_seen] = time.monotonic()
@@ -203,12 +202,18 @@ class BlePort:
 
     # -- the inside ------------------------------------------------------------------------------------------------
 
-    def _guesses(self, wanted: Callable[[Identity], bool], first: str | None) -> list[str]:
-        """Addresses to try before anyone else is listened for: as the tap said, as it was found before."""
-        if self.spec.address:
+    def _guesses(self, wanted: Callable[[Identity], bool]) -> list[str]:
+        """Addresses at which a wanted node was met before, to be tried before anyone else is listened for.
+
+        None where anybody is wanted: then the first that advertises is as good.
+        """
+        if self.spec.address or wanted(_NOBODY):
             return []
-        known = [address for address, identity in self._known.items() if wanted(identity)]
-        return list(dict.fromkeys([*([first] if first else []), *known]))
+        return [address for address, identity in self._known.items() if wanted(identity)][:_MOST_GUESSES]
+
+    def _advertises(self, address: str) -> bool:
+        """Whether this address is heard within a moment."""
+        return address in self._loop.run(self._adapter.scan(_GUESS_SECONDS, lambda seen: address in seen))
 
     def _advertising(self, seconds: float, asked: dict[str, float]) -> list[str]:
         """Who advertises and was not asked for a while, the first that comes."""
@@ -254,7 +259,7 @@ class BlePort:
         except Exception:
             self._leave(link, in_use=in_use)
             raise
-        self._known[address] = identity
+        self._known.learn(address, identity)
         if not wanted(identity):
             self._leave(link, in_use=in_use)
             if identity.uuid not in told:

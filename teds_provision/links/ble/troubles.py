@@ -5,6 +5,7 @@ Names of D-Bus errors and BlueZ's words ("le-connection-…") are those of bluet
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from typing import Final
 
 from teds_provision.errors import LinkFailure, NodeSilent, NoReader
@@ -12,12 +13,8 @@ from teds_provision.lazy import how_to_install
 
 SERVICE_HINT: Final = "sudo systemctl start bluetooth (package bluez); teds-provision doctor looks closer."
 POWER_HINT: Final = "bluetoothctl power on; where that is refused: rfkill unblock bluetooth."
-_FULL: Final = (
-    "le-connection-concurrent-connection-limit",
-    "le-connection-refused",
-    "le-connection-busy",
-    "le-connection-memory-allocation",
-)
+_LIMIT: Final = "le-connection-concurrent-connection-limit"
+_REFUSED: Final = ("le-connection-refused", "le-connection-busy", "le-connection-memory-allocation")
 _BUSY: Final = ("org.bluez.Error.InProgress", "org.bluez.Error.NotReady")
 _UNKNOWN: Final = ("org.freedesktop.DBus.Error.UnknownObject", "org.freedesktop.DBus.Error.UnknownMethod")
 _NO_SERVICE: Final = ("org.freedesktop.DBus.Error.ServiceUnknown", "org.freedesktop.DBus.Error.NameHasNoOwner")
@@ -28,9 +25,10 @@ def missing_bleak() -> NoReader:
     return NoReader("BLE needs bleak, which is not installed.", hint=how_to_install("bleak"))
 
 
-def is_full(error: BaseException) -> bool:
-    """Whether the adapter took no further connection."""
-    return any(word in str(error) for word in _FULL)
+def is_full(error: BaseException, held: Collection[object]) -> bool:
+    """Whether the adapter took no further connection beside those that are ``held``; with none it is only busy."""
+    text = str(error)
+    return _LIMIT in text or (bool(held) and any(word in text for word in _REFUSED))
 
 
 def is_busy(error: BaseException) -> bool:
@@ -70,9 +68,13 @@ def adapter_trouble(error: Exception, adapter: str) -> LinkFailure | None:
     return None
 
 
-def too_many(held: int, adapter: str) -> LinkFailure:
+class TooMany(LinkFailure):
+    """An adapter's connections are used up."""
+
+
+def too_many(held: int, adapter: str) -> TooMany:
     """The error for an adapter whose connections are used up."""
-    return LinkFailure(
+    return TooMany(
         f"The Bluetooth of {adapter} holds {held} connection{'' if held == 1 else 's'} and takes no more.",
         hint="Measure fewer nodes over it, or add an adapter: many take 5 to 9, Nordic's own controllers 20.",
     )

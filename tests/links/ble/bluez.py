@@ -31,6 +31,7 @@ class Manners:
     forget: float = 30.0
     in_progress: bool = False
     aborts: int = 0
+    refusals: int = 0
     limit: int = 0
     stale: bool = False
     always_stale: bool = False
@@ -304,6 +305,9 @@ class Bluez:
     async def _connect(self, remote: Remote) -> None:
         if self.manners.limit and self.held >= self.manners.limit:
             raise DBusError(FAILED, "le-connection-concurrent-connection-limit")
+        if self.manners.refusals:
+            self.manners.refusals -= 1
+            raise DBusError(FAILED, "Input/output error")
         if self.manners.aborts:
             self.manners.aborts -= 1
             remote.connected = True

@@ -26,6 +26,7 @@ def air(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[..
             for folder in folders:
                 keyed_node(folder, profile=ANGLE)
             nodes = folders
+        monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
         radio = Radio(tmp_path, nodes, **more)
         made.append(radio)
         monkeypatch.setenv("DBUS_SYSTEM_BUS_ADDRESS", radio.address)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import threading
 import time
 from collections.abc import Callable
@@ -11,6 +12,7 @@ import pytest
 
 from teds_provision.errors import LinkFailure, NoNode, NoReader, UsageFailure
 from teds_provision.links.ble.port import BlePort
+from teds_provision.links.ble.remembered import cache_file
 from teds_provision.links.ble.spec import parse_spec
 from teds_provision.links.ports import Contact, Notice
 from teds_provision.node import described
@@ -72,6 +74,17 @@ def test_a_request_whose_connection_is_cut_is_repeated_over_a_new_one(air: Air, 
     assert contact.link.exchange(IDENTIFY)
     assert [notice.kind for notice in notices if notice.kind != "waiting"] == ["retry"]
     assert radio.do("counts")["connects"] == 2
+
+
+def test_an_adapter_that_is_busy_after_a_cut_is_waited_for(air: Air, port: Ports) -> None:
+    """As real bluetoothd is: after a connection ended it answers "busy" for seconds."""
+    radio = air()
+    contact = find(port())
+    radio.do("manners", {"refusals": 4})
+    radio.do("drop", 0)
+    until(lambda: radio.do("lines", 0) == 0)
+    assert contact.link.exchange(IDENTIFY)
+    assert radio.do("manners", {})["refusals"] == 0
 
 
 def test_a_session_does_not_outlive_its_connection(air: Air, port: Ports) -> None:
@@ -167,6 +180,27 @@ def test_the_address_may_be_named(air: Air, port: Ports) -> None:
     assert radio.do("lines", 1) == 1
     assert radio.do("lines", 0) == 0
     assert contact.connection is not None
+
+
+def test_a_node_that_was_met_before_is_asked_alone(air: Air, port: Ports) -> None:
+    """Its address is kept from command to command, so that twenty others are left in peace."""
+    radio = air(6)
+    first = port()
+    contacts = first.everyone(seconds=30, notice=quiet)
+    first.close()
+    before = radio.do("counts")["connects"]
+    wanted = contacts[4].identity.uuid
+    assert find(port(), lambda identity: identity.uuid == wanted).identity.uuid == wanted
+    assert radio.do("counts")["connects"] == before + 1
+
+
+def test_a_cache_that_is_damaged_or_stale_harms_nothing(air: Air, port: Ports) -> None:
+    air(1)
+    cache_file().parent.mkdir(parents=True)
+    cache_file().write_text("{]")
+    wanted = find(port()).identity
+    cache_file().write_text(json.dumps({"C0:00:00:00:00:01": wanted.encode().hex()}))
+    assert find(port(), lambda identity: identity.uuid == wanted.uuid).identity.uuid == wanted.uuid
 
 
 def test_watching_gives_each_node_once(air: Air, port: Ports) -> None:
