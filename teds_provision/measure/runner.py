@@ -14,7 +14,7 @@ from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass, field
 from typing import Any
 
-from teds_provision.errors import NoNode, TedsProvisionError
+from teds_provision.errors import NoNode, StoreFailure, TedsProvisionError
 from teds_provision.measure.blocks import Block, ChannelFacts, Command, NodeReport, StationFacts
 from teds_provision.measure.carrying import trigger
 from teds_provision.measure.carrying.together import Together
@@ -219,7 +219,7 @@ class Measurement:
     def _ended(self) -> Ended:
         nodes = [_summary(keeper) for keeper in self.keepers]
         errors = [keeper.error for keeper in self.keepers if keeper.error is not None]
-        errors += [TedsProvisionError(s.stats.error, hint=s.stats.hint) for s in self.sinks if s.stats.error]
+        errors += [_as_error(sink) for sink in self.sinks if sink.stats.error]
         worst = min(errors, key=_rank) if errors else None
         files = [name for sink in self.sinks for name in sink.files]
         return Ended(nodes, files, worst, self._together.apart)
@@ -232,6 +232,12 @@ def _summary(keeper: NodeKeeper) -> dict[str, Any]:
     if keeper.error is not None:
         node["error"] = {"code": keeper.error.code, "message": keeper.error.message}
     return node
+
+
+def _as_error(sink: Sink) -> TedsProvisionError:
+    """What ended a sink: of a recording it is the disk (7)."""
+    kind = StoreFailure if sink.files else TedsProvisionError
+    return kind(sink.stats.error, hint=sink.stats.hint)
 
 
 def _rank(error: TedsProvisionError) -> int:

@@ -1,0 +1,98 @@
+"""A bus that dies and comes back, a disk that is full, a reader that stalls: told, and the measurement goes on."""
+
+from __future__ import annotations
+
+import csv
+import signal
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from tests.e2e.desk import ANGLE, Running, limited
+from tests.links.can.hub import Hub
+from tests.measure.hall import Hall, events, of, states
+
+pytestmark = pytest.mark.link
+
+
+@pytest.fixture
+def hall(tmp_path: Path) -> Iterator[Hall]:
+    made = Hall(tmp_path, {"a": ANGLE})
+    try:
+        yield made
+    finally:
+        made.close()
+
+
+def wait_for_count(running: Running, text: str, count: int, seconds: float = 60.0) -> None:
+    """Wait until a text has come so often."""
+    until = time.monotonic() + seconds
+    while running.out.count(text) < count:
+        assert time.monotonic() < until, running.out[-2000:]
+        running.read(0.1)
+
+
+def rows(file: Path) -> int:
+    """Rows of values in a text recording, without a torn one at the end."""
+    return sum(1 for line in file.read_text().splitlines() if not line.startswith("#")) - 1
+
+
+def test_a_bus_that_dies_is_opened_again_when_it_is_back(hall: Hall) -> None:
+    hub = Hub()
+    port = hub.port
+    try:
+        hall.nodes["a"].start(can=hub.spec)
+        running = hall.begin(hall.nodes["a"].uuid, "--rate", 20, can=hub.spec)
+        running.wait_for('"event":"data"', 60)
+        hub.close()
+        running.wait_for('"state":"lost"', 60)
+        hub = Hub(port=port)
+        wait_for_count(running, '"state":"running"', 2)
+        data = running.out.count('"event":"data"')
+        wait_for_count(running, '"event":"data"', data + 5)
+        running.signal(signal.SIGTERM)
+        outcome = running.end(60)
+    finally:
+        hub.close()
+    assert outcome.code == 0, outcome.err
+    lines = events(outcome.out)
+    assert states(lines)[:2] == ["waiting", "running"]
+    assert states(lines)[-1] == "ended"
+    times = [instant for line in of(lines) for instant in line["time"]]
+    assert times == sorted(times)
+
+
+def test_a_full_disk_ends_that_recording_and_nothing_else(hall: Hall, tmp_path: Path) -> None:
+    hall.nodes["a"].start()
+    file = tmp_path / "full.csv"
+    running = hall.begin(hall.nodes["a"].uuid, "--rate", 200, "--to", file, program=limited(200_000))
+    running.wait_for("cannot be written", 90)
+    data = running.out.count('"event":"data"')
+    wait_for_count(running, '"event":"data"', data + 5)
+    running.signal(signal.SIGTERM)
+    outcome = running.end(60)
+    assert outcome.code == 7, outcome.err
+    end = events(outcome.out)[-1]
+    assert end["nodes"][0]["streams"][0]["bad"] == 0
+    assert "error" in end
+    text = [line for line in file.read_text().splitlines() if not line.startswith("#")]
+    whole = list(csv.DictReader(text[:-1]))
+    assert all(row["a/angle [rad]"] for row in whole), "whole up to there"
+
+
+def test_a_reader_that_stalls_holds_up_no_recording(hall: Hall, tmp_path: Path) -> None:
+    hall.nodes["a"].start()
+    file = tmp_path / "run.csv"
+    running = hall.begin(hall.nodes["a"].uuid, "--rate", 500, "--to", file)
+    running.wait_for('"event":"data"', 60)
+    until = time.monotonic() + 30  # nobody reads its lines from here on: the pipe is full after a second
+    before = rows(file)
+    while rows(file) < before + 2000:
+        assert time.monotonic() < until, "the recording went on"
+        time.sleep(0.1)
+    running.signal(signal.SIGTERM)
+    outcome = running.end(60)
+    assert outcome.code == 0, outcome.err
+    assert events(outcome.out)[-1]["event"] == "end"

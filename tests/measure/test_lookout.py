@@ -1,0 +1,188 @@
+"""What is seen on the buses, who begins together, whether datasheets suffice, and who holds what: without a bus."""
+
+from __future__ import annotations
+
+import threading
+import time
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from teds_provision.errors import AddressConflict, NoNode, PolicyRefused
+from teds_provision.measure.carrying.judging import Judging
+from teds_provision.measure.carrying.together import Together
+from teds_provision.measure.clock import ClockMap, Exchange
+from teds_provision.measure.finding.lookout import Sighting, Sightings
+from teds_provision.protocol.announce import Announce, uuid_crc
+from teds_provision.protocol.messages.identity import Identity, NodeState
+from teds_provision.protocol.operation.stream_commands import SOON, WAITS
+from teds_provision.store.lock import Mark, Taken
+from teds_provision.teds.fits import parse_require
+from teds_provision.teds.image import Image
+from teds_provision.teds.profile import load_profile
+from teds_provision.teds.sheet import Sheet
+from tests.e2e.desk import ANGLE
+
+ONE, TWO, THREE = (bytes([number]) * 10 for number in (1, 2, 3))
+
+
+class Port:
+    """A port that is only named."""
+
+    def __init__(self, place: str) -> None:
+        self.place = place
+
+
+def seen(uuid: bytes, address: int, *, place: str = "can:x", at: float | None = None) -> Sighting:
+    identity = Identity(uuid, NodeState.PROVISIONED, 1, 1, 2048, address)
+    port: Any = Port(place)
+    return Sighting(identity, address, port, time.monotonic() if at is None else at)
+
+
+def find(sightings: Sightings, uuid: bytes, **more: Any) -> Sighting:
+    return sightings.find(uuid, seconds=more.pop("seconds", 0.05), stop=threading.Event(), **more)
+
+
+def test_a_node_that_was_seen_is_found_and_one_that_was_not_is_missing_meanwhile() -> None:
+    sightings = Sightings()
+    sightings.saw(seen(ONE, 7))
+    assert find(sightings, ONE).address == 7
+    with pytest.raises(NoNode):
+        find(sightings, TWO)
+    assert not sightings.missing()
+    found: list[Sighting] = []
+    waiting = threading.Thread(target=lambda: found.append(find(sightings, TWO, seconds=10)))
+    waiting.start()
+    while not sightings.missing():
+        time.sleep(0.001)
+    assert sightings.awaits(Announce(9, 2, uuid_crc(TWO)))
+    assert not sightings.awaits(Announce(9, 2, uuid_crc(ONE)))
+    sightings.saw(seen(TWO, 9))
+    waiting.join(10)
+    assert [one.address for one in found] == [9]
+
+
+def test_what_turned_out_wrong_goes_behind_another_that_says_the_same() -> None:
+    sightings = Sightings()
+    forged, true = seen(ONE, 7), seen(ONE, 8)
+    sightings.saw(forged)
+    sightings.wrong(forged)
+    for one in (seen(ONE, 7), true, seen(ONE, 7)):
+        sightings.saw(one)
+    assert find(sightings, ONE).address == 8
+
+
+def test_only_what_was_seen_since_counts_for_a_node_that_was_lost() -> None:
+    sightings = Sightings()
+    sightings.saw(seen(ONE, 7))
+    with pytest.raises(NoNode):
+        find(sightings, ONE, fresh=time.monotonic())
+
+
+def test_nothing_is_opened_under_an_address_that_two_nodes_have() -> None:
+    told: list[str] = []
+    sightings = Sightings(note=told.append)
+    sightings.saw(seen(ONE, 7))
+    sightings.conflict("can:x", 7)
+    with pytest.raises(AddressConflict):
+        find(sightings, ONE)
+    assert told
+
+
+def test_an_announce_is_told_to_whom_it_concerns_by_address_or_by_uuid() -> None:
+    sightings, heard = Sightings(), list[str]()
+    for name, uuid, address in (("one", ONE, 7), ("two", TWO, 8)):
+        sightings.on_announce(seen(uuid, address), lambda name=name: heard.append(name))
+    sightings.announced("can:x", Announce(7, 2, 0))
+    sightings.announced("can:x", Announce(99, 2, uuid_crc(TWO)))
+    sightings.announced("can:other", Announce(7, 2, uuid_crc(TWO)))
+    assert heard == ["one", "two"]
+    sightings.let_announce(ONE)
+    sightings.announced("can:x", Announce(7, 2, 0))
+    assert heard == ["one", "two"]
+
+
+def clock(offset: int) -> ClockMap:
+    """A node's clock that stands ``offset`` ns behind the host's, asked just now."""
+    made, now = ClockMap(), time.monotonic_ns()
+    made.exchange(Exchange(now - 2000, now, now - 1500 - offset, now - 500 - offset, 1, 50))
+    return made
+
+
+def test_nodes_that_are_there_in_time_begin_at_one_moment_and_a_late_one_when_it_comes() -> None:
+    together = Together({ONE, TWO, THREE}, waiting=0.2)
+    clocks, ticks = {ONE: clock(10**9), TWO: clock(7 * 10**9)}, dict[bytes, int]()
+    threads = [
+        threading.Thread(target=lambda uuid=uuid: ticks.update({uuid: together.start(uuid, clocks[uuid])}))
+        for uuid in clocks
+    ]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join(10)
+    moments = [clocks[uuid].host_of(tick) for uuid, tick in ticks.items()]
+    assert abs(moments[0] - moments[1]) < 1e-4
+    assert min(moments) > time.monotonic() - 0.2
+    assert together.apart == pytest.approx(abs(moments[0] - moments[1]), abs=1e-6)
+    assert 0 < together.until(ticks[ONE]) < 1
+    assert together.start(ONE, clocks[ONE]) == SOON, "after a restart it begins by itself"
+    while together.until(ticks[ONE]):
+        time.sleep(0.01)
+    assert together.start(THREE, clock(0)) == SOON
+
+
+def test_a_node_alone_waits_for_nobody_and_one_that_is_gone_is_not_waited_for() -> None:
+    assert Together({ONE}).start(ONE, clock(0)) == SOON
+    together = Together({ONE, TWO}, waiting=60)
+    together.gone(TWO)
+    assert together.start(ONE, clock(0)) != SOON
+
+
+def test_a_stream_waits_for_the_trigger_until_it_has_gone_out() -> None:
+    together = Together({ONE, TWO}, trigger=True)
+    assert together.start(ONE, clock(0)) == WAITS
+    assert not together.due(1, 2)
+    assert together.due(2, 2)
+    assert together.left is None
+    together.triggered()
+    assert not together.due(2, 2)
+    assert together.start(TWO, clock(0)) == SOON
+
+
+def sheet(uuid: bytes) -> Sheet:
+    return Sheet.of(Image(uuid, load_profile(ANGLE, None).build(uuid).blocks))
+
+
+def test_datasheets_are_judged_once_all_are_there_and_one_that_is_gone_is_not_waited_for() -> None:
+    met = parse_require('[angle]\nrange = ">= 10 deg"\n', "task")
+    judging = Judging(met, waiting=60)
+    judging.expect([ONE, TWO])
+    threading.Timer(0.05, judging.gone, [TWO]).start()
+    with pytest.raises(PolicyRefused):  # a profile without calibration gives no value
+        judging.offer(ONE, sheet(ONE), threading.Event())
+    assert [fit["uuid"] for fit in judging.fits] == [ONE.hex()]
+
+
+def test_a_mark_names_its_holder_and_tells_of_one_that_was_killed(tmp_path: Path) -> None:
+    place = tmp_path / "marks" / "bus.lock"
+    with Mark(place, command="measure crane") as held:
+        assert not held.left_behind
+        assert Mark(place, command="").is_taken
+        with pytest.raises(Taken, match="measure crane"), Mark(place, command="set"):
+            pass
+        with pytest.raises(Taken), Mark(place, command="set", shared=True):
+            pass
+    assert not Mark(place, command="").is_taken
+    with (
+        Mark(place, command="set a", shared=True),
+        Mark(place, command="set b", shared=True),
+        pytest.raises(Taken, match="set b"),
+        Mark(place, command="measure"),
+    ):
+        pass
+    with Mark(place, command="measure") as free:
+        assert not free.left_behind, "whoever leaves in order puts the mark away"
+    place.write_text("{}")  # what a process leaves that was killed
+    with Mark(place, command="measure") as again:
+        assert again.left_behind
