@@ -198,8 +198,11 @@ def test_the_command_line_works_beside_it_at_the_same_node(lab: Lab) -> None:
     assert station.ask("sample", lab.node.uuid, *over)["samples"][0]["valid"] is True
     after = lab.flows()["measuring"]
     assert after["state"] == "running"
-    assert after["lost"] == before["lost"]
     assert after["samples"] > before["samples"]
+    assert lab.service.process is not None
+    lab.service.process.read(0.1)
+    told = [json.loads(line) for line in lab.service.process.out.splitlines()]
+    assert "lost" not in {line["state"] for line in told if line.get("event") == "node"}, "its session was never ended"
     lab.service.end()
 
 

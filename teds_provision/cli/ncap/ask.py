@@ -28,9 +28,7 @@ def _status(console: Console, found: dict[str, Any]) -> None:
     served = found["url"] or "no page; start it with --http"
     console.print(f"{found['station']['name']}: {found['detection']} mode, {served}", markup=False)
     for link in found["links"]:
-        problem = f": {link['problem']['message']}" if link["problem"] else ""
-        others = f", {link['strangers']} not on the whitelist" if link["strangers"] else ""
-        console.print(f"{link['place']}: {link['state']}, {link['nodes']} nodes{others}{problem}", markup=False)
+        console.print(_link(link), markup=False)
     for node in found["nodes"]:
         there = "there" if node["present"] else "away"
         name = shown(node["name"]) or "no name"
@@ -39,6 +37,12 @@ def _status(console: Console, found: dict[str, Any]) -> None:
         console.print(f"measurement {one['id']}: {one['state']}", markup=False)
     for one in found.get("sinks", ()):
         console.print(f"{shown(one['name'])}: {one['state']}, {one['dropped']} dropped", markup=False)
+
+
+def _link(link: dict[str, Any]) -> str:
+    problem = f": {link['problem']['message']}" if link["problem"] else ""
+    others = f", {link['strangers']} not on the whitelist" if link["strangers"] else ""
+    return f"{link['place']}: {link['state']}, {link['nodes']} nodes{others}{problem}"
 
 
 @command("teds-provision ncap detection transparent", name="detection")

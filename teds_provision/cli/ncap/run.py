@@ -63,12 +63,10 @@ def run(
 
     One line is printed when it is ready, then a line for each event.
     """
-    missing = [name for name in _NEEDED if importlib.util.find_spec(name) is None]
-    if missing:
-        raise UsageFailure(f"ncap run needs {', '.join(missing)}.", hint=how_to_install(*missing))
-    places = [settings.with_own_source(f"can:{one}") for one in can] + [f"nfc:{one}" for one in nfc]
-    places += [f"ble:{one}" for one in ble]
-    sinks = [*(["ros1"] if ros1 else []), *(["ros2"] if ros2 else []), *([mqtt] if mqtt else [])]
+    _require_extra()
+    places = [settings.with_own_source(f"can:{one}") for one in can]
+    places += [f"{link}:{one}" for link, named in (("nfc", nfc), ("ble", ble)) for one in named]
+    sinks = [name for name, asked in (("ros1", ros1), ("ros2", ros2), (mqtt or "", mqtt)) if asked]
     wanted = settings.Settings(
         places=tuple(dict.fromkeys(places)),
         http=None if http is None else settings.parse_http(http),
@@ -79,6 +77,12 @@ def run(
     station = app.station()
     station.unlock()  # nobody is asked for a passphrase later
     running.run(station, wanted, Lines(app).tell)
+
+
+def _require_extra() -> None:
+    missing = [name for name in _NEEDED if importlib.util.find_spec(name) is None]
+    if missing:
+        raise UsageFailure(f"ncap run needs {', '.join(missing)}.", hint=how_to_install(*missing))
 
 
 class Lines:

@@ -10,11 +10,11 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Callable, Iterator
-from contextlib import AbstractContextManager, ExitStack, contextmanager
+from contextlib import AbstractContextManager, ExitStack, contextmanager, suppress
 from dataclasses import dataclass, field
 from typing import Any, Final
 
-from teds_provision.errors import LinkFailure, NoNode, TedsProvisionError
+from teds_provision.errors import LinkFailure, NoNode, StoreFailure, TedsProvisionError
 from teds_provision.links.ports import Notice
 from teds_provision.measure.acting import DEAD_MAN, Acting
 from teds_provision.measure.trusting import Trusted, open_trusted, require_whitelisted
@@ -98,33 +98,39 @@ class Holding:
         """
         require_whitelisted(self._station, bytes.fromhex(uuid))
         seconds = HOLD if hold is None else min(hold, LONGEST)
-        key = (uuid, channel)
-        with self._guard:
-            held = self._held.get(key)
-            if held is None or held.ended or held.let_go:
-                held = self._held[key] = _Held(uuid, channel, 0.0, _Order(value, unit, 1))
-                thread = threading.Thread(
-                    target=self._run, args=(held, value, unit), name=f"hold {uuid[:8]}", daemon=True
-                )
-                fresh = True
-            else:
-                fresh = False
+        held, fresh = self._held_for(uuid, channel, value, unit)
         with held.news:
             held.until = time.monotonic() + seconds + (_STARTING if fresh else 0.0)
-            mine = held.order.number + (0 if fresh else 1)
+            mine = held.order.number + (not fresh)
             held.order = _Order(value, unit, mine)
             held.news.notify_all()
             if fresh:
-                thread.start()
-            done = held.news.wait_for(lambda: held.answered >= mine or held.ended, _STARTING)
-            if held.error is not None and held.answered <= mine:
-                raise held.error
-            if not done or held.applied is None:
-                raise LinkFailure(
-                    "The actuator did not answer in time.", hint="Its dead-man brings it to its safe state."
-                )
-            held.until = time.monotonic() + seconds
-            return {"applied": held.applied, "until": time.time() + seconds, "safe": False}
+                self._start(held, value, unit)
+            held.news.wait_for(lambda: held.answered >= mine or held.ended, _STARTING)
+            return self._answer(held, mine, seconds)
+
+    def _held_for(self, uuid: str, channel: int, value: float, unit: str | None) -> tuple[_Held, bool]:
+        """The actuator as it is held now, or a new one; and whether it is new."""
+        key = (uuid, channel)
+        with self._guard:
+            held = self._held.get(key)
+            if held is not None and not held.ended and not held.let_go:
+                return held, False
+            held = self._held[key] = _Held(uuid, channel, 0.0, _Order(value, unit, 1))
+            return held, True
+
+    def _start(self, held: _Held, value: float, unit: str | None) -> None:
+        name = f"hold {held.uuid[:8]}"
+        threading.Thread(target=self._run, args=(held, value, unit), name=name, daemon=True).start()
+
+    @staticmethod
+    def _answer(held: _Held, mine: int, seconds: float) -> dict[str, Any]:
+        if held.error is not None and held.answered <= mine:
+            raise held.error
+        if held.answered < mine or held.applied is None:
+            raise LinkFailure("The actuator did not answer in time.", hint="Its dead-man brings it to its safe state.")
+        held.until = time.monotonic() + seconds
+        return {"applied": held.applied, "until": time.time() + seconds, "safe": False}
 
     def let_go(self, uuid: str, channel: int) -> dict[str, Any]:
         """Let go now; ``safe`` is what the node itself said, None where it did not say."""
@@ -149,10 +155,9 @@ class Holding:
     # -- the thread of one actuator ----------------------------------------------------------------------------------
 
     def _run(self, held: _Held, value: float, unit: str | None) -> None:
-        self._station.audit(
-            "set", bytes.fromhex(held.uuid), "begun", channel=held.channel, value=value, unit=unit or ""
-        )
+        node, facts = bytes.fromhex(held.uuid), {"channel": held.channel}
         try:
+            self._station.audit("set", node, "begun", value=value, unit=unit or "", **facts)
             with self._session(held.uuid) as session:
                 self._hold(held, session)
         except SessionLost as lost:
@@ -160,14 +165,15 @@ class Holding:
         except TedsProvisionError as error:
             held.error = error
         finally:
+            outcome = "done" if held.error is None else held.error.code
+            with suppress(StoreFailure):  # a full disk must not keep who waits for this waiting
+                self._station.audit("set", node, outcome, safe=held.safe, **facts)
+            self._tell(held, safe=held.safe)
             with self._guard:
                 self._held.pop((held.uuid, held.channel), None)
             with held.news:
                 held.ended = True
                 held.news.notify_all()
-            outcome = "done" if held.error is None else held.error.code
-            self._station.audit("set", bytes.fromhex(held.uuid), outcome, channel=held.channel, safe=held.safe)
-            self._tell(held, safe=held.safe)
 
     @contextmanager
     def _session(self, uuid: str) -> Iterator[Measured]:

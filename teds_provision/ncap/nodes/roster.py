@@ -34,6 +34,7 @@ class Seen:
     present: bool = False
     seen: float = 0.0
     tapped: float = 0.0
+    says: str | None = None  # its state by a plain Identify: a hint, for who is not known
     verdict: str | None = None
     checks: list[dict[str, str]] = field(default_factory=list)
     looked: float = 0.0
@@ -53,7 +54,7 @@ class Roster:
         self.topic: Callable[[str, int], str | None] = lambda _uuid, _number: None
         self.actuator: Callable[[str, int], dict[str, Any] | None] = lambda _uuid, _number: None
         self.virtual: Callable[[str], bool] = lambda _uuid: False
-        self._lock = threading.RLock()
+        self._lock, self._reading = threading.RLock(), threading.Lock()
         self._seen: dict[str, Seen] = {}
         self._rows: dict[str, dict[str, Any]] = {}
         self._channels: dict[str, tuple[str, list[dict[str, Any]]]] = {}
@@ -65,18 +66,16 @@ class Roster:
 
     def refresh(self, uuids: Iterable[str] | None = None) -> None:
         """Read the rows of these nodes anew, or of all that the store knows; datasheets when somebody asks for them."""
-        wanted = (
-            self._station.nodes.find(Search())
-            if uuids is None
-            else [bytes.fromhex(uuid) for uuid in dict.fromkeys(uuids)]
-        )
-        rows = {row["uuid"]: row for row in inventory(self._station, wanted)}
-        with self._lock:
-            self.changes += 1
-            if uuids is None:
-                self._rows = rows
-            else:
-                self._rows |= rows
+        with self._reading:  # what was read earlier never takes the place of what was read later
+            every = self._station.nodes.find(Search()) if uuids is None else map(bytes.fromhex, dict.fromkeys(uuids))
+            wanted = list(every)
+            rows = {row["uuid"]: row for row in inventory(self._station, wanted)}
+            with self._lock:
+                self.changes += 1
+                if uuids is None:
+                    self._rows = rows
+                else:
+                    self._rows |= rows
 
     def _sheet(self, uuid: str) -> list[dict[str, Any]]:
         """The channels of the datasheet that a node had last; decoded once for each datasheet."""
@@ -210,7 +209,7 @@ class Roster:
                 "present": seen.present,
                 "last_seen": _moment(seen.seen) or row.get("last_seen"),
                 "tapped": seen.tapped or None,
-                "state": row.get("state"),
+                "state": row.get("state") or seen.says,
                 "whitelisted": row.get("whitelisted", False),
                 "fingerprint": row.get("fingerprint"),
                 "epoch": row.get("epoch", 0),
@@ -229,7 +228,7 @@ class Roster:
                 "power": seen.power,
             }
         out["virtual"] = self.virtual(uuid)
-        out["mode"] = "measuring" if out["measurement"] else "idle" if out["present"] else None
+        out["mode"] = _mode(seen)
         out["channels"] = [{**one, **self._now(uuid, one["number"])} for one in channels]
         return out
 
@@ -248,6 +247,12 @@ class Roster:
         age = max(0.0, time.time() - last.time)
         value = last.value if last.value is None or math.isfinite(last.value) else None
         return {"value": value, "raw": last.raw, "valid": value is not None, "time": last.time, "age": round(age, 3)}
+
+
+def _mode(seen: Seen) -> str | None:
+    """``measuring``, ``idle``; None for a node that is not there."""
+    idle = "idle" if seen.present else None
+    return "measuring" if seen.measurement else idle
 
 
 def channel_facts(one: Channel) -> dict[str, Any]:

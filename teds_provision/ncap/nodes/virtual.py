@@ -246,18 +246,25 @@ class Virtuals:
                 )
             if self._stop.is_set() or one.uuid not in self._all:
                 _end(process)
-            assert process.stdout is not None
-            for line in process.stdout:
-                if b'"ready"' in line:
-                    self._say(one, "running")
-                    pause = _AGAIN
-            process.wait()
+            if self._until_its_end(one, process):
+                pause = _AGAIN
             if self._stop.is_set() or one.uuid not in self._all:
                 return
             last = log.read_text(errors="replace").strip().splitlines()
             self._say(one, "ended", last[-1] if last else "")
             self._stop.wait(pause)
             pause = min(2 * pause, _LONGEST)
+
+    def _until_its_end(self, one: Virtual, process: subprocess.Popen[bytes]) -> bool:
+        """Read its lines until it ends; whether it ever was ready."""
+        assert process.stdout is not None
+        ready = False
+        for line in process.stdout:
+            if b'"ready"' in line:
+                ready = True
+                self._say(one, "running")
+        process.wait()
+        return ready
 
     def _say(self, one: Virtual, state: str, why: str = "") -> None:
         one.state, one.why = state, why

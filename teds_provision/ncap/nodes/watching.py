@@ -249,7 +249,8 @@ class Watch:
     def _came(self, contact: Contact) -> None:
         uuid = contact.identity.uuid.hex()
         facts: dict[str, Any] = {
-            "place": self.place, "address": contact.address, "present": True, "seen": time.time()
+            "place": self.place, "address": contact.address, "present": True, "seen": time.time(),
+            "says": contact.identity.state.name.lower(),
         }  # fmt: skip
         if contact.link.capabilities.tapped:
             self._roster.note(uuid, "tapped", tapped=time.time(), **facts)

@@ -161,13 +161,17 @@ def document() -> dict[str, Any]:
     }
 
 
-def _operation(one: Operation) -> dict[str, Any]:
+def _parameters(one: Operation) -> list[dict[str, Any]]:
     names = [part[1:-1] for part in one.path.split("/") if part.startswith("{")]
-    parameters: list[dict[str, Any]] = [
+    path = [
         {"name": name, "in": "path", "required": True, "schema": INTEGER if name == "number" else text()}
         for name in names
     ]
-    parameters += [{"name": name, "in": "query", "schema": schema} for name, schema in one.query.items()]
+    return [*path, *({"name": name, "in": "query", "schema": schema} for name, schema in one.query.items())]
+
+
+def _operation(one: Operation) -> dict[str, Any]:
+    parameters = _parameters(one)
     content: dict[str, Any] = {"application/json": {"schema": one.answer}}
     if one.document:
         content |= {"application/xml": {"schema": text()}, "text/plain": {"schema": text()}}
