@@ -1,6 +1,6 @@
 // The provisioning tab: from a type to a signed datasheet, waiting for the tap and followed live.
 
-import { paths, post } from "../api.js";
+import { get, paths, post } from "../api.js";
 import { button, chip, field, fill, h, icon, keyed, say, text, trouble } from "../dom.js";
 import { clock, short } from "../format.js";
 import { measuring, now, on, state } from "../state.js";
@@ -46,6 +46,16 @@ export class ProvisionTab {
     );
     this.off = on("profiles nodes status connection measurements provision", () => this.paint());
     this.ticking = setInterval(() => this.tick(), 250);
+    this.paint();
+    this.recall();
+  }
+
+  /** What was asked for before this page was opened, here or in another browser. */
+  async recall() {
+    if (this.run) return;
+    const run = await get(paths.provision(this.uuid)).catch(() => null); // nobody asked: there is nothing to show
+    if (!run || this.run || !["waiting", "running"].includes(run.state)) return;
+    state.runs.set(this.uuid, run);
     this.paint();
   }
 
