@@ -267,7 +267,7 @@ class Measuring:
                 self._roster.note(uuid, measurement=one.kept.id)
             job = Job(self._station, one.kept, more=lambda: self._more(one.kept))
             one.job = job
-            self._say(one, "running")
+            self._say(one, "starting")
             job.start(self._buses, self._watcher(one))
             while job.alive and not one.stop.wait(0.5):
                 self._say(one, *_state_of(one, job))
@@ -351,7 +351,7 @@ def _state_of(one: Running, job: Job) -> tuple[str, str]:
         return "running", f"{len(lacking)} of {len(one.uuids)} nodes are missing" if lacking else ""
     if job.error is not None:
         return "waiting", job.error.message
-    return ("waiting", "no node has answered yet") if states else ("running", "")
+    return ("waiting", "no node has answered yet") if states else ("starting", "")
 
 
 def _sink_json(measurement: str, sink: Sink) -> dict[str, Any]:

@@ -71,6 +71,11 @@ def refusals(port: int) -> list[tuple[str, str, str, dict[str, str | None], Any,
         ("no such node", "GET", "/api/v1/nodes/ffffffffffffffffffff", {}, None, 404, "not-found"),
         ("no such resource", "GET", "/api/v1/secrets", {}, None, 404, "not-found"),
         ("not for this resource", "PUT", "/api/v1/nodes", JSON, "{}", 405, "usage"),
+        ("a file of this user as a source", "POST", "/api/v1/virtual", JSON,
+         '{"profile": "gripper", "source": "file:/etc/passwd"}', 422, "refused"),
+        ("a socket of this user as a source", "POST", "/api/v1/virtual", JSON,
+         '{"profile": "gripper", "source": "unix:/run/x"}', 422, "refused"),
+        ("the readers over the net", "GET", "/api/v1/lend", {}, None, 422, "refused"),
         ("a login link over the net", "POST", "/api/v1/login-link", JSON, "{}", 422, "refused"),
     ]  # fmt: skip
 

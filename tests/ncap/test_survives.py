@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
+import signal
 import socket
 import subprocess
 import time
@@ -15,6 +16,7 @@ from typing import Any
 
 import pytest
 
+from teds_provision.client import ApiError
 from teds_provision.store import Store
 from tests.e2e.desk import ANGLE, Desk, Node, clean_environment, limited
 from tests.ncap.service import Service, until, verified, virtual
@@ -231,6 +233,44 @@ def test_an_actuator_is_safe_when_the_daemon_ends_and_when_it_is_killed(desk: De
         service.end()
     entries = service.station.ask("log", "--act", "set")["entries"]
     assert (entries[-1]["outcome"], entries[-1]["detail"]["safe"]) == ("done", True)
+
+
+def test_an_actuator_that_another_command_holds_is_423(desk: Desk) -> None:
+    service = Service(desk, desk.station()).start()
+    uuid = virtual(service)
+    with service.client() as asked:
+        place = next(link["place"] for link in asked.status()["links"] if link["virtual"])
+        bus = place.removeprefix("can:").partition("&source=")[0]
+        held = service.station.start("--json", "set", uuid, 1, 0.05, "--via", "can", "--can", bus)
+        held.wait_for('"applied"')
+        with pytest.raises(ApiError) as refused:
+            asked.set(uuid, 1, 0.02)
+        assert (refused.value.status, refused.value.code) == (423, "node-refused")
+        held.signal(signal.SIGTERM)
+        assert held.end().code == 0
+        assert asked.set(uuid, 1, 0.02)["applied"]["value"] == pytest.approx(0.02, abs=1e-4)
+        assert asked.let_go(uuid, 1) is True
+    service.end()
+
+
+def test_factory_nodes_of_a_bus_are_taken_up_where_that_was_asked_for(desk: Desk) -> None:
+    node = desk.node("new", called="new").start(nfc=False, can=True)
+    service = Service(desk, desk.station()).start("--detection", "transparent", "--adopt")
+    with service.client() as asked:
+        until(lambda: any(one["whitelisted"] for one in asked.nodes()))
+        found = verified(service, node.uuid)
+        assert (found["epoch"], found["whitelisted"]) == (1, True)
+    assert service.station.keys(node.uuid) == [("active", 1)]
+    service.end()
+
+
+def test_with_record_every_measurement_has_a_file(lab: Lab) -> None:
+    folder = lab.desk.folder / "recorded"
+    lab.service.start("--record", folder)
+    lab.measure()
+    lab.service.end()
+    [file] = folder.glob("*.csv")
+    assert len(recorded(file)) > 5
 
 
 def test_systemd_hears_when_it_is_ready_that_it_lives_and_when_it_ends(desk: Desk) -> None:

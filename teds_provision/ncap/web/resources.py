@@ -310,6 +310,13 @@ class Resources:
         }
         body.take("format", str)
         body.done()
+        caller: Caller = request.scope[CALLER]
+        if caller.kind != "socket" and asked["source"].startswith(("file:", "unix:")):
+            # What is wrong with a file is told with a piece of it: no token reads this user's files.
+            raise PolicyRefused(
+                "A source that is a file or a socket is named on this machine alone.",
+                hint="Use noise, sine:S or ramp:S.",
+            )
         return JSONResponse(await asyncio.to_thread(lambda: self._daemon.make_virtual(**asked)), 201)
 
     async def one_virtual(self, request: Request) -> Response:

@@ -18,6 +18,10 @@ _ENDING: Final = 2
 """Seconds that open requests have at the end."""
 
 
+_MOST: Final = 500
+"""Connections at once; more get 503, so that who opens them without end takes no memory without end."""
+
+
 class _Server(uvicorn.Server):
     """A server whose signals are the daemon's business."""
 
@@ -67,6 +71,7 @@ class Servers:
             ws_max_size=4096,
             ws_per_message_deflate=False,
             timeout_keep_alive=30,
+            limit_concurrency=_MOST,
             timeout_graceful_shutdown=_ENDING,
             h11_max_incomplete_event_size=32_768,
             ssl_certfile=tls.certificate if tls else None,
