@@ -56,22 +56,28 @@ def bluetooth(place: Place) -> Iterator[Finding]:
     if place.system != Path("/") and "DBUS_SYSTEM_BUS_ADDRESS" not in place.environment:
         yield Finding(_NAME, "skipped", "Another machine's folders are looked at.")
         return
-    bad: Result = "failed" if place.ble is not None else "skipped"
+    asked = place.ble is not None
     try:
         spec = parse_spec(place.ble or "")
         found = adapters(place.environment.get("DBUS_SYSTEM_BUS_ADDRESS"))
     except (NoReader, UsageFailure) as failure:
-        yield Finding(_NAME, bad, failure.message, failure.hint if bad == "failed" else "")
+        yield _missing(failure.message, failure.hint, asked=asked)
         return
     if not found:
-        yield Finding(_NAME, bad, "bluetoothd has no adapter.", "Plug one in; bluetoothctl list" if place.ble else "")
+        yield _missing("bluetoothd has no adapter.", "Plug one in; bluetoothctl list", asked=asked)
         return
-    if spec.adapter is not None and spec.adapter not in {each.name for each in found}:
-        named = ", ".join(each.name for each in found)
-        yield Finding(_NAME, "failed", f"There is no Bluetooth adapter {spec.adapter}.", f"There is {named}.")
+    names = [each.name for each in found]
+    if spec.adapter is not None and spec.adapter not in names:
+        there = f"There is {', '.join(names)}."
+        yield Finding(_NAME, "failed", f"There is no Bluetooth adapter {spec.adapter}.", there)
         return
     for each in found:
-        yield _adapter(each, spec, asked=place.ble is not None)
+        yield _adapter(each, spec, asked=asked)
+
+
+def _missing(what: str, cure: str, *, asked: bool) -> Finding:
+    """No Bluetooth: a failure with its cure where it was asked for, else nothing that anybody misses."""
+    return Finding(_NAME, "failed", what, cure) if asked else Finding(_NAME, "skipped", what)
 
 
 def _adapter(facts: AdapterFacts, spec: BleSpec, *, asked: bool) -> Finding:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
@@ -69,7 +69,6 @@ def measure(
     files: Sequence[str],
     mqtt: str | None,
     require: Path | None,
-    scalar_rate: float,
     **wished: Any,
 ) -> None:
     """Measure a group or nodes: session, datasheet verified, claim, stream; ends by Ctrl-C or --duration.
@@ -80,16 +79,37 @@ def measure(
         _recover(app, what[1:])
         return
     links = over_the_bus(links)
+    _require_streams(links, trigger=wished["trigger"])
+    station = app.station()
+    group, uuids = _who(station, what)
+    ros = [name for name in ("ros1", "ros2") if wished[name]]
+    kept = _asked(group, uuids, [*files, *ros, *filter(None, [mqtt])], wished)
+    wish = measure_room.orders.Wish(
+        test_pattern=wished["test_pattern"],
+        timeout=links.timeout,
+        unsigned=wished["unsigned"],
+        require=_judging(require),
+    )
+    if group and duration is None and not (wish.test_pattern or wish.unsigned):
+        kept = _carried_on(app, station, kept)
+    job = measure_room.carrying.job.Job(station, kept, wish=wish)
+    for uuid in uuids:
+        station.unlock(uuid)
+    _tell_end(app, _run(app, job, links, uuids, duration), wish.require)
+
+
+def _require_streams(links: LinkSettings, *, trigger: bool) -> None:
     if not LINKS[links.via].capabilities.streams:
         raise UsageFailure(
             "Streams need a bus or the air.", hint="Name it with --can or --ble; over NFC: teds-provision sample UUID"
         )
-    if wished["trigger"] and links.via == "ble":
+    if trigger and links.via == "ble":
         raise UsageFailure("A trigger is a frame on a CAN bus.", hint="Over the air leave --trigger out.")
-    station = app.station()
-    group, uuids = _who(station, what)
-    sinks = (*files, *(name for name in ("ros1", "ros2") if wished[name]), *([mqtt] if mqtt else []))
-    kept = Measurement(
+
+
+def _asked(group: str, uuids: Sequence[bytes], sinks: Sequence[str], wished: Mapping[str, Any]) -> Measurement:
+    """What the command line asks for, as a group keeps it."""
+    return Measurement(
         "",
         group=group or None,
         uuids=() if group else tuple(uuids),
@@ -99,26 +119,16 @@ def measure(
         trigger=wished["trigger"],
         actuators=wished["actuators"] and (wished["ros1"] or wished["ros2"]),
         dead_man=wished["dead_man"],
-        scalar_rate=scalar_rate,
+        scalar_rate=wished["scalar_rate"],
         sinks=tuple(measure_room.carrying.job.whole_path(spec) for spec in sinks),
         lasting=False,
     )
-    wish = measure_room.orders.Wish(
-        test_pattern=wished["test_pattern"],
-        timeout=links.timeout,
-        unsigned=wished["unsigned"],
-        require=None if require is None else _judging(require),
-    )
-    if group and duration is None and not wish.test_pattern and not wish.unsigned:
-        kept = _carried_on(app, station, kept)
-    job = measure_room.carrying.job.Job(station, kept, wish=wish)
-    for uuid in uuids:
-        station.unlock(uuid)
-    _tell_end(app, _run(app, job, links, uuids, duration), wish.require)
 
 
-def _judging(file: Path) -> Judging:
-    """What the task needs of the datasheets."""
+def _judging(file: Path | None) -> Judging | None:
+    """What the task needs of the datasheets, where a file says so."""
+    if file is None:
+        return None
     text = read_file(file).decode(errors="replace")
     return measure_room.carrying.judging.Judging(teds.fits.parse_require(text, str(file)))
 
@@ -175,15 +185,20 @@ def _tell_end(app: App, ended: Ended, require: Judging | None) -> None:
         result["fits"] = require.fits
     if ended.apart:
         result["began_apart"] = ended.apart
-    lines = []
-    for node in ended.nodes:
-        for stream in node["streams"]:
-            lost = f", lost {stream['lost']}, late {stream['late']}, bad {stream['bad']}"
-            lines.append(f"{node['uuid']}: {stream['samples']} values in {stream['messages']} messages{lost}")
+    app.conclude(result, "\n".join(_end_lines(ended, require)) or "Nothing was measured.", ended.error)
+
+
+def _end_lines(ended: Ended, require: Judging | None) -> list[str]:
+    lines = [_stream_line(node["uuid"], stream) for node in ended.nodes for stream in node["streams"]]
     lines += [f"Written: {name}" for name in ended.files]
     if require is not None and ended.error is not None:
         lines += [str(fit["why"]) for fit in require.fits if fit["result"] != "passed"]
-    app.conclude(result, "\n".join(lines) or "Nothing was measured.", ended.error)
+    return lines
+
+
+def _stream_line(uuid: str, stream: Mapping[str, Any]) -> str:
+    lost = f"lost {stream['lost']}, late {stream['late']}, bad {stream['bad']}"
+    return f"{uuid}: {stream['samples']} values in {stream['messages']} messages, {lost}"
 
 
 def _recover(app: App, files: Sequence[str]) -> None:

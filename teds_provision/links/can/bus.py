@@ -92,7 +92,7 @@ class Bus:
             if message.arbitration_id & _BUS_OFF:
                 self._bus_off()
             return None
-        if message.is_remote_frame or not message.is_extended_id or (self._marks_own and not message.is_rx):
+        if message.is_remote_frame or not message.is_extended_id or self._is_own(message):
             return None
         frame = Frame(message.arbitration_id, bytes(message.data), message.is_fd, _arrival(message.timestamp))
         if self._echoes and self._echoes.take(frame):
@@ -100,6 +100,9 @@ class Bus:
         if self._trace is not None:
             self._trace.frame("can", "in", frame.data, identifier=frame.identifier, fd=frame.fd, at=frame.at)
         return frame
+
+    def _is_own(self, message: can.Message) -> bool:
+        return self._marks_own and not message.is_rx
 
     def _next(self, seconds: float) -> can.Message | None:
         import can
