@@ -112,7 +112,6 @@ class Hearing:
 
     def __init__(self, place: str) -> None:
         self._streams: dict[tuple[int, int], HeardStream] = {}
-        self._announced: dict[int, Callable[[], None]] = {}
         self._lock = threading.Lock()
         self._stop = threading.Event()
         self.lost_frames = 0
@@ -133,13 +132,6 @@ class Hearing:
         if heard is not None:
             heard.finish()
         return heard
-
-    def on_announce(self, node: int, tell: Callable[[], None] | None) -> None:
-        """Call ``tell`` when the node at this address announces itself: it has started anew."""
-        with self._lock:
-            self._announced = {key: value for key, value in self._announced.items() if key != node}
-            if tell is not None:
-                self._announced[node] = tell
 
     def close(self) -> None:
         """End the thread."""
@@ -178,10 +170,7 @@ class CanHearing(Hearing):
         super().__init__(port.place)
 
     def _wanted(self, frame: Frame) -> bool:
-        if frame.identifier & _MASK != _DATA:
-            return False
-        station = frame.identifier >> 13 & 7
-        return station in (0, self._own & 7)
+        return frame.identifier & _MASK == _DATA and frame.identifier >> 13 & 7 == self._own & 7
 
     def _hear(self) -> None:
         with self._port.bus().listen(self._wanted, most=MOST_HELD) as ear:
@@ -194,11 +183,6 @@ class CanHearing(Hearing):
 
     def _take(self, frame: Frame) -> None:
         address = data_address(frame.identifier)
-        if address is None:
-            tell = self._announced.get(frame.identifier & 0xFF)
-            if tell is not None:
-                tell()
-            return
-        heard = self._streams.get((address.node, address.stream))
-        if heard is not None:
+        heard = self._streams.get((address.node, address.stream)) if address is not None else None
+        if address is not None and heard is not None:
             heard.take(address.segment, frame)
