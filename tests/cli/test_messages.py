@@ -1,4 +1,9 @@
-"""Each message names what it is, not how it failed to parse (what was found at the bench, and the like of it)."""
+"""Each message names what it is, not how it failed to parse: the fifteen of issue 9 section 1 line 8, and their like.
+
+Here: files that are not there (3), files that are something else (5), a number that is none, a serial line without a
+reader, a kernel without CAN, a wrong board on the reader, a second init, a node without name. Elsewhere: matplotlib is
+missing (tests/teds/test_plot.py), no node of ours on a bus (tests/e2e/test_many.py).
+"""
 
 from __future__ import annotations
 
