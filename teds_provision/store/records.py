@@ -34,7 +34,7 @@ def iso(moment: datetime) -> str:
     return moment.astimezone(UTC).strftime("%Y-%m-%dT%H:%M:%SZ")
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, slots=True)
 class WhitelistEntry:
     """A node that may be provisioned: its UUID, and the key it is pinned to (None until the first proven contact)."""
 
@@ -46,7 +46,7 @@ class WhitelistEntry:
     mac: bytes | None = field(default=None, repr=False, compare=False)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, slots=True)
 class NodeRecord:
     """What is known of one node.
 
@@ -72,7 +72,7 @@ class NodeRecord:
     due: str | None = None
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, slots=True)
 class KeyRecord:
     """One link key of one node, wrapped by the vault; ``key_id`` is 16 hex digits (profile.md, "Key agreement").
 

@@ -130,7 +130,7 @@ def seal_signed(payload: Bundle, sender: PrivateKey, recipients: Sequence[bytes]
         _check_writable(node)
     for point in recipients:
         _station_signature(payload, point)
-    signed = jose.sign_compact(dump(_to_json(payload)), sender, typ=TYPE)
+    signed = jose.sign_compact(_payload(payload), sender, typ=TYPE)
     sealed = jose.encrypt(signed, recipients, cty=CONTENT_TYPE)
     if len(sealed) > MAX_BUNDLE_OCTETS:
         raise BadData(f"{len(payload.nodes)} nodes are too many for one bundle.", hint="Export them in groups.")
@@ -242,7 +242,8 @@ def _station_signature(bundle: Bundle, station: bytes) -> bytes | None:
     return signature
 
 
-def _to_json(bundle: Bundle) -> dict[str, object]:
+def _payload(bundle: Bundle) -> bytes:
+    """The JSON that is signed, node by node: ten thousand of them as objects would take many times its size."""
     members: dict[str, object] = {
         "format": FORMAT,
         "id": bundle.id,
@@ -256,9 +257,12 @@ def _to_json(bundle: Bundle) -> dict[str, object]:
             receiver: encode_base64url(signature) for receiver, signature in bundle.station_signatures.items()
         },
         "count": len(bundle.nodes),
-        "nodes": [_node_to_json(node) for node in bundle.nodes],
     }
-    return members | ({"revoked": list(bundle.revoked)} if bundle.revoked else {})
+    octets = bytearray(dump(members)[:-1] + b',"nodes":[')
+    for number, node in enumerate(bundle.nodes):
+        octets += b"," * (number > 0) + dump(_node_to_json(node))
+    octets += b"]" + (b',"revoked":' + dump(list(bundle.revoked)) if bundle.revoked else b"") + b"}"
+    return bytes(octets)
 
 
 def _node_to_json(node: BundledNode) -> dict[str, object]:

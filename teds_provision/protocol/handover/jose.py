@@ -14,6 +14,7 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from io import BytesIO
 from typing import Any
 
 from cryptography.exceptions import InvalidSignature, InvalidTag
@@ -32,6 +33,7 @@ from teds_provision.protocol.handover.strict_json import (
     dump,
     encode_base64url,
     load_object,
+    write_base64url,
 )
 from teds_provision.protocol.keys import SIGNATURE_OCTETS, PrivateKey, SoftwareKey, fingerprint, public_key
 
@@ -75,8 +77,11 @@ class JweHeader:
 def sign_compact(payload: bytes, key: PrivateKey, *, typ: str) -> bytes:
     """Return a compact JWS: ES256, ``kid`` the fingerprint of ``key``."""
     header = {"alg": SIGNATURE_ALGORITHM, "kid": fingerprint(key.point), "typ": typ}
-    signed = base64url(dump(header)) + b"." + base64url(payload)
-    return signed + b"." + base64url(key.sign(signed))
+    octets = BytesIO()
+    octets.write(base64url(dump(header)) + b".")
+    write_base64url(octets, memoryview(payload))
+    octets.write(b"." + base64url(key.sign(octets.getvalue())))
+    return octets.getvalue()
 
 
 def verify_compact(octets: bytes, find_key: FindKey, *, typ: str, max_octets: int) -> Verified:
@@ -130,17 +135,21 @@ def encrypt(payload: bytes, recipients: Sequence[bytes], *, cty: str) -> bytes:
     protected = encode_base64url(dump({"alg": KEY_ALGORITHM, "cty": cty, "enc": CONTENT_ALGORITHM}))
     content_key, iv = os.urandom(_KEY_OCTETS), os.urandom(_IV_OCTETS)
     entries = [_recipient_entry(point, content_key) for point in recipients]
-    sealed = AESGCM(content_key).encrypt(iv, payload, protected.encode())
+    sealed = memoryview(AESGCM(content_key).encrypt(iv, payload, protected.encode()))
     head = dump(
         {
             "protected": protected,
             "recipients": entries,
             "iv": encode_base64url(iv),
-            "tag": encode_base64url(sealed[-_TAG_OCTETS:]),
+            "tag": encode_base64url(bytes(sealed[-_TAG_OCTETS:])),
         }
     )
-    # Base64url needs no escape, and a JSON writer would copy the megabytes twice more.
-    return b"".join((head[:-1], b',"ciphertext":"', base64url(sealed[:-_TAG_OCTETS]), b'"}'))
+    # Base64url needs no escape; a JSON writer, and a coder of it all at once, would copy the megabytes many times.
+    octets = BytesIO()
+    octets.write(head[:-1] + b',"ciphertext":"')
+    write_base64url(octets, sealed[:-_TAG_OCTETS])
+    octets.write(b'"}')
+    return octets.getvalue()
 
 
 def _recipient_entry(point: bytes, content_key: bytes) -> dict[str, object]:

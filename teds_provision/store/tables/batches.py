@@ -11,6 +11,9 @@ from teds_provision.store.database import Database
 from teds_provision.store.records import Holder, KeyRecord, NodeRecord, Tombstone, WhitelistEntry
 
 _NODE_FIELDS = tuple(column.name for column in fields(NodeRecord))
+_FIELDS: dict[type[object], tuple[str, ...]] = {
+    kind: tuple(column.name for column in fields(kind)) for kind in (KeyRecord, WhitelistEntry, Holder, Tombstone)
+}
 _NODES = f"INSERT OR REPLACE INTO nodes({', '.join(_NODE_FIELDS)}) VALUES({', '.join('?' * len(_NODE_FIELDS))})"
 _KEYS = (
     "INSERT INTO keys(uuid, epoch, key_id, state, slot, wrapped, source, created) VALUES(?,?,?,?,?,?,?,?)"
@@ -59,10 +62,10 @@ class BulkTables:
         self._database.execute_many("DELETE FROM tombstones WHERE uuid = ?", ((uuid,) for uuid in uuids))
 
 
-def _row(record: Any) -> tuple[Any, ...]:
-    return tuple(vars(record).values())
+def _row(record: KeyRecord | WhitelistEntry | Holder | Tombstone) -> tuple[Any, ...]:
+    return tuple([getattr(record, name) for name in _FIELDS[type(record)]])
 
 
 def _node_row(record: NodeRecord) -> tuple[Any, ...]:
-    values = {**vars(record), "groups": json.dumps(list(record.groups))}
-    return tuple(values[name] for name in _NODE_FIELDS)
+    groups = json.dumps(list(record.groups))
+    return tuple(groups if name == "groups" else getattr(record, name) for name in _NODE_FIELDS)
