@@ -8,16 +8,20 @@ largest sizes, less the time of a command that does nothing (``--version``). Aim
 from __future__ import annotations
 
 import hashlib
+import json
 import math
 import os
+import shutil
 import statistics
 import subprocess
 import sys
 import tempfile
 import time
 from collections.abc import Iterator
+from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from teds_provision.protocol.keys import SoftwareKey, fingerprint
 from teds_provision.station.station import Station, initialise
@@ -27,6 +31,8 @@ from teds_provision.teds.profile import load_profile
 from teds_provision.vault import forget_vaults, node_key_context, passphrase
 
 PASSPHRASE = "correct horse battery"
+RECEIVER = "receiver"
+NODE_PORT = 28653
 SIZES = (10, 1000, 10_000, 100_000)
 _PAGE = 2000
 
@@ -39,6 +45,8 @@ class Row:
     words: tuple[str, ...]
     seconds: float | None = None
     megabytes: float | None = 100.0
+    once: bool = False
+    """Whether a second run would find it done."""
 
 
 @dataclass(frozen=True)
@@ -118,6 +126,54 @@ def commands(folder: Path, count: int) -> Iterator[Row]:
     yield Row("whitelist export", ("whitelist", "export", listed))
     yield Row("whitelist import", ("whitelist", "import", listed))
     yield Row("doctor", ("doctor",), 3.0, None)
+    bundle, sealed = str(folder / f"bundle{count}"), str(folder / f"backup{count}")
+    words = ("export-keys", "--to", RECEIVER, "--all", "--mode", "copy", "--output", bundle, "--yes")
+    yield Row("export-keys", words, None, None, once=True)
+    yield Row(
+        "import-keys", ("--home", str(folder / f"receiver{count}"), "import-keys", bundle, "--yes"), None, None, True
+    )
+    yield Row("backup", ("backup", sealed), None, None, once=True)
+    restored = ("--home", str(folder / f"restored{count}"), "restore", sealed, "--keystore", "file", "--yes")
+    yield Row("restore", restored, None, None, once=True)
+    nfc = f"udp:localhost:{NODE_PORT}"
+    yield Row("provision (NFC)", ("provision", "-p", "temperature-sensor", "--yes", "--nfc", nfc), None, None, True)
+
+
+def told(home: Path, *words: str) -> dict[str, Any]:
+    """Run a command with --json that is not timed; its one object."""
+    read, write = os.pipe()
+    os.write(write, PASSPHRASE.encode() + b"\n")
+    os.close(write)
+    command = [sys.executable, "-m", "teds_provision", "--home", str(home), "--passphrase-fd", str(read), "--json"]
+    done = subprocess.run([*command, *words], capture_output=True, text=True, check=True, pass_fds=(read,))
+    os.close(read)
+    return dict(json.loads(done.stdout))
+
+
+def acquaint(folder: Path, home: Path, count: int) -> None:
+    """A second station, and each with the other's key: who hands over and who takes in."""
+    receiver = folder / f"receiver{count}"
+    keys = {"sender": told(home, "init"), RECEIVER: told(receiver, "init", "--keystore", "file", "--name", RECEIVER)}
+    for at, name in ((receiver, "sender"), (home, RECEIVER)):
+        file = folder / f"{name}{count}.pem"
+        file.write_text(keys[name]["public_key"])
+        told(at, "trust", "add", name, str(file), "--yes")
+
+
+@contextmanager
+def node(folder: Path) -> Iterator[None]:
+    """A factory node on the simulated reader of ``provision``."""
+    told(folder, "node", "create", str(folder / "node"))
+    command = [sys.executable, "-m", "teds_provision", "node", "run", str(folder / "node")]
+    process = subprocess.Popen([*command, "--nfc", f"udp:localhost:{NODE_PORT}"], stdout=subprocess.PIPE)
+    try:
+        assert process.stdout is not None
+        process.stdout.readline()
+        yield
+    finally:
+        process.terminate()
+        process.wait(20)
+        shutil.rmtree(folder / "node")
 
 
 def run(home: Path, words: tuple[str, ...]) -> Taken:
@@ -129,8 +185,10 @@ def run(home: Path, words: tuple[str, ...]) -> Taken:
     begun = time.perf_counter()
     process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, pass_fds=(read,))
     os.close(read)
-    _, _, usage = os.wait4(process.pid, 0)
-    process.returncode = 0
+    _, status, usage = os.wait4(process.pid, 0)
+    process.returncode = os.waitstatus_to_exitcode(status)
+    if process.returncode:
+        print(f"exit {process.returncode}: {' '.join(words)}", file=sys.stderr)
     return Taken(time.perf_counter() - begun, usage.ru_maxrss / 1024)
 
 
@@ -144,9 +202,11 @@ def main(sizes: tuple[int, ...]) -> None:
             fill(home, size)
             octets = (home / "store.sqlite3").stat().st_size
             print(f"{size} nodes: {octets / size / 1000:.2f} kB a node", file=sys.stderr, flush=True)
+            acquaint(Path(name), home, size)
             for row in commands(Path(name), size):
                 rows[row.name] = row
-                runs = [run(home, row.words) for _ in range(1 if size >= 100_000 else 3)]
+                with node(Path(name)) if row.name.startswith("provision") else nullcontext():
+                    runs = [run(home, row.words) for _ in range(1 if row.once or size >= 100_000 else 3)]
                 median = statistics.median(one.seconds for one in runs)
                 taken.setdefault(row.name, {})[size] = Taken(median, max(one.megabytes for one in runs))
     print_table(sizes, rows, taken)
