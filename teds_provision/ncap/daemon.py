@@ -26,7 +26,7 @@ from teds_provision.ncap.nodes.sheets import Sheets
 from teds_provision.ncap.nodes.turns import Turns
 from teds_provision.ncap.nodes.virtual import Virtuals
 from teds_provision.ncap.nodes.watching import Watch
-from teds_provision.ncap.settings import Detection, Settings
+from teds_provision.ncap.settings import Detection, Settings, own_source, with_source
 from teds_provision.ncap.web.tokens import Tokens
 from teds_provision.station.station import Station
 from teds_provision.talk.conversation import Conversation
@@ -64,7 +64,8 @@ class Daemon:
         self._version = station.version()
         self._stop = threading.Event()
         self._guard = threading.Lock()
-        self.watches = [self._watch(place) for place in settings.places]
+        source = own_source(station.id)
+        self.watches = [self._watch(with_source(place, source)) for place in settings.places]
         self._observer = threading.Thread(target=self._observe, name="store", daemon=True)
 
     # -- its life ----------------------------------------------------------------------------------------------------
@@ -186,6 +187,7 @@ class Daemon:
             "state": state.state,
             "problem": state.problem,
             "waiting": state.waiting or None,
+            "notice": state.told or None,
             "since": state.since,
             "nodes": self.roster.present(watch.place),
             "strangers": self.roster.strangers(watch.place),

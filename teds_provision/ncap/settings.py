@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ipaddress
+import zlib
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Final, Literal
@@ -10,8 +11,8 @@ from typing import Final, Literal
 from teds_provision.errors import UsageFailure
 
 Detection = Literal["transparent", "whitelist"]
-SOURCE: Final = 0xF7
-"""The daemon's own address on a bus: the command line, which has 0xF1 unless told otherwise, works beside it."""
+_FIRST, _SOURCES = 0xF2, 6
+"""Addresses of daemons on a bus, 0xF2 to 0xF7: the command line, which has 0xF1 unless told otherwise, works beside."""
 _LOCAL_NAMES: Final = ("localhost",)
 
 
@@ -36,12 +37,17 @@ class Settings:
     clause_12: bool = False
 
 
-def with_own_source(place: str) -> str:
-    """A CAN place with the daemon's own source address, unless it names one."""
+def own_source(station_id: str) -> int:
+    """A daemon's address on a bus, by the identity of its store: two stations on one bus seldom have the same."""
+    return _FIRST + zlib.crc32(station_id.encode()) % _SOURCES
+
+
+def with_source(place: str, source: int) -> str:
+    """A CAN place with a source address, unless it names one."""
     link, _, where = place.partition(":")
     if link != "can" or "source=" in where.partition("?")[2]:
         return place
-    return f"{place}{'&' if '?' in where else '?'}source=0x{SOURCE:02X}"
+    return f"{place}{'&' if '?' in where else '?'}source=0x{source:02X}"
 
 
 def parse_http(text: str) -> tuple[str, int]:

@@ -9,7 +9,7 @@ import socket
 import subprocess
 import time
 from collections.abc import Iterator
-from contextlib import suppress
+from contextlib import closing, suppress
 from datetime import datetime
 from pathlib import Path
 from typing import Any
@@ -17,9 +17,11 @@ from typing import Any
 import pytest
 
 from teds_provision.client import ApiError
+from teds_provision.ncap.settings import own_source
 from teds_provision.store import Store
-from tests.e2e.desk import ANGLE, Desk, Node, clean_environment, limited
+from tests.e2e.desk import ANGLE, Desk, Node, Station, clean_environment, limited
 from tests.ncap.service import Service, until, verified, virtual
+from tests.workflow.bench import make_station
 
 pytestmark = pytest.mark.link
 CALIBRATION = "# date: 2026-10-01\nraw,value [degree]\n0,0\n65535,359.9\n"
@@ -271,6 +273,37 @@ def test_with_record_every_measurement_has_a_file(lab: Lab) -> None:
     lab.service.end()
     [file] = folder.glob("*.csv")
     assert len(recorded(file)) > 5
+
+
+def another_home(folder: Path, first: Path) -> Path:
+    """A station whose daemon has another address on a bus; one of six has the same."""
+    with Store.open(first) as store:
+        taken = own_source(store.id)
+    for number in range(20):
+        with closing(make_station(folder / str(number), "second")) as station:
+            if own_source(station.id) != taken:
+                return station.home
+    raise AssertionError("twenty stations of one address")
+
+
+def test_two_daemons_on_one_bus_measure_their_own_nodes(lab: Lab, prepared: Path, tmp_path: Path) -> None:
+    """Another station of another home: an address of its own, no session of the first is ended."""
+    lab.service.start()
+    lab.measure()
+    other = Desk(tmp_path, prepared)
+    other.links = lab.desk.links
+    try:
+        home = another_home(tmp_path, lab.service.station.home)
+        second = Service(other, Station(other, home)).start("--detection", "transparent")
+        with second.client() as asked, lab.service.client() as own:
+            until(lambda: [node["uuid"] for node in asked.nodes() if node["present"]] == [lab.node.uuid])
+            until(lambda: asked.node(lab.node.uuid)["verdict"] or asked.node(lab.node.uuid)["problem"])
+            assert lab.flows()["measuring"]["state"] == "running"
+            assert [one.status()["links"][0]["notice"] for one in (asked, own)] == [None, None]
+        second.end()
+    finally:
+        other.clear()
+    lab.service.end()
 
 
 def test_systemd_hears_when_it_is_ready_that_it_lives_and_when_it_ends(desk: Desk) -> None:

@@ -64,8 +64,7 @@ def run(
     One line is printed when it is ready, then a line for each event.
     """
     _require_extra()
-    places = [settings.with_own_source(f"can:{one}") for one in can]
-    places += [f"{link}:{one}" for link, named in (("nfc", nfc), ("ble", ble)) for one in named]
+    places = [f"{link}:{one}" for link, named in (("can", can), ("nfc", nfc), ("ble", ble)) for one in named]
     sinks = [name for name, asked in (("ros1", ros1), ("ros2", ros2), (mqtt or "", mqtt)) if asked]
     wanted = settings.Settings(
         places=tuple(dict.fromkeys(places)),

@@ -26,7 +26,7 @@ from typing import Any, Final
 from teds_provision.errors import NotFound, UsageFailure
 from teds_provision.files import write_whole
 from teds_provision.ncap.live import Live
-from teds_provision.ncap.settings import SOURCE
+from teds_provision.ncap.settings import own_source, with_source
 from teds_provision.node.described import create
 from teds_provision.protocol.announce import default_can_address
 from teds_provision.protocol.keys import fingerprint
@@ -90,7 +90,7 @@ class Virtuals:
     @property
     def place(self) -> str:
         """The bus as a link of the daemon."""
-        return f"can:{self.bus}&source=0x{SOURCE:02X}"
+        return with_source(f"can:{self.bus}", own_source(self._station.id))
 
     def all(self) -> list[dict[str, Any]]:
         """Every one."""

@@ -164,6 +164,8 @@ class Watch:
                     bus.lookout.discover()
             failure = bus.lookout.failure
             self._say("up" if failure is None else "down", failure)
+            if isinstance(port, CanPort) and failure is None:
+                port.tell_of_rivals(self._notice)
             every = max(poll, POLL_PER_NODE * len(self._known))
             bus.lookout.poll(every)
             self._see_who_left(GONE_POLLS * every + 1.0)
@@ -234,7 +236,7 @@ class Watch:
             self._say("up")
         elif notice.kind == "waiting":
             self.state.waiting = notice.text
-        elif notice.text != self.state.told:
+        elif notice.kind != "retry" and notice.text != self.state.told:
             self.state.told = notice.text
             self._live.event("link", place=self.place, state=notice.kind, text=notice.text)
 

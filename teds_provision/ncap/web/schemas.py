@@ -165,6 +165,7 @@ SCHEMAS: Final[dict[str, Schema]] = {
         state=text(enum=["opening", "up", "down", "lent"]),
         problem=or_null(ref("Problem")),
         waiting=maybe("string"),
+        notice=maybe("string", description="what came by last: another station under our address, an address twice"),
         since=TIME,
         nodes=INTEGER,
         strangers=INTEGER,
