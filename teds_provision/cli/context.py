@@ -192,24 +192,20 @@ class App:
             if self._passphrase is None:
                 self._passphrase = read_line(self._passphrase_fd)
             return self._passphrase
-        if self.no_input or not sys.stdin.isatty():
-            raise WrongPassphrase(
-                f"{prompt.rstrip(': ')} is needed and nobody can be asked.",
-                hint="Give it through a file descriptor: --passphrase-fd 3 3<FILE.",
-            )
-        self.live_line()
-        answer: str = click.prompt(harmless(prompt), hide_input=True, confirmation_prompt=confirm, err=True)
-        return answer
+        return self._typed(prompt, confirm=confirm, instead="--passphrase-fd 3 3<FILE")
 
     def ask_new(self, prompt: str) -> str:
         """Get a new passphrase where --passphrase-fd gives the old one: from the terminal, typed twice."""
+        return self._typed(prompt, confirm=True, instead="--new-passphrase-fd 4 4<FILE")
+
+    def _typed(self, prompt: str, *, confirm: bool, instead: str) -> str:
         if self.no_input or not sys.stdin.isatty():
             raise WrongPassphrase(
                 f"{prompt.rstrip(': ')} is needed and nobody can be asked.",
-                hint="Give it through a file descriptor: --new-passphrase-fd 4 4<FILE.",
+                hint=f"Give it through a file descriptor: {instead}.",
             )
         self.live_line()
-        answer: str = click.prompt(harmless(prompt), hide_input=True, confirmation_prompt=True, err=True)
+        answer: str = click.prompt(harmless(prompt), hide_input=True, confirmation_prompt=confirm, err=True)
         return answer
 
     # -- the station -----------------------------------------------------------------------------------------------

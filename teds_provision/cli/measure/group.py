@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING
 
 import click
 
 from teds_provision.cli.context import App, pass_app
 from teds_provision.cli.options import COMMAND_SETTINGS, command, dry_run_option, examples
+from teds_provision.station.groups import Groups
 
 if TYPE_CHECKING:
     from teds_provision.store.records import Group
@@ -63,13 +64,7 @@ def create(app: App, name: str, nodes: Sequence[str], *, dry_run: bool) -> None:
 @pass_app
 def add(app: App, name: str, nodes: Sequence[str], *, dry_run: bool) -> None:
     """Add nodes to a group."""
-    station = app.station()
-    uuids = [station.nodes.resolve(text) for text in nodes]
-    if dry_run:
-        _tell(app, [station.groups.get(name)])
-        return
-    with station.lock("group add", app.note):
-        _tell(app, [station.groups.add(name, uuids)])
+    _change(app, name, nodes, "add", Groups.add, dry_run=dry_run)
 
 
 @command("teds-provision group remove hand 77f0", name="remove")
@@ -79,13 +74,25 @@ def add(app: App, name: str, nodes: Sequence[str], *, dry_run: bool) -> None:
 @pass_app
 def remove(app: App, name: str, nodes: Sequence[str], *, dry_run: bool) -> None:
     """Take nodes out of a group."""
+    _change(app, name, nodes, "remove", Groups.remove, dry_run=dry_run)
+
+
+def _change(
+    app: App,
+    name: str,
+    nodes: Sequence[str],
+    act: str,
+    change: Callable[[Groups, str, Sequence[bytes]], Group],
+    *,
+    dry_run: bool,
+) -> None:
     station = app.station()
     uuids = [station.nodes.resolve(text) for text in nodes]
     if dry_run:
         _tell(app, [station.groups.get(name)])
         return
-    with station.lock("group remove", app.note):
-        _tell(app, [station.groups.remove(name, uuids)])
+    with station.lock(f"group {act}", app.note):
+        _tell(app, [change(station.groups, name, uuids)])
 
 
 @command("teds-provision group delete hand", name="delete")
