@@ -80,6 +80,10 @@ def refused(reason: int | None, doing: str, *, sealed: bool = False) -> NodeRefu
     )
 
 
+# What a node says to an Open of which an octet was changed on the way; said twice it is what the node means.
+_DISTURBED = (Reason.UNKNOWN_KEY, Reason.BAD_FORM, Reason.BAD_POINT)
+
+
 class SessionLost(Exception):
     """The session is gone at the node; ``cause`` is what to tell when opening a new one does not help."""
 
@@ -141,7 +145,8 @@ class Conversation:
     def open(self, key: bytes) -> None:
         """Open a session under a link key; raises NodeRefused (16: unknown key) or NotAuthentic (wrong node tag)."""
         session, reply = self._open(key)
-        if reply.reason == Reason.BAD_TAG:  # another station's Open was faster: its counter is used up
+        # another station's Open was faster, its counter is used up; or, on a bus, a frame was disturbed
+        if reply.reason == Reason.BAD_TAG or (self._is_noisy and reply.reason in _DISTURBED):
             session, reply = self._open(key)
         if not reply.ok:
             raise refused(reply.reason, _OPENING)
@@ -217,9 +222,14 @@ class Conversation:
     def ask(self, command: Command, doing: str) -> bytes:
         """Send a command that may be repeated without harm, over a new session where the old one was lost."""
         reopenings = repeats = torn = 0
+        heard: set[int | None] = set()
         while True:
             try:
                 return self.send(command, doing)
+            except NodeRefused as refusal:
+                if self.sealed or not self._is_noisy or refusal.reason in heard:
+                    raise
+                heard.add(refusal.reason)  # once may be a disturbed frame, twice it is what the node says
             except SessionLost as lost:
                 reopenings += 1
                 if reopenings > _REOPENINGS:
@@ -231,12 +241,17 @@ class Conversation:
                 if repeats > _REPEATS or torn > _TORN_REPEATS or not self.lives():
                     raise
 
+    @property
+    def _is_noisy(self) -> bool:
+        """Whether commands and replies go through nothing but the checksums of single frames: a bus."""
+        return self.contact.link.capabilities.many
+
     def lives(self) -> bool:
         """Whether a node that a message did not reach still answers: on a bus single frames are lost, nodes are not.
 
         Never True at a reader: what is not answered there has left the field.
         """
-        if not self.contact.link.capabilities.many:
+        if not self._is_noisy:
             return False
         try:
             self._exchange(security_command(Function.IDENTIFY))

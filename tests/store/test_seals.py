@@ -140,6 +140,14 @@ def test_a_planted_end_of_trust_and_a_planted_lifting_do_not_count(home: Path, o
     assert len(list(station.seals.all_broken())) == 2
 
 
+def test_a_lifting_needs_the_vault(opened: Open) -> None:
+    station = opened(ask=nobody)
+    station.policy.deny(Revocation(NODE, None, "lost", "a ban", "2026-11-21T00:00:00Z"))
+    with pytest.raises(WrongPassphrase):
+        station.policy.lift(NODE)
+    assert station.policy.revocation(NODE) is not None
+
+
 def test_an_end_of_trust_and_a_lifting_that_a_person_made_hold(opened: Open) -> None:
     station = opened()
     station.unlock()

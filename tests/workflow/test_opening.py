@@ -7,8 +7,9 @@ import pytest
 from teds_provision.errors import NodeRefused
 from teds_provision.protocol.agreement import Credentials, StationAgreement
 from teds_provision.protocol.keys import SoftwareKey, station_key_message
-from teds_provision.protocol.messages.frames import Function, Reason, decode_reply, security_command
+from teds_provision.protocol.messages.frames import Function, Reason, decode_reply, read_teds, security_command
 from teds_provision.protocol.session import StationSession
+from teds_provision.teds.image import SECURITY
 
 from .bench import Board, MemoryLink, talk
 
@@ -69,4 +70,37 @@ def test_an_unknown_key_is_not_tried_twice(board: Board) -> None:
         with pytest.raises(NodeRefused) as caught:
             node.open(bytes(16))
         assert caught.value.reason == Reason.UNKNOWN_KEY
+    assert link.count == 2
+
+
+class Disturbed(MemoryLink):
+    """A bus on which an octet of some requests is changed on the way: ``at`` are their numbers, ``octet`` which one."""
+
+    def __init__(self, board: Board, at: set[int], octet: int) -> None:
+        super().__init__(board, via="can", tapped=False)
+        self._at, self._octet = at, octet
+
+    def exchange(self, frame: bytes) -> bytes:
+        changed = bytearray(frame)
+        if self.count + 1 in self._at:
+            changed[self._octet] ^= 0x40
+        return super().exchange(bytes(changed))
+
+
+@pytest.mark.parametrize(("octet", "what"), [(6, "keyId"), (20, "Es"), (5, "the length")])
+def test_an_open_that_was_disturbed_on_a_bus_is_tried_once_more(board: Board, octet: int, what: str) -> None:
+    key = keyed(board)
+    with talk(board, Disturbed(board, {2}, octet)) as node:
+        node.open(key)
+        assert node.sealed, what
+
+
+def test_a_refusal_of_a_plain_question_on_a_bus_counts_when_it_comes_twice(board: Board) -> None:
+    """A disturbed octet made of "read TEDS 128" another one, which the node does not have: no word of the node's."""
+    question = read_teds(*SECURITY, 0)
+    with talk(board, Disturbed(board, {1}, 6)) as node:
+        assert node.ask(question, "to read") == node.ask(question, "to read")
+    link = Disturbed(board, {1, 2}, 6)
+    with talk(board, link) as node, pytest.raises(NodeRefused):
+        node.ask(question, "to read")
     assert link.count == 2

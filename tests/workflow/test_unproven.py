@@ -153,13 +153,14 @@ def test_in_its_session_a_node_is_held_against_what_this_station_saw(station: St
     """A flash put back from a copy, sequence and epoch with it: the node agrees with its own old datasheet."""
     run(station, board)
     copy = board.state
-    run(station, board, order=replace(ANGLE, name="renamed"))
+    newer = run(station, board, order=replace(ANGLE, name="renamed")).image
     board.flash.state = copy
     board.power_on()
     with talk(board) as node:
         verified = look_at_node(station, node, identify(station, node)).verified
     assert verified.verdict == "not authentic"
     assert [check.name for check in verified.checks if check.result == "failed"] == ["sequence"]
+    assert station.nodes.datasheet(board.uuid) == newer, "what it had stays known"
 
 
 def test_one_uuid_at_two_addresses_is_a_conflict_that_names_both(board: Board) -> None:
@@ -261,3 +262,20 @@ def test_a_refusal_in_a_session_is_the_nodes_own_word(station: Station, board: B
         require_session(station, node)
         with pytest.raises(NodeRefused, match="The node refused to do the unknown"):
             node.send(security_command(99), "to do the unknown")
+
+
+@pytest.mark.parametrize("answer", [bytes(64), b"", b"the wrong signature".ljust(64)])
+def test_who_does_not_prove_the_key_that_he_shows_is_not_identified(
+    station: Station, board: Board, answer: bytes
+) -> None:
+    """The TEDS of a node on another chip: the public key is there, and nothing signs a fresh challenge."""
+
+    def forged(_count: int, reply: bytes) -> bytes:
+        return Reply(True, answer).encode() if len(reply) == 3 + 64 else reply
+
+    with (
+        talk(board, MemoryLink(board, tamper=forged)) as node,
+        pytest.raises(NotAuthentic, match="does not hold the key"),
+    ):
+        identify(station, node)
+    assert station.nodes.get(board.uuid) is None
