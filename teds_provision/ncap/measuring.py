@@ -19,6 +19,7 @@ from teds_provision.errors import NodeBusy, NotFound, TedsProvisionError, UsageF
 from teds_provision.measure.blocks import ChannelFacts, NodeReport
 from teds_provision.measure.carrying.job import Job
 from teds_provision.measure.finding.buses import Buses
+from teds_provision.measure.planning import period_of, sensors_of
 from teds_provision.measure.runner import Watcher
 from teds_provision.measure.sinks import FILES, Sink, open_sink
 from teds_provision.measure.trusting import Trusted
@@ -26,9 +27,11 @@ from teds_provision.ncap.live import Live
 from teds_provision.ncap.nodes.looking import as_problem
 from teds_provision.ncap.nodes.roster import Roster
 from teds_provision.ncap.nodes.turns import Turns
+from teds_provision.protocol.operation.stream_commands import Kind
 from teds_provision.station.station import Station
 from teds_provision.store import Measurement
 from teds_provision.teds.image import Image
+from teds_provision.teds.sheet import Sheet
 
 RECORDINGS: Final = "recordings"
 BUDGET: Final = 5000
@@ -125,12 +128,22 @@ class Measuring:
             other = self.of(uuid.hex())
             if other is not None:
                 raise NodeBusy(f"Node {uuid.hex()} is measured already ({other}).", hint="End that measurement first.")
+            self._require_plan(uuid, kept)
         for spec in kept.sinks:
             open_sink(spec)
         with self._station.durable("measure"):
             kept = self._station.measurements.keep(kept)
             self._station.audit("measure", None, "begun", id=kept.id, group=group, nodes=[one.hex() for one in nodes])
         return self._json(self._begin(kept))
+
+    def _require_plan(self, uuid: bytes, kept: Measurement) -> None:
+        """Raise BadData or PolicyRefused where the datasheet that is known says that it can never be measured so."""
+        image = self._station.nodes.datasheet(uuid)
+        if image is None:
+            return
+        kind = None if kept.kind is None else Kind[kept.kind.upper()]
+        for channel in sensors_of(Sheet.of(image).channels, kept.channels, kind):
+            period_of(channel, kept.rate)
 
     def delete(self, measurement_id: str) -> None:
         """End it, and forget it; raises NotFound."""

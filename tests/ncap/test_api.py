@@ -121,8 +121,9 @@ def test_a_measurement_gives_values_freezes_its_nodes_and_ends(service: Service,
         refused(asked, 409, "frozen", method, path, body)
     assert "measured already" in refused(asked, 423, "node-busy", "POST", "/measurements", {"uuids": [hand]})
     assert asked.request("GET", f"/nodes/{hand}/teds")["verdict"] == "authentic", "reading goes on meanwhile"
+    until(lambda: asked.request("GET", "/measurements")["measurements"][0]["state"] == "running")
     [one] = asked.request("GET", "/measurements")["measurements"]
-    assert (one["state"], one["rate"], one["nodes"][0]["state"]) == ("running", 50, "running")
+    assert (one["rate"], one["nodes"][0]["state"]) == (50, "running")
     until(lambda: asked.request("GET", "/measurements")["measurements"][0]["nodes"][0]["samples"] > 0)
     asked.request("DELETE", f"/measurements/{made['id']}")
     assert asked.request("GET", "/measurements")["measurements"] == []
@@ -149,6 +150,9 @@ def test_a_measurement_that_cannot_be_is_refused(asked: Client, hand: str) -> No
     ):
         refused(asked, 422, "usage", "POST", "/measurements", body)
     refused(asked, 404, "not-found", "POST", "/measurements", {"group": "nobody"})
+    fast = refused(asked, 422, "refused", "POST", "/measurements", {"uuids": [hand], "rate": 5000})
+    assert "at most 100 samples" in fast, "what the datasheet rules out is not kept and tried for ever"
+    refused(asked, 422, "bad-data", "POST", "/measurements", {"uuids": [hand], "channels": [1]})
     assert asked.request("GET", "/measurements")["measurements"] == []
 
 
