@@ -60,24 +60,21 @@ def bluetooth(place: Place) -> Iterator[Finding]:
     try:
         spec = parse_spec(place.ble or "")
         found = adapters(place.environment.get("DBUS_SYSTEM_BUS_ADDRESS"))
+        _require(found, spec)
     except (NoReader, UsageFailure) as failure:
-        yield _missing(failure.message, failure.hint, asked=asked)
-        return
-    if not found:
-        yield _missing("bluetoothd has no adapter.", "Plug one in; bluetoothctl list", asked=asked)
-        return
-    names = [each.name for each in found]
-    if spec.adapter is not None and spec.adapter not in names:
-        there = f"There is {', '.join(names)}."
-        yield Finding(_NAME, "failed", f"There is no Bluetooth adapter {spec.adapter}.", there)
+        yield Finding(_NAME, "failed" if asked else "skipped", failure.message, failure.hint if asked else "")
         return
     for each in found:
         yield _adapter(each, spec, asked=asked)
 
 
-def _missing(what: str, cure: str, *, asked: bool) -> Finding:
-    """No Bluetooth: a failure with its cure where it was asked for, else nothing that anybody misses."""
-    return Finding(_NAME, "failed", what, cure) if asked else Finding(_NAME, "skipped", what)
+def _require(found: list[AdapterFacts], spec: BleSpec) -> None:
+    """Raise NoReader where there is no adapter, or not the one that was named."""
+    if not found:
+        raise NoReader("bluetoothd has no adapter.", hint="Plug one in; bluetoothctl list")
+    if spec.adapter is not None and spec.adapter not in {each.name for each in found}:
+        named = ", ".join(each.name for each in found)
+        raise NoReader(f"There is no Bluetooth adapter {spec.adapter}.", hint=f"There is {named}.")
 
 
 def _adapter(facts: AdapterFacts, spec: BleSpec, *, asked: bool) -> Finding:

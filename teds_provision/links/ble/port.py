@@ -130,21 +130,11 @@ class BlePort:
         """
         where = f"at {self.spec.address} " if self.spec.address else ""
         notice(Notice("waiting", f"Looking for the node {where}over BLE ({self.spec.text}).", seconds))
-        until = time.monotonic() + seconds
         told: set[bytes] = set()
-        asked: dict[str, float] = {}
-        for known in self._guesses(wanted):
-            if self._is_up(known) or self._advertises(known):
-                contact = self._ask(known, wanted, notice, told)
-                asked[known] = time.monotonic()
-                if contact is not None:
-                    return contact
-        while (left := until - time.monotonic()) > 0:
-            for address_seen in self._advertising(min(left, _ROUND_SECONDS), asked):
-                asked[address_seen] = time.monotonic()
-                contact = self._ask(address_seen, wanted, notice, told)
-                if contact is not None:
-                    return contact
+        for each in self._candidates(wanted, time.monotonic() + seconds):
+            contact = self._ask(each, wanted, notice, told)
+            if contact is not None:
+                return contact
         others = f"; others did: {', '.join(sorted(uuid.hex() for uuid in told))}" if told else ""
         raise NoNode(
             f"No such node was met over BLE {where}within {seconds:g} s{others}.",
@@ -201,6 +191,18 @@ class BlePort:
                     return
 
     # -- the inside ------------------------------------------------------------------------------------------------
+
+    def _candidates(self, wanted: Callable[[Identity], bool], until: float) -> Iterator[str]:
+        """Addresses to ask, until then: where it was met before, then whoever advertises, each now and then."""
+        asked: dict[str, float] = {}
+        for known in self._guesses(wanted):
+            if self._is_up(known) or self._advertises(known):
+                yield known
+                asked[known] = time.monotonic()
+        while (left := until - time.monotonic()) > 0:
+            for address in self._advertising(min(left, _ROUND_SECONDS), asked):
+                asked[address] = time.monotonic()
+                yield address
 
     def _guesses(self, wanted: Callable[[Identity], bool]) -> list[str]:
         """Addresses at which a wanted node was met before, to be tried before anyone else is listened for.
