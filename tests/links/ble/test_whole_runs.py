@@ -206,3 +206,17 @@ def test_two_nodes_are_measured_over_the_air(desk: Desk, air: Air) -> None:
 def test_no_trigger_goes_over_the_air(desk: Desk, bench: Station) -> None:
     refused = bench.refuses("measure", "00" * 10, "--ble", "auto", "--trigger", code=2)
     assert "CAN bus" in refused["message"]
+
+
+def test_node_check_and_mode_work_over_the_air(desk: Desk, air: Air) -> None:
+    home = desk.folder / "home"
+    station = make_station(home)
+    tapped_once(station, desk.folder / "left")
+    station.close()
+    air([desk.folder / "left"])
+    bench = Station(desk, home)
+    done = bench.ask("node", "check", "--via", "ble")
+    assert done["failed"] == 0, [check for check in done["checks"] if check["result"] == "failed"]
+    passed = {check["rule"] for check in done["checks"] if check["result"] == "passed"}
+    assert {"repetition", "sealed-counter", "open-once"} <= passed
+    assert bench.ask("mode", done["uuid"], "--ble", "auto")["uuid"] == done["uuid"]
