@@ -270,7 +270,7 @@ def _agree_anew(
     agreement = StationAgreement(
         replace(station.credentials(), ca=ca, station_signature=station.identity.signature_under(ca)), uuid
     )
-    reply = node.send(agreement.request(), "the key agreement")
+    reply = node.sure(agreement.request(), "the key agreement")  # it lies in RAM only, and goes at the next one
     epoch = station.pins.epoch_to_exceed(uuid, entry.fingerprint)
     agreed = agreement.accept(reply, pinned=entry.fingerprint, epoch=epoch)
     key_id = agreed.key_id.hex()

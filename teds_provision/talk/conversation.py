@@ -219,17 +219,24 @@ class Conversation:
             raise refused(inner.reason, doing, sealed=True)
         return inner.payload
 
+    def sure(self, command: Command, doing: str) -> bytes:
+        """Send; a refusal on a bus outside a session is asked for once more: a disturbed frame may have made it.
+
+        For commands that may run twice. Raises what :meth:`send` raises.
+        """
+        try:
+            return self.send(command, doing)
+        except NodeRefused:
+            if self.sealed or not self._is_noisy:
+                raise
+        return self.send(command, doing)
+
     def ask(self, command: Command, doing: str) -> bytes:
         """Send a command that may be repeated without harm, over a new session where the old one was lost."""
         reopenings = repeats = torn = 0
-        heard: set[int | None] = set()
         while True:
             try:
-                return self.send(command, doing)
-            except NodeRefused as refusal:
-                if self.sealed or not self._is_noisy or refusal.reason in heard:
-                    raise
-                heard.add(refusal.reason)  # once may be a disturbed frame, twice it is what the node says
+                return self.sure(command, doing)
             except SessionLost as lost:
                 reopenings += 1
                 if reopenings > _REOPENINGS:

@@ -104,3 +104,15 @@ def test_a_refusal_of_a_plain_question_on_a_bus_counts_when_it_comes_twice(board
     with talk(board, link) as node, pytest.raises(NodeRefused):
         node.ask(question, "to read")
     assert link.count == 2
+
+
+def test_a_request_that_was_disturbed_on_a_bus_is_sent_once_more(board: Board) -> None:
+    link = Disturbed(board, {1}, 80)  # an octet of field 104
+    link.tapped = True  # a node that was built without NFC, in factory state
+    agreement = StationAgreement(
+        Credentials(STATION, CA.sign(station_key_message(STATION.point)), CA.point), board.uuid
+    )
+    with talk(board, link) as node:
+        reply = node.sure(agreement.request(), "the key agreement")
+    assert agreement.accept(reply, pinned=None, epoch=0).epoch == 1
+    assert link.count == 2
