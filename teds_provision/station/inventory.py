@@ -62,6 +62,7 @@ def _described(known: Known) -> dict[str, Any]:
         "verdict": node.get("verdict"),
         "last_seen": node.get("last_seen"),
         "due": node.get("due"),
+        "charging": json.loads(node["charging"]) if node.get("charging") else None,
         "channels": node.get("channels", 0),
         "can_address": node.get("can_address", 0),
         "group": groups[0] if groups else None,

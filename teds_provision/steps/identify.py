@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 from collections.abc import Callable
 from contextlib import suppress
@@ -70,7 +71,7 @@ def identify(
     expect(who)
     entry = who.whitelisted
     counts = node.tapped or (entry is not None and entry.fingerprint is not None)
-    facts = _facts(station, who, counts=counts)
+    facts = _facts(station, who, counts=counts) | _charge(node)
     pinned = _pinned_now(station, who) if counts else None
     with station.durable("identify"):
         if facts:
@@ -92,6 +93,12 @@ def _facts(station: Station, who: Identified, *, counts: bool) -> dict[str, obje
     if counts or (known is not None and known.point == who.point):
         facts["last_seen"] = utc_now()  # its own key signed a moment ago; any other key may be anybody's
     return facts
+
+
+def _charge(node: Conversation) -> dict[str, object]:
+    """What the node's initial message says of its charge, with the time; a hint that is only shown."""
+    charging = node.contact.charging
+    return {} if charging is None else {"charging": json.dumps({**charging.to_json(), "at": utc_now()})}
 
 
 def _pinned_now(station: Station, who: Identified) -> WhitelistEntry | None:

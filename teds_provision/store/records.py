@@ -52,7 +52,8 @@ class NodeRecord:
 
     ``state`` is that of Identify (0 factory, 1 keyed, 2 provisioned); ``can_address`` 1 to 239, 0 for none;
     ``teds_sha256`` is the digest (hex) of the Security TEDS last committed; ``channels`` counts TransducerChannels;
-    ``due`` is the day (ISO 8601) on which the first calibration of its datasheet ends.
+    ``due`` is the day (ISO 8601) on which the first calibration of its datasheet ends; ``charging`` what it last said
+    of its charge, JSON with the time ``at``, which nobody authenticated.
     """
 
     uuid: bytes
@@ -70,6 +71,7 @@ class NodeRecord:
     channels: int = 0
     point_mac: bytes | None = field(default=None, repr=False, compare=False)
     due: str | None = None
+    charging: str | None = None
 
 
 @dataclass(frozen=True, slots=True)

@@ -9,7 +9,7 @@ from __future__ import annotations
 from typing import Final
 
 APPLICATION_ID: Final = 0x54454453  # "TEDS"
-SCHEMA_VERSION: Final = 4
+SCHEMA_VERSION: Final = 5
 
 _VERSION_1: Final = (
     "CREATE TABLE meta(name TEXT PRIMARY KEY, value TEXT NOT NULL) STRICT, WITHOUT ROWID",
@@ -157,5 +157,14 @@ _VERSION_4: Final = (
     "ALTER TABLE ended_cas ADD COLUMN mac BLOB CHECK(length(mac) = 16)",
 )
 
+# What came with version 5: what a node last said of its charge (JSON with its time), a hint that nobody authenticated.
+_VERSION_5: Final = ("ALTER TABLE nodes ADD COLUMN charging TEXT",)
+
 # STEPS_TO[n] are the statements that bring a store of version n - 1 to version n.
-STEPS_TO: Final[dict[int, tuple[str, ...]]] = {1: _VERSION_1, 2: _VERSION_2, 3: _VERSION_3, 4: _VERSION_4}
+STEPS_TO: Final[dict[int, tuple[str, ...]]] = {
+    1: _VERSION_1,
+    2: _VERSION_2,
+    3: _VERSION_3,
+    4: _VERSION_4,
+    5: _VERSION_5,
+}

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import math
 import signal
 import threading
@@ -28,6 +29,7 @@ if TYPE_CHECKING:
     from teds_provision.measure.trusting import Trusted
     from teds_provision.protocol.operation.commands import Operation, Power
     from teds_provision.station.station import Station
+    from teds_provision.talk.conversation import Conversation
 
 
 def over_the_bus(links: LinkSettings) -> LinkSettings:
@@ -103,6 +105,7 @@ def mode(app: App, node: str, links: LinkSettings) -> None:
             for number, (state, claimant) in sorted(found.channels.items())
         ],
         "power": _power(power),
+        "charging": _charging(station, trusted.node),
     }
     app.emit(result, lambda console: _mode(console, found, names, power))
 
@@ -110,6 +113,14 @@ def mode(app: App, node: str, links: LinkSettings) -> None:
 def words(state: int) -> list[str]:
     """State bits of a channel as words."""
     return [bit.name.lower().replace("_", " ") for bit in operation.commands.ChannelState if state & bit and bit.name]
+
+
+def _charging(station: Station, node: Conversation) -> dict[str, Any] | None:
+    """What it says of its charge where it was tapped, else what it last said, with the time; a hint."""
+    if node.contact.charging is not None:
+        return dict(node.contact.charging.to_json())
+    known = station.nodes.get(node.uuid)
+    return dict(json.loads(known.charging)) if known is not None and known.charging else None
 
 
 def _power(power: Power | None) -> dict[str, Any] | None:

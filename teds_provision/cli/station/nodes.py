@@ -159,6 +159,11 @@ def _remarks(node: dict[str, Any]) -> str:
     return "; ".join(remarks)
 
 
+def _charge(charging: dict[str, Any] | None) -> str:
+    """What the node last said of it; nobody vouches for that."""
+    return f"{shown(charging['text'])} (at {local_time(charging['at'])}, as it says)" if charging else ""
+
+
 def _link_keys(node: dict[str, Any]) -> list[str]:
     keys = [
         f"{key['key_id']} {key['state']}, epoch {key['epoch']}, {local_time(key['created'])}" for key in node["keys"]
@@ -178,6 +183,7 @@ _LINES: tuple[tuple[str, Callable[[dict[str, Any]], str | list[str]]], ...] = (
     ("verdict", lambda node: node["verdict"] or "never verified"),
     ("last seen", lambda node: local_time(node["last_seen"]) if node["last_seen"] else "never"),
     ("calibration", lambda node: f"due {node['due']}" if node["due"] else ""),
+    ("charging", lambda node: _charge(node["charging"])),
     ("channels", lambda node: str(node["channels"])),
     ("CAN address", lambda node: f"0x{node['can_address']:02x}" if node["can_address"] else "none"),
     ("groups", lambda node: ", ".join(node["groups"])),

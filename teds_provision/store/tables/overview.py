@@ -152,7 +152,7 @@ class OverviewTables:
 
 _NODE = (
     "point", "name", "profile", "state", "epoch", "sequence", "can_address", "groups", "teds_sha256", "verdict",
-    "last_seen", "channels", "due",
+    "last_seen", "channels", "due", "charging",
 )  # fmt: skip
 
 
