@@ -62,12 +62,12 @@ def test_the_store_is_free_while_a_person_is_asked(tmp_path: Path, monkeypatch: 
     home = tmp_path / "home"
     station, board, asked = make_station(home), Board(), []
 
-    def confirm(question: str, **_: object) -> bool:
+    def prompt(question: str, **_: object) -> str:
         with StoreLock(home, command="another", wait=0.0):
             asked.append(question)
-        return True
+        return "y"
 
-    monkeypatch.setattr(click, "confirm", confirm)
+    monkeypatch.setattr(click, "prompt", prompt)
     monkeypatch.setattr(App, "interactive", True)
     questions = _questions(App(home=home, quiet=True), False)
     with talk(board) as node:
