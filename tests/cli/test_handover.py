@@ -16,7 +16,7 @@ from cryptography.hazmat.primitives.asymmetric import ec, rsa
 from cryptography.hazmat.primitives.serialization import Encoding, NoEncryption, PrivateFormat, PublicFormat
 
 from teds_provision.protocol.handover import jose
-from teds_provision.protocol.handover.bundle import TYPE, Bundle, BundledNode, _to_json, seal_bundle
+from teds_provision.protocol.handover.bundle import TYPE, Bundle, BundledNode, _payload, seal_bundle
 from teds_provision.protocol.handover.strict_json import base64url, decode_base64url, dump
 from teds_provision.protocol.keys import SoftwareKey, fingerprint, station_key_message, to_pem
 from teds_provision.vault import forget_vaults
@@ -282,7 +282,7 @@ class Forger:
 
     def members(self, **changes: Any) -> bytes:
         """A payload with members that the sender's own code would not write."""
-        payload = json.loads(dump(_to_json(self.good))) | changes
+        payload = json.loads(_payload(self.good)) | changes
         return self.signed(dump(payload))
 
     def signed(self, payload: bytes, **header: Any) -> bytes:
@@ -314,7 +314,7 @@ def _expired(forger: Forger) -> bytes:
 
 
 def _with_duplicate(forger: Forger) -> bytes:
-    nodes = json.loads(dump(_to_json(forger.good)))["nodes"]
+    nodes = json.loads(_payload(forger.good))["nodes"]
     return forger.members(nodes=[nodes[0], nodes[0]])
 
 
