@@ -355,6 +355,8 @@ class Measuring:
         elif said.state in ("lost", "refused", "waiting") and said.why:
             facts["problem"] = as_problem(TedsProvisionError(said.why))
         self._roster.note(said.uuid, said.state if changed else None, **facts)
+        if changed and one.job is not None and not one.stop.is_set():
+            self._say(one, *_state_of(one, one.job))
 
 
 def _state_of(one: Running, job: Job) -> tuple[str, str]:
