@@ -57,8 +57,8 @@ from teds_provision.vault import forget_vaults
 from teds_provision.vault.passphrase import THROWAWAY
 from teds_provision.vault.software import SoftwareVault
 
+from ..bench import PASSPHRASE, make_station
 from ..vault.softhsm import PIN, loaded, unload
-from ..workflow.bench import PASSPHRASE, make_station
 
 FIXTURES = Path(__file__).parent / "fixtures"
 SEALED = "sealed under other words"

@@ -24,7 +24,7 @@ from teds_provision.protocol.messages.identity import NodeState
 from teds_provision.protocol.session import OPEN_OCTETS, open_mac
 from teds_provision.teds.codec.frame import frame
 
-from ..workflow.bench import Board, MemoryLink
+from ..bench import Board, MemoryLink
 
 Next = Callable[[bytes], bytes]
 """What the reference node answers to a command frame."""

@@ -19,8 +19,8 @@ from teds_provision.station.station import Station
 from teds_provision.steps.identify import identify
 from teds_provision.steps.reset import reset_node
 
+from ..bench import Board, make_station, talk
 from ..protocol.desk import META, NAME
-from ..workflow.bench import Board, make_station, talk
 from . import faulty
 from .faulty import Fault, FaultyLink
 

@@ -8,9 +8,9 @@ from pathlib import Path
 import pytest
 
 from teds_provision.check.rule import RULES
+from tests.bench import PASSPHRASE, make_station
 from tests.cli.shell import Outcome, spawn
 from tests.e2e.desk import Desk
-from tests.workflow.bench import PASSPHRASE, make_station
 
 pytestmark = pytest.mark.link
 

@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from teds_provision.vault import forget_vaults
-from tests.workflow.bench import make_station
+from tests.bench import make_station
 
 
 @pytest.fixture

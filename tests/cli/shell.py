@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from teds_provision.cli.main import run
-from tests.workflow.bench import PASSPHRASE
+from tests.bench import PASSPHRASE
 
 
 @dataclass(frozen=True)

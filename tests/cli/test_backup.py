@@ -14,7 +14,7 @@ import pytest
 
 from teds_provision.store import Draft, KeyRecord, NodeRecord, Store
 from teds_provision.teds.image import Image
-from tests.workflow.bench import PASSPHRASE, make_station
+from tests.bench import PASSPHRASE, make_station
 
 from .shell import call, clean_environment, spawn
 

@@ -18,7 +18,7 @@ import pytest
 
 from teds_provision import __version__
 from teds_provision.cli.table import COMMANDS, GROUPS
-from tests.workflow.bench import PASSPHRASE
+from tests.bench import PASSPHRASE
 
 from .shell import Outcome, call, clean_environment, spawn
 
@@ -301,7 +301,7 @@ def test_no_input_and_json_never_ask(home: Path, words: list[str]) -> None:
 
 
 def test_a_passphrase_that_is_typed_is_not_shown(home: Path, tmp_path: Path) -> None:
-    from tests.workflow.bench import PASSPHRASE
+    from tests.bench import PASSPHRASE
 
     master, terminal = pty.openpty()
     process = subprocess.Popen(

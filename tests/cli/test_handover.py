@@ -20,9 +20,9 @@ from teds_provision.protocol.handover.bundle import TYPE, Bundle, BundledNode, _
 from teds_provision.protocol.handover.strict_json import base64url, decode_base64url, dump
 from teds_provision.protocol.keys import SoftwareKey, fingerprint, station_key_message, to_pem
 from teds_provision.vault import forget_vaults
-from tests.workflow.bench import PASSPHRASE
-from tests.workflow.handover_desk import Pair, everything, session
-from tests.workflow.handover_victim import open_station
+from tests.bench import PASSPHRASE
+from tests.handover.desk import Pair, everything, session
+from tests.handover.victim import open_station
 
 from .shell import Outcome, call, spawn
 

@@ -7,9 +7,9 @@ from pathlib import Path
 
 import pytest
 
+from tests.bench import PASSPHRASE, make_station
 from tests.e2e.desk import Desk, Node, free_port
-from tests.workflow.bench import PASSPHRASE, make_station
-from tests.workflow.handover_desk import trust
+from tests.handover.desk import trust
 
 from .shell import Outcome, spawn
 

@@ -16,7 +16,7 @@ from teds_provision.errors import NoNode, NoReader
 from teds_provision.links.can import bus as can_bus
 from teds_provision.links.can.spec import parse_spec
 from teds_provision.links.nfc.reader import NfcPort
-from tests.workflow.bench import PASSPHRASE
+from tests.bench import PASSPHRASE
 
 from .shell import call, spawn
 

@@ -22,7 +22,7 @@ from teds_provision.steps.visits.sign_command import SignOrder, sign_image
 from teds_provision.store import StoreLock, WhitelistEntry
 from teds_provision.talk.progress import Silent
 
-from ..workflow.bench import PASSPHRASE, Board, make_station, talk
+from ..bench import PASSPHRASE, Board, make_station, talk
 from .shell import call, clean_environment, spawn
 
 ANGLE = BuildOrder(profile="magnetic-angular-position-sensor")

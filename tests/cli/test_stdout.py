@@ -13,8 +13,8 @@ import pytest
 
 from teds_provision.harmless import harmless, harmless_json, printable
 from teds_provision.store import NodeRecord, Store
+from tests.bench import PASSPHRASE
 from tests.cli.shell import call, clean_environment
-from tests.workflow.bench import PASSPHRASE
 
 UUID = bytes.fromhex("8d4d9da65281f7000000")
 

@@ -10,7 +10,7 @@ from cryptography.hazmat.primitives.serialization import Encoding, NoEncryption,
 
 from teds_provision.handover.trust import spoken
 from teds_provision.protocol.keys import SoftwareKey, fingerprint, to_pem
-from tests.workflow.bench import PASSPHRASE
+from tests.bench import PASSPHRASE
 
 from .shell import Outcome, call, spawn
 

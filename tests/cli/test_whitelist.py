@@ -10,7 +10,7 @@ import pytest
 from teds_provision.station.station import Station
 from teds_provision.store import WhitelistEntry
 from teds_provision.vault import forget_vaults
-from tests.workflow.bench import PASSPHRASE
+from tests.bench import PASSPHRASE
 
 from .shell import call
 

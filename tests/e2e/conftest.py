@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.workflow.bench import make_station
+from tests.bench import make_station
 
 from .desk import Desk, Node, Station
 

@@ -19,8 +19,8 @@ from pathlib import Path
 from typing import Any
 
 from teds_provision.store import Store
+from tests.bench import PASSPHRASE
 from tests.cli.shell import Outcome, clean_environment
-from tests.workflow.bench import PASSPHRASE
 
 ROOT = Path(__file__).resolve().parents[2]
 PROGRAM = (sys.executable, "-m", "teds_provision")

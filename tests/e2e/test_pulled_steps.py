@@ -19,8 +19,8 @@ from teds_provision.station.station import Station as BaseStation
 from teds_provision.steps.many.boards import Boards, Questions, Request
 from teds_provision.steps.order import BuildOrder
 from teds_provision.talk.progress import Silent
+from tests.bench import PASSPHRASE
 from tests.links.nfc.field import Field
-from tests.workflow.bench import PASSPHRASE
 
 from .desk import ANGLE, Station
 from .test_pulled import boards, field, serial

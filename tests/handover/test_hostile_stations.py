@@ -32,8 +32,8 @@ from teds_provision.steps.identify import identify
 from teds_provision.steps.sign import known_node_keys, sign
 from teds_provision.steps.write import write
 from teds_provision.store import NodeRecord
-from tests.workflow.bench import Board, MemoryLink, make_station, talk
-from tests.workflow.handover_desk import Pair, held, key_up, provisioned, session, trust
+from tests.bench import Board, MemoryLink, make_station, talk
+from tests.handover.desk import Pair, held, key_up, provisioned, session, trust
 
 HIGHEST = 0xFFFFFFFF
 

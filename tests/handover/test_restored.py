@@ -15,8 +15,8 @@ from teds_provision.steps.agree import agree, require_session
 from teds_provision.steps.identify import identify
 from teds_provision.vault import forget_vaults
 from teds_provision.vault.passphrase import THROWAWAY
-from tests.workflow.bench import PASSPHRASE, Board, MemoryLink, make_station, talk
-from tests.workflow.handover_desk import held, key_up
+from tests.bench import PASSPHRASE, Board, MemoryLink, make_station, talk
+from tests.handover.desk import held, key_up
 
 
 def ask(prompt: str, confirm: bool) -> str:

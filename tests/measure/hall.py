@@ -21,9 +21,9 @@ from teds_provision.steps.provision import provision
 from teds_provision.store import WhitelistEntry, utc_now
 from teds_provision.talk.conversation import Conversation
 from teds_provision.talk.progress import Silent
+from tests.bench import make_station
 from tests.e2e.desk import ANGLE, Desk, Running
 from tests.e2e.desk import Station as Commands
-from tests.workflow.bench import make_station
 
 CALIBRATIONS = {
     ANGLE: "# date: 2026-10-01\nraw,value [degree]\n0,0\n65535,359.9\n",

@@ -11,10 +11,10 @@ from pathlib import Path
 
 import pytest
 
+from tests.bench import make_station
 from tests.e2e.desk import Desk
 from tests.measure.sinks.test_ros1 import Master, master, pytestmark  # noqa: F401  the fixture, and what it needs
 from tests.measure.test_measuring import Bench
-from tests.workflow.bench import make_station
 
 
 @pytest.fixture

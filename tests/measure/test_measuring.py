@@ -14,8 +14,8 @@ import pytest
 from mcap.reader import make_reader
 
 from teds_provision.measure.sinks.mcap.recover import recover
+from tests.bench import make_station
 from tests.e2e.desk import ANGLE, Desk, Node, Station
-from tests.workflow.bench import make_station
 
 pytestmark = pytest.mark.link
 CALIBRATIONS = {

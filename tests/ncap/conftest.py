@@ -7,9 +7,9 @@ from pathlib import Path
 
 import pytest
 
+from tests.bench import make_station
 from tests.e2e.desk import Desk
 from tests.ncap.service import Service
-from tests.workflow.bench import make_station
 
 
 @pytest.fixture(scope="session")

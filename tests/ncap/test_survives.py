@@ -19,9 +19,9 @@ import pytest
 from teds_provision.client import ApiError
 from teds_provision.ncap.settings import own_source
 from teds_provision.store import Store
+from tests.bench import make_station
 from tests.e2e.desk import ANGLE, Desk, Node, Station, clean_environment, limited
 from tests.ncap.service import Service, until, verified, virtual
-from tests.workflow.bench import make_station
 
 pytestmark = pytest.mark.link
 CALIBRATION = "# date: 2026-10-01\nraw,value [degree]\n0,0\n65535,359.9\n"

@@ -11,9 +11,9 @@ from pathlib import Path
 import pytest
 
 from teds_provision.node.flash_file import FlashFile
+from tests.bench import make_station
 from tests.cli.shell import spawn as run
 from tests.e2e.desk import Links, Running
-from tests.workflow.bench import make_station
 
 
 @contextmanager

@@ -14,8 +14,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from teds_provision import client
+from tests.bench import PASSPHRASE, make_station
 from tests.e2e.desk import ANGLE, Desk, Node, Running, Station
-from tests.workflow.bench import PASSPHRASE, make_station
 
 if TYPE_CHECKING:
     from playwright.sync_api import Browser, Page

@@ -12,7 +12,7 @@ from teds_provision.station.station import Station
 from teds_provision.steps.build import BuildOrder
 from teds_provision.steps.provision import provision
 from teds_provision.talk.progress import Silent
-from tests.workflow.bench import Board, make_station, talk
+from tests.bench import Board, make_station, talk
 
 _CHANGES = ("INSERT", "UPDATE", "DELETE", "REPLACE")
 

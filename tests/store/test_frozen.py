@@ -71,7 +71,7 @@ def test_everything_is_read_and_nothing_is_written(home: Path, script: str, word
 
 @pytest.mark.parametrize("words", [["nodes"], ["log"], ["whitelist", "list"], ["trust", "list"]])
 def test_commands_that_read_work_on_a_read_only_disk(tmp_path: Path, words: list[str]) -> None:
-    from tests.workflow.bench import make_station
+    from tests.bench import make_station
 
     make_station(tmp_path / "home").close()
     said = mounted(

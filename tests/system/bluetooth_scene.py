@@ -11,11 +11,11 @@ from typing import Any
 
 from teds_provision.links.ble.bluez import adapters
 from teds_provision.station.station import Station
+from tests.bench import PASSPHRASE
 from tests.e2e.desk import ANGLE
 from tests.links.ble.radio import CONFIG
 from tests.links.ble.test_whole_runs import tapped_once
 from tests.system.inside import FOLDER, Bench, look, process, sh
-from tests.workflow.bench import PASSPHRASE
 
 BUS = Path("/run/dbus/system_bus_socket")
 

@@ -18,8 +18,8 @@ from pathlib import Path
 from typing import Any
 
 from teds_provision.cli import main as command_line
+from tests.bench import PASSPHRASE, make_station
 from tests.system.machine import tell
-from tests.workflow.bench import PASSPHRASE, make_station
 
 FOLDER = Path(tempfile.mkdtemp(prefix="scene"))
 

@@ -15,9 +15,9 @@ import pytest
 from teds_provision.cli.main import run as in_process
 from teds_provision.vault import forget_vaults
 from teds_provision.vault.agent import asking, holding
+from tests.bench import PASSPHRASE, make_station
 from tests.cli.shell import Outcome, clean_environment, spawn
 from tests.vault.softhsm import PIN, loaded, unload
-from tests.workflow.bench import PASSPHRASE, make_station
 
 NODE = "0102030405060708090a"
 NEW = "four other random words"

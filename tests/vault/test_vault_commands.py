@@ -19,9 +19,9 @@ from teds_provision.store.database import Database
 from teds_provision.vault import forget_vaults
 from teds_provision.vault.file_vault import FileVault
 from teds_provision.vault.passphrase import THROWAWAY
+from tests.bench import PASSPHRASE, make_station
 from tests.cli.shell import clean_environment, spawn
 from tests.vault.softhsm import PIN, loaded, unload
-from tests.workflow.bench import PASSPHRASE, make_station
 
 NODES = [number.to_bytes(10, "big") for number in range(1, 5)]
 NEW = "four other random words"

@@ -24,8 +24,8 @@ from teds_provision.steps.provision import Provisioned, provision
 from teds_provision.talk.conversation import Conversation
 from teds_provision.talk.meeting import meet
 from teds_provision.talk.progress import Silent, StepResult
+from tests.bench import make_station
 from tests.e2e.desk import Desk, Station, results
-from tests.workflow.bench import make_station
 
 from .conftest import ANGLE
 from .radio import Radio, needs_dbus

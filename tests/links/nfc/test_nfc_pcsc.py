@@ -17,8 +17,8 @@ import pytest
 from teds_provision.errors import NoReader, UsageFailure
 from teds_provision.links.nfc import pcsc
 from teds_provision.links.nfc.frontend import open_reader
+from tests.bench import PASSPHRASE, make_station
 from tests.cli.shell import clean_environment
-from tests.workflow.bench import PASSPHRASE, make_station
 
 from .conftest import ROOT
 from .pcsc_scene import DRIVER

@@ -30,8 +30,7 @@ from teds_provision.talk.progress import Silent
 from teds_provision.teds.codec import security
 from teds_provision.teds.codec.frame import frame
 from teds_provision.teds.image import SECURITY
-
-from .bench import Board, MemoryLink, make_station, talk
+from tests.bench import Board, MemoryLink, make_station, talk
 
 ANGLE = BuildOrder(profile="magnetic-angular-position-sensor")
 

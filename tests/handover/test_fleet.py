@@ -28,9 +28,8 @@ from teds_provision.steps.verify import Verified, verify_image
 from teds_provision.store import WhitelistEntry
 from teds_provision.teds.image import Image
 from teds_provision.vault import forget_vaults, passphrase
-
-from .bench import PASSPHRASE, Board, make_station, talk
-from .handover_desk import provisioned, session, trust
+from tests.bench import PASSPHRASE, Board, make_station, talk
+from tests.handover.desk import provisioned, session, trust
 
 
 def ask(prompt: str, confirm: bool) -> str:

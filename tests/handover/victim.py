@@ -17,8 +17,7 @@ from teds_provision.handover.import_keys import ImportPlan, import_keys, plan_im
 from teds_provision.handover.selection import ExportOrder
 from teds_provision.station.station import Station
 from teds_provision.store.database import Database
-
-from .bench import PASSPHRASE
+from tests.bench import PASSPHRASE
 
 
 @contextmanager

@@ -19,8 +19,7 @@ from teds_provision.steps.identify import identify
 from teds_provision.steps.provision import Provisioned, provision
 from teds_provision.store import Handover, TrustRecord, WhitelistEntry
 from teds_provision.talk.progress import Silent
-
-from .bench import Board, MemoryLink, make_station, talk
+from tests.bench import Board, MemoryLink, make_station, talk
 
 
 def trust(station: Station, other: Station, name: str | None = None) -> None:

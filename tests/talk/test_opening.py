@@ -10,8 +10,7 @@ from teds_provision.protocol.keys import SoftwareKey, station_key_message
 from teds_provision.protocol.messages.frames import Function, Reason, decode_reply, read_teds, security_command
 from teds_provision.protocol.session import StationSession
 from teds_provision.teds.image import SECURITY
-
-from .bench import Board, MemoryLink, talk
+from tests.bench import Board, MemoryLink, talk
 
 STATION, CA = SoftwareKey(5), SoftwareKey(3)
 

@@ -10,8 +10,7 @@ from teds_provision.station.station import Station
 from teds_provision.steps.identify import identify
 from teds_provision.steps.whitelist import add, plan_addition, remove
 from teds_provision.steps.whitelist_files import Listed
-
-from .bench import Board, MemoryLink, talk
+from tests.bench import Board, MemoryLink, talk
 
 
 def test_the_first_tap_pins_the_key_and_raises_the_assurance(station: Station, board: Board) -> None:

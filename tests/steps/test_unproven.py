@@ -36,8 +36,8 @@ from teds_provision.store import WhitelistEntry
 from teds_provision.talk.conversation import Conversation, refused
 from teds_provision.talk.meeting import refuse_twins
 from teds_provision.teds.image import SECURITY, Image
+from tests.bench import Board, MemoryLink, contact, make_station, talk
 
-from .bench import Board, MemoryLink, contact, make_station, talk
 from .test_provision import ANGLE, Silent, run
 
 FORGED_ADDRESS = 99

@@ -9,8 +9,7 @@ from teds_provision.protocol.messages.frames import Reply
 from teds_provision.steps.read import LARGEST_SECURITY, read_block
 from teds_provision.teds.codec.frame import frame
 from teds_provision.teds.image import SECURITY
-
-from .bench import Board, MemoryLink, talk
+from tests.bench import Board, MemoryLink, talk
 
 
 @pytest.mark.parametrize(("block", "most"), [(SECURITY, LARGEST_SECURITY), ((0, 1), 1 << 20)])

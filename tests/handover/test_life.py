@@ -20,9 +20,8 @@ from teds_provision.steps.reset import ResetReceipt, reset_node
 from teds_provision.steps.verify import verify_image
 from teds_provision.store import WhitelistEntry
 from teds_provision.teds.image import Image
-
-from .bench import Board, talk
-from .handover_desk import Pair, held, key_up, provisioned, session
+from tests.bench import Board, talk
+from tests.handover.desk import Pair, held, key_up, provisioned, session
 
 
 @pytest.fixture

@@ -26,9 +26,8 @@ from teds_provision.steps.read import read_image
 from teds_provision.steps.reset import reset_node
 from teds_provision.steps.verify_node import verify_node
 from teds_provision.store import WhitelistEntry
-
-from .bench import Board, MemoryLink, make_station, talk
-from .handover_desk import Pair, everything, held, key_up, node_key_id, provisioned, row, session, trust
+from tests.bench import Board, MemoryLink, make_station, talk
+from tests.handover.desk import Pair, everything, held, key_up, node_key_id, provisioned, row, session, trust
 
 SESSIONS = 1000
 

@@ -19,8 +19,8 @@ from teds_provision.steps.write import write
 from teds_provision.store import WhitelistEntry
 from teds_provision.talk.meeting import the_one
 from teds_provision.teds.image import Image
+from tests.bench import Board, MemoryLink, contact, talk
 
-from .bench import Board, MemoryLink, contact, talk
 from .test_provision import run as provision
 
 ANGLE = BuildOrder(profile="magnetic-angular-position-sensor")

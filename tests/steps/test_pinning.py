@@ -11,8 +11,8 @@ from teds_provision.station.station import Station
 from teds_provision.steps import read as reading
 from teds_provision.steps.identify import identify
 from teds_provision.steps.provision import add_to_whitelist
+from tests.bench import Board, MemoryLink, make_station, talk
 
-from .bench import Board, MemoryLink, make_station, talk
 from .test_agree import run as agree
 from .test_agree import whitelist
 

@@ -15,8 +15,7 @@ from teds_provision.errors import BadData, NotAuthentic, NotFound, PolicyRefused
 from teds_provision.handover.trust import add, candidate, candidates_of, find_trusted, private_keys, remove, spoken
 from teds_provision.protocol.keys import SoftwareKey, fingerprint, to_pem
 from teds_provision.station.station import Station
-
-from .bench import make_station
+from tests.bench import make_station
 
 ROOT = Path(__file__).resolve().parents[2]
 OTHER = SoftwareKey(21)

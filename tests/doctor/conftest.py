@@ -8,8 +8,7 @@ from pathlib import Path
 import pytest
 
 from teds_provision.station.station import Station
-
-from .bench import Board, make_station
+from tests.bench import Board, make_station
 
 
 @pytest.fixture

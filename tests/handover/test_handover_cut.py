@@ -15,10 +15,9 @@ from teds_provision.errors import PolicyRefused
 from teds_provision.handover.pending import close
 from teds_provision.station.station import Station
 from teds_provision.vault import forget_vaults
-
-from .bench import Board
-from .handover_desk import Pair, everything, held, session
-from .handover_victim import counted, export, open_station, take
+from tests.bench import Board
+from tests.handover.desk import Pair, everything, held, session
+from tests.handover.victim import counted, export, open_station, take
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -135,7 +134,7 @@ def test_an_import_cut_at_every_write(prepared: Prepared) -> None:
 
 
 def kill(home: Path, act: str, step: int, bundle: Path) -> int:
-    command = [sys.executable, "-m", "tests.workflow.handover_victim", str(home), act, str(step), str(bundle)]
+    command = [sys.executable, "-m", "tests.handover.victim", str(home), act, str(step), str(bundle)]
     return subprocess.run(command, cwd=ROOT, capture_output=True, timeout=60, check=False).returncode
 
 

@@ -26,8 +26,7 @@ from teds_provision.protocol.keys import SoftwareKey, to_pem
 from teds_provision.store import Draft, Facts, KeyRecord, Marks, NodeRecord, Store, StoreLock, WhitelistEntry
 from teds_provision.teds.image import Image
 from teds_provision.vault import forget_vaults
-
-from .bench import PASSPHRASE, make_station
+from tests.bench import PASSPHRASE, make_station
 
 
 @pytest.fixture

@@ -15,8 +15,7 @@ from teds_provision.station.station import Station
 from teds_provision.steps.agree import Agreed, agree, open_session
 from teds_provision.steps.identify import identify
 from teds_provision.store import WhitelistEntry
-
-from .bench import Board, MemoryLink, make_station, talk
+from tests.bench import Board, MemoryLink, make_station, talk
 
 
 def run(station: Station, board: Board, link: MemoryLink | None = None, *, rotate: bool = False) -> Agreed:

@@ -17,8 +17,7 @@ from teds_provision.protocol.tim import Tim
 from teds_provision.station.station import Station, initialise
 from teds_provision.talk.conversation import Conversation
 from teds_provision.vault import passphrase
-
-from ..protocol.memory import PowerCut, RamFlash
+from tests.protocol.memory import PowerCut, RamFlash
 
 PASSPHRASE = "correct horse battery"
 

@@ -20,8 +20,8 @@ from teds_provision.store import TrustRecord
 from teds_provision.teds.codec import security
 from teds_provision.teds.codec.frame import frame
 from teds_provision.teds.image import SECURITY, Image
+from tests.bench import Board, make_station, talk
 
-from .bench import Board, make_station, talk
 from .test_provision import run
 
 

@@ -7,8 +7,8 @@ import pytest
 from teds_provision.errors import NodeRefused
 from teds_provision.station.station import Station
 from teds_provision.steps.address import set_address
+from tests.bench import Board, MemoryLink, talk
 
-from .bench import Board, MemoryLink, talk
 from .test_provision import run
 
 

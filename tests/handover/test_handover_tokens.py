@@ -15,9 +15,8 @@ from teds_provision.handover.pending import close
 from teds_provision.handover.selection import ExportOrder
 from teds_provision.station.station import Station, initialise
 from teds_provision.vault import forget_vaults
+from tests.handover.desk import boards, held, key_up, provisioned, session, trust
 from tests.vault.softhsm import PIN, loaded, unload
-
-from .handover_desk import boards, held, key_up, provisioned, session, trust
 
 pytestmark = pytest.mark.system
 

@@ -14,8 +14,7 @@ from teds_provision.steps.provision import Provisioned, provision
 from teds_provision.talk.charge import Low, wait_for_charge
 from teds_provision.talk.conversation import Conversation
 from teds_provision.talk.progress import Silent
-
-from .bench import Board, contact
+from tests.bench import Board, contact
 
 ANGLE = "magnetic-angular-position-sensor"
 
