@@ -32,7 +32,7 @@ _OTHERS: Final = 422  # guard, limits, bad data, policy: the request is understo
 
 
 def status_of(error: TedsProvisionError) -> int:
-    """The status of an error (api.md, "Errors")."""
+    """The status of an error (docs/contract/api.md)."""
     if isinstance(error, NodeRefused) and error.reason == Reason.BUSY:
         return 423
     return next((status for kind, status in _STATUS if isinstance(error, kind)), _OTHERS)
