@@ -85,6 +85,7 @@ def test_json_holds_all_that_is_known_but_no_key(known: Path) -> None:
         "group": "hand",
         "groups": ["hand"],
         "due": None,
+        "charging": None,
         "rotation_due": None,
         "teds_sha256": None,
         "keys": None,
