@@ -149,7 +149,7 @@ def calibrations(draw: st.DrawFn, inputs: int) -> Calibration:
 
 
 def by_hand(calibration: Calibration, *inputs: float) -> Fraction:
-    """The formula of ieee-1451.0.md section 6 in exact arithmetic, written down once more."""
+    """The formula of teds.md ("5 CalTEDS") in exact arithmetic, written down once more."""
     cell, distances = 0, []
     for part, value in zip(calibration.inputs, inputs, strict=True):
         segment = sum(1 for edge in part.boundaries[1:-1] if value >= edge)
