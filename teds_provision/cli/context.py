@@ -12,14 +12,12 @@ from typing import TYPE_CHECKING, Any, ClassVar, TextIO
 
 import click
 
+from teds_provision import protocol, vault
 from teds_provision import station as station_room
-from teds_provision import vault
 from teds_provision.cli import terminal
 from teds_provision.cli.configuration import home_of
 from teds_provision.errors import PolicyRefused, StoreFailure, TedsProvisionError, UsageFailure, WrongPassphrase
 from teds_provision.harmless import harmless, harmless_json
-from teds_provision.protocol.fingerprints import read_fingerprint, same_key
-from teds_provision.station.label import read_label
 
 if TYPE_CHECKING:
     from rich.console import Console, RenderableType
@@ -171,9 +169,9 @@ class App:
             ).strip()
             if said.lower() in ("y", "yes", "n", "no"):
                 return said.lower().startswith("y")
-            label = read_label(said)
-            digits = label[1] if label is not None else read_fingerprint(said)
-            if digits is not None and not same_key(digits, fingerprint):
+            label = station_room.label.read_label(said)
+            digits = label[1] if label is not None else protocol.fingerprints.read_fingerprint(said)
+            if digits is not None and not protocol.fingerprints.same_key(digits, fingerprint):
                 print("These are the digits of another key.", file=sys.stderr, flush=True)
                 return False
             if digits is not None:

@@ -10,6 +10,7 @@ if TYPE_CHECKING:
         announce,
         commit,
         datasheet,
+        fingerprints,
         flash,
         handover,
         keys,
