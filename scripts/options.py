@@ -5,6 +5,7 @@ Usage: python scripts/options.py [--check]. With --check it writes nothing and e
 
 from __future__ import annotations
 
+import inspect
 import sys
 from collections.abc import Iterator
 from pathlib import Path
@@ -108,7 +109,8 @@ def man_page() -> str:
         context = click.Context(command, info_name=title)
         usage = " ".join(command.collect_usage_pieces(context))
         out += [".SH " + ("SYNOPSIS" if not path else _roff(path.upper())), f".B {_roff(title)}", _roff(usage), ".PP"]
-        out.append(_roff((command.help or "").replace("\b", "").strip()))
+        text = inspect.cleandoc((command.help or "").replace("\b", ""))  # Python 3.13 takes the indentation away itself
+        out.append(_roff(text))
         for option in options_of(command):
             names = ", ".join([*option.opts, *option.secondary_opts])
             out += [".TP", f".B {_roff(names)}", _roff(option.help or "")]
