@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from teds_provision.errors import BadData, Garbled, NodeRefused
 from teds_provision.protocol.messages.frames import (
     Attribute,
+    Command,
     Function,
     Reason,
     TedsStatus,
@@ -26,6 +27,7 @@ LARGEST_SECURITY = 4094 - 78
 """It fits into the sealed reply to Request, a frame of at most 4094 octets (profile.md, "Command frames")."""
 LARGEST_IMAGE = 4 << 20
 _NOISY_READS = 4
+_REFUSED_READS = 2
 READING_SECONDS = 300.0
 """A whole image takes seconds, over a slow link a minute; who dawdles longer holds others up."""
 
@@ -75,10 +77,21 @@ def _read_once(node: Conversation, block: BlockId, until: float | None) -> bytes
 
 def _read_segment(node: Conversation, block: BlockId, offset: int) -> bytes:
     channel, access_code = block
-    payload = node.ask(read_teds(channel, access_code, offset), f"to read TEDS {access_code} of channel {channel}")
+    payload = _asked(node, read_teds(channel, access_code, offset), f"to read TEDS {access_code} of channel {channel}")
     if len(payload) < 4 or int.from_bytes(payload[:4], "big") != offset:
         raise Garbled(f"The node read TEDS {access_code} of channel {channel} from another offset than was asked.")
     return payload[4:]
+
+
+def _asked(node: Conversation, command: Command, what: str) -> bytes:
+    """Ask; a refusal that came in no session is asked for again: noise on the line makes another question of a read."""
+    for left in range(_REFUSED_READS, -1, -1):
+        try:
+            return node.ask(command, what)
+        except NodeRefused:
+            if node.sealed or not left:
+                raise
+    raise AssertionError("the last refusal is raised")
 
 
 def list_blocks(node: Conversation) -> list[BlockId]:
