@@ -78,7 +78,6 @@ def test_a_prefix_that_two_nodes_share_is_refused(station: Station) -> None:
         ["agree"],
         ["provision", "--via", "radio"],
         ["provision", "--via", "can"],
-        ["identify", "--via", "ble"],
         ["identify", "--timeout", "0"],
         ["identify", "--via", "can", "--can", "nonsense"],
         ["identify", "--via", "can", "--can", "udp_multicast:239.74.163.2?node=900"],
