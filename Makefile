@@ -37,6 +37,7 @@ unit: $(VENV)/.dev
 bench: $(VENV)/.dev
 	$(BIN)/python -m benchmarks.provisioning
 	$(BIN)/python -m benchmarks.commands
+	$(BIN)/python -m benchmarks.radio
 
 bench-teds: $(VENV)/.dev
 	$(BIN)/python -m benchmarks.teds_codec
