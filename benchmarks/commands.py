@@ -9,6 +9,7 @@ operations counted × 80 ms.
 from __future__ import annotations
 
 import argparse
+import compileall
 import json
 import os
 import statistics
@@ -20,7 +21,8 @@ from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 
-from benchmarks.provisioning import PROFILE, SLOW, free_port, next_node, nodes
+import teds_provision
+from benchmarks.provisioning import PROFILE, SLOW, free_port, next_node, next_nodes, nodes
 from teds_provision.station.station import initialise
 from teds_provision.vault import forget_vaults
 from teds_provision.vault.passphrase import THROWAWAY
@@ -119,9 +121,9 @@ def one_command(rows: Rows) -> None:
                         finished(started(home, *PROVISION, "--via", via, f"--{via}", link, **environment))
                         taken.append(time.perf_counter() - began)
                     rows.tell(f"provision over {via}, paced, {kind}, {name}", statistics.median(taken), "s")
-                _, operations = next_node(process)
+                _, before = next_node(process)
                 if slow:
-                    rows.tell(f"  of it {operations} point operations", operations * slow, "s")
+                    rows.tell(f"  of it {before.operations} point operations", before.operations * slow, "s")
 
 
 def watching(rows: Rows) -> None:
@@ -133,22 +135,25 @@ def watching(rows: Rows) -> None:
         count = 8 if slow else 25
         with station(quick=True) as home, nodes(via, link, *delay) as process:
             watch = started(home, *PROVISION, "--watch", "--via", via, f"--{via}", link)
-            assert watch.stdout is not None
-            began, operations = 0.0, 0
-            for number in range(count + 1):
-                _, operations = next_node(process)
-                passed = _next_board(watch)
-                if not passed:
-                    raise SystemExit("a board failed under --watch")
-                if number == 0:
-                    began = time.perf_counter()
-            each = (time.perf_counter() - began) / count
+            each, operations = _changed_at_once(process, watch, count)
             watch.terminate()
             watch.communicate(timeout=_WAIT)
         kind = f"{'80 ms' if slow else 'immediate'} nodes"
         rows.tell(f"provision --watch over {via}, {kind}, changed at once", 3600 / each, "nodes/h", aim=aim, least=True)
         if slow:
             rows.tell(f"  floor of {operations} point operations", 3600 / (operations * slow), "nodes/h")
+
+
+def _changed_at_once(process: subprocess.Popen[str], watch: subprocess.Popen[str], count: int) -> tuple[float, int]:
+    """Put ``count`` boards down, one after the first: seconds for each, and point operations of the last."""
+    began, operations = 0.0, 0
+    for number in range(count + 1):
+        operations = next_node(process)[1].operations
+        if not _next_board(watch):
+            raise SystemExit("a board failed under --watch")
+        if number == 0:
+            began = time.perf_counter()
+    return (time.perf_counter() - began) / count, operations
 
 
 def _next_board(watch: subprocess.Popen[str]) -> bool:
@@ -177,8 +182,7 @@ def eight_readers(rows: Rows) -> None:
             next_node(boards[0])  # everything is loaded and unlocked with the first board
             _next_board(watch)
             began = time.perf_counter()
-            for board in boards:
-                next_node(board)
+            next_nodes(boards)
             passed = sum(_next_board(watch) for _ in boards)
             taken = time.perf_counter() - began
             watch.terminate()
@@ -193,8 +197,7 @@ def eight_readers(rows: Rows) -> None:
     rows.tell(f"--watch, {READERS} readers against one", all_of_them / one, "×", aim=1.2)
     with station(quick=True) as home, ExitStack() as stack:
         links = [f"udp:127.0.0.1:{free_port()}" for _ in range(READERS)]
-        for link in links:
-            next_node(stack.enter_context(nodes("nfc", link, *slow)))
+        next_nodes([stack.enter_context(nodes("nfc", link, *slow)) for link in links])
         before, began = os.times(), time.perf_counter()
         commands = [started(home, *PROVISION, "--nfc", link) for link in links]
         for command in commands:
@@ -231,6 +234,8 @@ def main(words: list[str] | None = None) -> None:
     parser.add_argument("--only", default="", help="start_up, one_command, watching, eight_readers or whole_bus")
     parser.add_argument("--nodes", type=int, default=200, help="nodes of the whole bus")
     options = parser.parse_args(words)
+    # as an installer leaves it: PYTHONDONTWRITEBYTECODE, here or there, would have each process compile what it loads
+    compileall.compile_dir(Path(teds_provision.__file__).parent, quiet=2)
     rows = Rows()
     for part in (start_up, one_command, watching, eight_readers):
         if options.only in ("", part.__name__):

@@ -13,6 +13,7 @@ import threading
 from collections import Counter
 from collections.abc import Iterator
 from contextlib import contextmanager
+from inspect import CO_OPTIMIZED
 from pathlib import Path
 from types import FrameType
 
@@ -34,8 +35,10 @@ def counted(calls: Counter[str]) -> Iterator[None]:
     """Count the calls of our functions by file, in every thread that begins now."""
 
     def called(frame: FrameType, event: str, _argument: object) -> None:
-        if event == "call" and frame.f_code.co_filename.startswith(PACKAGE) and frame.f_code.co_name != "<module>":
-            calls[frame.f_code.co_filename] += 1
+        code = frame.f_code
+        # Neither a module's own code nor a class's is optimised: they run when it is imported, and are no calls.
+        if event == "call" and code.co_flags & CO_OPTIMIZED and code.co_filename.startswith(PACKAGE):
+            calls[code.co_filename] += 1
 
     sys.setprofile(called)
     threading.setprofile(called)

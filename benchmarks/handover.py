@@ -1,13 +1,17 @@
-"""Export and import of 10,000 node keys beside the bare JOSE operations of jwcrypto on the same payload.
+"""Export and import of 10,000 node keys beside the floor of their parts (issue 13 row 9).
 
 Run: ``python -m benchmarks.handover [COUNT]``. Ours is everything between the command and its end but the terminal:
-reading and unwrapping keys, the bundle, the file, the store's transaction with its sync to disk, the receipt. Theirs is
-JWS and JWE over the payload in memory, with JSON, and nothing kept. Aim: less than twice as long.
+reading and unwrapping keys, the bundle, the file, the store's transaction with its sync to disk, the receipt. The floor
+is what no program that keeps the contract is spared, each by the quickest library at hand: JWS and JWE over the payload
+with JSON (jwcrypto), AES-GCM over every key, HMAC over every row that is sealed, and the rows read or written by SQLite
+with executemany. All in seconds of the processor, so that a busy machine spoils little. Aim: less than twice the floor.
 """
 
 from __future__ import annotations
 
+import hmac
 import json
+import os
 import sys
 import tempfile
 import time
@@ -16,6 +20,7 @@ from collections.abc import Callable
 from datetime import UTC, datetime
 from pathlib import Path
 
+from cryptography.hazmat.primitives.ciphers.aead import AESGCM
 from jwcrypto import jwe, jwk, jws
 
 from teds_provision.handover.export_keys import export_keys, plan_export
@@ -23,7 +28,7 @@ from teds_provision.handover.import_keys import Imported, import_keys, plan_impo
 from teds_provision.handover.selection import ExportOrder
 from teds_provision.protocol.agreement import key_id
 from teds_provision.protocol.handover import jose
-from teds_provision.protocol.handover.bundle import TYPE, _to_json, open_bundle
+from teds_provision.protocol.handover.bundle import TYPE, _payload, open_bundle
 from teds_provision.protocol.handover.strict_json import dump, load_object
 from teds_provision.protocol.keys import SoftwareKey, fingerprint
 from teds_provision.station.station import Station, initialise
@@ -57,9 +62,9 @@ def fill(station: Station, count: int) -> None:
 
 
 def timed(work: Callable[[], object]) -> tuple[float, object]:
-    begun = time.perf_counter()
+    begun = time.process_time()
     result = work()
-    return time.perf_counter() - begun, result
+    return time.process_time() - begun, result
 
 
 def bare(payload: bytes, north: jwk.JWK, south: jwk.JWK) -> tuple[float, float]:
@@ -86,6 +91,39 @@ def bare(payload: bytes, north: jwk.JWK, south: jwk.JWK) -> tuple[float, float]:
         assert json.loads(inner.payload)["count"] == len(members["nodes"])
 
     return min(timed(seal)[0] for _ in range(ROUNDS)), min(timed(open_)[0] for _ in range(ROUNDS))
+
+
+_TABLES = {"nodes": 1, "whitelist": 1, "keys": 0, "key_slots": 0, "holders": 0, "marks": 1}
+"""What an import writes, and how many seals a row of it has."""
+
+
+def rest(south: Station, empty: Station, count: int) -> tuple[float, float]:
+    """Seconds of the processor for the other parts of an export and an import: AES-GCM, HMAC, SQLite."""
+    rows = {table: south._store._database.execute(f"SELECT * FROM {table}") for table in _TABLES}
+    cipher, context, key = AESGCM(bytes(32)), bytes(60), bytes(16)
+    sealed = cipher.encrypt(bytes(12), key, context)
+
+    def seals(number: int) -> None:
+        for _ in range(number):
+            hmac.digest(key, bytes(120), "sha256")
+
+    def export() -> None:
+        for table in ("nodes", "whitelist", "keys"):
+            south._store._database.execute(f"SELECT * FROM {table}")
+        for _ in range(count):
+            cipher.decrypt(bytes(12), sealed, context)
+        seals(2 * count)
+
+    def take_in() -> None:
+        for _ in range(count):
+            cipher.encrypt(os.urandom(12), key, context)
+        seals(sum(_TABLES[table] * len(each) for table, each in rows.items()))
+        with empty.transaction():
+            for table, each in rows.items():
+                marks = ", ".join("?" * len(each[0])) if each else "NULL"
+                empty._store._database.execute_many(f"INSERT OR REPLACE INTO {table} VALUES({marks})", each)
+
+    return min(timed(export)[0] for _ in range(ROUNDS)), min(timed(take_in)[0] for _ in range(1))
 
 
 def jose_layer(payload: bytes) -> tuple[float, float]:
@@ -133,18 +171,19 @@ def main(count: int = 10_000) -> None:
             imports.append(seconds)
         octets = bundle.read_bytes()
         opened = open_bundle(octets, south.vault.identity(), {north.fingerprint: north.point}.get, datetime.now(UTC))
-        payload = dump(_to_json(opened.bundle))
+        payload = _payload(opened.bundle)
         keys = [jwk.JWK.generate(kty="EC", crv="P-256") for _ in range(2)]
         theirs = bare(payload, *keys)
         layer = jose_layer(payload)
         print(f"{count} keys, payload {len(payload) / 1e6:.1f} MB, bundle {len(octets) / 1e6:.1f} MB; best of {ROUNDS}")
-        for name, ours, other in (("export", min(exports), theirs[0]), ("import", min(imports), theirs[1])):
-            mark = "" if ours < AIM * other else f"   (aim: {AIM:.0f} x)"
-            print(f"  {name}: ours {ours:6.2f} s, bare jwcrypto {other:6.2f} s, ratio {ours / other:5.2f}{mark}")
+        parts = rest(south, make(place / "empty", "empty"), count)
+        for at, (name, ours) in enumerate((("export", min(exports)), ("import", min(imports)))):
+            floor = theirs[at] + parts[at]
+            met = "met" if ours < AIM * floor else "MISSED"
+            told = f"jwcrypto {theirs[at]:.2f} s, AES-GCM, HMAC and SQLite {parts[at]:.2f} s"
+            print(f"  {name}: ours {ours:.2f} s; floor {told}: {ours / floor:.2f} ×, aim {AIM:.0f} ×: {met}")
         for name, ours, other in (("sign and seal", layer[0], theirs[0]), ("open and verify", layer[1], theirs[1])):
             print(f"  JOSE alone, {name}: ours {ours:6.3f} s, jwcrypto {other:6.3f} s, ratio {ours / other:5.2f}")
-        total, bare_total = min(exports) + min(imports), sum(theirs)
-        print(f"  both:   ours {total:6.2f} s, bare jwcrypto {bare_total:6.2f} s, ratio {total / bare_total:5.2f}")
         memory(place, north, count)
 
 

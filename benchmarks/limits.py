@@ -1,10 +1,16 @@
-"""What no tool can beat: how long the octets of an exchange occupy its link; seconds, from (request, reply) sizes."""
+"""What no tool can beat: how long the octets of an exchange occupy its link, and the waits that the contract demands.
+
+Seconds, from (request, reply) sizes. Of a CAN bus a question counts with its answer; of a Type 4 tag the activation,
+the initial message, selecting and leaving the service, and t_wait before each answer (docs/contract, "NFC").
+"""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
 
-from teds_provision.links.can.pacing import classic_bits, fd_seconds
+from teds_provision.links.can.wire.pacing import classic_bits, fd_seconds
+from teds_provision.links.nfc import message, tnep
 from teds_provision.node.nfc.air import answer_seconds, command_seconds
 
 Sizes = Sequence[tuple[int, int]]
@@ -40,18 +46,51 @@ def fd(sizes: Sizes) -> float:
 
 
 def type4(sizes: Sizes) -> float:
-    """The same on a Type 4 tag at 106 kbit/s, waiting times and presence checks left out."""
+    """The same on a Type 4 tag at 106 kbit/s: each message with its length in as few commands as it fits into."""
+    return sum(_written(request) + _answer(reply) for request, reply in sizes)
 
-    def block(there: int, back: int) -> float:
-        command = bytes(there + 1)
-        return command_seconds(command) + _FRAME_DELAY + answer_seconds(command, bytes(back + 1))
 
-    total = 0.0
-    for request, reply in sizes:
-        total += sum(block(5 + octets, 2) for octets in _cut(2 + _RECORD + request))
-        total += block(5, 4)
-        total += sum(block(5, octets + 2) for octets in _cut(_RECORD + _STATUS + reply))
-    return total
+def type4_in_two_steps(sizes: Sizes) -> float:
+    """The same with the length read by a command of its own, as NFC Forum's read procedure has it."""
+    return sum(
+        _written(request) + _block(5, 4) + sum(_block(5, octets + 2) for octets in _cut(_RECORD + _STATUS + reply))
+        for request, reply in sizes
+    )
+
+
+def type4_finding() -> float:
+    """From the first short frame to the initial message, and what the service's selection and its end cost."""
+    initial = message.encode([tnep.ServiceParameters(tnep.SERVICE, 4, 15, 2000).record(), tnep.id_record(bytes(23))])
+    activation = ((b"\x26", 2), (b"\x93\x20", 5), (bytes(7), 1), (b"\xe0\x80", 5))  # a UID of four octets
+    application = ((13, 2), (7, 2), (5, 17), (7, 2), *((5, octets + 2) for octets in _cut(2 + len(initial))))
+    select, leave, status = (
+        2 + len(message.encode([record])) for record in (tnep.select(tnep.SERVICE), tnep.select(b""), tnep.status(0))
+    )
+    service = ((5 + select, 2), (5, status + 2), (5 + leave, 2))
+    return sum(_frame(command, bytes(back)) for command, back in activation) + sum(
+        _block(there, back) for there, back in (*application, *service)
+    )
+
+
+def type4_waits(exchanges: int) -> float:
+    """t_wait between each request and the first look for its answer, selecting the service included."""
+    return (exchanges + 1) * tnep.ServiceParameters(tnep.SERVICE, 4, 15, 2000).t_wait
+
+
+def _written(request: int) -> float:
+    return sum(_block(5 + octets, 2) for octets in _cut(2 + _RECORD + request))
+
+
+def _answer(reply: int) -> float:
+    return sum(_block(5, octets + 2) for octets in _cut(2 + _RECORD + _STATUS + reply))
+
+
+def _block(there: int, back: int) -> float:
+    return _frame(bytes(there + 1), bytes(back + 1))
+
+
+def _frame(command: bytes, answer: bytes) -> float:
+    return command_seconds(command) + _FRAME_DELAY + answer_seconds(command, answer)
 
 
 def _each(sizes: Sizes) -> Iterable[int]:
@@ -71,3 +110,29 @@ def _flows(consecutive: int) -> int:
 
 def _cut(octets: int) -> list[int]:
     return [min(_LARGEST_APDU_DATA, octets - at) for at in range(0, octets, _LARGEST_APDU_DATA)]
+
+
+IDENTIFY = (6, 26)
+"""Octets of the command that finds a node on a bus, and of its reply."""
+
+
+@dataclass(frozen=True)
+class Limit:
+    """The least of one link: what its ``octets`` occupy, finding included, and the contract's ``waits`` by exchanges.
+
+    ``exchanges`` is what was reckoned until 2026-11-21: the octets of the exchanges after the finding, nothing else.
+    """
+
+    octets: Callable[[Sizes], float]
+    waits: Callable[[int], float]
+    exchanges: Callable[[Sizes], float]
+
+
+def _found(octets: Callable[[Sizes], float]) -> Callable[[Sizes], float]:
+    return lambda sizes: octets([IDENTIFY, *sizes])
+
+
+TYPE4 = Limit(lambda sizes: type4_finding() + type4(sizes), type4_waits, type4_in_two_steps)
+# What a node waits before it answers everyone is drawn at random: each tells its own (benchmarks.nodes).
+CLASSIC = Limit(_found(classic), lambda _: 0.0, classic)
+FD = Limit(_found(fd), lambda _: 0.0, fd)

@@ -24,19 +24,17 @@ from pathlib import Path
 
 import numpy as np
 
-from teds_provision.links import LINKS, Capabilities, Contact
 from teds_provision.links.can.port import CanPort
 from teds_provision.measure.blocks import Block
-from teds_provision.measure.carrying.job import Job
 from teds_provision.measure.finding.buses import Buses
 from teds_provision.measure.orders import Wish
 from teds_provision.measure.runner import Watcher
+from teds_provision.measure.running.job import Job
 from teds_provision.node.can.server import CanServer
 from teds_provision.node.described import create
 from teds_provision.node.hardware.board import Board
 from teds_provision.node.pulse import Pulse
 from teds_provision.node.virtual import VirtualNode
-from teds_provision.protocol.messages.identity import Identity
 from teds_provision.protocol.operation.streams import DataFrame
 from teds_provision.station.station import Station, initialise
 from teds_provision.steps.order import BuildOrder
@@ -47,6 +45,7 @@ from teds_provision.talk.progress import Silent
 from teds_provision.teds.image import Image
 from teds_provision.teds.sheet import Sheet
 from teds_provision.vault import passphrase
+from tests.bench import on_reader
 
 TYPE, RATE, N = "magnetic-angular-position-sensor", 100.0, 2
 STAMPS, SINK, FIRST = 1e-3, 20e-3, 1.0  # seconds: the aims; a sink's beside n periods
@@ -54,35 +53,13 @@ SETTLING = 2.0  # seconds until stamps are judged
 CALIBRATION = "# date: 2026-10-01\nraw,value [degree]\n0,0\n65535,359.9\n"
 
 
-@dataclass
-class NodeLink:
-    """A virtual node that lies on the reader of this process."""
-
-    node: VirtualNode
-    via: str = "nfc"
-
-    @property
-    def capabilities(self) -> Capabilities:
-        """As a reader's."""
-        return LINKS[self.via].capabilities
-
-    def exchange(self, frame: bytes) -> bytes:
-        """One request, one reply."""
-        return self.node.request(self.via, frame, tapped=True)
-
-    def close(self) -> None:
-        """The node leaves the field."""
-        self.node.lost(self.via)
-
-
 def provisioned(station: Station, folder: Path, name: str) -> bytes:
     """A node with a signed, calibrated datasheet; its UUID."""
     create(folder, name=name, profile=TYPE)
     node = VirtualNode(folder)
     (folder / "calibration.csv").write_text(CALIBRATION)
-    contact = Contact(Identity.decode(node.identify()), NodeLink(node), tag_uid=bytes(7))
     order = BuildOrder(TYPE, calibration=folder / "calibration.csv", name=name)
-    with Conversation(contact, notice=lambda _notice: None) as talk:
+    with Conversation(on_reader(node), notice=lambda _notice: None) as talk:
         provision(station, talk, order, accept=lambda _who: None, reporter=Silent())
     return node.tim.flash.uuid
 

@@ -1,9 +1,10 @@
 """The other side of the provisioning benchmarks: virtual nodes, one after the other on one reader or bus, or many.
 
 Started as a process of its own: ``python -m benchmarks.nodes nfc|can LINK [--pace] [--tag 2] [--crypto-delay MS]``. For
-every line on stdin it takes the present node away and puts a new one down, and answers with two words: the node's UUID,
-and how many point operations (signatures, ECDH, checks of signatures; one-time keys are made in idle time) the node
-before it did. With ``--many N`` there are N nodes on a bus at once, until stdin closes.
+every line on stdin it takes the present node away and puts a new one down, and answers with four words: the node's
+UUID, how many point operations (signatures, ECDH, checks of signatures; one-time keys are made in idle time) the node
+before it did, how many seconds its flash took to be safe (this machine's disk), and how many it waited, at random,
+before its last answer to everyone. With ``--many N`` there are N nodes on a bus at once, until stdin closes.
 """
 
 from __future__ import annotations
@@ -11,6 +12,7 @@ from __future__ import annotations
 import argparse
 import sys
 import tempfile
+import time
 from pathlib import Path
 from typing import Literal
 
@@ -18,18 +20,43 @@ from teds_provision.node.can.server import CanServer
 from teds_provision.node.flash_file import FlashFile
 from teds_provision.node.nfc.server import NfcServer
 from teds_provision.node.virtual import Delays, VirtualNode
+from teds_provision.protocol.flash import Flash
 
 TAGS: dict[str, Literal["2", "4"]] = {"2": "2", "4": "4"}
 
 
 class CountingNode(VirtualNode):
-    """A virtual node that counts its point operations."""
+    """A virtual node that counts its point operations, and the seconds of its flash."""
 
     operations = 0
+    flash = 0.0
+
+    def __init__(self, folder: Path, *, delays: Delays) -> None:
+        super().__init__(folder, delays=delays)
+        plain = self.flash_file.commit
+
+        def commit(state: Flash) -> None:
+            began = time.perf_counter()
+            try:
+                plain(state)
+            finally:
+                self.flash += time.perf_counter() - began
+
+        self.flash_file.commit = commit  # type: ignore[method-assign]
 
     def _work(self) -> None:
         self.operations += 1
         super()._work()
+
+
+class CountingServer(CanServer):
+    """A bus that remembers how long its node waited before its last answer to everyone."""
+
+    waited = 0.0
+
+    def _spread(self) -> float:
+        self.waited = super()._spread()
+        return self.waited
 
 
 def made(folder: Path, delay: float) -> CountingNode:
@@ -45,15 +72,16 @@ def one_after_the_other(options: argparse.Namespace, place: Path) -> None:
     for number, _ in enumerate(sys.stdin):
         if server is not None:
             server.stop()
-        operations = node.operations if node is not None else 0
+        operations, flash = (node.operations, node.flash) if node is not None else (0, 0.0)
+        waited = server.waited if isinstance(server, CountingServer) else 0.0
         node = made(place / str(number), options.crypto_delay / 1000)
         if options.via == "nfc":
             tag = TAGS[options.tag]
             server = NfcServer(options.link, node, tag=tag, wt_int=options.wait_time, pace=options.pace)
         else:
-            server = CanServer(options.link, node, counts_as_tapped=node.in_factory_state)
+            server = CountingServer(options.link, node, counts_as_tapped=node.in_factory_state)
         server.start()
-        print(node.tim.flash.uuid.hex(), operations, flush=True)
+        print(node.tim.flash.uuid.hex(), operations, flash, waited, flush=True)
     if server is not None:
         server.stop()
 

@@ -1,8 +1,9 @@
 """What grows with the number of nodes: commands on stores of 10 to 100,000 nodes, wall time, memory and exponents.
 
-Run: ``python -m benchmarks.scale [SIZE …]`` (default 10 1000 10000 100000). Each command is the shipped one, a process
-of its own, the median of three runs (one at 100,000). ``exponent``: 0 is flat, 1 grows as the nodes do, between the two
-largest sizes, less the time of a command that does nothing (``--version``). Aims: issue 13 row 8, issue 9 "At scale".
+Run: ``python -m benchmarks.scale [SIZE …]`` (default 10 1000 10000 100000). Each command is the shipped one, a
+process of its own, the median of three runs (one at 100,000). ``CPU`` and ``MB`` are those at the largest size.
+``exponent``: 0 is flat, 1 grows as the nodes do, between the two largest sizes, less the time of a command that does
+nothing (``--version``). Aims: issue 13 row 8, issue 9 "At scale".
 """
 
 from __future__ import annotations
@@ -51,10 +52,11 @@ class Row:
 
 @dataclass(frozen=True)
 class Taken:
-    """Seconds and megabytes of one command."""
+    """Seconds on the wall and of the processor, and megabytes, of one command."""
 
     seconds: float
     megabytes: float
+    cpu: float
 
 
 def fill(home: Path, count: int) -> None:
@@ -124,7 +126,7 @@ def commands(folder: Path, count: int) -> Iterator[Row]:
     yield Row("whitelist list", ("whitelist", "list"))
     yield Row("whitelist add", ("whitelist", "add", "ee" * 10))
     yield Row("whitelist export", ("whitelist", "export", listed))
-    yield Row("whitelist import", ("whitelist", "import", listed))
+    yield Row("whitelist import", ("whitelist", "import", listed), None, None)  # whole or not at all: no list
     yield Row("doctor", ("doctor",), 3.0, None)
     bundle, sealed = str(folder / f"bundle{count}"), str(folder / f"backup{count}")
     words = ("export-keys", "--to", RECEIVER, "--all", "--mode", "copy", "--output", bundle, "--yes")
@@ -189,7 +191,7 @@ def run(home: Path, words: tuple[str, ...]) -> Taken:
     process.returncode = os.waitstatus_to_exitcode(status)
     if process.returncode:
         print(f"exit {process.returncode}: {' '.join(words)}", file=sys.stderr)
-    return Taken(time.perf_counter() - begun, usage.ru_maxrss / 1024)
+    return Taken(time.perf_counter() - begun, usage.ru_maxrss / 1024, usage.ru_utime + usage.ru_stime)
 
 
 def main(sizes: tuple[int, ...]) -> None:
@@ -208,19 +210,20 @@ def main(sizes: tuple[int, ...]) -> None:
                 with node(Path(name)) if row.name.startswith("provision") else nullcontext():
                     runs = [run(home, row.words) for _ in range(1 if row.once or size >= 100_000 else 3)]
                 median = statistics.median(one.seconds for one in runs)
-                taken.setdefault(row.name, {})[size] = Taken(median, max(one.megabytes for one in runs))
+                cpu, most = statistics.median(one.cpu for one in runs), max(one.megabytes for one in runs)
+                taken.setdefault(row.name, {})[size] = Taken(median, most, cpu)
     print_table(sizes, rows, taken)
 
 
 def print_table(sizes: tuple[int, ...], rows: dict[str, Row], taken: dict[str, dict[int, Taken]]) -> None:
     """One line a command: seconds at each size, memory at the largest, the exponent, and the verdict on its aim."""
-    print("command".ljust(18) + "".join(f"{size:>10}" for size in sizes) + "        MB  exponent  aim")
+    print("command".ljust(18) + "".join(f"{size:>10}" for size in sizes) + "       CPU        MB  exponent  aim")
     nothing = taken["--version"]
     for name, each in taken.items():
         cells = "".join(f"{each[size].seconds:>8.2f} s" for size in sizes)
         most, least = each[sizes[-1]], nothing[sizes[-1]]
         exponent, aim = _exponent(sizes, each, nothing), _aim(rows[name], most, least)
-        print(f"{name:<18}{cells}{most.megabytes:>10.0f}{exponent:>10}  {aim}")
+        print(f"{name:<18}{cells}{most.cpu:>8.2f} s{most.megabytes:>10.0f}{exponent:>10}  {aim}")
     table, listed = taken["nodes (table)"][sizes[-1]], taken["nodes --json"][sizes[-1]]
     print(f"table / JSON: {table.seconds / listed.seconds:.2f} (aim 2)")
 

@@ -7,12 +7,14 @@ cannot flake against their aims.
 from __future__ import annotations
 
 import ast
+import re
 import subprocess
 import sys
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TypeGuard
 
 PACKAGE = Path(__file__).resolve().parent.parent / "teds_provision"
 NAME = "teds_provision"
@@ -52,7 +54,19 @@ def _targets(tree: ast.AST, known: set[str]) -> set[str]:
     return result
 
 
-def circles(found: dict[str, Module]) -> list[list[str]]:
+def scripts() -> dict[str, frozenset[str]]:
+    """What each script of the page imports, by its path in the page's folder."""
+    folder = PACKAGE / "ncap" / "page" / "js"
+    found = {}
+    for path in folder.rglob("*.js"):
+        named = re.findall(r"""from "(\.[^"]+)";""", path.read_text(encoding="utf-8"))
+        found[str(path.relative_to(folder))] = frozenset(
+            str((path.parent / name).resolve().relative_to(folder)) for name in named
+        )
+    return found
+
+
+def circles(imports: Mapping[str, Collection[str]]) -> list[list[str]]:
     """Groups of files that import each other (Tarjan's strongly connected components of more than one)."""
     number: dict[str, int] = {}
     low: dict[str, int] = {}
@@ -62,7 +76,7 @@ def circles(found: dict[str, Module]) -> list[list[str]]:
     def visit(name: str) -> None:
         number[name] = low[name] = len(number)
         stack.append(name)
-        for target in found[name].imports:
+        for target in imports[name]:
             if target not in number:
                 visit(target)
                 low[name] = min(low[name], low[target])
@@ -75,7 +89,7 @@ def circles(found: dict[str, Module]) -> list[list[str]]:
             if len(group) > 1:
                 result.append(sorted(group))
 
-    for name in found:
+    for name in imports:
         if name not in number:
             visit(name)
     return result
@@ -83,24 +97,27 @@ def circles(found: dict[str, Module]) -> list[list[str]]:
 
 def late_imports(found: dict[str, Module]) -> list[str]:
     """Imports of our own modules inside functions: ``file:line``."""
-    result = []
+    result = set()
     for module in found.values():
-        for function in ast.walk(module.tree):
-            if isinstance(function, ast.FunctionDef | ast.AsyncFunctionDef):
-                for node in ast.walk(function):
-                    ours = isinstance(node, ast.ImportFrom) and (node.module or "").split(".")[0] == NAME
-                    if ours or (isinstance(node, ast.Import) and any(a.name.startswith(NAME) for a in node.names)):
-                        result.append(f"{module.path.relative_to(PACKAGE)}:{node.lineno}")
-    return sorted(set(result))
+        functions = (node for node in ast.walk(module.tree) if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef))
+        late = (node for function in functions for node in ast.walk(function) if _imports_ours(node))
+        result |= {f"{module.path.relative_to(PACKAGE)}:{node.lineno}" for node in late}
+    return sorted(result)
+
+
+def _imports_ours(node: ast.AST) -> TypeGuard[ast.Import | ast.ImportFrom]:
+    if isinstance(node, ast.ImportFrom):
+        return (node.module or "").split(".")[0] == NAME
+    return isinstance(node, ast.Import) and any(alias.name.split(".")[0] == NAME for alias in node.names)
 
 
 def complex_functions(found: dict[str, Module]) -> list[str]:
     """Functions of cyclomatic complexity C or worse (11 and more, as radon counts)."""
-    from radon.complexity import cc_visit  # noqa: PLC0415  only this figure needs it
+    from radon.complexity import cc_visit_ast  # noqa: PLC0415  only this figure needs it
 
     result = []
     for module in found.values():
-        for block in cc_visit(module.path.read_text(encoding="utf-8")):
+        for block in cc_visit_ast(module.tree):
             for one in [block, *getattr(block, "methods", [])]:
                 if type(one).__name__ == "Function" and one.complexity > 10:
                     result.append(f"{one.complexity:3} {module.path.relative_to(PACKAGE)}:{one.lineno} {one.name}")
@@ -140,7 +157,8 @@ def entered() -> str:
 def report() -> Iterator[str]:
     """The table, line by line."""
     found = modules()
-    rings, late, knots = circles(found), late_imports(found), complex_functions(found)
+    rings = circles({name: module.imports for name, module in found.items()}) + circles(scripts())
+    late, knots = late_imports(found), complex_functions(found)
     yield f"circles of files                        {len(rings):6}   aim 0"
     yield from (f"    {' ~ '.join(ring)}" for ring in rings)
     yield f"imports of our own inside functions     {len(late):6}   aim 10 at most"

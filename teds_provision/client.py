@@ -59,7 +59,7 @@ def default_home() -> Path:
 
 
 def connect(
-    url: str | None = None, *, token: str | None = None, home: Path | None = None, timeout: float = 120.0
+    url: str | None = None, *, token: str | None = None, home: str | Path | None = None, timeout: float = 120.0
 ) -> Client:
     """A client: of ``url`` with a ``token`` (ncap token add), else of the Unix socket in ``home`` (default: yours)."""
     return Client(url, token=token, home=home, timeout=timeout)
@@ -69,10 +69,15 @@ class Client:
     """See the module. ``timeout`` in seconds, of one request."""
 
     def __init__(
-        self, url: str | None = None, *, token: str | None = None, home: Path | None = None, timeout: float = 120.0
+        self,
+        url: str | None = None,
+        *,
+        token: str | None = None,
+        home: str | Path | None = None,
+        timeout: float = 120.0,
     ) -> None:
         self.url, self._token, self._timeout = url, token, timeout
-        self._home = home or default_home()
+        self._home = Path(home) if home else default_home()
         self._connection: http.client.HTTPConnection | None = None
 
     def __enter__(self) -> Client:
@@ -154,8 +159,15 @@ class Client:
         return list(self.request("POST", "/discover", {})["nodes"])
 
     def nodes(self) -> list[dict[str, Any]]:
-        """Every node."""
-        return list(self.request("GET", "/nodes")["nodes"])
+        """Every node, asked for a thousand at a time."""
+        found: dict[str, dict[str, Any]] = {}
+        offset = 0
+        while True:
+            answer = self.request("GET", f"/nodes?offset={offset}")
+            found |= {node["uuid"]: node for node in answer["nodes"]}
+            offset += len(answer["nodes"])
+            if not answer["nodes"] or offset >= answer["total"]:
+                return list(found.values())
 
     def node(self, node: str) -> dict[str, Any]:
         """One node, by UUID, prefix or name."""

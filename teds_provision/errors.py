@@ -10,7 +10,16 @@ This module stands below every room and imports nothing.
 
 from __future__ import annotations
 
-from typing import ClassVar
+import re
+from typing import ClassVar, Final
+
+_LONG_WORD: Final = r"\S{513,}"
+"""Longer than any path or key that a person reads: somebody's five thousand letters, given back to him."""
+
+
+def _shortened(text: str) -> str:
+    """The text with the middle left out of words that are too long to be read; an error has three lines."""
+    return re.sub(_LONG_WORD, lambda word: f"{word[0][:200]}[…]{word[0][-40:]}", text)
 
 
 class TedsProvisionError(Exception):
@@ -20,9 +29,15 @@ class TedsProvisionError(Exception):
     code: ClassVar[str] = "failed"
 
     def __init__(self, message: str, *, hint: str = "") -> None:
-        super().__init__(message)
-        self.message = message
+        self.message = _shortened(message)
+        super().__init__(self.message)
         self.hint = hint
+
+
+class Bug(TedsProvisionError):
+    """A foreign exception where a thread would have ended without a word (exit 1)."""
+
+    code = "bug"
 
 
 class UsageFailure(TedsProvisionError):

@@ -15,7 +15,7 @@ import re
 import secrets
 import stat
 import time
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import BinaryIO, Final
@@ -29,6 +29,7 @@ SHARED: Final = 0o666
 _SUFFIX: Final = ".teds-part"
 _STALE_SECONDS: Final = 60.0  # between making the file and locking it a living writer looks like a dead one
 _LONGEST_SOCKET: Final = 100
+_PIECE: Final = 1 << 16
 """Octets: Linux takes 107 for the name of a Unix socket."""
 _NO_FOLDER_SYNC: Final = frozenset({errno.EINVAL, errno.ENOTSUP, errno.ENOSYS, errno.EROFS, errno.EACCES})
 _NO_HARD_LINKS: Final = frozenset({errno.EPERM, errno.ENOTSUP, errno.ENOSYS, errno.EMLINK, errno.EXDEV, errno.EACCES})
@@ -48,6 +49,10 @@ def whole_file(path: Path, *, replace: bool, mode: int = PRIVATE) -> Iterator[Bi
 @contextmanager
 def whole_draft(path: Path, *, replace: bool, mode: int = PRIVATE) -> Iterator[tuple[Path, BinaryIO]]:
     """Like :func:`whole_file`, with the file's present name, for those who write it by its name."""
+    if not path.name:  # "" and "/"
+        raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), str(path))
+    if replace and path.exists() and not (path.is_file() or path.is_dir()):  # a rename would end a device: /dev/null
+        raise OSError(errno.EINVAL, "it is a device, a pipe or a socket, which is not replaced by a file", str(path))
     draft = path.with_name(f".{path.name}.{secrets.token_hex(8)}{_SUFFIX}")
     _sweep(path)
     descriptor = os.open(draft, os.O_CREAT | os.O_EXCL | os.O_RDWR | os.O_NOFOLLOW | os.O_CLOEXEC, mode)
@@ -66,12 +71,16 @@ def whole_draft(path: Path, *, replace: bool, mode: int = PRIVATE) -> Iterator[t
 
 
 def write_whole(
-    path: Path, octets: bytes, *, mode: int = PRIVATE, failure: type[TedsProvisionError] = StoreFailure
+    path: Path,
+    octets: bytes | Iterable[bytes],
+    *,
+    mode: int = PRIVATE,
+    failure: type[TedsProvisionError] = StoreFailure,
 ) -> None:
     """Put a file in the place of ``path``, whole and durable; raises ``failure``, and then the old one is as it was."""
     try:
         with whole_file(path, replace=True, mode=mode) as file:
-            file.write(octets)
+            file.writelines((octets,) if isinstance(octets, bytes) else octets)
     except OSError as error:
         raise _cannot_write(path, error, failure) from error
 
@@ -79,14 +88,23 @@ def write_whole(
 def write_new(
     path: Path, octets: bytes, *, mode: int = PRIVATE, failure: type[TedsProvisionError] = StoreFailure
 ) -> None:
-    """Write a new file, whole and durable, never over another.
+    """Write a new file, whole and durable, never over another; raises as :func:`new_file` does."""
+    with new_file(path, mode=mode, failure=failure) as file:
+        file.write(octets)
+
+
+@contextmanager
+def new_file(
+    path: Path, *, mode: int = PRIVATE, failure: type[TedsProvisionError] = StoreFailure
+) -> Iterator[BinaryIO]:
+    """Give a new file to write; when the block ends well it becomes ``path``, whole and durable, never over another.
 
     Raises UsageFailure where something lies at ``path``, NotFound where its folder is missing, else ``failure``.
     """
     require_new(path)
     try:
         with whole_file(path, replace=False, mode=mode) as file:
-            file.write(octets)
+            yield file
     except FileExistsError:
         raise _taken(path) from None
     except OSError as error:
@@ -111,12 +129,27 @@ def read_limited(
 ) -> bytes:
     """Return the octets of a file, reading no more than ``max_octets`` of it.
 
-    ``follow`` False refuses a symbolic link. Raises NotFound (no such file), BadData (larger than any ``what``), else
-    ``failure``.
+    ``follow`` False refuses a symbolic link. Raises NotFound (no such file), ``failure`` (it cannot be read), and
+    BadData (larger than any ``what``).
     """
+    with _told(path, failure):
+        octets = _read(os.open(path, os.O_RDONLY | os.O_CLOEXEC | (0 if follow else os.O_NOFOLLOW)), max_octets + 1)
+    if len(octets) > max_octets:
+        raise BadData(f"{path} is larger than {max_octets} octets: that is no {what}.")
+    return octets
+
+
+def open_to_read(path: Path) -> BinaryIO:
+    """Open a file to read from; raises NotFound where it is not there or cannot be read."""
+    with _told(path, NotFound):
+        return open(os.open(path, os.O_RDONLY | os.O_CLOEXEC), "rb")
+
+
+@contextmanager
+def _told(path: Path, failure: type[TedsProvisionError]) -> Iterator[None]:
+    """Say why a file cannot be read."""
     try:
-        with open(os.open(path, os.O_RDONLY | os.O_CLOEXEC | (0 if follow else os.O_NOFOLLOW)), "rb") as file:
-            octets = file.read(max_octets + 1)
+        yield
     except FileNotFoundError:
         raise NotFound(f"There is no file {path}.") from None
     except IsADirectoryError:
@@ -125,9 +158,26 @@ def read_limited(
         raise NotFound(f"{str(path)!r} is no name of a file.") from error
     except OSError as error:
         raise failure(f"{path} cannot be read: {error.strerror}.", hint="Check its owner and mode.") from error
-    if len(octets) > max_octets:
-        raise BadData(f"{path} is larger than {max_octets} octets: that is no {what}.")
-    return octets
+
+
+def _read(descriptor: int, most: int) -> bytes:
+    """So many octets at most of an open file, which is closed; raises OSError."""
+    parts: list[bytes] = []
+    try:  # by the system's own calls: half of what open() does, where there are thousands of files
+        while most and (part := os.read(descriptor, min(most, _PIECE))):
+            parts.append(part)
+            most -= len(part)
+    finally:
+        os.close(descriptor)
+    return b"".join(parts)
+
+
+def holds(path: Path, octets: bytes) -> bool:
+    """Whether a regular file holds exactly these octets; no more of it is read than they are long. Raises OSError."""
+    if not path.is_file():
+        return False
+    with path.open("rb") as file:
+        return file.read(len(octets) + 1) == octets
 
 
 def sync_folder(folder: Path) -> None:

@@ -2,7 +2,14 @@
 
 from __future__ import annotations
 
-import json
+from typing import TYPE_CHECKING
+
+from teds_provision.lazy import late
+
+if TYPE_CHECKING:
+    import json
+else:
+    json = late("json")
 
 
 def printable(text: str) -> str:

@@ -16,14 +16,11 @@ This module stands below every room and imports nothing of ours.
 
 from __future__ import annotations
 
-import shlex
 import sys
 from collections.abc import Callable, Mapping
 from importlib import import_module
-from importlib.util import find_spec
-from pathlib import Path
 from types import MappingProxyType
-from typing import Final
+from typing import TYPE_CHECKING, Final
 
 _NOTHING: Final[Mapping[str, str]] = MappingProxyType({})
 
@@ -40,9 +37,14 @@ def lazy(package: str, where: Mapping[str, str] = _NOTHING) -> Callable[[str], o
             value: object = getattr(import_module(f"{package}.{where[name]}"), name)
             setattr(sys.modules[package], name, value)
             return value
-        if name.startswith("_") or find_spec(f"{package}.{name}") is None:
-            raise AttributeError(f"module {package!r} has no attribute {name!r}")
-        return import_module(f"{package}.{name}")
+        module = f"{package}.{name}"
+        try:
+            if not name.startswith("_"):
+                return import_module(module)
+        except ModuleNotFoundError as error:
+            if error.name != module:  # it is there, and something that it needs is not
+                raise
+        raise AttributeError(f"module {package!r} has no attribute {name!r}")
 
     return load
 
@@ -59,18 +61,25 @@ class _Late:
         return value
 
 
-def how_to_install(*packages: str) -> str:
-    """The command that puts packages beside this tool, where it is: pipx keeps it apart, else this Python's own pip."""
-    names = " ".join(packages)
-    parts = Path(sys.prefix).parts
-    if "pipx" in parts and "venvs" in parts:
-        return f"Install it: pipx inject {parts[-1]} {names}"
-    return f"Install it: {shlex.quote(sys.executable)} -m pip install {names}"
-
-
 def late(module: str) -> object:
     """Return what stands for a heavy library until its first use, so that its import can stand on top.
 
     For type checkers: ``if TYPE_CHECKING: import numpy as np``, ``else: np = late("numpy")``.
     """
     return _Late(module)
+
+
+if TYPE_CHECKING:
+    import pathlib
+    import shlex
+else:
+    pathlib, shlex = late("pathlib"), late("shlex")
+
+
+def how_to_install(*packages: str) -> str:
+    """The command that puts packages beside this tool, where it is: pipx keeps it apart, else this Python's own pip."""
+    names = " ".join(packages)
+    parts = pathlib.Path(sys.prefix).parts
+    if "pipx" in parts and "venvs" in parts:
+        return f"Install it: pipx inject {parts[-1]} {names}"
+    return f"Install it: {shlex.quote(sys.executable)} -m pip install {names}"

@@ -11,6 +11,7 @@ import json
 import re
 from collections.abc import Iterable
 from dataclasses import dataclass
+from functools import cache
 from typing import Any, Final
 
 from teds_provision.errors import BadData
@@ -69,19 +70,23 @@ def load_json(text: str | bytes, what: str, *, octets: int = LIMITS.teds_file, f
     ``what`` names it in errors, with its article: "the image"; with ``file`` they name file and line. Raises BadData.
     """
     check_size(len(text), octets, what)
+    if not text.strip():
+        raise BadData(f"{f'{file}:1: ' * bool(file)}{_upper(what)} is empty.")
     if isinstance(text, str):
         opened, values = text.count("[") + text.count("{"), text.count(",")
     else:
         opened, values = text.count(b"[") + text.count(b"{"), text.count(b",")
     check_count(opened + values, LIMITS.json_values, f"values in {what}")
     try:
-        value = json.loads(text, object_pairs_hook=_unique, parse_int=_integer)
+        value = _parsed(text)
     except RecursionError as error:
         raise BadData(f"{file}:1: " * bool(file) + f"{_upper(what)} is nested too deeply.") from error
     except json.JSONDecodeError as error:
         if file:
             raise BadData(f"{file}:{error.lineno}: this is not JSON: {error.msg}.") from error
         raise BadData(f"{_upper(what)} is not JSON: line {error.lineno}: {error.msg}.") from error
+    except UnicodeDecodeError as error:
+        raise BadData(f"{_upper(what)} is no text: it is binary, or not UTF-8.") from error
     except ValueError as error:
         raise BadData(f"{file}:1: " * bool(file) + f"{_upper(what)} cannot be read: {error}.") from error
     if opened > LIMITS.json_depth:  # fewer brackets than levels nest no deeper
@@ -120,13 +125,13 @@ def check_toml(text: str, file: str) -> None:
         raise BadData(f"{file}: there are {keys} keys; at most {LIMITS.toml_keys} are read.")
 
 
-def check_xml(text: bytes, what: str, *, elements: int = 0, attributes: int = 0) -> None:
-    """Raise BadData for XML with more elements or attributes than are read; 0 stands for the usual limit.
+def check_xml(text: bytes, what: str) -> None:
+    """Raise BadData for XML with more elements or attributes than are read.
 
     Counted in the octets: expat takes no encoding in which ``<`` and ``=`` are other octets than in ASCII.
     """
-    check_count(text.count(b"<"), elements or LIMITS.xml_elements, f"tags in {what}")
-    check_count(text.count(b"="), attributes or LIMITS.xml_attributes, f"attributes in {what}")
+    check_count(text.count(b"<"), LIMITS.xml_elements, f"tags in {what}")
+    check_count(text.count(b"="), LIMITS.xml_attributes, f"attributes in {what}")
 
 
 def whole_number(text: str, what: str) -> int:
@@ -136,6 +141,20 @@ def whole_number(text: str, what: str) -> int:
         shown = digits if len(digits) <= 40 else f"{digits[:12]}… ({len(digits)} characters)"
         raise BadData(f"{_upper(what)} is no whole number: {shown!r}.")
     return int(digits)
+
+
+def _parsed(text: str | bytes) -> Any:
+    """As ``json.loads`` does it, which would make another decoder for every document."""
+    if isinstance(text, str) and text.startswith("\ufeff"):
+        return json.loads(text)  # it says what is wrong there
+    return _decoder().decode(
+        text if isinstance(text, str) else text.decode(json.detect_encoding(text), "surrogatepass")
+    )
+
+
+@cache
+def _decoder() -> json.JSONDecoder:
+    return json.JSONDecoder(object_pairs_hook=_unique, parse_int=_integer)
 
 
 class _TwiceNamed(ValueError):

@@ -8,6 +8,7 @@ from pathlib import Path
 
 from teds_provision.errors import NodeSilent
 from teds_provision.links import LINKS, Capabilities, Contact
+from teds_provision.node.virtual import VirtualNode
 from teds_provision.protocol.announce import default_can_address
 from teds_provision.protocol.flash import Flash
 from teds_provision.protocol.keys import SoftwareKey, node_key_message
@@ -96,6 +97,29 @@ class MemoryLink:
 
     def close(self) -> None:
         self.board.tim.link_lost(self.via)
+
+
+@dataclass
+class VirtualLink:
+    """A virtual node that lies on the reader of this process."""
+
+    node: VirtualNode
+    via: str = "nfc"
+
+    @property
+    def capabilities(self) -> Capabilities:
+        return LINKS[self.via].capabilities
+
+    def exchange(self, frame: bytes) -> bytes:
+        return self.node.request(self.via, frame, tapped=True)
+
+    def close(self) -> None:
+        self.node.lost(self.via)
+
+
+def on_reader(node: VirtualNode) -> Contact:
+    """The virtual node as a reader would find it."""
+    return Contact(Identity.decode(node.identify()), VirtualLink(node), tag_uid=b"\x04" + bytes(6))
 
 
 def contact(board: Board, link: MemoryLink | None = None) -> Contact:

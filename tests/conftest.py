@@ -1,5 +1,7 @@
 """For all tests: hypothesis without deadlines (machines are shared), the same examples on every run of the gate.
 
+``station`` and ``board`` are a fresh desk for each test; rooms whose stations are others have fixtures of their own.
+
 At the gate (``CI`` is set) a test marked ``system`` that is skipped has failed: what it needs is to be installed there.
 """
 
@@ -7,14 +9,19 @@ from __future__ import annotations
 
 import os
 import signal
-from collections.abc import Generator
+from collections.abc import Generator, Iterator
+from pathlib import Path
 
 import pytest
 from hypothesis import settings
 
+from teds_provision.station.station import Station
+from tests.bench import Board, make_station
+
 AT_THE_GATE = os.environ.get("CI", "").lower() not in ("", "0", "false")
 
 settings.register_profile("desk", deadline=None, print_blob=True)
+settings.register_profile("quick", deadline=None, print_blob=True, max_examples=20)
 settings.register_profile("gate", deadline=None, print_blob=True, derandomize=True)
 settings.load_profile("gate" if AT_THE_GATE else "desk")
 
@@ -33,3 +40,17 @@ def pytest_runtest_makereport(item: pytest.Item) -> Generator[None, pytest.TestR
         why = report.longrepr[2] if isinstance(report.longrepr, tuple) else report.longrepr
         report.outcome, report.longrepr = "failed", f"skipped at the gate, where nothing may be missing: {why}"
     return report
+
+
+@pytest.fixture
+def station(tmp_path: Path) -> Iterator[Station]:
+    """A new station with a passphrase vault at the lowest cost."""
+    made = make_station(tmp_path / "home")
+    yield made
+    made.close()
+
+
+@pytest.fixture
+def board() -> Board:
+    """A new node in factory state."""
+    return Board()

@@ -16,6 +16,7 @@ from teds_provision import files
 from teds_provision.errors import BadData, NotFound, StoreFailure, UsageFailure, VaultFailure
 from teds_provision.files import (
     SHARED,
+    holds,
     private_folder,
     read_limited,
     whole_file,
@@ -81,6 +82,20 @@ def test_replacing_a_link_leaves_what_it_points_to_alone(tmp_path: Path) -> None
     write_whole(tmp_path / "a", b"new")
     assert (target.read_bytes(), (tmp_path / "a").read_bytes()) == (b"old", b"new")
     assert not (tmp_path / "a").is_symlink()
+
+
+@pytest.mark.parametrize("link", [False, True])
+def test_a_device_is_never_replaced(tmp_path: Path, link: bool) -> None:
+    """As root, ``show --plot /dev/null`` made /dev/null a file: every other program of the machine wrote into it."""
+    pipe = tmp_path / "pipe"
+    os.mkfifo(pipe)
+    named = tmp_path / "named"
+    named.symlink_to(pipe)
+    with pytest.raises(UsageFailure, match="is a device, a pipe or a socket"):
+        write_whole(named if link else pipe, b"new", failure=UsageFailure)
+    assert pipe.is_fifo()
+    assert named.is_symlink()
+    assert sorted(tmp_path.iterdir()) == [named, pipe]
 
 
 def test_nothing_is_left_when_writing_fails(tmp_path: Path) -> None:
@@ -177,3 +192,12 @@ def test_a_folder_that_cannot_be_brought_to_the_disk_is_told(tmp_path: Path, mon
     monkeypatch.setattr(files.os, "fsync", broken)
     with pytest.raises(StoreFailure):
         write_whole(tmp_path / "a", b"")
+
+
+def test_a_file_holds_these_octets_and_no_more_is_read_of_it(tmp_path: Path) -> None:
+    path = tmp_path / "a"
+    path.write_bytes(b"one")
+    told = {octets: holds(path, octets) for octets in (b"one", b"on", b"one ", b"")}
+    assert told == {b"one": True, b"on": False, b"one ": False, b"": False}
+    assert not holds(tmp_path / "none", b"")
+    assert not holds(Path("/dev/zero"), b"\0")

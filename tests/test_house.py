@@ -16,7 +16,6 @@ import pytest
 
 ROOT = Path(__file__).parent.parent
 
-COMPLEX_FUNCTIONS = 4
 FILES_IN_A_FOLDER = 15
 FULLER: dict[str, int] = {}
 """Folders that have more files, and how many."""
@@ -37,15 +36,27 @@ def house() -> ModuleType:
     return module
 
 
-def test_imports_of_our_own_stand_on_top(house: ModuleType) -> None:
-    found = Counter(place.rpartition(":")[0] for place in house.late_imports(house.modules()))
+@pytest.fixture(scope="module")
+def modules(house: ModuleType) -> dict[str, object]:
+    return dict(house.modules())
+
+
+def test_imports_of_our_own_stand_on_top(house: ModuleType, modules: dict[str, object]) -> None:
+    found = Counter(place.rpartition(":")[0] for place in house.late_imports(modules))
     more = [f"{file}: {count}" for file, count in found.items() if count > LATE_IMPORTS.get(file, 0)]
     assert not more, "import on top, through the room if it must load late (CONTRIBUTING.md, The house)"
 
 
-def test_no_more_functions_have_too_many_branches(house: ModuleType) -> None:
-    found = house.complex_functions(house.modules())
-    assert len(found) <= COMPLEX_FUNCTIONS, "\n".join(["a function of complexity C more:", *found])
+def test_scripts_of_the_page_import_each_other_one_way(house: ModuleType) -> None:
+    """The circles of Python's files are tests/test_architecture.py's."""
+    found = house.scripts()
+    assert found["views/node.js"], "the scripts' imports are not read"
+    assert house.circles(found) == []
+
+
+def test_no_more_functions_have_too_many_branches(house: ModuleType, modules: dict[str, object]) -> None:
+    found = house.complex_functions(modules)
+    assert not found, "\n".join(["functions of complexity C or worse:", *found])
 
 
 def test_a_folder_holds_what_can_be_looked_over(house: ModuleType) -> None:

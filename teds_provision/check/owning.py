@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from teds_provision.check.outcome import NotApplicable
 from teds_provision.check.probe import Probe, demand, holds
 from teds_provision.check.rule import Stage, rule
+from teds_provision.check.teds_rules import security_state
 from teds_provision.protocol.agreement import AgreedKey, Credentials, RequestPayload, StationAgreement
 from teds_provision.protocol.keys import (
     SoftwareKey,
@@ -25,32 +26,35 @@ _OFF_CURVE = b"\x04" + bytes(64)
 
 
 @dataclass(frozen=True)
-class _Strangers:
+class Strangers:
     """A station and its CA, made for one question."""
 
     station: SoftwareKey
     ca: SoftwareKey
 
     @classmethod
-    def make(cls) -> _Strangers:
+    def make(cls) -> Strangers:
+        """New keys."""
         return cls(SoftwareKey.generate(), SoftwareKey.generate())
 
     def request(self, *, certified: bool = True, one_time: bytes = b"") -> bytes:
+        """Payload of a Request of theirs."""
         signer = self.ca if certified else self.station
         signature = signer.sign(station_key_message(self.station.point))
         one_time = one_time or SoftwareKey.generate().point
         return RequestPayload(self.station.point, signature, self.ca.point, one_time).encode()
 
 
-def _request(payload: bytes) -> Command:
+def request(payload: bytes) -> Command:
+    """Request (128.1) with any payload."""
     return security_command(Function.REQUEST, payload)
 
 
-def _tapped_or_bus(probe: Probe) -> None:
+def tapped_or_bus(probe: Probe) -> None:
     """Whether Request is looked at on this link at all: tapped, or the bus of a node without NFC in factory state."""
     if probe.tapped:
         return
-    if probe.plain(_request(b"")).reason == Reason.NOT_PERMITTED:
+    if probe.plain(request(b"")).reason == Reason.NOT_PERMITTED:
         raise NotApplicable("Request is not permitted on this link: the node is to be tapped.")
 
 
@@ -82,21 +86,21 @@ def factory_reset(probe: Probe) -> str:
 @rule("request-checks", "Key agreement", Stage.FACTORY)
 def request_checks(probe: Probe) -> str:
     """Length before points before SIG104: 4, 15, 5."""
-    _tapped_or_bus(probe)
-    strange = _Strangers.make()
+    tapped_or_bus(probe)
+    strange = Strangers.make()
     wrong = strange.request(certified=False)
-    probe.refused(_request(_OFF_CURVE + wrong[65:-1]), Reason.BAD_FORM, "one octet short, P(station) off the curve")
-    probe.refused(_request(_OFF_CURVE + wrong[65:]), Reason.BAD_POINT, "P(station) off the curve, SIG104 wrong")
-    probe.refused(_request(wrong[:-65] + _OFF_CURVE), Reason.BAD_POINT, "E off the curve, SIG104 wrong")
+    probe.refused(request(_OFF_CURVE + wrong[65:-1]), Reason.BAD_FORM, "one octet short, P(station) off the curve")
+    probe.refused(request(_OFF_CURVE + wrong[65:]), Reason.BAD_POINT, "P(station) off the curve, SIG104 wrong")
+    probe.refused(request(wrong[:-65] + _OFF_CURVE), Reason.BAD_POINT, "E off the curve, SIG104 wrong")
     own = probe.security().node_key
-    probe.refused(_request(strange.request(one_time=own)), Reason.BAD_POINT, "E the node's own point")
-    return probe.refused(_request(wrong), Reason.BAD_SIGNATURE, "SIG104 of another key")
+    probe.refused(request(strange.request(one_time=own)), Reason.BAD_POINT, "E the node's own point")
+    return probe.refused(request(wrong), Reason.BAD_SIGNATURE, "SIG104 of another key")
 
 
 @rule("confirm-without-request", "Key agreement", Stage.FACTORY)
 def confirm_without_request(probe: Probe) -> str:
     """A Confirm with nothing pending gets 2."""
-    _tapped_or_bus(probe)
+    tapped_or_bus(probe)
     return probe.refused(security_command(Function.CONFIRM, bytes(16)), Reason.WRONG_STATE)
 
 
@@ -113,7 +117,7 @@ def agree(probe: Probe, credentials: Credentials, *, epoch: int) -> AgreedKey:
 @rule("confirm-checks", "Key agreement", Stage.AGREEMENT)
 def confirm_checks(probe: Probe) -> str:
     """A Confirm of wrong length gets 4 and leaves what pends; a wrong tagS gets 12, and what pends goes."""
-    _tapped_or_bus(probe)
+    tapped_or_bus(probe)
     before = probe.identity()
     agreed = agree(probe, probe.station, epoch=0)
     wrong = bytes([agreed.confirm.payload[0] ^ 1]) + agreed.confirm.payload[1:]
@@ -128,12 +132,21 @@ def confirm_checks(probe: Probe) -> str:
 @rule("agreement-epoch", "Key agreement", Stage.AGREEMENT)
 def agreement_epoch(probe: Probe) -> str:
     """The epoch that Request offers is the stored one + 1, and Request alone changes nothing."""
-    _tapped_or_bus(probe)
+    tapped_or_bus(probe)
     before = probe.identity()
     agreed = agree(probe, probe.station, epoch=0)
     holds(agreed.epoch == before.epoch + 1, f"Request offers epoch {agreed.epoch}; {before.epoch + 1} is due.")
     holds(probe.identity() == before, "Request changed what Identify says before its Confirm.")
     return f"epoch {agreed.epoch} offered"
+
+
+@rule("agreement-fresh", "Key agreement", Stage.AGREEMENT)
+def agreement_fresh(probe: Probe) -> str:
+    """Each Request gets a nonce of its own."""
+    tapped_or_bus(probe)
+    nonces = {probe.good(StationAgreement(probe.station, probe.uuid).request())[:16] for _ in range(2)}
+    holds(len(nonces) == 2, "Two Requests (128.1) were answered with the same nonceN.")
+    return "two Requests, two nonces"
 
 
 # -- a node that has a key ---------------------------------------------------------------------------------------------
@@ -145,9 +158,31 @@ def keyed_untapped(probe: Probe) -> str:
     if probe.tapped:
         raise NotApplicable("This link counts as tapped; try it over CAN.")
     # what is refused here would change nothing even where it is let through: its SIG104, length and state are wrong
-    probe.refused(_request(_Strangers.make().request(certified=False)), Reason.NOT_PERMITTED)
+    probe.refused(request(Strangers.make().request(certified=False)), Reason.NOT_PERMITTED)
     probe.refused(security_command(Function.CONFIRM, bytes(16)), Reason.NOT_PERMITTED)
     return probe.refused(security_command(Function.SET_CAN_ADDRESS, b"\0"), Reason.NOT_PERMITTED)
+
+
+@rule("keyed-security", "The Security TEDS", Stage.KEYED)
+def keyed_security(probe: Probe) -> str:
+    """With a key too the Security TEDS agrees with Identify: a new epoch is in the initial one at once."""
+    return security_state(probe)
+
+
+@rule("confirm-elsewhere", "Key agreement", Stage.KEYED)
+def confirm_elsewhere(probe: Probe) -> str:
+    """A Confirm that is not by the same session as its Request gets 2, looked at before its tag."""
+    if not probe.tapped:
+        raise NotApplicable("Needs a tap: try it over NFC.")
+    probe.sealed_good(StationAgreement(probe.station, probe.uuid).request())
+    wrong = security_command(Function.CONFIRM, bytes(16))  # a wrong tagS: no node takes a key by it
+    seen = probe.refused(wrong, Reason.WRONG_STATE, "plain, of a Request in a session")
+    probe.close()
+    probe.good(StationAgreement(probe.station, probe.uuid).request())
+    probe.sealed_refused(wrong, Reason.WRONG_STATE, "of a plain Request")
+    probe.refused(wrong, Reason.BAD_TAG, "tagS wrong")
+    probe.close()
+    return seen
 
 
 @rule("keyed-reset", "Which command when", Stage.KEYED)
@@ -162,5 +197,5 @@ def first_owner_wins(probe: Probe) -> str:
     if not probe.tapped:
         raise NotApplicable("Needs a tap: try it over NFC.")
     probe.require(NodeState.KEYED, NodeState.PROVISIONED)
-    probe.refused(_request(_Strangers.make().request(certified=False)), Reason.UNTRUSTED_STATION, "SIG104 wrong too")
-    return probe.refused(_request(_Strangers.make().request()), Reason.UNTRUSTED_STATION, "another owner's CA")
+    probe.refused(request(Strangers.make().request(certified=False)), Reason.UNTRUSTED_STATION, "SIG104 wrong too")
+    return probe.refused(request(Strangers.make().request()), Reason.UNTRUSTED_STATION, "another owner's CA")

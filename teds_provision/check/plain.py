@@ -63,6 +63,14 @@ def prove_length(probe: Probe) -> str:
     return seen
 
 
+@rule("no-payload", "Command frames", Stage.PLAIN)
+def no_payload(probe: Probe) -> str:
+    """Identify and List have no payload."""
+    for function in (Function.IDENTIFY, Function.LIST):
+        seen = probe.refused(security_command(function, b"\0"), Reason.BAD_FORM, "one octet of payload")
+    return seen
+
+
 @rule("frame-length", "Which command when", Stage.PLAIN)
 def frame_length(probe: Probe) -> str:
     """A frame too short for its header, or whose length is wrong."""

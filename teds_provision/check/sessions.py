@@ -9,7 +9,7 @@ from teds_provision.check.probe import Probe, demand, holds
 from teds_provision.check.rule import Stage, rule
 from teds_provision.links.ports import Repeats
 from teds_provision.protocol.agreement import key_id
-from teds_provision.protocol.keys import SoftwareKey
+from teds_provision.protocol.keys import POINT_OCTETS, SoftwareKey
 from teds_provision.protocol.messages.frames import (
     COMMON,
     SECURITY,
@@ -77,6 +77,31 @@ def open_tag(probe: Probe) -> str:
     return "a good tag; Identify the same inside and outside"
 
 
+@rule("open-one-time", "Sessions", Stage.SESSION)
+def open_one_time(probe: Probe) -> str:
+    """A one-time key of the node is for one Open."""
+    seen = []
+    for _ in range(2):
+        session = StationSession(probe.link_key, probe.uuid)
+        seen.append(probe.good(session.open(_ask(probe)))[:POINT_OCTETS])
+    holds(seen[0] != seen[1], "Open (128.3): two Opens were answered with the same one-time key En.")
+    return "two Opens, two one-time keys"
+
+
+@rule("open-beside", "Sessions", Stage.SESSION)
+def open_beside(probe: Probe) -> str:
+    """A new Open leaves the session alone until a good frame comes under it; then the old one is over."""
+    old = probe.open()
+    probe.sealed_good(_IDENTIFY)
+    new = probe.open()
+    good = probe.plain(old.seal(_IDENTIFY))
+    holds(good.ok, f"Sealed (128.4) in a session beside a half-open Open: success is due, {told(good)} came.")
+    old.unseal(good.payload)
+    probe.session = new
+    probe.sealed_good(_IDENTIFY)
+    return demand(probe.plain(old.seal(_IDENTIFY)), Reason.BAD_TAG, "Sealed (128.4) in the session that was replaced")
+
+
 @rule("sealed-counter", "Sessions", Stage.SESSION)
 def sealed_counter(probe: Probe) -> str:
     """Gaps are fine; a counter that was used, a lower one and 0 get 13; the session goes on."""
@@ -106,6 +131,18 @@ def sealed_tag(probe: Probe) -> str:
     return seen
 
 
+@rule("sealed-padding", "Sessions", Stage.SESSION)
+def sealed_padding(probe: Probe) -> str:
+    """A frame whose tag is good and whose PKCS #7 padding is not gets 12; it ends nothing."""
+    session, frame = probe.open(), _IDENTIFY.encode()
+    probe.sealed_good(_IDENTIFY)
+    room = 16 - len(frame)
+    for padding in (bytes(room), b"\0" * (room - 1) + bytes([room]), bytes([17]) * room):
+        seen = demand(probe.plain(session.seal_padded(frame + padding)), Reason.BAD_TAG, f"padding {padding.hex()}")
+    probe.sealed_good(_IDENTIFY)
+    return seen
+
+
 @rule("sealed-only-sealed", "Which command when", Stage.SESSION)
 def sealed_only_sealed(probe: Probe) -> str:
     """Open and Sealed inside a session get 3; unknown functions 1."""
@@ -113,6 +150,16 @@ def sealed_only_sealed(probe: Probe) -> str:
         probe.sealed_refused(security_command(function), Reason.NOT_PERMITTED)
     probe.sealed_refused(Command(0, SECURITY, 99), Reason.UNKNOWN_COMMAND)
     return probe.sealed_refused(Command(0, COMMON, 99), Reason.UNKNOWN_COMMAND)
+
+
+@rule("address-checks", "Command frames", Stage.SESSION)
+def address_checks(probe: Probe) -> str:
+    """Set CAN address takes one octet, 1 to 239; anything else gets 4 and changes nothing."""
+    before = probe.identity()
+    for payload in (b"", b"\0", bytes([240]), b"\x01\x02"):
+        seen = probe.sealed_refused(security_command(Function.SET_CAN_ADDRESS, payload), Reason.BAD_FORM, payload.hex())
+    holds(probe.identity() == before, "A refused Set CAN address changed Identify.")
+    return seen
 
 
 @rule("repetition", "Repetition", Stage.SESSION)

@@ -7,17 +7,21 @@ from collections.abc import Callable
 from dataclasses import replace
 
 from teds_provision.check.outcome import NotApplicable
+from teds_provision.check.owning import Strangers, request, tapped_or_bus
 from teds_provision.check.probe import Probe, holds
 from teds_provision.check.rule import Stage, rule
-from teds_provision.check.teds_rules import absent
+from teds_provision.check.teds_rules import absent, security_state
 from teds_provision.protocol.datasheet import NodeKeys, digests, sign_datasheet, unsigned_datasheet
 from teds_provision.protocol.keys import SoftwareKey, fingerprint, normalise_signature, reset_message, verify
 from teds_provision.protocol.messages.frames import (
     COMMON,
+    Attribute,
     Command,
     Function,
     Reason,
     TedsFunction,
+    TedsStatus,
+    query_teds,
     security_command,
     update_teds,
     write_teds,
@@ -25,9 +29,11 @@ from teds_provision.protocol.messages.frames import (
 from teds_provision.protocol.messages.identity import NodeState
 from teds_provision.teds.codec import security
 from teds_provision.teds.codec.frame import frame
-from teds_provision.teds.codec.security import SecurityTeds
+from teds_provision.teds.codec.security import OUR_VALUES, SecurityTeds
 from teds_provision.teds.image import SECURITY, BlockId
 
+_MOST_WRITTEN = 32768
+"""MaxTEDSSize up to which a TEDS of that size is staged for trying."""
 _HEAD = 53
 """Octets of a Write that are not TEDS: of maxMessage so many less may be written at once."""
 
@@ -60,6 +66,39 @@ def update_checks(probe: Probe) -> str:
     holds(block not in probe.listed(), f"List (128.11) names {block}, which is staged and not committed.")
     probe.close()
     return seen
+
+
+@rule("write-drops", "Writing to flash", Stage.SESSION)
+def write_drops(probe: Probe) -> str:
+    """What lay behind the written octets is dropped; more than MaxTEDSSize gets 10."""
+    block = absent(probe)
+    good = _example(block)
+    probe.sealed_good(write_teds(*block, 0, good))
+    probe.sealed_good(write_teds(*block, 0, good[:6]))
+    probe.sealed_refused(update_teds(*block), Reason.BAD_FORM, "its end was dropped")
+    most = TedsStatus.decode(probe.good(query_teds(*block))).max_size
+    if most > _MOST_WRITTEN:
+        return f"MaxTEDSSize {most} was not tried"
+    room = probe.max_message - _HEAD
+    for offset in range(0, most, room):
+        probe.sealed_good(write_teds(*block, offset, bytes(min(room, most - offset))))
+    seen = probe.sealed_refused(write_teds(*block, most, b"\0"), Reason.TOO_LARGE, f"octet {most + 1}")
+    probe.close()
+    return seen
+
+
+@rule("staging-ends", "Sessions", Stage.SESSION)
+def staging_ends(probe: Probe) -> str:
+    """Staged TEDS go with the session: Update then answers like Query."""
+    block = absent(probe)
+    probe.sealed_good(write_teds(*block, 0, _example(block)))
+    staged = TedsStatus.decode(probe.sealed_good(update_teds(*block)))
+    holds(staged.size == len(_example(block)), f"Update (1.4) of a staged TEDS: size {staged.size}.")
+    probe.close()
+    asked, updated = probe.good(query_teds(*block)), probe.sealed_good(update_teds(*block))
+    holds(asked == updated, "Update (1.4) of what was staged in an earlier session does not answer like Query.")
+    probe.close()
+    return "a new session begins with nothing staged"
 
 
 # -- the commit --------------------------------------------------------------------------------------------------------
@@ -99,9 +138,17 @@ Change = Callable[[SecurityTeds], SecurityTeds]
 
 def _refused_commit(probe: Probe, reason: Reason, why: str, change: Change) -> str:
     """Commit a datasheet that is wrong in one thing, over what is stored; what came."""
-    _write(probe, SECURITY, _signed(probe, change(_sheet(probe, _stored(probe)))))
+    return _refused_over(probe, reason, why, _signed(probe, change(_sheet(probe, _stored(probe)))))
+
+
+def _refused_over(probe: Probe, reason: Reason, why: str, octets: bytes) -> str:
+    """Commit this Security TEDS with what is staged; what came, when the node is as it was before."""
+    before = probe.identity(), probe.teds(SECURITY), probe.listed()
+    _write(probe, SECURITY, octets)
     seen = probe.sealed_refused(update_teds(*SECURITY), reason, why)
     probe.close()
+    after = probe.identity(), probe.teds(SECURITY), probe.listed()
+    holds(after == before, f"Update (1.4) of 128 was refused ({why}), and changed the node.")
     return seen
 
 
@@ -152,6 +199,51 @@ def commit_digests(probe: Probe) -> str:
     return seen
 
 
+@rule("commit-digest", "Writing to flash", Stage.COMMIT)
+def commit_digest(probe: Probe) -> str:
+    """A staged TEDS with another digest than the one that is listed gets 6."""
+    block = absent(probe)
+    listed = _stored(probe) | {block: frame(bytes([3, 4, 0, block[1], 1, 1, 0x80, 2, 0xBE, 0xEF]))}
+    _write(probe, block, _example(block))
+    octets = _signed(probe, _sheet(probe, listed))
+    return _refused_over(probe, Reason.DIGEST_MISMATCH, "another digest", octets)
+
+
+@rule("commit-own-check", "Writing to flash", Stage.COMMIT)
+def commit_own_check(probe: Probe) -> str:
+    """A staged image that does not pass its own check gets 4, whatever is signed."""
+    block = absent(probe)
+    wrong = _example(block)[:-1] + bytes([_example(block)[-1] ^ 1])
+    _write(probe, block, wrong)
+    octets = _signed(probe, _sheet(probe, _stored(probe) | {block: wrong}))
+    return _refused_over(probe, Reason.BAD_FORM, "checksum of a staged TEDS", octets)
+
+
+@rule("commit-values", "Writing to flash", Stage.COMMIT)
+def commit_values(probe: Probe) -> str:
+    """Fields 1 to 4, 105, 109 and 110 with other values than this profile's get 4, signed as they may be."""
+    for field in OUR_VALUES:
+
+        def other(sheet: SecurityTeds, field: int = field) -> SecurityTeds:
+            return replace(sheet, values={**sheet.values, field: 9})
+
+        seen = _refused_commit(probe, Reason.BAD_FORM, f"field {field} with 9", other)
+    return seen
+
+
+@rule("commit-uuid", "Writing to flash", Stage.COMMIT)
+def commit_uuid(probe: Probe) -> str:
+    """A Meta-TEDS of the 2007 form that names another UUID gets 9."""
+    meta = (0, 1)
+    if TedsStatus.decode(probe.good(query_teds(*meta))).attributes & Attribute.READ_ONLY:
+        raise NotApplicable("The Meta-TEDS of this node is read-only.")
+    other = bytes(each ^ 0x55 for each in probe.uuid)
+    octets = frame(bytes([3, 4, 0, 1, 1, 1, 4, 10]) + other)
+    _write(probe, meta, octets)
+    listed = _stored(probe) | {meta: octets}
+    return _refused_over(probe, Reason.WRONG_UUID, "another UUID", _signed(probe, _sheet(probe, listed)))
+
+
 @rule("commit-sequence", "Writing to flash", Stage.COMMIT)
 def commit_sequence(probe: Probe) -> str:
     """A sequence that is not greater, or greater by more than 65536, gets 7."""
@@ -194,7 +286,8 @@ def commit(probe: Probe) -> str:
 @rule("reset", "Reset", Stage.RESET)
 def reset(probe: Probe) -> str:
     """In a session Reset erases key and trust and proves it; epoch and sequence stay, sessions end."""
-    before, challenge = probe.identity(), os.urandom(32)
+    before, stored, challenge = probe.identity(), _stored(probe), os.urandom(32)
+    probe.sealed_refused(security_command(Function.RESET, challenge[1:]), Reason.BAD_FORM, "a challenge of 31 octets")
     proof = probe.sealed_good(security_command(Function.RESET, challenge))
     probe.session = None
     point = probe.security().node_key
@@ -209,4 +302,17 @@ def reset(probe: Probe) -> str:
         kept, f"Reset took epoch {before.epoch} and sequence {before.sequence} to {after.epoch} and {after.sequence}."
     )
     holds(not probe.security().signed, "After Reset the node still shows a signed Security TEDS.")
+    holds(_stored(probe) == stored, "After Reset the other TEDS of the node are not what they were.")
+    security_state(probe)
     return f"factory, epoch {after.epoch} and sequence {after.sequence} kept"
+
+
+@rule("reset-forgets", "Reset", Stage.RESET)
+def reset_forgets(probe: Probe) -> str:
+    """After a reset the first owner wins again: a Request that shows another CA is answered, and nothing is sealed."""
+    tapped_or_bus(probe)
+    if probe.identity().state != NodeState.FACTORY:
+        raise NotApplicable("The node was not reset.")
+    probe.refused(security_command(Function.SEALED, bytes(36)), Reason.WRONG_STATE)
+    probe.good(request(Strangers.make().request()))
+    return "a Request of another owner is answered"

@@ -7,15 +7,20 @@ table in it a command of that group. The names are those of the command line, wi
 from __future__ import annotations
 
 import re
-import tomllib
 from collections.abc import Iterator
-from difflib import get_close_matches
-from pathlib import Path
-from typing import Any, Final
+from typing import TYPE_CHECKING, Any, Final
 
 from teds_provision.cli.option_names import OPTIONS
 from teds_provision.cli.table import COMMANDS, GROUPS
 from teds_provision.errors import BadData
+from teds_provision.lazy import late
+
+if TYPE_CHECKING:
+    import difflib
+    import tomllib
+    from pathlib import Path
+else:
+    difflib, tomllib = late("difflib"), late("tomllib")  # for a file that is there
 
 PARAMETERS: Final = {"json": "as_json", "format": "form", "to": "receivers", "all": "everything"}
 """Options that the code calls otherwise than the command line does."""
@@ -84,9 +89,12 @@ def read_config(path: Path) -> dict[str, Any] | None:
     if len(octets) > _MOST_OCTETS:
         raise BadData(f"{path} has more than 1 MiB.", hint="Mend or remove the file.")
     try:
-        text = octets.decode()
+        text = octets.decode("utf-8-sig")  # some editors put a mark in front
         values = tomllib.loads(text)
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError, RecursionError) as error:
+    except UnicodeDecodeError as error:
+        why = f"{path} is not valid TOML: it is no UTF-8 text."
+        raise BadData(why, hint="Mend or remove the file.") from error
+    except (tomllib.TOMLDecodeError, RecursionError) as error:
         raise BadData(f"{path} is not valid TOML: {error}.", hint="Mend or remove the file.") from error
     for problem in problems(values, text):
         raise BadData(f"{path}, {problem}", hint="teds-provision config show lists what there is.")
@@ -126,7 +134,7 @@ def _options_below(command: str) -> set[str]:
 
 
 def _near(name: str, known: Any) -> str:
-    near = get_close_matches(name, list(known), n=1)
+    near = difflib.get_close_matches(name, list(known), n=1)
     return f" Did you mean {near[0]!r}?" if near else ""
 
 

@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import json
 import os
 import sys
-from collections.abc import Callable
-from contextlib import suppress
-from pathlib import Path
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager, suppress
 from typing import TYPE_CHECKING, Any, ClassVar, TextIO
 
 import click
@@ -18,11 +16,17 @@ from teds_provision.cli import terminal
 from teds_provision.cli.configuration import home_of
 from teds_provision.errors import PolicyRefused, StoreFailure, TedsProvisionError, UsageFailure, WrongPassphrase
 from teds_provision.harmless import harmless, harmless_json
+from teds_provision.lazy import late
 
 if TYPE_CHECKING:
+    import json
+    from pathlib import Path
+
     from rich.console import Console, RenderableType
 
     from teds_provision.station.station import Station
+else:
+    json = late("json")
 
 
 class App:
@@ -61,12 +65,23 @@ class App:
         ``human`` is a rich renderable (or a str), or a function that is given the console.
         """
         self.live_line()
-        try:
+        with self._answering():
             if self.json:
                 print(to_json(result), flush=True)
             elif human is not None:
                 self._print(human)
                 sys.stdout.flush()
+
+    def lines(self, lines: Sequence[str]) -> None:
+        """Tell a part of a result that has many lines, each of them as it is to be shown."""
+        self.live_line()
+        with self._answering():
+            print("\n".join(lines), flush=True)
+
+    @contextmanager
+    def _answering(self) -> Iterator[None]:
+        try:
+            yield
         except BrokenPipeError:
             raise
         except OSError as error:  # the work is done and safe; a script that gets no answer must hear of it

@@ -5,12 +5,10 @@ from __future__ import annotations
 import contextlib
 import errno
 import importlib
-import json
 import os
 import sys
 from collections.abc import Callable
-from pathlib import Path
-from typing import Any, ClassVar, Final
+from typing import TYPE_CHECKING, Any, ClassVar, Final
 
 import click
 
@@ -20,13 +18,25 @@ from teds_provision.cli.configuration import PARAMETERS, Defaults, as_parameters
 from teds_provision.cli.context import App, nowhere
 from teds_provision.cli.globals import in_front
 from teds_provision.cli.table import COMMANDS, SECTIONS
-from teds_provision.errors import BadData, StoreFailure, TedsProvisionError
+from teds_provision.errors import BadData, NotFound, StoreFailure, TedsProvisionError
 from teds_provision.harmless import harmless
+from teds_provision.lazy import late
+
+if TYPE_CHECKING:
+    import difflib
+    import json
+    import pathlib
+    from pathlib import Path
+else:
+    difflib, json, pathlib = late("difflib"), late("json"), late("pathlib")  # --help needs none of them
 
 ENVIRONMENT_PREFIX = "TEDS_PROVISION"
 INTERRUPTED, BROKEN_PIPE = 130, 141
+_NO_NAMES: Final = frozenset({errno.ENAMETOOLONG, errno.ELOOP, errno.ENOTDIR})
+"""What the system says of a name that somebody gave, wherever it is first looked at."""
 _FULL: Final = frozenset({errno.ENOSPC, errno.EDQUOT, errno.EIO, errno.EBADF})
 _COMPLETE = "_TEDS_PROVISION_COMPLETE"
+_WIDEST, _NARROWEST = 100, 50
 
 
 class LazyGroup(click.Group):
@@ -61,19 +71,25 @@ class LazyGroup(click.Group):
         try:
             return super().resolve_command(ctx, args)
         except click.UsageError as error:
-            from difflib import get_close_matches
-
-            near = get_close_matches(args[0], COMMANDS, n=1)
+            near = difflib.get_close_matches(args[0], COMMANDS, n=1)
             if near:
                 raise click.UsageError(f"{error.message} Did you mean {near[0]!r}?", ctx) from None
             raise
 
     def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
-        """Write the sections of the table."""
+        """Write the sections of the table.
+
+        Lines that fit are written as they are: click would look at each letter of them for where to break it.
+        """
         width = max(map(len, COMMANDS))
         for title, entries in SECTIONS.items():
             with formatter.section(title):
-                formatter.write_dl([(name.ljust(width), entry.help) for name, entry in entries.items()])
+                room = formatter.width - formatter.current_indent - width - 2
+                for name, entry in entries.items():
+                    if len(entry.help) <= room:
+                        formatter.write(f"{'':>{formatter.current_indent}}{name:<{width}}  {entry.help}\n")
+                    else:
+                        formatter.write_dl([(name.ljust(width), entry.help)])
 
 
 def _read_by_name(command: click.Command) -> None:
@@ -84,6 +100,14 @@ def _read_by_name(command: click.Command) -> None:
             option.envvar = f"{ENVIRONMENT_PREFIX}_{names[option.name].upper()}"
     for inner in command.commands.values() if isinstance(command, click.Group) else ():
         _read_by_name(inner)
+
+
+class _Folder(click.Path):
+    """A folder's path, as ``click.Path(path_type=pathlib.Path)`` gives it."""
+
+    def coerce_path_result(self, value: str | os.PathLike[str]) -> Path:
+        """The path of a name."""
+        return pathlib.Path(os.fsdecode(value))
 
 
 _BROKEN: Final = "teds_provision.config_error"
@@ -105,14 +129,14 @@ def _read_config(ctx: click.Context, _parameter: click.Parameter, home: Path | N
     context_settings={
         "help_option_names": ["-h", "--help"],
         "auto_envvar_prefix": ENVIRONMENT_PREFIX,
-        "max_content_width": 100,
+        "max_content_width": _WIDEST,
     },
     epilog="A node is named by its UUID, by four or more of its first digits, or by its name. Every option can also "
     "stand in TEDS_PROVISION_<NAME> or in config.toml in the home.\n\nStart with: teds-provision demo",
 )
 @click.option(
     "--home",
-    type=click.Path(path_type=Path, file_okay=False),
+    type=_Folder(file_okay=False),
     is_eager=True,
     callback=_read_config,
     help="Folder of the store (default: the platform's user data folder).",
@@ -143,7 +167,7 @@ def run(arguments: list[str]) -> int:
         return _complete(asked)
     try:
         arguments = in_front(arguments, _command_of)
-        with cli.make_context("teds-provision", list(arguments)) as ctx:
+        with cli.make_context("teds-provision", list(arguments), terminal_width=_help_width()) as ctx:
             cli.invoke(ctx)
         return 0
     except click.exceptions.Exit as finished:
@@ -164,6 +188,21 @@ def run(arguments: list[str]) -> int:
             App.current.close()
 
 
+def _help_width() -> int:
+    """Columns of a help text: the terminal's less two, as click reckons it, without the libraries of archives.
+
+    click asks shutil, which loads bz2 and lzma: a tenth of the time of ``--help``.
+    """
+    with contextlib.suppress(ValueError):
+        if (asked := int(os.environ.get("COLUMNS", "0"))) > 0:
+            return max(min(asked, _WIDEST) - 2, _NARROWEST)
+    try:
+        columns = os.get_terminal_size(sys.__stdout__.fileno() if sys.__stdout__ is not None else 1).columns
+    except (OSError, ValueError, AttributeError):  # no terminal
+        columns = 0
+    return max(min(columns or 80, _WIDEST) - 2, _NARROWEST)
+
+
 def _misused(arguments: list[str], error: click.ClickException) -> int:
     if isinstance(error, click.exceptions.NoArgsIsHelpError):
         return _help_instead(arguments, error)
@@ -175,6 +214,11 @@ def _untold(arguments: list[str], error: OSError) -> int:
     if isinstance(error, BrokenPipeError):
         nowhere(sys.stdout)
         return BROKEN_PIPE
+    if error.errno in _NO_NAMES and error.filename is not None:
+        name = str(error.filename)
+        name = name if len(name) <= 100 else f"{name[:64]}…"
+        told = f"{name!r} is no name of a file: {error.strerror}."
+        return _fail(arguments, NotFound.exit_code, NotFound.code, told, "")
     if error.errno not in _FULL:
         return _bug(arguments, error)
     nowhere(sys.stdout)  # a table that was being printed; what reads a store or a file has errors of its own

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -12,7 +13,7 @@ import click
 from teds_provision.cli.context import App
 from teds_provision.cli.tracing import tracing
 from teds_provision.lazy import late
-from teds_provision.links import LinkSettings
+from teds_provision.links import LINKS, LinkSettings
 from teds_provision.protocol.fingerprints import read_fingerprint
 
 if TYPE_CHECKING:
@@ -35,7 +36,8 @@ def examples(*lines: str) -> str:
 
 def command(*lines: str, **attributes: Any) -> Callable[[Callable[..., Any]], click.Command]:
     """Make a click command whose options read TEDS_PROVISION_<NAME>; ``lines`` are the examples of its help."""
-    return click.command(context_settings=COMMAND_SETTINGS, epilog=examples(*lines), **attributes)
+    settings = COMMAND_SETTINGS | attributes.pop("context_settings", {})
+    return click.command(context_settings=settings, epilog=examples(*lines), **attributes)
 
 
 class _Several(click.Option):
@@ -46,7 +48,43 @@ class _Several(click.Option):
         return super().type_cast_value(ctx, (value,) if isinstance(value, str) else value)
 
 
-class Seconds(click.FloatRange):
+class Number(click.FloatRange):
+    """A finite number within bounds: NaN is within all bounds of click, and nothing can be done with it."""
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
+        """Read a number; raises BadParameter."""
+        number = super().convert(value, param, ctx)
+        if not math.isfinite(number):
+            self.fail(f"{value!r} is not a finite number.", param, ctx)
+        return number
+
+
+class WholeNumber(click.IntRange):
+    """A whole number within bounds; says so where it is none."""
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
+        """Read a whole number; raises BadParameter."""
+        if isinstance(value, str) and not value.strip().lstrip("+-").isdecimal():
+            self.fail(f"{value!r} is no whole number.", param, ctx)
+        return super().convert(value, param, ctx)
+
+
+class Channel(click.IntRange):
+    """The number of a TransducerChannel, 1 to 255; says so where it is none."""
+
+    name = "channel"
+
+    def __init__(self) -> None:
+        super().__init__(1, 255)
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
+        """Read a number; raises BadParameter."""
+        if isinstance(value, str) and not value.strip().lstrip("+-").isdecimal():
+            self.fail(f"{value!r} is no number of a channel, 1 to 255.", param, ctx)
+        return super().convert(value, param, ctx)
+
+
+class Seconds(Number):
     """A time in seconds; says so where it is none."""
 
     name = "seconds"
@@ -92,7 +130,7 @@ def link_options(function: Function) -> Function:
 
     options = [
         click.option(
-            "--via", type=click.Choice(["nfc", "can", "ble"]), default="nfc", show_default=True, help="The link to use."
+            "--via", type=click.Choice(list(LINKS)), default="nfc", show_default=True, help="The link to use."
         ),
         click.option(
             "--nfc",
@@ -141,6 +179,12 @@ def links_given(ctx: click.Context) -> bool:
     return any(
         ctx.get_parameter_source(name) != click.core.ParameterSource.DEFAULT for name in ("via", "nfc", "can", "ble")
     )
+
+
+def said_here(*names: str) -> set[str]:
+    """Which of these options stand in the command line itself, and not in config.toml or a variable."""
+    ctx = click.get_current_context()
+    return {name for name in names if ctx.get_parameter_source(name) == click.core.ParameterSource.COMMANDLINE}
 
 
 def fingerprint_option(says: str) -> Callable[[Function], Function]:

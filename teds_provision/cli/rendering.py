@@ -9,6 +9,9 @@ from collections.abc import Iterable
 from datetime import datetime
 from typing import TYPE_CHECKING, Any
 
+import click
+
+from teds_provision.errors import TedsProvisionError
 from teds_provision.harmless import harmless
 from teds_provision.talk.progress import NOTHING, Reporter, Silent, StepResult
 
@@ -20,7 +23,6 @@ if TYPE_CHECKING:
     from teds_provision.cli.context import App
     from teds_provision.links import Notice
 
-_FOREIGN_SHOWN = 3
 _PIPE_COLUMNS = 1000
 
 
@@ -38,15 +40,25 @@ def local_time(text: str) -> str:
 
 
 def print_json_list(name: str, entries: Iterable[dict[str, Any]]) -> None:
-    """One JSON object with one list, written to stdout as it is made: a long list takes no memory."""
+    """One JSON object with one list, written to stdout as it is made: a long list takes no memory.
+
+    An error in the middle stands in the same object, behind what came before it; then raises Exit with its code.
+    """
     out = sys.stdout
     wide = (out.encoding or "utf-8").lower().replace("-", "") == "utf8"
     encode = json.JSONEncoder(ensure_ascii=not wide).encode
     out.write(f'{{"{name}": [')
-    for number, entry in enumerate(entries):
-        out.write(f", {encode(entry)}" if number else encode(entry))
-    out.write("]}\n")
+    failed: TedsProvisionError | None = None
+    try:
+        for number, entry in enumerate(entries):
+            out.write(f", {encode(entry)}" if number else encode(entry))
+    except TedsProvisionError as error:
+        failed = error
+    told = {"code": failed.code, "message": failed.message, "hint": failed.hint} if failed is not None else None
+    out.write(f'], "error": {encode(told)}}}\n' if told is not None else "]}\n")
     out.flush()
+    if failed is not None:
+        raise click.exceptions.Exit(failed.exit_code)
 
 
 def print_table(console: Console, table: Table) -> None:

@@ -12,16 +12,14 @@ import os
 import re
 import sys
 from contextlib import suppress
-from typing import TYPE_CHECKING, Final
-
-if TYPE_CHECKING:
-    from _typeshed import ReadableBuffer as Buffer
+from typing import Any, Final
 
 BROKEN_PIPE: Final = 141
 _NOT_TOLD: Final = 7
 # Control characters but line breaks, tabs and ESC; zero-width and direction marks; halves of surrogate pairs.
-_STEERING: Final = re.compile(
-    "[\x00-\x08\x0b\x0c\x0e-\x1a\x1c-\x1f\x7f-\x9f\u200b-\u200f\u202a-\u202e\u2060-\u2064\u2066-\u206f\ufeff\ud800-\udfff]"
+_STEERING: Final = (
+    "[\x00-\x08\x0b\x0c\x0e-\x1a\x1c-\x1f\x7f-\x9f"
+    "\u200b-\u200f\u202a-\u202e\u2060-\u2064\u2066-\u206f\ufeff\ud800-\udfff]"
 )
 
 
@@ -30,8 +28,8 @@ class GuardedOutput(io.FileIO):
 
     failure = ""
 
-    def write(self, octets: Buffer, /) -> int:
-        """Write, or note why not; raises BrokenPipeError where nobody reads."""
+    def write(self, octets: Any, /) -> int:
+        """Write what has octets (bytes, a memoryview), or note why not; raises BrokenPipeError where nobody reads."""
         try:
             return super().write(octets)
         except BrokenPipeError:
@@ -50,8 +48,8 @@ class CleanText(io.TextIOWrapper):
 
     def write(self, text: str, /) -> int:
         """Write a text; returns its length as it was given."""
-        if not text.isprintable():
-            super().write(_STEERING.sub(lambda found: f"\\u{ord(found[0]):04x}", text))
+        if not text.replace("\n", "").isprintable():
+            super().write(re.sub(_STEERING, lambda found: f"\\u{ord(found[0]):04x}", text))
         else:
             super().write(text)
         return len(text)

@@ -12,7 +12,7 @@ from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from importlib import import_module
 from pathlib import Path
-from typing import Final, Literal
+from typing import Any, Final, Literal
 
 from teds_provision.errors import TedsProvisionError
 
@@ -43,6 +43,8 @@ class Place:
     environment: Mapping[str, str] = field(default_factory=lambda: os.environ)
     settings: Mapping[str, frozenset[str]] | None = None
     """Names that config.toml may have, by table ("" outside of one); None where nobody knows them."""
+    bad_value: Callable[[Mapping[str, Any]], str] = lambda _: ""
+    """Says which value of config.toml no command takes, and why; "" where all are good."""
     ask: Callable[[str, bool], str] | None = None
     """Gives the passphrase without asking anybody, None where nobody gave one."""
 

@@ -7,6 +7,7 @@ from collections.abc import Iterator
 from datetime import UTC, datetime
 from typing import Any, Final
 
+from teds_provision import teds
 from teds_provision.doctor.doctor import Finding, Place, check
 from teds_provision.errors import StoreChanged, StoreFailure, VaultFailure
 from teds_provision.station.station import Station
@@ -24,8 +25,11 @@ def config(place: Place) -> Iterator[Finding]:
         yield Finding("config", "skipped", "There is no config.toml.")
         return
     try:
-        values = tomllib.loads(path.read_text(encoding="utf-8"))
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        values = tomllib.loads(path.read_text(encoding="utf-8-sig"))
+    except UnicodeDecodeError:
+        yield Finding("config", "failed", f"{path} is not valid TOML: it is no UTF-8 text.", "Mend or remove the file.")
+        return
+    except tomllib.TOMLDecodeError as error:
         yield Finding("config", "failed", f"{path} is not valid TOML: {error}.", "Mend or remove the file.")
         return
     except OSError as error:
@@ -37,6 +41,10 @@ def config(place: Place) -> Iterator[Finding]:
         yield Finding(
             "config", "failed", f"{path} has keys that no command knows: {names}.", f"Take them out of {path}."
         )
+        return
+    bad = place.bad_value(values)
+    if bad:
+        yield Finding("config", "failed", bad, "Mend that line.")
     else:
         yield Finding("config", "ok", f"{path} holds {len(values)} settings.")
 
@@ -55,6 +63,26 @@ def _unknown(values: dict[str, Any], place: Place) -> Iterator[str]:
         else:
             allowed = known[key.replace("_", "-")]
             yield from (f"{key}.{inner}" for inner in value if inner.replace("-", "_") not in allowed)
+
+
+@check("profiles", "machine")
+def profiles(place: Place) -> Iterator[Finding]:
+    """Can every profile in this home be read; the shipped ones are tested where they are made."""
+    folder = place.home / "profiles"
+    if not folder.is_dir():
+        yield Finding("profiles", "skipped", f"There is no folder {folder}.")
+        return
+    listed = [
+        one
+        for one in teds.profile.list_profiles(teds.profile.default_folders(place.home))
+        if folder in one.path.parents
+    ]
+    for one in listed:
+        if one.error:
+            why = f"The profile {one.name} cannot be used: {one.error}"
+            yield Finding("profiles", "failed", why, f"teds-provision profile check {one.path}")
+    if not any(one.error for one in listed):
+        yield Finding("profiles", "ok", f"{len(listed)} of this station's own in {folder}.")
 
 
 @check("store file", "store")

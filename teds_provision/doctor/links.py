@@ -32,7 +32,6 @@ READERS: Final = {
     (0x054C, 0x06C3): "Sony RC-S380/P",
     (0x072F, 0x2200): "ACS ACR122U",
 }
-_ACR122U: Final = (0x072F, 0x2200)
 _ARPHRD_CAN: Final = 280  # linux/if_arp.h
 _IFF_UP: Final = 1
 _SENSES: Final = 8
@@ -164,7 +163,7 @@ def nfc(place: Place) -> Iterator[Finding]:
         return
 
     try:
-        reader = nfc_room.frontend.open_reader(place.nfc)
+        reader = nfc_room.reader.open_reader(place.nfc)
     except (NoReader, UsageFailure) as failure:
         yield Finding("nfc", "failed", failure.message, failure.hint)
         return

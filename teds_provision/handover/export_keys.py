@@ -8,21 +8,24 @@ from __future__ import annotations
 
 import hashlib
 import uuid as uuids
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime, timedelta
+from operator import attrgetter
 from pathlib import Path
 
 from teds_provision.errors import NotFound, PolicyRefused, UsageFailure
-from teds_provision.files import require_new, write_new
+from teds_provision.files import new_file, require_new
+from teds_provision.handover import collector
 from teds_provision.handover.pending import OPEN, Notes, content_digest
-from teds_provision.handover.selection import Chosen, ExportOrder, Selection
+from teds_provision.handover.selection import Chosen, ExportOrder, Leaving, Selection
 from teds_provision.handover.trust import find_trusted
-from teds_provision.protocol.handover.bundle import Bundle, BundledNode, Mode, seal_signed
+from teds_provision.protocol.handover.bundle import Bundle, BundledNode, Mode, sealing
 from teds_provision.protocol.handover.payload import time_text
+from teds_provision.protocol.handover.sealing import Sealing
 from teds_provision.protocol.keys import fingerprint
 from teds_provision.station.station import Station
-from teds_provision.store import Batch, Handover, Holder, KeyRecord, NodeRecord, Tombstone, TrustRecord, utc_now
+from teds_provision.store import Batch, Handover, Holder, Tombstone, TrustRecord, pages, utc_now
 
 NODES_IN_A_BUNDLE = 50_000
 """Well below what a bundle can hold (64 MiB), so that a few long names do not burst one."""
@@ -41,7 +44,7 @@ class ExportPlan:
     receivers: tuple[TrustRecord, ...]
     ca: bytes
     signatures: Mapping[str, bytes]
-    nodes: tuple[tuple[NodeRecord, KeyRecord], ...]
+    nodes: tuple[Leaving, ...]
     skipped: tuple[tuple[bytes, str], ...]
     content: str
     expires: datetime
@@ -61,34 +64,31 @@ class Exported:
     fresh: bool
 
 
-def plan_export(station: Station, order: ExportOrder, now: datetime | None = None) -> ExportPlan:
+def plan_export(station: Station, order: ExportOrder) -> ExportPlan:
     """:func:`plan_exports` for what fits into one bundle; raises UsageFailure for more."""
-    plans = plan_exports(station, order, now)
+    plans = plan_exports(station, order)
     if len(plans) > 1:
         raise UsageFailure("These are too many nodes for one bundle.", hint="Export them in several.")
     return plans[0]
 
 
-def plan_exports(
-    station: Station, order: ExportOrder, now: datetime | None = None, *, most: int = NODES_IN_A_BUNDLE
-) -> list[ExportPlan]:
+@collector.put_off()
+def plan_exports(station: Station, order: ExportOrder, *, most: int = NODES_IN_A_BUNDLE) -> list[ExportPlan]:
     """Find the receivers and nodes, and the CA's signature over each receiver; changes nothing.
 
     Returns a plan for each bundle, of at most ``most`` nodes. Raises NotFound, UsageFailure (two receivers of a move),
     PolicyRefused (a node without proven key, given away, revoked, due for rotation or, for a move, with an agreement
     that is not settled; nodes of several CAs; a receiver that is not certified), BadData (a receiver's file).
     """
-    now = now or datetime.now(UTC)
     receivers = tuple({record.point: record for record in _receivers(station, order)}.values())
     _check(order, receivers)
     selection = Selection(station, order, {record.fingerprint for record in receivers})
     nodes, skipped = selection.choose()
     ca = _one_ca(station, order, nodes)
     if order.ca is not None:
-        cas, own = station.keys.cas_of_nodes(), station.ca
-        nodes = [(node, key) for node, key in nodes if cas.get(node.uuid, own) == ca]
+        nodes = [node for node, kept in _with_ca(station, nodes) if kept == ca]
     signatures = {record.fingerprint: _signature(station, ca, record) for record in receivers}
-    common = _Common(order, receivers, ca, signatures, now, station.fingerprint, selection.rows)
+    common = _Common(order, receivers, ca, signatures, datetime.now(UTC), station.fingerprint, selection.rows)
     plans = [common.plan(part, _other_holders(station, part, receivers)) for part in selection.parts(nodes, most)]
     return [replace(plans[0], skipped=tuple(skipped)), *plans[1:]]
 
@@ -115,7 +115,7 @@ class _Common:
     def plan(self, nodes: Chosen, also_held_by: tuple[str, ...]) -> ExportPlan:
         """The plan of one bundle; an open one of the same content is carried on."""
         mode, to = self.order.mode, [record.fingerprint for record in self.receivers]
-        listed = ((node.uuid, key.key_id, key.epoch) for node, key in nodes)
+        listed = ((node.uuid, node.key_id, node.epoch) for node in sorted(nodes, key=attrgetter("uuid")))
         content = content_digest(self.sender, to, mode, self.ca, listed)
         earlier = next((row for row in self.rows if _is_same(row, content, self.now)), None)
         expires = datetime.fromisoformat(Notes.from_json(earlier.nodes).expires) if earlier else None
@@ -137,9 +137,11 @@ class _Common:
         )
 
 
+@collector.put_off()
 def export_keys(station: Station, plan: ExportPlan, output: Path, now: datetime | None = None) -> Exported:
-    """Seal the bundle into a new file of mode 0600; a move's keys rest from before that file exists.
+    """Seal the bundle into a new file of mode 0600; a move's keys rest from before anybody could open that file.
 
+    What is written before the store has it is a draft without signature and tag, under a name of its own.
     The same command over its own file finds nothing to do. Raises UsageFailure (another file lies there),
     StoreFailure, VaultFailure.
     """
@@ -147,17 +149,18 @@ def export_keys(station: Station, plan: ExportPlan, output: Path, now: datetime 
     if before is not None:
         return Exported(plan, before, output.stat().st_size, fresh=False)
     require_new(output)
-    sealed, signed = _seal(station, plan, now or datetime.now(UTC))
-    digest = hashlib.sha256(sealed).hexdigest()
-    with station.transaction():
-        _record(station, plan, (digest, signed))
-    write_new(output, sealed)
-    return Exported(plan, digest, len(sealed), fresh=True)
+    made = _sealing(station, plan, now or datetime.now(UTC))
+    with new_file(output) as file:
+        for piece in made.body():
+            file.write(piece)
+        end = made.end()
+        with station.transaction():
+            _record(station, plan, (made.sha256, made.signed_sha256))
+        file.write(end)
+    return Exported(plan, made.sha256, made.octets, fresh=True)
 
 
-def export_all(
-    station: Station, plans: Sequence[ExportPlan], outputs: Sequence[Path], now: datetime | None = None
-) -> list[Exported]:
+def export_all(station: Station, plans: Sequence[ExportPlan], outputs: Sequence[Path]) -> list[Exported]:
     """Seal each plan into its file. Of several, all keys of a move rest before the first file exists.
 
     Raises what :func:`export_keys` raises; the same command carries on.
@@ -170,7 +173,7 @@ def export_all(
         run = plans[0].earlier and Notes.from_json(plans[0].earlier.nodes).run
         with station.transaction():
             ready = [plan if plan.earlier else _announced(station, plan, run or plans[0].id) for plan in plans]
-    return [export_keys(station, plan, output, now) for plan, output in zip(ready, outputs, strict=True)]
+    return [export_keys(station, plan, output) for plan, output in zip(ready, outputs, strict=True)]
 
 
 def _announced(station: Station, plan: ExportPlan, run: str) -> ExportPlan:
@@ -190,10 +193,9 @@ def _receivers(station: Station, order: ExportOrder) -> list[TrustRecord]:
     return [find_trusted(station, text, "station") for text in order.to]
 
 
-def _one_ca(station: Station, order: ExportOrder, nodes: list[tuple[NodeRecord, KeyRecord]]) -> bytes:
+def _one_ca(station: Station, order: ExportOrder, nodes: Chosen) -> bytes:
     """The CA that the nodes keep: one bundle has one."""
-    of, own = station.keys.cas_of_nodes(), station.ca
-    found = {fingerprint(ca): ca for ca in {of.get(node.uuid, own) for node, _ in nodes}}
+    found = {fingerprint(ca): ca for ca in {ca for _, ca in _with_ca(station, nodes)}}
     if order.ca is not None:
         found = {digits: ca for digits, ca in found.items() if digits.startswith(order.ca.lower())}
         if not found:
@@ -204,6 +206,14 @@ def _one_ca(station: Station, order: ExportOrder, nodes: list[tuple[NodeRecord, 
             hint=f"Export them apart: --ca {' / --ca '.join(sorted(digits[:16] for digits in found))}",
         )
     return next(iter(found.values()))
+
+
+def _with_ca(station: Station, nodes: Chosen) -> Iterator[tuple[Leaving, bytes]]:
+    """Each node with the CA that it keeps."""
+    own = station.ca
+    for page in pages(nodes):
+        kept = station.keys.cas_of_page([node.uuid for node in page])
+        yield from ((node, kept.get(node.uuid, own)) for node in page)
 
 
 def _signature(station: Station, ca: bytes, receiver: TrustRecord) -> bytes:
@@ -223,11 +233,9 @@ def _signature(station: Station, ca: bytes, receiver: TrustRecord) -> bytes:
     return known
 
 
-def _other_holders(
-    station: Station, nodes: list[tuple[NodeRecord, KeyRecord]], receivers: tuple[TrustRecord, ...]
-) -> tuple[str, ...]:
+def _other_holders(station: Station, nodes: Chosen, receivers: tuple[TrustRecord, ...]) -> tuple[str, ...]:
     """Stations besides the receivers that hold any of these keys since an earlier copy."""
-    chosen = {node.uuid for node, _ in nodes}
+    chosen = {node.uuid for node in nodes}
     found = {holder.fingerprint for holder in station.keys.holders() if holder.uuid in chosen}
     return tuple(sorted(found - {record.fingerprint for record in receivers}))
 
@@ -248,7 +256,7 @@ def _already(plan: ExportPlan, output: Path) -> str | None:
     return digest if digest in _files_before(plan) else None
 
 
-def _seal(station: Station, plan: ExportPlan, now: datetime) -> tuple[bytes, str]:
+def _sealing(station: Station, plan: ExportPlan, now: datetime) -> Sealing:
     own = station.identity.certificate(plan.ca, station.point)
     bundle = Bundle(
         id=plan.id,
@@ -258,27 +266,36 @@ def _seal(station: Station, plan: ExportPlan, now: datetime) -> tuple[bytes, str
         expires=plan.expires,
         mode=plan.mode,
         ca=plan.ca,
-        nodes=tuple(_bundled(station, node, key) for node, key in plan.nodes),
+        nodes=(),
         # The sender's own goes along, so that the receiver can hand the nodes back one day.
         station_signatures={**plan.signatures, **({station.fingerprint: own} if own else {})},
         revoked=tuple(revocation.statement for revocation in station.policy.revocations()),
     )
-    return seal_signed(bundle, station.vault.identity(), [record.point for record in plan.receivers])
+    to = [record.point for record in plan.receivers]
+    return sealing(bundle, _bundled(station, plan.nodes), len(plan.nodes), station.vault.identity(), to)
 
 
-def _bundled(station: Station, node: NodeRecord, key: KeyRecord) -> BundledNode:
-    assert node.point is not None
-    return BundledNode(
-        uuid=node.uuid,
-        node_key=node.point,
-        key=station.keys.unwrap(key),
-        epoch=key.epoch,
-        sequence=node.sequence,
-        profile=node.profile,
-        name=node.name,
-        groups=node.groups,
-        teds_sha256=node.teds_sha256,
-    )
+def _bundled(station: Station, nodes: Iterable[Leaving]) -> Iterator[BundledNode]:
+    """Read the nodes and unwrap their keys, a page at a time."""
+    for page in pages(nodes):
+        uuids_of_page = [node.uuid for node in page]
+        records = station.nodes.of_page(uuids_of_page)
+        keys = {(key.uuid, key.key_id): key for key in station.keys.of_page(uuids_of_page)}
+        for leaving in page:
+            record, key = records.get(leaving.uuid), keys.get((leaving.uuid, leaving.key_id))
+            if record is None or record.point is None or key is None:
+                raise PolicyRefused(f"Node {leaving.uuid.hex()} was changed meanwhile.", hint="Run it again.")
+            yield BundledNode(
+                uuid=record.uuid,
+                node_key=record.point,
+                key=station.keys.unwrap(key),
+                epoch=key.epoch,
+                sequence=record.sequence,
+                profile=record.profile,
+                name=record.name,
+                groups=record.groups,
+                teds_sha256=record.teds_sha256,
+            )
 
 
 def _record(station: Station, plan: ExportPlan, digests: tuple[str, ...]) -> Handover:
@@ -287,8 +304,8 @@ def _record(station: Station, plan: ExportPlan, digests: tuple[str, ...]) -> Han
     ``digests`` are those of the file and of what was signed in it; none where a bundle of several is announced.
     """
     files = _files_before(plan)
-    uuids_hex = tuple(node.uuid.hex() for node, _ in plan.nodes)
-    keys = tuple(key.key_id for _, key in plan.nodes)
+    uuids_hex = tuple(node.uuid.hex() for node in plan.nodes)
+    keys = tuple(node.key_id for node in plan.nodes)
     notes = Notes(
         uuids_hex, plan.content, plan.ca.hex(), time_text(plan.expires), (*files, *digests), (), keys, plan.run
     )
@@ -312,7 +329,7 @@ def _files_before(plan: ExportPlan) -> tuple[str, ...]:
 
 def _record_holders(station: Station, plan: ExportPlan, peers: tuple[str, ...]) -> None:
     """Who holds the keys from now on: each receiver of a copy beside us; of a move, that is, the receiver alone."""
-    now, uuids_of_nodes = utc_now(), [node.uuid for node, _ in plan.nodes]
+    now, uuids_of_nodes = utc_now(), [node.uuid for node in plan.nodes]
     if plan.mode == "copy":
         station.handovers.take_in(Batch(holders=[Holder(uuid, peer, now) for uuid in uuids_of_nodes for peer in peers]))
     elif plan.earlier is None:

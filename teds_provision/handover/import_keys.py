@@ -7,42 +7,27 @@ the CA's signature over this station, the deny list and the receipt. The same bu
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable
-from dataclasses import dataclass, replace
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass
 from datetime import UTC, datetime
-from typing import Any, Literal
 
 from teds_provision.errors import NotAuthentic, PolicyRefused
+from teds_provision.handover import collector
+from teds_provision.handover.arrivals import Arrivals, Decision, PlannedNode
 from teds_provision.handover.deny import deny_all, why_not
 from teds_provision.handover.pending import IMPORTED, Notes, digest_of
-from teds_provision.protocol.agreement import key_id
-from teds_provision.protocol.fingerprints import is_whole, same_key
+from teds_provision.protocol.fingerprints import same_key
 from teds_provision.protocol.handover.bundle import Bundle, BundledNode, OpenedBundle, check_times, open_bundle
 from teds_provision.protocol.handover.payload import time_text
 from teds_provision.protocol.handover.receipt import Receipt, RefusedNode, seal_receipt
 from teds_provision.protocol.handover.revocation import Revocation as Statement
+from teds_provision.protocol.handover.sealing import Source
 from teds_provision.protocol.keys import fingerprint, station_key_message, verify
-from teds_provision.protocol.messages.identity import NodeState
 from teds_provision.station.node_keys import MAX_PENDING
 from teds_provision.station.station import Station
-from teds_provision.store import Batch, Handover, Holder, KeyRecord, NodeRecord, WhitelistEntry, utc_now
+from teds_provision.store import Handover, pages
 
-Decision = Literal["new", "newer", "same", "refused"]
 _LIKE_UUID = re.compile("(0x)?[0-9a-f]{4,}", re.IGNORECASE)
-
-
-@dataclass(frozen=True)
-class PlannedNode:
-    """What becomes of one node of the bundle, and why where it is refused.
-
-    ``name`` is the one that it gets here, ``notes`` say what a person should know of a node that is taken.
-    """
-
-    node: BundledNode
-    decision: Decision
-    why: str = ""
-    name: str | None = None
-    notes: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -80,11 +65,13 @@ class Imported:
     @property
     def uuids(self) -> tuple[bytes, ...]:
         """The nodes that were taken in."""
-        return tuple(bytes.fromhex(uuid) for uuid in self.notes.uuids if uuid not in self.refused_uuids)
+        refused = self.refused_uuids
+        return tuple(bytes.fromhex(uuid) for uuid in self.notes.uuids if uuid not in refused)
 
 
-def plan_import(station: Station, octets: bytes, now: datetime | None = None) -> ImportPlan | Imported:
-    """Open and check a bundle, and say what would become of each node; changes nothing.
+@collector.put_off()
+def plan_import(station: Station, source: Source, now: datetime | None = None) -> ImportPlan | Imported:
+    """Open and check a bundle (octets, or a file), and say what would become of each node; changes nothing.
 
     A bundle that was taken in before is returned as such, even when it has expired since. What it says of sequences
     and epochs is hearsay: none of it is kept but the epoch of a pending key, which the first session corrects. A node
@@ -92,7 +79,7 @@ def plan_import(station: Station, octets: bytes, now: datetime | None = None) ->
     :func:`open_bundle` raises, and PolicyRefused: an id seen with other content, no signature of the bundle's CA over
     this station, or every node refused.
     """
-    opened = open_bundle(octets, station.vault.identity(), station.policy.station_points().get, None)
+    opened = open_bundle(source, station.vault.identity(), station.policy.station_points().get, None)
     bundle, content = opened.bundle, digest_of(opened.bundle)
     row = station.handovers.get(bundle.id, "in")
     if row is not None:
@@ -127,6 +114,7 @@ def _is_known_ca(station: Station, ca: bytes) -> bool:
     return station.policy.counts(ca) and (certified or ca in station.policy.trusted_cas())
 
 
+@collector.put_off()
 def import_keys(station: Station, plan: ImportPlan, now: datetime | None = None) -> Imported:
     """Take the bundle in, all of it in one transaction, and sign its receipt."""
     bundle = plan.opened.bundle
@@ -161,9 +149,10 @@ def import_keys(station: Station, plan: ImportPlan, now: datetime | None = None)
     with station.transaction():
         _keep_ca(station, plan)
         deny_all(station, plan.denied, bundle)
-        _Arrivals(station, plan).take_in()
+        Arrivals(station, plan.opened.bundle).take_in(plan.taken)
         station.handovers.put(row)
-        taken = [node.node.uuid.hex() for node in plan.taken]
+        refused = {refused.uuid.hex() for refused in receipt.refused}
+        taken = [uuid for uuid in notes.uuids if uuid not in refused]
         detail = {"handover": bundle.id, "mode": bundle.mode, "from": bundle.sender, "nodes": taken}
         station.audit("import", None, "done", refused=len(receipt.refused), **detail)
     return Imported(row, notes, text, fresh=True)
@@ -192,27 +181,36 @@ def _check_certified(station: Station, opened: OpenedBundle) -> None:
 
 
 class _Judge:
-    """Holds a bundle's nodes against the store, whose tables are read once."""
+    """Holds a bundle's nodes against the store, whose tables are read a page at a time."""
 
     def __init__(self, station: Station, denied: Iterable[Statement], bundle: Bundle) -> None:
         policy = station.policy
+        self.station = station
         self.sender, self.mode = bundle.sender, bundle.mode
-        self.nodes = {node.uuid: node for node in station.nodes.all()}
-        self.pins = station.pins.all(self.nodes.values())
-        self.names = {entry.name: entry.uuid for entry in station.pins.whitelist() if entry.name}
-        self.names |= {node.name: node.uuid for node in self.nodes.values() if node.name}
         self.denied = {entry.uuid: (entry.fingerprint, entry.why) for entry in policy.revocations()}
         self.denied |= {one.uuid: (one.fingerprint, one.why) for one in denied}
         self.tombstones = {tombstone.uuid: tombstone for tombstone in policy.tombstones()}
-        self.held: dict[bytes, dict[str, tuple[str, int]]] = {}
-        for key in station.keys.all():
-            self.held.setdefault(key.uuid, {})[key.key_id] = (key.state, key.epoch)
+        self.given: dict[str, bytes] = {}
+        """Names that nodes of this bundle get."""
+        self._turn_to([])
 
-    def each(self, nodes: Iterable[BundledNode]) -> Iterable[PlannedNode]:
+    def each(self, nodes: Iterable[BundledNode]) -> Iterator[PlannedNode]:
         """Judge every node."""
-        for node in nodes:
-            why = self._obstacle(node) or self._stale_key(node)
-            yield PlannedNode(node, "refused", why) if why else self._taken(node)
+        for page in pages(nodes):
+            self._turn_to(page)
+            for node in page:
+                why = self._obstacle(node) or self._stale_key(node)
+                yield PlannedNode(node, "refused", why) if why else self._taken(node)
+
+    def _turn_to(self, page: Sequence[BundledNode]) -> None:
+        """Read what is known here of a page of nodes, and who has their names."""
+        station, uuids = self.station, [node.uuid for node in page]
+        self.nodes = station.nodes.of_page(uuids)
+        self.pins = station.pins.among(self.nodes.values(), station.pins.of_page(uuids).values())
+        self.bearers = station.nodes.bearers_of([node.name for node in page if node.name])
+        self.held: dict[bytes, dict[str, tuple[str, int]]] = {}
+        for key in station.keys.of_page(uuids):
+            self.held.setdefault(key.uuid, {})[key.key_id] = (key.state, key.epoch)
 
     def _obstacle(self, node: BundledNode) -> str:
         """Why the node itself is not taken, "" for nothing."""
@@ -230,7 +228,7 @@ class _Judge:
     def _stale_key(self, node: BundledNode) -> str:
         """Why the key that it comes with is not taken beside those that are held, "" for nothing."""
         held = self.held.get(node.uuid, {})
-        if key_id(node.key).hex() in held:
+        if node.kid in held:
             return ""
         if sum(state == "pending" for state, _ in held.values()) >= MAX_PENDING:
             return f"{MAX_PENDING} keys of it wait here for their proof"
@@ -253,20 +251,25 @@ class _Judge:
             name = self._free_name(node.uuid, name)
             if name != node.name:
                 notes.append(f"it is called {name} here: {node.name} is the name of another node, or like a UUID")
-            self.names[name] = node.uuid
+            self.given[name] = node.uuid
         return PlannedNode(node, self._decision(node), name=name, notes=tuple(notes))
 
     def _free_name(self, uuid: bytes, name: str) -> str:
         """A name that no other node has and that cannot be taken for the first digits of a UUID."""
         tried, digits = name, 4
-        while self.names.get(tried, uuid) != uuid or _LIKE_UUID.fullmatch(tried):
+        while self._bearer(tried, uuid) != uuid or _LIKE_UUID.fullmatch(tried):
             tried = f"{name}-{uuid.hex()[-digits:]}"
             digits += 2
+            self.bearers |= self.station.nodes.bearers_of([tried])
         return tried
+
+    def _bearer(self, name: str, uuid: bytes) -> bytes:
+        """Who has this name, among the nodes that come or here; ``uuid`` where nobody has it."""
+        return self.given.get(name) or self.bearers.get(name, uuid)
 
     def _decision(self, node: BundledNode) -> Decision:
         held = self.held.get(node.uuid, {})
-        if key_id(node.key).hex() in held:
+        if node.kid in held:
             return "new" if node.uuid in self.tombstones else "same"
         return "newer" if held else "new"
 
@@ -285,105 +288,3 @@ def _keep_ca(station: Station, plan: ImportPlan) -> None:
         if not verify(bundle.ca, station_key_message(point), signature):
             raise NotAuthentic(f"The bundle's CA signature over station {digits[:16]} does not verify.")
         station.identity.keep_certificate(bundle.ca, point, signature)
-
-
-class _Arrivals:
-    """The rows of every node that is taken in, made from the tables as they are (read once), written at once."""
-
-    def __init__(self, station: Station, plan: ImportPlan) -> None:
-        bundle = plan.opened.bundle
-        self.station, self.plan, self.bundle = station, plan, bundle
-        self.known = {node.uuid: node for node in station.nodes.all()}
-        self.pins = {entry.uuid: entry for entry in station.pins.whitelist()}
-        self.slots = station.keys.slots()
-        self.cas = station.keys.cas_of_nodes()
-        self.resting = {tombstone.uuid for tombstone in station.policy.tombstones()}
-        self.others = sorted({bundle.sender, *bundle.to} - {station.fingerprint})
-        self.now = utc_now()
-
-    def take_in(self) -> None:
-        """Write all of them."""
-        self.station.keys.refresh()
-        taken = self.plan.taken
-        self._take_back([one.node.uuid for one in taken if one.node.uuid in self.resting])
-        self.station.handovers.take_in(
-            Batch(
-                nodes=[self._node(one) for one in taken],
-                whitelist=[entry for entry in map(self._entry, taken) if entry is not None],
-                keys=[self._key(one.node) for one in taken if one.decision != "same"],
-                holders=[holder for one in taken for holder in self._holders(one.node)],
-                marks=self._marks(),
-            )
-        )
-
-    def _take_back(self, uuids: list[bytes]) -> None:
-        self.station.policy.take_back(uuids)
-        for uuid in uuids:
-            self.station.audit("handover", uuid, "came back", handover=self.bundle.id)
-
-    def _holders(self, node: BundledNode) -> list[Holder]:
-        """The other stations that have this key from now on: the sender, and who else the bundle is for."""
-        return [Holder(node.uuid, other, self.now, self.bundle.mode) for other in self.others]
-
-    def _key(self, node: BundledNode) -> KeyRecord:
-        return self.station.keys.wrapped(
-            node.uuid,
-            key=node.key,
-            key_id=key_id(node.key),
-            epoch=node.epoch,
-            slot=self.slots.get(node.uuid, 0) + 1,
-            source="import",
-            created=self.now,
-        )
-
-    def _entry(self, one: PlannedNode) -> WhitelistEntry | None:
-        """The whitelist entry, pinned to the node's key; None where it is pinned already."""
-        node = one.node
-        pin, digits = self.pins.get(node.uuid), fingerprint(node.node_key)
-        if pin is None:
-            return WhitelistEntry(node.uuid, digits, self.now, "import", one.name)
-        return None if is_whole(pin.fingerprint) else replace(pin, fingerprint=digits, assurance="import")
-
-    def _node(self, one: PlannedNode) -> NodeRecord:
-        """What is known of the node from now on; not its epoch and sequence, which a session has to tell."""
-        node = one.node
-        state = int(NodeState.PROVISIONED if node.teds_sha256 else NodeState.KEYED)
-        known = self.known.get(node.uuid)
-        if known is None:
-            return NodeRecord(
-                node.uuid,
-                node.node_key,
-                one.name,
-                node.profile,
-                state,
-                groups=node.groups,
-                teds_sha256=node.teds_sha256,
-            )
-        return replace(
-            known,
-            point=node.node_key,
-            name=known.name or one.name,
-            profile=known.profile or node.profile,
-            groups=tuple(dict.fromkeys((*known.groups, *node.groups))),
-            state=known.state or state,
-            teds_sha256=known.teds_sha256 or node.teds_sha256,
-        )
-
-    def _marks(self) -> dict[bytes, dict[str, Any]]:
-        """Rotations that are due after a move; the CA that each node keeps, or keeps once its new key is proven."""
-        ca, own = self.bundle.ca, self.station.ca
-        marks: dict[bytes, dict[str, Any]] = {}
-        for one in self.plan.taken:
-            uuid = one.node.uuid
-            if uuid in self.resting:
-                marks[uuid] = {"rotation": f"it came back by {self.bundle.id}: others have had this key"}
-            if self.bundle.mode == "move":
-                marks[uuid] = {"rotation": f"moved here by {self.bundle.id}: the sender has had this key"}
-            if one.decision == "same" or self.cas.get(uuid, own) == ca:
-                continue
-            if one.decision == "newer":  # the key held now stays good, under its CA, until the new one is proven
-                kept: dict[str, Any] = {"next_key_id": key_id(one.node.key).hex(), "next_ca": ca}
-            else:
-                kept = {"ca": ca}
-            marks[uuid] = {**marks.get(uuid, {}), **kept}
-        return marks

@@ -11,10 +11,10 @@ import json
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from datetime import datetime
+from operator import attrgetter
 from typing import Any
 
 from teds_provision.errors import BadData, NotAuthentic, NotFound, PolicyRefused
-from teds_provision.protocol.agreement import key_id
 from teds_provision.protocol.handover.bundle import Bundle
 from teds_provision.protocol.handover.receipt import Receipt, open_receipt
 from teds_provision.protocol.handover.strict_json import decode_base64url, load_object
@@ -68,16 +68,25 @@ def content_digest(
 ) -> str:
     """Return what tells one handover from another: who gives which keys (UUID, keyId, epoch) of which CA to whom.
 
-    No time and no id: the same command gives the same digest again. Key ids are public, keys are not in it.
+    No time and no id: the same command gives the same digest again. Key ids are public, keys are not in it. ``nodes``
+    ascend by UUID. The digest is over JSON, which is never there as a whole.
     """
-    listed = sorted((uuid.hex(), identifier, epoch) for uuid, identifier, epoch in nodes)
-    said = [sender, sorted(to), mode, ca.hex(), listed]
-    return hashlib.sha256(json.dumps(said, separators=(",", ":")).encode()).hexdigest()
+    digest = hashlib.sha256(_compact([sender, sorted(to), mode, ca.hex()])[:-1] + b",[")
+    for number, (uuid, identifier, epoch) in enumerate(nodes):
+        # as JSON, by hand: hex digits and a number need no quoting, and there may be ten thousand
+        digest.update(f'{"," if number else ""}["{uuid.hex()}","{identifier}",{epoch}]'.encode())
+    digest.update(b"]]")
+    return digest.hexdigest()
+
+
+def _compact(value: object) -> bytes:
+    return json.dumps(value, separators=(",", ":")).encode()
 
 
 def digest_of(bundle: Bundle) -> str:
     """:func:`content_digest` of an opened bundle."""
-    nodes = ((node.uuid, key_id(node.key).hex(), node.epoch) for node in bundle.nodes)
+    ascending = sorted(bundle.nodes, key=attrgetter("uuid"))
+    nodes = ((node.uuid, node.kid, node.epoch) for node in ascending)
     return content_digest(bundle.sender, bundle.to, bundle.mode, bundle.ca, nodes)
 
 

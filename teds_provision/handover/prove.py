@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
 
 from teds_provision.errors import LinkFailure, NoNode, TedsProvisionError
-from teds_provision.links import LinkSettings, Port, open_port
+from teds_provision.links import LinkSettings, open_port
 from teds_provision.station.station import Station
 from teds_provision.steps.agree import require_session
 from teds_provision.steps.identify import identify
+from teds_provision.store import pages
 from teds_provision.talk.conversation import Conversation
 from teds_provision.talk.progress import Reporter
 
@@ -44,10 +45,13 @@ def prove_node(station: Station, node: Conversation) -> Proven:
     return Proven(node.uuid, held.record.epoch, rotated=due)
 
 
-def is_proven(station: Station, uuid: bytes) -> bool:
-    """Whether a session was opened under the key that is held, and no rotation is due any more."""
-    active = any(key.state == "active" for key in station.keys.of(uuid))
-    return active and station.keys.rotation_due(uuid) is None
+def proven_of(station: Station, uuids: Iterable[bytes]) -> set[bytes]:
+    """Those of many nodes with which a session was opened under the key that is held, and no rotation is due."""
+    proven: set[bytes] = set()
+    for page in pages(uuids):
+        active = {key.uuid for key in station.keys.of_page(page) if key.state == "active"}
+        proven |= active - station.keys.due_of_page(page)
+    return proven
 
 
 def prove_nodes(
@@ -56,7 +60,6 @@ def prove_nodes(
     uuids: Sequence[bytes],
     reporter: Reporter,
     *,
-    opened: Callable[[LinkSettings], Port] = open_port,
     hold: Callable[[], AbstractContextManager[object]] = nullcontext,
 ) -> list[Proven | NotProven]:
     """Meet each of these nodes on the chosen link, in whatever order they come; ends when none comes in time.
@@ -65,7 +68,7 @@ def prove_nodes(
     """
     waiting, outcomes = set(uuids), dict[bytes, Proven | NotProven]()
     try:
-        port = opened(links)
+        port = open_port(links)
     except LinkFailure as error:
         return [NotProven(uuid, error.message) for uuid in uuids]
     try:

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 from teds_provision.errors import NotFound, PolicyRefused
 from teds_provision.handover.pending import OPEN, Notes
@@ -11,11 +12,11 @@ from teds_provision.protocol.fingerprints import same_key
 from teds_provision.protocol.handover.bundle import Mode
 from teds_provision.protocol.keys import fingerprint
 from teds_provision.station.station import Station
-from teds_provision.store import KeyRecord, NodeRecord
-from teds_provision.store.records import KeyState
+from teds_provision.store import NodeRecord, Shown, pages
 
 DEFAULT_DAYS = 7
 OUT_OF_SERVICE = ("decommissioned", "replaced by")  # verdicts that workflow.life gives
+_UNKNOWN = "its public key is not known"
 _CURE = "See teds-provision nodes UUID; settle it by any session, or: teds-provision agree UUID --rotate"
 
 
@@ -30,19 +31,30 @@ class ExportOrder:
     ca: str | None = None
 
 
-Chosen = list[tuple[NodeRecord, KeyRecord]]
+class Leaving(NamedTuple):
+    """A node that goes, by its UUID, and the key that it has now: the rest is read when it is sealed."""
+
+    uuid: bytes
+    key_id: str
+    epoch: int
+
+
+Chosen = list[Leaving]
 
 
 class Selection:
-    """Which nodes go, by the tables as they are now (read once: there may be ten thousand)."""
+    """Which nodes go, by the tables as they are now (read once, a page at a time: there may be ten thousand)."""
 
     def __init__(self, station: Station, order: ExportOrder, receivers: set[str]) -> None:
-        self.station, self.order, self.receivers = station, order, receivers
-        self.nodes = {node.uuid: node for node in station.nodes.all()}
-        self.pins = station.pins.all(self.nodes.values())
-        held = list(station.keys.all())
-        self.keys = _in_state(held, "active")
-        self.pending = _in_state(held, "pending").keys()
+        self.order, self.receivers = order, receivers
+        self.keys: dict[bytes, Leaving] = {}
+        self.pending: set[bytes] = set()
+        for uuid, key_id, epoch, state in _keys(station, order.nodes):
+            if state == "active":
+                self.keys[uuid] = Leaving(uuid, key_id, epoch)
+            else:
+                self.pending.add(uuid)
+        self.stays = _why_nodes_stay(station, order.nodes)
         self.due = station.keys.rotations_due().keys()
         self.tombstones = {tombstone.uuid: tombstone for tombstone in station.policy.tombstones()}
         self.revoked = {revocation.uuid for revocation in station.policy.revocations()}
@@ -53,15 +65,15 @@ class Selection:
         """Divide the nodes into bundles: those of an open move as they were, the others by ``most``."""
         resting: dict[str, Chosen] = {}
         free: Chosen = []
-        for node, key in nodes:
+        for node in nodes:
             tombstone = self.tombstones.get(node.uuid)
-            (free if tombstone is None else resting.setdefault(tombstone.handover_id, [])).append((node, key))
+            (free if tombstone is None else resting.setdefault(tombstone.handover_id, [])).append(node)
         return [*resting.values(), *(free[start : start + most] for start in range(0, len(free), most))]
 
     def choose(self) -> tuple[Chosen, list[tuple[bytes, str]]]:
         """The nodes with their keys, and those that ``--all`` leaves out."""
         why = self._every() if self.order.nodes is None else self._named(self.order.nodes)
-        chosen = [(self.nodes[uuid], self.keys[uuid]) for uuid, obstacle in why.items() if not obstacle]
+        chosen = [self.keys[uuid] for uuid, obstacle in why.items() if not obstacle]
         if not chosen:
             raise NotFound("There is no node to hand over.", hint="Name nodes, or see: teds-provision nodes")
         return chosen, [(uuid, obstacle) for uuid, obstacle in why.items() if obstacle]
@@ -82,7 +94,7 @@ class Selection:
         return why
 
     def _obstacle(self, uuid: bytes) -> str:
-        return self._key_stays(uuid) or self._node_stays(uuid)
+        return self._key_stays(uuid) or self.stays.get(uuid, _UNKNOWN)
 
     def _key_stays(self, uuid: bytes) -> str:
         tombstone = self.tombstones.get(uuid)
@@ -96,16 +108,6 @@ class Selection:
             return "an agreement with it is not settled: the key that it has now may be a newer one"
         if uuid in self.due:
             return "its key must be rotated first"
-        return ""
-
-    def _node_stays(self, uuid: bytes) -> str:
-        node = self.nodes.get(uuid)
-        if node is not None and (node.verdict or "").startswith(OUT_OF_SERVICE):
-            return "it is out of service"
-        if node is None or node.point is None:
-            return "its public key is not known"
-        if not same_key(self.pins.get(uuid, ""), fingerprint(node.point)):
-            return "the key that it showed last is not the one that it is pinned to"
         return ""
 
     def _is_cut(self, uuid: bytes) -> bool:
@@ -129,8 +131,39 @@ class Selection:
         return sorted(bytes.fromhex(uuid) for one in together for uuid in one.uuids)
 
 
-def _in_state(keys: Iterable[KeyRecord], state: KeyState) -> dict[bytes, KeyRecord]:
-    return {key.uuid: key for key in keys if key.state == state}
+def _keys(station: Station, wanted: tuple[bytes, ...] | None) -> Iterator[tuple[bytes, str, int, str]]:
+    """UUID, key id, epoch and state of the keys of the nodes that are wanted, or of all."""
+    if wanted is None:
+        return station.keys.each_name()
+    records = (key for page in pages(wanted) for key in station.keys.of_page(page))
+    return ((key.uuid, key.key_id, key.epoch, key.state) for key in records)
+
+
+def _why_nodes_stay(station: Station, wanted: tuple[bytes, ...] | None) -> dict[bytes, str]:
+    """Why each node of the wanted ones, or of all, cannot go, whatever its key is; "" for nothing."""
+    known: Iterable[Sequence[NodeRecord | Shown]] = (
+        pages(station.nodes.each_shown()) if wanted is None else map(_listed, map(station.nodes.of_page, pages(wanted)))
+    )
+    stays: dict[bytes, str] = {}
+    for page in known:
+        entries = station.pins.of_page([node.uuid for node in page])
+        pins = station.pins.among(page, entries.values())
+        stays |= {node.uuid: _why_node_stays(node, pins.get(node.uuid, "")) for node in page}
+    return stays
+
+
+def _listed(nodes: dict[bytes, NodeRecord]) -> list[NodeRecord]:
+    return list(nodes.values())
+
+
+def _why_node_stays(node: NodeRecord | Shown, pin: str) -> str:
+    if (node.verdict or "").startswith(OUT_OF_SERVICE):
+        return "it is out of service"
+    if node.point is None:
+        return _UNKNOWN
+    if not same_key(pin, fingerprint(node.point)):
+        return "the key that it showed last is not the one that it is pinned to"
+    return ""
 
 
 def _of_the_last_run(notes: list[Notes]) -> list[Notes]:

@@ -32,7 +32,7 @@ class LinkKind:
 LINKS: Final = {
     kind.name: kind
     for kind in (
-        LinkKind("nfc", "teds_provision.links.nfc.reader", NFC, "nfc:usb"),
+        LinkKind("nfc", "teds_provision.links.nfc.port", NFC, "nfc:usb"),
         LinkKind(
             "can",
             "teds_provision.links.can.port",

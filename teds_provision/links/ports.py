@@ -106,7 +106,7 @@ class Link(Protocol):
         """
 
     def close(self) -> None:
-        """Leave the node in peace (NFC: deselect the service); never raises."""
+        """End the talk with the node (NFC: deselect the service); never raises."""
 
 
 @runtime_checkable
@@ -118,6 +118,29 @@ class Repeats(Protocol):
 
         Returns and raises as ``exchange`` does (profile.md, "Repetition").
         """
+
+
+@runtime_checkable
+class Prompt(Protocol):
+    """A link on which a request can be given up soon: what it orders would be too late afterwards."""
+
+    def exchange_within(self, frame: bytes, seconds: float) -> bytes:
+        """As ``exchange``; repeated after a quarter and a half of ``seconds``, given up at their end.
+
+        operation.md section 2, "No late orders".
+        """
+
+
+@runtime_checkable
+class Timed(Protocol):
+    """A link that knows better than who asks when messages left and came, in seconds of ``time.monotonic()``.
+
+    ``left``: a moment just before the first request left since this was last set to 0. ``came``: when the last reply
+    was whole, by the kernel's time stamp where there is one; 0 where none came since.
+    """
+
+    left: float
+    came: float
 
 
 @dataclass(frozen=True)
@@ -144,12 +167,21 @@ class Contact:
         return self.address or self.connection or 0
 
     def note(
-        self, direction: Direction, frame: bytes, words: str, *, sealed: bool = False, opened: bytes | None = None
+        self,
+        direction: Direction,
+        frame: bytes,
+        words: str | Callable[[], str],
+        *,
+        sealed: bool = False,
+        opened: bytes | None = None,
     ) -> None:
-        """Write a whole message with this node to the trace, where there is one; see ``Trace.message``."""
+        """Write a whole message with this node to the trace, where there is one; see ``Trace.message``.
+
+        ``words`` may be what finds them, which is called only there.
+        """
         if self.trace is not None:
-            uuid = self.identity.uuid
-            self.trace.message(self.link.via, direction, frame, words, uuid=uuid, sealed=sealed, opened=opened)
+            uuid, said = self.identity.uuid, words if isinstance(words, str) else words()
+            self.trace.message(self.link.via, direction, frame, said, uuid=uuid, sealed=sealed, opened=opened)
 
 
 class Port(Protocol):

@@ -1,7 +1,8 @@
 """Operating one actuator: a set point, kept alive by the loop that computes it, and the safe state at the end.
 
 The dead-man (operation.md section 2) is fed only by :meth:`Acting.apply`, which sends a value. No thread keeps it
-alive: whatever dies, the node brings its actuator to its safe state within the dead-man.
+alive: whatever dies, the node brings its actuator to its safe state within the dead-man. A value that nobody answers
+is sent again after a quarter and a half of the dead-man, and given up at its end.
 """
 
 from __future__ import annotations
@@ -46,9 +47,10 @@ def unit_for(channel: Channel, text: str | None) -> WrittenUnit:
         return WrittenUnit(channel.si_unit, channel.units, 1.0, 0.0)
     unit = parse_unit(text)
     if unit.units != channel.units:
+        words = " or ".join(dict.fromkeys((channel.unit.text, channel.si_unit)))
         raise BadData(
             f"{text} is no unit of channel {channel.number}, whose values are in {channel.si_unit}.",
-            hint=f"Use {channel.unit.text} or {channel.si_unit}.",
+            hint=f"Use {words}.",
         )
     return unit
 
@@ -100,7 +102,9 @@ class Acting:
         octets = self.octets_of(value)
         began = time.monotonic()
         try:
-            self._trusted.node.send(write_data_set(self.channel.number, octets), "to set the actuator")
+            self._trusted.node.send(
+                write_data_set(self.channel.number, octets), "to set the actuator", within=self._dead_man / 1000
+            )
         except SessionLost as lost:
             raise LinkFailure(
                 f"The session was lost while the actuator was operated: {lost.cause.message}",

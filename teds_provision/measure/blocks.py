@@ -125,16 +125,20 @@ class StationFacts:
 
     ``names`` maps (uuid, channel) to the topic that the user chose, channel 0 to the node's part of it;
     ``frame_ids`` maps a uuid to a frame. ``scalar_rate`` limits topics of one value (Hz), 0 leaves them out.
+    ``nodes`` maps a uuid to the node's name as this station knows it, before the node itself was asked.
+    ``instance`` tells the measurements of one station apart, which may run side by side; "" where there is one alone.
     """
 
     name: str
     group: str = ""
+    instance: str = ""
     started: float = 0.0  # unix seconds
     clock: str = "host's wall clock, node ticks mapped to it"
     names: Mapping[tuple[str, int], str] = field(default_factory=dict)
     frame_ids: Mapping[str, str] = field(default_factory=dict)
     scalar_rate: float = 10.0
     test_pattern: bool = False
+    nodes: Mapping[str, str] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)

@@ -34,6 +34,8 @@ BUCKET = 50_000_000  # ns: the best arrival of each stands for it
 REFIT_AFTER = 10  # buckets
 SLEW = 1_000_000_000  # ns over which a refit's difference is let out
 SPAN_OF_A_HULL = 2_000_000_000  # ns of arrivals before they say something about skew
+END_OF_TICKS = 1 << 63  # 292 years of ns since the node's start: no tick is so late
+ANY_TICK = TickBounds(-(1 << 64), 1 << 64)  # without evidence
 SPAN_OF_EXCHANGES = 60_000_000_000  # ns of exchanges before they say more about it than the arrivals
 
 
@@ -99,7 +101,10 @@ class ClockMap:
         return tuple(self._exchanges)
 
     def exchange(self, one: Exchange) -> bool:
-        """Take an exchange; False where the clock lies (``lie`` says how). A lying exchange changes nothing else."""
+        """Take an exchange; False where the clock lies (``lie`` says how). It moves no stamp where there is better."""
+        if one.sent >= END_OF_TICKS:
+            self.lie = "the node says that it has run for centuries"
+            return False
         if one.sent < one.received:
             self.lie = "the node sent its reply before it received the request, by its own clock"
         elif one.sent - one.received > (one.answered - one.asked) * (1 + one.drift / 1e6) + 2 * one.step:
@@ -116,12 +121,21 @@ class ClockMap:
             self._narrow(one.tick, one.offset - one.error, one.offset + one.error)
             self._refit(one.tick)
             return True
+        if not self._known:  # stamps go on: until a sample arrives, the end of the reply is all that there is
+            self._origin, self._offset = one.sent, float(one.answered - one.sent)
         return False
 
     def arrival(self, tick: int, host: int) -> None:
         """Take a sample's tick and when the message that held it had come (host, monotonic ns)."""
         upper = host - tick
-        self._narrow(tick, -math.inf, upper)
+        # What _narrow does, with an upper limit alone.
+        age = tick - self._when
+        if age > 0:
+            doubt = self._rate * age
+            self._low -= doubt
+            self._high += doubt
+            self._when, age = tick, 0
+        self._high = min(self._high, upper - self._rate * age)
         if self._hull.take(tick, upper) and self._hull.count % REFIT_AFTER == 1:
             self._refit(tick)
 
@@ -145,23 +159,42 @@ class ClockMap:
         guess = host - round(self._offset)
         return host - round(self._line(guess))
 
-    def bound(self, tick: int) -> float:
-        """Bound of the error of ``host`` at a tick, seconds; infinite without an exchange."""
-        low, high = self._limits(tick)
-        now = self._line(tick)
-        return max(high - now, now - low, 0.0) / 1e9
-
     def ticks_at(self, host: int) -> TickBounds:
         """What the node's tick may be at a host time (monotonic ns), by all evidence."""
-        tick = self.tick_at(host)
-        low, high = self._limits(tick)
-        if math.isinf(low) or math.isinf(high):
-            return TickBounds(0, 1 << 64)
-        return TickBounds(int(host - high), int(host - low) + 1)
+        ahead = self.ahead(host)
+        return TickBounds(max(0, host + ahead.low), host + ahead.high)
+
+    def ahead(self, host: int) -> TickBounds:
+        """By what the node's tick may be ahead of the host's time (monotonic ns), at that time."""
+        # The tick itself is the line's; what skew adds to its offset changes this doubt by some ns in a minute.
+        doubt = self._rate * abs(host - self._offset - self._when) + 1.0
+        low, high = self._low - doubt, self._high + doubt
+        if low == -math.inf or high == math.inf:
+            return ANY_TICK
+        return TickBounds(-math.ceil(high), 1 - math.floor(low))
+
+    def line(self, first: int, last: int) -> tuple[int, float, float]:
+        """Host time of a tick (monotonic ns), ns of host time for each of the node's from there on, and the bound.
+
+        The bound is of the error of what this says of any tick from ``first`` to ``last``, in seconds; infinite without
+        an exchange.
+        """
+        self._handed_out = True
+        rate = 1.0 + self._skew
+        if self._residue and 0 <= first - self._refitted < SLEW:
+            rate -= self._residue / SLEW
+        begin = round(self._line(first))
+        end = begin + (rate - 1.0) * (last - first)
+        upper, lower = (begin, end) if begin > end else (end, begin)
+        doubt = self._rate * max(abs(first - self._when), abs(last - self._when))
+        bound = max(self._high + doubt - lower, upper - self._low + doubt, 0.0) / 1e9
+        return first + begin, rate, bound
 
     def _line(self, tick: int) -> float:
-        left = min(max(1.0 - (tick - self._refitted) / SLEW, 0.0), 1.0)
-        return self._offset + self._skew * (tick - self._origin) + self._residue * left
+        line = self._offset + self._skew * (tick - self._origin)
+        if not self._residue or tick - self._refitted >= SLEW:
+            return line
+        return line + self._residue * min(1.0 - (tick - self._refitted) / SLEW, 1.0)
 
     def _limits(self, tick: int) -> tuple[float, float]:
         """The offsets that all evidence allows at a tick."""
@@ -185,22 +218,33 @@ class ClockMap:
         self._known = True
 
     def _by_exchanges(self, tick: int) -> tuple[float, float]:
-        """Weighted line through the exchanges, the skew held within the drift; (offset at tick, skew)."""
+        """The middle of what all exchanges allow, at most what the arrivals do; (offset at tick, skew).
+
+        Delay only ever widens an exchange, on one side or the other. So the quickest request of all says more than the
+        mean of many, and so does the quickest reply. What they say is carried to ``tick`` along the skew, whose own
+        doubt makes old ones say less.
+        """
         at = np.array([one.tick - tick for one in self._exchanges], dtype=np.float64)
         offsets = np.array([one.offset for one in self._exchanges])
         errors = np.array([one.error for one in self._exchanges])
         base = offsets[-1]
+        edge, skew = self._by_arrivals(tick)
+        if len(at) >= 4 and at.max() - at.min() >= SPAN_OF_EXCHANGES:
+            skew = self._skew_of(at, offsets - base, errors)
+        # The skew is known the better the longer was seen, and as well as the best exchange is over that time.
+        seen = max(self._hull.span, at.max() - at.min(), SPAN_OF_A_HULL)
+        carried = offsets - base - skew * at
+        widened = errors + min(self._rate * SPAN_OF_A_HULL, errors.min()) / seen * np.abs(at)
+        middle = float(base + ((carried - widened).max() + (carried + widened).min()) / 2)
+        return (min(middle, edge) if self._hull.count else middle), skew
+
+    def _skew_of(self, at: NDArray[Any], offsets: NDArray[Any], errors: NDArray[Any]) -> float:
+        """Of a weighted line through exchanges, held within the drift."""
         # A round trip's excess over the quickest one is delay that fell on one way or the other: it says little.
         weights = 1.0 / (errors - 0.9 * errors.min() + 1_000.0) ** 2
-        by_hull = self._by_arrivals(tick)[1]
-        middle = np.average(at, weights=weights)
-        level = np.average(offsets - base, weights=weights)
-        spread = float(np.sum(weights * (at - middle) ** 2))
-        skew = by_hull
-        if spread and len(at) >= 4 and at.max() - at.min() >= SPAN_OF_EXCHANGES:
-            skew = float(np.sum(weights * (at - middle) * (offsets - base - level)) / spread)
-            skew = min(max(skew, -self._rate), self._rate)
-        return float(base + level - skew * middle), skew
+        middle, level = np.average(at, weights=weights), np.average(offsets, weights=weights)
+        skew = float(np.sum(weights * (at - middle) * (offsets - level)) / np.sum(weights * (at - middle) ** 2))
+        return min(max(skew, -self._rate), self._rate)
 
     def _by_arrivals(self, tick: int) -> tuple[float, float]:
         """The edge of the lower hull over the middle of the window; (offset at tick, skew)."""
@@ -227,22 +271,23 @@ class LowerHull:
     def __init__(self) -> None:
         self.count = 0
         self._closed: deque[tuple[int, int]] = deque()
-        self._last: tuple[int, int] | None = None  # the best of the bucket that is still open
+        self._best = (0, 0)  # of the bucket that is still open, where ``count`` says that there is one
+        self._end = 0  # tick at which it ends
         self._hull: list[tuple[int, int]] = []
 
     def take(self, tick: int, upper: int) -> bool:
         """Take an arrival; whether it begins a new bucket."""
-        if self._last is not None and tick // BUCKET <= self._last[0] // BUCKET:
+        if tick < self._end:
             # Of another stream it may be a little older than what came before it: then it tells nothing new.
-            if upper < self._last[1] and tick // BUCKET == self._last[0] // BUCKET:
-                self._last = (tick, upper)
+            if upper < self._best[1] and tick >= self._end - BUCKET:
+                self._best = (tick, upper)
             return False
-        if self._last is not None:
-            self._closed.append(self._last)
-            _extend(self._hull, self._last)
+        if self.count:
+            self._closed.append(self._best)
+            _extend(self._hull, self._best)
         if self._closed and self._closed[0][0] < tick - WINDOW - WINDOW // 10:
             self._forget(tick - WINDOW)
-        self._last = (tick, upper)
+        self._best, self._end = (tick, upper), (tick // BUCKET + 1) * BUCKET
         self.count += 1
         return True
 
@@ -253,11 +298,16 @@ class LowerHull:
         for point in self._closed:
             _extend(self._hull, point)
 
+    @property
+    def span(self) -> int:
+        """Ticks (ns) from the oldest arrival to the newest bucket."""
+        return self._best[0] - self._closed[0][0] if self._closed else 0
+
     def points(self) -> list[tuple[int, int]]:
         """The hull's corners, oldest first."""
         hull = list(self._hull)
-        if self._last is not None:
-            _extend(hull, self._last)
+        if self.count:
+            _extend(hull, self._best)
         return hull
 
 
@@ -305,3 +355,10 @@ class Monotone:
         if len(held):
             self._last = float(held[-1])
         return held
+
+    def straight(self, times: NDArray[np.float64]) -> NDArray[np.float64]:
+        """The same for at least one time, all on a straight line: mostly there is nothing to do."""
+        if times[-1] >= times[0] >= self._last:
+            self._last = float(times[-1])
+            return times
+        return self(times)

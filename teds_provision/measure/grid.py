@@ -25,7 +25,9 @@ LONGEST_BURST = 10_000  # rows at once; a longer gap of all streams is left out
 
 @dataclass
 class _Stream:
+    channels: tuple[int, ...]
     columns: list[int]
+    place: slice | list[int]  # the same; as a slice where they lie side by side, which numpy reaches more quickly
     keeps: float  # seconds that a value stands for its channels
     times: list[NDArray[Any]] = field(default_factory=list)
     values: list[NDArray[Any]] = field(default_factory=list)
@@ -36,18 +38,16 @@ class _Stream:
 class Grid:
     """Gathers blocks of a group's streams and gives out rows.
 
-    ``period`` is in seconds (the shortest of the channels' unless given), ``patience`` the longest wait for a row
+    ``period`` is in seconds, the shortest of the channels'; ``patience`` the longest wait for a row
     after its time. Channels without a period (events) keep their last value.
     """
 
-    def __init__(
-        self, group: str, facts: Sequence[ChannelFacts], *, period: float | None = None, patience: float = 0.1
-    ) -> None:
+    def __init__(self, group: str, facts: Sequence[ChannelFacts], *, patience: float = 0.1) -> None:
         self.group = group
         self.channels = tuple(one.key for one in facts)
         self.patience = patience
         periods = [one.period for one in facts if one.period]
-        self.period = period or (min(periods) if periods else 1.0)
+        self.period = min(periods, default=1.0)
         self._columns = {key: place for place, key in enumerate(self.channels)}
         self._keeps = {one.key: PERIODS_OF_A_VALUE * one.period if one.period else math.inf for one in facts}
         self._streams: dict[tuple[str, int], _Stream] = {}
@@ -59,9 +59,11 @@ class Grid:
         stream = self._stream(block)
         if stream is None or not len(block.time):
             return
-        order = [place for place, number in enumerate(block.channels) if (block.uuid, number) in self._columns]
+        value = block.value
+        if len(stream.columns) < len(block.channels):
+            value = value[:, [k for k, number in enumerate(block.channels) if (block.uuid, number) in self._columns]]
         stream.times.append(block.time)
-        stream.values.append(np.where(block.valid, block.value, np.nan)[:, order])
+        stream.values.append(value)
         if math.isnan(stream.began):
             stream.began = float(block.time[0])
         stream.newest = max(stream.newest, float(block.time[-1]))
@@ -71,13 +73,14 @@ class Grid:
 
     def _stream(self, block: Block) -> _Stream | None:
         key = block.uuid, block.stream
+        known = self._streams.get(key)
+        if known is not None and known.channels == block.channels:
+            return known
         columns = [self._columns[block.uuid, one] for one in block.channels if (block.uuid, one) in self._columns]
         if not columns:
             return None
-        known = self._streams.get(key)
-        if known is None or known.columns != columns:
-            keeps = max(self._keeps[self.channels[one]] for one in columns)
-            known = self._streams[key] = _Stream(columns, keeps)
+        keeps = max(self._keeps[self.channels[one]] for one in columns)
+        known = self._streams[key] = _Stream(block.channels, columns, _side_by_side(columns), keeps)
         return known
 
     def rows(self, now: float) -> GroupRows | None:
@@ -95,8 +98,9 @@ class Grid:
         times = np.arange(first, until + 1) * self.period
         value = np.full((len(times), len(self.channels)), np.nan)
         age = np.full_like(value, np.nan)
+        upto = times + self.period * 1e-6
         for stream in self._streams.values():
-            _fill(stream, times, value, age, self.period * 1e-6)
+            _fill(stream, times, upto, value, age)
         return GroupRows(self.group, self.channels, times, value, age, self._test)
 
     def began_apart(self) -> float:
@@ -105,16 +109,28 @@ class Grid:
         return max(began) - min(began) if began else 0.0
 
 
-def _fill(stream: _Stream, rows: NDArray[Any], value: NDArray[Any], age: NDArray[Any], rounding: float) -> None:
+def _side_by_side(columns: list[int]) -> slice | list[int]:
+    first, count = columns[0], len(columns)
+    return slice(first, first + count) if columns == list(range(first, first + count)) else columns
+
+
+def _fill(stream: _Stream, rows: NDArray[Any], upto: NDArray[Any], value: NDArray[Any], age: NDArray[Any]) -> None:
+    """The columns of a stream; ``upto``: times of the rows, and a little for rounding."""
     if not stream.times:
         return
-    times, values = np.concatenate(stream.times), np.concatenate(stream.values)
-    place = np.searchsorted(times, rows + rounding, side="right") - 1
-    old = rows - times[np.maximum(place, 0)]
-    good = (place >= 0) & (old <= stream.keeps)
-    for offset, column in enumerate(stream.columns):
-        value[good, column] = values[place[good], offset]
-        age[good, column] = np.maximum(old[good], 0.0)
+    times, values = stream.times[0], stream.values[0]
+    if len(stream.times) > 1:
+        times, values = np.concatenate(stream.times), np.concatenate(stream.values)
+    place = times.searchsorted(upto, "right") - 1
+    old = rows - times[place]
+    if place[0] >= 0 and old.max() <= stream.keeps:
+        value[:, stream.place] = values[place]
+        age[:, stream.place] = np.maximum(old, 0.0)[:, None]
+    else:
+        good = np.flatnonzero((place >= 0) & (old <= stream.keeps))
+        value[good[:, None], stream.columns] = values[place[good]]
+        age[good[:, None], stream.columns] = np.maximum(old[good], 0.0)[:, None]
+    kept = int(place[-1])
     # What a later row may still need: the last value before the next row, and all after it.
-    kept = max(int(place[-1]), 0)
-    stream.times, stream.values = [times[kept:]], [values[kept:]]
+    if kept > 0:
+        stream.times, stream.values = [times[kept:]], [values[kept:]]

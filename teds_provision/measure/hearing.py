@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import threading
 import time
+from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass, field
 
@@ -19,14 +20,16 @@ from teds_provision.links.can.port import CanPort
 from teds_provision.measure.blocks import Block
 from teds_provision.measure.clock import ClockMap
 from teds_provision.measure.interpreter import StreamInterpreter
-from teds_provision.protocol.operation.can_frames import Assembly, data_address
+from teds_provision.protocol.operation.can_frames import Assembly
 from teds_provision.protocol.operation.subscription import Message, Receiver
 
-SLICE = 0.01  # seconds between looks at what waits
-GATHER = 0.02  # seconds that messages wait to be calibrated together
-HEARD_OUT = 0.25  # seconds for what was received before Stop's reply to be looked at
+SLICE = 0.004  # seconds between looks at what waits
+REST = 0.003  # seconds that frames gather on one bus: to be woken for each of them costs more than to read it
+GATHER = 0.012  # seconds that messages wait to be opened and calibrated together: of a tick's 20 ms to its sink
+HEARD_OUT = 0.25  # seconds for the last message that is wanted to come and to be looked at
 MOST_HELD = 50_000  # frames: some seconds of a full bus
 _DATA, _MASK = 0x1CFF0000, 0x1FFF0000
+_STREAM = 0x18FF  # of an identifier: node and stream
 
 
 @dataclass
@@ -47,6 +50,14 @@ class HeardStream:
     samples: int = 0
     invalid: int = 0
     bound: float | None = None
+    _came: deque[tuple[bytes, int]] = field(default_factory=deque)
+    _since: float = 0.0
+
+    def __post_init__(self) -> None:
+        plan = self.receiver.plan
+        self._at_once = plan.span >= GATHER * 1e9
+        self._last_instant = plan.span - plan.subscribe.period
+        self._test_pattern = plan.subscribe.test_pattern
 
     def take(self, segment: int, frame: Frame) -> None:
         """A frame of this stream."""
@@ -55,56 +66,80 @@ class HeardStream:
             self.whole(octets, int((frame.at or time.monotonic()) * 1e9))
 
     def whole(self, octets: bytes, at: int) -> None:
-        """A whole message of this stream, which came at ``at`` (monotonic ns)."""
-        with self.mapping:
-            message = self.receiver.take(octets, self.clock.ticks_at(at))
-            if message is not None:
-                last = message.tick + self.receiver.plan.span - self.receiver.plan.subscribe.period
-                self.clock.arrival(last, at)
-        if message is not None:
-            self.good(message)
+        """A whole message of this stream, which came at ``at`` (monotonic ns); it waits for others that come soon."""
+        if not self._came:
+            self._since = time.monotonic()
+        self._came.append((octets, at))
+
+    @property
+    def due(self) -> bool:
+        """Whether a message waits which no other will join soon."""
+        return self._at_once and bool(self._came)
 
     def begin(self, start: int) -> None:
         """The first instant of a stream that waited for a trigger is known."""
+        self.finish()
         with self.mapping:
             messages = self.receiver.begin(start)
-        for message in messages:
-            self.good(message)
-
-    def good(self, message: Message) -> None:
-        """A message whose tag and time are right."""
-        self.heard = time.monotonic()
-        if message.test_pattern and message.data != self.receiver.expected(message):
-            self.wrong_pattern += 1
-        with self.mapping:
-            block = self.interpreter.take(message)
-        self._deliver(block)
+            blocks = self.interpreter.blocks(messages)
+        self._good(messages, blocks)
 
     def flush(self, now: float) -> None:
-        """Hand on what has waited for GATHER."""
-        since = self.interpreter.waiting_since
-        if since and now - since >= GATHER:
+        """Open and hand on what has waited for GATHER."""
+        if self._came and now - self._since >= GATHER:
             self.finish()
 
     def finish(self) -> None:
-        """Hand on what is left."""
-        with self.mapping:
-            block = self.interpreter.flush()
-        self._deliver(block)
+        """Open, check, calibrate and hand on what is left.
 
-    def hear_out(self, counter: int) -> None:
-        """Wait for the hearing thread: frames that came before Stop's reply may still lie in its queue."""
+        All that waits at once, since most of what that costs does not depend on how much it is.
+        """
+        came = [self._came.popleft() for _ in range(len(self._came))]
+        if not came:
+            return
+        with self.mapping:
+            messages = self.receiver.take_all(came, self.clock.ahead(came[-1][1]))
+            if messages:
+                self._note_arrival(came, messages)
+            blocks = self.interpreter.blocks(messages)
+        self._good(messages, blocks)
+
+    def _note_arrival(self, came: list[tuple[bytes, int]], messages: list[Message]) -> None:
+        """Tell the clock which message came soonest after its samples; of a batch with drops the last one will do."""
+        at, tick = came[-1][1], messages[-1].tick
+        if len(messages) == len(came) > 1:
+            soonest = at - tick
+            for (_, arrived), message in zip(came, messages, strict=True):
+                if arrived - message.tick < soonest:
+                    at, tick, soonest = arrived, message.tick, arrived - message.tick
+        self.clock.arrival(tick + self._last_instant, at)
+
+    def _good(self, messages: list[Message], blocks: list[Block]) -> None:
+        """Messages whose tag and time are right."""
+        if messages:
+            self.heard = time.monotonic()
+        if self._test_pattern:
+            self.wrong_pattern += sum(message.data != self.receiver.expected(message) for message in messages)
+        for block in blocks:
+            self._deliver(block)
+
+    def ending(self) -> int:
+        """The measurement ends now: how many messages of the run are wanted, the one that is being filled included."""
+        with self.mapping:
+            return self.receiver.begun(self.clock.tick_at(time.monotonic_ns()))
+
+    def hear_out(self, wanted: int) -> None:
+        """Wait for the last of so many messages; it may be on its way, or in the queue of the hearing thread."""
         until = time.monotonic() + HEARD_OUT
-        while self.receiver.last < counter - 1 and time.monotonic() < until:
+        while self.receiver.last < wanted - 1 and time.monotonic() < until:
             time.sleep(0.002)
 
-    def _deliver(self, block: Block | None) -> None:
-        if block is not None:
-            self.samples += block.value.size
-            if not block.test_pattern:
-                self.invalid += block.valid.size - int(np.count_nonzero(block.valid))
-            self.bound = block.clock_error
-            self.deliver(block)
+    def _deliver(self, block: Block) -> None:
+        self.samples += block.value.size
+        if not block.test_pattern:
+            self.invalid += block.valid.size - int(np.count_nonzero(block.valid))
+        self.bound = block.clock_error
+        self.deliver(block)
 
 
 class Hearing:
@@ -176,13 +211,18 @@ class CanHearing(Hearing):
         with self._port.bus().listen(self._wanted, most=MOST_HELD) as ear:
             looked = time.monotonic()
             while not self._stop.is_set():
-                frame = ear.get(SLICE)
-                if frame is not None:
-                    self._take(frame)
+                # All that wait first: a thread that fell behind calibrates more at once, and catches up.
+                touched = {frame.identifier & _STREAM: self._take(frame) for frame in ear.get_all(SLICE)}
+                for heard in touched.values():
+                    if heard is not None and heard.due:
+                        heard.finish()
                 looked = self._flush(looked, ear.lost)
+                time.sleep(REST)
 
-    def _take(self, frame: Frame) -> None:
-        address = data_address(frame.identifier)
-        heard = self._streams.get((address.node, address.stream)) if address is not None else None
-        if address is not None and heard is not None:
-            heard.take(address.segment, frame)
+    def _take(self, frame: Frame) -> HeardStream | None:
+        # Whoever is registered has a good address, and other stations' frames do not come here.
+        identifier = frame.identifier
+        heard = self._streams.get((identifier & 0xFF, identifier >> 11 & 3))
+        if heard is not None:
+            heard.take(identifier >> 8 & 7, frame)
+        return heard

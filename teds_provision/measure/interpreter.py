@@ -6,6 +6,7 @@ the stream begins.
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Sequence
 
@@ -16,7 +17,7 @@ from teds_provision.measure.clock import ClockMap, Monotone, Wall
 from teds_provision.protocol.operation.stream_commands import Kind
 from teds_provision.protocol.operation.subscription import Message, Plan
 from teds_provision.teds.calibration.interpreter import ChannelInterpreter
-from teds_provision.teds.calibration.together import Together
+from teds_provision.teds.calibration.many_channels import ManyChannels
 from teds_provision.teds.sheet import Sheet
 
 
@@ -39,71 +40,75 @@ class StreamInterpreter:
             at += width
         self._places = places
         self._row = at
-        self._steps = np.arange(plan.subscribe.n, dtype=np.uint64) * np.uint64(plan.subscribe.period)
-        self._waiting: list[Message] = []
-        self._since = 0.0
+        self._period, self._n = plan.subscribe.period, plan.subscribe.n
+        self._even = plan.subscribe.kind == Kind.PERIODIC
+        self._stream, self._numbers = plan.subscribe.stream, plan.layout.channels
+        self._test_pattern = plan.subscribe.test_pattern
+        self._steps, self._seconds = np.zeros(0, dtype=np.uint64), np.zeros(0)  # of instants: ns, s after the first
         present = set(plan.layout.channels)
         why = {one.channel.number: raw_only or _why_raw(one, present) for one in self._channels}
         self.problems = {number: reason for number, reason in why.items() if reason}
 
         usable = [one.channel.number not in self.problems for one in self._channels]
-        self._together = Together.of(self._channels, usable)
+        self._many = ManyChannels.of(self._channels, usable)
 
-    @property
-    def waiting_since(self) -> float:
-        """Monotonic time since which a message waits; 0 where none does."""
-        return self._since if self._waiting else 0.0
-
-    def take(self, message: Message) -> Block | None:
-        """A message; gives the block before it where this one does not follow on from it."""
-        done = None
-        if self._waiting:
-            last = self._waiting[-1]
-            if message.index != last.index + self._plan.subscribe.n or self._plan.subscribe.kind != Kind.PERIODIC:
-                done = self.flush()
-        if not self._waiting:
-            self._since = time.monotonic()
-        self._waiting.append(message)
+    def blocks(self, messages: Sequence[Message]) -> list[Block]:
+        """Messages as blocks: one for all that follow on from each other, and another one after each gap."""
+        if not messages:
+            return []
+        if len(messages) == 1:
+            return [self._block(messages)]
+        if self._even and messages[-1].index - messages[0].index == (len(messages) - 1) * self._n:
+            return [self._block(messages)]
+        done, begin = [], 0
+        for end in range(1, len(messages) + 1):
+            follows = end < len(messages) and self._even and messages[end].index == messages[end - 1].index + self._n
+            if not follows:
+                done.append(self._block(messages[begin:end]))
+                begin = end
         return done
 
-    def flush(self) -> Block | None:
-        """What waits, as one block."""
-        messages, self._waiting = self._waiting, []
-        if not messages:
-            return None
-        plan, n = self._plan, self._plan.subscribe.n
-        octets = np.frombuffer(b"".join(message.data for message in messages), dtype=np.uint8)
-        rows = octets.reshape(len(messages) * n, self._row)
-        first = np.array([message.tick for message in messages], dtype=np.uint64)
-        ticks = (first[:, None] + self._steps).ravel()
-        host = self._clock.host(ticks)
-        raws, value, valid = self._values(rows)
-        told = [message.valid and not message.test_pattern for message in messages]
-        if not all(told):
-            valid = valid & np.repeat(told, n)[:, None]
+    def _block(self, messages: Sequence[Message]) -> Block:
+        first, count = messages[0], len(messages) * self._n
+        if len(messages) == 1:
+            octets, flags = first.data, first.flags
+        else:
+            octets, flags = b"".join([one.data for one in messages]), max([one.flags for one in messages])
+        raws, value, valid = self._values(octets)
+        if flags:
+            told = [message.valid and not message.test_pattern for message in messages]
+            valid = valid & np.repeat(told, self._n)[:, None]
             value = np.where(valid, value, np.nan)
-        bound = self._clock.bound(int(ticks[-1]))
+        if len(self._steps) < count:
+            self._steps = np.arange(count, dtype=np.uint64) * np.uint64(self._period)
+            self._seconds = self._steps / 1e9
+        span = (count - 1) * self._period
+        # Whole nanoseconds first: a tick of months and an offset of years would lose microseconds as floats.
+        host, rate, bound = self._clock.line(first.tick, first.tick + span)
+        times = self._seconds[:count] * rate
+        times += host / 1e9 + self._wall.offset
         return Block(
             uuid=self._uuid,
-            stream=plan.subscribe.stream,
-            channels=plan.layout.channels,
-            index=messages[0].index,
-            time=self._monotone(self._wall.unix(host)),
-            tick=ticks,
+            stream=self._stream,
+            channels=self._numbers,
+            index=first.index,
+            time=self._monotone.straight(times),
+            tick=self._steps[:count] + first.tick,
             raw=raws,
             value=value,
             valid=valid,
-            age=time.monotonic() - float(host[-1]),
-            clock_error=bound if np.isfinite(bound) else None,
-            test_pattern=plan.subscribe.test_pattern,
+            age=time.monotonic() - (host + span * rate) / 1e9,
+            clock_error=bound if bound < math.inf else None,
+            test_pattern=self._test_pattern,
             run=self._run,
         )
 
-    def _values(self, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    def _values(self, octets: bytes) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Raw values, values (NaN where not valid), and which are valid, of instants as they stand in messages."""
-        if self._together is not None:
-            raws = self._together.raw(rows)
-            return raws, *self._together.values(raws)
+        if self._many is not None:
+            raws = self._many.raw(octets)
+            return raws, *self._many.values(raws)
+        rows = np.frombuffer(octets, dtype=np.uint8).reshape(-1, self._row)
         columns = [one.reader.raw(rows[:, place]) for one, place in zip(self._channels, self._places, strict=True)]
         by_number = dict(zip(self._plan.layout.channels, columns, strict=True))
         value = np.full((len(rows), len(columns)), np.nan)

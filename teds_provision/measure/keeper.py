@@ -8,6 +8,7 @@ Announce at once.
 from __future__ import annotations
 
 import functools
+import logging
 import threading
 import time
 from collections.abc import Sequence
@@ -15,6 +16,7 @@ from contextlib import suppress
 
 from teds_provision.errors import (
     BadData,
+    Bug,
     LinkFailure,
     NodeRefused,
     NotAuthentic,
@@ -22,16 +24,16 @@ from teds_provision.errors import (
     StoreFailure,
     TedsProvisionError,
 )
+from teds_provision.measure.actuators import Actuators
 from teds_provision.measure.blocks import Command, NodeReport, State
-from teds_provision.measure.carrying.streams import NodeStreams
-from teds_provision.measure.carrying.together import Together
 from teds_provision.measure.clock import AT_FIRST, Wall
 from teds_provision.measure.finding.buses import Bus, Buses
-from teds_provision.measure.finding.lookout import Sighting
-from teds_provision.measure.hands import Hands
+from teds_provision.measure.finding.sightings import Sighting
 from teds_provision.measure.orders import Events, Wish
 from teds_provision.measure.planning import BusTime, Plans, plan_node, sensors_of
-from teds_provision.measure.trusting import Trusted, claim, open_trusted
+from teds_provision.measure.running.common_start import CommonStart
+from teds_provision.measure.running.streams import NodeStreams
+from teds_provision.measure.trusting import Standing, Trusted, claim, open_trusted
 from teds_provision.protocol.messages.frames import Reason
 from teds_provision.protocol.operation.commands import idle
 from teds_provision.protocol.operation.stream_commands import SOON
@@ -39,14 +41,16 @@ from teds_provision.station.station import Station
 from teds_provision.talk.conversation import Conversation, SessionLost
 from teds_provision.teds.sheet import Channel
 
+_log = logging.getLogger(__name__)
 FIRST_PAUSE, LAST_PAUSE = 1.0, 30.0
 LOOKING = 2.0  # seconds that a node which ran before is looked for, between its reports
 LOOK = 0.2  # seconds between looks at how it does
 LOOK_FOR_DATA = 0.4  # seconds after an announcement in which data shows that it was not the node's
 ANNOUNCED = 1.0  # seconds until a node without such data is asked after it
+AT_ONCE = 1.0  # seconds between two tries, however often something announces itself as this node
 SLOWER = 10  # halvings of the rate while the firmware says that its shortest period is longer
 _CURED_BY_TIME = frozenset({Reason.WRONG_STATE, Reason.BUSY, Reason.BAD_TAG, 21, 22, 23})
-_FINAL = (NotAuthentic, PolicyRefused, BadData, StoreFailure)
+_FINAL = (NotAuthentic, PolicyRefused, BadData, StoreFailure, Bug)
 
 
 class NodeKeeper:
@@ -60,7 +64,7 @@ class NodeKeeper:
         wish: Wish,
         wall: Wall,
         events: Events,
-        together: Together,
+        common_start: CommonStart,
     ) -> None:
         self.uuid = uuid
         self.error: TedsProvisionError | None = None
@@ -73,13 +77,14 @@ class NodeKeeper:
         self.done = threading.Event()
         self._station, self._buses = station, buses
         self.bus: Bus | None = None  # where it is, once it was found
-        self._wish, self._events, self._together = wish, events, together
+        self._wish, self._events, self._common_start = wish, events, common_start
         self._stop = threading.Event()
         self._anew = threading.Event()
         self._announced = 0.0  # when it announced itself (time.monotonic), 0: it did not
         self._lost_at = 0.0
+        self._sighting: Sighting | None = None  # where it was last
         self._halved = 0
-        self._hands: Hands | None = None
+        self._driven: Actuators | None = None
         self._told = ""
         self._thread = threading.Thread(target=self._run, name=f"node {uuid.hex()[:8]}", daemon=True)
 
@@ -94,9 +99,9 @@ class NodeKeeper:
 
     def command(self, command: Command) -> None:
         """A set point for one of its actuators; dropped while it is not there."""
-        hands = self._hands
-        if hands is not None:
-            hands.take(command)
+        driven = self._driven
+        if driven is not None:
+            driven.take(command)
 
     def join(self, seconds: float) -> None:
         """Wait for its end."""
@@ -120,17 +125,25 @@ class NodeKeeper:
                 if time.monotonic() - began > LAST_PAUSE:
                     pause = FIRST_PAUSE
                 self._say("lost" if self.ever_ran else "waiting", error, f"; again in {pause:.0f} s")
-                self._anew.wait(pause)
+                self._wait(pause, began)
                 pause = min(2 * pause, LAST_PAUSE)
             self._say("ended")
         finally:
-            self._together.gone(self.uuid)
+            self._common_start.gone(self.uuid)
             if self._wish.require is not None:
                 self._wish.require.gone(self.uuid)
             for bus in self._buses.all():
                 bus.share.gone(self.uuid)
             self.done.set()
             self.ready.set()
+
+    def _wait(self, pause: float, began: float) -> None:
+        """Wait until it is time to try again: after ``pause`` seconds, or at once when the node announces itself."""
+        if self._sighting is not None:
+            self._buses.sightings.on_announce(self._sighting, self._anew.set)
+        self._anew.wait(pause)
+        self._buses.sightings.let_announce(self.uuid)  # from here on it is looked for
+        self._stop.wait(max(0.0, began + AT_ONCE - time.monotonic()))
 
     def _failure(self) -> TedsProvisionError | None:
         """Measure until the end or an error: what ended it, None for the end in order."""
@@ -140,6 +153,9 @@ class NodeKeeper:
             return lost.cause
         except TedsProvisionError as error:
             return error
+        except Exception as bug:  # noqa: BLE001 - a thread that ends without a word looks like an end in order
+            _log.debug("Measuring node %s failed.", self.uuid.hex(), exc_info=True)
+            return Bug(f"Unexpected {type(bug).__name__}.", hint="This is a bug: please report it with -vv.")
         return None
 
     def _gives_up(self, error: TedsProvisionError, first: float) -> bool:
@@ -156,6 +172,7 @@ class NodeKeeper:
     def _once(self) -> None:
         seconds = self._wish.timeout if not self.ever_ran else LOOKING
         sighting = self._buses.sightings.find(self.uuid, seconds=seconds, stop=self._stop, fresh=self._lost_at)
+        self._sighting = sighting
         self.bus = self._buses.of(sighting)
         for other in self._buses.all():
             if other is not self.bus:
@@ -168,6 +185,7 @@ class NodeKeeper:
             raise
 
     def _in_session(self, bus: Bus, sighting: Sighting) -> None:
+        standing = Standing(self._station, self.uuid)
         with Conversation(sighting.contact(), notice=lambda _notice: None) as node:
             trusted = open_trusted(self._station, node, unsigned=self._wish.unsigned)
             if self._wish.require is not None:
@@ -176,7 +194,8 @@ class NodeKeeper:
             self._buses.sightings.on_announce(sighting, self._heard_announce)
             try:
                 self._measure(bus, trusted, sighting.address)
-                self._keep(trusted)
+                standing.drives = self._driven is not None
+                self._keep(trusted, standing)
             finally:
                 self._end(bus, trusted, sighting.address)
 
@@ -192,7 +211,7 @@ class NodeKeeper:
         periods = plans.periods()
         self._events.facts([trusted.facts(one, periods.get(one.number)) for one in (*channels, *actuators)])
         if actuators:
-            self._hands = self._hands_for(bus, trusted, actuators, address)
+            self._driven = self._take_up(bus, trusted, actuators, address)
         notes = [plans.slowed] if plans.slowed else []
         notes += [problem for heard in self.streams.running.values() for problem in heard.interpreter.problems.values()]
         self.ever_ran, self.error = True, None
@@ -226,8 +245,8 @@ class NodeKeeper:
         for number in [0] if whole else [one.number for one in channels]:
             claim(trusted, number, lease=self._wish.lease)
 
-    def _hands_for(self, bus: Bus, trusted: Trusted, actuators: list[Channel], address: int) -> Hands:
-        return Hands(
+    def _take_up(self, bus: Bus, trusted: Trusted, actuators: list[Channel], address: int) -> Actuators:
+        return Actuators(
             trusted,
             functools.partial(bus.drive, address),
             tuple(sorted(one.number for one in actuators)),
@@ -243,7 +262,7 @@ class NodeKeeper:
         rate, share = self._wish.rate, bus.share
         if rate is None:
             share.want(self.uuid, self._plan(channels, bus.time_for(share.time, address), SOON).load)
-        start = self._together.start(self.uuid, self.streams.clock)
+        start = self._common_start.start(self.uuid, self.streams.clock)
         while True:
             with share.lock:
                 time_left = bus.time_for(share.others(self.uuid, sharing=rate is None), address)
@@ -251,10 +270,10 @@ class NodeKeeper:
                 share.taken[self.uuid] = plans.load
             try:
                 for plan in plans.streams:
-                    self.streams.subscribe(bus, trusted, plan, address, ahead=self._together.until(start))
+                    self.streams.subscribe(bus, trusted, plan, address, ahead=self._common_start.until(start))
             except NodeRefused as refusal:
                 if refusal.reason == Reason.TOO_LATE and start != SOON:
-                    self._together.late(self.uuid)
+                    self._common_start.late(self.uuid)
                     start = SOON
                 elif refusal.reason != Reason.OUT_OF_RANGE or rate is not None or self._halved >= SLOWER:
                     raise
@@ -275,13 +294,14 @@ class NodeKeeper:
             slower=2**self._halved,
         )
 
-    def _keep(self, trusted: Trusted) -> None:
-        """Clock every lease / 3 until the end, or until the node is lost."""
+    def _keep(self, trusted: Trusted, standing: Standing) -> None:
+        """Clock every lease / 3 until the end, or until the node is lost, or may not be measured any more."""
         told = time.monotonic()
         every = self._wish.lease / 3
         lied = False
         while not self._stop.is_set():
             self._anew.wait(LOOK)
+            standing.require()
             now = time.monotonic()
             if self._doubted(now) or now - told >= every:
                 with self.turn:
@@ -325,9 +345,9 @@ class NodeKeeper:
     def _end(self, bus: Bus, trusted: Trusted, address: int) -> None:
         """Let go in order, as far as the node still answers."""
         alive = self._stop.is_set()
-        if self._hands is not None:
-            self._hands.close()
-            self._hands = None
+        if self._driven is not None:
+            self._driven.close()
+            self._driven = None
         self._buses.sightings.let_announce(self.uuid)
         self.streams.stop(bus, trusted if alive else None, address)
         with bus.share.lock:

@@ -8,9 +8,9 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field, replace
 
 from teds_provision.measure.blocks import Block, ChannelFacts, NodeReport
-from teds_provision.measure.carrying.judging import Judging
 from teds_provision.measure.hearing import HeardStream
 from teds_provision.measure.planning import BusTime
+from teds_provision.measure.running.requirements import Requirements
 from teds_provision.protocol.operation.budget import MOST_LOAD
 from teds_provision.protocol.operation.stream_commands import Kind
 
@@ -34,7 +34,7 @@ class Wish:
     dead_man: int = DEAD_MAN
     patient: bool = False  # whether a node is waited for, and tried again, for ever: no refusal is final
     unsigned: bool = False  # whether raw values of a node are wanted whose datasheet nobody has signed
-    require: Judging | None = None
+    require: Requirements | None = None
 
 
 @dataclass

@@ -9,26 +9,28 @@ from __future__ import annotations
 import math
 import threading
 import time
+from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass, field
 from typing import Any
 
 from teds_provision.errors import NoNode, StoreFailure, TedsProvisionError
-from teds_provision.measure.blocks import Block, ChannelFacts, Command, NodeReport, StationFacts
-from teds_provision.measure.carrying import trigger
-from teds_provision.measure.carrying.together import Together
+from teds_provision.measure.blocks import Block, ChannelFacts, Command, GroupRows, NodeReport, StationFacts
 from teds_provision.measure.clock import Wall
 from teds_provision.measure.finding.buses import Buses
 from teds_provision.measure.grid import Grid
 from teds_provision.measure.keeper import NodeKeeper
 from teds_provision.measure.orders import Events, Wish
+from teds_provision.measure.running import trigger
+from teds_provision.measure.running.common_start import CommonStart
 from teds_provision.measure.sinks import Sink
 from teds_provision.measure.trusting import Trusted
 from teds_provision.station.station import Station
 
 BEAT = 0.02  # seconds between rows of the group
 REPORTING = 1.0
+WAITING = 3.0  # seconds without a master or a broker that somebody should know of; rospy needs 2 to start
 ENDING = 10.0  # seconds for all nodes to let go
 
 
@@ -51,6 +53,7 @@ class Ended:
     files: list[str]
     error: TedsProvisionError | None
     apart: float = 0.0
+    sinks: list[dict[str, Any]] = field(default_factory=list)
 
 
 @dataclass
@@ -75,8 +78,10 @@ class Measurement:
         self._wall, self._lock = Wall.now(), threading.Lock()
         self._known: dict[tuple[str, int], ChannelFacts] = {}
         self._grid: Grid | None = None
-        self._failed: set[str] = set()
-        self._together = Together(self.uuids, trigger=self.wish.trigger)
+        self._for_grid: deque[Block] = deque()
+        self._shown: dict[str, str] = {}  # what was told of each sink last, and since when one waits
+        self._waits: dict[str, float] = {}
+        self._common_start = CommonStart(self.uuids, trigger=self.wish.trigger)
         opened: list[Sink] = []
         try:
             for sink in self.sinks:
@@ -91,7 +96,7 @@ class Measurement:
             self.wish.require.expect(self.uuids)
         events = Events(self._block, self._describe, self._report)
         self.keepers = [
-            NodeKeeper(self.station, self.buses, uuid, self.wish, self._wall, events, self._together)
+            NodeKeeper(self.station, self.buses, uuid, self.wish, self._wall, events, self._common_start)
             for uuid in self.uuids
         ]
         for keeper in self.keepers:
@@ -109,8 +114,8 @@ class Measurement:
             now = time.monotonic()
             if self._all_done():
                 return
-            if self._together.due(sum(one.ready.is_set() for one in self.keepers), len(self.keepers)):
-                trigger.pull(self._together, self.keepers, self.watcher.note)
+            if self._common_start.due(sum(one.ready.is_set() for one in self.keepers), len(self.keepers)):
+                trigger.pull(self._common_start, self.keepers, self.watcher.note)
             if until == math.inf:
                 until = self._until(now, duration)
             if now >= until:
@@ -124,11 +129,13 @@ class Measurement:
 
     def _until(self, now: float, duration: float | None) -> float:
         """When ``duration`` seconds of data are over: they count from the first values."""
-        left = self._together.left
+        left = self._common_start.left
         if duration is None or left is None or not any(keeper.ever_ran for keeper in self.keepers):
             return math.inf
         self.began()
-        return now + left + duration
+        # A stream that may begin when its node likes begins a moment after Subscribe.
+        first = [one.streams.first_sample() for one in self.keepers]
+        return max(now + left, *first) + duration
 
     def _all_done(self) -> bool:
         return all(keeper.done.is_set() for keeper in self.keepers)
@@ -141,16 +148,35 @@ class Measurement:
         for keeper in self.keepers:
             self._report(keeper.report())
         for sink in self.sinks:
-            if sink.stats.error and sink.name not in self._failed:
-                self._failed.add(sink.name)
+            if self._is_news(sink):
                 self.watcher.sink(sink)
+
+    def _is_news(self, sink: Sink) -> bool:
+        """Whether a sink failed, waits for its consumers for long, or has them again."""
+        stats, now = sink.stats, time.monotonic()
+        state = "failed" if stats.error else str(stats.state)
+        since = self._waits.setdefault(sink.name, now)
+        if state != "waiting":
+            del self._waits[sink.name]
+        before = self._shown.get(sink.name, "running")
+        if state == before or state not in ("failed", "running", "waiting"):
+            return False
+        if state == "waiting" and now - since < WAITING:
+            return False
+        self._shown[sink.name] = state
+        return True
 
     def _rows(self) -> None:
         with self._lock:
-            rows = self._grid.rows(time.time()) if self._grid is not None else None
+            rows = self._synchronized(self._grid) if self._grid is not None else None
         if rows is not None:
             for sink in self.sinks:
                 sink.write_group(rows)
+
+    def _synchronized(self, grid: Grid) -> GroupRows | None:
+        while self._for_grid:
+            grid.take(self._for_grid.popleft())
+        return grid.rows(time.time())
 
     @contextmanager
     def session(self, uuid: bytes) -> Iterator[Trusted | None]:
@@ -177,8 +203,7 @@ class Measurement:
         for sink in self.sinks:
             sink.write(block)
         if self._grid is not None:
-            with self._lock:
-                self._grid.take(block)
+            self._for_grid.append(block)  # without the lock: the thread that hears must not wait while rows are made
         self.watcher.block(block)
 
     def _describe(self, facts: Sequence[ChannelFacts]) -> None:
@@ -222,7 +247,8 @@ class Measurement:
         errors += [_as_error(sink) for sink in self.sinks if sink.stats.error]
         worst = min(errors, key=_rank) if errors else None
         files = [name for sink in self.sinks for name in sink.files]
-        return Ended(nodes, files, worst, self._together.apart)
+        sinks = [{"sink": one.name, "written": one.stats.written, "dropped": one.stats.dropped} for one in self.sinks]
+        return Ended(nodes, files, worst, self._common_start.apart, sinks)
 
 
 def _summary(keeper: NodeKeeper) -> dict[str, Any]:

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from teds_provision.measure.clock import ClockMap, Wall
+from teds_provision.measure.clock import END_OF_TICKS, ClockMap, Wall
 from teds_provision.measure.planning import sensors_of
 from teds_provision.measure.sinks.lines import plain
 from teds_provision.measure.trusting import Trusted, claim, exchange_clock
@@ -57,7 +57,7 @@ def take_samples(trusted: Trusted, numbers: Sequence[int]) -> list[Sample]:
     for part in _parts(interpreters):
         width = sum(interpreters[number].octets for number in part)
         reply = Sampled.decode(trusted.node.send(sample(part), "to sample"), width)
-        at, stamp = 0, float(wall.unix(clock.host(np.array([reply.tick], dtype=np.uint64)))[0])
+        at, stamp = 0, _moment(clock, wall, reply.tick)
         for number in part:
             one = interpreters[number]
             raws[number] = one.reader.raw(reply.data[at : at + one.octets])
@@ -65,6 +65,13 @@ def take_samples(trusted: Trusted, numbers: Sequence[int]) -> list[Sample]:
             at += one.octets
     trusted.node.send(idle(0), "to let go")
     return [_sample(interpreters[one.number], raws, good, times[one.number]) for one in channels]
+
+
+def _moment(clock: ClockMap, wall: Wall, tick: int) -> float:
+    """Unix time of a sample that has just come; where the node's clock lies, that of its arrival."""
+    if clock.lie or tick >= END_OF_TICKS:
+        return time.time()
+    return float(wall.unix(np.array([clock.host_of(tick)]))[0])
 
 
 def _interpreters(sheet: Sheet, asked: Sequence[int]) -> dict[int, ChannelInterpreter]:
@@ -110,6 +117,6 @@ def _sample(one: ChannelInterpreter, raws: dict[int, np.ndarray], good: dict[int
         raw=plain(raws[channel.number].tolist()[0]),
         uncertainty=plain(uncertainty),
         valid=valid,
-        time=stamp if stamp else time.time(),
+        time=stamp,
         why=why,
     )

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import hashlib
+import math
 import time
 from dataclasses import dataclass
 
 from teds_provision.errors import BadData, PolicyRefused
+from teds_provision.links.ports import Timed
 from teds_provision.measure.blocks import ChannelFacts
 from teds_provision.measure.clock import ClockMap, Exchange
 from teds_provision.measure.facts import facts_of
@@ -88,13 +90,56 @@ def require_whitelisted(station: Station, uuid: bytes) -> None:
         )
 
 
+class Standing:
+    """What a person decides of a node while it is measured: a ban, its key given away, the whitelist.
+
+    ``drives``: whether set points are taken for its actuators. Looked at where another process has changed the store.
+    """
+
+    def __init__(self, station: Station, uuid: bytes) -> None:
+        self._station, self._uuid = station, uuid
+        self._version = station.version()
+        self.drives = False
+
+    def require(self) -> None:
+        """Raise PolicyRefused where the node may not be measured, or not be moved, any more."""
+        version = self._station.version()
+        if version == self._version:
+            return
+        self._version = version
+        policy = self._station.policy
+        policy.require_not_given_away(self._uuid)
+        revoked = policy.denied(self._uuid, None) if not self._station.keys.held(self._uuid) else None
+        if revoked is not None:
+            raise PolicyRefused(f"Node {self._uuid.hex()} was revoked: {revoked.why}.")
+        if not self._station.keys.held(self._uuid):
+            raise PolicyRefused(f"The key of node {self._uuid.hex()} is not held here any more.")
+        if self.drives:
+            require_whitelisted(self._station, self._uuid)
+
+
 def exchange_clock(node: Conversation, clock: ClockMap) -> Clock:
     """One Clock command, taken into the map; the map's ``lie`` says where the node's clock cannot be believed."""
+    reply, exchange = ask_clock(node)
+    clock.exchange(exchange)
+    return reply
+
+
+def ask_clock(node: Conversation) -> tuple[Clock, Exchange]:
+    """One Clock command, for a map that others read meanwhile.
+
+    What this process took over sealing, opening and waking up is not the link's delay: a link that knows when the first
+    copy left and when the reply was whole is believed (operation.md section 5).
+    """
+    link = node.contact.link
+    if isinstance(link, Timed):
+        link.left = link.came = 0.0
     asked = time.monotonic_ns()
     reply = Clock.decode(node.send(CLOCK, "to tell its time"))
     answered = time.monotonic_ns()
-    clock.exchange(Exchange(asked, answered, reply.received, reply.sent, reply.step, reply.drift))
-    return reply
+    if isinstance(link, Timed) and link.left < link.came:
+        asked, answered = math.floor(link.left * 1e9), math.ceil(link.came * 1e9)
+    return reply, Exchange(asked, answered, reply.received, reply.sent, reply.step, reply.drift)
 
 
 def claim(trusted: Trusted, channel: int, *, lease: int, dead_man: int | None = None) -> None:

@@ -12,8 +12,9 @@ from typing import Any, Final, get_args
 from teds_provision import __version__
 from teds_provision.errors import Frozen, NotFound, UsageFailure
 from teds_provision.links import Port
+from teds_provision.measure.blocks import Command
 from teds_provision.measure.finding.buses import Buses
-from teds_provision.measure.finding.lookout import Sighting
+from teds_provision.measure.finding.sightings import Sighting
 from teds_provision.ncap.live import Live
 from teds_provision.ncap.measuring import Measuring
 from teds_provision.ncap.names import Names
@@ -27,6 +28,7 @@ from teds_provision.ncap.nodes.turns import Turns
 from teds_provision.ncap.nodes.virtual import Virtuals
 from teds_provision.ncap.nodes.watching import Watch
 from teds_provision.ncap.settings import Detection, Settings, own_source, with_source
+from teds_provision.ncap.sinks import DaemonSinks
 from teds_provision.ncap.web.tokens import Tokens
 from teds_provision.station.station import Station
 from teds_provision.talk.conversation import Conversation
@@ -46,9 +48,8 @@ class Daemon:
         self.roster = Roster(station, self.live)
         self.buses = Buses(news=self._saw)
         self.desk = Desk(self.roster, self.turns, self._port_of)
-        self.measuring = Measuring(
-            station, self.roster, self.live, self.turns, self.buses, sinks=settings.sinks, record=settings.record
-        )
+        sinks = DaemonSinks(station.home, settings.sinks, settings.record, actuators=settings.actuators)
+        self.measuring = Measuring(station, self.roster, self.live, self.turns, self.buses, sinks, self._admits)
         self.names = Names(station, self.roster, self.live, self.measuring.is_measured)
         self.sheets = Sheets(station, self.roster, self.desk, self.measuring.sheet)
         self.provisioning = Provisioning(station, self.roster, self.live, self.desk)
@@ -116,7 +117,8 @@ class Daemon:
         def transparent() -> bool:
             return self.detection == "transparent"
 
-        return Watch(place, self.station, self.roster, self.live, self.turns, self, transparent, self.buses)
+        buses, trace = self.buses, self.settings.trace
+        return Watch(place, self.station, self.roster, self.live, self.turns, self, transparent, buses, trace)
 
     def _start_virtuals(self) -> None:
         """Virtual transducers hang on a bus of their own, which is a link like others."""
@@ -177,6 +179,9 @@ class Daemon:
             "clock_error": self.measuring.clock_error(),
             "budget": self.measuring.budget(),
         }
+
+    def _admits(self, set_point: Command) -> bool:
+        return self.holding.admits(set_point)
 
     def _link(self, watch: Watch) -> dict[str, Any]:
         state = watch.state

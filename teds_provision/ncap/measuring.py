@@ -6,38 +6,37 @@ watchers (the live channel, the roster), and the sinks that the daemon was start
 
 from __future__ import annotations
 
-import re
 import threading
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import Any, Final
 
 from teds_provision.errors import NodeBusy, NotFound, TedsProvisionError, UsageFailure
-from teds_provision.measure.blocks import ChannelFacts, NodeReport
-from teds_provision.measure.carrying.job import Job
+from teds_provision.measure.blocks import ChannelFacts, Command, NodeReport
 from teds_provision.measure.finding.buses import Buses
+from teds_provision.measure.orders import DEAD_MAN
 from teds_provision.measure.planning import period_of, sensors_of
 from teds_provision.measure.runner import Watcher
-from teds_provision.measure.sinks import FILES, Sink, open_sink
+from teds_provision.measure.running.job import Job
+from teds_provision.measure.sinks import Sink, open_sink
 from teds_provision.measure.trusting import Trusted
 from teds_provision.ncap.live import Live
 from teds_provision.ncap.nodes.looking import as_problem
 from teds_provision.ncap.nodes.roster import Roster
 from teds_provision.ncap.nodes.turns import Turns
+from teds_provision.ncap.sinks import DaemonSinks, sink_json
 from teds_provision.protocol.operation.stream_commands import Kind
 from teds_provision.station.station import Station
 from teds_provision.store import Measurement
 from teds_provision.teds.image import Image
 from teds_provision.teds.sheet import Sheet
 
-RECORDINGS: Final = "recordings"
+SCALAR_RATE: Final = 10.0
+"""Values a second on a topic of one value, where a measurement does not say."""
 BUDGET: Final = 5000
 """Messages a second that ROS 1, ROS 2 and MQTT carried in measurements of this machine's class (docs/ros.md)."""
-_SERVICE: Final = re.compile(r"ros1\Z|ros2\Z|mqtts?://\S+\Z")
-_NAME: Final = re.compile(r"[A-Za-z0-9][A-Za-z0-9._ -]{0,80}\Z")
 
 
 @dataclass
@@ -55,7 +54,7 @@ class Running:
 
 
 class Measuring:
-    """All of them. ``sinks`` are the words of those that take every measurement, ``record`` a folder for recordings."""
+    """All of them. ``admits`` says of a set point that came by a topic whether it may pass."""
 
     def __init__(
         self,
@@ -64,12 +63,11 @@ class Measuring:
         live: Live,
         turns: Turns,
         buses: Buses,
-        *,
-        sinks: Sequence[str] = (),
-        record: Path | None = None,
+        sinks: DaemonSinks,
+        admits: Callable[[Command], bool],
     ) -> None:
         self._station, self._roster, self._live, self._turns = station, roster, live, turns
-        self._buses, self._sinks, self._record = buses, tuple(sinks), record
+        self._buses, self._sinks, self._admits = buses, sinks, admits
         self._running: dict[str, Running] = {}
         self._guard = threading.Lock()
         self._messages: tuple[float, int] = (time.monotonic(), 0)
@@ -103,6 +101,9 @@ class Measuring:
         kind: Any = None,
         trigger: bool = False,
         sinks: Sequence[str] = (),
+        actuators: bool = True,
+        dead_man: int = DEAD_MAN,
+        scalar_rate: float = SCALAR_RATE,
     ) -> dict[str, Any]:
         """Measure from now on, after every restart too, until it is deleted.
 
@@ -119,7 +120,10 @@ class Measuring:
             rate=rate,
             kind=kind,
             trigger=trigger,
-            sinks=tuple(self._whole(spec) for spec in sinks),
+            sinks=tuple(self._sinks.whole(spec) for spec in sinks),
+            actuators=actuators,
+            dead_man=dead_man,
+            scalar_rate=scalar_rate,
         )
         nodes = self._station.measurements.nodes_of(kept)
         if not nodes:
@@ -142,7 +146,10 @@ class Measuring:
         if image is None:
             return
         kind = None if kept.kind is None else Kind[kept.kind.upper()]
-        for channel in sensors_of(Sheet.of(image).channels, kept.channels, kind):
+        channels = Sheet.of(image).channels
+        if self._sinks.moves(kept) and channels and all(one.actuator for one in channels):
+            return  # it has nothing to measure; set points come for it
+        for channel in sensors_of(channels, kept.channels, kind):
             period_of(channel, kept.rate)
 
     def delete(self, measurement_id: str) -> None:
@@ -207,7 +214,7 @@ class Measuring:
         """Every sink with what became of what it was given."""
         with self._guard:
             jobs = [(key, one.job) for key, one in self._running.items() if one.job is not None]
-        return [_sink_json(key, sink) for key, job in jobs for sink in job.sinks]
+        return [sink_json(key, sink) for key, job in jobs for sink in job.sinks]
 
     def budget(self) -> dict[str, Any]:
         """Messages a second that go to ROS and MQTT now, and how many are known to be carried."""
@@ -235,6 +242,7 @@ class Measuring:
             "kind": kept.kind,
             "trigger": kept.trigger,
             "sinks": list(kept.sinks),
+            "actuators": self._sinks.moves(kept),
             "created": kept.created,
             "state": one.state,
             "why": one.why,
@@ -243,21 +251,6 @@ class Measuring:
         }
 
     # -- running -----------------------------------------------------------------------------------------------------
-
-    def _whole(self, spec: str) -> str:
-        """The words for a sink: a service, or a file by its bare name, which lies in the folder of recordings."""
-        if _SERVICE.match(spec):
-            return spec
-        if not _NAME.match(spec) or Path(spec).suffix.lower() not in FILES:
-            raise UsageFailure(
-                f"{spec!r} is no sink.", hint=f"Use ros1, ros2, mqtt://HOST, or a file name in {', '.join(FILES)}."
-            )
-        return str(self._folder() / spec)
-
-    def _folder(self) -> Path:
-        folder = self._record or self._station.home / RECORDINGS
-        folder.mkdir(parents=True, exist_ok=True)
-        return folder
 
     def _begin(self, kept: Measurement) -> Running:
         uuids = tuple(uuid.hex() for uuid in self._station.measurements.nodes_of(kept))
@@ -278,7 +271,12 @@ class Measuring:
                     return
                 taken.append(uuid)
                 self._roster.note(uuid, measurement=one.kept.id)
-            job = Job(self._station, one.kept, more=lambda: self._more(one.kept))
+            job = Job(
+                self._station,
+                one.kept,
+                more=lambda take: self._sinks.more(one.kept, take),
+                admits=self._admits if self._sinks.moves(one.kept) else None,
+            )
             one.job = job
             self._say(one, "starting")
             job.start(self._buses, self._watcher(one))
@@ -314,14 +312,6 @@ class Measuring:
             one.state, one.why = state, why
             self._live.event("measurement", state=state, id=one.kept.id, group=one.kept.group, why=why)
 
-    def _more(self, kept: Measurement) -> list[Sink]:
-        """The daemon's own sinks for one run of a measurement."""
-        specs = list(self._sinks)
-        if self._record is not None:
-            stamp = time.strftime("%Y%m%d-%H%M%S")
-            specs.append(str(self._folder() / f"{_plain(kept.group or kept.id)}-{stamp}.csv"))
-        return [open_sink(spec) for spec in specs]
-
     # -- what it hears -----------------------------------------------------------------------------------------------
 
     def _watcher(self, one: Running) -> Watcher:
@@ -334,7 +324,7 @@ class Measuring:
                 self._roster.refresh([uuid])
 
         def sink(failed: Sink) -> None:
-            self._live.event("sink", **_sink_json(one.kept.id, failed))
+            self._live.event("sink", **sink_json(one.kept.id, failed))
 
         def note(text: str) -> None:
             self._live.event("measurement", state="note", id=one.kept.id, why=text)
@@ -367,25 +357,3 @@ def _state_of(one: Running, job: Job) -> tuple[str, str]:
     if job.error is not None:
         return "waiting", job.error.message
     return ("waiting", "no node has answered yet") if states else ("starting", "")
-
-
-def _sink_json(measurement: str, sink: Sink) -> dict[str, Any]:
-    stats = sink.stats
-    return {
-        "measurement": measurement,
-        "name": sink.name,
-        "state": stats.state,
-        "detail": stats.detail,
-        "error": stats.error,
-        "hint": stats.hint,
-        "written": stats.written,
-        "dropped": stats.dropped,
-        "octets": stats.octets,
-        "messages": stats.messages,
-        "recorder": bool(getattr(sink, "recorder", False)),
-        "files": [str(file) for file in sink.files],
-    }
-
-
-def _plain(name: str) -> str:
-    return re.sub(r"[^A-Za-z0-9_-]+", "_", name)[:60] or "measurement"

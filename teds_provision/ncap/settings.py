@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Final, Literal
 
 from teds_provision.errors import UsageFailure
+from teds_provision.links import Trace
 
 Detection = Literal["transparent", "whitelist"]
 _FIRST, _SOURCES = 0xF2, 6
@@ -21,7 +22,8 @@ class Settings:
     """``places`` are links as ``can:…`` and ``nfc:…``; ``detection`` None: as it was last set, else ``whitelist``.
 
     ``http`` is (host, port) or None: then only the Unix socket of the home is served. ``sinks`` take what is measured,
-    beside those of each measurement; ``record`` is a folder for a recording of each measurement.
+    beside those of each measurement; ``record`` is a folder for a recording of each measurement. ``actuators``: whether
+    set points may come by topics of ROS. ``trace`` is an open one: every frame of every link is written to it.
     """
 
     places: tuple[str, ...] = ()
@@ -33,8 +35,10 @@ class Settings:
     key: Path | None = None
     record: Path | None = None
     sinks: tuple[str, ...] = ()
+    actuators: bool = True
     metrics: bool = False
     clause_12: bool = False
+    trace: Trace | None = None
 
 
 def own_source(station_id: str) -> int:

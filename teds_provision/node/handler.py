@@ -34,8 +34,8 @@ class NodeHandler(Protocol):
 class Measuring(Protocol):
     """What a bus tells a node that measures, beside its commands (operation.md, sections 3 to 6). Thread-safe."""
 
-    def tick(self) -> int:
-        """The present tick of the node's clock, ns."""
+    def tick(self, at: float = 0.0) -> int:
+        """The tick of the node's clock, ns: the present one, or that of ``at`` (time.monotonic) a moment ago."""
 
     def request_received(
         self,

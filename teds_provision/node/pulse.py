@@ -13,6 +13,7 @@ import time
 from typing import Protocol
 
 from teds_provision.errors import LinkFailure
+from teds_provision.links.can.wire.pacing import sharp_timers
 
 
 class Beating(Protocol):
@@ -57,6 +58,7 @@ class Pulse:
             self._condition.notify()
 
     def _run(self) -> None:
+        sharp_timers()
         while (node := self._next()) is not None:
             try:
                 wait = node.beat()

@@ -21,9 +21,8 @@ from teds_provision.protocol.keys import (
     SoftwareKey,
     fingerprint,
     is_point,
-    node_key_message,
+    node_key_good,
     public_key,
-    verify,
 )
 from teds_provision.protocol.messages.frames import Command, Function, security_command
 from teds_provision.teds.codec import security
@@ -144,7 +143,7 @@ class StationAgreement:
             raise other_key(pinned, node)
         if node in (self._credentials.key.point, self._one_time.point) or not is_point(node):
             raise NotAuthentic("The node's public key is not a valid point, or is this station's own.")
-        if not verify(node, node_key_message(self._uuid, node), shown.node_key_signature):
+        if not node_key_good(self._uuid, node, shown.node_key_signature):
             raise NotAuthentic("The node's key is not signed for this UUID (field 102): it belongs to another node.")
         if offered <= epoch:
             raise PolicyRefused(

@@ -18,7 +18,7 @@ def read_fingerprint(text: str) -> str | None:
 
 def same_key(one: str, other: str) -> bool:
     """Whether two fingerprints, each whole or its first digits, are of the same key."""
-    short, long = sorted((one, other), key=len)
+    short, long = (one, other) if len(one) <= len(other) else (other, one)
     return len(short) >= LEAST_DIGITS and long.startswith(short)
 
 

@@ -14,7 +14,7 @@ from typing import Protocol
 from cryptography.exceptions import InvalidSignature, UnsupportedAlgorithm
 from cryptography.hazmat.primitives import hashes
 from cryptography.hazmat.primitives.asymmetric import ec
-from cryptography.hazmat.primitives.asymmetric.utils import decode_dss_signature, encode_dss_signature
+from cryptography.hazmat.primitives.asymmetric.utils import Prehashed, decode_dss_signature, encode_dss_signature
 from cryptography.hazmat.primitives.serialization import Encoding, PublicFormat, load_pem_public_key
 
 from teds_provision.errors import BadData
@@ -36,6 +36,9 @@ class PrivateKey(Protocol):
     def sign(self, message: bytes) -> bytes:
         """SIG(key, message): ECDSA with SHA-256, r ‖ s, 64 octets, s in the lower half of the group order."""
 
+    def sign_digest(self, digest: bytes) -> bytes:
+        """The same signature, of a message whose SHA-256 the caller made piece by piece."""
+
     def ecdh(self, peer: bytes) -> bytes:
         """x-coordinate (32 octets) of the ECC CDH with the 65-octet point ``peer``."""
 
@@ -43,14 +46,14 @@ class PrivateKey(Protocol):
 class SoftwareKey:
     """A P-256 private key in this process's memory; signs deterministically (RFC 6979)."""
 
-    def __init__(self, secret: int) -> None:
-        self._key = ec.derive_private_key(secret, ec.SECP256R1())
+    def __init__(self, secret: int | ec.EllipticCurvePrivateKey) -> None:
+        self._key = ec.derive_private_key(secret, ec.SECP256R1()) if isinstance(secret, int) else secret
         self.point: bytes = self._key.public_key().public_bytes(Encoding.X962, PublicFormat.UncompressedPoint)
 
     @classmethod
     def generate(cls) -> SoftwareKey:
         """Make a new random key."""
-        return cls(ec.generate_private_key(ec.SECP256R1()).private_numbers().private_value)
+        return cls(ec.generate_private_key(ec.SECP256R1()))
 
     @classmethod
     def from_secret(cls, octets: bytes) -> SoftwareKey:
@@ -67,6 +70,11 @@ class SoftwareKey:
     def sign(self, message: bytes) -> bytes:
         """SIG(key, message), see :class:`PrivateKey`."""
         der = self._key.sign(message, ec.ECDSA(hashes.SHA256(), deterministic_signing=True))
+        return raw_signature(der)
+
+    def sign_digest(self, digest: bytes) -> bytes:
+        """SIG(key, message) by its SHA-256, see :class:`PrivateKey`."""
+        der = self._key.sign(digest, ec.ECDSA(Prehashed(hashes.SHA256()), deterministic_signing=True))
         return raw_signature(der)
 
     def ecdh(self, peer: bytes) -> bytes:
@@ -109,6 +117,8 @@ def is_point(point: bytes) -> bool:
     return True
 
 
+_SHA256 = ec.ECDSA(hashes.SHA256())
+
 Verify = Callable[[bytes, bytes, bytes], bool]
 """Whether a signature (64 octets) is SIG(point, message); :func:`verify`, or a chip that does it."""
 
@@ -121,7 +131,7 @@ def verify(point: bytes, message: bytes, signature: bytes) -> bool:
     if not 0 < r < GROUP_ORDER or not 0 < s <= _HALF_ORDER:
         return False
     try:
-        public_key(point).verify(encode_dss_signature(r, s), message, ec.ECDSA(hashes.SHA256()))
+        public_key(point).verify(encode_dss_signature(r, s), message, _SHA256)
     except (InvalidSignature, BadData):
         return False
     return True
@@ -153,6 +163,15 @@ def from_pem(text: bytes) -> bytes:
 
 
 # Labelled messages of the profile. Labels of signatures end in 00.
+
+
+@lru_cache(maxsize=256)
+def node_key_good(uuid: bytes, node: bytes, signature: bytes) -> bool:
+    """Whether SIG102 (64 octets) is a node's over its own key for this UUID; False for what is no point.
+
+    Asked at each step of a provisioning, about the same octets: the answer is remembered, as it never changes.
+    """
+    return verify(node, node_key_message(uuid, node), signature)
 
 
 def node_key_message(uuid: bytes, node: bytes) -> bytes:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import fcntl
+import hashlib
 import os
 import re
 from collections.abc import Iterable, Iterator, Sequence
@@ -71,13 +72,18 @@ class Groups:
 
     def delete(self, name: str) -> bool:
         """Delete a group; False where there is none. Raises Frozen while it is measured."""
+        if self.find(name) is None:
+            return False
         with self.frozen(name):
             return self._store.remove_group(name)
 
     @contextmanager
     def frozen(self, name: str) -> Iterator[None]:
         """Hold a group as it is; raises Frozen where another process does."""
-        place = self._home / f"measuring-{name.encode().hex()}.lock"
+        digest = hashlib.sha256(
+            name.encode()
+        ).hexdigest()  # 64 characters of any script are more than a file name takes
+        place = self._home / f"measuring-{digest}.lock"
         descriptor = os.open(place, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
         try:
             try:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 from teds_provision.station.node_keys import NodeKeys
 from teds_provision.station.seals import Seals
 from teds_provision.store import Batch, Handover, Store
@@ -38,7 +36,9 @@ class Handovers:
         """Add or replace many rows, all or none; the caller has held them against what is there."""
         with self._store.transaction():
             seals = self._seals
-            nodes = [replace(n, point_mac=seals.point(n.uuid, n.point) if n.point else None) for n in batch.nodes]
-            entries = [seals.entry(entry) for entry in batch.whitelist]
-            self._store.put_batch(replace(batch, nodes=nodes, whitelist=entries))
+            self._store.put_batch(
+                batch,
+                seal_node=lambda node: seals.point(node.uuid, node.point) if node.point else None,
+                seal_entry=seals.of_entry,
+            )
             self._keys.mark(batch.marks)

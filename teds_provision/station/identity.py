@@ -128,8 +128,11 @@ class Identity:
 
     def certificate(self, ca: bytes, point: bytes) -> bytes | None:
         """SIG104 of ``ca`` over a station's key as far as it is known here."""
-        if (ca, point) == (self.ca, self.point):
-            return self.signature
+        return self._certificate(self._facts, ca, point)
+
+    def _certificate(self, facts: Facts, ca: bytes, point: bytes) -> bytes | None:
+        if (ca, point) == (facts.ca, facts.point):
+            return self._made(facts.signature)
         return self._store.certificate(keys.fingerprint(ca), keys.fingerprint(point))
 
     def keep_certificate(self, ca: bytes, point: bytes, signature: bytes) -> None:
@@ -143,7 +146,8 @@ class Identity:
 
     def signature_under(self, ca: bytes) -> bytes:
         """SIG104 of ``ca`` over this station's key; raises PolicyRefused where there is none."""
-        signature = self.certificate(ca, self.point)
+        facts = self._facts
+        signature = self._certificate(facts, ca, self._made(facts.point))
         if signature is None:
             raise PolicyRefused(
                 f"This station is not certified by the CA {keys.fingerprint(ca)[:16]}.",

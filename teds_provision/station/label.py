@@ -1,7 +1,8 @@
 """The label on a board: ``TEDS1:UUID:FINGERPRINT`` as QR code and text, and what a scanner types of it.
 
 A scanner that types as a keyboard knows nothing of the layout that the computer has. The separators come out as
-something else, and on a French layout so do the digits and A. Lengths are fixed, so separators are skipped by position.
+something else, on some layouts the letters too, and on a French one the digits and A. Lengths are fixed, so separators
+are skipped by position.
 """
 
 from __future__ import annotations
@@ -23,8 +24,22 @@ if TYPE_CHECKING:
 PREFIX: Final = "TEDS1"
 _UUID_DIGITS, _FINGERPRINT_DIGITS = 20, 64
 _LENGTH = len(PREFIX) + 1 + _UUID_DIGITS + 1 + _FINGERPRINT_DIGITS
-_FRENCH: Final = str.maketrans({**dict(zip("à&é\"'(-è_ç", "0123456789", strict=True)), "Q": "A", "q": "a"})
-"""What a French layout makes of the digits and of A when a scanner presses the keys of a US keyboard."""
+_KEYS: Final = "ABCDEFTS"
+_LAYOUTS: Final = {
+    "": "ABCDEFTS",  # and German, Turkish Q, and others that have these letters where a US keyboard has them
+    "French": "QBCDEFTS",
+    "Dvorak": "AXJE>UYO",
+    "Russian": "ФИСВУАЕЫ",
+    "Ukrainian": "ФИСВУАЕІ",
+    "Greek": "ΑΒΨΔΕΦΤΣ",
+    "Turkish F": "UÇVEĞAOİ",
+}
+"""What layouts make of the letters of a label when a scanner presses the keys of a US keyboard, in the order of _KEYS.
+
+Dvorak's E without Shift is a full stop; digits are the same but on a French layout, which needs Shift for them.
+"""
+_LOWER: Final = str.maketrans({"İ": "i", ">": "."})  # what lower() alone would not give
+_FRENCH_DIGITS: Final = dict(zip("à&é\"'(-è_ç", "0123456789", strict=True))
 _MODULE, _QUIET = 8, 4
 
 
@@ -64,15 +79,27 @@ def label_of(station: Station, uuid: bytes) -> Label:
 def read_label(text: str) -> tuple[bytes, str] | None:
     """UUID and fingerprint of what a scanner typed, whatever became of the separators; None for anything else."""
     text = text.strip()
-    if len(text) != _LENGTH or text[: len(PREFIX)].upper().translate(_FRENCH)[:4] != PREFIX[:4]:
+    if len(text) != _LENGTH:
         return None
     first = len(PREFIX) + 1
     second = first + _UUID_DIGITS + 1
-    uuid, digits = text[first : second - 1], text[second:]
-    for read in (uuid + digits, (uuid + digits).translate(_FRENCH)):
-        if re.fullmatch("[0-9A-Fa-f]+", read):
-            return bytes.fromhex(read[:_UUID_DIGITS]), read[_UUID_DIGITS:].lower()
+    for table in _TABLES:
+        read = text.translate(table).upper()
+        digits = read[first : second - 1] + read[second:]
+        if len(read) == _LENGTH and read.startswith(PREFIX) and re.fullmatch("[0-9A-F]+", digits):
+            return bytes.fromhex(digits[:_UUID_DIGITS]), digits[_UUID_DIGITS:].lower()
     return None
+
+
+def _table(layout: str, letters: str) -> dict[int, str]:
+    """From what a layout types back to the keys of a US keyboard, with and without Shift."""
+    table = dict(zip(letters, _KEYS, strict=True))
+    small = [letter.translate(_LOWER).lower() for letter in letters]  # one by one: the last sigma of a word is another
+    table |= dict(zip(small, _KEYS, strict=True))
+    return str.maketrans(table | (_FRENCH_DIGITS if layout == "French" else {}))
+
+
+_TABLES: Final = tuple(_table(layout, letters) for layout, letters in _LAYOUTS.items())
 
 
 def write_label(label: Label, path: Path) -> None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime, timedelta
 from typing import TYPE_CHECKING, Any, Final
@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, Final
 from teds_provision.errors import NoKeyring, VaultFailure, WrongPassphrase
 from teds_provision.station.identity import Identity
 from teds_provision.station.seals import Seals
-from teds_provision.store import Holder, KeyRecord, Marks, Store, utc_now
+from teds_provision.store import Holder, KeyRecord, Marks, Store, pages, utc_now
 from teds_provision.store.records import KeySource
 from teds_provision.vault.base import node_key_context
 
@@ -20,8 +20,6 @@ if TYPE_CHECKING:
 MAX_PENDING = 8
 """So many keys of one node may wait for their proof at a time (issue 7 L4)."""
 
-_FEW = 20
-"""So many nodes are looked up one by one; for more the table of marks is read once."""
 _NO_MARKS: Final = Marks()
 
 RESTORED = "restored from a backup"
@@ -66,6 +64,10 @@ class NodeKeys:
         """Every key of every node, wrapped, in the order they came, a page at a time."""
         return self._store.all_keys()
 
+    def each_name(self) -> Iterator[tuple[bytes, str, int, str]]:
+        """UUID, key id, epoch and state of every key, in the order they came, a page at a time."""
+        return self._store.each_key_name()
+
     def held(self, uuid: bytes) -> bool:
         """Whether any key is held for a node."""
         return bool(self._store.keys(uuid))
@@ -92,25 +94,30 @@ class NodeKeys:
         """Epoch of the current (active) key of a node, 0 for none."""
         return next((record.epoch for record in self._store.keys(uuid) if record.state == "active"), 0)
 
-    def slots(self) -> dict[bytes, int]:
-        """The last slot given to each node's keys."""
-        return self._store.slots()
+    def of_page(self, uuids: Sequence[bytes]) -> list[KeyRecord]:
+        """The keys of a page of nodes, wrapped, in the order they came."""
+        return self._store.keys_of(uuids)
 
-    def add_pending(self, uuid: bytes, *, key: bytes, key_id: bytes, epoch: int, imported: bool = False) -> None:
+    def slots_of(self, uuids: Sequence[bytes]) -> dict[bytes, int]:
+        """The last slot given to the keys of each node of a page."""
+        return self._store.slots_of(uuids)
+
+    def add_pending(self, uuid: bytes, *, key: bytes, key_id: bytes, epoch: int) -> None:
         """Store a new key durably as pending; of the others only the oldest pending one goes, beyond eight.
 
         The newest are tried first, and a node knows one key at most that was never proven: whoever makes a station
         agree again and again fills no disk.
         """
-        with self._store.transaction():
+        with self._store.together():
             self.refresh()
             pending = [record for record in self._store.keys(uuid) if record.state == "pending"]
             for record in pending[MAX_PENDING - 1 :]:
                 self._store.remove_key(uuid, record.key_id)
             slot = self._store.next_slot(uuid)
-            source: KeySource = "import" if imported else "agreement"
             self._store.add_key(
-                self.wrapped(uuid, key=key, key_id=key_id, epoch=epoch, slot=slot, source=source, created=utc_now())
+                self.wrapped(
+                    uuid, key=key, key_id=key_id, epoch=epoch, slot=slot, source="agreement", created=utc_now()
+                )
             )
 
     def refresh(self) -> None:
@@ -168,7 +175,7 @@ class NodeKeys:
 
         Raises NotFound for a key that is not held.
         """
-        with self._store.transaction():
+        with self._store.together():
             record = next((held for held in self._store.keys(uuid) if held.key_id == key_id), None)
             if record is not None:
                 for other in self.outdated(record):
@@ -199,7 +206,7 @@ class NodeKeys:
         The wrapped form is bound to the epoch, so it is made anew, in one transaction.
         """
         key = self.unwrap(record)
-        with self._store.transaction():
+        with self._store.together():
             slot = self._store.next_slot(record.uuid)
             context = node_key_context(self._store.id, record.uuid, epoch, slot)
             corrected = replace(record, epoch=epoch, slot=slot, wrapped=self._vault().wrap(key, context=context))
@@ -219,8 +226,15 @@ class NodeKeys:
 
     def cas_of_nodes(self) -> dict[bytes, bytes]:
         """P(CA) of every node that keeps another CA than the owner's."""
+        return self._checked_cas(self._store.all_marks())
+
+    def cas_of_page(self, uuids: Sequence[bytes]) -> dict[bytes, bytes]:
+        """P(CA) of those of a page of nodes that keep another CA than the owner's."""
+        return self._checked_cas(self._store.marks_of(uuids))
+
+    def _checked_cas(self, marked: Mapping[bytes, Marks]) -> dict[bytes, bytes]:
         cas: dict[bytes, bytes] = {}
-        for uuid, marks in self._store.all_marks().items():
+        for uuid, marks in marked.items():
             if marks.ca is not None:
                 self._seals.check_ca(uuid, marks.ca, marks.ca_mac)
                 cas[uuid] = marks.ca
@@ -228,11 +242,13 @@ class NodeKeys:
 
     def set_ca_of(self, uuid: bytes, ca: bytes) -> None:
         """Note which CA a node keeps."""
-        self.mark({uuid: {"ca": ca}})
+        self._mark(uuid, ca=ca)
 
     def mark(self, changes: Mapping[bytes, Mapping[str, Any]]) -> None:
         """Change marks of many nodes at once, by the names of :class:`Marks`; the owner's CA is none."""
-        present = self._store.all_marks() if len(changes) > _FEW else {u: self._store.marks(u) for u in changes}
+        self._mark_all(changes, {uuid: m for page in pages(changes) for uuid, m in self._store.marks_of(page).items()})
+
+    def _mark_all(self, changes: Mapping[bytes, Mapping[str, Any]], present: Mapping[bytes, Marks]) -> None:
         own = self._identity.ca
         wanted: dict[bytes, Marks] = {}
         for uuid, change in changes.items():
@@ -243,14 +259,15 @@ class NodeKeys:
                 sealed = {"ca": None, "ca_mac": None}
             elif ca is not None and ca != before.ca:
                 sealed = {"ca_mac": self._seals.ca(uuid, ca)}
-            after = replace(before, **{**change, **sealed})
+            values = {**change, **sealed}
+            after = Marks(**values) if before is _NO_MARKS else replace(before, **values)  # replace() costs four times
             if after != before:
                 wanted[uuid] = after
         if wanted:
             self._store.put_marks(wanted)
 
     def _mark(self, uuid: bytes, **change: Any) -> None:
-        self.mark({uuid: change})
+        self._mark_all({uuid: change}, {uuid: self._store.marks(uuid)})
 
     # -- rotations and other holders -------------------------------------------------------------------------------
 
@@ -262,6 +279,11 @@ class NodeKeys:
         """Why a rotation is due, for every node that has one."""
         marks = self._store.all_marks()
         return {uuid: mark.rotation for uuid, mark in marks.items() if mark.rotation is not None}
+
+    def due_of_page(self, uuids: Sequence[bytes]) -> set[bytes]:
+        """Those of a page of nodes whose key has to be rotated."""
+        marks = self._store.marks_of(uuids)
+        return {uuid for uuid, mark in marks.items() if mark.rotation is not None}
 
     def restored(self, uuid: bytes) -> bool:
         """Whether the keys of a node came back from a backup and none was agreed since."""

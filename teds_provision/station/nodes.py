@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING
 
 from teds_provision.lazy import late
 from teds_provision.station.seals import Seals
-from teds_provision.store import DatasheetRecord, Draft, Known, NodeRecord, Search, Store
+from teds_provision.store import DatasheetRecord, Draft, Known, NodeRecord, Search, Shown, Store
+from teds_provision.teds.codec.codes import AccessCode
 from teds_provision.teds.image import Image
 
 if TYPE_CHECKING:
@@ -28,31 +29,45 @@ class Nodes:
         """All nodes, by UUID."""
         return self._store.nodes()
 
+    def each_shown(self) -> Iterator[Shown]:
+        """Identity key and verdict of all nodes, by UUID, a page at a time."""
+        return self._store.each_shown()
+
+    def of_page(self, uuids: Sequence[bytes]) -> dict[bytes, NodeRecord]:
+        """What is known of a page of nodes, by UUID."""
+        return self._store.nodes_of(uuids)
+
+    def bearers_of(self, names: Sequence[str]) -> dict[str, bytes]:
+        """Who has each of a page of names."""
+        return self._store.bearers_of(names)
+
     def get(self, uuid: bytes) -> NodeRecord | None:
         """What is known of a node, None if nothing is."""
         return self._store.node(uuid)
 
     def put(self, record: NodeRecord) -> None:
         """Add or replace a node. Epoch and sequence never go back; raises OtherKey for another identity key."""
-        self._store.put_node(self._sealed(record, self._store.node(record.uuid)))
+        present = self._store.node(record.uuid)
+        self._store.put_node(replace(record, point_mac=self._seal(record.uuid, record.point, present)))
 
     def remember(self, uuid: bytes, **facts: object) -> NodeRecord:
         """Bring what is known of a node up to date and return it."""
-        with self._store.transaction():  # no other process changes what was read before it is written
+        with self._store.together():  # no other process changes what was read before it is written
             present = self._store.node(uuid)
-            changed = replace(present or NodeRecord(uuid), **facts)  # type: ignore[arg-type]
-            sealed = self._sealed(changed, present)
-            if present is None or changed != present or sealed.point_mac != present.point_mac:
-                self._store.put_node(sealed)
-        return sealed
+            before = present or NodeRecord(uuid)
+            mac = self._seal(uuid, facts.get("point", before.point), present)
+            changed = replace(before, **facts, point_mac=mac)  # type: ignore[arg-type]
+            if present is None or changed != present or mac != present.point_mac:
+                self._store.replace_node(changed, present)
+        return changed
 
-    def _sealed(self, record: NodeRecord, present: NodeRecord | None) -> NodeRecord:
-        """A record whose identity key carries a seal, where it is new and the vault is open; else it is a hint."""
-        if record.point is None:
-            return record
-        if present is not None and present.point == record.point and present.point_mac is not None:
-            return replace(record, point_mac=present.point_mac)
-        return replace(record, point_mac=self._seals.point(record.uuid, record.point))
+    def _seal(self, uuid: bytes, point: object, present: NodeRecord | None) -> bytes | None:
+        """The seal of an identity key, new where the vault is open; without one it is a hint."""
+        if not isinstance(point, bytes):
+            return None
+        if present is not None and present.point == point and present.point_mac is not None:
+            return present.point_mac
+        return self._seals.point(uuid, point)
 
     def resolve(self, text: str) -> bytes:
         """The UUID that ``text`` (a UUID, a prefix of it, or a name) means; raises NotFound, UsageFailure."""
@@ -94,14 +109,13 @@ class Nodes:
 
         A draft of the same content is done with. ``profile`` names the type, where that is known.
         """
-        with self._store.transaction():
+        with self._store.together():
             draft = self._store.draft(image.uuid)
             if draft is not None and draft.image == image:
                 profile = profile or draft.profile
                 self._store.drop_draft(image.uuid)
             if self._store.put_datasheet(image, profile):
-                ends = [channel.due for channel in sheet.Sheet.of(image).channels if channel.due is not None]
-                self._store.set_due(image.uuid, min(ends).strftime("%Y-%m-%d") if ends else None)
+                self._store.set_due(image.uuid, _first_due(image))
 
     def history(self, uuid: bytes) -> list[DatasheetRecord]:
         """The datasheets that a node had, newest first: the present one and at most ten older ones.
@@ -125,3 +139,11 @@ class Nodes:
     def drop_draft(self, uuid: bytes) -> bool:
         """Forget the image that a node was to be given; False if there was none."""
         return self._store.drop_draft(uuid)
+
+
+def _first_due(image: Image) -> str | None:
+    """The day (ISO 8601) on which the first calibration of a datasheet ends, None where none does."""
+    if not any(code == AccessCode.CALIBRATION for _, code in image):
+        return None
+    ends = [channel.due for channel in sheet.Sheet.of(image).channels if channel.due is not None]
+    return min(ends).strftime("%Y-%m-%d") if ends else None

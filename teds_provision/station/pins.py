@@ -2,19 +2,24 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
-from typing import TYPE_CHECKING
+import time
+from collections.abc import Iterable, Iterator, Sequence
+from typing import TYPE_CHECKING, Final
 
 from teds_provision.lazy import late
 from teds_provision.protocol.fingerprints import is_whole, same_key
 from teds_provision.station.node_keys import NodeKeys
 from teds_provision.station.seals import Seals
-from teds_provision.store import NodeRecord, Store, WhitelistEntry
+from teds_provision.store import NodeRecord, Shown, Store, WhitelistEntry
 
 if TYPE_CHECKING:
     from teds_provision.protocol import agreement, keys
 else:  # cryptography: not for commands that only list
     agreement, keys = late("teds_provision.protocol.agreement"), late("teds_provision.protocol.keys")
+
+RECORD_AGAIN: Final = 600.0
+"""Seconds in which a process records one wrong key of a UUID: anybody on a bus can show wrong keys, and a new one each
+time; a service that looks at each would fill the disk with its audit log."""
 
 
 class Pins:
@@ -27,6 +32,7 @@ class Pins:
         self._store = store
         self._keys = keys
         self._seals = seals
+        self._recorded: dict[bytes, tuple[float, int]] = {}
 
     def pinned(self, uuid: bytes) -> str | None:
         """Fingerprint of the key that this UUID has to show, None where none is known yet.
@@ -45,12 +51,16 @@ class Pins:
 
     def all(self, nodes: Iterable[NodeRecord] | None = None) -> dict[bytes, str]:
         """Fingerprint of every pinned UUID; ``nodes`` are all of the store where they have been read already."""
+        return self.among(self._store.nodes() if nodes is None else nodes, self.whitelist())
+
+    def among(self, nodes: Iterable[NodeRecord | Shown], entries: Iterable[WhitelistEntry]) -> dict[bytes, str]:
+        """Fingerprint of each of these nodes and entries that is pinned, by UUID."""
         pins: dict[bytes, str] = {}
-        for node in self._store.nodes() if nodes is None else nodes:
+        for node in nodes:
             if node.point is not None:
                 self._seals.check_point(node)
                 pins[node.uuid] = keys.fingerprint(node.point)
-        for entry in self.whitelist():
+        for entry in entries:
             if entry.fingerprint is not None:
                 pins[entry.uuid] = _wholer(entry.fingerprint, pins.get(entry.uuid))
         return pins
@@ -59,10 +69,19 @@ class Pins:
         """Raise OtherKey where this UUID is known with another key than ``point``."""
         pinned = self.pinned(uuid)
         if pinned is not None and not same_key(pinned, keys.fingerprint(point)):
-            self._store.audit.append(
-                "identify", uuid, "other key", {"shown": keys.fingerprint(point), "pinned": pinned}
-            )
+            self._record(uuid, keys.fingerprint(point), pinned)
             raise agreement.other_key(pinned, point)
+
+    def _record(self, uuid: bytes, shown: str, pinned: str) -> None:
+        """One entry of the audit log in :data:`RECORD_AGAIN`; ``unrecorded``: how often it happened since the last."""
+        now = time.monotonic()
+        at, passed_over = self._recorded.get(uuid, (-RECORD_AGAIN, 0))
+        if now - at < RECORD_AGAIN:
+            self._recorded[uuid] = at, passed_over + 1
+            return
+        more = {"unrecorded": passed_over} if passed_over else {}
+        self._store.audit.append("identify", uuid, "other key", {"shown": shown, "pinned": pinned, **more})
+        self._recorded[uuid] = now, 0
 
     # -- the whitelist ---------------------------------------------------------------------------------------------
 
@@ -85,10 +104,14 @@ class Pins:
         """The whitelist entry of a node, None where it is not on it."""
         return self._seals.check_entry(self._store.whitelisted(uuid))
 
+    def of_page(self, uuids: Sequence[bytes]) -> dict[bytes, WhitelistEntry]:
+        """The entries of a page of nodes, by UUID."""
+        return {uuid: self._checked(entry) for uuid, entry in self._store.whitelist_of(uuids).items()}
+
     def put(self, *entries: WhitelistEntry) -> None:
         """Add or replace entries of the whitelist (the vault opens); the caller has held keys against pinned ones."""
         self._seals.require()
-        with self._store.transaction():
+        with self._store.together():
             self._store.put_whitelist_entries(self._seals.entry(entry) for entry in entries)
 
     def remove(self, uuid: bytes) -> bool:

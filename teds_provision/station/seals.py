@@ -18,7 +18,7 @@ from dataclasses import replace
 from typing import TYPE_CHECKING
 
 from teds_provision.errors import StoreChanged
-from teds_provision.store import Facts, NodeRecord, Store, TrustRecord, WhitelistEntry, utc_now
+from teds_provision.store import Facts, NodeRecord, Shown, Store, TrustRecord, WhitelistEntry, utc_now
 
 if TYPE_CHECKING:
     from teds_provision.vault import Vault
@@ -61,7 +61,11 @@ class Seals:
 
     def entry(self, entry: WhitelistEntry) -> WhitelistEntry:
         """A whitelist entry with its seal."""
-        return replace(entry, mac=self._mac("whitelist", *_entry(entry)))
+        return replace(entry, mac=self.of_entry(entry))
+
+    def of_entry(self, entry: WhitelistEntry) -> bytes:
+        """The seal of a whitelist entry."""
+        return self._mac("whitelist", *_entry(entry))
 
     def trust(self, record: TrustRecord) -> TrustRecord:
         """A trusted key with its seal."""
@@ -87,7 +91,7 @@ class Seals:
             raise changed([f"the whitelist entry of {entry.uuid.hex()}"], "Take it off the whitelist, and add it anew.")
         return entry
 
-    def check_point(self, node: NodeRecord) -> None:
+    def check_point(self, node: NodeRecord | Shown) -> None:
         """Raise StoreChanged where a node's sealed identity key was changed."""
         bad = node.point is not None and node.point_mac is not None
         if bad and self.active and not self._holds(node.point_mac, "node", node.uuid, node.point):
@@ -227,12 +231,14 @@ class Seals:
         if self._key is None:
             self.require()
         assert self._key is not None
-        whole = [kind.encode(), b"\0"]
+        whole = kind.encode() + b"\0"  # in one piece: there may be 100,000
         for value in values:
-            octets = value.encode() if isinstance(value, str) else value
-            # None is not the empty text: a length that no value has
-            whole.append(b"\xff\xff\xff\xff" if octets is None else len(octets).to_bytes(4, "big") + octets)
-        return hmac.digest(self._key, b"".join(whole), "sha256")[:SEAL_OCTETS]  # in one piece: there may be 100,000
+            if value is None:  # not the empty text: a length that no value has
+                whole += b"\xff\xff\xff\xff"
+            else:
+                octets = value if isinstance(value, bytes) else value.encode()
+                whole += len(octets).to_bytes(4, "big") + octets
+        return hmac.digest(self._key, whole, "sha256")[:SEAL_OCTETS]
 
     def _holds(self, mac: bytes | None, kind: str, *values: str | bytes | None) -> bool:
         return mac is not None and hmac.compare_digest(mac, self._mac(kind, *values))

@@ -57,6 +57,7 @@ class Station:
         self._ask = ask
         self._vault: Vault | None = None
         self._turn, self._held = threading.RLock(), 0
+        self._run = threading.local()
         self.notice: Callable[[str], object] = lambda text: None
         """Told in one sentence whom this station waits for."""
         self.use_agent = True
@@ -195,13 +196,28 @@ class Station:
                     self._held -= 1
 
     @contextmanager
-    def durable(self, command: str) -> Iterator[None]:
+    def durable(self, command: str, *, more_follows: bool = False) -> Iterator[None]:
         """One durable step: the store held, and all of the block on the disk or nothing of it.
 
-        Never held while a node is talked to: a slow node would hold up every other command.
+        Never held while a node is talked to: a slow node would hold up every other command. ``more_follows``: in a
+        :meth:`run` it may reach the disk together with the step after it. Only for what nobody is promised before
+        that: a loss of power in between is then as one an instant earlier.
         """
-        with self.lock(command), self.transaction():
+        later = more_follows and getattr(self._run, "going", False)
+        with self.lock(command), self._store.transaction(later=later):
+            if later:
+                self._run.last = self._store.later + 1  # this one, when it is committed
             yield
+
+    @contextmanager
+    def run(self) -> Iterator[None]:
+        """Several steps by one thread, of which the last is durable: so are all of them when the block has ended."""
+        self._run.going, self._run.last = True, 0
+        try:
+            yield
+        finally:
+            self._run.going = False
+            self._store.settle(self._run.last)  # not what other threads have written since: they see to it themselves
 
     def turn(self, uuid: bytes) -> NodeTurn:
         """Have one node to oneself: two commands of this station do not work on the same node at once."""
@@ -210,6 +226,10 @@ class Station:
     def transaction(self) -> AbstractContextManager[None]:
         """All of the block reaches the disk, or nothing of it; may stand inside another one."""
         return self._store.transaction()
+
+    def reading(self) -> AbstractContextManager[None]:
+        """Ask many things of one moment; nobody is talked to or waited for in the block."""
+        return self._store.reading()
 
     def audit(self, act: str, uuid: bytes | None, outcome: str, **detail: object) -> None:
         """Append to the audit log: who did what to which node, with which outcome; never a secret."""

@@ -1,4 +1,7 @@
-"""Step 3: agree on a link key, or find that one is agreed (profile.md, "Key agreement"). Lost messages heal here."""
+"""Step 3: agree on a link key, or find that one is agreed (profile.md, "Key agreement").
+
+What a lost message left half done is found and finished here.
+"""
 
 from __future__ import annotations
 
@@ -170,8 +173,9 @@ def _agree(
     again: bool,
 ) -> Agreed:
     new = who.state == NodeState.FACTORY
-    returning = _may_return(station, who)
-    entry = _entry_for(station, node.uuid, newcomer, returning=returning)
+    with station.reading():
+        returning = _may_return(station, who)
+        entry = _entry_for(station, node.uuid, newcomer, returning=returning)
     demanded = rotate and not again
     # of a run that was just cut short the node may have the new key, whatever it said before
     held = open_session(station, node, word=rotate) if not new or again else None
@@ -267,11 +271,10 @@ def _agree_anew(
     ``returning`` nodes were given away: only a signed-for initial Security TEDS shows that they were reset since.
     """
     uuid = node.uuid
-    agreement = StationAgreement(
-        replace(station.credentials(), ca=ca, station_signature=station.identity.signature_under(ca)), uuid
-    )
+    agreement = StationAgreement(station.identity.credentials(ca), uuid)
     reply = node.sure(agreement.request(), "the key agreement")  # it lies in RAM only, and goes at the next one
-    epoch = station.pins.epoch_to_exceed(uuid, entry.fingerprint)
+    with station.reading():
+        epoch = station.pins.epoch_to_exceed(uuid, entry.fingerprint)
     agreed = agreement.accept(reply, pinned=entry.fingerprint, epoch=epoch)
     key_id = agreed.key_id.hex()
     if returning and not agreed.unsigned:
@@ -288,7 +291,7 @@ def _agree_anew(
     node.forget()
     node.open(agreed.key)
     identity = read_identity(node)
-    with station.durable("agree"):
+    with station.durable("agree", more_follows=True):
         station.keys.promote(uuid, key_id)
         station.nodes.remember(
             uuid,

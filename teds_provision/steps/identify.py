@@ -12,7 +12,7 @@ from teds_provision import teds
 from teds_provision.errors import BadData, NodeRefused, NoKeyring, NotAuthentic, WrongPassphrase
 from teds_provision.harmless import printable
 from teds_provision.protocol.fingerprints import is_whole
-from teds_provision.protocol.keys import fingerprint, is_point, node_key_message, prove_message, verify
+from teds_provision.protocol.keys import fingerprint, node_key_good, prove_message, verify
 from teds_provision.protocol.messages.frames import Function, security_command
 from teds_provision.protocol.messages.identity import NodeState
 from teds_provision.station.station import Station
@@ -73,7 +73,7 @@ def identify(
     counts = node.tapped or (entry is not None and entry.fingerprint is not None)
     facts = _facts(station, who, counts=counts) | _charge(node)
     pinned = _pinned_now(station, who) if counts else None
-    with station.durable("identify"):
+    with station.durable("identify", more_follows=True):
         if facts:
             station.nodes.remember(node.uuid, **facts)
         if pinned is not None:
@@ -126,10 +126,12 @@ def examine(station: Station, node: Conversation) -> Identified:
     octets = read_block(node, SECURITY)
     shown = security.decode(octets)
     point = shown.node_key
-    if not is_point(point) or not verify(point, node_key_message(node.uuid, point), shown.node_key_signature):
+    if not node_key_good(node.uuid, point, shown.node_key_signature):
         raise NotAuthentic(f"The key that the node shows is not signed for UUID {node.uuid.hex()} (field 102).")
     prove(node, point)
-    station.pins.check(node.uuid, point)
+    with station.reading():
+        station.pins.check(node.uuid, point)
+        entry = station.pins.entry(node.uuid)
     identity = node.identity
     return Identified(
         uuid=node.uuid,
@@ -139,7 +141,7 @@ def examine(station: Station, node: Conversation) -> Identified:
         tag_uid=node.contact.tag_uid,
         address=node.contact.address,
         security_teds=octets,
-        whitelisted=station.pins.entry(node.uuid),
+        whitelisted=entry,
     )
 
 

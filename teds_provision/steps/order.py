@@ -68,6 +68,8 @@ class Prepared:
     profile: Profile | None = None
     calibrations: Mapping[int, Calibration] | None = None
     warnings: tuple[str, ...] = ()
+    passed: tuple[str, ...] = ()
+    """What a person should know of where the profile was found."""
 
 
 @dataclass(frozen=True)
@@ -102,7 +104,7 @@ def prepare(station: Station, order: BuildOrder, uuid: bytes | None = None) -> P
 
     Changes nothing. Raises UsageFailure (no profile known), NotFound, BadData, PolicyRefused (the guard).
     """
-    _check_name(order.name)
+    check_name(order.name)
     wanted = order.profile or (_known_profile(station, uuid) if uuid is not None else None)
     if order.calibration is not None and not order.calibration.is_file():
         raise NotFound(f"There is no calibration file {order.calibration}.")
@@ -110,14 +112,14 @@ def prepare(station: Station, order: BuildOrder, uuid: bytes | None = None) -> P
         if uuid is not None and not order.names_nothing:
             raise no_profile(uuid)
         return Prepared(order)
-    profile = _load(station, wanted)
+    profile, passed = _load(station, wanted), _passed_over(station, wanted)
     calibrations = _from_file(order, profile)
     if calibrations is None:
-        return Prepared(order, profile)
+        return Prepared(order, profile, passed=passed)
     made = _made(profile, _NOBODY, calibrations, order.name, 2007)
     trial = Image(_NOBODY, dict(made.blocks))
     warnings = guard(station, trial, None, order.accept_calibration, calibrations, profile, record=False)
-    return Prepared(order, profile, calibrations, merged(warnings))
+    return Prepared(order, profile, calibrations, merged(warnings), passed)
 
 
 def named_for(station: Station, uuid: bytes, prepared: Prepared, *, keep: bool = False) -> Prepared:
@@ -146,7 +148,7 @@ def _named_for(station: Station, uuid: bytes, prepared: Prepared) -> Prepared:
             f"Node {others[0].hex()} has the name {name!r} already.",
             hint="Give this one another name; {uuid} or {n} in --name makes each its own.",
         )
-    _check_name(name)
+    check_name(name)
     return replace(prepared, order=replace(prepared.order, name=name))
 
 
@@ -189,15 +191,19 @@ def compose(
     if wanted is None:
         raise no_profile(uuid)
     profile = prepared.profile or _load(station, wanted)
-    passed = passed_over(wanted, default_folders(station.home))
+    passed = prepared.passed if prepared.profile is not None else _passed_over(station, wanted)
     calibrations = prepared.calibrations if prepared.calibrations is not None else _from_file(order, profile)
     warnings: tuple[str, ...] = ()
     if calibrations is None:
         calibrations, warnings = _kept_calibrations(order, has)
-    record = station.nodes.get(uuid)
-    kept = order.name or name or (record.name if record and as_known else None)
+    kept = order.name or name or (_known_name(station, uuid) if as_known else None)
     made = _made(profile, uuid, calibrations, kept, edition)
     return Composed(profile, wanted, kept, calibrations, made.blocks, merged((*passed, *warnings, *made.warnings)))
+
+
+def _known_name(station: Station, uuid: bytes) -> str | None:
+    record = station.nodes.get(uuid)
+    return record.name if record is not None else None
 
 
 def _kept_calibrations(order: BuildOrder, has: Image | None) -> tuple[dict[int, Calibration], tuple[str, ...]]:
@@ -211,6 +217,8 @@ def _kept_calibrations(order: BuildOrder, has: Image | None) -> tuple[dict[int, 
 
 def teds_calibrations(image: Image) -> dict[int, Calibration]:
     """The calibrations that an image holds, by channel."""
+    if not _is_calibrated(image):
+        return {}
     return dict(Sheet.of(image).calibrations)
 
 
@@ -301,8 +309,8 @@ def _said(finding: GuardFinding) -> str:
     return f"channel {finding.channel}: {finding.message}"
 
 
-def _check_name(name: str | None) -> None:
-    """Raise UsageFailure for a name that does not fit into a TEDS, BadData for one that is no text."""
+def check_name(name: str | None) -> None:
+    """Raise UsageFailure for a name that fits into no TEDS or is not shown whole, BadData for one that is no text."""
     if name is None:
         return
     try:
@@ -311,6 +319,8 @@ def _check_name(name: str | None) -> None:
         raise BadData("The name of the node is not valid text.", hint="Give it in the terminal's encoding.") from error
     if not 1 <= octets <= NAME_OCTETS:
         raise UsageFailure(f"A name has 1 to {NAME_OCTETS} octets of UTF-8, this one {octets}.")
+    if not name.isprintable():
+        raise UsageFailure(f"A name is one line of printable characters, not {name!r}.")
 
 
 def _known_profile(station: Station, uuid: bytes) -> str | None:
@@ -325,6 +335,10 @@ def no_profile(uuid: bytes) -> UsageFailure:
 
 def _load(station: Station, wanted: str) -> Profile:
     return load_profile(wanted, default_folders(station.home))
+
+
+def _passed_over(station: Station, wanted: str) -> tuple[str, ...]:
+    return passed_over(wanted, default_folders(station.home))
 
 
 def _from_file(order: BuildOrder, profile: Profile) -> Mapping[int, Calibration] | None:

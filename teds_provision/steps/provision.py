@@ -22,18 +22,18 @@ from teds_provision.steps.read import Survey, survey
 from teds_provision.steps.sign import Signed, sign
 from teds_provision.steps.verify import Verified
 from teds_provision.steps.verify_node import verify_node
-from teds_provision.steps.write import Written, write
+from teds_provision.steps.write import Low, Written, wait_for_charge, write
 from teds_provision.store import Draft, WhitelistEntry
 from teds_provision.store.records import Assurance
-from teds_provision.talk.charge import Low, wait_for_charge
 from teds_provision.talk.conversation import Conversation
-from teds_provision.talk.onward import Onward, stay
 from teds_provision.talk.progress import DONE, NOTHING, Reporter, StepResult, Steps
 from teds_provision.teds.calibration.describe import sentence
 from teds_provision.teds.image import SECURITY, Image
 
 Order = BuildOrder | Prepared | Callable[["Identified"], Prepared]
 """What a node gets: as it was asked for, read already, or by who it is (which raises where it gets nothing)."""
+Onward = Callable[[Conversation], None]
+"""Takes the conversation to another link; see ``talk/onward.py``."""
 Accept = Callable[[Identified], None]
 """Asked before an unknown node is whitelisted; raises where the answer is no."""
 
@@ -57,7 +57,7 @@ def provision(
     accept: Accept,
     reporter: Reporter,
     confirm: Confirm = nobody,
-    onward: Onward = stay,
+    onward: Onward | None = None,
     low: Low = wait_for_charge,
 ) -> Provisioned:
     """Bring one node from wherever it stands to a verified datasheet; raises at the first step that fails.
@@ -68,7 +68,7 @@ def provision(
     """
     run = _Run(station, node, order, accept, confirm, reporter, onward, low)
     try:
-        with station.turn(node.uuid):
+        with station.turn(node.uuid), station.run():
             return run.run()
     except TedsProvisionError as error:
         with suppress(StoreFailure):  # a full disk must not hide what happened
@@ -85,7 +85,7 @@ class _Run:
         accept: Accept,
         confirm: Confirm,
         reporter: Reporter,
-        onward: Onward,
+        onward: Onward | None,
         low: Low,
     ) -> None:
         self.station, self.node, self.order = station, node, order
@@ -97,7 +97,8 @@ class _Run:
         prepared = self._prepared(who)
         entry = self._whitelist(who)
         self._agree(who, entry)
-        self.onward(self.node)
+        if self.onward is not None:
+            self.onward(self.node)
         present = survey(self.node, initial=who.security_teds)
         proposal = self._build(prepared, present)
         signed = self._sign(who, proposal, present)
@@ -208,10 +209,11 @@ def newcomer(station: Station, node: Conversation, who: Identified) -> Whitelist
     """
     new = who.state == NodeState.FACTORY and node.wired
     assurance: Assurance = "tap" if node.tapped else "bus" if new else "uuid"
-    revoked = station.policy.revocation(who.uuid)
-    if revoked is not None:
-        raise PolicyRefused(f"Node {who.uuid.hex()} was revoked: {revoked.why}.", hint="It was not whitelisted.")
-    station.pins.check(who.uuid, who.point)
+    with station.reading():
+        revoked = station.policy.revocation(who.uuid)
+        if revoked is not None:
+            raise PolicyRefused(f"Node {who.uuid.hex()} was revoked: {revoked.why}.", hint="It was not whitelisted.")
+        station.pins.check(who.uuid, who.point)
     return WhitelistEntry(who.uuid, who.fingerprint if node.tapped or new else None, assurance=assurance)
 
 

@@ -6,7 +6,7 @@ import time
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from teds_provision.errors import BadData, NotFound, PolicyRefused
+from teds_provision.errors import BadData, NotFound, PolicyRefused, TedsProvisionError
 from teds_provision.protocol.datasheet import (
     NodeKeys,
     can_be_stored,
@@ -16,7 +16,7 @@ from teds_provision.protocol.datasheet import (
     signature_good,
     unsigned_datasheet,
 )
-from teds_provision.protocol.keys import fingerprint, node_key_message, verify
+from teds_provision.protocol.keys import fingerprint, node_key_good
 from teds_provision.station.station import Station
 from teds_provision.store import Draft
 from teds_provision.teds.codec import security
@@ -44,7 +44,7 @@ class Signed:
 def node_keys_of(uuid: bytes, security_teds: bytes) -> NodeKeys:
     """Take fields 101 and 102 from a Security TEDS of the node; raises BadData where 102 is not over this UUID."""
     shown = security.decode(security_teds)
-    if not verify(shown.node_key, node_key_message(uuid, shown.node_key), shown.node_key_signature):
+    if not node_key_good(uuid, shown.node_key, shown.node_key_signature):
         raise BadData(f"The Security TEDS of {uuid.hex()} belongs to another node (field 102).")
     return NodeKeys(uuid, shown.node_key, shown.node_key_signature)
 
@@ -108,8 +108,7 @@ def sign(
             number = _sequence_if_the_same(station, keys, image, octets, epoch)
             if number is not None and (octets == on_node or number > node_sequence):
                 return Signed(image.with_block(SECURITY, octets), number, reused=True)
-    ca = station.keys.ca_of(keys.uuid)
-    signature, credentials = station.identity.signature_under(ca), station.credentials(keys.uuid)
+    credentials = station.credentials(keys.uuid)
     with station.durable("sign"):
         known = station.nodes.get(keys.uuid)
         number = max(node_sequence, known.sequence if known else 0) + 1 if sequence is None else sequence
@@ -117,10 +116,10 @@ def sign(
             raise PolicyRefused("The sequence of this node is used up.")
         unsigned = unsigned_datasheet(
             keys,
-            station.point,
-            signature,
+            credentials.key.point,
+            credentials.station_signature,
             digests(image.blocks),
-            ca=security.ca_hint(station.name, fingerprint(ca)),
+            ca=security.ca_hint(station.name, fingerprint(credentials.ca)),
             last_modified=_now(),
             sequence=number,
             key_epoch=epoch,
@@ -159,6 +158,8 @@ def _sequence_if_the_same(station: Station, keys: NodeKeys, image: Image, octets
 
 
 def _now() -> bytes:
-    """TimeInstance of now: u32 s, u32 ns, UTC."""
+    """TimeInstance of now: u32 s, u32 ns, UTC; raises TedsProvisionError where no u32 holds it."""
     seconds, nanoseconds = divmod(time.time_ns(), 1_000_000_000)
+    if not 0 <= seconds < 1 << 32:
+        raise TedsProvisionError("The clock of this machine says what cannot be.", hint="Set it; see: doctor")
     return seconds.to_bytes(4, "big") + nanoseconds.to_bytes(4, "big")

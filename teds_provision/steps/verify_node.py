@@ -73,7 +73,8 @@ def verify_node(station: Station, node: Conversation, image: Image, point: bytes
     ``why`` says why there is no session although a key is held: then nothing of what was read is recorded.
     """
     identity = (node.proven or read_identity(node)) if node.sealed else None
-    checks: list[Check] = verify_image(station, image, known=known_of(station, node.uuid, identity))
+    with station.reading():
+        checks: list[Check] = verify_image(station, image, known=known_of(station, node.uuid, identity))
     checks.append(possession(lambda: prove(node, point)))
     checks.append(vouched(node, point, why))
     verified = Verified(node.uuid, tuple(checks))

@@ -9,7 +9,7 @@ from __future__ import annotations
 import csv
 import io
 import json
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -18,10 +18,9 @@ from teds_provision.errors import OtherKey, PolicyRefused, UsageFailure
 from teds_provision.protocol.fingerprints import same_key
 from teds_provision.station.station import Station
 from teds_provision.steps.whitelist_files import FIELDS, FORMATS, Listed
-from teds_provision.store import WhitelistEntry
+from teds_provision.store import WhitelistEntry, pages
 
 _SHOWN = 5
-_FEW = 50
 
 
 @dataclass(frozen=True)
@@ -38,35 +37,30 @@ def plan_addition(station: Station, listed: Sequence[Listed]) -> Plan:
 
     Raises OtherKey where a UUID is pinned to another key, PolicyRefused for a revoked node: then none may be added.
     """
-    pinned, present, revoked = _known(station, [entry.uuid for entry in listed])
+    revoked = {one.uuid: one.why for one in station.policy.revocations()}
     _refuse_revoked([entry.uuid for entry in listed if entry.uuid in revoked], revoked)
     write: list[WhitelistEntry] = []
     conflicts: list[tuple[Listed, str]] = []
-    for entry in listed:
-        known = present.get(entry.uuid)
-        pin = pinned.get(entry.uuid)
-        if entry.fingerprint is not None and pin is not None and not same_key(pin, entry.fingerprint):
-            conflicts.append((entry, str(pin)))
-            continue
-        wanted = _merged(known, entry)
-        if wanted != known:
-            write.append(wanted)
+    new = 0
+    for page in pages(listed):
+        uuids = [entry.uuid for entry in page]
+        present = station.pins.of_page(uuids)
+        pinned = station.pins.among(station.nodes.of_page(uuids).values(), present.values())
+        for entry in page:
+            known, pin = present.get(entry.uuid), pinned.get(entry.uuid)
+            if pin is not None and _names_another_key(entry, pin):
+                conflicts.append((entry, pin))
+                continue
+            wanted = _merged(known, entry)
+            if wanted != known:
+                write.append(wanted)
+                new += known is None
     _refuse_conflicts(conflicts)
-    new = sum(entry.uuid not in present for entry in write)
     return Plan(tuple(write), new, len(listed) - len(write))
 
 
-def _known(
-    station: Station, uuids: Sequence[bytes]
-) -> tuple[dict[bytes, str], dict[bytes, WhitelistEntry], dict[bytes, str]]:
-    """Pinned keys, whitelist entries and reasons of revocations: one by one for a few, whole tables for many."""
-    if len(uuids) > _FEW:
-        present = {entry.uuid: entry for entry in station.pins.whitelist()}
-        return station.pins.all(), present, {one.uuid: one.why for one in station.policy.revocations()}
-    pins = {uuid: pin for uuid in uuids if (pin := station.pins.pinned(uuid)) is not None}
-    entries = {uuid: entry for uuid in uuids if (entry := station.pins.entry(uuid)) is not None}
-    revoked = {uuid: one.why for uuid in uuids if (one := station.policy.revocation(uuid)) is not None}
-    return pins, entries, revoked
+def _names_another_key(entry: Listed, pin: str) -> bool:
+    return entry.fingerprint is not None and not same_key(pin, entry.fingerprint)
 
 
 def _merged(known: WhitelistEntry | None, entry: Listed) -> WhitelistEntry:
@@ -160,23 +154,34 @@ def form_of(path: Path, form: str | None) -> str:
     return "xml"
 
 
-def render(entries: Iterable[WhitelistEntry], form: str) -> str:
-    """The whitelist as text, by UUID: XML of the NCAP with our attributes, CSV with a header, or JSON."""
-    rows = [as_dict(entry) for entry in sorted(entries, key=lambda entry: entry.uuid)]
+def render(entries: Iterable[WhitelistEntry], form: str) -> Iterator[str]:
+    """The whitelist as text, a line or more at a time: XML of the NCAP with our attributes, CSV with a header, JSON."""
+    rows = map(as_dict, entries)
     if form == "json":
-        return json.dumps({"whitelist": rows}, indent=1, ensure_ascii=False) + "\n"
-    if form == "csv":
-        out = io.StringIO(newline="")
-        writer = csv.DictWriter(out, FIELDS, lineterminator="\n")
+        yield json.dumps({"whitelist": list(rows)}, indent=1, ensure_ascii=False) + "\n"
+    elif form == "csv":
+        yield _csv_line(dict.fromkeys(FIELDS), names=True)
+        yield from map(_csv_line, rows)
+    else:
+        yield '<?xml version="1.0" encoding="UTF-8"?>\n<whitelist>\n'
+        yield from map(_xml_line, rows)
+        yield "</whitelist>\n"
+
+
+def _csv_line(row: Mapping[str, Any], *, names: bool = False) -> str:
+    out = io.StringIO(newline="")
+    writer = csv.DictWriter(out, FIELDS, lineterminator="\n")
+    if names:
         writer.writeheader()
-        writer.writerows(rows)
-        return out.getvalue()
-    lines = ['<?xml version="1.0" encoding="UTF-8"?>', "<whitelist>"]
-    for row in rows:
-        attributes = {**row, "uuid": f"0x{row['uuid']}"}
-        shown = " ".join(f"{key}={_quoted(_legal(value))}" for key, value in attributes.items() if value is not None)
-        lines.append(f"  <transducer {shown}/>")
-    return "\n".join([*lines, "</whitelist>", ""])
+    else:
+        writer.writerow(row)
+    return out.getvalue()
+
+
+def _xml_line(row: Mapping[str, Any]) -> str:
+    attributes = {**row, "uuid": f"0x{row['uuid']}"}
+    shown = " ".join(f"{key}={_quoted(_legal(value))}" for key, value in attributes.items() if value is not None)
+    return f"  <transducer {shown}/>\n"
 
 
 def _quoted(text: str) -> str:

@@ -105,6 +105,8 @@ def read_whitelist(path: Path, form: str | None = None) -> list[Listed]:
     Raises NotFound, or BadData that names file, line and field of every mistake (the first ten in full).
     """
     text = _text(path)
+    if not text.strip():
+        raise BadData(f"{path} is empty: it lists no node.", hint="Give XML, CSV (a line of column names) or JSON.")
     form = form or _form_of(path, text)
     reading = _Reading(str(path))
     readers: dict[str, Callable[[str, _Reading], None]] = {"xml": _read_xml, "csv": _read_csv, "json": _read_json}

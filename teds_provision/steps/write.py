@@ -1,4 +1,9 @@
-"""Step 6: stage every TEDS, commit, read back, compare (profile.md, "Writing to flash")."""
+"""Step 6: stage every TEDS, commit, read back, compare (profile.md, "Writing to flash").
+
+Before that the charge of the node is asked: power that fails in the middle helps nobody (operation.md section 7). The
+initial NFC message says it to anyone; over the air the session asks for it (Power, 128.18). On a wired bus nodes are
+fed by the bus, and nobody asks. It is a hint: it delays a write, and decides nothing else.
+"""
 
 from __future__ import annotations
 
@@ -6,20 +11,22 @@ import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from types import MappingProxyType
+from typing import Final
 
 from teds_provision.errors import BadData, Garbled, NodeRefused, NodeSilent, NotAuthentic, PolicyRefused
 from teds_provision.protocol.datasheet import SEQUENCE_WINDOW
 from teds_provision.protocol.messages.frames import Reason, update_teds, write_teds
 from teds_provision.protocol.messages.identity import Identity, NodeState
+from teds_provision.protocol.operation.commands import POWER, Power, PowerFlag
 from teds_provision.station.station import Station
 from teds_provision.steps.read import Survey, read_block, read_identity, read_image
 from teds_provision.steps.sign import known_image, node_keys_of, sign
-from teds_provision.talk.charge import Low, require_charge, wait_for_charge
 from teds_provision.talk.conversation import Conversation, SessionLost
 from teds_provision.teds.codec import security
 from teds_provision.teds.codec.security import SecurityTeds
 from teds_provision.teds.image import SECURITY, BlockId, Image
 
+LEAST_PERCENT: Final = 10
 WRITE_OVERHEAD = 53
 _STARTS = 3
 _LOSSES = 20
@@ -27,6 +34,15 @@ _SMALLEST_PIECE = 48
 
 Progress = Callable[[int, int], None]
 """``progress(octets written, octets to write)``."""
+Low = Callable[[str], object]
+"""Asked, with a whole sentence, before a node with a low battery is written; raises where the answer is no."""
+
+
+def wait_for_charge(question: str) -> None:
+    """The answer where nobody was asked: no. Raises PolicyRefused."""
+    raise PolicyRefused(
+        question.removesuffix(" Write it?"), hint="Charge it first (leave it on the reader), or write it with --yes."
+    )
 
 
 @dataclass(frozen=True)
@@ -68,7 +84,7 @@ def write(
             return Written(0, time.monotonic() - started, has)
     identity = node.proven or read_identity(node)
     _require_newer(signed, identity, jump=jump)
-    require_charge(node, low)
+    _require_charge(node, low)
     octets = 0
     for step in range(identity.sequence + SEQUENCE_WINDOW, signed.sequence, SEQUENCE_WINDOW):
         keys = node_keys_of(image.uuid, image.blocks[SECURITY])
@@ -87,7 +103,7 @@ def _conclude(
 ) -> None:
     """Record what was read back, and whether it is what was written; raises NotAuthentic where it is not."""
     differing = [block for block in image if back.blocks.get(block) != image.blocks[block]]
-    with station.durable("write"):
+    with station.durable("write", more_follows=True):
         profile = facts.get("profile")
         station.nodes.keep_datasheet(back, profile if isinstance(profile, str) else None)
         if differing:
@@ -102,6 +118,28 @@ def _conclude(
             f"The node gives back another TEDS {access_code} of channel {channel} than was written.",
             hint="Try again; if it stays, the board's flash is broken.",
         )
+
+
+def _require_charge(node: Conversation, low: Low) -> None:
+    percent = _percent(node)
+    if percent is not None and percent < LEAST_PERCENT:
+        low(
+            f"The battery of node {node.uuid.hex()} is at {percent} %: a write may be cut short, and would have to be "
+            "begun anew. Write it?"
+        )
+
+
+def _percent(node: Conversation) -> int | None:
+    """Per cent, None where nobody knows, or where the node is fed."""
+    if node.charging is not None and node.charging.battery_percent is not None:
+        return node.charging.battery_percent
+    if node.tapped or node.wired or not node.sealed:
+        return None
+    try:
+        power = Power.decode(node.ask(POWER, "to tell its charge"))
+    except (NodeRefused, BadData):
+        return None  # it has no battery, or does not measure
+    return power.level if power.flags & PowerFlag.BATTERY else None
 
 
 def _require_newer(signed: SecurityTeds, identity: Identity, *, jump: bool) -> None:

@@ -19,13 +19,14 @@ if TYPE_CHECKING:
         Measurement,
         NodeRecord,
         Revocation,
+        Shown,
         Tombstone,
         TrustRecord,
         WhitelistEntry,
         utc_now,
     )
     from teds_provision.store.store import Store
-    from teds_provision.store.tables.batches import Batch
+    from teds_provision.store.tables.batches import Batch, pages
     from teds_provision.store.tables.overview import Known, Search
 else:
     __getattr__ = lazy(
@@ -46,6 +47,7 @@ else:
                     "Measurement",
                     "NodeRecord",
                     "Revocation",
+                    "Shown",
                     "Tombstone",
                     "TrustRecord",
                     "WhitelistEntry",
@@ -54,7 +56,7 @@ else:
                 "records",
             ),
             "Store": "store",
-            "Batch": "tables.batches",
+            **dict.fromkeys(("Batch", "pages"), "tables.batches"),
             **dict.fromkeys(("Known", "Search"), "tables.overview"),
         },
     )
@@ -79,11 +81,13 @@ __all__ = [
     "NodeTurn",
     "Revocation",
     "Search",
+    "Shown",
     "Store",
     "StoreLock",
     "Tombstone",
     "TrustRecord",
     "WhitelistEntry",
     "is_failure",
+    "pages",
     "utc_now",
 ]

@@ -16,12 +16,16 @@ import json
 import os
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
+from functools import cache
 from typing import Any
 
 from teds_provision.store.database import Database
 from teds_provision.store.records import utc_now
 
 _quoted = json.encoder.encode_basestring_ascii
+_encode = json.JSONEncoder(sort_keys=True, separators=(",", ":")).encode
+_NOTED = "(SELECT value FROM meta WHERE name = 'audit-head')"
+_END = f"SELECT seq, hash, {_NOTED} FROM audit ORDER BY seq DESC LIMIT 1"
 _PAGE_OF_ENTRIES = "SELECT * FROM audit WHERE seq > ? ORDER BY seq LIMIT ?"
 
 
@@ -81,14 +85,14 @@ class AuditLog:
     def append(self, act: str, uuid: bytes | None, outcome: str, detail: Mapping[str, Any] | None = None) -> None:
         """Add one entry; ``detail`` holds JSON values only and never a secret. Raises StoreFailure."""
         text = _canonical(dict(detail or {}))
-        with self._database.transaction():
-            last = self._database.one("SELECT seq, hash FROM audit ORDER BY seq DESC LIMIT 1")
-            count, previous = last or (0, self._root)
-            if self._remembered() != (count, previous):  # goes on, but the loss is never forgotten
+        with self._database.together():
+            last = self._database.one(_END)
+            count, previous, noted = last or (0, self._root, self._noted())
+            if self._read(noted) != (count, previous):  # goes on, but the loss is never forgotten
                 self._database.execute("INSERT OR IGNORE INTO meta VALUES('audit-lost', ?)", (str(count + 1),))
             row = (count + 1, utc_now(), _who(), act, uuid, outcome, text)
             head = _chained(previous, row)
-            self._database.execute("INSERT INTO audit VALUES(?, ?, ?, ?, ?, ?, ?, ?)", (*row, head))
+            self._database.add("INSERT INTO audit VALUES(?, ?, ?, ?, ?, ?, ?, ?)", (*row, head))
             self._remember(count + 1, head)
 
     def entries(self, after: int = 0) -> Iterator[AuditEntry]:
@@ -151,10 +155,16 @@ class AuditLog:
 
     def _remembered(self) -> tuple[int, bytes] | None:
         """Return the number of entries and the last hash, None where that note itself is damaged."""
-        row = self._database.one("SELECT value FROM meta WHERE name = 'audit-head'")
-        if row is None:
+        return self._read(self._noted())
+
+    def _noted(self) -> object:
+        row = self._database.one(f"SELECT {_NOTED}")
+        return None if row is None else row[0]
+
+    def _read(self, noted: object) -> tuple[int, bytes] | None:
+        if noted is None:
             return 0, self._root
-        count, _, head = str(row[0]).partition(":")
+        count, _, head = str(noted).partition(":")
         try:
             return int(count), bytes.fromhex(head)
         except ValueError:
@@ -216,10 +226,12 @@ def _terms(choice: Choice) -> str:
 
 
 def _canonical(value: dict[str, Any]) -> str:
-    return json.dumps(value, sort_keys=True, separators=(",", ":"))
+    return _encode(value)
 
 
+@cache
 def _who() -> str:
+    """Who runs this process, and where; neither changes while it runs."""
     try:
         user = getpass.getuser()
     except (KeyError, OSError):  # no entry in the user database, as in a container

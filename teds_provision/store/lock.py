@@ -17,18 +17,29 @@ import time
 from abc import ABC, abstractmethod
 from collections.abc import Callable
 from contextlib import suppress
+from functools import lru_cache
 from pathlib import Path
 from types import TracebackType
 from typing import Self
 
 from teds_provision.errors import NodeBusy, StoreLocked
-from teds_provision.store.database import as_store_failure
+from teds_provision.store.failures import as_store_failure
 from teds_provision.store.records import utc_now
 
 FILE_NAME = "store.lock"
 TURNS_NAME = "store.turns"
+_TURN_SECONDS = 60.0
 _FIRST_POLL_SECONDS = 0.001
+_LAST_QUIET_POLL_SECONDS = 0.004
 _POLL_SECONDS = 0.05
+_SIGNATURE_OCTETS = 256
+_quoted = json.encoder.encode_basestring_ascii
+
+
+@lru_cache(maxsize=4)
+def _beside(home: Path, name: str) -> Path:
+    """The file of a home, made once: a run of steps takes the store six times."""
+    return home / name
 
 
 class _HeldFile(ABC):
@@ -81,20 +92,19 @@ class StoreLock(_HeldFile):
     def __init__(
         self, home: Path, *, command: str, wait: float = 10.0, notice: Callable[[str], object] | None = None
     ) -> None:
-        super().__init__(home / FILE_NAME)
+        super().__init__(_beside(home, FILE_NAME))
         self._command = command
         self._wait = wait
         self._notice = notice
 
-    def _release(self, descriptor: int) -> None:
-        os.ftruncate(descriptor, 0)
-
     def _acquire(self, descriptor: int) -> None:
         self._lock(descriptor)
-        _sign(descriptor, self._command)
+        with suppress(OSError):  # a full disk must not hide the store's own, better message
+            # over what the last holder left, which says nothing any more: cutting a file off costs more than a step
+            os.pwrite(descriptor, _signature(self._command).ljust(_SIGNATURE_OCTETS), 0)
 
     def _lock(self, descriptor: int) -> None:
-        until = time.monotonic() + self._wait
+        began = time.monotonic()
         told, pause = False, _FIRST_POLL_SECONDS
         while True:
             try:
@@ -105,14 +115,16 @@ class StoreLock(_HeldFile):
                 raise as_store_failure(error, self._path) from error
             else:
                 return
-            holder = _holder(descriptor)
-            if time.monotonic() >= until:
-                raise StoreLocked(f"The store is held by {holder}.", hint="Wait until it has ended, or end it.")
-            if not told and pause >= _POLL_SECONDS and self._notice is not None:
-                self._notice(f"Waiting for the store, held by {holder}.")
+            waited = time.monotonic() - began
+            if waited >= self._wait:
+                hint = "Wait until it has ended, or end it."
+                raise StoreLocked(f"The store is held by {_holder(descriptor)}.", hint=hint)
+            if not told and waited >= _POLL_SECONDS and self._notice is not None:
+                self._notice(f"Waiting for the store, held by {_holder(descriptor)}.")
                 told = True
             time.sleep(pause)
-            pause = min(2 * pause, _POLL_SECONDS)  # a durable step of another command takes milliseconds
+            # a durable step of another command takes milliseconds, and others wait for its end as well
+            pause = min(2 * pause, _POLL_SECONDS if told else _LAST_QUIET_POLL_SECONDS)
 
 
 class Mark(_HeldFile):
@@ -142,7 +154,9 @@ class Mark(_HeldFile):
             holder = _holder(descriptor)
             raise Taken(f"It is held by {holder}.", holder) from None
         self.left_behind = bool(os.pread(descriptor, 1, 0))
-        _sign(descriptor, self._command)
+        with suppress(OSError):  # as above
+            os.ftruncate(descriptor, 0)
+            os.pwrite(descriptor, _signature(self._command), 0)
 
     def _release(self, descriptor: int) -> None:
         if self._shared:  # the last one puts it away
@@ -173,11 +187,8 @@ class Taken(StoreLocked):
         self.holder = holder
 
 
-def _sign(descriptor: int, command: str) -> None:
-    text = json.dumps({"pid": os.getpid(), "command": command, "since": utc_now()})
-    with suppress(OSError):  # a full disk must not hide the store's own, better message
-        os.ftruncate(descriptor, 0)
-        os.pwrite(descriptor, text.encode(), 0)
+def _signature(command: str) -> bytes:
+    return f'{{"pid": {os.getpid()}, "command": {_quoted(command)}, "since": "{utc_now()}"}}'.encode()
 
 
 def _holder(descriptor: int) -> str:
@@ -192,19 +203,17 @@ class NodeTurn(_HeldFile):
     """``with NodeTurn(home, uuid):`` one command works on this node of the store, the next one waits for it.
 
     One octet of a file is locked, at a place that the UUID names (two nodes may share one: then they take turns, no
-    more). Waits up to ``wait`` seconds; raises NodeBusy after that, StoreFailure where the file cannot be made.
+    more). Waits up to a minute; raises NodeBusy after that, StoreFailure where the file cannot be made.
     """
 
-    def __init__(
-        self, home: Path, uuid: bytes, *, wait: float = 60.0, notice: Callable[[str], object] | None = None
-    ) -> None:
-        super().__init__(home / TURNS_NAME)
-        self._uuid, self._wait, self._notice = uuid, wait, notice
+    def __init__(self, home: Path, uuid: bytes, *, notice: Callable[[str], object] | None = None) -> None:
+        super().__init__(_beside(home, TURNS_NAME))
+        self._uuid, self._notice = uuid, notice
 
     def _acquire(self, descriptor: int) -> None:
         place = int.from_bytes(hashlib.sha256(self._uuid).digest()[:6], "big")
         asked = struct.pack("hhqqi4x", fcntl.F_WRLCK, os.SEEK_SET, place, 1, 0)  # struct flock
-        until, told = time.monotonic() + self._wait, False
+        until, told = time.monotonic() + _TURN_SECONDS, False
         while True:
             try:
                 # a lock of this open file, not of the process: threads take turns too

@@ -5,6 +5,7 @@ from __future__ import annotations
 import struct
 import zlib
 from datetime import UTC, datetime
+from functools import lru_cache
 from typing import TYPE_CHECKING, Any
 
 from teds_provision.errors import BadData
@@ -41,6 +42,12 @@ def packed(image: Image) -> bytes:
     """The blocks of an image, ascending, deflated: channel u16, access code u8, length u32, octets."""
     parts = (_BLOCK.pack(channel, code, len(image.blocks[channel, code])) for channel, code in image)
     whole = b"".join(head + image.blocks[block] for head, block in zip(parts, image, strict=True))
+    return _deflated(whole)
+
+
+@lru_cache(maxsize=4)
+def _deflated(whole: bytes) -> bytes:
+    """An image is kept as a draft, and as it is written a moment later."""
     return zlib.compress(whole, 9)
 
 

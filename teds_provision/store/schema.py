@@ -9,7 +9,7 @@ from __future__ import annotations
 from typing import Final
 
 APPLICATION_ID: Final = 0x54454453  # "TEDS"
-SCHEMA_VERSION: Final = 5
+SCHEMA_VERSION: Final = 6
 
 _VERSION_1: Final = (
     "CREATE TABLE meta(name TEXT PRIMARY KEY, value TEXT NOT NULL) STRICT, WITHOUT ROWID",
@@ -160,6 +160,13 @@ _VERSION_4: Final = (
 # What came with version 5: what a node last said of its charge (JSON with its time), a hint that nobody authenticated.
 _VERSION_5: Final = ("ALTER TABLE nodes ADD COLUMN charging TEXT",)
 
+# What came with version 6: what was asked beside of a measurement, so that one that is carried on is the same one.
+_VERSION_6: Final = (
+    "ALTER TABLE measurements ADD COLUMN test_pattern INTEGER NOT NULL DEFAULT 0 CHECK(test_pattern IN (0, 1))",
+    "ALTER TABLE measurements ADD COLUMN unsigned INTEGER NOT NULL DEFAULT 0 CHECK(unsigned IN (0, 1))",
+    "ALTER TABLE measurements ADD COLUMN require TEXT NOT NULL DEFAULT ''",
+)
+
 # STEPS_TO[n] are the statements that bring a store of version n - 1 to version n.
 STEPS_TO: Final[dict[int, tuple[str, ...]]] = {
     1: _VERSION_1,
@@ -167,4 +174,5 @@ STEPS_TO: Final[dict[int, tuple[str, ...]]] = {
     3: _VERSION_3,
     4: _VERSION_4,
     5: _VERSION_5,
+    6: _VERSION_6,
 }

@@ -12,7 +12,8 @@ from teds_provision.errors import BadData, StoreFailure
 from teds_provision.files import whole_draft
 from teds_provision.lazy import late
 from teds_provision.store.audit import AuditLog
-from teds_provision.store.database import FILE_NAME, Database, as_store_failure
+from teds_provision.store.database import FILE_NAME, Database
+from teds_provision.store.failures import as_store_failure
 from teds_provision.store.store import Store
 
 if TYPE_CHECKING:

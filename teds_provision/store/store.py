@@ -38,6 +38,7 @@ class Store(
 
     def __init__(self, database: Database) -> None:
         self._database = database
+        self._home = database.path.parent
 
     @classmethod
     def open(cls, home: Path, *, create: bool = False) -> Store:
@@ -58,7 +59,7 @@ class Store(
     @property
     def home(self) -> Path:
         """The directory that the store lies in."""
-        return self._database.path.parent
+        return self._home
 
     @property
     def frozen(self) -> StoreFailure | None:
@@ -77,9 +78,29 @@ class Store(
     ) -> None:
         self.close()
 
-    def transaction(self) -> AbstractContextManager[None]:
-        """All of the block or nothing of it; may stand inside another one."""
-        return self._database.transaction()
+    def transaction(self, *, later: bool = False) -> AbstractContextManager[None]:
+        """All of the block or nothing of it; may stand inside another one.
+
+        ``later``: it is on the disk with the next one that is not, or after :meth:`settle`.
+        """
+        return self._database.transaction(later=later)
+
+    def together(self) -> AbstractContextManager[None]:
+        """All of the block or nothing of it, nor of a transaction around it: no error in it is to be caught."""
+        return self._database.together()
+
+    def reading(self) -> AbstractContextManager[None]:
+        """Many questions at one moment: what was read before counts as it was when the block began."""
+        return self._database.reading()
+
+    def settle(self, through: int | None = None) -> None:
+        """Wait until everything that was committed is on the disk, or what was when :attr:`later` was ``through``."""
+        self._database.settle(through)
+
+    @property
+    def later(self) -> int:
+        """How many commits did not wait for the disk; see :meth:`transaction`."""
+        return self._database.later
 
     def when_waiting(self, notice: Callable[[str], object]) -> None:
         """Have ``notice`` told, in a sentence, when a change has to wait for another process."""
@@ -87,7 +108,7 @@ class Store(
 
     def version(self) -> int:
         """Return a number that changes when another connection has changed the file."""
-        return int(self._database.execute("PRAGMA data_version")[0][0])
+        return self._database.version()
 
     def count(self, table: Literal["nodes", "whitelist", "keys", "trust"]) -> int:
         """Return how many rows a table has."""

@@ -5,11 +5,12 @@ from __future__ import annotations
 import logging
 import time
 from collections.abc import Callable
+from functools import partial
 from types import TracebackType
 
 from teds_provision.errors import Garbled, LinkFailure, NodeRefused, NodeSilent, TedsProvisionError
 from teds_provision.links import Contact, Notice
-from teds_provision.links.ports import NoticeSink
+from teds_provision.links.ports import Link, NoticeSink, Prompt
 from teds_provision.protocol.messages.frames import Command, Function, Reason, Reply, decode_reply, security_command
 from teds_provision.protocol.messages.identity import Identity
 from teds_provision.protocol.messages.words import answered, asked
@@ -23,6 +24,8 @@ _REPEATS = 5
 """How often a command that does no harm is sent again on a link that loses frames."""
 _TORN_REPEATS = 40
 """Of one whose reply is torn: where 3 % are lost a long one loses a frame more often than not, and costs 20 ms."""
+_REPEATING_SECONDS = 60.0
+"""How long that goes on: a node that is there and answers nothing but Identify holds nobody up for ever."""
 _OPENING = "to open a session"
 
 _MEANING = {
@@ -201,20 +204,23 @@ class Conversation:
             raise refused(reply.reason, doing)
         return reply.payload
 
-    def send(self, command: Command, doing: str) -> bytes:
-        """Send sealed where a session is open, else plain. Raises SessionLost where the session is gone."""
+    def send(self, command: Command, doing: str, *, within: float | None = None) -> bytes:
+        """Send sealed where a session is open, else plain. Raises SessionLost where the session is gone.
+
+        ``within``: seconds after which what it orders is of no use; it is given up then (NodeSilent).
+        """
         session = self._session
         if session is None:
             return self.plain(command, doing)
-        outer = self._exchange(session.seal(command), command)
+        outer = self._exchange(session.seal(command), command, within)
         if not outer.ok:
             raise SessionLost(refused(outer.reason, doing))
         try:
             inner = session.unseal(outer.payload)
         except TedsProvisionError as error:
-            self.contact.note("in", outer.encode(), answered(command, outer), sealed=True)
+            self.contact.note("in", outer.encode(), lambda: answered(command, outer), sealed=True)
             raise SessionLost(error) from error
-        self.contact.note("in", outer.encode(), answered(command, inner), sealed=True, opened=inner.encode())
+        self._trace_opened(command, outer, inner)
         if not inner.ok:
             raise refused(inner.reason, doing, sealed=True)
         return inner.payload
@@ -234,6 +240,7 @@ class Conversation:
     def ask(self, command: Command, doing: str) -> bytes:
         """Send a command that may be repeated without harm, over a new session where the old one was lost."""
         reopenings = repeats = torn = 0
+        until = time.monotonic() + _REPEATING_SECONDS
         while True:
             try:
                 return self.sure(command, doing)
@@ -245,7 +252,7 @@ class Conversation:
             except (NodeSilent, Garbled) as failure:
                 torn += isinstance(failure, Garbled)
                 repeats += isinstance(failure, NodeSilent)
-                if repeats > _REPEATS or torn > _TORN_REPEATS or not self.lives():
+                if repeats > _REPEATS or torn > _TORN_REPEATS or time.monotonic() > until or not self.lives():
                     raise
 
     @property
@@ -266,22 +273,39 @@ class Conversation:
             return False
         return True
 
-    def _exchange(self, command: Command, inside: Command | None = None) -> Reply:
+    def _exchange(self, command: Command, inside: Command | None = None, within: float | None = None) -> Reply:
         """Send a command, again while the node is busy; ``inside`` is what is sealed in it."""
-        until = time.monotonic() + _BUSY_SECONDS
+        until = time.monotonic() + (_BUSY_SECONDS if within is None else 0.0)
         while True:
             frame = command.encode()
-            opened = None if inside is None else inside.encode()
-            self.contact.note("out", frame, asked(inside or command), sealed=inside is not None, opened=opened)
-            raw = self.contact.link.exchange(frame)
+            self._trace_sent(frame, command, inside)
+            raw = _carry(self.contact.link, frame, within)
             _log.debug("%d.%d: %d octets out, %d back", command.command_class, command.function, len(frame), len(raw))
             reply = decode_reply(raw)
             if inside is None or not reply.ok:  # what is sealed is told when it is opened
-                self.contact.note("in", raw, answered(command, reply))
+                self.contact.note("in", raw, partial(answered, command, reply))
             if reply.ok or reply.reason != Reason.BUSY or time.monotonic() >= until:
                 return reply
             self._notice(Notice("retry", "The node is busy with another station", until - time.monotonic()))
             time.sleep(_BUSY_PAUSE)
+
+    # The messages are encoded once more for the trace, so these look whether there is one.
+
+    def _trace_sent(self, frame: bytes, command: Command, inside: Command | None) -> None:
+        if self.contact.trace is not None:
+            opened = None if inside is None else inside.encode()
+            self.contact.note("out", frame, asked(inside or command), sealed=inside is not None, opened=opened)
+
+    def _trace_opened(self, command: Command, outer: Reply, inner: Reply) -> None:
+        if self.contact.trace is not None:
+            words, opened = answered(command, inner), inner.encode()
+            self.contact.note("in", outer.encode(), words, sealed=True, opened=opened)
+
+
+def _carry(link: Link, frame: bytes, within: float | None) -> bytes:
+    if within is not None and isinstance(link, Prompt):
+        return link.exchange_within(frame, within)
+    return link.exchange(frame)
 
 
 def _nothing() -> None:

@@ -6,8 +6,8 @@ from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 
 from teds_provision.errors import AddressConflict, StoreLocked, UsageFailure
-from teds_provision.links import Contact, LinkSettings, open_port
-from teds_provision.links.ports import Port
+from teds_provision.links import Contact, LinkSettings, Notice, open_port
+from teds_provision.links.ports import NoticeSink, Port
 from teds_provision.protocol.announce import default_can_address
 from teds_provision.protocol.messages.identity import Identity, NodeState
 from teds_provision.station.station import Station
@@ -79,11 +79,27 @@ def meet_everyone(links: LinkSettings, reporter: Reporter) -> Iterator[list[Conv
     """Wait for any node and give a conversation with each that is there: the tapped one, or all on the bus."""
     port = open_port(links)
     try:
-        contacts = refuse_twins(port.everyone(seconds=links.timeout, notice=reporter.notice))
+        contacts = without_twins(port.everyone(seconds=links.timeout, notice=reporter.notice), reporter.notice)
         with ExitStack() as stack:
             yield [stack.enter_context(Conversation(contact, notice=reporter.notice)) for contact in contacts]
     finally:
         port.close()
+
+
+def without_twins(contacts: list[Contact], notice: NoticeSink) -> list[Contact]:
+    """Those whose UUID answers at one address alone; anybody can copy a UUID, so it costs that node and no other.
+
+    ``notice`` is told of the rest; raises AddressConflict where nothing is left.
+    """
+    same: dict[bytes, list[Contact]] = {}
+    for contact in contacts:
+        same.setdefault(contact.identity.uuid, []).append(contact)
+    for uuid, group in same.items():
+        try:
+            refuse_twins(group)
+        except AddressConflict as conflict:
+            notice(Notice("conflict", f"{conflict.message} {conflict.hint}", uuid=uuid))
+    return [one for one in contacts if len(same[one.identity.uuid]) == 1] or refuse_twins(contacts)
 
 
 def refuse_twins(contacts: list[Contact]) -> list[Contact]:

@@ -12,21 +12,15 @@ from teds_provision.links.ports import NoticeSink
 from teds_provision.protocol.messages.identity import Identity
 from teds_provision.talk.conversation import Conversation
 
-Onward = Callable[[Conversation], None]
 
-
-def stay(_node: Conversation) -> None:
-    """Go on where the conversation is."""
-
-
-def onward(links: LinkSettings, notice: NoticeSink) -> Onward:
-    """How to go on once a key is agreed on: where both ``--nfc`` and ``--ble`` are named, over BLE; else as it is.
+def onward(links: LinkSettings, notice: NoticeSink) -> Callable[[Conversation], None] | None:
+    """How to go on once a key is agreed on: where both ``--nfc`` and ``--ble`` are named, over BLE; None where not.
 
     What is returned raises NoReader, NoNode (it does not advertise, or is out of reach), LinkFailure.
     """
     place = links.onward
     if place is None:
-        return stay
+        return None
 
     def go_on(node: Conversation) -> None:
         if not node.tapped:

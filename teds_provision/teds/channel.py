@@ -167,9 +167,9 @@ def described(number: int, blocks: Mapping[BlockId, bytes]) -> Channel:
     return read_channel(number, "", decode(octets) if octets is not None else None)
 
 
-def channel_from(decoded: Decoded, number: int = 0) -> Channel:
+def channel_from(decoded: Decoded) -> Channel:
     """What a decoded TransducerChannel TEDS alone says of its channel."""
-    return read_channel(number, "", decoded)
+    return read_channel(0, "", decoded)
 
 
 def read_channel(number: int, name: str, teds: Decoded | None) -> Channel:

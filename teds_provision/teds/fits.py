@@ -253,18 +253,18 @@ def _same_kind(one: Units, other: Units) -> bool:
     return one == other
 
 
-def _term(text: str, known: tuple[str, ...] = _PROPERTIES) -> Term:
+def _term(text: str) -> Term:
     match = _TERM.match(text)
     if match is None:
         raise BadData(
             f'"{text.strip()[:60]}" is no bound.', hint='Write a name, one of >= <= > <, and a value: "rate >= 1 kHz".'
         )
     name = match[1].strip().lower().replace(" ", "-").replace("_", "-")
-    if name not in known and name not in QUANTITIES:
-        near = get_close_matches(name[:64], [*known, *QUANTITIES], n=1, cutoff=0.6)
+    if name not in _PROPERTIES and name not in QUANTITIES:
+        near = get_close_matches(name[:64], [*_PROPERTIES, *QUANTITIES], n=1, cutoff=0.6)
         raise BadData(
             f'"{name}" is no quantity that is known here.',
-            hint=f'Did you mean "{near[0]}"?' if near else f"Known are {', '.join([*known, *QUANTITIES])}.",
+            hint=f'Did you mean "{near[0]}"?' if near else f"Known are {', '.join([*_PROPERTIES, *QUANTITIES])}.",
         )
     try:
         value = float(match[3])

@@ -12,10 +12,13 @@ import binascii
 import json
 import os
 from dataclasses import dataclass, field, replace
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from teds_provision.errors import VaultFailure
 from teds_provision.protocol.keys import SoftwareKey
+
+if TYPE_CHECKING:
+    from cryptography.hazmat.primitives.ciphers.aead import AESGCM
 
 MASTER_OCTETS = 32
 _SECRET_OCTETS = 32
@@ -31,6 +34,7 @@ class MasterKeys:
     """Numbered master keys; the highest number wraps, all of them unwrap."""
 
     keys: dict[int, bytes] = field(repr=False)
+    _ciphers: dict[int, AESGCM] = field(init=False, default_factory=dict, repr=False, compare=False)
 
     @classmethod
     def generate(cls) -> MasterKeys:
@@ -52,29 +56,35 @@ class MasterKeys:
 
     def wrap(self, key: bytes, *, context: bytes) -> bytes:
         """Seal ``key`` and bind it to ``context``."""
-        from cryptography.hazmat.primitives.ciphers.aead import AESGCM
-
-        head = bytes([_VERSION]) + self.current.to_bytes(4, "big")
+        number = self.current
+        head = bytes([_VERSION]) + number.to_bytes(4, "big")
         nonce = os.urandom(_NONCE_OCTETS)
-        return head + nonce + AESGCM(self.keys[self.current]).encrypt(nonce, key, head + context)
+        return head + nonce + self._cipher(number).encrypt(nonce, key, head + context)
 
     def unwrap(self, wrapped: bytes, *, context: bytes) -> bytes:
         """Open a wrapped key; raises VaultFailure if it is damaged, moved, or of another master key."""
         from cryptography.exceptions import InvalidTag
-        from cryptography.hazmat.primitives.ciphers.aead import AESGCM
 
         head, nonce, sealed = wrapped[:_HEAD_OCTETS], wrapped[_HEAD_OCTETS:][:_NONCE_OCTETS], wrapped[17:]
         if len(sealed) < 16 or head[0] != _VERSION:
             raise VaultFailure("A wrapped key in the store is damaged.", hint=_DAMAGED)
-        master = self.keys.get(int.from_bytes(head[1:], "big"))
-        if master is None:
+        number = int.from_bytes(head[1:], "big")
+        if number not in self.keys:
             raise VaultFailure("A key in the store is wrapped under a master key that the vault lacks.", hint=_DAMAGED)
         try:
-            return AESGCM(master).decrypt(nonce, sealed, head + context)
+            return self._cipher(number).decrypt(nonce, sealed, head + context)
         except InvalidTag:
             raise VaultFailure(
                 "A wrapped key in the store does not belong to this vault, node, epoch or slot.", hint=_DAMAGED
             ) from None
+
+    def _cipher(self, number: int) -> AESGCM:
+        """The cipher of one master key, made once: a handover opens ten thousand keys."""
+        from cryptography.hazmat.primitives.ciphers.aead import AESGCM
+
+        if number not in self._ciphers:
+            self._ciphers[number] = AESGCM(self.keys[number])
+        return self._ciphers[number]
 
 
 @dataclass(frozen=True)

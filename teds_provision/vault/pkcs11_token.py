@@ -39,9 +39,12 @@ class TokenKey:
 
     def sign(self, message: bytes) -> bytes:
         """SIG(key, message): CKM_ECDSA over the SHA-256 made here, s brought into the lower half."""
+        return self.sign_digest(hashlib.sha256(message).digest())
+
+    def sign_digest(self, digest: bytes) -> bytes:
+        """The same by the SHA-256 of the message."""
         from pkcs11 import Mechanism
 
-        digest = hashlib.sha256(message).digest()
         return normalise_signature(guarded(lambda: bytes(self._key.sign(digest, mechanism=Mechanism.ECDSA))))
 
     def ecdh(self, peer: bytes) -> bytes:

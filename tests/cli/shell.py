@@ -59,6 +59,11 @@ def clean_environment(**more: str) -> dict[str, str]:
     return kept | more
 
 
+def unmeasured_environment() -> dict[str, str]:
+    """A clean environment in which coverage, which loads modules of its own, does not start."""
+    return {name: value for name, value in clean_environment().items() if not name.startswith("COVERAGE_")}
+
+
 def spawn(*words: object, passphrase: str | None = None, environment: dict[str, str] | None = None) -> Outcome:
     """Run the program as a process of its own; ``passphrase`` is given through --passphrase-fd."""
     command = [sys.executable, "-m", "teds_provision"]

@@ -29,7 +29,7 @@ def test_an_ended_demo_takes_its_node_and_its_folder_away(tmp_path: Path, number
             assert process.poll() is None
             time.sleep(0.02)
         process.send_signal(number)
-        process.communicate(timeout=30)  # ends only when the node, which has the same stdout or none, lets go
+        process.communicate(timeout=60)  # ends only when the node, which has the same stdout or none, lets go
     finally:
         process.kill()
     assert process.returncode == 130

@@ -59,3 +59,20 @@ def test_a_broken_config_stops_every_command_but_doctor(home: Path) -> None:
     config = {one["name"]: one for one in call(home, "--json", "doctor").json["checks"]}["config"]
     assert "provision.profle" in config["why"]
     assert "no_input" not in config["why"]
+
+
+def test_values_that_no_command_takes_and_profiles_that_cannot_be_read_are_told(home: Path) -> None:
+    """Both were passed over: only ``config show`` and the command itself said so."""
+    (home / "config.toml").write_bytes(b"\xef\xbb\xbf[provision]\ntimeout = -3\n")
+    (home / "profiles").mkdir()
+    (home / "profiles" / "mine.toml").write_text("x = [")
+    done = call(home, "--json", "doctor")
+    checks = {one["name"]: one for one in done.json["checks"]}
+    assert done.code == 1
+    assert (checks["config"]["result"], "provision.timeout = -3" in checks["config"]["why"]) == ("failed", True)
+    assert (checks["profiles"]["result"], "profile mine" in checks["profiles"]["why"]) == ("failed", True)
+    (home / "config.toml").write_bytes(b"\xff\xfe=")
+    assert call(home, "--json", "nodes").json["error"]["message"].endswith("is not valid TOML: it is no UTF-8 text.")
+    (home / "profiles" / "mine.toml").write_text('extends = "load-cell"\ntitle = "mine"\n')
+    (home / "config.toml").write_text("[provision]\ntimeout = 3\n")
+    assert call(home, "--json", "doctor").json["failed"] == 0

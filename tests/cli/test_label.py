@@ -50,6 +50,29 @@ def test_any_separator_and_a_french_keyboard_are_read(uuid: bytes, key: bytes, s
     assert read_label(text.translate(FRENCH)) == (uuid, key.hex())
 
 
+@pytest.mark.parametrize(
+    ("keys", "typed"),
+    [
+        ("ABCDEFTS:", "ФИСВУАЕЫЖ"),
+        ("abcdefts:", "фисвуаеыЖ"),
+        ("ABCDEFTS:", "ФИСВУАЕІЖ"),
+        ("ABCDEFTS:", "AXJE>UYOS"),
+        ("abcdefts:", "axje.uyoS"),
+        ("ABCDEFTS:", "ΑΒΨΔΕΦΤΣ¨"),
+        ("abcdefts:", "αβψδεφτσ¨"),
+        ("ABCDEFTS:", "UÇVEĞAOİŞ"),
+        ("abcdefts:", "uçveğaoiŞ"),
+        ("ABCDEFTS:", "ABCDEFTSÖ"),
+        ("ABCDEFTS:", "ABCDEFTSŞ"),
+    ],
+    ids=["ru", "ru small", "uk", "dvorak", "dvorak small", "el", "el small", "tr-f", "tr-f small", "de", "tr-q"],
+)
+def test_layouts_that_have_other_letters_are_read(keys: str, typed: str) -> None:
+    text = Label(bytes.fromhex(UUID), KEY).text
+    text = text if keys.isupper() else text.lower()
+    assert read_label(text.translate(str.maketrans(keys, typed))) == (bytes.fromhex(UUID), KEY)
+
+
 @given(st.text(max_size=100))
 def test_other_words_are_no_label(text: str) -> None:
     if not text.strip().upper().startswith("TEDS"):

@@ -8,8 +8,9 @@ from pathlib import Path
 import pytest
 
 from tests.bench import PASSPHRASE, make_station
-from tests.e2e.desk import Desk, Node, free_port
+from tests.e2e.desk import Desk, Node
 from tests.handover.desk import trust
+from tests.places import free_bus
 
 from .shell import Outcome, spawn
 
@@ -29,7 +30,7 @@ class Yard:
         north.close()
         south.close()
         self.bus = ["--via", "can", "--can", self.desk.links.can]
-        self.nowhere = ["--via", "can", "--can", f"udp_multicast:239.74.163.2?port={free_port()}", "--timeout", "1"]
+        self.nowhere = ["--via", "can", "--can", free_bus(), "--timeout", "1"]
 
     def run(self, home: str, *words: object) -> Outcome:
         return spawn("--home", self.homes[home], "--json", *words, passphrase=PASSPHRASE)

@@ -94,7 +94,7 @@ def test_following_gives_one_object_per_line_until_it_is_ended(home: Path, numbe
         call(home, "whitelist", "add", ONE)
         assert json.loads(follower.stdout.readline())["uuid"] == ONE
         follower.send_signal(number)
-        _, err = follower.communicate(timeout=20)
+        _, err = follower.communicate(timeout=60)
     finally:
         follower.kill()
     assert follower.returncode == code
@@ -170,7 +170,7 @@ def test_a_terminal_of_80_columns_cuts_nothing_off(home: Path) -> None:
                 said += os.read(ours, 4096)
             except OSError:
                 break
-        assert process.wait(30) == 0
+        assert process.wait(60) == 0
     os.close(ours)
     lines = said.decode().splitlines()
     assert max(map(len, lines)) <= 80

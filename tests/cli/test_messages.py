@@ -8,6 +8,8 @@ missing (tests/teds/test_plot.py), no node of ours on a bus (tests/e2e/test_many
 from __future__ import annotations
 
 import errno
+import re
+import time
 from pathlib import Path
 
 import pytest
@@ -15,7 +17,9 @@ import pytest
 from teds_provision.errors import NoNode, NoReader
 from teds_provision.links.can import bus as can_bus
 from teds_provision.links.can.spec import parse_spec
-from teds_provision.links.nfc.reader import NfcPort
+from teds_provision.links.nfc.port import NfcPort
+from teds_provision.trace import lines
+from teds_provision.trace.record import Record
 from tests.bench import PASSPHRASE
 
 from .shell import call, spawn
@@ -39,6 +43,15 @@ UUID = "8d4d9da65281f7000000"
         (["provision", "--report", "x.pdf", "--batch", "hello.txt"], 2, "neither CSV nor HTML", "FILE.html"),
         (["provision", "--batch", "hello.txt"], 8, "hello.txt:1: there is no column 'hello'", "Mend the sheet"),
         (["provision", "--name", "", "-p", "load-cell"], 2, "A name has 1 to 120 octets", ""),
+        (["provision", "--name", "a\nb", "-p", "load-cell"], 2, "A name is one line of printable characters", ""),
+        (["handover", "receipt", "hello.txt"], 8, "hello.txt is no receipt", "import-keys"),
+        (["whitelist", "import", "empty"], 8, "empty is empty: it lists no node", "CSV"),
+        (["verify", "empty"], 8, "empty is no TEDS image: The TEDS image is empty", "build, sign and read"),
+        (["verify", "octets"], 8, "octets is no TEDS image: The TEDS image is no text", "build, sign and read"),
+        (["sign", "folder"], 3, "folder is a folder", ""),
+        (["verify", "/dev/null"], 3, "/dev/null is no regular file", ""),
+        (["nodes", "--due", "soon"], 2, "'soon' is no whole number", ""),
+        (["write", "8d4d", "--from", "last"], 2, "'last' is no whole number", ""),
         (["init", "--name", "another"], 2, "There is a station", "--name"),
         (["init", "--keystore", "keyring"], 2, "There is a station", "--keystore"),
     ],
@@ -47,13 +60,16 @@ def test_a_message_names_what_it_is(
     home: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, words: list[str], code: int, said: str, cure: str
 ) -> None:
     (tmp_path / "hello.txt").write_text("hello\n")
+    (tmp_path / "empty").touch()
+    (tmp_path / "folder").mkdir()
+    (tmp_path / "octets").write_bytes(b"\xe4" * 9)
     (tmp_path / "some.json").write_text('{"a": 1}\n')
     monkeypatch.chdir(tmp_path)
     told = call(home, "--json", *words)
     assert told.code == code, told
     assert said in told.json["error"]["message"]
     assert cure in told.json["error"]["hint"]
-    for word in ("base64url", "JWE", "float range", "hold it flat", "054c:"):
+    for word in ("base64url", "JWE", "JWS", "codec", "float range", "integer range", "hold it flat", "054c:"):
         assert word not in told.out
 
 
@@ -107,3 +123,88 @@ def test_replacing_a_node_without_name_prints_no_none(home: Path) -> None:
     station.close()
     told = spawn("--home", home, "replace", UUID, UUID[:-1] + "1", "--dry-run", passphrase=PASSPHRASE)
     assert (told.code, "None" in told.out, "without name and profile" in told.out) == (0, False, True), told
+
+
+def test_a_name_that_no_file_can_have_is_called_that_and_is_no_bug(home: Path, tmp_path: Path) -> None:
+    long, loop, file = "x" * 5000, tmp_path / "loop", tmp_path / "file"
+    loop.symlink_to(loop)
+    file.write_text("x")
+    wrong = []
+    for words, code in (
+        (["trust", "ca", "export", long], 3),
+        (["init", "--request", long], 3),
+        (["identify", "--trace", long, "--timeout", "1"], 3),
+        (["build", UUID, "-p", "load-cell", "-c", long], 3),
+        (["sign", long], 3),
+        (["trust", "ca", "export", str(loop / "x")], 3),
+        (["profile", "new", "thing", "-o", str(file / "x")], 2),
+        (["whitelist", "export", ""], 2),
+        (["import-keys", ""], 3),
+        (["group", "delete", "\udcff"], 8),
+        (["group", "create", "\udcff", UUID], 2),
+        (["log", "--act", "\udcff"], 8),
+        (["profile", "new", "thing", "-o", "/dev/full"], 2),  # which can be read without end
+    ):
+        told = call(home, "--json", *words)
+        if told.code != code or "bug" in told.out or len(told.out) > 700:
+            wrong.append((words[:3], told.code, told.out[:200]))
+    assert not wrong
+
+
+def test_a_group_of_any_script_is_made_changed_and_deleted(home: Path) -> None:
+    """64 characters are a name, whatever their length in octets; and a name that nobody gave leaves no file."""
+    name = "名" * 64
+    for words in (
+        ["create", name],
+        ["add", name, UUID],
+        ["remove", name, UUID],
+        ["delete", name],
+        ["delete", "x" * 999],
+    ):
+        told = call(home, "--json", "group", *words)
+        assert told.code == 0, told
+    assert len([path for path in home.iterdir() if path.name.startswith("measuring-")]) == 1
+
+
+def test_a_number_that_is_none_is_no_number_of_anything(home: Path) -> None:
+    """NaN is within all bounds of click; a rate of NaN measured nothing and ended well."""
+    for words in (
+        ["identify", "--timeout", "nan"],
+        ["identify", "--timeout", "inf"],
+        ["measure", UUID, "--rate", "nan"],
+        ["measure", UUID, "--rate", "inf"],
+        ["measure", UUID, "--duration", "nan"],
+        ["measure", UUID, "--scalar-rate", "nan"],
+        ["set", UUID, "1", "1", "--hold", "nan"],
+        ["set", UUID, "1", "nan"],
+        ["node", "run", "nowhere", "--battery", "nan"],
+    ):
+        told = call(home, "--json", *words)
+        assert told.code == 2, told
+        assert "finite" in told.json["error"]["message"], told
+
+
+def test_a_list_that_breaks_off_is_one_json_object_all_the_same(home: Path, tmp_path: Path) -> None:
+    """What was told before stands, the error beside it, and its code is the command's."""
+    line = lines.line(Record(1.0, "out", "can", "frame", b"\1", "a frame"))
+    (tmp_path / "b.trace").write_bytes(lines.head() + line + b"{]\n" + line)
+    told = call(home, "--json", "trace", "show", tmp_path / "b.trace")
+    assert told.code == 8
+    assert len(told.json["frames"]) == 1
+    assert told.json["error"]["code"] == "bad-data"
+
+
+def test_people_see_their_own_time_with_its_offset(home: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """cli.md: local time with offset for people, ISO 8601 with Z in JSON."""
+    call(home, "whitelist", "add", UUID)
+    monkeypatch.setenv("TZ", "Asia/Tokyo")
+    time.tzset()
+    try:
+        told = call(home, "whitelist", "list").out
+        assert "+09:00" in told
+        assert not re.search(r"\dZ\b", told)
+        (entry,) = call(home, "--json", "whitelist", "list").json["whitelist"]
+        assert entry["added"].endswith("Z")
+    finally:
+        monkeypatch.undo()
+        time.tzset()

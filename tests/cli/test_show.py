@@ -9,6 +9,9 @@ import pytest
 
 from teds_provision import teds
 from teds_provision.cli.main import run
+from teds_provision.limits import LIMITS
+from teds_provision.protocol.handover.jose import encrypt
+from teds_provision.protocol.keys import SoftwareKey
 from teds_provision.teds.codec.security import initial
 from teds_provision.teds.formats import Block, read_blocks, write_blocks
 from teds_provision.teds.image import Image
@@ -178,16 +181,45 @@ def test_a_message_is_shown_with_the_teds_inside(show):
 
 
 def test_a_bundle_shows_its_header_alone(show, show_json, tmp_path):
-    from teds_provision.protocol.handover import jose
-    from teds_provision.protocol.keys import SoftwareKey
-
-    sealed = jose.encrypt(b"x", [SoftwareKey.generate().point], cty="JWS")
+    sealed = encrypt(b"x", [SoftwareKey.generate().point], cty="JWS")
     path = tmp_path / "bundle.json"
     path.write_bytes(sealed)
     code, out, _ = show(path)
     assert (code, "sealed handover bundle" in out) == (0, True)
     code, shown = show_json(path)
     assert (code, shown["teds"], len(shown["bundles"])) == (0, [], 1)
+
+
+def test_a_bundle_longer_than_any_file_of_teds_shows_its_header(show, tmp_path):
+    """It was called no file of TEDS."""
+    sealed = encrypt(b"\0" * (26 << 20), [SoftwareKey.generate().point], cty="JWS")
+    assert len(sealed) > LIMITS.teds_file
+    path = tmp_path / "bundle.json"
+    path.write_bytes(sealed)
+    code, out, _ = show(path)
+    assert (code, "sealed handover bundle" in out) == (0, True)
+
+
+@pytest.mark.parametrize(
+    ("octets", "what", "command"),
+    [
+        (b'{"format":"teds-backup/2","store":"x"}\n', "a backup", "restore"),
+        (b"\x89MCAP0\r\n" + bytes(100), "a recording", "mcap info"),
+        (b"\n\r\r\n" + bytes(100), "a trace", "trace show"),
+        (b'{"format": "teds-trace/1"}\n', "a trace", "trace show"),
+        (b'{"format":"teds-backup/2"}' + bytes(33 << 20), "a backup", "restore"),
+        (bytes(33 << 20), "it has more than 32 MiB", ""),
+    ],
+    ids=["backup", "mcap", "pcapng", "trace", "long backup", "long"],
+)
+def test_another_file_of_this_program_is_called_what_it_is(show, tmp_path, octets, what, command):
+    path = tmp_path / "file"
+    path.write_bytes(octets)
+    code, _, err = show(path)
+    assert code == 8
+    assert "file holds no TEDS: " in err
+    assert what in err
+    assert command in err
 
 
 def test_several_files_are_told_apart(show, show_json):

@@ -4,47 +4,38 @@ from __future__ import annotations
 
 import json
 import os
-import random
 import re
 import selectors
 import signal
-import socket
 import sqlite3
 import subprocess
 import sys
 import time
-from contextlib import closing, suppress
+from contextlib import closing
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+from teds_provision.node.described import create
 from teds_provision.store import Store
 from tests.bench import PASSPHRASE
 from tests.cli.shell import Outcome, clean_environment
+from tests.pace import PATIENCE, until
+from tests.places import free_bus, free_reader
 
 ROOT = Path(__file__).resolve().parents[2]
 PROGRAM = (sys.executable, "-m", "teds_provision")
 ANGLE = "magnetic-angular-position-sensor"
 FINGER = "tactile-finger-sensor"
-WATCHED = 25.0
 _TIMES = re.compile(r"\d{4}-\d\d-\d\dT[\d:.]+Z?")
-
-
-def free_port() -> int:
-    """A UDP port of 127.0.0.1 that nobody has, below those that the system deals out to others a moment later."""
-    while True:
-        port = random.SystemRandom().randrange(10_000, 32_000)
-        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe, suppress(OSError):
-            probe.bind(("127.0.0.1", port))
-            return port
 
 
 @dataclass(frozen=True)
 class Links:
     """A reader and a bus that nobody else uses."""
 
-    nfc: str = field(default_factory=lambda: f"udp:localhost:{free_port()}")
-    can: str = field(default_factory=lambda: f"udp_multicast:239.74.163.2?port={free_port()}")
+    nfc: str = field(default_factory=free_reader)
+    can: str = field(default_factory=free_bus)
 
     def over(self, via: str) -> list[str]:
         """The user's options for one of them."""
@@ -109,30 +100,30 @@ class Running:
                 self.err += octets.decode()
         return came
 
-    def wait_for(self, text: str, seconds: float = WATCHED) -> None:
+    def wait_for(self, text: str, seconds: float = PATIENCE) -> None:
         """Wait until ``text`` stands on stdout or stderr."""
-        until = time.monotonic() + seconds
+        end = time.monotonic() + seconds
         while text not in self.out + self.err:
-            assert time.monotonic() < until, f"no {text!r} in {self.out!r} {self.err!r}"
+            assert time.monotonic() < end, f"no {text!r} in {self.out!r} {self.err!r}"
             if not self._selector.get_map():
                 raise AssertionError(f"ended without {text!r}: {self.out!r} {self.err!r}")
             self.read(0.1)
 
-    def wait_for_lines(self, count: int, seconds: float = WATCHED) -> list[Any]:
+    def wait_for_lines(self, count: int, seconds: float = PATIENCE) -> list[Any]:
         """Wait for ``count`` lines of JSON on stdout and return them."""
-        until = time.monotonic() + seconds
+        end = time.monotonic() + seconds
         while self.out.count("\n") < count:
-            assert time.monotonic() < until, f"not {count} lines: {self.out!r} {self.err!r}"
+            assert time.monotonic() < end, f"not {count} lines: {self.out!r} {self.err!r}"
             assert self._selector.get_map(), f"ended before line {count}: {self.out!r} {self.err!r}"
             self.read(0.1)
         return [json.loads(line) for line in self.out.splitlines()]
 
-    def end(self, seconds: float = WATCHED) -> Outcome:
+    def end(self, seconds: float = PATIENCE) -> Outcome:
         """Wait for its end by itself."""
-        until = time.monotonic() + seconds
-        while self._selector.get_map() and time.monotonic() < until:
+        end = time.monotonic() + seconds
+        while self._selector.get_map() and time.monotonic() < end:
             self.read(0.1)
-        code = self.process.wait(max(0.1, until - time.monotonic()))
+        code = self.process.wait(max(0.1, end - time.monotonic()))
         return Outcome(code, self.out, self.err)
 
     def signal(self, number: int) -> None:
@@ -143,7 +134,7 @@ class Running:
         """End it, whatever it does."""
         if self.process.poll() is None:
             self.process.kill()
-        self.process.wait(10)
+        self.process.wait(PATIENCE)
         self._selector.close()
         for stream in (self.process.stdout, self.process.stderr):
             assert stream is not None
@@ -176,12 +167,10 @@ class Desk:
         return Station(self, home)
 
     def node(self, name: str = "node", *, uuid: str | None = None, called: str = "") -> Node:
-        """A new node in factory state, made by command."""
-        folder = self.folder / name
-        words = ["--json", "node", "create", folder, *(["--uuid", uuid] if uuid else []), "--name", called]
-        made = self.start(*words).end()
-        assert made.code == 0, made
-        return Node(self, folder, made.json["uuid"])
+        """A new node in factory state, made in this process: what the command does is in tests/node."""
+        made = create(self.folder / name, uuid=bytes.fromhex(uuid) if uuid else None, name=called)
+        made.release()
+        return Node(self, self.folder / name, made.load().uuid.hex())
 
 
 @dataclass
@@ -218,10 +207,7 @@ class Node:
         """Hold its button, and wait until it is in factory state."""
         assert self.process is not None
         self.process.signal(signal.SIGUSR1)
-        until = time.monotonic() + 5
-        while self.flash["key"] is not None:
-            assert time.monotonic() < until
-            time.sleep(0.02)
+        until(lambda: self.flash["key"] is None)
 
     @property
     def octets(self) -> bytes:
@@ -253,7 +239,7 @@ class Station:
 
     def run(self, *words: object, **more: Any) -> Outcome:
         """Run a command to its end."""
-        return self.start(*words, **more).end(40)
+        return self.start(*words, **more).end()
 
     def ask(self, *words: object, code: int = 0, **more: Any) -> Any:
         """Run a command with --json to its end; its one object. The exit code must be ``code``."""

@@ -52,7 +52,7 @@ def test_two_runs_of_one_station_at_once_end_well_one_after_the_other(station: S
     first = station.start(*words, f"{station.desk.links.can}&source=0xF1", UUIDS[0])
     second = station.start(*words, f"{station.desk.links.can}&source=0xF2", UUIDS[1])
     for command, uuid in ((first, UUIDS[0]), (second, UUIDS[1])):
-        outcome = command.end(40)
+        outcome = command.end()
         assert outcome.code == 0, outcome
         assert (outcome.json["uuid"], outcome.json["verdict"]) == (uuid, "authentic")
     assert station.log_is_whole()
@@ -61,7 +61,7 @@ def test_two_runs_of_one_station_at_once_end_well_one_after_the_other(station: S
 def test_the_same_command_twice_at_once_provisions_once(station: Station, bus: list[Node]) -> None:
     words = ["--json", "provision", UUIDS[0], "--profile", ANGLE, "--yes", "--via", "can", "--can"]
     commands = [station.start(*words, f"{station.desk.links.can}&source={source}") for source in ("0xF1", "0xF2")]
-    outcomes = [command.end(40) for command in commands]
+    outcomes = [command.end() for command in commands]
     assert [outcome.code for outcome in outcomes] == [0, 0], outcomes
     written = sorted(results(outcome.json)["write"] for outcome in outcomes)
     assert written == ["done", "nothing to do"]
@@ -78,7 +78,7 @@ def test_two_owners_race_for_a_new_node_and_one_has_it(desk: Desk, delay: str) -
         owner.start(*words, f"{desk.links.can}&source={source}")
         for owner, source in zip(owners, ("0xF1", "0xF2"), strict=True)
     ]
-    outcomes = [command.end(40) for command in commands]
+    outcomes = [command.end() for command in commands]
     assert sorted(outcome.code for outcome in outcomes) == [0, 6], outcomes
     won = [outcome.code for outcome in outcomes].index(0)
     assert owners[won].ask("verify", node.uuid, *desk.links.over("can"))["verdict"] == "authentic"

@@ -110,7 +110,7 @@ def test_a_person_is_asked_on_a_terminal_and_may_say_no(station: Station, node: 
         while b"[y/N]" not in said:
             said += os.read(ours, 4096)
         os.write(ours, b"n\n")
-        out, _ = process.communicate(timeout=20)
+        out, _ = process.communicate(timeout=60)
     finally:
         process.kill()
         process.wait()

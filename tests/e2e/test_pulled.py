@@ -43,7 +43,7 @@ def boards(tmp_path: Path) -> Iterator[list[tuple[str, str]]]:
     assert process.stdout
     yield list(zip(json.loads(process.stdout.readline()), paths, strict=True))
     process.stdin.close()
-    process.wait(10)
+    process.wait(60)
     process.stdout.close()
 
 
@@ -106,7 +106,7 @@ def serial(field: Field) -> Iterator[tuple[str, subprocess.Popen[str]]]:
     yield f"tty:{name}:pn532", process
     if process.poll() is None:
         process.terminate()
-        process.wait(10)
+        process.wait(60)
     process.stdout.close()
 
 
@@ -132,5 +132,5 @@ def test_a_pn532_needs_few_host_commands_and_one_lost_answer_is_not_told(
     again = station.run("--json", "verify", uuid, "--nfc", place)
     assert again.code == 0, again
     process.terminate()
-    commands = int(process.communicate(timeout=10)[0].split()[-1])
+    commands = int(process.communicate(timeout=60)[0].split()[-1])
     assert commands < 500, f"{commands} host commands for provision and verify; 786 before, with identify"

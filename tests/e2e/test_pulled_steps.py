@@ -14,7 +14,7 @@ import pytest
 
 from teds_provision.errors import LinkFailure
 from teds_provision.links import LinkSettings
-from teds_provision.links.nfc import reader
+from teds_provision.links.nfc import port
 from teds_provision.station.station import Station as BaseStation
 from teds_provision.steps.many.boards import Boards, Questions, Request
 from teds_provision.steps.order import BuildOrder
@@ -80,7 +80,7 @@ def pull_at_each(home: Path, field: Field, path: str, lying: list[tuple[str, str
 def test_above_the_udp_driver(
     station: Station, field: Field, boards: list[tuple[str, str]], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(reader, "RETURN_WITHIN", 0.5)
+    monkeypatch.setattr(port, "RETURN_WITHIN", 0.5)
     pull_at_each(station.home, field, field.path, boards)
 
 
@@ -91,7 +91,7 @@ def test_above_the_pn53x_driver(
     serial: tuple[str, subprocess.Popen[str]],
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr(reader, "RETURN_WITHIN", 0.5)
+    monkeypatch.setattr(port, "RETURN_WITHIN", 0.5)
     pull_at_each(station.home, field, serial[0], boards)
 
 

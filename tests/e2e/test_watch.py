@@ -6,7 +6,9 @@ import signal
 
 import pytest
 
-from .desk import ANGLE, Desk, Links, Node, Station, free_port, results
+from tests.places import free_reader
+
+from .desk import ANGLE, Desk, Links, Node, Station, results
 
 pytestmark = pytest.mark.link
 
@@ -103,7 +105,7 @@ def test_a_person_reads_one_line_for_each_node(station: Station, node: Node) -> 
 def test_several_readers_serve_several_taps_and_a_slow_board_holds_nobody_up(desk: Desk, station: Station) -> None:
     """Two readers; the board on one takes its time over each point operation, the other one passes meanwhile."""
     slow, quick = desk.node("slow"), desk.node("quick")
-    ports = [desk.links.nfc, f"udp:localhost:{free_port()}"]
+    ports = [desk.links.nfc, free_reader()]
     words = ["--json", "provision", "--watch", "--yes", "-p", ANGLE, "--nfc", ports[0], "--nfc", ports[1]]
     watch = station.start(*words)
     slow.start("--crypto-delay", "700")

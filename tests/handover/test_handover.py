@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 import stat
 from collections.abc import Iterator
@@ -11,11 +12,11 @@ from pathlib import Path
 
 import pytest
 
-from teds_provision.errors import NodeRefused, NotAuthentic, NotFound, PolicyRefused, UsageFailure
+from teds_provision.errors import BadData, NodeRefused, NotAuthentic, NotFound, PolicyRefused, UsageFailure
 from teds_provision.handover.export_keys import export_keys, plan_export
 from teds_provision.handover.import_keys import Imported, ImportPlan, import_keys, plan_import
-from teds_provision.handover.pending import close, find_handover, list_handovers, undo
-from teds_provision.handover.prove import is_proven, prove_node
+from teds_provision.handover.pending import close, content_digest, find_handover, list_handovers, undo
+from teds_provision.handover.prove import prove_node, proven_of
 from teds_provision.handover.selection import ExportOrder
 from teds_provision.protocol.agreement import key_id
 from teds_provision.protocol.handover.bundle import open_bundle
@@ -121,6 +122,40 @@ def test_a_copy_for_several_is_closed_by_the_last_receipt(pair: Pair, tmp_path: 
 # -- move -------------------------------------------------------------------------------------------------------------
 
 
+def test_a_handover_is_known_by_the_digest_that_earlier_versions_noted() -> None:
+    nodes = [(bytes([number]) * 10, f"{number:016x}", number) for number in (1, 2, 255)]
+    said = [
+        "ab" * 32,
+        ["cd" * 32, "ef" * 32],
+        "copy",
+        "04" * 65,
+        [[uuid.hex(), key, epoch] for uuid, key, epoch in nodes],
+    ]
+    whole = hashlib.sha256(json.dumps(said, separators=(",", ":")).encode()).hexdigest()
+    assert content_digest("ab" * 32, ["ef" * 32, "cd" * 32], "copy", b"\x04" * 65, nodes) == whole
+
+
+def test_what_lies_there_before_the_key_rests_opens_for_nobody(pair: Pair, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A run that is killed before the store has the move leaves a draft at most, without signature and tag."""
+    left: list[bytes] = []
+
+    def dying(*_: object) -> None:
+        (draft,) = (path for path in pair.folder.glob(".*") if path.name.endswith(".teds-part"))
+        left.append(draft.read_bytes())
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr("teds_provision.handover.export_keys._record", dying)
+        with pytest.raises(KeyboardInterrupt):
+            pair.export("move")
+    assert not pair.north.policy.tombstones()
+    assert b'"tag"' not in left[0]
+    for closed in (left[0], left[0] + b'"}', left[0] + b'","tag":"AAAAAAAAAAAAAAAAAAAAAA"}'):
+        with pytest.raises((BadData, NotAuthentic)):
+            plan_import(pair.south, closed)
+    assert isinstance(plan_import(pair.south, pair.export("move")[0].read_bytes()), ImportPlan)
+
+
 def test_a_move_rests_the_key_at_once(pair: Pair) -> None:
     _, exported = pair.export("move")
     for act in (session, key_again):
@@ -150,7 +185,7 @@ def test_the_receiver_of_a_move_rotates_at_its_first_contact(pair: Pair) -> None
     assert (proven.rotated, proven.epoch) == (True, 2)
     assert node_key_id(pair.board) != before
     assert held(pair.south, pair.board) == [("active", 2, "agreement")]
-    assert is_proven(pair.south, pair.board.uuid)
+    assert proven_of(pair.south, [pair.board.uuid]) == {pair.board.uuid}
     assert pair.south.keys.holders() == []
     assert pair.south.keys.rotation_due(pair.board.uuid) is None
 
@@ -438,7 +473,7 @@ def test_nodes_of_two_cas_go_in_two_bundles(pair: Pair) -> None:
     from teds_provision.protocol.keys import fingerprint
 
     plan = plan_export(pair.south, ExportOrder(("north",), None, ca=fingerprint(pair.north.ca)[:16]))
-    assert [node.uuid for node, _ in plan.nodes] == [pair.board.uuid]
+    assert [node.uuid for node in plan.nodes] == [pair.board.uuid]
 
 
 def test_a_plan_changes_nothing(pair: Pair) -> None:

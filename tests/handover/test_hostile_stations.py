@@ -4,14 +4,17 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import replace
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
+from typing import BinaryIO
 from uuid import uuid4
 
 import pytest
 
 from teds_provision.errors import PolicyRefused, UsageFailure
+from teds_provision.files import new_file
 from teds_provision.handover.deny import lift
 from teds_provision.handover.export_keys import export_all, export_keys, outputs_of, plan_exports
 from teds_provision.handover.import_keys import Imported, ImportPlan, import_keys, plan_import
@@ -384,14 +387,16 @@ def test_a_move_in_several_bundles_that_was_cut_is_carried_on(
     pair = Pair.make(tmp_path, 5)
     output, written = tmp_path / "all.jwe", []
 
-    def dying(path: Path, octets: bytes) -> None:
+    @contextmanager
+    def dying(path: Path) -> Iterator[BinaryIO]:
         written.append(path)
-        if len(written) == cut:
-            raise KeyboardInterrupt
-        path.write_bytes(octets)
+        with new_file(path) as file:
+            yield file
+            if len(written) == cut:
+                raise KeyboardInterrupt
 
     with monkeypatch.context() as patch:
-        patch.setattr("teds_provision.handover.export_keys.write_new", dying)
+        patch.setattr("teds_provision.handover.export_keys.new_file", dying)
         with pytest.raises(KeyboardInterrupt):
             several(pair, "move", output)
     assert len(pair.north.policy.tombstones()) == 5  # all of them rest before the first file exists

@@ -9,10 +9,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from teds_provision.links import LINKS, Capabilities, Contact
 from teds_provision.node.described import create
 from teds_provision.node.virtual import VirtualNode
-from teds_provision.protocol.messages.identity import Identity
 from teds_provision.station.station import Station
 from teds_provision.steps.agree import agree
 from teds_provision.steps.identify import identify
@@ -21,7 +19,7 @@ from teds_provision.steps.provision import provision
 from teds_provision.store import WhitelistEntry, utc_now
 from teds_provision.talk.conversation import Conversation
 from teds_provision.talk.progress import Silent
-from tests.bench import make_station
+from tests.bench import make_station, on_reader
 from tests.e2e.desk import ANGLE, Desk, Running
 from tests.e2e.desk import Station as Commands
 
@@ -32,24 +30,6 @@ CALIBRATIONS = {
 FAULTY = (sys.executable, "-m", "tests.measure.faulty_node")
 
 
-@dataclass
-class NodeLink:
-    """A virtual node that lies on the reader of this process."""
-
-    node: VirtualNode
-    via: str = "nfc"
-
-    @property
-    def capabilities(self) -> Capabilities:
-        return LINKS[self.via].capabilities
-
-    def exchange(self, frame: bytes) -> bytes:
-        return self.node.request(self.via, frame, tapped=True)
-
-    def close(self) -> None:
-        self.node.lost(self.via)
-
-
 def provisioned(station: Station, folder: Path, type_: str, name: str) -> str:
     """Make a node of this type, and provision it; its UUID. ``keyed:TYPE`` gets a key, and no datasheet is signed."""
     keyed, type_ = type_.startswith("keyed:"), type_.removeprefix("keyed:")
@@ -57,9 +37,8 @@ def provisioned(station: Station, folder: Path, type_: str, name: str) -> str:
     node = VirtualNode(folder)
     calibration = folder / "calibration.csv"
     calibration.write_text(CALIBRATIONS[type_])
-    contact = Contact(Identity.decode(node.identify()), NodeLink(node), tag_uid=b"\x04" + bytes(6))
     order = BuildOrder(type_, calibration=calibration, name=name)
-    with Conversation(contact, notice=lambda _notice: None) as talk:
+    with Conversation(on_reader(node), notice=lambda _notice: None) as talk:
         if keyed:
             who = identify(station, talk)
             agree(station, talk, who, newcomer=WhitelistEntry(talk.uuid, who.fingerprint, utc_now(), "tap", name))
@@ -138,7 +117,7 @@ class Hall:
 
     def measure(self, *words: object, code: int = 0, **more: Any) -> list[dict[str, Any]]:
         """Measure to the end; the events."""
-        outcome = self.begin(*words, **more).end(60)
+        outcome = self.begin(*words, **more).end()
         assert outcome.code == code, outcome
         return events(outcome.out)
 
@@ -171,7 +150,7 @@ def states(lines: list[dict[str, Any]]) -> list[str]:
 def crowd(can: str, folders: list[Path], desk: Desk) -> Running:
     """Many nodes in one process."""
     process = desk.start("--json", "node", "run", *folders, "--can", can, "--source", "ramp:2")
-    process.wait_for('"ready": true', 60)
+    process.wait_for('"ready": true')
     return process
 
 

@@ -45,15 +45,15 @@ def test_a_bus_that_dies_is_opened_again_when_it_is_back(hall: Hall) -> None:
     try:
         hall.nodes["a"].start(can=hub.spec)
         running = hall.begin(hall.nodes["a"].uuid, "--rate", 20, can=hub.spec)
-        running.wait_for('"event":"data"', 60)
+        running.wait_for('"event":"data"')
         hub.close()
-        running.wait_for('"state":"lost"', 60)
+        running.wait_for('"state":"lost"')
         hub = Hub(port=port)
         wait_for_count(running, '"state":"running"', 2)
         data = running.out.count('"event":"data"')
         wait_for_count(running, '"event":"data"', data + 5)
         running.signal(signal.SIGTERM)
-        outcome = running.end(60)
+        outcome = running.end()
     finally:
         hub.close()
     assert outcome.code == 0, outcome.err
@@ -72,7 +72,7 @@ def test_a_full_disk_ends_that_recording_and_nothing_else(hall: Hall, tmp_path: 
     data = running.out.count('"event":"data"')
     wait_for_count(running, '"event":"data"', data + 5)
     running.signal(signal.SIGTERM)
-    outcome = running.end(60)
+    outcome = running.end()
     assert outcome.code == 7, outcome.err
     end = events(outcome.out)[-1]
     assert end["nodes"][0]["streams"][0]["bad"] == 0
@@ -86,13 +86,13 @@ def test_a_reader_that_stalls_holds_up_no_recording(hall: Hall, tmp_path: Path) 
     hall.nodes["a"].start()
     file = tmp_path / "run.csv"
     running = hall.begin(hall.nodes["a"].uuid, "--rate", 500, "--to", file)
-    running.wait_for('"event":"data"', 60)
+    running.wait_for('"event":"data"')
     until = time.monotonic() + 30  # nobody reads its lines from here on: the pipe is full after a second
     before = rows(file)
     while rows(file) < before + 2000:
         assert time.monotonic() < until, "the recording went on"
         time.sleep(0.1)
     running.signal(signal.SIGTERM)
-    outcome = running.end(60)
+    outcome = running.end()
     assert outcome.code == 0, outcome.err
     assert events(outcome.out)[-1]["event"] == "end"

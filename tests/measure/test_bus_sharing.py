@@ -81,5 +81,5 @@ def test_a_node_waits_for_the_others_to_say_what_they_want() -> None:
     thread = threading.Thread(target=first)
     thread.start()
     share.want(SECOND, 0.01)
-    thread.join(5)
+    thread.join(60)
     assert seen == [{FIRST, SECOND}]

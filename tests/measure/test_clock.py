@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import random
+import time
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -11,6 +13,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from teds_provision.measure.clock import AT_FIRST, ClockMap, Exchange, Monotone, Wall
+from teds_provision.measure.running.streams import NodeStreams
+from teds_provision.measure.trusting import exchange_clock
+from teds_provision.protocol.operation.stream_commands import Clock
 
 SECOND = 1_000_000_000
 BOOT = 77 * SECOND  # host time at the node's tick 0
@@ -52,7 +57,7 @@ def run(
         tick = node.tick(taken)
         clock.arrival(tick, taken + node.delay())
         errors.append(float(clock.host(np.array([tick], dtype=np.uint64))[0]) * 1e9 - node.host(tick))
-        bounds.append(clock.bound(tick) * 1e9)
+        bounds.append(clock.line(tick, tick)[2] * 1e9)
     return errors, bounds, clock
 
 
@@ -97,6 +102,62 @@ def test_stamps_of_a_stream_never_go_back_and_a_refit_does_not_step() -> None:
     assert monotone(np.array([2.5, 4.0])).tolist() == [3.0, 4.0]
 
 
+@pytest.mark.parametrize("ppm", [-60, 0, 60])
+def test_the_quickest_request_and_the_quickest_reply_count_not_the_mean(ppm: int) -> None:
+    """A busy machine: of nine exchanges in 27 s one had a quick request, another one a quick reply."""
+    node, clock = Node(ppm), ClockMap()
+    chance = random.Random(7)
+    for k in range(27 * 50):
+        at = BOOT + SECOND + k * SECOND // 50
+        if k % 150 == 0:
+            there = at + (100_000 if k == 300 else chance.randrange(5_000_000, 20_000_000))
+            back = there + 50_000
+            came = back + (100_000 if k == 750 else chance.randrange(5_000_000, 20_000_000))
+            assert clock.exchange(Exchange(at, came, node.tick(there), node.tick(back), 1000, 100)), clock.lie
+        clock.arrival(node.tick(at), at + chance.randrange(3_000_000, 6_000_000))
+    tick = node.tick(at)
+    error = clock.host_of(tick) * 1e9 - node.host(tick)
+    assert abs(error) < 500_000, f"{error / 1e6:.2f} ms"
+    assert abs(error) <= clock.line(tick, tick)[2] * 1e9 + 1_000
+
+
+def test_of_an_exchange_the_link_knows_when_it_left_and_came() -> None:
+    """Sealing, opening and waking up are not the link's delay; a link that does not know is not asked."""
+
+    class Link:
+        left = came = 7.0  # of another exchange
+
+    def ask(link: object, left: float, came: float) -> Exchange:
+        def send(*_: object) -> bytes:
+            if isinstance(link, Link):
+                assert (link.left, link.came) == (0.0, 0.0), "they are asked of this exchange alone"
+                link.left, link.came = left, came
+            return Clock(SECOND, SECOND + 1000, 0, 1, 20, 0).encode()
+
+        clock = ClockMap()
+        node = SimpleNamespace(contact=SimpleNamespace(link=link), send=send)
+        exchange_clock(node, clock)  # type: ignore[arg-type]  # what it asks of a conversation
+        return clock.exchanges[0]
+
+    told = ask(Link(), 77.000001, 77.000102)
+    assert (told.asked, told.answered) == (77_000_001_000, 77_000_102_000)
+    for link in (Link(), object()):
+        before = time.monotonic_ns()
+        own = ask(link, 77.0, 0.0)
+        assert before <= own.asked <= own.answered <= time.monotonic_ns()
+
+
+def test_streams_of_a_clock_that_always_lies_have_the_time_of_their_arrival() -> None:
+    """Not that of the node's start, hours ago, until a hull of arrivals stands."""
+    streams = NodeStreams(Wall.now(), lambda _block: None)
+    sent = 10 * 3600 * SECOND  # its tick
+    lying = Clock(sent + 1, sent, 0, 1, 20, 0).encode()
+    node = SimpleNamespace(contact=SimpleNamespace(link=object()), send=lambda *_: lying)
+    streams.tell_time(SimpleNamespace(node=node))  # type: ignore[arg-type]  # what it asks of a conversation
+    assert "before it received" in streams.clock.lie
+    assert streams.clock.host_of(sent) == pytest.approx(time.monotonic(), abs=10)
+
+
 def test_a_clock_that_lies_is_found() -> None:
     node = Node(0)
     honest = node.exchange(BOOT + SECOND)
@@ -125,14 +186,38 @@ def test_a_lie_moves_no_stamp() -> None:
     assert clock.host(ticks) == before
 
 
+def test_a_clock_that_only_ever_lied_is_stamped_by_when_it_said_so() -> None:
+    """Nothing was known of it, and its samples were stamped with the time at which the node had started."""
+    node, clock = Node(0), ClockMap()
+    one = node.exchange(BOOT + SECOND)
+    clock.exchange(replace(one, sent=one.received - 1))
+    assert "before it received" in clock.lie
+    assert not clock.known
+    assert abs(clock.host_of(one.received) - (BOOT + SECOND) / 1e9) < 1
+    clock = ClockMap()
+    clock.exchange(replace(one, received=2**64 - 2, sent=2**64 - 1))
+    assert "centuries" in clock.lie
+
+
 def test_a_delayed_reply_widens_the_bound_and_moves_nothing_beyond_it() -> None:
     node, clock = Node(0), ClockMap()
     one = node.exchange(BOOT + SECOND)
     clock.exchange(replace(one, answered=one.answered + SECOND))
     tick = node.tick(BOOT + SECOND)
     error = abs(float(clock.host(np.array([tick], dtype=np.uint64))[0]) - (BOOT + SECOND) / 1e9)
-    assert 0.4 < clock.bound(tick) < 0.6
-    assert error <= clock.bound(tick)
+    assert 0.4 < clock.line(tick, tick)[2] < 0.6
+    assert error <= clock.line(tick, tick)[2]
+
+
+def test_a_reply_cannot_have_taken_longer_than_the_exchange() -> None:
+    """operation.md section 5: sent - received > d - a lies; its own drift and the steps of its clock are borne."""
+    asked, took, step, drift = BOOT + SECOND, 10_000_000, 1_000, 100
+    most = round(took * (1 + drift / 1e6)) + 2 * step
+    for inside, lies in ((took, False), (most, False), (most + 10, True), (took * 3 // 2, True), (2 * took, True)):
+        clock = ClockMap()
+        one = Exchange(asked, asked + took, SECOND, SECOND + inside, step, drift)
+        assert clock.exchange(one) is not lies, inside
+        assert ("took longer" in clock.lie) is lies
 
 
 def test_ticks_of_years_keep_their_microseconds() -> None:
@@ -151,6 +236,4 @@ def test_the_present_tick_is_the_inverse_of_the_map() -> None:
 
 
 def test_wall_time_is_read_once() -> None:
-    import time
-
     assert abs(Wall.now().unix(np.array([time.monotonic()]))[0] - time.time()) < 0.5

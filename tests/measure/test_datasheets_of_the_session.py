@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import csv
+import json
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+from mcap.reader import make_reader
 
 from tests.e2e.desk import ANGLE
 from tests.measure.hall import Hall, of, states
@@ -52,7 +54,8 @@ def test_raw_values_of_an_unsigned_datasheet_come_only_where_asked_for_and_are_m
     lines = hall.measure(uuid, "--rate", 20, "--duration", 1, code=4)
     assert not of(lines)
     assert lines[-1]["error"]["code"] == "not-authentic"
-    lines = hall.measure(uuid, "--rate", 20, "--duration", 1, "--unsigned", "--to", file)
+    lines = hall.measure(uuid, "--rate", 20, "--duration", 1, "--unsigned", "--to", file,
+                         "--to", file.with_suffix(".mcap"), "--to", file.with_suffix(".jsonl"))  # fmt: skip
     assert of(lines)
     for line in of(lines):
         assert line["unsigned"] is True
@@ -66,5 +69,13 @@ def test_raw_values_of_an_unsigned_datasheet_come_only_where_asked_for_and_are_m
     rows = list(csv.DictReader(line for line in text if not line.startswith("#")))
     assert {row["note"] for row in rows} == {"unsigned datasheet"}
     assert any('"unsigned": true' in line for line in text if line.startswith("# channel"))
+    told = [json.loads(line) for line in file.with_suffix(".jsonl").read_text().splitlines()]
+    assert all(line["unsigned"] for line in told if line["event"] in ("channel", "data"))
+    with file.with_suffix(".mcap").open("rb") as recording:
+        found = make_reader(recording)
+        streams = [one for one in found.get_summary().channels.values() if "/stream_" in one.topic]
+        channels = [one.metadata for one in found.iter_metadata() if one.name == "channel"]
+    assert all(json.loads(one.metadata["channels"])[0]["unsigned"] is True for one in streams)
+    assert [one["unsigned"] for one in channels] == ["true"]
     signed = of(hall.measure(hall.nodes["a"].uuid, "--rate", 20, "--duration", 1, "--unsigned"))
     assert all("unsigned" not in line and None not in line["value"] for line in signed)

@@ -88,6 +88,18 @@ def test_channels_of_other_groups_are_left_out() -> None:
     assert grid.rows(NOW + 1) is None
 
 
+def test_channels_that_do_not_lie_side_by_side_come_into_their_columns() -> None:
+    """Two streams of one node whose channels take turns, one of them with channels that are not of the group."""
+    facts = [replace(ANGLE, number=number) for number in (1, 2, 3, 4)]
+    grid = Grid("g", facts, patience=0.0)
+    grid.take(block([[3, 9, 1], [30, 9, 10]], channels=(3, 9, 1)))
+    grid.take(replace(block([[4, 2]], channels=(4, 2)), stream=1))
+    got = rows(grid, NOW + 0.0351)
+    np.testing.assert_allclose(got.value[:2], [[0.1, 0.2, 0.3, 0.4], [1.0, 0.2, 3.0, 0.4]])
+    assert np.isnan(got.value[3]).tolist() == [False, True, False, True], "the second stream ended a row earlier"
+    np.testing.assert_allclose(got.age[2], [0.01, 0.02, 0.01, 0.02], atol=1e-6)
+
+
 def test_how_far_apart_streams_began_is_told() -> None:
     grid = Grid("g", [ANGLE, FORCE])
     grid.take(block([[1]]))

@@ -4,16 +4,19 @@ from __future__ import annotations
 
 import threading
 import time
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import pytest
 
 from teds_provision.errors import AddressConflict, NoNode, PolicyRefused
-from teds_provision.measure.carrying.judging import Judging
-from teds_provision.measure.carrying.together import Together
+from teds_provision.links.ports import Contact
 from teds_provision.measure.clock import ClockMap, Exchange
-from teds_provision.measure.finding.lookout import Sighting, Sightings
+from teds_provision.measure.finding.air import AirLookout
+from teds_provision.measure.finding.sightings import MOST, TWIN, Sighting, Sightings
+from teds_provision.measure.running.common_start import CommonStart
+from teds_provision.measure.running.requirements import Requirements
 from teds_provision.protocol.announce import Announce, uuid_crc
 from teds_provision.protocol.messages.identity import Identity, NodeState
 from teds_provision.protocol.operation.stream_commands import SOON, WAITS
@@ -59,8 +62,30 @@ def test_a_node_that_was_seen_is_found_and_one_that_was_not_is_missing_meanwhile
     assert sightings.awaits(Announce(9, 2, uuid_crc(TWO)))
     assert not sightings.awaits(Announce(9, 2, uuid_crc(ONE)))
     sightings.saw(seen(TWO, 9))
-    waiting.join(10)
+    waiting.join(60)
     assert [one.address for one in found] == [9]
+
+
+class EmptyAir:
+    """An adapter that hears nobody."""
+
+    place = "ble:x"
+    rounds = 0
+
+    def everyone(self, **_more: object) -> Iterator[Contact]:
+        self.rounds += 1
+        raise NoNode("Nobody advertises.")
+
+
+def test_who_asks_a_look_out_that_has_nothing_to_do_waits_for_one_round_alone() -> None:
+    air: Any = EmptyAir()
+    lookout = AirLookout(air, Sightings())
+    began = time.monotonic()
+    lookout.discover()
+    lookout.discover()
+    lookout.close()
+    assert air.rounds == 2
+    assert time.monotonic() - began < lookout.LONGEST / 2
 
 
 def test_what_turned_out_wrong_goes_behind_another_that_says_the_same() -> None:
@@ -71,6 +96,38 @@ def test_what_turned_out_wrong_goes_behind_another_that_says_the_same() -> None:
     for one in (seen(ONE, 7), true, seen(ONE, 7)):
         sightings.saw(one)
     assert find(sightings, ONE).address == 8
+
+
+def test_the_node_itself_is_waited_for_where_a_copy_of_its_identity_answers_sooner() -> None:
+    """Who answers at once was taken again and again, and the node, after its random wait, never."""
+    sightings = Sightings()
+    copy, true = seen(ONE, 7), seen(ONE, 8)
+    sightings.saw(copy)
+    sightings.saw(true)
+    sightings.wrong(copy)
+    lost = time.monotonic()
+    sightings.saw(seen(ONE, 7))
+    with pytest.raises(NoNode):
+        find(sightings, ONE, fresh=lost)
+    sightings.saw(seen(ONE, 8))
+    assert find(sightings, ONE, fresh=lost).address == 8
+    sightings.wrong(seen(ONE, 8))
+    alone = time.monotonic()
+    sightings.saw(seen(ONE, 7))
+    assert find(sightings, ONE, seconds=10 * TWIN, fresh=alone).address == 7, "nobody else answers: it is tried again"
+
+
+def test_made_up_uuids_fill_no_memory_and_put_no_node_out() -> None:
+    sightings = Sightings()
+    announced = seen(TWO, 8)
+    sightings.saw(announced)
+    sightings.on_announce(announced, lambda: None)
+    for number in range(3 * MOST):
+        sightings.saw(seen(number.to_bytes(10, "big"), number % 239))
+        if number % 100 == 0:
+            sightings.saw(seen(ONE, 7))  # answers now and then, as everyone is asked every 30 s
+    assert len(sightings.all()) <= MOST
+    assert {ONE, TWO} <= {one.uuid for one in sightings.all()}
 
 
 def test_only_what_was_seen_since_counts_for_a_node_that_was_lost() -> None:
@@ -111,43 +168,43 @@ def clock(offset: int) -> ClockMap:
 
 
 def test_nodes_that_are_there_in_time_begin_at_one_moment_and_a_late_one_when_it_comes() -> None:
-    together = Together({ONE, TWO, THREE}, waiting=0.2)
+    common = CommonStart({ONE, TWO, THREE}, waiting=0.2)
     clocks, ticks = {ONE: clock(10**9), TWO: clock(7 * 10**9)}, dict[bytes, int]()
     threads = [
-        threading.Thread(target=lambda uuid=uuid: ticks.update({uuid: together.start(uuid, clocks[uuid])}))
+        threading.Thread(target=lambda uuid=uuid: ticks.update({uuid: common.start(uuid, clocks[uuid])}))
         for uuid in clocks
     ]
     for thread in threads:
         thread.start()
     for thread in threads:
-        thread.join(10)
+        thread.join(60)
     moments = [clocks[uuid].host_of(tick) for uuid, tick in ticks.items()]
     assert abs(moments[0] - moments[1]) < 1e-4
     assert min(moments) > time.monotonic() - 0.2
-    assert together.apart == pytest.approx(abs(moments[0] - moments[1]), abs=1e-6)
-    assert 0 < together.until(ticks[ONE]) < 1
-    assert together.start(ONE, clocks[ONE]) == SOON, "after a restart it begins by itself"
-    while together.until(ticks[ONE]):
+    assert common.apart == pytest.approx(abs(moments[0] - moments[1]), abs=1e-6)
+    assert 0 < common.until(ticks[ONE]) < 1
+    assert common.start(ONE, clocks[ONE]) == SOON, "after a restart it begins by itself"
+    while common.until(ticks[ONE]):
         time.sleep(0.01)
-    assert together.start(THREE, clock(0)) == SOON
+    assert common.start(THREE, clock(0)) == SOON
 
 
 def test_a_node_alone_waits_for_nobody_and_one_that_is_gone_is_not_waited_for() -> None:
-    assert Together({ONE}).start(ONE, clock(0)) == SOON
-    together = Together({ONE, TWO}, waiting=60)
-    together.gone(TWO)
-    assert together.start(ONE, clock(0)) != SOON
+    assert CommonStart({ONE}).start(ONE, clock(0)) == SOON
+    common = CommonStart({ONE, TWO}, waiting=60)
+    common.gone(TWO)
+    assert common.start(ONE, clock(0)) != SOON
 
 
 def test_a_stream_waits_for_the_trigger_until_it_has_gone_out() -> None:
-    together = Together({ONE, TWO}, trigger=True)
-    assert together.start(ONE, clock(0)) == WAITS
-    assert not together.due(1, 2)
-    assert together.due(2, 2)
-    assert together.left is None
-    together.triggered()
-    assert not together.due(2, 2)
-    assert together.start(TWO, clock(0)) == SOON
+    common = CommonStart({ONE, TWO}, trigger=True)
+    assert common.start(ONE, clock(0)) == WAITS
+    assert not common.due(1, 2)
+    assert common.due(2, 2)
+    assert common.left is None
+    common.triggered()
+    assert not common.due(2, 2)
+    assert common.start(TWO, clock(0)) == SOON
 
 
 def sheet(uuid: bytes) -> Sheet:
@@ -156,12 +213,12 @@ def sheet(uuid: bytes) -> Sheet:
 
 def test_datasheets_are_judged_once_all_are_there_and_one_that_is_gone_is_not_waited_for() -> None:
     met = parse_require('[angle]\nrange = ">= 10 deg"\n', "task")
-    judging = Judging(met, waiting=60)
-    judging.expect([ONE, TWO])
-    threading.Timer(0.05, judging.gone, [TWO]).start()
+    required = Requirements(met, waiting=60)
+    required.expect([ONE, TWO])
+    threading.Timer(0.05, required.gone, [TWO]).start()
     with pytest.raises(PolicyRefused):  # a profile without calibration gives no value
-        judging.offer(ONE, sheet(ONE), threading.Event())
-    assert [fit["uuid"] for fit in judging.fits] == [ONE.hex()]
+        required.offer(ONE, sheet(ONE), threading.Event())
+    assert [fit["uuid"] for fit in required.fits] == [ONE.hex()]
 
 
 def test_a_mark_names_its_holder_and_tells_of_one_that_was_killed(tmp_path: Path) -> None:

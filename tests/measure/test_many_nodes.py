@@ -46,7 +46,7 @@ def test_fifty_nodes_are_measured_at_once(hall: Hall) -> None:
         took = time.monotonic() - began
     finally:
         stop.set()
-        listening.join(5)
+        listening.join(60)
         port.close()
     end = lines[-1]
     assert len(end["nodes"]) == NODES

@@ -5,8 +5,6 @@ from __future__ import annotations
 import http.client
 import json
 import signal
-import time
-from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass, field
 from typing import Any
@@ -17,8 +15,7 @@ import jsonschema
 from teds_provision import client
 from teds_provision.ncap.web.openapi import document
 from tests.e2e.desk import Desk, Running, Station
-
-PATIENCE = 30.0
+from tests.pace import PATIENCE, until
 
 
 @dataclass
@@ -147,17 +144,6 @@ class Service:
         assert self.process is not None
         self.process.process.kill()
         self.process.end()
-
-
-def until(found: Callable[[], Any], what: str = "", seconds: float = PATIENCE) -> Any:
-    """Wait until ``found`` gives something true, and return it."""
-    end = time.monotonic() + seconds
-    while True:
-        value = found()
-        if value:
-            return value
-        assert time.monotonic() < end, what or f"still {value!r}"
-        time.sleep(0.05)
 
 
 def verified(service: Service, uuid: str) -> dict[str, Any]:

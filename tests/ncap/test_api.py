@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import json
+from pathlib import Path
 from typing import Any
 
 import pytest
 
 from teds_provision.client import ApiError, Client
 from tests.e2e.desk import ANGLE
-from tests.ncap.service import Service, until, verified, virtual
+from tests.ncap.service import Service, verified, virtual
+from tests.pace import until
 
 pytestmark = pytest.mark.link
 
@@ -125,7 +127,7 @@ def test_a_measurement_gives_values_freezes_its_nodes_and_ends(service: Service,
     [one] = asked.request("GET", "/measurements")["measurements"]
     assert (one["rate"], one["nodes"][0]["state"]) == (50, "running")
     until(lambda: asked.request("GET", "/measurements")["measurements"][0]["nodes"][0]["samples"] > 0)
-    asked.request("DELETE", f"/measurements/{made['id']}")
+    asked.end_measurement(made["id"])
     assert asked.request("GET", "/measurements")["measurements"] == []
     file = service.station.home / "recordings" / "run.csv"
     assert [str(file)] == one["files"]
@@ -227,6 +229,8 @@ def test_a_virtual_transducer_is_made_from_a_document_under_a_uuid_of_its_own(
     until(lambda: asked.node(made["uuid"])["present"] is False)
     refused(asked, 404, "not-found", "DELETE", f"/virtual/{made['uuid']}")
     refused(asked, 422, "usage", "POST", "/virtual", {"profile": "gripper", "source": "exec:true"})
+    taken = refused(asked, 422, "usage", "POST", "/virtual", {"profile": "gripper", "name": "hand", "source": "noise"})
+    assert f"Node {hand} has the name 'hand' already." in taken
     refused(asked, 422, "usage", "POST", "/virtual", {"source": "noise"})
     refused(asked, 404, "not-found", "POST", "/virtual", {"profile": "no-such-type", "source": "noise"})
 
@@ -273,3 +277,17 @@ def test_the_command_line_sees_what_the_daemon_did_and_the_daemon_what_it_did(
     told = service.station.ask("ncap", "status")
     assert hand in {node["uuid"] for node in told["nodes"]}
     service.station.ask("group", "delete", "made-beside")
+
+
+def test_more_than_a_thousand_nodes_come_in_pages(service: Service, asked: Client, hand: str, tmp_path: Path) -> None:
+    many = [f"{number:020x}" for number in range(1, 2346)]
+    sheet = tmp_path / "many.csv"
+    sheet.write_text("uuid\n" + "\n".join(many) + "\n")
+    service.station.ask("whitelist", "import", sheet)
+    answer = until(lambda: (a := asked.request("GET", "/nodes"))["total"] > 2000 and a)
+    assert len(answer["nodes"]) == 1000
+    uuids = [one["uuid"] for one in asked.nodes()]
+    assert len(uuids) == len(set(uuids)) == answer["total"]
+    assert {*many, hand} <= set(uuids)
+    few = asked.request("GET", f"/nodes?offset={answer['total'] - 1}&limit=5")
+    assert [one["uuid"] for one in few["nodes"]] == uuids[-1:]

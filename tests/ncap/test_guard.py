@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import json
 import os
 import socket
@@ -9,6 +10,7 @@ import stat
 import subprocess
 import threading
 import time
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +18,8 @@ import pytest
 from websockets.exceptions import InvalidStatus
 from websockets.sync.client import connect
 
+from teds_provision.ncap.web.guard import Guard, Message, Receive, Refusal, Scope, Send
+from teds_provision.ncap.web.tokens import Tokens
 from tests.e2e.desk import PASSPHRASE, Desk
 from tests.ncap.service import Answer, Service, virtual
 
@@ -75,6 +79,20 @@ def refusals(port: int) -> list[tuple[str, str, str, dict[str, str | None], Any,
          '{"profile": "gripper", "source": "file:/etc/passwd"}', 422, "refused"),
         ("a socket of this user as a source", "POST", "/api/v1/virtual", JSON,
          '{"profile": "gripper", "source": "unix:/run/x"}', 422, "refused"),
+        ("a file of this user as a profile", "POST", "/api/v1/virtual", JSON,
+         '{"profile": "/etc/passwd"}', 422, "usage"),
+        ("a file of the working folder as a profile", "POST", "/api/v1/nodes/next/provision", JSON,
+         '{"profile": "x.toml"}', 422, "usage"),
+        ("a period of nothing", "POST", "/api/v1/virtual", JSON,
+         '{"profile": "gripper", "source": "sine:0"}', 422, "usage"),
+        ("a period without end", "POST", "/api/v1/virtual", JSON,
+         '{"profile": "gripper", "source": "ramp:99999999999999999999"}', 422, "usage"),
+        ("a member twice", "PUT", put, JSON, '{"mode": "whitelist", "mode": "transparent"}', 400, "usage"),
+        ("a member twice, deeper", "POST", "/api/v1/groups", JSON,
+         '{"name": "x", "uuids": [{"a": 1, "a": 2}]}', 400, "usage"),
+        ("a number of thousands of digits", "GET", f"/api/v1/log?limit={'1' * 5000}", {}, None, 422, "usage"),
+        ("less than no node", "GET", "/api/v1/nodes?offset=-1", {}, None, 422, "usage"),
+        ("more than a thousand nodes", "GET", "/api/v1/nodes?limit=1001", {}, None, 422, "usage"),
         ("the readers over the net", "GET", "/api/v1/lend", {}, None, 422, "refused"),
         ("a login link over the net", "POST", "/api/v1/login-link", JSON, "{}", 422, "refused"),
     ]  # fmt: skip
@@ -93,11 +111,49 @@ def test_every_refusal_of_the_contract(service: Service, bearer: dict[str, str |
     assert service.raw("GET", "/api/v1/status", {**bearer, "host": "evil.example"}).status == 400, "two Hosts"
 
 
+def test_a_refusal_shown_as_a_page_is_text() -> None:
+    """Whatever a message quotes: in a browser's address line it is text, not elements."""
+
+    async def refusing(_scope: Scope, _receive: Receive, _send: Send) -> None:
+        raise Refusal(403, "refused", "<script>alert(1)</script>", "<b>")
+
+    sent: list[Message] = []
+
+    async def run() -> None:
+        async def send(message: Message) -> None:
+            sent.append(message)
+
+        async def receive() -> Message:
+            return {"type": "http.disconnect"}
+
+        scope = {"type": "http", "method": "GET", "path": "/", "headers": [(b"accept", b"text/html")]}
+        await Guard(refusing, Tokens(Path("nowhere")), None)(scope, receive, send)
+
+    asyncio.run(run())
+    assert b"&lt;script&gt;" in sent[1]["body"]
+    assert b"<script" not in sent[1]["body"]
+    assert b"<b>" not in sent[1]["body"]
+
+
 def test_a_body_without_a_length_is_cut_off_all_the_same(service: Service, bearer: dict[str, str | None]) -> None:
     chunk = b"10000\r\n" + b"x" * 65536 + b"\r\n"
     headers = {**bearer, **JSON, "Transfer-Encoding": "chunked"}
     answer = service.raw("PUT", "/api/v1/detection", headers, chunk * 17 + b"0\r\n\r\n")
     assert (answer.status, answer.code) == (413, "too-large")
+
+
+def test_a_body_of_two_lengths_is_refused_and_nothing_behind_it_is_a_request(
+    service: Service, bearer: dict[str, str | None]
+) -> None:
+    """RFC 9112, section 6.3: a proxy in front may go by the other length, and pass a request on inside a body."""
+    head = f"Host: 127.0.0.1:{service.port}\r\nAuthorization: {bearer['Authorization']}\r\n"
+    both = "Content-Type: application/json\r\nContent-Length: 4\r\nTransfer-Encoding: chunked\r\n"
+    hidden = f"GET /api/v1/status HTTP/1.1\r\n{head}\r\n"
+    with socket.create_connection(("127.0.0.1", service.port), 20) as peer:
+        peer.sendall(f"PUT /api/v1/detection HTTP/1.1\r\n{head}{both}\r\n0\r\n\r\n{hidden}".encode())
+        answers = b"".join(iter(lambda: peer.recv(65536), b""))
+    assert answers.count(b"HTTP/1.1 ") == 1, answers
+    assert answers.startswith(b"HTTP/1.1 400 "), answers
 
 
 def test_a_read_only_token_reads_and_changes_nothing(service: Service) -> None:
@@ -120,6 +176,20 @@ def test_a_token_that_is_removed_is_refused_at_once(service: Service) -> None:
     assert service.raw("GET", "/api/v1/status", bearer).status == 200
     service.station.ask("ncap", "token", "remove", "guest")
     assert service.raw("GET", "/api/v1/status", bearer).status == 401
+
+
+def test_tokens_that_are_made_at_once_are_all_kept(tmp_path: Path) -> None:
+    """`ncap token add` beside a daemon that lets a browser in: each writes the whole file."""
+    homes = [Tokens(tmp_path) for _ in range(4)]
+
+    def make(number: int) -> list[str]:
+        return [homes[number].add(f"{number}-{one}") for one in range(10)]
+
+    with ThreadPoolExecutor(len(homes)) as pool:
+        made = [token for tokens in pool.map(make, range(len(homes))) for token in tokens]
+    after = Tokens(tmp_path)
+    assert all(after.find(token) is not None for token in made)
+    assert after.find("nonsense") is None
 
 
 def test_the_login_works_once_and_leaves_a_cookie_that_scripts_cannot_read(service: Service) -> None:
@@ -242,7 +312,7 @@ def test_another_host_needs_tls_and_a_name(desk: Desk, tmp_path: Path) -> None:
     request = urllib.request.Request(
         f"https://localhost:{port}/api/v1/status", headers={"Authorization": f"Bearer {token}"}
     )
-    with urllib.request.urlopen(request, context=context, timeout=10) as answer:
+    with urllib.request.urlopen(request, context=context, timeout=60) as answer:
         assert answer.status == 200
     with socket.create_connection(("127.0.0.1", int(port)), 5) as plain:
         plain.sendall(b"GET / HTTP/1.1\r\nHost: localhost\r\n\r\n")

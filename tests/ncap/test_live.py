@@ -18,7 +18,8 @@ from websockets.sync.client import connect
 
 from teds_provision.measure.blocks import Block
 from teds_provision.ncap.live import POINTS, Listener, Live, thinned
-from tests.ncap.service import Service, until, virtual
+from tests.ncap.service import Service, virtual
+from tests.pace import until
 
 numbers = st.one_of(st.floats(-1e6, 1e6), st.just(float("nan")))
 

@@ -12,7 +12,8 @@ from xml.etree import ElementTree
 import pytest
 
 from tests.e2e.desk import Desk
-from tests.ncap.service import Answer, Service, until, virtual
+from tests.ncap.service import Answer, Service, virtual
+from tests.pace import until
 
 pytestmark = pytest.mark.link
 

@@ -8,7 +8,8 @@ from typing import Any
 import pytest
 
 from tests.e2e.desk import ANGLE, Desk
-from tests.ncap.service import Service, until
+from tests.ncap.service import Service
+from tests.pace import until
 
 pytestmark = pytest.mark.link
 
@@ -33,7 +34,7 @@ def test_a_provisioning_waits_for_the_tap_and_every_step_is_told(desk: Desk) -> 
         asked_for = asked.request("POST", f"/nodes/{node.uuid}/provision", {"profile": ANGLE, "name": "crane"})
         assert (asked_for["state"], asked_for["waits_for"]) == ("waiting", "tap")
         node.start()
-        following.join(30)
+        following.join(60)
         told = [one for one in events if one.get("event") == "provision"]
         assert told[0]["state"] == "waiting"
         done = [one["step"] for one in told if one.get("result") in ("done", "nothing to do")]

@@ -270,6 +270,54 @@ def test_200_nodes_in_one_process_answer_everyone_and_keep_to_few_threads(hub: H
         stranger.bus.close()
 
 
+class Listening(EchoNode):
+    """A node that notes at which tick it heard a trigger."""
+
+    def __init__(self, address: int) -> None:
+        super().__init__(address)
+        self.ticks: list[int] = []
+
+    def tick(self, at: float = 0.0) -> int:
+        return round(at * 1e9) if at else time.monotonic_ns()
+
+    def request_received(self, link: str, frame: bytes, *, tapped: bool, **_: object) -> bytes:
+        return self.request(link, frame, tapped=tapped)
+
+    def reply_left(self, link: str) -> None: ...
+
+    def drive(self, link: str, data: bytes) -> None: ...
+
+    def trigger(self, link: str, token: bytes, tick: int) -> None:
+        self.ticks.append(tick)
+
+
+def test_a_trigger_is_timed_while_a_data_frame_of_the_node_is_still_on_the_wire(hub: Hub) -> None:
+    """The tick of a trigger is that of its end within 100 µs (operation.md section 5), whatever the node sends."""
+    node = Listening(0x21)
+    server = CanServer(f"{hub.spec}&pace=1&bitrate=200")  # a frame of 8 octets takes 0.65 s
+    server.add(node, measuring=node)
+    server.start()
+    stranger = Stranger(hub.spec)
+    try:
+        assert stranger.ask(0x21, b"\x09" + COUNT, 20.0)
+        ends: list[int] = []
+
+        def send() -> None:
+            server.send_data(node, 0x1CFF2021, b"measured", fd=False)
+            ends.append(time.monotonic_ns())
+
+        began = time.monotonic_ns()
+        sending = threading.Thread(target=send)
+        sending.start()
+        stranger.bus.send(Frame(0x18FF00F1, b"eight oc"))
+        assert wait_for(lambda: bool(node.ticks))
+        sending.join()
+        assert began < node.ticks[0] < ends[0]
+    finally:
+        server.stop()
+        stranger.bus.close()
+
+
 def test_a_lost_flow_control_costs_the_next_request_nothing(station: Stranger, server: CanServer) -> None:
     """The node waits for a flow control that never comes; the same request again gets the whole stored reply."""
     request = b"\x05\x00\x00\x01\x03\x00\x1e" + bytes(30)

@@ -20,6 +20,7 @@ from teds_provision.node.nfc.tnep import TnepTag
 from teds_provision.node.nfc.type2 import Type2Memory
 from teds_provision.node.nfc.type4 import IsoDepTag, NdefApplication, Type4Memory
 from teds_provision.protocol.operation.commands import Power, PowerFlag
+from tests.pace import best_of
 
 SELECT_APPLICATION = bytes.fromhex("00A4040007D276000085010100")
 SELECT_CC, SELECT_NDEF = bytes.fromhex("00A4000C02E103"), bytes.fromhex("00A4000C02E104")
@@ -38,7 +39,7 @@ class Handler:
 
     def request(self, link: str, frame: bytes, *, tapped: bool) -> bytes:
         self.entered.set()
-        self.go.wait(10)
+        self.go.wait(60)
         self.frames.append(frame)
         return b"\x01\x00\x00" + bytes((len(self.frames),)) + frame
 
@@ -158,7 +159,7 @@ def test_an_answer_that_is_ready_after_the_field_was_gone_is_not_put(desk: Desk)
     desk.handler.go.clear()
     desk.mailbox.write(request(Piece(1, 4, 0, b"abcd")))
     assert desk.mailbox.read() == b""  # more time, please
-    assert desk.handler.entered.wait(5)
+    assert desk.handler.entered.wait(60)
     desk.tag.lost()
     desk.tag.activated()
     assert not desk.tag.ready(0.05)
@@ -431,11 +432,17 @@ def test_frames_take_what_a_data_sheet_says() -> None:
 
 def test_a_paced_exchange_lasts_as_long_as_on_air() -> None:
     air = Air()
-    began = time.perf_counter()
-    for _ in range(10):
-        air(b"\x30\x04", False)
-        air(bytes(16), True)
-    assert 0.0205 < time.perf_counter() - began < 0.2  # 10 x 2.09 ms
+
+    def ten() -> float:
+        began = time.perf_counter()
+        for _ in range(10):
+            air(b"\x30\x04", False)
+            air(bytes(16), True)
+        took = time.perf_counter() - began
+        assert took > 0.0205  # 10 x 2.09 ms
+        return took
+
+    best_of(10, 0.05, ten)
 
 
 def test_a_tag_that_cannot_be_is_refused() -> None:

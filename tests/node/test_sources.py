@@ -220,7 +220,7 @@ def test_standard_input_ends_and_the_node_stays() -> None:
         assert wait_for(lambda: source.at(1, 1.0) == Reading(value=1.0))
         os.write(writing, b'ue": {"angle": 2}}')
         os.close(writing)
-        assert clock.ended.wait(10)
+        assert clock.ended.wait(60)
         assert clock.steps == [1.0, 2.0]
         assert source.at(1, 2.0) is None
         assert "end" in told[0]
@@ -235,7 +235,7 @@ def test_simulations_come_and_go_at_a_unix_socket(tmp_path: Path) -> None:
         assert path.stat().st_mode & 0o777 == 0o600
         with pytest.raises(NoReader, match=r"hand\.sock"):
             make_source(f"unix:{path}", PLACES, print).start(Clock())
-        assert clock.ended.wait(10)  # the second node knocked, and went away
+        assert clock.ended.wait(60)  # the second node knocked, and went away
         for value in (1.0, 2.0):
             clock.ended.clear()
             with socket.socket(socket.AF_UNIX) as simulation:
@@ -244,7 +244,7 @@ def test_simulations_come_and_go_at_a_unix_socket(tmp_path: Path) -> None:
                 assert wait_for(lambda: source.at(1, 0.0) == Reading(value=value))  # noqa: B023 - waited for here
                 source.acted({"gripper": value})
                 assert json.loads(simulation.recv(100)) == {"set": {"gripper": value}}
-            assert clock.ended.wait(10)
+            assert clock.ended.wait(60)
             assert source.at(1, 0.0) is None
     finally:
         source.stop()
@@ -279,7 +279,7 @@ def test_a_program_gives_values_is_told_what_actuators_do_and_may_end(tmp_path: 
     source.acted({"gripper": 7.5})
     assert wait_for(lambda: source.at(1, 0.0) == Reading(value=7.5))
     source.acted({"gripper": 0.0})
-    assert clock.ended.wait(10)
+    assert clock.ended.wait(60)
     assert source.at(1, 0.0) is None
     assert "ended with 3" in told[0]
     source.stop()

@@ -5,10 +5,8 @@ from __future__ import annotations
 import json
 import shutil
 import signal
-import socket
-import time
-from collections.abc import Callable, Iterator
-from contextlib import closing, contextmanager
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -16,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 from teds_provision import client
 from tests.bench import PASSPHRASE, make_station
 from tests.e2e.desk import ANGLE, Desk, Node, Running, Station
+from tests.places import free_tcp_port
 
 if TYPE_CHECKING:
     from playwright.sync_api import Browser, Page
@@ -36,19 +35,12 @@ CALIBRATIONS = {
         ),
     ),
 }
-SECONDS = 15.0
-PATIENCE = 15_000  # ms that a test waits for something to be seen
+PATIENCE = 60_000  # ms that a test waits for something to be seen
 
 
 def chromium() -> str | None:
     """The browser of this system."""
     return shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
-
-
-def free_tcp_port() -> int:
-    with closing(socket.socket()) as probe:
-        probe.bind(("127.0.0.1", 0))
-        return int(probe.getsockname()[1])
 
 
 @dataclass
@@ -90,7 +82,7 @@ class Lab:
         """End the daemon."""
         assert self.daemon is not None
         self.daemon.signal(number)
-        self.daemon.process.wait(20)
+        self.daemon.process.wait(60)
         self.daemon.close()
 
     def create(self, name: str, type_: str) -> Node:
@@ -138,14 +130,6 @@ class Lab:
         """An address of the page with a token that works once."""
         with client.connect(home=self.station.home) as station:
             return station.login_url(read_only=read_only)
-
-
-def until(what: Callable[[], object], why: str, seconds: float = SECONDS) -> None:
-    """Wait until ``what()`` is true. (The page's policy forbids the evaluation with which playwright would wait.)"""
-    end = time.monotonic() + seconds
-    while not what():
-        assert time.monotonic() < end, why
-        time.sleep(0.05)
 
 
 @contextmanager

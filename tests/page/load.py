@@ -15,8 +15,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from teds_provision import client
+from tests.pace import until
 
-from .lab import QUIET, Lab, chromium, opened, until
+from .lab import QUIET, Lab, chromium, opened
 
 if TYPE_CHECKING:
     from playwright.sync_api import Browser, CDPSession, Page

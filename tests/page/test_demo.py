@@ -19,13 +19,13 @@ def test_the_demo_serves_the_page_measures_and_leaves_nothing_behind() -> None:
     try:
         [told] = running.wait_for_lines(1, 60)
         browser = urllib.request.build_opener(urllib.request.HTTPCookieProcessor(CookieJar()))
-        with browser.open(told["url"], timeout=20) as page:
+        with browser.open(told["url"], timeout=60) as page:
             assert b"js/main.js" in page.read()
-        with browser.open(told["url"].split("/login")[0] + "/api/v1/measurements", timeout=20) as answer:
+        with browser.open(told["url"].split("/login")[0] + "/api/v1/measurements", timeout=60) as answer:
             assert b'"group":"crane"' in answer.read()
         assert Path(told["home"]).exists()
         running.signal(signal.SIGINT)
-        assert running.end(30).code == 0
+        assert running.end().code == 0
         assert not Path(told["home"]).exists()
     finally:
         running.close()

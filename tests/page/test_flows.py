@@ -4,12 +4,17 @@ from __future__ import annotations
 
 import json
 import re
+from contextlib import closing
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import pytest
 
-from .lab import Lab, opened, until
+from teds_provision.station.station import Station
+from tests.bench import PASSPHRASE
+from tests.pace import until
+
+from .lab import Lab, opened
 
 if TYPE_CHECKING:
     from playwright.sync_api import Browser, Locator, Page
@@ -181,13 +186,22 @@ def test_provisioning_waits_for_the_tap_and_follows_it(browser: Browser, lab: La
 
 
 def test_names_from_a_datasheet_are_text_and_nothing_else(browser: Browser, fresh: Lab) -> None:
+    foreign = "0123456789abcdef0123"  # its datasheet was written elsewhere
+    with closing(Station.open(fresh.station.home, ask=lambda _prompt, confirm: PASSPHRASE)) as station:
+        station.nodes.remember(bytes.fromhex(foreign), name=TURNED)
     fresh.run()
     with opened(browser, fresh, route="virtual") as page:
         page.get_by_label("Transducer type").select_option("gripper")
         page.get_by_label("Name").fill(HOSTILE + TURNED)
         page.get_by_role("button", name="Make it").click()
+        page.get_by_role("alert").filter(has_text="one line of printable characters").wait_for()
+        page.goto(f"{fresh.url}/#/nodes/{foreign}")
+        page.get_by_role("heading", name="\ufffdgrab\ufffd", exact=True).wait_for()
+        page.goto(f"{fresh.url}/#/virtual")
+        page.get_by_label("Transducer type").select_option("gripper")
+        page.get_by_label("Name").fill(HOSTILE)
+        page.get_by_role("button", name="Make it").click()
         page.get_by_role("link", name=HOSTILE).first.click()
-        page.get_by_role("heading", name=f"{HOSTILE}\ufffdgrab\ufffd", exact=True).wait_for()
         page.locator(".card").get_by_text("Authentic", exact=True).wait_for()
         title = page.title()
         for view in ("nodes", "measure", "virtual", "log", "station"):

@@ -8,10 +8,21 @@ from dataclasses import replace
 from datetime import timedelta
 
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from teds_provision.errors import BadData, NotAuthentic, PolicyRefused
 from teds_provision.protocol.handover import jose
-from teds_provision.protocol.handover.bundle import CLOCK_TOLERANCE, TYPE, open_bundle, peek_bundle, seal_bundle
+from teds_provision.protocol.handover.bundle import (
+    CLOCK_TOLERANCE,
+    TYPE,
+    BundledNode,
+    _node_to_json,
+    open_bundle,
+    peek_bundle,
+    seal_bundle,
+)
+from teds_provision.protocol.handover.payload import LAST_U32
 from teds_provision.protocol.handover.revocation import seal_revocation
 from teds_provision.protocol.handover.strict_json import dump, encode_base64url
 from teds_provision.protocol.keys import SoftwareKey, fingerprint, station_key_message
@@ -46,6 +57,7 @@ def test_a_bundle_comes_out_as_it_went_in(count):
     assert found.station_signature == made.station_signatures[fingerprint(RECEIVER.point)]
 
 
+@pytest.mark.slow
 def test_ten_thousand_nodes_need_memory_in_proportion_to_the_file():
     made = bundle(10_000)
     octets, sealing = peak_of(lambda: seal_bundle(made, SENDER, [RECEIVER.point]))
@@ -355,3 +367,17 @@ def test_a_bundle_sealed_by_hand_with_a_key_of_no_station_opens_only_in_its_name
     with pytest.raises(NotAuthentic):
         opened(octets)
     assert OWNER.point == opened(seal_bundle(bundle(), SENDER, [RECEIVER.point])).bundle.ca
+
+
+@given(
+    st.lists(st.text(st.characters(blacklist_categories=("Cs", "Cc", "Cf", "Zl", "Zp")), max_size=20), min_size=3),
+    st.integers(1, LAST_U32),
+)
+def test_a_node_written_by_hand_is_the_json_that_an_encoder_gives(texts: list[str], epoch: int) -> None:
+    profile, name, *groups = texts
+    node = BundledNode(bytes(10), SoftwareKey(1).point, bytes(16), epoch, 7, profile, name, tuple(groups), None)
+    written = _node_to_json(node)
+    members = json.loads(written)
+    assert json.dumps(members, separators=(",", ":")) == written
+    assert (members["profile"], members["name"], members["groups"]) == (profile, name, groups)
+    assert (members["epoch"], members["sequence"], members["teds_sha256"]) == (epoch, 7, None)

@@ -111,7 +111,7 @@ def other(request, tmp_path):
     return CTool(tmp_path) if request.param is CTool else JwCrypto()
 
 
-@pytest.mark.parametrize("count", [1, 1_000, 10_000])
+@pytest.mark.parametrize("count", [1, 1_000, pytest.param(10_000, marks=pytest.mark.slow)])
 def test_the_other_opens_our_bundle(other, count):
     made = bundle(count, to=RECEIVERS)
     octets = seal_bundle(made, SENDER, [key.point for key in RECEIVERS])
@@ -120,7 +120,7 @@ def test_the_other_opens_our_bundle(other, count):
         assert json.loads(payload) == json.loads(_payload(made))
 
 
-@pytest.mark.parametrize("count", [1, 1_000, 10_000])
+@pytest.mark.parametrize("count", [1, 1_000, pytest.param(10_000, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("receivers", [RECEIVERS[:1], RECEIVERS], ids=["one receiver", "two receivers"])
 def test_we_open_the_others_bundle(other, count, receivers):
     made = bundle(count, to=receivers)

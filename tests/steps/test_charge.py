@@ -11,7 +11,7 @@ from teds_provision.links.hints import Charging
 from teds_provision.station.station import Station
 from teds_provision.steps.build import BuildOrder
 from teds_provision.steps.provision import Provisioned, provision
-from teds_provision.talk.charge import Low, wait_for_charge
+from teds_provision.steps.write import Low, wait_for_charge
 from teds_provision.talk.conversation import Conversation
 from teds_provision.talk.progress import Silent
 from tests.bench import Board, contact

@@ -13,7 +13,7 @@ from dataclasses import dataclass, field, replace
 import pytest
 
 from teds_provision.errors import AddressConflict, NodeRefused, NotAuthentic, PolicyRefused, Unproven
-from teds_provision.links import Contact, LinkSettings
+from teds_provision.links import Contact, LinkSettings, Notice
 from teds_provision.links.ports import CAN, Capabilities
 from teds_provision.protocol.messages.frames import (
     COMMON,
@@ -34,7 +34,7 @@ from teds_provision.steps.visits.at_node import ReadDone, read_at, verify_at
 from teds_provision.steps.visits.visit import Visit
 from teds_provision.store import WhitelistEntry
 from teds_provision.talk.conversation import Conversation, refused
-from teds_provision.talk.meeting import refuse_twins
+from teds_provision.talk.meeting import refuse_twins, without_twins
 from teds_provision.teds.image import SECURITY, Image
 from tests.bench import Board, MemoryLink, contact, make_station, talk
 
@@ -169,6 +169,17 @@ def test_one_uuid_at_two_addresses_is_a_conflict_that_names_both(board: Board) -
         refuse_twins([here, there])
     other = replace(contact(Board(uuid=bytes(10))), address=0x22)
     assert refuse_twins([here, other]) == [here, other]
+
+
+def test_a_copied_uuid_costs_its_own_node_alone(board: Board) -> None:
+    """One stranger with somebody's UUID had hidden every node of the bus from `identify` and `provision --all`."""
+    here, there = (replace(contact(board, MemoryLink(board, via="can")), address=at) for at in (0x11, 0x22))
+    other = replace(contact(Board(uuid=bytes(10))), address=0x33)
+    told: list[Notice] = []
+    assert without_twins([here, other, there], told.append) == [other]
+    assert [notice.uuid for notice in told] == [board.uuid]
+    with pytest.raises(AddressConflict):
+        without_twins([here, there], told.append)
 
 
 def test_a_stranger_without_the_key_judges_by_signatures(station: Station, board: Board, tmp_path) -> None:  # type: ignore[no-untyped-def]

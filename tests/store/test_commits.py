@@ -2,17 +2,22 @@
 
 from __future__ import annotations
 
+import os
+import threading
 from collections.abc import Iterator
+from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 
 import pytest
 
+from teds_provision.errors import LinkFailure
 from teds_provision.station.station import Station
 from teds_provision.steps.build import BuildOrder
 from teds_provision.steps.provision import provision
+from teds_provision.store import NodeRecord
 from teds_provision.talk.progress import Silent
-from tests.bench import Board, make_station, talk
+from tests.bench import Board, MemoryLink, make_station, talk
 
 _CHANGES = ("INSERT", "UPDATE", "DELETE", "REPLACE")
 
@@ -23,6 +28,8 @@ class Watched:
 
     station: Station
     statements: list[str] = field(default_factory=list)
+    waited: int = 0
+    """Commits of the last run that waited for the disk."""
 
     def run(self, board: Board) -> tuple[int, int]:
         """Provision once; returns rows written, and commits that wrote something."""
@@ -30,8 +37,8 @@ class Watched:
         with talk(board) as node:
             order = BuildOrder("temperature-sensor")
             provision(self.station, node, order, accept=lambda who: None, reporter=Silent())
-        rows = commits = open_rows = 0
-        last = ""
+        rows = commits = open_rows = self.waited = 0
+        last, waits = "", True
         for statement in self.statements:
             word = statement.split(maxsplit=1)[0]
             if word in _CHANGES and statement != last:  # SQLite tells a statement once more for its trigger
@@ -39,7 +46,10 @@ class Watched:
                 open_rows += 1
             elif word == "COMMIT":
                 commits += open_rows > 0
+                self.waited += open_rows > 0 and waits
                 open_rows = 0
+            elif statement.startswith("PRAGMA synchronous"):
+                waits = statement.endswith("FULL")
             last = statement
         assert open_rows == 0, "a row was written outside a transaction"
         return rows, commits
@@ -53,9 +63,72 @@ def watched(tmp_path: Path) -> Iterator[Watched]:
     watched.station.close()
 
 
-def test_a_whole_provisioning_is_eight_durable_commits_at_most(watched: Watched) -> None:
+def test_a_whole_provisioning_is_eight_commits_at_most_and_waits_for_three(watched: Watched) -> None:
+    """The pending key before Confirm, the sequence before the signature leaves, and the verdict with all before it."""
     _, commits = watched.run(Board())
     assert commits <= 8
+    assert watched.waited == 3
+
+
+@pytest.fixture
+def synced(monkeypatch: pytest.MonkeyPatch) -> list[str]:
+    """The files that this process waited for by itself, beside what SQLite does."""
+    names: list[str] = []
+    monkeypatch.setattr(
+        "os.fdatasync", lambda descriptor: names.append(Path(os.readlink(f"/proc/self/fd/{descriptor}")).name)
+    )
+    return names
+
+
+def test_a_run_that_ends_early_is_on_the_disk_all_the_same(watched: Watched, synced: list[str]) -> None:
+    """Identify is written to the log and not waited for: the next step was to do that."""
+    link = MemoryLink(Board(), lose_request=3)
+    with pytest.raises(LinkFailure), talk(link.board, link) as node:
+        provision(watched.station, node, BuildOrder("temperature-sensor"), accept=lambda who: None, reporter=Silent())
+    assert synced == ["store.sqlite3-wal"]
+
+
+def test_what_comes_later_is_on_the_disk_with_the_next_entry_or_when_it_is_asked_for(
+    watched: Watched, synced: list[str]
+) -> None:
+    store, node = watched.station._store, NodeRecord(bytes(10))
+    with store.transaction(later=True):
+        store.put_node(node)
+    with store.transaction():
+        store.put_node(node)  # the same again: SQLite may find nothing to write
+    store.settle()
+    assert synced == ["store.sqlite3-wal"]
+    with store.transaction(later=True):
+        store.put_node(node)
+    store.audit.append("identify", node.uuid, "done")
+    store.settle()
+    assert synced == ["store.sqlite3-wal"]
+
+
+def test_a_step_by_itself_never_comes_later(watched: Watched) -> None:
+    """Only a run of steps may leave one to the next; ``identify`` alone waits."""
+    with watched.station.durable("identify", more_follows=True):
+        watched.station.audit("identify", None, "done")
+    assert "PRAGMA synchronous=NORMAL" not in watched.statements
+
+
+def test_the_stations_facts_are_never_older_than_the_store(watched: Watched) -> None:
+    """They are remembered: another process, and a change that was taken back, must be seen."""
+    here = watched.station
+    there = Station.open(here.home, ask=lambda prompt, confirm: pytest.fail("no secret is needed"))
+    try:
+        assert here.identity.master == there.identity.master == 1
+        there.identity.begin_rewrapping(2)
+        assert here.identity.master == 2
+        with here.transaction():
+            assert here.identity.master == 2
+        with suppress(InterruptedError), here.transaction():
+            here.identity.begin_rewrapping(3)
+            assert here.identity.master == 3
+            raise InterruptedError
+        assert here.identity.master == 2
+    finally:
+        there.close()
 
 
 def test_a_provisioning_with_nothing_to_do_writes_four_rows_and_waits_twice_for_the_disk(watched: Watched) -> None:
@@ -65,3 +138,59 @@ def test_a_provisioning_with_nothing_to_do_writes_four_rows_and_waits_twice_for_
         rows, commits = watched.run(board)
         assert rows <= 4
         assert commits <= 2
+
+
+def test_a_run_does_not_wait_for_what_another_thread_has_written_since(watched: Watched, synced: list[str]) -> None:
+    """Eight readers on one store would wait for each other's steps."""
+    other_is_going, this_is_done = threading.Event(), threading.Event()
+
+    def other() -> None:
+        with watched.station.run():
+            with watched.station.durable("identify", more_follows=True):
+                watched.station.audit("identify", None, "done")
+            other_is_going.set()
+            this_is_done.wait(60)
+
+    reader = threading.Thread(target=other)
+    with watched.station.run():
+        with watched.station.durable("identify", more_follows=True):
+            watched.station.audit("identify", None, "done")
+        with watched.station.durable("sign"):
+            watched.station.audit("sign", None, "done")
+        reader.start()
+        assert other_is_going.wait(60)
+    assert synced == []
+    this_is_done.set()
+    reader.join(60)
+    assert synced == ["store.sqlite3-wal"]
+
+
+def test_what_is_not_waited_for_does_not_bring_what_came_before_onto_the_disk(
+    watched: Watched, synced: list[str]
+) -> None:
+    """Two readers: the second one's step that comes later said nothing about the first one's."""
+    with watched.station.run():
+        for act in ("identify", "whitelist"):
+            with watched.station.durable(act, more_follows=True):
+                watched.station.audit(act, None, "done")
+        watched.station._store.settle(1)
+        assert synced == ["store.sqlite3-wal"]
+
+
+def test_nothing_that_a_provisioning_or_a_look_up_asks_reads_a_whole_table(watched: Watched) -> None:
+    """They cost the same with a hundred thousand nodes; the list of trusted stations is short, and read whole."""
+    store, board = watched.station._store, Board()
+    watched.run(board)
+    store.is_known(board.uuid)
+    store.resolve(board.uuid.hex()[:8])
+    store.named("finger-1")
+    asked = {one for one in watched.statements if one.startswith(("SELECT", "UPDATE", "DELETE"))}
+    assert len(asked) > 20
+    plans = {one: [row[3] for row in store._database.execute(f"EXPLAIN QUERY PLAN {one}")] for one in asked}
+    one_row = {"SCAN trust", "SCAN station", "SCAN CONSTANT ROW"}  # or as many as there are stations
+    whole = {
+        asked_for
+        for asked_for, plan in plans.items()
+        if any(step.startswith("SCAN") and step not in one_row for step in plan)
+    }
+    assert {one for one in whole if not one.endswith("FROM audit ORDER BY seq DESC LIMIT 1")} == set()

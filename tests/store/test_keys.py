@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from contextlib import suppress
+from pathlib import Path
 
 import pytest
 
@@ -104,3 +105,47 @@ def test_transactions_nest_and_undo_only_what_failed(store: Store) -> None:
             store.add_key(a_key(1))
         raise RuntimeError
     assert (store.facts(), store.keys(NODE)) == (None, [])
+
+
+def test_a_part_of_a_change_that_failed_takes_the_whole_with_it(store: Store) -> None:
+    """``together`` sets no savepoint: whoever catches its error and goes on keeps nothing, and is told."""
+
+    def caught() -> None:
+        with store.transaction():
+            store.put_node(NodeRecord(NODE))
+            with suppress(RuntimeError), store.together():
+                store.put_node(NodeRecord(OTHER))
+                raise RuntimeError
+
+    with pytest.raises(StoreFailure, match="A part of this change failed"):
+        caught()
+    assert store.nodes() == []
+    with store.transaction():
+        store.put_node(NodeRecord(NODE))
+        with suppress(NotFound), store.together():
+            store.activate_key(NODE, "00" * 8)  # nothing was changed before it failed
+        with suppress(RuntimeError), store.transaction(), store.together():  # a savepoint around it takes it back
+            store.put_node(NodeRecord(OTHER))
+            raise RuntimeError
+    assert [node.uuid for node in store.nodes()] == [NODE]
+
+
+def test_what_was_read_a_moment_ago_is_never_older_than_the_store(store: Store, home: Path) -> None:
+    """Rows are remembered: another process, an own change, and one that was taken back must be seen."""
+    store.put_node(NodeRecord(NODE, name="a"))
+    with Store.open(home) as other:
+        assert [store.node(NODE), other.node(NODE)] == [NodeRecord(NODE, name="a")] * 2
+        other.put_node(NodeRecord(NODE, name="b"))
+        assert store.node(NODE) == NodeRecord(NODE, name="b")
+        with suppress(RuntimeError), store.transaction():
+            store.put_node(NodeRecord(NODE, name="c"))
+            assert store.node(NODE) == NodeRecord(NODE, name="c")
+            raise RuntimeError
+        assert store.node(NODE) == NodeRecord(NODE, name="b")
+        with store.reading():
+            assert store.node(NODE) == NodeRecord(NODE, name="b")
+            other.put_node(NodeRecord(NODE, name="d"))
+            assert store.node(NODE) == NodeRecord(NODE, name="b"), "as it was when the block began"
+            store.put_node(NodeRecord(OTHER))
+            assert store.node(NODE) == NodeRecord(NODE, name="d"), "but for one's own changes"
+        assert store.node(NODE) == NodeRecord(NODE, name="d")

@@ -92,8 +92,9 @@ def main() -> None:
 def identify(bench: Bench, uuids: list[str]) -> dict[str, Any]:
     done = bench.run("identify", "--via", "ble", "--timeout", "120")
     said = json.loads(done.out)
-    found = sorted(node["uuid"] for node in said.get("nodes", [said]))
-    return {"code": done.code, "found": found, "expected": sorted(uuids)}
+    found = sorted(node["uuid"] for node in said.get("nodes", [said]) if "uuid" in node)
+    told = said.get("error") or done.err[-500:]
+    return {"code": done.code, "found": found, "expected": sorted(uuids), "told": told}
 
 
 if __name__ == "__main__":

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from teds_provision import teds
 from teds_provision.errors import BadData
-from teds_provision.teds.codec.frame import frame
+from teds_provision.teds.codec.frame import checksum, frame
 from tests.teds.strategies import some_fields
 from tests.teds.vectors import ALL, TEDS, octets_of
 
@@ -118,3 +118,10 @@ def test_damaged_vectors_decode(data: st.DataObject) -> None:
     cut = data.draw(st.integers(0, len(octets)))
     teds.decode(bytes(octets))
     teds.decode(bytes(octets[:cut]))
+
+
+@given(octets=st.binary(max_size=1100) | st.integers(0, 70_000).map(lambda size: b"\xff" * size))
+@settings(max_examples=300, deadline=None)
+def test_the_checksum_is_the_plain_sum_at_any_length(octets: bytes) -> None:
+    """It is made from Adler-32, whose modulus is not 65536."""
+    assert checksum(octets) == 0xFFFF - (sum(octets) & 0xFFFF)

@@ -20,6 +20,7 @@ from teds_provision.teds.formats import read_blocks
 from teds_provision.teds.image import Image
 from teds_provision.teds.units.units import parse_unit
 
+pytestmark = pytest.mark.slow
 MIB = 1 << 20
 # The address space holds the interpreter and numpy too (their own 200 MB are mapped, not used).
 SPACE = 300 * MIB + 700 * MIB

@@ -178,6 +178,11 @@ def test_a_calibration_becomes_a_block_and_its_key(tmp_path: Path) -> None:
     assert teds.decode(built.blocks[1, 3]).get("CalKey") == 1
     assert teds.decode(built.blocks[1, 5]).verdict == "clean"
     assert list(built.blocks) == sorted(built.blocks)
+    again = profile.build(UUID, name="another")  # what all nodes have alike is kept; the key and the name are not
+    assert teds.decode(again.blocks[1, 3]).get("CalKey") == 0
+    assert teds.decode(again.blocks[0, 12]).get("TCName") == "another"
+    fresh = load_profile(write(tmp_path, "force", GOOD)).build(UUID, name="another")
+    assert again.blocks == fresh.blocks
 
 
 def test_what_a_person_should_know_is_a_warning(tmp_path: Path) -> None:

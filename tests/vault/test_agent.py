@@ -94,7 +94,7 @@ def test_a_machine_that_slept_finds_it_closed(home: Path, monkeypatch: pytest.Mo
     assert asking.held(home, "pkcs11") is None
     clock[0] = 201.0
     assert asking.held(home, "file") is None
-    thread.join(10)
+    thread.join(60)
     listener.close()
     assert not thread.is_alive()
     assert bytes(page.view()) == b""
@@ -112,7 +112,7 @@ def test_another_user_at_either_end_gets_nothing(home: Path, monkeypatch: pytest
             assert not asking.lock(home)
     assert asking.held(home, "file") == b"secret"
     assert asking.lock(home)
-    thread.join(10)
+    thread.join(60)
     listener.close()
 
 

@@ -150,7 +150,7 @@ class Session:
             start_new_session=True,
         )
         try:
-            output, errors = process.communicate(password or "", timeout=40)
+            output, errors = process.communicate(password or "", timeout=60)
         finally:
             with suppress(ProcessLookupError):
                 os.killpg(process.pid, signal.SIGKILL)

@@ -12,7 +12,7 @@ from __future__ import annotations
 import json
 import re
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Final
@@ -39,6 +39,24 @@ _SCALARS: Final = {
     "hex": "teds_octets",
     "text": "const char *",
 }
+
+
+_NOTHING: Final = {"object": "NULL", "text": "NULL", "hex": "{NULL, 0}"}
+
+
+def _text(value: Any) -> str:
+    return json.dumps(value if isinstance(value, str) else json.dumps(value), ensure_ascii=False)
+
+
+_SAID: Final[dict[str, Callable[[Any], str]]] = {
+    "": "INT64_C({})".format,
+    "int": "INT64_C({})".format,
+    "big": "UINT64_C({})".format,
+    "bool": lambda value: "true" if value else "false",
+    "float": lambda value: repr(float(value)),
+    "text": _text,
+}
+"""Initializers of values that point to nothing; kind "" stands for no value at all."""
 
 
 @dataclass
@@ -135,18 +153,12 @@ class Constants:
     def value(self, name: str, shape: Shape, value: Any) -> str:
         """The initializer of a value; what it points to is added to ``rows``."""
         if value is None:
-            return "NULL" if shape.kind in ("object", "text") else "{NULL, 0}" if shape.kind == "hex" else "0"
+            return _NOTHING.get(shape.kind, "0")
         if shape.kind == "hex":
             return self._of_octets(value)
-        if shape.kind == "text":
-            return json.dumps(value if isinstance(value, str) else json.dumps(value), ensure_ascii=False)
-        if shape.kind == "bool":
-            return "true" if value else "false"
         if shape.kind == "object":
             return f"{{{', '.join(self._members(name, shape, value))}}}"
-        if shape.kind == "float":
-            return repr(float(value))
-        return f"UINT64_C({value})" if shape.kind == "big" else f"INT64_C({value})"
+        return _SAID[shape.kind](value)
 
     def _members(self, name: str, shape: Shape, value: dict[str, Any]) -> Iterator[str]:
         for member, inner in shape.members.items():

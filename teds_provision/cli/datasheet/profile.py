@@ -13,7 +13,7 @@ from teds_provision.cli.context import App, pass_app
 from teds_provision.cli.options import COMMAND_SETTINGS, command, dry_run_option, examples
 from teds_provision.cli.rendering import print_table
 from teds_provision.errors import BadData, UsageFailure
-from teds_provision.files import SHARED, write_new
+from teds_provision.files import SHARED, holds, write_new
 from teds_provision.teds.profile import check as check_profile
 from teds_provision.teds.profile import (
     default_folders,
@@ -201,7 +201,7 @@ def new(app: App, name: str, extends: str | None, output: Path | None, dry_run: 
             f"\n[channel.1]\n# high-limit = 20.0\n"
         )
     path = output or _place(app.home, name)
-    done = path.exists() and path.read_text(encoding="utf-8", errors="replace") == text
+    done = holds(path, text.encode())
     if path.exists() and not done:
         raise UsageFailure(f"{path} exists already and says something else.", hint="Take another name, or --output.")
     if dry_run:

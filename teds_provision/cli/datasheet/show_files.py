@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
+import os
 import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Final
 
 from teds_provision.errors import BadData
-from teds_provision.files import read_limited
+from teds_provision.files import open_to_read
 from teds_provision.limits import LIMITS
 from teds_provision.protocol import handover
 from teds_provision.protocol.messages.message import Message, decode_message, looks_like_message
@@ -25,6 +26,14 @@ if TYPE_CHECKING:
     from teds_provision.teds.guard.guard import GuardFinding
 
 STDIN = "-"
+_HEAD_OCTETS: Final = 64
+_OTHERS: Final = {
+    b'{"format":"teds-backup/': ("a backup of a station", "teds-provision restore {}"),
+    b"\x89MCAP0\r\n": ("a recording (MCAP)", "mcap info {}"),
+    b"\n\r\r\n": ("a trace (pcapng)", "teds-provision trace show {}"),
+    b'{"format": "teds-trace/': ("a trace", "teds-provision trace show {}"),
+}
+"""What other files of this program begin with, what they are, and the command that reads them."""
 
 
 @dataclass(frozen=True)
@@ -57,7 +66,11 @@ class ShownFile:
 def read_file(name: str) -> bytes:
     """Octets of a file or, for ``-``, of standard input; raises NotFound and, for more than 32 MiB, BadData."""
     if name != STDIN:
-        return read_limited(Path(name), LIMITS.teds_file, "file of TEDS")
+        with open_to_read(Path(name)) as file:
+            octets = file.read(LIMITS.teds_file + 1)
+        if len(octets) <= LIMITS.teds_file:
+            return octets
+        raise _no_teds(name, octets, f"it has more than {LIMITS.teds_file >> 20} MiB")
     octets = sys.stdin.buffer.read(LIMITS.teds_file + 1)
     if len(octets) > LIMITS.teds_file:
         raise BadData(f"Standard input gives more than {LIMITS.teds_file >> 20} MiB; no file of TEDS has.")
@@ -66,8 +79,13 @@ def read_file(name: str) -> bytes:
 
 def load(name: str, edition: Edition | None = None) -> ShownFile:
     """Read one file and put it into words, converted to ``edition`` where one is asked."""
+    bundle = _long_bundle(name)
+    if bundle is not None:
+        return ShownFile(name, "bundle", bundle=bundle)
     octets = read_file(name)
     kind: Kind | None = None
+    if octets.startswith(tuple(_OTHERS)):
+        raise _no_teds(name, octets, "")
     try:
         kind = detect(octets)
         if kind == "bundle":
@@ -80,6 +98,30 @@ def load(name: str, edition: Edition | None = None) -> ShownFile:
     if len(blocks) == 1 and is_message(blocks[0].octets):
         return ShownFile(name, kind, message=decode_message(blocks[0].octets))
     return _described(name, kind, blocks, edition)
+
+
+def _long_bundle(name: str) -> BundleHeader | None:
+    """The header of a bundle that is longer than any file of TEDS, read piece by piece; None for everything else."""
+    try:
+        if name == STDIN or os.stat(name).st_size <= LIMITS.teds_file:  # a pipe has none, and is opened once
+            return None
+    except (OSError, ValueError):
+        return None
+    with open_to_read(Path(name)) as file:
+        if not file.read(_HEAD_OCTETS).lstrip().startswith(b"{"):
+            return None
+        try:
+            return handover.bundle.peek_bundle(file)
+        except BadData:
+            return None
+
+
+def _no_teds(name: str, octets: bytes, why: str) -> BadData:
+    """The error for a file of another kind: what it is, and which command reads it, where its first octets tell."""
+    for head, (what, command) in _OTHERS.items():
+        if octets.startswith(head):
+            return BadData(f"{name} holds no TEDS: it is {what}.", hint=f"Read it with: {command.format(name)}")
+    return BadData(f"{name} holds no TEDS: {why}.")
 
 
 def _of_file(name: str, kind: Kind | None, error: BadData) -> BadData:

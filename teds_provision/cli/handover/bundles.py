@@ -2,32 +2,44 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import os
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import contextmanager
+from io import BytesIO
+from itertools import chain, islice
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any, BinaryIO, Literal
 
 import click
 
 from teds_provision import handover, protocol
 from teds_provision.cli.context import App, pass_app
-from teds_provision.cli.options import command, dry_run_option, link_options, links_given, yes_option
-from teds_provision.cli.rendering import reporter_for
+from teds_provision.cli.options import WholeNumber, command, dry_run_option, link_options, links_given, yes_option
+from teds_provision.cli.rendering import local_time, reporter_for
 from teds_provision.errors import BadData, LinkFailure, PolicyRefused
-from teds_provision.files import read_limited, require_new, write_new
+from teds_provision.files import holds, open_to_read, require_new, write_new
 from teds_provision.links import LinkSettings
 
 if TYPE_CHECKING:
     from contextlib import AbstractContextManager
 
+    from teds_provision.handover.arrivals import PlannedNode
     from teds_provision.handover.export_keys import Exported, ExportPlan
     from teds_provision.handover.import_keys import Imported, ImportPlan
+    from teds_provision.handover.selection import Leaving
     from teds_provision.station.station import Station
 
+_SHOWN = 20
+_SHOWN_TO_IMPORT = 40
+_PIECE = 64 * 1024
+_CIPHERTEXT = b'"ciphertext"'
 _MEANS = {
     "copy": "A copy: both stations hold the same keys from now on, and either can pose as a node to the other.",
     "move": "A move: the keys rest here at once. Only when the other station has rotated them at its first contact is"
     " this one locked out for certain.",
 }
+_COPIED = "A copy: the sender keeps the same keys, and either can pose as a node to the other."
+_MOVED = "A move: each key is rotated at the first contact; until then the sender can still use it."
 
 
 @command(
@@ -47,7 +59,7 @@ _MEANS = {
 )
 @click.option(
     "--expires",
-    type=click.IntRange(1, 365),
+    type=WholeNumber(1, 365),
     default=7,
     show_default=True,
     metavar="DAYS",
@@ -128,7 +140,7 @@ def _exported(plans: Sequence[ExportPlan], outputs: Sequence[Path], station: Sta
         "count": sum(len(one.nodes) for one in plans),
         "id": plan.id,
         "expires": plan.expires.strftime("%Y-%m-%dT%H:%M:%SZ"),
-        "nodes": [node.uuid.hex() for one in plans for node, _ in one.nodes],
+        "nodes": [node.uuid.hex() for one in plans for node in one.nodes],
         "skipped": [{"uuid": uuid.hex(), "why": why} for uuid, why in plan.skipped],
         "also_held_by": sorted({digits for one in plans for digits in one.also_held_by}),
         "bundles": [
@@ -140,9 +152,9 @@ def _exported(plans: Sequence[ExportPlan], outputs: Sequence[Path], station: Sta
 
 def _plan_text(plans: Sequence[ExportPlan], station: Station) -> str:
     plan, chosen = plans[0], [one for part in plans for one in part.nodes]
-    lines = [f"{plan.mode.capitalize()} {_count(plans)}, to be imported by {plan.expires:%Y-%m-%d %H:%M} UTC"]
+    lines = [f"{plan.mode.capitalize()} {_count(plans)}, to be imported by {local_time(plan.expires.isoformat())}"]
     lines += [f"  in {len(plans)} bundles"] if len(plans) > 1 else []
-    lines += _first([f"  {node.uuid.hex()}  epoch {key.epoch}  {node.name or ''}".rstrip() for node, key in chosen], 20)
+    lines += _first(_node_lines(chosen[:_SHOWN], station), _SHOWN, len(chosen))
     lines += [f"  not {uuid.hex()}: {why}" for uuid, why in plan.skipped]
     if plan.also_held_by:
         names = ", ".join(handover.pending.peer_name(station, digits) for digits in plan.also_held_by)
@@ -153,9 +165,14 @@ def _plan_text(plans: Sequence[ExportPlan], station: Station) -> str:
     return "\n".join([*lines, _MEANS[plan.mode]])
 
 
-def _first(lines: list[str], most: int) -> list[str]:
-    """The first lines of a list, and how many more there are."""
-    return [*lines[:most], f"  … and {len(lines) - most} more"] if len(lines) > most else lines
+def _node_lines(chosen: Sequence[Leaving], station: Station) -> list[str]:
+    known = station.nodes.of_page([node.uuid for node in chosen])
+    return [f"  {node.uuid.hex()}  epoch {node.epoch}  {known[node.uuid].name or ''}".rstrip() for node in chosen]
+
+
+def _first(lines: list[str], most: int, count: int) -> list[str]:
+    """The first lines of a list of so many, and how many more there are."""
+    return [*lines[:most], f"  … and {count - most} more"] if count > most else lines
 
 
 @command(
@@ -193,27 +210,26 @@ def import_keys(
     app = ctx.find_object(App)
     assert app is not None
     station = app.station()
-    receipt = receipt or file.with_name(file.name + ".receipt")
-    octets = _read_bundle(file)
-    station.unlock()
-    shown = handover.import_keys.plan_import(station, octets)
-    state = station.version()
-    told, text = _import_plan(station, shown)
-    if dry_run:
-        app.emit({**told, "receipt": None, "plan": True}, text)
-        return
-    if not isinstance(shown, handover.import_keys.Imported):
-        require_new(receipt)
-        app.note(text)
-        app.confirm(f"Take {count_of(len(shown.taken))} in?", yes=yes)
-    with station.lock("import-keys", app.note):
-        plan = shown if station.version() == state else handover.import_keys.plan_import(station, octets)
-        done = _take_in(station, plan, shown)
-        _write_receipt(receipt, done.receipt)
+    with _bundle_file(file) as bundle:
+        receipt = receipt or file.with_name(file.name + ".receipt")
+        station.unlock()
+        shown = handover.import_keys.plan_import(station, bundle)
+        state = station.version()
+        if dry_run:
+            app.emit({**_import_plan(shown), "receipt": None, "plan": True}, _import_text(station, shown))
+            return
+        if not isinstance(shown, handover.import_keys.Imported):
+            require_new(receipt)
+            app.note(_import_text(station, shown))
+            app.confirm(f"Take {count_of(len(shown.taken))} in?", yes=yes)
+        with station.lock("import-keys", app.note):
+            plan = shown if station.version() == state else handover.import_keys.plan_import(station, bundle)
+            done = _take_in(station, plan, shown)
+            _write_receipt(receipt, done.receipt)
     outcomes: list[dict[str, Any]] = []
     if links_given(ctx) if prove is None else prove:
         outcomes = _prove(app, station, done, links)
-    _tell_import(app, station, done, receipt, told, outcomes)
+    _tell_import(app, station, done, receipt, _import_plan(shown), outcomes)
     if prove:
         _require_proven(outcomes)
 
@@ -224,11 +240,28 @@ def _require_proven(outcomes: list[dict[str, Any]]) -> None:
         raise click.exceptions.Exit(LinkFailure.exit_code)
 
 
-def _read_bundle(file: Path) -> bytes:
-    octets = read_limited(file, protocol.handover.bundle.MAX_BUNDLE_OCTETS, "bundle")
-    if octets.lstrip()[:1] != b"{" or b'"ciphertext"' not in octets:
-        raise BadData(f"{file} is no handover bundle.", hint="Give the file that export-keys wrote.")
-    return octets
+@contextmanager
+def _bundle_file(path: Path) -> Iterator[BinaryIO]:
+    """Open a bundle, to be read from any place; one that comes through a pipe is read whole."""
+    most = protocol.handover.bundle.MAX_BUNDLE_OCTETS
+    with open_to_read(path) as file:
+        whole = file if file.seekable() else BytesIO(file.read(most + 1))
+        if whole.seek(0, os.SEEK_END) > most:
+            raise BadData(f"{path} is larger than {most} octets: that is no bundle.")
+        if not _is_sealed(whole):
+            raise BadData(f"{path} is no handover bundle.", hint="Give the file that export-keys wrote.")
+        yield whole
+
+
+def _is_sealed(file: BinaryIO) -> bool:
+    """Whether a file looks like a JWE."""
+    file.seek(0)
+    before = file.read(_PIECE)
+    if before.lstrip()[:1] != b"{":
+        return False
+    while (piece := file.read(_PIECE)) and _CIPHERTEXT not in before:
+        before = before[-len(_CIPHERTEXT) :] + piece
+    return _CIPHERTEXT in before
 
 
 def _take_in(station: Station, plan: ImportPlan | Imported, shown: ImportPlan | Imported) -> Imported:
@@ -245,69 +278,80 @@ def _require_same(same: bool) -> None:
         raise PolicyRefused("Another command changed the plan while this one waited.", hint="Run it again.")
 
 
-def _import_plan(station: Station, plan: ImportPlan | Imported) -> tuple[dict[str, Any], str]:
-    """The result as far as it is known before anything happens, and the plan for people."""
+def _import_plan(plan: ImportPlan | Imported) -> dict[str, Any]:
+    """The result as far as it is known before anything happens."""
     if isinstance(plan, handover.import_keys.Imported):
-        return _taken_before(plan), f"This bundle was taken in on {plan.row.created}; nothing is left to do."
+        return _taken_before(plan)
     bundle = plan.opened.bundle
-    nodes = [{"uuid": one.node.uuid.hex(), "decision": one.decision, "why": one.why} for one in plan.nodes]
+    nodes = ((one.node.uuid.hex(), one.decision, one.why) for one in plan.nodes)
     denied = [{"uuid": one.uuid.hex(), "why": one.why} for one in plan.denied]
     told = _import_result(bundle.sender, bundle.mode, bundle.id, nodes, denied)
     notes = {one.node.uuid.hex(): list(one.notes) for one in plan.nodes if one.notes}
     passed_over = [{"uuid": one.uuid.hex(), "why": why} for one, why in plan.passed_over]
-    told |= {"notes": notes, "revocations_passed_over": passed_over}
-    return told, _import_text(station, plan, told, nodes)
+    return told | {"notes": notes, "revocations_passed_over": passed_over}
 
 
 def _taken_before(done: Imported) -> dict[str, Any]:
-    nodes = [{"uuid": uuid.hex(), "decision": "same", "why": ""} for uuid in done.uuids]
-    nodes += [{"uuid": uuid, "decision": "refused", "why": why} for uuid, why in done.notes.refused]
+    refused = done.refused_uuids
+    same = ((uuid, "same", "") for uuid in done.notes.uuids if uuid not in refused)
+    nodes = chain(same, ((uuid, "refused", why) for uuid, why in done.notes.refused))
     return _import_result(done.row.peers[0], done.row.mode, done.row.id, nodes, [])
 
 
-def _import_text(station: Station, plan: ImportPlan, told: dict[str, Any], nodes: list[dict[str, str]]) -> str:
-    bundle = plan.opened.bundle
+def _import_text(station: Station, plan: ImportPlan | Imported) -> str:
+    """The plan for people."""
+    if isinstance(plan, handover.import_keys.Imported):
+        return f"This bundle was taken in on {plan.row.created}; nothing is left to do."
+    bundle, nodes = plan.opened.bundle, plan.nodes
     lines = [f"A {bundle.mode} of {count_of(len(nodes))} from {handover.pending.peer_name(station, bundle.sender)}"]
-    lines += _first([f"  {node['decision']:<8} {node['uuid']}  {node['why']}".rstrip() for node in nodes], 40)
-    lines += [f"  {uuid}: {note}" for uuid, said in [*told["notes"].items()][:40] for note in said]
-    lines += [f"  revoked  {one['uuid']}  {one['why']}" for one in told["revoked"]]
-    lines += [f"  its ban of {one['uuid']} does not count: {one['why']}" for one in told["revocations_passed_over"]]
+    shown = [f"  {one.decision:<8} {one.node.uuid.hex()}  {one.why}".rstrip() for one in nodes[:_SHOWN_TO_IMPORT]]
+    lines += _first(shown, _SHOWN_TO_IMPORT, len(nodes))
+    lines += _noted(nodes)
+    lines += [f"  revoked  {one.uuid.hex()}  {one.why}" for one in plan.denied]
+    lines += [f"  its ban of {one.uuid.hex()} does not count: {why}" for one, why in plan.passed_over]
     own, sender = handover.trust.spoken(station.fingerprint), handover.trust.spoken(bundle.sender)
     lines += [f"For comparison by voice:\n  from {sender}\n  to   {own}"]
     if not plan.ca_is_known:
         lines.append(
             f"The CA {protocol.keys.fingerprint(bundle.ca)[:32]} will be trusted for these nodes, and for no others."
         )
-    lines.append(
-        "A copy: the sender keeps the same keys, and either can pose as a node to the other."
-        if bundle.mode == "copy"
-        else "A move: each key is rotated at the first contact; until then the sender can still use it."
-    )
-    return "\n".join(lines)
+    return "\n".join([*lines, _COPIED if bundle.mode == "copy" else _MOVED])
+
+
+def _noted(nodes: Iterable[PlannedNode]) -> list[str]:
+    noted = islice((one for one in nodes if one.notes), _SHOWN_TO_IMPORT)
+    return [f"  {one.node.uuid.hex()}: {note}" for one in noted for note in one.notes]
 
 
 def _import_result(
-    sender: str, mode: str, handover_id: str, nodes: list[dict[str, str]], denied: list[dict[str, str]]
+    sender: str, mode: str, handover_id: str, nodes: Iterable[tuple[str, str, str]], denied: list[dict[str, str]]
 ) -> dict[str, Any]:
+    decisions: dict[str, str] = {}
+    refused: list[dict[str, str]] = []
+    for uuid, decision, why in nodes:
+        decisions[uuid] = decision
+        if decision == "refused":
+            refused.append({"uuid": uuid, "why": why})
     return {
         "from": sender,
         "id": handover_id,
         "mode": mode,
-        "count": len(nodes),
-        "imported": [node["uuid"] for node in nodes if node["decision"] != "refused"],
-        "refused": [{"uuid": node["uuid"], "why": node["why"]} for node in nodes if node["decision"] == "refused"],
-        "decisions": {node["uuid"]: node["decision"] for node in nodes},
+        "count": len(decisions),
+        "imported": [uuid for uuid, decision in decisions.items() if decision != "refused"],
+        "refused": refused,
+        "decisions": decisions,
         "revoked": denied,
     }
 
 
 def _write_receipt(receipt: Path, octets: bytes) -> None:
-    if not (receipt.is_file() and receipt.read_bytes().strip() == octets):
+    if not holds(receipt, octets + b"\n"):
         write_new(receipt, octets + b"\n")
 
 
 def _prove(app: App, station: Station, done: Imported, links: LinkSettings) -> list[dict[str, Any]]:
-    waiting = [uuid for uuid in done.uuids if not handover.prove.is_proven(station, uuid)]
+    proven = handover.prove.proven_of(station, done.uuids)
+    waiting = [uuid for uuid in done.uuids if uuid not in proven]
 
     def hold() -> AbstractContextManager[None]:
         return station.lock("import-keys", app.note)
@@ -324,15 +368,20 @@ def _prove(app: App, station: Station, done: Imported, links: LinkSettings) -> l
 def _tell_import(
     app: App, station: Station, done: Imported, receipt: Path, told: dict[str, Any], outcomes: list[dict[str, Any]]
 ) -> None:
-    proven = [uuid.hex() for uuid in done.uuids if handover.prove.is_proven(station, uuid)]
-    pending = [uuid.hex() for uuid in done.uuids if uuid.hex() not in set(proven)]
+    imported = told["imported"]
+    known = handover.prove.proven_of(station, map(bytes.fromhex, imported))
+    proven = [uuid for uuid in imported if bytes.fromhex(uuid) in known] if known else []
+    pending = [uuid for uuid in imported if bytes.fromhex(uuid) not in known] if known else imported
     not_met = {one["uuid"]: one["why"] for one in outcomes if one["why"]}
     told |= {"receipt": str(receipt), "fresh": done.fresh, "proven": proven, "pending": pending, "not_proven": not_met}
     app.emit(told, _import_told(done, receipt, not_met, pending, sum(bool(one["rotated"]) for one in outcomes)))
 
 
 def _import_told(done: Imported, receipt: Path, not_met: dict[str, str], pending: list[str], rotated: int) -> str:
-    lines = [f"{count_of(len(done.uuids))} taken in" + ("." if done.fresh else " before; nothing changed.")]
+    lines = [
+        f"{count_of(len(done.notes.uuids) - len(done.notes.refused))} taken in"
+        + ("." if done.fresh else " before; nothing changed.")
+    ]
     lines += [f"  refused {uuid}: {why}" for uuid, why in done.notes.refused]
     lines += [f"  not met {uuid}: {why}" for uuid, why in not_met.items()]
     lines += [f"{count_of(rotated)} rotated: the sender is locked out for certain."] if rotated else []

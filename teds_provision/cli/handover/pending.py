@@ -12,7 +12,8 @@ from teds_provision import protocol
 from teds_provision.cli.context import App, pass_app
 from teds_provision.cli.handover.bundles import count_of
 from teds_provision.cli.options import COMMAND_SETTINGS, dry_run_option, examples, yes_option
-from teds_provision.errors import NotFound, TedsProvisionError
+from teds_provision.cli.rendering import local_time
+from teds_provision.errors import BadData, NotFound, TedsProvisionError
 from teds_provision.files import read_limited
 
 if TYPE_CHECKING:
@@ -52,7 +53,7 @@ def list_(app: App) -> None:
     ]
     lines = [
         f"{row['id']}  {row['direction']:<3} {row['mode']}  {row['state']:<8} {row['count']:>5}"
-        f"  {', '.join(row['names'])}  {row['created']}{'  expired' if row['expired'] else ''}"  # type: ignore[arg-type]
+        f"  {', '.join(row['names'])}  {local_time(str(row['created']))}{'  expired' if row['expired'] else ''}"  # type: ignore[arg-type]
         for row in rows
     ]
     app.emit({"handovers": rows}, "\n".join(lines) or "No bundle has left or come.")
@@ -92,6 +93,8 @@ def _close_all(
             octets = read_limited(path, protocol.handover.receipt.MAX_RECEIPT_OCTETS, "receipt")
             closed.append(handover_room.pending.close(station, octets))
         except TedsProvisionError as error:
+            if not go_on and error.message == protocol.handover.jose.NO_COMPACT_JWS:
+                raise BadData(f"{path} is no receipt.", hint="Give the file that import-keys wrote.") from error
             if not go_on:
                 raise
             app.warn(f"{path.name}: {error.message}")

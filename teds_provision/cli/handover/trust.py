@@ -12,7 +12,7 @@ from teds_provision.cli.context import App, pass_app
 from teds_provision.cli.handover.bundles import count_of
 from teds_provision.cli.options import COMMAND_SETTINGS, dry_run_option, examples, fingerprint_option, yes_option
 from teds_provision.errors import OtherKey
-from teds_provision.files import read_limited, write_new
+from teds_provision.files import holds, read_limited, write_new
 from teds_provision.protocol.fingerprints import same_key
 
 if TYPE_CHECKING:
@@ -259,7 +259,7 @@ def sign(app: App, request: Path, output: Path, yes: bool, dry_run: bool) -> Non
     app.confirm("Certify it? Whoever holds its key can then write and rekey every node of this owner.", yes=yes)
     with station.lock("trust ca sign", app.note):
         octets = handover.certify.write_certificate(handover.certify.sign_request(station, wanted))
-        fresh = not (output.is_file() and output.read_bytes() == octets)
+        fresh = not holds(output, octets)
         if fresh:
             write_new(output, octets)
     text = f"{wanted.name} ({digits[:16]}) is certified: {output}. There: teds-provision init --certificate {output}"

@@ -17,16 +17,16 @@ from teds_provision import teds
 from teds_provision.cli import measure as measure_cli
 from teds_provision.cli.context import App, pass_app
 from teds_provision.cli.measure.values import ending, over_the_bus
-from teds_provision.cli.options import command, link_options
+from teds_provision.cli.options import Channel, Number, WholeNumber, command, link_options
 from teds_provision.cli.steps.build import read_file
 from teds_provision.errors import UsageFailure
 from teds_provision.links import LINKS, LinkSettings, ble, can
 from teds_provision.store import Measurement
 
 if TYPE_CHECKING:
-    from teds_provision.measure.carrying.job import Job
-    from teds_provision.measure.carrying.judging import Judging
     from teds_provision.measure.runner import Ended
+    from teds_provision.measure.running.job import Job
+    from teds_provision.measure.running.requirements import Requirements
     from teds_provision.station.station import Station
 
 KINDS = ("periodic", "event", "free")
@@ -39,11 +39,9 @@ KINDS = ("periodic", "event", "free")
     "teds-provision measure recover run.mcap",
 )
 @click.argument("what", nargs=-1, required=True, metavar="NAME|UUID …")
-@click.option("--rate", type=click.FloatRange(min=0.001), metavar="HZ", help="Samples a second; else the datasheet's.")
-@click.option("--duration", type=click.FloatRange(min=0.1), metavar="S", help="Seconds; without it until Ctrl-C.")
-@click.option(
-    "--channel", "channels", type=click.IntRange(1, 255), multiple=True, metavar="N", help="This channel alone."
-)
+@click.option("--rate", type=Number(min=0.001), metavar="HZ", help="Samples a second; else the datasheet's.")
+@click.option("--duration", type=Number(min=0.1), metavar="S", help="Seconds; without it until Ctrl-C.")
+@click.option("--channel", "channels", type=Channel(), multiple=True, metavar="N", help="This channel alone.")
 @click.option("--kind", type=click.Choice(KINDS), help="How the node samples; without it as each channel is.")
 @click.option("--trigger", is_flag=True, help="Begin on all nodes at one moment, by one frame.")
 @click.option("--test-pattern", is_flag=True, help="Stream the test pattern and check it: no measurement.")
@@ -53,10 +51,10 @@ KINDS = ("periodic", "event", "free")
 @click.option("--ros2", is_flag=True, help="Publish to ROS 2 (ROS_DOMAIN_ID), on this machine.")
 @click.option("--mqtt", metavar="URL", help="Publish to a broker: mqtt://HOST, with Home Assistant discovery.")
 @click.option("--actuators/--no-actuators", default=True, show_default=True, help="Take set points from ROS topics.")
-@click.option("--dead-man", type=click.IntRange(20, 10_000), default=1000, show_default=True, metavar="MS",
+@click.option("--dead-man", type=WholeNumber(20, 10_000), default=1000, show_default=True, metavar="MS",
               help="An actuator without set points for so long is safe.")  # fmt: skip
 @click.option("--require", type=click.Path(path_type=Path, dir_okay=False), metavar="FILE", help="What the task needs.")
-@click.option("--scalar-rate", type=click.FloatRange(0, 1000), default=10.0, show_default=True, metavar="HZ",
+@click.option("--scalar-rate", type=Number(0, 1000), default=10.0, show_default=True, metavar="HZ",
               help="Rate of topics of one value.")  # fmt: skip
 @link_options
 @pass_app
@@ -78,24 +76,20 @@ def measure(
     if what[0] == "recover":
         _recover(app, what[1:])
         return
-    links = over_the_bus(links)
+    links = over_the_bus(links, streams=True)
+    if mqtt is not None and not mqtt.startswith(("mqtt://", "mqtts://")):
+        raise UsageFailure(f"--mqtt {mqtt!r} names no broker.", hint="Write it like mqtt://HOST or mqtts://USER@HOST.")
     _require_streams(links, trigger=wished["trigger"])
     station = app.station()
     group, uuids = _who(station, what)
     ros = [name for name in ("ros1", "ros2") if wished[name]]
-    kept = _asked(group, uuids, [*files, *ros, *filter(None, [mqtt])], wished)
-    wish = measure_room.orders.Wish(
-        test_pattern=wished["test_pattern"],
-        timeout=links.timeout,
-        unsigned=wished["unsigned"],
-        require=_judging(require),
-    )
-    if group and duration is None and not (wish.test_pattern or wish.unsigned):
+    kept = _asked(group, uuids, [*files, *ros, *filter(None, [mqtt])], wished | {"require": _requirements(require)})
+    if group and duration is None:
         kept = _carried_on(app, station, kept)
-    job = measure_room.carrying.job.Job(station, kept, wish=wish)
+    job = measure_room.running.job.Job(station, kept, wish=measure_room.orders.Wish(timeout=links.timeout))
     for uuid in uuids:
         station.unlock(uuid)
-    _tell_end(app, _run(app, job, links, uuids, duration), wish.require)
+    _tell_end(app, _run(app, job, links, uuids, duration), job.wish.require)
 
 
 def _require_streams(links: LinkSettings, *, trigger: bool) -> None:
@@ -120,17 +114,21 @@ def _asked(group: str, uuids: Sequence[bytes], sinks: Sequence[str], wished: Map
         actuators=wished["actuators"] and (wished["ros1"] or wished["ros2"]),
         dead_man=wished["dead_man"],
         scalar_rate=wished["scalar_rate"],
-        sinks=tuple(measure_room.carrying.job.whole_path(spec) for spec in sinks),
+        sinks=tuple(measure_room.running.job.whole_path(spec) for spec in sinks),
         lasting=False,
+        test_pattern=wished["test_pattern"],
+        unsigned=wished["unsigned"],
+        require=wished["require"],
     )
 
 
-def _judging(file: Path | None) -> Judging | None:
-    """What the task needs of the datasheets, where a file says so."""
+def _requirements(file: Path | None) -> str:
+    """What the task needs of the datasheets, "" where no file says so; raises BadData where it says nothing useful."""
     if file is None:
-        return None
+        return ""
     text = read_file(file).decode(errors="replace")
-    return measure_room.carrying.judging.Judging(teds.fits.parse_require(text, str(file)))
+    teds.fits.parse_require(text, str(file))
+    return text
 
 
 def _who(station: Station, what: Sequence[str]) -> tuple[str, list[bytes]]:
@@ -150,7 +148,9 @@ def _carried_on(app: App, station: Station, asked: Measurement) -> Measurement:
         return asked
     rate = f"{kept.rate:g} Hz" if kept.rate else "the datasheets' rates"
     to = f" to {', '.join(kept.sinks)}" if kept.sinks else ""
-    app.note(f"Carrying on what was begun at {kept.created}: {rate}{to}.")
+    more = {"test pattern": kept.test_pattern, "unsigned nodes too": kept.unsigned, "with --require": kept.require}
+    beside = "".join(f", {name}" for name, asked_for in more.items() if asked_for)
+    app.note(f"Carrying on what was begun at {kept.created}: {rate}{to}{beside}.")
     return kept
 
 
@@ -179,8 +179,8 @@ def _run(app: App, job: Job, links: LinkSettings, uuids: Sequence[bytes], durati
     return ended
 
 
-def _tell_end(app: App, ended: Ended, require: Judging | None) -> None:
-    result: dict[str, Any] = {"event": "end", "nodes": ended.nodes, "files": ended.files}
+def _tell_end(app: App, ended: Ended, require: Requirements | None) -> None:
+    result: dict[str, Any] = {"event": "end", "nodes": ended.nodes, "files": ended.files, "sinks": ended.sinks}
     if require is not None:
         result["fits"] = require.fits
     if ended.apart:
@@ -188,9 +188,10 @@ def _tell_end(app: App, ended: Ended, require: Judging | None) -> None:
     app.conclude(result, "\n".join(_end_lines(ended, require)) or "Nothing was measured.", ended.error)
 
 
-def _end_lines(ended: Ended, require: Judging | None) -> list[str]:
+def _end_lines(ended: Ended, require: Requirements | None) -> list[str]:
     lines = [_stream_line(node["uuid"], stream) for node in ended.nodes for stream in node["streams"]]
     lines += [f"Written: {name}" for name in ended.files]
+    lines += [f"{one['sink']}: {one['dropped']} values dropped" for one in ended.sinks if one["dropped"]]
     if require is not None and ended.error is not None:
         lines += [str(fit["why"]) for fit in require.fits if fit["result"] != "passed"]
     return lines

@@ -8,7 +8,7 @@ import click
 
 from teds_provision import measure, teds
 from teds_provision.cli.context import App, pass_app
-from teds_provision.cli.options import COMMAND_SETTINGS, command, dry_run_option, examples
+from teds_provision.cli.options import COMMAND_SETTINGS, WholeNumber, command, dry_run_option, examples
 from teds_provision.errors import NotFound, UsageFailure
 from teds_provision.station.measurements import STATION
 
@@ -39,7 +39,7 @@ def list_names(app: App) -> None:
     name="set",
 )
 @click.argument("node", metavar="UUID|station")
-@click.argument("channel", type=click.IntRange(0, 255))
+@click.argument("channel", type=WholeNumber(0, 255))
 @click.argument("name")
 @dry_run_option
 @pass_app
@@ -64,7 +64,7 @@ def set_name(app: App, node: str, channel: int, name: str, *, dry_run: bool) -> 
 
 @command("teds-provision names reset 8d4d 1", name="reset")
 @click.argument("node", metavar="UUID|station")
-@click.argument("channel", type=click.IntRange(0, 255))
+@click.argument("channel", type=WholeNumber(0, 255))
 @dry_run_option
 @pass_app
 def reset_name(app: App, node: str, channel: int, *, dry_run: bool) -> None:
@@ -111,7 +111,7 @@ def _channels(station: Station) -> list[tuple[bytes, int, ChannelFacts]]:
 
 def _tell(app: App, station: Station) -> None:
     chosen = station.measurements.names
-    facts = measure.carrying.job.station_facts(station)
+    facts = measure.running.job.station_facts(station)
     topics = measure.sinks.names.Topics(facts)
     channels = _channels(station)
     topics.learn(one for _, _, one in channels)

@@ -73,12 +73,14 @@ class JsonLines(ThreadedSink):
             self.report(report)
 
     def sink(self, sink: Sink) -> None:
-        """A sink that failed."""
+        """A sink that failed, waits for its consumers, or has them again."""
         stats = sink.stats
+        why = stats.error or stats.detail
         with self._guard:
             self._events.append(
-                {"event": "sink", "sink": sink.name, "state": stats.state, "why": stats.error, "hint": stats.hint}
-            )
+                {"event": "sink", "sink": sink.name, "state": stats.state, "why": why, "hint": stats.hint,
+                 "dropped": stats.dropped}
+            )  # fmt: skip
 
     def _prepare(self, facts: tuple[ChannelFacts, ...], station: StationFacts) -> None:
         """Nothing to open."""
@@ -124,8 +126,10 @@ class PlainLines:
             self._app.note(f"{report.uuid}: {report.state}{f': {report.why}' if report.why else ''}")
 
     def sink(self, sink: Sink) -> None:
-        """A sink that failed."""
-        self._app.warn(f"{sink.stats.error} {sink.stats.hint}".strip())
+        """A sink that failed, waits for its consumers, or has them again."""
+        stats = sink.stats
+        text = f"{stats.error} {stats.hint}" if stats.error else f"{sink.name}: {stats.state}, {stats.detail}"
+        self._app.warn(text.strip())
 
 
 class LiveTable:
@@ -159,8 +163,9 @@ class LiveTable:
             self._reports[report.uuid] = report
 
     def sink(self, sink: Sink) -> None:
-        """A sink that failed is a line that stays."""
-        self._app.warn(f"{sink.stats.error} {sink.stats.hint}".strip())
+        """A sink that failed is a line that stays; the states of the others stand below the table."""
+        if sink.stats.error:
+            self._app.warn(f"{sink.stats.error} {sink.stats.hint}".strip())
 
     @contextmanager
     def shown(self) -> Iterator[LiveTable]:

@@ -16,7 +16,7 @@ import click
 
 from teds_provision import measure, talk
 from teds_provision.cli.context import App, pass_app
-from teds_provision.cli.options import command, link_options
+from teds_provision.cli.options import Channel, Number, WholeNumber, command, link_options, said_here
 from teds_provision.cli.rendering import print_table, reporter_for, shown
 from teds_provision.errors import LinkFailure, NodeRefused, UsageFailure
 from teds_provision.links import LinkSettings
@@ -32,12 +32,25 @@ if TYPE_CHECKING:
     from teds_provision.talk.conversation import Conversation
 
 
-def over_the_bus(links: LinkSettings) -> LinkSettings:
-    """The links of a command for which a bus that is named is meant, also without ``--via can``."""
-    bare = links.via == "nfc" and not links.nfc
-    if bare and (links.can or links.ble):
-        return replace(links, via="can" if links.can else "ble")
+def over_the_bus(links: LinkSettings, *, streams: bool = False) -> LinkSettings:
+    """The links of a command for which a bus that is named is meant, also without ``--via can``.
+
+    What stands in this command line goes before a reader that is named in config.toml or a variable. ``streams``: so
+    does every bus that is named, as a reader carries none.
+    """
+    said = said_here("via", "nfc", "can", "ble")
+    bus = _bus_meant(links, said)
+    reader_is_meant = said & {"via", "nfc"} or (links.nfc and not streams and bus not in said)
+    if bus is not None and links.via == "nfc" and not reader_is_meant:
+        return replace(links, via=bus)
     return links.after_agreeing()
+
+
+def _bus_meant(links: LinkSettings, said: set[str]) -> str | None:
+    """The bus, or the air, that is named; of both the one that stands in the command line, else the bus."""
+    named = [name for name, given in (("can", links.can), ("ble", links.ble)) if given]
+    here = [name for name in named if name in said]
+    return next(iter(here or named), None)
 
 
 @contextmanager
@@ -56,7 +69,7 @@ def trusted_node(app: App, station: Station, links: LinkSettings, uuid: bytes) -
     "teds-provision sample 8d4d 1 3 --nfc usb",
 )
 @click.argument("node", metavar="UUID")
-@click.argument("channels", nargs=-1, type=click.IntRange(1, 255), metavar="[CHANNEL …]")
+@click.argument("channels", nargs=-1, type=Channel(), metavar="[CHANNEL …]")
 @link_options
 @pass_app
 def sample(app: App, node: str, channels: Sequence[int], links: LinkSettings) -> None:
@@ -157,16 +170,18 @@ def _mode(console: Console, found: Operation, names: dict[int, str], power: Powe
 @command(
     "teds-provision set 91aa 1 0.5 --can socketcan:can0",
     "teds-provision set 91aa 1 45 --unit degree --hold 3 --can socketcan:can0",
+    "teds-provision set 91aa 1 -0.5 --can socketcan:can0",
     name="set",
+    context_settings={"ignore_unknown_options": True},  # -0.5 is a value, and no option
 )
 @click.argument("node", metavar="UUID")
-@click.argument("channel", type=click.IntRange(1, 255))
+@click.argument("channel", type=Channel())
 @click.argument("value", type=float)
 @click.option("--unit", metavar="U", help="Unit of VALUE; without it the SI unit of the datasheet.")
-@click.option("--hold", type=click.FloatRange(min=0), metavar="S", help="Seconds; without it until Ctrl-C.")
+@click.option("--hold", type=Number(min=0), metavar="S", help="Seconds; without it until Ctrl-C.")
 @click.option(
     "--dead-man",
-    type=click.IntRange(20, 10_000),
+    type=WholeNumber(20, 10_000),
     default=1000,
     show_default=True,
     metavar="MS",

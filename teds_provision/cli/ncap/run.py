@@ -3,17 +3,21 @@
 from __future__ import annotations
 
 import importlib.util
+import os
 import sys
 import threading
+from collections import deque
 from collections.abc import Sequence
 from contextlib import suppress
+from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Final
 
 import click
 
 from teds_provision.cli.context import App, pass_app, to_json
 from teds_provision.cli.options import command
+from teds_provision.cli.tracing import tracing
 from teds_provision.errors import UsageFailure
 from teds_provision.lazy import how_to_install, late
 
@@ -22,6 +26,8 @@ if TYPE_CHECKING:
 else:
     running, settings = late("teds_provision.ncap.running"), late("teds_provision.ncap.settings")
 
+MOST: Final = 1000  # lines that may wait for somebody to read them
+LEAVING: Final = 2.0  # seconds for them to leave at the end
 _NEEDED = ("starlette", "uvicorn", "websockets")
 _FILE = click.Path(path_type=Path, dir_okay=False, exists=True)
 
@@ -41,11 +47,18 @@ _FILE = click.Path(path_type=Path, dir_okay=False, exists=True)
 @click.option("--ros1", is_flag=True, help="Publish to ROS 1 (ROS_MASTER_URI).")
 @click.option("--ros2", is_flag=True, help="Publish to ROS 2 (ROS_DOMAIN_ID), on this machine.")
 @click.option("--mqtt", metavar="URL", help="Publish to a broker: mqtt://HOST.")
+@click.option("--actuators/--no-actuators", default=True, show_default=True, help="Take set points from ROS topics.")
 @click.option("--metrics", is_flag=True, help="Serve /metrics for Prometheus.")
 @click.option("--http-1451", "clause_12", is_flag=True, help="Serve the paths of IEEE 1451.0 clause 12, read only.")
 @click.option("--nfc", multiple=True, metavar="PATH", help="A reader: auto, usb, udp:localhost:54321; several times.")
 @click.option("--can", multiple=True, metavar="INTERFACE:CHANNEL", help="A bus: socketcan:can0; several times.")
 @click.option("--ble", multiple=True, metavar="ADAPTER", help="Bluetooth: auto, hci0; several times.")
+@click.option(
+    "--trace",
+    metavar="FILE",
+    type=click.Path(path_type=Path, dir_okay=False),
+    help="Write down every frame of every link; it grows without bound. See: trace show.",
+)
 @pass_app
 def run(
     app: App,
@@ -57,6 +70,7 @@ def run(
     ros1: bool,
     ros2: bool,
     mqtt: str | None,
+    trace: Path | None,
     **wished: Any,
 ) -> None:
     """Run the base station until SIGTERM or Ctrl-C.
@@ -75,7 +89,11 @@ def run(
     settings.require_safe(wanted)
     station = app.station()
     station.unlock()  # nobody is asked for a passphrase later
-    running.run(station, wanted, Lines(app).tell)
+    lines = Lines(app)
+    with tracing(trace) as opened:
+        running.run(station, replace(wanted, trace=opened), lines.tell)
+    if not lines.end():
+        os._exit(0)  # all has ended in order; a line that nobody takes would hold the end of the process up for ever
 
 
 def _require_extra() -> None:
@@ -85,15 +103,54 @@ def _require_extra() -> None:
 
 
 class Lines:
-    """The daemon's lines: JSON on stdout, or sentences on stderr. Whoever stops reading them stops nothing."""
+    """The daemon's lines: JSON on stdout, or sentences on stderr; a thread of their own writes them.
+
+    Whoever stops reading them, a script that wanted the first one or a terminal that is held by Ctrl-S, stops nothing:
+    of more than MOST that wait the oldest go, and the next line says how many.
+    """
 
     def __init__(self, app: App) -> None:
         self._app = app
-        self._turn = threading.Lock()
+        self._waiting: deque[dict[str, Any]] = deque()
+        self._news = threading.Condition()
+        self._dropped = 0
+        self._ending = False
+        self._thread = threading.Thread(target=self._run, name="lines", daemon=True)
+        self._thread.start()
 
     def tell(self, event: dict[str, Any]) -> None:
-        """One line, whole, from whichever thread."""
-        with self._turn, suppress(OSError, ValueError):
+        """One line, from whichever thread; returns at once."""
+        with self._news:
+            if len(self._waiting) >= MOST:
+                self._waiting.popleft()
+                self._dropped += 1
+            self._waiting.append(event)
+            self._news.notify()
+
+    def end(self) -> bool:
+        """Write what waits; False where nobody takes it within LEAVING seconds."""
+        with self._news:
+            self._ending = True
+            self._news.notify()
+        self._thread.join(LEAVING)
+        return not self._thread.is_alive()
+
+    def _run(self) -> None:
+        while True:
+            with self._news:
+                self._news.wait_for(lambda: self._waiting or self._ending)
+                if not self._waiting:
+                    return
+                events = [*self._waiting]
+                if self._dropped:
+                    events.insert(0, {"event": "lines", "state": "dropped", "count": self._dropped})
+                self._waiting.clear()
+                self._dropped = 0
+            for event in events:
+                self._write(event)
+
+    def _write(self, event: dict[str, Any]) -> None:
+        with suppress(OSError, ValueError):
             if self._app.json:
                 sys.stdout.write(to_json(event) + "\n")
                 sys.stdout.flush()

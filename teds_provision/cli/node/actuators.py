@@ -1,9 +1,13 @@
-"""What virtual actuators do, as lines on stdout: at most twenty a second each, the last state always."""
+"""What virtual actuators do, as lines on stdout: at most twenty a second each, the last state always.
+
+``time`` of a line is when the state began, not when the line was printed: how long a dead-man took can be read there.
+"""
 
 from __future__ import annotations
 
 import threading
 from collections.abc import Callable
+from datetime import UTC, datetime
 from typing import TYPE_CHECKING
 
 from teds_provision.cli.context import App
@@ -81,6 +85,9 @@ class ActuatorLines:
                 "unit": state.unit,
                 "raw": state.raw if state.raw == state.raw else None,
                 "safe": state.safe,
+                "time": datetime.fromtimestamp(state.time, UTC)
+                .isoformat(timespec="milliseconds")
+                .replace("+00:00", "Z"),
             },
             f"{uuid} {name}: {'safe state, ' if state.safe else ''}{value}",
         )

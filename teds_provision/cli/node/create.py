@@ -9,7 +9,7 @@ import click
 from teds_provision import node, protocol
 from teds_provision import teds as teds_room
 from teds_provision.cli.context import App, pass_app
-from teds_provision.cli.options import command
+from teds_provision.cli.options import WholeNumber, command
 from teds_provision.errors import UsageFailure
 
 _NAME_OCTETS = 120
@@ -54,7 +54,7 @@ def _name(_ctx: click.Context, _parameter: click.Parameter, text: str) -> str:
 @click.option("--profile", metavar="P", help="Its datasheet and hardware: those of a transducer type.")
 @click.option(
     "--max-message",
-    type=click.IntRange(1024, 4094),
+    type=WholeNumber(1024, 4094),
     default=2048,
     show_default=True,
     metavar="OCTETS",

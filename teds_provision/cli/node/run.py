@@ -15,7 +15,7 @@ from teds_provision import node as node_room
 from teds_provision import protocol, teds
 from teds_provision.cli.context import App, pass_app
 from teds_provision.cli.node.actuators import ActuatorLines
-from teds_provision.cli.options import command
+from teds_provision.cli.options import Number, WholeNumber, command
 from teds_provision.errors import UsageFailure
 from teds_provision.node import ble as ble_room
 from teds_provision.node import can as can_room
@@ -60,15 +60,11 @@ _DEFAULT_SOURCE = "noise"
     metavar="SOURCE",
     help="Where values come from: noise, sine:PERIOD, ramp:PERIOD, file:CSV, -, unix:PATH, exec:COMMAND.",
 )
-@click.option(
-    "--crypto-delay", type=click.FloatRange(min=0), default=0, metavar="MS", help="Milliseconds per point operation."
-)
-@click.option(
-    "--flash-delay", type=click.FloatRange(min=0), default=0, metavar="MS", help="Milliseconds per flash commit."
-)
+@click.option("--crypto-delay", type=Number(min=0), default=0, metavar="MS", help="Milliseconds per point operation.")
+@click.option("--flash-delay", type=Number(min=0), default=0, metavar="MS", help="Milliseconds per flash commit.")
 @click.option(
     "--wait-time",
-    type=click.IntRange(4, 60),
+    type=WholeNumber(4, 60),
     default=4,
     show_default=True,
     metavar="WT_INT",
@@ -76,7 +72,7 @@ _DEFAULT_SOURCE = "noise"
 )
 @click.option(
     "--battery",
-    type=click.FloatRange(0, 100),
+    type=Number(0, 100),
     metavar="PERCENT",
     help="It has a battery, so full: a reader's field charges it (2 % a minute), else it empties (0.1 %).",
 )

@@ -113,7 +113,7 @@ def restore(
     the audit log only grows. A backup of another station is refused (exit 6). A wrong passphrase is exit 7, a file
     that was changed 4, one that is cut off or something else 8.
     """
-    content = _open(app, file, recovery_key, _asker(app, backup_passphrase_fd))
+    content = _open(file, recovery_key, _asker(app, backup_passphrase_fd))
     app.closing(content.close)
     present = backup_room.restore.open_present(app.home, content)
     if present is not None:
@@ -203,7 +203,7 @@ def _emit(app: App, content: Content, done: Restored, text: str, *, dry: bool = 
     app.emit(result, lambda console: console.print(text, markup=False))
 
 
-def _open(app: App, file: Path, recovery_key: Path | None, ask: Callable[[str, bool], str]) -> Content:
+def _open(file: Path, recovery_key: Path | None, ask: Callable[[str, bool], str]) -> Content:
     sealed = backup_room.sealed_file.SealedFile(file)
     if not sealed.is_for_key:
         return sealed.open_with_passphrase(ask("Passphrase of the backup", False))

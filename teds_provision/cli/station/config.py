@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
-from click.shell_completion import get_completion_class
 
+from teds_provision.cli import terminal
 from teds_provision.cli.configuration import as_parameters, config_path, read_config
 from teds_provision.cli.context import App, pass_app
 from teds_provision.cli.option_names import OPTIONS
@@ -51,14 +51,19 @@ def show(app: App, ctx: click.Context) -> None:
     values = read_config(place) or {}
     root = ctx.find_root()
     assert isinstance(root.command, click.Group)
-    for name, value in _flat(values):
-        _check_value(root, name, value, place)
+    check_values(root, values, place)
     home = "--home" if root.get_parameter_source("home") == click.core.ParameterSource.COMMANDLINE else "default"
     source = f"environment ({_PREFIX}HOME)" if os.environ.get(f"{_PREFIX}HOME") and home == "default" else home
     settings = [{"name": "home", "value": str(app.home), "source": source}]
     settings += [_from_environment(name, app) for name in sorted(os.environ) if _is_ours(name)]
     settings += [{"name": name, "value": value, "source": str(place)} for name, value in _flat(values)]
     app.emit({"settings": settings}, lambda console: _table(console, settings))
+
+
+def check_values(root: click.Context, values: Mapping[str, Any], place: Path) -> None:
+    """Have click read every value of config.toml as its command would; raises BadData for the first that is bad."""
+    for name, value in _flat(values):
+        _check_value(root, name, value, place)
 
 
 def _is_ours(name: str) -> bool:
@@ -72,7 +77,7 @@ def _from_environment(name: str, app: App) -> dict[str, Any]:
     return {"name": option, "value": os.environ[name], "source": f"environment ({name})"}
 
 
-def _flat(values: dict[str, Any], above: str = "") -> Iterator[tuple[str, Any]]:
+def _flat(values: Mapping[str, Any], above: str = "") -> Iterator[tuple[str, Any]]:
     for name, value in values.items():
         if isinstance(value, dict):
             yield from _flat(value, f"{above}{name}.")
@@ -121,8 +126,6 @@ def completion(app: App, shell: str) -> None:
 
     In bash: eval "$(teds-provision completion bash)"
     """
-    kind = get_completion_class(shell)
-    assert kind is not None
     root = click.get_current_context().find_root().command
-    script = kind(root, {}, "teds-provision", _COMPLETE).source()
+    script = terminal.completing.SHELLS[shell](root, {}, "teds-provision", _COMPLETE).source()
     app.emit({"shell": shell, "script": script}, lambda console: print(script))

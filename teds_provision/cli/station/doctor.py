@@ -2,14 +2,19 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from collections.abc import Mapping
+from functools import partial
+from typing import TYPE_CHECKING, Any
 
 import click
 
 from teds_provision import doctor as doctor_room
+from teds_provision.cli.configuration import config_path
 from teds_provision.cli.context import App, pass_app
 from teds_provision.cli.options import command
 from teds_provision.cli.settings import known_settings
+from teds_provision.cli.station.config import check_values
+from teds_provision.errors import BadData
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -31,10 +36,13 @@ def doctor(app: App, nfc: str | None, can: str | None, ble: str | None) -> None:
     of pins and trust are checked too. Exits 0 unless something failed
     (warnings are no failure): 7 for the store, the keyring or the vault, 5 for a named reader or bus, 1 for the rest.
     """
-    group = click.get_current_context().find_root().command
+    root = click.get_current_context().find_root()
+    group = root.command
     settings = known_settings(group) if isinstance(group, click.Group) else None
     ask = app.ask_secret if app.has_passphrase else None
-    place = doctor_room.doctor.Place(app.home, nfc, can, ble, settings=settings, ask=ask)
+    place = doctor_room.doctor.Place(
+        app.home, nfc, can, ble, settings=settings, ask=ask, bad_value=partial(_bad_value, app, root)
+    )
     found = list(doctor_room.doctor.examine(place))
     findings = [finding for _, finding in found]
     checks = [{"name": one.name, "result": one.result, "why": one.why, "fix": one.fix} for one in findings]
@@ -44,6 +52,14 @@ def doctor(app: App, nfc: str | None, can: str | None, ble: str | None) -> None:
     app.note(", ".join(f"{count} {word}" for word, count in counts.items()) + ".")
     if code:
         raise click.exceptions.Exit(code)
+
+
+def _bad_value(app: App, root: click.Context, values: Mapping[str, Any]) -> str:
+    try:
+        check_values(root, values, config_path(app.home))
+    except BadData as error:
+        return error.message
+    return ""
 
 
 def _print(console: Console, findings: list[Finding]) -> None:

@@ -17,7 +17,7 @@ import click
 from teds_provision import store
 from teds_provision.cli.context import App, pass_app
 from teds_provision.cli.moments import moment
-from teds_provision.cli.options import command
+from teds_provision.cli.options import WholeNumber, command
 from teds_provision.cli.rendering import local_time, shown
 from teds_provision.errors import StoreFailure, UsageFailure
 
@@ -32,7 +32,7 @@ _POLL_SECONDS = 0.3
 @command("teds-provision log --last 20", "teds-provision log --today --failed", "teds-provision log --follow")
 @click.argument("uuid", required=False)
 @click.option("--follow", "-f", is_flag=True, help="Go on: one line per entry as it comes (with --json one object).")
-@click.option("--last", "-n", type=click.IntRange(min=0), metavar="N", help="Only the last N entries.")
+@click.option("--last", "-n", type=WholeNumber(min=0), metavar="N", help="Only the last N entries.")
 @click.option("--today", is_flag=True, help="Only entries of today.")
 @click.option("--since", metavar="TIME", help="Only entries since: ISO 8601, today, or 2h, 3d.")
 @click.option("--act", metavar="A", help="Only entries of this act: agree, write, verify, whitelist …")

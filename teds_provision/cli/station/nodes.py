@@ -14,7 +14,7 @@ import click
 
 from teds_provision.cli.context import App, pass_app
 from teds_provision.cli.moments import moment
-from teds_provision.cli.options import command
+from teds_provision.cli.options import WholeNumber, command
 from teds_provision.cli.rendering import local_time, print_json_list, shown
 from teds_provision.cli.station.fits import show_fits
 from teds_provision.station.inventory import STATES, inventory, search
@@ -31,7 +31,7 @@ _GAP = "  "
 @click.option("--group", metavar="G", help="Only nodes of this group.")
 @click.option(
     "--due",
-    type=click.IntRange(min=0, max=36500),
+    type=WholeNumber(min=0, max=36500),
     metavar="DAYS",
     help="Only nodes with a calibration that ends within so many days, or has ended.",
 )

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -97,9 +97,10 @@ def build(app: App, uuid: str, order: Any, output: Path | None, edition: str, ye
     )
 
 
-def write_file(path: Path, text: str) -> None:
-    """Write a result file whole or not at all."""
-    write_whole(path, text.encode("utf-8"), mode=SHARED, failure=UsageFailure)
+def write_file(path: Path, text: str | Iterable[str]) -> None:
+    """Write a result file whole or not at all; its parts as they come."""
+    parts = (text,) if isinstance(text, str) else text
+    write_whole(path, (part.encode("utf-8") for part in parts), mode=SHARED, failure=UsageFailure)
 
 
 def read_file(path: Path) -> bytes:

@@ -6,6 +6,7 @@ import click
 
 from teds_provision.cli.context import App, pass_app
 from teds_provision.cli.options import command, dry_run_option, examples, yes_option
+from teds_provision.cli.rendering import local_time
 from teds_provision.steps import visits
 
 
@@ -22,7 +23,10 @@ def list_(app: App) -> None:
         {"uuid": one.uuid.hex(), "profile": one.profile, "stage": one.stage, "created": one.created}
         for one in app.station().nodes.drafts()
     ]
-    lines = [f"{one['uuid']}  {one['stage']:<6}  {one['created']}  {one['profile'] or ''}".rstrip() for one in drafts]
+    lines = [
+        f"{one['uuid']}  {one['stage']:<6}  {local_time(str(one['created']))}  {one['profile'] or ''}".rstrip()
+        for one in drafts
+    ]
     app.emit({"drafts": drafts}, "\n".join(lines) or "Nothing lies ready.")
 
 
@@ -65,7 +69,10 @@ def history(app: App, uuid: str) -> None:
         for record in records
     ]
     lines = [
-        f"{one.sequence:>6}  epoch {one.epoch}  {one.signed or 'not signed':<20}  {one.profile or ''}".rstrip()
+        f"{one.sequence:>6}  epoch {one.epoch}  {local_time(one.signed or 'not signed'):<25}  {one.profile or ''}"
         for one in records
     ]
-    app.emit({"uuid": node.hex(), "history": told}, "\n".join(lines) or f"No datasheet of node {node.hex()} is known.")
+    app.emit(
+        {"uuid": node.hex(), "history": told},
+        "\n".join(map(str.rstrip, lines)) or f"No datasheet of node {node.hex()} is known.",
+    )

@@ -14,7 +14,7 @@ from teds_provision.cli.context import App, pass_app
 from teds_provision.cli.options import command, dry_run_option, link_options, yes_option
 from teds_provision.cli.rendering import print_table, reporter_for
 from teds_provision.cli.steps.build import order_options
-from teds_provision.cli.steps.screen import screen_for
+from teds_provision.cli.steps.screen import Watched, screen_for
 from teds_provision.errors import NotWhitelisted, TedsProvisionError
 from teds_provision.links import LinkSettings
 from teds_provision.steps import many
@@ -22,6 +22,7 @@ from teds_provision.steps import many
 if TYPE_CHECKING:
     from rich.console import Console
 
+    from teds_provision.cli.steps.screen import Screen
     from teds_provision.steps.build import NotNamed
     from teds_provision.steps.identify import Identified
     from teds_provision.steps.many.board import Board
@@ -78,13 +79,18 @@ def provision(
     """
     request = many.boards.Request(uuid, order, watch, everything, batch, report)
     several = everything or len(links.places) > 1
-    boards = many.boards.Boards(app.station(), links, request, reporter_for(app, several=several))
-    for warning in boards.prepared.warnings:
+    reporter = Watched(reporter_for(app, several=several))
+    boards = many.boards.Boards(app.station(), links, request, reporter)
+    for warning in boards.warnings:
         app.warn(warning)
     if dry_run:
         _tell_plan(app, boards.plan())
     elif request.several:
-        _many(app, boards, _questions(app, yes, strangers=not everything), totals=everything or batch is not None)
+        boards.unlock()  # asked for before the screen says what to do
+        begun = None if several else reporter  # with several readers one board may be begun while another one ends
+        with screen_for(app, boards, begun) as screen:
+            questions = _questions(app, yes, strangers=not everything)
+            _many(app, boards, questions, screen, totals=everything or batch is not None)
     else:
         _one(app, boards, _questions(app, yes))
 
@@ -98,18 +104,17 @@ def _one(app: App, boards: Boards, questions: Questions) -> None:
     _tell(app, done, error=_failure(done))
 
 
-def _many(app: App, boards: Boards, questions: Questions, *, totals: bool) -> None:
+def _many(app: App, boards: Boards, questions: Questions, screen: Screen, *, totals: bool) -> None:
     signal.signal(signal.SIGTERM, lambda *_: boards.stop.ask())
-    with screen_for(app, boards) as screen:
-        try:
-            for board in boards.many(questions):
-                if not screen.tells:
-                    _tell_board(app, board)
-                screen.ended(board)
-        finally:
-            screen.close()
-            if totals:
-                _tell_totals(app, boards)
+    try:
+        for board in boards.many(questions):
+            if not screen.tells:
+                _tell_board(app, board)
+            screen.ended(board)
+    finally:
+        screen.close()
+        if totals:
+            _tell_totals(app, boards)
     error = boards.totals().error if totals else None
     if error is not None and app.json:
         raise click.exceptions.Exit(error.exit_code)

@@ -4,22 +4,29 @@ from __future__ import annotations
 
 import sys
 from collections import deque
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from datetime import datetime
 from typing import TYPE_CHECKING, Final, Protocol
 
 from teds_provision.cli.context import App
 from teds_provision.harmless import harmless
+from teds_provision.talk.progress import Reporter, StepResult
 
 if TYPE_CHECKING:
     from rich.console import Console
 
+    from teds_provision.links import Notice
     from teds_provision.steps.many.board import Board
     from teds_provision.steps.many.boards import Boards
+    from teds_provision.steps.many.sheet import Row
 
 _BELL: Final = "\a"
 _LAST: Final = 5
 _ROWS: Final = 5
+_WHY_LINES: Final = 3
+_ROOMY: Final = 30
+"""Lines of a terminal on which the large letters have air above and below."""
 _GLYPHS: Final = {
     "A": " ## |#  #|####|#  #|#  #",
     "F": "####|#   |### |#   |#   ",
@@ -29,6 +36,7 @@ _GLYPHS: Final = {
     "P": "### |#  #|### |#   |#   ",
     "S": " ###|#   | ## |   #|### ",
     "T": "#####|  #  |  #  |  #  |  #  ",
+    "W": "#   #|#   #|# # #|## ##|#   #",
     "0": " ## |#  #|#  #|#  #| ## ",
     "1": " # |## | # | # |###",
     "2": "### |   #| ## |#   |####",
@@ -50,6 +58,24 @@ def big(text: str) -> list[str]:
     shapes = [_GLYPHS[character].split("|") for character in text.upper() if character in _GLYPHS]
     lines = ["  ".join(shape[row] for shape in shapes) for row in range(_ROWS)]
     return [line.replace("#", "██").replace(" ", "  ") for line in lines]
+
+
+class Told(Protocol):
+    """What the screen needs to know of the batch: :class:`Boards` is one."""
+
+    def __len__(self) -> int:
+        """How many boards the sheet has."""
+
+    @property
+    def passed(self) -> int:
+        """How many of them have passed."""
+
+    @property
+    def next_row(self) -> Row | None:
+        """The row that the next board may be of."""
+
+    def row(self, number: int) -> Row:
+        """The row of that number."""
 
 
 class Screen(Protocol):
@@ -76,43 +102,100 @@ class _Plain:
         """Nothing to give back."""
 
 
-class OperatorScreen:
-    """Drawn anew after each board, on stderr."""
+class Watched:
+    """A reporter that also says when a board is begun: its first step is to identify it."""
 
-    def __init__(self, console: Console, boards: Boards) -> None:
+    def __init__(self, inner: Reporter) -> None:
+        self._inner = inner
+        self.begun: Callable[[], None] = lambda: None
+
+    def started(self, step: str) -> None:
+        """A step begins."""
+        if step == "identify":
+            self.begun()
+        self._inner.started(step)
+
+    def finished(self, step: StepResult) -> None:
+        """A step ended well."""
+        self._inner.finished(step)
+
+    def notice(self, notice: Notice) -> None:
+        """Something is waited for, or came by."""
+        self._inner.notice(notice)
+
+    def written(self, octets: int, total: int) -> None:
+        """So many octets of the datasheet are staged."""
+        self._inner.written(octets, total)
+
+
+class OperatorScreen:
+    """Drawn anew when a board is begun and when it ends, on stderr; ``live_line`` takes away what runs below it."""
+
+    def __init__(self, console: Console, boards: Told, live_line: Callable[[], None] = lambda: None) -> None:
         self.tells = sys.stdout.isatty()  # a file or a pipe gets its lines all the same
-        self._console, self._boards = console, boards
+        self._console, self._boards, self._live_line = console, boards, live_line
         self._last: deque[Board] = deque(maxlen=_LAST)
-        self.draw(None)
+        self._draw(">>> ", self._next())
+
+    def begun(self) -> None:
+        """A board lies on the reader: what stood there of the one before counts no more."""
+        self._draw(">>> ", "KEEP THE BOARD ON THE READER", word=("WAIT", "black on yellow"))
 
     def ended(self, board: Board) -> None:
         """Ring, and show PASS or FAIL."""
         self._last.appendleft(board)
         self._console.file.write(_BELL)
-        self.draw(board)
+        word = _WORDS.get(board.result, ("SKIP", "black on yellow"))
+        self._draw(">>> TAKE IT OFF. ", self._next(), word=word, board=board)
 
-    def draw(self, board: Board | None) -> None:
-        """Show it all."""
+    def close(self) -> None:
+        """Leave what stands there."""
+
+    def _draw(self, mark: str, now: str, *, word: tuple[str, str] | None = None, board: Board | None = None) -> None:
         from rich.text import Text
 
+        self._live_line()
         console, boards = self._console, self._boards
+        air = [""] if console.height >= _ROOMY else []
         console.clear()
+        if word is not None:
+            for line in [*air, *big(word[0]), *air]:
+                console.print(Text(f"    {line}".ljust(console.width)), style=word[1], no_wrap=True)
         if board is not None:
-            word, style = _WORDS.get(board.result, ("SKIP", "black on yellow"))
-            for line in ["", *big(word), ""]:
-                console.print(Text(f"    {line}".ljust(console.width)), style=style, no_wrap=True)
-            console.print(Text(f"{board.seconds:.1f} s  {board.uuid.hex()}"), style="bold")
-            if board.failure is not None:
-                console.print(Text(harmless(board.failure.message)), style="bold red")
+            self._tell_end(board)
         for line in ["", *big(f"{boards.passed}/{len(boards)}"), ""]:
             console.print(Text(f"    {line}"), no_wrap=True)
-        console.print(Text(f">>> {self._what_now()}"), style="bold")
+        self._line(f"{mark}{now}", style="bold")
         for one in self._last:
             row = f"row {one.row}" if one.row is not None else ""
-            line = f"{one.time}  {row:<8} {one.uuid.hex()}  {one.result.upper():<8} {one.seconds:6.1f} s"
-            console.print(Text(line), style="green" if one.result == "passed" else "red", no_wrap=True)
+            line = f"{_clock(one.time)}  {row:<8} {one.uuid.hex()}  {one.result.upper():<8} {one.seconds:6.1f} s"
+            style = "green" if one.result == "passed" else "red"
+            self._line(f"{line}  {self._name(one)}", style=style)
 
-    def _what_now(self) -> str:
+    def _tell_end(self, board: Board) -> None:
+        """Seconds and which board; of one that failed why, and what to do, in a few lines."""
+        from rich.text import Text
+
+        row = f"  row {board.row}" if board.row is not None else ""
+        self._line(f"{board.seconds:.1f} s  {board.uuid.hex()}{row}  {self._name(board)}", style="bold")
+        if board.failure is not None:
+            hint = f" → {board.failure.hint}" if board.failure.hint else ""
+            why = Text(harmless(f"{board.failure.message}{hint}"), style="bold red")
+            for line in why.wrap(self._console, self._console.width)[:_WHY_LINES]:
+                self._console.print(line)
+        elif board.done is not None and board.done.warnings:
+            self._line(f"Warning: {board.done.warnings[0]}", style="yellow")
+
+    def _line(self, text: str, *, style: str) -> None:
+        """One line, cut with an ellipsis where the terminal ends."""
+        from rich.text import Text
+
+        self._console.print(Text(harmless(text).rstrip()), style=style, no_wrap=True, overflow="ellipsis")
+
+    def _name(self, board: Board) -> str:
+        return self._boards.row(board.row).prepared.order.name or "" if board.row is not None else ""
+
+    def _next(self) -> str:
         row = self._boards.next_row
         if row is None:
             return "ALL BOARDS ARE DONE."
@@ -122,14 +205,19 @@ class OperatorScreen:
         which = row.uuid.hex() if row.uuid is not None else f"key {(row.fingerprint or '')[:16]}"
         return harmless(f"TAP ANY BOARD OF THE SHEET, e.g. {which}  {name}".rstrip())
 
-    def close(self) -> None:
-        """Leave what stands there."""
+
+def _clock(moment: str) -> str:
+    """The time of day here, of a moment in UTC."""
+    return datetime.fromisoformat(moment).astimezone().strftime("%H:%M:%S")
 
 
 @contextmanager
-def screen_for(app: App, boards: Boards) -> Iterator[Screen]:
-    """The operator's screen on a terminal with a sheet, else none."""
+def screen_for(app: App, boards: Boards, reporter: Watched | None = None) -> Iterator[Screen]:
+    """The operator's screen on a terminal with a sheet, else none; ``reporter`` tells it when a board is begun."""
     if app.json or app.quiet or not len(boards) or not sys.stderr.isatty():
         yield _Plain()
         return
-    yield OperatorScreen(app.console(stderr=True), boards)
+    screen = OperatorScreen(app.console(stderr=True), boards, app.live_line)
+    if reporter is not None:
+        reporter.begun = screen.begun
+    yield screen

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from teds_provision.cli.context import App
+from teds_provision.cli.context import App, to_json
 from teds_provision.harmless import printable
 from teds_provision.steps.many.verify_files import Totals, image_files, verify_files
 
@@ -25,17 +25,14 @@ def verify_many(app: App, what: Sequence[str]) -> None:
     """Judge every file by itself; one that fails stops no other."""
     files = image_files([Path(word) for word in what])
     totals = Totals()
-    for found in verify_files(app.station(), files):
-        totals.add(found)
-        if app.json:
-            app.emit(found.to_json())
-        else:
-            click.echo(printable(_line(found)))
+    for lines, counted in verify_files(app.station(), files, _json if app.json else _line):
+        totals.join(counted)
+        app.lines(lines)
     if app.json:
         app.emit(totals.to_json())
     else:
-        counted = ", ".join(f"{count} {word}" for word, count in sorted(totals.verdicts.items()))
-        click.echo(f"{totals.files} image{'' if totals.files == 1 else 's'}: {counted}.")
+        words = ", ".join(f"{count} {word}" for word, count in sorted(totals.verdicts.items()))
+        app.lines([f"{totals.files} image{'' if totals.files == 1 else 's'}: {words}."])
     if totals.exit_code:
         raise click.exceptions.Exit(totals.exit_code)
 
@@ -43,4 +40,8 @@ def verify_many(app: App, what: Sequence[str]) -> None:
 def _line(found: FileVerdict) -> str:
     why = found.error or ("; ".join(found.warnings) if found.warnings else "")
     text = f"{found.verdict or 'unreadable':<13}  {found.uuid or '-':<20}  {found.path}"
-    return f"{text}: {why}" if why else text
+    return printable(f"{text}: {why}" if why else text)
+
+
+def _json(found: FileVerdict) -> str:
+    return to_json(found.to_json())

@@ -12,7 +12,7 @@ import click
 from teds_provision import steps
 from teds_provision.cli.context import App, pass_app
 from teds_provision.cli.options import COMMAND_SETTINGS, dry_run_option, examples, fingerprint_option, yes_option
-from teds_provision.cli.rendering import print_json_list, shown
+from teds_provision.cli.rendering import local_time, print_json_list, shown
 from teds_provision.cli.steps.build import write_file
 from teds_provision.protocol.fingerprints import same_key
 from teds_provision.station.label import read_label
@@ -117,10 +117,12 @@ def list_entries(app: App) -> None:
     if first is None:
         print("The whitelist is empty.")
         return
-    print(f"{'UUID':<20}  {'key':<16}  {'assurance':<9}  {'added':<20}  name")
+    print(f"{'UUID':<20}  {'key':<16}  {'assurance':<9}  {'added':<25}  name")
     for entry in chain([first], entries):
         key = entry.fingerprint[:16] if entry.fingerprint else "not pinned yet"
-        line = f"{entry.uuid.hex()}  {key:<16}  {entry.assurance:<9}  {entry.added:<20}  {shown(entry.name)}"
+        line = (
+            f"{entry.uuid.hex()}  {key:<16}  {entry.assurance:<9}  {local_time(entry.added):<25}  {shown(entry.name)}"
+        )
         sys.stdout.write(f"{line.rstrip()}\n")
     sys.stdout.flush()
 
@@ -166,14 +168,12 @@ def export_file(app: App, file: Path, form: str | None, dry_run: bool) -> None:
     """Write every entry, sorted, to a file in one piece; a file of that name is replaced."""
     station = app.station()
     form = steps.whitelist.form_of(file, form)
-    entries = station.pins.whitelist()
     if not dry_run:
-        write_file(file, steps.whitelist.render(entries, form))
+        write_file(file, steps.whitelist.render(station.pins.each(), form))
+    listed = [steps.whitelist.as_dict(entry) for entry in station.pins.each()] if app.json else []
+    count = len(listed) if app.json else sum(1 for _ in station.pins.each())
     verb = "Would write" if dry_run else "Wrote"
-    app.emit(
-        {"whitelist": [steps.whitelist.as_dict(entry) for entry in entries], "file": str(file), "format": form},
-        f"{verb} {len(entries)} entries as {form} to {file}.",
-    )
+    app.emit({"whitelist": listed, "file": str(file), "format": form}, f"{verb} {count} entries as {form} to {file}.")
 
 
 def _emit_plan(app: App, station: Station, plan: Plan, *, dry_run: bool) -> None:

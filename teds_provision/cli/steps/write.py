@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from teds_provision.cli.context import App, pass_app
-from teds_provision.cli.options import command, dry_run_option, link_options, yes_option
+from teds_provision.cli.options import WholeNumber, command, dry_run_option, link_options, yes_option
 from teds_provision.cli.rendering import reporter_for
 from teds_provision.errors import UsageFailure
 from teds_provision.links import LinkSettings
@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 @click.option(
     "--from",
     "sequence",
-    type=click.IntRange(0, 2**32 - 1),
+    type=WholeNumber(0, 2**32 - 1),
     metavar="SEQUENCE",
     help="Bring back what it had; see history.",
 )

@@ -29,8 +29,6 @@ _BUSY_TRIES: Final = 6
 _FIRST_PAUSE: Final = 0.25
 _LOOK_SECONDS: Final = 0.05
 
-Lost = Callable[[], None]
-
 
 class Adapter:
     """``spec.adapter``, or the first that is powered."""

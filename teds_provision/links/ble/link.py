@@ -54,6 +54,17 @@ class BleLink:
         self._last = self._number()
         return self._ask(frame, self._last)
 
+    def exchange_within(self, frame: bytes, seconds: float) -> bytes:
+        """Send one command frame that is of no use after ``seconds``; see ``Prompt.exchange_within``.
+
+        It is not repeated: the radio's link layer does that by itself.
+        """
+        self._last = self._number()
+        try:
+            return self._loop.run(self.connection.exchange(self._last, frame, seconds))
+        except (ConnectionLost, TimeoutError) as lost:
+            raise troubles.silent(self.connection.address, lost if isinstance(lost, ConnectionLost) else None) from lost
+
     def again(self, frame: bytes) -> bytes:
         """Send the last frame once more under its transaction; see ``Repeats.again``."""
         return self._ask(frame, self._last)

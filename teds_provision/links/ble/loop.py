@@ -1,4 +1,4 @@
-"""The one asyncio loop of a Bluetooth port, in a thread of its own: bleak's world, into which everything else calls."""
+"""The one asyncio loop of a Bluetooth port, in a thread of its own: bleak lives in it, all else calls into it."""
 
 from __future__ import annotations
 

@@ -58,7 +58,7 @@ class BlePort:
     via: Final = "ble"
 
     def __init__(self, spec_text: str, trace: Trace | None = None) -> None:
-        self._trace = trace
+        self.trace = trace
         self.spec = parse_spec(spec_text)
         self.place = f"ble:{spec_text}"
         self._loop = Loop()
@@ -266,10 +266,10 @@ class BlePort:
             self._leave(link, in_use=in_use)
             if identity.uuid not in told:
                 told.add(identity.uuid)
-                uuid = identity.uuid.hex().upper()
+                uuid = identity.uuid.hex()
                 notice(Notice("foreign-tag", f"Node {uuid} is at {address}, but it is not the one looked for."))
             return None
-        return Contact(identity, link, connection=link.connection.number, trace=self._trace)
+        return Contact(identity, link, connection=link.connection.number, trace=self.trace)
 
     def _leave(self, link: BleLink, *, in_use: bool) -> None:
         """End a connection that was made for a question alone."""
@@ -281,7 +281,7 @@ class BlePort:
             connection = self._connections.get(address)
             if connection is None:
                 connection = self._connections[address] = Connection(
-                    self._adapter, address, self._take_data, self._trace
+                    self._adapter, address, self._take_data, self.trace
                 )
         return BleLink(self._loop, connection, self.next_transaction, self._make_room, notice)
 

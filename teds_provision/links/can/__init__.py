@@ -8,18 +8,18 @@ if TYPE_CHECKING:
     from teds_provision.links.can import (
         arrivals,
         bus,
-        echoes,
         finding,
         frame,
         gathering,
         isotp,
         link,
-        pacing,
         port,
+        reading,
         rivals,
         shared,
         spec,
         transfer,
+        wire,
     )
 else:
     __getattr__ = lazy(__name__)

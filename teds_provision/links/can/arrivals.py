@@ -21,12 +21,15 @@ _ANNOUNCE: Final = 0x1CFF0000
 _ANNOUNCE_MASK: Final = 0x1FFFFF00
 _GONE_SECONDS: Final = 3.0
 """A node that has been silent for so long has left."""
-_SILENCE_SECONDS: Final = 0.07
+_SILENCE_SECONDS: Final = 0.055
 """Nodes answer after up to 50 ms; one that is later is heard in the next round."""
+_UNCLEAR_SECONDS: Final = 0.1
+"""The wait for one whose answer was torn: it was pulled in the middle of it more often than not, and while it is waited
+for nobody else is found. The next round asks everyone again."""
 _LONGEST_SECONDS: Final = 3.0
 _MOST_PAUSE: Final = 1.0
 _PAUSE_PER_NODE: Final = 0.03
-"""Seconds until everyone is asked again, for each node that answered: its six frames take 1.6 ms, 5 % of a bus."""
+"""Seconds from one question to the next for each node that answered: its six frames take 1.6 ms, 5 % of a bus."""
 
 
 @dataclass
@@ -50,8 +53,8 @@ class Watched(Protocol):
     def next_transaction(self) -> int:
         """A transaction number, 0 to 255."""
 
-    def identify(self, address: int) -> Identity | None:
-        """Ask one address who is there; None for nobody."""
+    def identify(self, address: int, *, seconds: float = ...) -> Identity | None:
+        """Ask one address who is there; None for nobody within ``seconds``."""
 
     def tell_of_rivals(self, notice: NoticeSink) -> None:
         """Say which other stations use our source address."""
@@ -65,6 +68,7 @@ class Arrivals:
         self._seen: dict[bytes, _Seen] = {}
         self._conflicts: set[int] = set()
         self._round = 0
+        self._asked_at = 0.0
         self._ear: Ear | None = None
         self._bus: SharedBus | None = None
 
@@ -75,6 +79,7 @@ class Arrivals:
     def round(self, stop: threading.Event) -> Iterator[tuple[int, Identity]]:
         """Ask everyone (or ``node=`` alone) and yield address and identity of each node that is news."""
         self._round += 1
+        self._asked_at = time.monotonic()
         self._listen()
         clashing: set[int] = set()
         if self._port.spec.node is not None:
@@ -89,9 +94,9 @@ class Arrivals:
             self._port.tell_of_rivals(self._notice)
 
     def pause(self, stop: threading.Event) -> None:
-        """Wait until everyone may be asked again, or a node announces itself."""
+        """Wait until everyone may be asked again, or a node announces itself; what a round took counts."""
         answered = sum(last.round == self._round for last in self._seen.values())
-        until = time.monotonic() + min(_MOST_PAUSE, _PAUSE_PER_NODE * answered)
+        until = self._asked_at + min(_MOST_PAUSE, _PAUSE_PER_NODE * answered)
         while (left := until - time.monotonic()) > 0 and not stop.is_set():
             if self._ear is None:
                 stop.wait(left)
@@ -123,12 +128,15 @@ class Arrivals:
                 found = news
             elif self._is_news(*news):
                 yield news
-        settled = settle(found, self._port.identify, until=time.monotonic() + _LONGEST_SECONDS)
+        settled = settle(found, self._ask_again, until=time.monotonic() + _LONGEST_SECONDS)
         clashing |= settled.conflicts
         for address in found.conflicts | found.unfinished:
             identity = settled.identities.get(address)
             if identity is not None and self._is_news(address, identity):
                 yield address, identity
+
+    def _ask_again(self, address: int) -> Identity | None:
+        return self._port.identify(address, seconds=_UNCLEAR_SECONDS)
 
     def _is_news(self, address: int, identity: Identity) -> bool:
         """New, back after silence, or reset to factory state. A new address alone is no news."""
@@ -146,6 +154,6 @@ class Arrivals:
             last.silent = last.silent or now
             if now - last.silent >= _GONE_SECONDS:
                 del self._seen[uuid]
-                name = uuid.hex().upper()
+                name = uuid.hex()
                 text = f"Node {name} at 0x{last.address:02X} does not answer any more."
                 self._notice(Notice("node-left", text, uuid=uuid))

@@ -12,10 +12,11 @@ import time
 from typing import TYPE_CHECKING, Any, Final, NoReturn
 
 from teds_provision.errors import LinkFailure, NoReader, UsageFailure
-from teds_provision.links.can.echoes import Echoes
 from teds_provision.links.can.frame import Frame
-from teds_provision.links.can.pacing import Pacer
 from teds_provision.links.can.spec import CanSpec
+from teds_provision.links.can.wire.echoes import Echoes
+from teds_provision.links.can.wire.multicast import Multicast, of_bus
+from teds_provision.links.can.wire.pacing import Pacer
 from teds_provision.links.ports import Trace
 
 if TYPE_CHECKING:
@@ -46,12 +47,15 @@ class Bus:
         self.spec = spec
         self._trace = trace
         self._bus = _open(spec)
+        self._multicast = _multicast(self._bus, spec)
         self._descriptor = _descriptor(self._bus)
-        self._pacer = Pacer(spec.bitrate, spec.data_bitrate) if spec.pace else None
+        self._clock_is_ours = _clock_is_ours(spec)
+        self._pacer = Pacer(spec.bitrate, spec.data_bitrate, spec.wire) if spec.pace else None
         # SocketCAN marks every frame of this machine as sent here, also those of other programs: nodes beside us
         self._marks_own = spec.interface != "socketcan"
         gives_back = not self._marks_own and "receive_own_messages" in dict(spec.options)
-        self._echoes = Echoes() if spec.interface == "udp_multicast" or gives_back else None
+        back = spec.interface == "udp_multicast" and self._multicast is None
+        self._echoes = Echoes() if back or gives_back else None
 
     @property
     def busy_seconds(self) -> float:
@@ -60,10 +64,23 @@ class Bus:
 
     def send(self, frame: Frame) -> None:
         """Put one frame on the bus; raises LinkFailure."""
-        import can
-
         if self._pacer:
             self._pacer.wait(frame.identifier, frame.data, fd=frame.fd)
+        if self._echoes:
+            self._echoes.sent(frame)
+        if self._trace is not None:  # before it goes, so that no answer stands before it
+            self._trace.frame("can", "out", frame.data, identifier=frame.identifier, fd=frame.fd)
+        if self._multicast is None:
+            self._send_message(frame)
+            return
+        try:
+            self._multicast.send(frame, _SEND_SECONDS)
+        except OSError as error:
+            self._failed("does not take a frame", error)
+
+    def _send_message(self, frame: Frame) -> None:
+        import can
+
         message = can.Message(
             arbitration_id=frame.identifier,
             is_extended_id=True,
@@ -71,10 +88,6 @@ class Bus:
             is_fd=frame.fd,
             bitrate_switch=frame.fd,
         )
-        if self._echoes:
-            self._echoes.sent(frame)
-        if self._trace is not None:  # before it goes, so that no answer stands before it
-            self._trace.frame("can", "out", frame.data, identifier=frame.identifier, fd=frame.fd)
         try:
             self._bus.send(message, timeout=_SEND_SECONDS)
         except (can.CanError, OSError, ValueError) as error:
@@ -85,6 +98,23 @@ class Bus:
 
         Waits ``seconds`` at most, and returns None before for what is no such frame.
         """
+        frame = self._receive_message(seconds) if self._multicast is None else self._heard(self._multicast, seconds)
+        if frame is not None and self._trace is not None:
+            self._trace.frame("can", "in", frame.data, identifier=frame.identifier, fd=frame.fd, at=frame.at)
+        return frame
+
+    def _heard(self, multicast: Multicast, seconds: float) -> Frame | None:
+        try:
+            heard = multicast.receive(seconds)
+        except OSError as error:
+            self._failed("cannot be read", error)
+        if heard is None:
+            return None
+        if heard.error & _BUS_OFF:
+            self._bus_off()
+        return heard.frame
+
+    def _receive_message(self, seconds: float) -> Frame | None:
         message = self._next(seconds)
         if message is None:
             return None
@@ -94,12 +124,13 @@ class Bus:
             return None
         if message.is_remote_frame or not message.is_extended_id or self._is_own(message):
             return None
-        frame = Frame(message.arbitration_id, bytes(message.data), message.is_fd, _arrival(message.timestamp))
-        if self._echoes and self._echoes.take(frame):
-            return None
-        if self._trace is not None:
-            self._trace.frame("can", "in", frame.data, identifier=frame.identifier, fd=frame.fd, at=frame.at)
-        return frame
+        frame = Frame(message.arbitration_id, bytes(message.data), message.is_fd, self._arrival(message.timestamp))
+        return None if self._echoes and self._echoes.take(frame) else frame
+
+    def _arrival(self, timestamp: float) -> float:
+        """Time of arrival on the monotonic clock: taken back by the age of a time stamp of this machine's clock."""
+        age = time.time() - timestamp if self._clock_is_ours else 0.0
+        return time.monotonic() - (age if 0.0 < age < _LATEST_SECONDS else 0.0)
 
     def _is_own(self, message: can.Message) -> bool:
         return self._marks_own and not message.is_rx
@@ -143,7 +174,11 @@ class Bus:
 
     def close(self) -> None:
         """Release the adapter; never raises."""
+        if self._pacer is not None:
+            self._pacer.close()
         try:
+            if self._multicast is not None:
+                self._multicast.close()
             self._bus.shutdown()
         except Exception:  # python-can back ends raise whatever their driver raises
             logging.getLogger(__name__).debug("The CAN bus did not close cleanly.", exc_info=True)
@@ -199,6 +234,17 @@ def _open(spec: CanSpec) -> can.BusABC:
     return bus
 
 
+def _multicast(bus: can.BusABC, spec: CanSpec) -> Multicast | None:
+    """The quick way to the bus of ``udp_multicast``, None for every other one."""
+    if spec.interface != "udp_multicast":
+        return None
+    try:
+        return of_bus(bus, dict(spec.options), fd=spec.fd)
+    except (OSError, ValueError) as error:
+        bus.shutdown()
+        raise _not_opened(spec, error) from error
+
+
 def _options(spec: CanSpec) -> dict[str, Any]:
     """What python-can is given to open the bus; a socketcand server is asked whether it is there."""
     options: dict[str, Any] = dict(spec.options)
@@ -247,10 +293,14 @@ def _descriptor(bus: can.BusABC) -> int:
         return -1
 
 
-def _arrival(timestamp: float) -> float:
-    """Time of arrival on the monotonic clock, from the kernel's or adapter's time stamp where that is a Unix time."""
-    late = time.time() - timestamp
-    return time.monotonic() - (late if 0.0 < late < _LATEST_SECONDS else 0.0)
+def _clock_is_ours(spec: CanSpec) -> bool:
+    """Whether frames are stamped by this machine's clock: by its kernel, not by an adapter or another machine.
+
+    By a clock that is a little behind a frame would seem older than it is, and the bound of a node's time be false.
+    """
+    host = str(dict(spec.options).get("host", "127.0.0.1"))
+    here = spec.interface == "socketcand" and host in ("127.0.0.1", "::1", "localhost")
+    return here or spec.interface in ("socketcan", "udp_multicast")
 
 
 def _this_group_alone(bus: can.BusABC) -> None:

@@ -33,6 +33,12 @@ class Found:
     conflicts: set[int] = field(default_factory=set)
     unfinished: set[int] = field(default_factory=set)
 
+    def together(self, other: Found) -> Found:
+        """What two questions came to; what one of them made clear is clear."""
+        identities = self.identities | other.identities
+        unfinished = (self.unfinished | other.unfinished) - identities.keys()
+        return Found(identities, self.conflicts | other.conflicts, unfinished)
+
     @property
     def twice(self) -> dict[bytes, list[int]]:
         """UUIDs that answer under more than one address, with these: one of them is not who it says."""
@@ -129,7 +135,7 @@ def conflict_text(node: int) -> str:
 def twice_text(uuid: bytes, addresses: list[int]) -> str:
     """One sentence that names the UUID and where it answers."""
     where = " and ".join(f"0x{address:02X}" for address in addresses)
-    return f"Node {uuid.hex().upper()} answers under {where}: one of them is not who it says."
+    return f"Node {uuid.hex()} answers under {where}: one of them is not who it says."
 
 
 def unfinished_text(nodes: set[int]) -> str:

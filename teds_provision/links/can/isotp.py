@@ -70,15 +70,20 @@ def single(body: bytes, *, fd: bool = False) -> bytes:
 
 
 class Pair:
-    """Our end of one pair of addresses. Not thread-safe; ``send_frame`` is called from within every method."""
+    """Our end of one pair of addresses. Not thread-safe; ``send_frame`` is called from within every method.
+
+    What fits into one frame is read and written here while nothing else is under way: can-isotp's states have nothing
+    to add to it, and take ten times as long over it.
+    """
 
     def __init__(self, own: int, peer: int, send_frame: Callable[[Frame], None], *, fd: bool = False) -> None:
         import isotp
 
         self.own, self.peer = own, peer
-        self._receive_id = physical_id(own, peer)
+        self._receive_id, self._send_id = physical_id(own, peer), physical_id(peer, own)
         self._send_frame = send_frame
         self._waiting: deque[Any] = deque()
+        self._singles: deque[bytes] = deque()
         self._message = isotp.CanMessage
         self._wait_fc = isotp.TransportLayerLogic.TxState.WAIT_FC
         self.error = ""
@@ -91,6 +96,10 @@ class Pair:
 
     def send(self, body: bytes) -> None:
         """Start to send; what is still under way goes first."""
+        fd = bool(self._logic.params.can_fd)
+        if 0 < len(body) <= (62 if fd else 7) and not self.sending:
+            self._send_frame(Frame(self._send_id, single(body, fd=fd), fd))
+            return
         self._logic.send(body)
         self.run()
 
@@ -106,10 +115,20 @@ class Pair:
         self._last = data if kind == _CONSECUTIVE else b""
         if kind != _FLOW:
             self.speak(fd=frame.fd)
+        if kind == _SINGLE and self._take_single(data):
+            return True
         self._waiting.append(
             self._message(arbitration_id=frame.identifier, data=data, extended_id=True, is_fd=frame.fd)
         )
         self.run()
+        return True
+
+    def _take_single(self, data: bytes) -> bool:
+        """Take a message of one frame without the state machine; False where that has to see it."""
+        body = read_single(data) if _is_plain(data) and not self._is_busy else None
+        if body is None:
+            return False
+        self._singles.append(body)
         return True
 
     def speak(self, *, fd: bool) -> None:
@@ -127,6 +146,8 @@ class Pair:
 
     def received(self) -> bytes | None:
         """The next whole message, None while there is none."""
+        if self._singles:
+            return self._singles.popleft()
         body = self._logic.recv()
         return None if body is None else bytes(body)
 
@@ -141,6 +162,11 @@ class Pair:
         return bool(self._logic.is_rx_active())
 
     @property
+    def _is_busy(self) -> bool:
+        """Whether can-isotp has anything to do, or a message that nobody has fetched yet."""
+        return bool(self._waiting) or self.sending or self.receiving or self._logic.available()
+
+    @property
     def waits_for_flow(self) -> bool:
         """Whether our first frame, or block, has not been answered yet."""
         return bool(self._logic.tx_state == self._wait_fc)
@@ -153,6 +179,7 @@ class Pair:
     def abandon(self) -> None:
         """Forget what is being sent and received, and past errors."""
         self._waiting.clear()
+        self._singles.clear()
         self._logic.reset()
         self.error, self.overflow = "", False
 
@@ -193,6 +220,11 @@ def _parameters(fd: bool) -> dict[str, Any]:
 
 def _not_waited_for(_seconds: float) -> None:
     """Only the library's own thread waits; we have none."""
+
+
+def _is_plain(single_frame: bytes) -> bool:
+    """Whether a single frame says its length where ISO 15765-2 wants it: by an escape in frames of more than 8."""
+    return single_frame[0] != 0 if len(single_frame) <= 8 else single_frame[0] == 0 and single_frame[1] > 7
 
 
 def _tolerable(data: bytes) -> bytes | None:

@@ -22,6 +22,8 @@ _SHARES: Final = (0.3, 0.7, 1.0)
 _LOSSY_SHARES: Final = (0.06, 0.24, 1.0)
 """Parts of the 5 s after which a request goes out again, on a bus that loses nothing and on one that lost a frame in
 the last minute: a lost request costs 1.5 s or 0.3 s, and a slow node still has its 5 s."""
+_PROMPT_SHARES: Final = (0.25, 0.25, 0.5)
+"""Parts of the time that an order may take (operation.md section 2, "No late orders")."""
 _FLOW_SECONDS: Final = (0.25, 0.5, 1.0)
 """The wait for a flow control, try after try, at most N_Bs of ISO 15765-2: a lost one ends it early."""
 _GAP_SECONDS: Final = 0.5
@@ -62,6 +64,7 @@ class CanLink:
         self._bus, self._number = bus, number
         self.address = address
         self._last = 0
+        self.left = self.came = 0.0  # see links.ports.Timed
         self._reply_seconds = REPLY_SECONDS if reply_seconds is None else reply_seconds
 
     @property
@@ -72,6 +75,11 @@ class CanLink:
     def exchange(self, frame: bytes) -> bytes:
         """Send one command frame and return its reply; see ``Link.exchange``."""
         return self.ask(frame, tries=TRIES, seconds=self._reply_seconds)
+
+    def exchange_within(self, frame: bytes, seconds: float) -> bytes:
+        """Send one command frame that is of no use after ``seconds``; see ``Prompt.exchange_within``."""
+        self._last = self._number()
+        return self._ask(frame, self._last, tries=TRIES, seconds=seconds, prompt=True)
 
     def again(self, frame: bytes) -> bytes:
         """Send the last frame once more under its transaction; see ``Repeats.again``."""
@@ -85,11 +93,13 @@ class CanLink:
         self._last = self._number()
         return self._ask(frame, self._last, tries=tries, seconds=seconds)
 
-    def _ask(self, frame: bytes, transaction: int, *, tries: int, seconds: float) -> bytes:
+    def _ask(self, frame: bytes, transaction: int, *, tries: int, seconds: float, prompt: bool = False) -> bytes:
         bus = self._bus()
         try:
             with bus.line(self.address).exchange(transaction) as line:
-                reply = _Exchange(bus, line, bytes([transaction]) + frame, tries, seconds).run()
+                exchange = _Exchange(bus, line, bytes([transaction]) + frame, tries, seconds, prompt=prompt)
+                self.left = self.left or time.monotonic()
+                reply, self.came = exchange.run()
         except LinkFailure as failure:
             if bus.rivals.seen() and not bus.failed:
                 raise type(failure)(f"{failure.message} {bus.rivals.text}", hint=bus.rivals.hint) from failure
@@ -102,20 +112,26 @@ class CanLink:
 class _Exchange:
     """One request and its reply, repeated as needed. Runs in the thread that asks."""
 
-    def __init__(self, bus: SharedBus, line: Line, body: bytes, tries: int, seconds: float) -> None:
+    def __init__(
+        self, bus: SharedBus, line: Line, body: bytes, tries: int, seconds: float, *, prompt: bool = False
+    ) -> None:
         self._bus, self._line, self._body = bus, line, body
-        self._tries, self._seconds = tries, seconds
+        self._tries, self._seconds, self._prompt = tries, seconds, prompt
+        self._longest = seconds if prompt else REPEAT_SECONDS
         self._fd = bus.spec.fd
         self._torn = False
         self._clash = False
 
-    def run(self) -> bytes:
-        """Return the whole reply, transaction first; raises NodeSilent, Garbled, AddressConflict, LinkFailure."""
+    def run(self) -> tuple[bytes, float]:
+        """Return the whole reply, transaction first, and when it was whole (time.monotonic).
+
+        Raises NodeSilent, Garbled, AddressConflict, LinkFailure.
+        """
         began = time.monotonic()
         whole = refused = 0
         while whole < self._tries:
             try:
-                self._send(_FLOW_SECONDS[min(refused, len(_FLOW_SECONDS) - 1)])
+                self._send(self._flow_patience(refused))
             except _NoFlow as lost:
                 refused += 1
                 if lost.begun:
@@ -123,22 +139,32 @@ class _Exchange:
                 if not self._worth_another(began, refused, begun=lost.begun):
                     break
                 continue
-            shares = _LOSSY_SHARES if self._bus.lossy else _SHARES
-            share = shares[max(0, len(shares) - self._tries + whole)] if self._tries > 1 else 1.0
+            share = self._share(whole)
             whole += 1
             reply = self._reply(self._seconds * share)
             if reply is not None:
                 return reply
             self._line.partial = None  # given up: when the same reply begins anew it is no doubled frame
-            if time.monotonic() - began >= REPEAT_SECONDS:
+            if time.monotonic() - began >= self._longest:
                 break
         raise self._failed()
+
+    def _flow_patience(self, refused: int) -> float:
+        seconds = _FLOW_SECONDS[min(refused, len(_FLOW_SECONDS) - 1)]
+        return min(seconds, self._seconds * _PROMPT_SHARES[0]) if self._prompt else seconds
+
+    def _share(self, whole: int) -> float:
+        """The part of the time that the reply to the next sending is waited for."""
+        if self._prompt:
+            return _PROMPT_SHARES[whole]
+        shares = _LOSSY_SHARES if self._bus.lossy else _SHARES
+        return shares[max(0, len(shares) - self._tries + whole)] if self._tries > 1 else 1.0
 
     def _worth_another(self, began: float, refused: int, *, begun: bool) -> bool:
         """Whether a request that never went out whole is begun anew: at once, while the node may only be busy."""
         passed = time.monotonic() - began
-        if begun:
-            return passed < REPEAT_SECONDS
+        if begun or self._prompt:
+            return passed < self._longest
         return self._tries > 1 and (refused < self._tries or passed < self._seconds)
 
     def _send(self, patience: float) -> None:
@@ -152,22 +178,26 @@ class _Exchange:
         self._put(head)
         left, begun = 0, False
         block, gap = 0, 0.0
+        end = time.monotonic() + _LONGEST_TRY
         for data in consecutive_frames(rest, fd=self._fd):
             if not left:
-                block, gap = self._flow(patience, begun=begun)
+                block, gap = self._flow(patience, end, begun=begun)
                 left, begun = block or len(self._body), True
             elif gap:
                 time.sleep(gap)
             self._put(data)
             left -= 1
 
-    def _flow(self, patience: float, *, begun: bool) -> tuple[int, float]:
-        """Wait for a flow control; returns its block size (0: no limit) and gap in seconds."""
+    def _flow(self, patience: float, end: float, *, begun: bool) -> tuple[int, float]:
+        """Wait for a flow control; returns its block size (0: no limit) and gap in seconds.
+
+        A node may say Wait for as long as a request is repeated, and not beyond ``end`` (monotonic).
+        """
         until = time.monotonic() + patience
-        end = time.monotonic() + _LONGEST_TRY
+        end = min(end, time.monotonic() + REPEAT_SECONDS)
         while (left := min(until, end) - time.monotonic()) > 0:
             try:
-                data = self._line.flows.get(timeout=left)
+                data = self._bus.next_of(self._line.flows, left)
             except Empty:
                 break
             if len(data) < 3:
@@ -187,13 +217,13 @@ class _Exchange:
     def _put(self, data: bytes) -> None:
         self._bus.send(Frame(physical_id(self._line.node, self._bus.own), data, self._fd))
 
-    def _reply(self, seconds: float) -> bytes | None:
+    def _reply(self, seconds: float) -> tuple[bytes, float] | None:
         """Wait for the reply; None after ``seconds`` without a beginning, or where it is torn."""
         until = time.monotonic() + seconds
         end = time.monotonic() + _LONGEST_TRY
         while (left := min(until, end) - time.monotonic()) > 0:
             try:
-                event = self._line.events.get(timeout=left)
+                event = self._bus.next_of(self._line.events, left)
             except Empty:
                 self._bus.check()
                 if self._line.partial is None:
@@ -203,7 +233,7 @@ class _Exchange:
                 continue
             match event.kind:
                 case "whole":
-                    return event.body
+                    return event.body, event.at
                 case "begun":
                     until = time.monotonic() + _GAP_SECONDS
                 case "clash":

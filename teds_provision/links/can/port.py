@@ -34,6 +34,10 @@ ANNOUNCE: Final = 0x1CFF0000
 _HELLO_SECONDS: Final = 1.0
 _GUESS_SECONDS: Final = 0.1
 """The wait for who may be at the address where a node is thought to be; everyone is asked after it."""
+_MANY: Final = 8
+_ROUNDS_OF_MANY: Final = 3
+"""Where so many answer, everyone is asked again until nobody new answers: the first frame of an answer that is lost
+leaves no trace of its node, and with each node more it is likelier that one was."""
 _ROUND_SECONDS: Final = 1.0
 _REOPEN_SECONDS: Final = 1.0
 
@@ -51,7 +55,7 @@ class CanPort:
     def __init__(self, spec_text: str, trace: Trace | None = None) -> None:
         self.spec = parse_spec(spec_text)
         self.place = f"can:{spec_text}"
-        self._trace = trace
+        self.trace = trace
         self._bus: SharedBus | None = SharedBus(Bus(self.spec, trace))
         self._transaction = secrets.randbelow(256)
         self._lock = threading.Lock()
@@ -69,7 +73,7 @@ class CanPort:
                 if self._bus is not None:
                     self._bus.close()
                     self._bus = None
-                self._bus = SharedBus(Bus(self.spec, self._trace))
+                self._bus = SharedBus(Bus(self.spec, self.trace))
             return self._bus
 
     def listen(self, wanted: Callable[[Frame], bool]) -> Ear:
@@ -161,16 +165,28 @@ class CanPort:
 
     def _everyone(self, longest: float, notice: NoticeSink) -> Found:
         began = time.monotonic()
-        found = Found()
-        for news in ask_all(self.bus(), self.next_transaction(), silence=SILENCE_SECONDS, longest=longest):
-            if isinstance(news, Found):
-                found = news
+        found = self._asked_once(longest)
+        for _ in range(_ROUNDS_OF_MANY - 1):
+            if len(found.identities) < _MANY or time.monotonic() - began >= longest:
+                break
+            more = self._asked_once(longest)
+            known = len(found.identities)
+            found = found.together(more)
+            if len(found.identities) == known:
+                break
         found = settle(found, self.identify, until=began + LONGEST_SECONDS + _HELLO_SECONDS)
         if found.unfinished:
             notice(Notice("unfinished", unfinished_text(found.unfinished)))
         for uuid, addresses in found.twice.items():
             notice(Notice("conflict", twice_text(uuid, addresses)))
         self.tell_of_rivals(notice)
+        return found
+
+    def _asked_once(self, longest: float) -> Found:
+        found = Found()
+        for news in ask_all(self.bus(), self.next_transaction(), silence=SILENCE_SECONDS, longest=longest):
+            if isinstance(news, Found):
+                found = news
         return found
 
     def watch(self, *, stop: threading.Event, notice: NoticeSink) -> Iterator[Contact]:
@@ -209,7 +225,7 @@ class CanPort:
             notice(Notice("conflict", f"{rivals.text} {rivals.hint}"))
 
     def _contact(self, node: int, identity: Identity) -> Contact:
-        return Contact(identity, self.link(node), address=node, trace=self._trace)
+        return Contact(identity, self.link(node), address=node, trace=self.trace)
 
     def _at(
         self, node: int, wanted: Callable[[Identity], bool], notice: NoticeSink, told: set[bytes]
@@ -251,5 +267,5 @@ class CanPort:
 def _tell(notice: NoticeSink, told: set[bytes], node: int, identity: Identity) -> None:
     if identity.uuid not in told:
         told.add(identity.uuid)
-        text = f"Node {identity.uuid.hex().upper()} answers at 0x{node:02X}, but it is not the one looked for."
+        text = f"Node {identity.uuid.hex()} answers at 0x{node:02X}, but it is not the one looked for."
         notice(Notice("foreign-tag", text))

@@ -1,7 +1,8 @@
-"""One CAN bus for many threads: one loop receives, and hands each frame to whoever waits for it.
+"""One CAN bus for many threads: whoever reads it (``reading.py``) hands each frame to those who wait for it.
 
-What nodes send to this station is put together here, whoever asked; the flow control leaves from the loop at once, so
-that a busy thread holds nobody up. Data frames, announcements and triggers go to those who listen (:meth:`listen`).
+What nodes send to this station is put together here, whoever asked; the flow control leaves at once from the thread
+that reads, so that a busy one holds nobody up. Data frames, announcements and triggers go to those who listen
+(:meth:`listen`).
 """
 
 from __future__ import annotations
@@ -24,12 +25,10 @@ from teds_provision.links.can.bus import Bus
 from teds_provision.links.can.frame import Frame
 from teds_provision.links.can.gathering import Gathering
 from teds_provision.links.can.isotp import addresses, read_single
+from teds_provision.links.can.reading import Reading, Thing
 from teds_provision.links.can.rivals import Rivals
 from teds_provision.links.can.transfer import CONTINUE, OVERFLOW, Reassembly, flow
 
-_ALIVE_SECONDS: Final = 0.25
-_SHORT_SLICE: Final = 0.02
-"""How long one receive waits on an interface that cannot be woken."""
 _REMEMBERED: Final = 16
 """Transactions of one node whose late replies are known as such."""
 _STRAGGLERS_SECONDS: Final = 0.5
@@ -55,6 +54,17 @@ class Ear:
         if frame is None:
             self._bus.check()
         return frame
+
+    def get_all(self, seconds: float) -> list[Frame]:
+        """All frames that wait, in order; where none does, the next one, or none after ``seconds``. Raises as get."""
+        first = self.get(seconds)
+        if first is None:
+            return []
+        frames = [first]
+        with contextlib.suppress(Empty):
+            while (frame := self._frames.get_nowait()) is not None:
+                frames.append(frame)
+        return frames
 
     def close(self) -> None:
         """Listen no more; a thread that waits in :meth:`get` returns."""
@@ -84,15 +94,22 @@ class Ear:
 
 @dataclass(frozen=True)
 class Event:
-    """What became of a reply: ``body`` (transaction first) whole, or it has begun, is torn, or another one began."""
+    """What became of a reply: ``body`` (transaction first) whole, or it has begun, is torn, or another one began.
+
+    ``at``: when the last frame of a whole one came in (time.monotonic).
+    """
 
     kind: str
     body: bytes = b""
+    at: float = 0.0
 
 
 @dataclass
 class Line:
-    """What the loop knows of one node: its message that comes in, and the thread that has an exchange with it."""
+    """What the loop knows of one node: its message that comes in, and the thread that has an exchange with it.
+
+    ``transaction`` is that of the exchange that runs, -1 for none.
+    """
 
     node: int
     turn: threading.Lock = field(default_factory=threading.Lock)
@@ -155,7 +172,8 @@ class SharedBus:
         self._sending = threading.Lock()
         self._closing = False
         self._wake, self._woken = socket.socketpair()
-        self._thread = threading.Thread(target=self._receive, name=f"can {self.spec.text}", daemon=True)
+        self._reading = Reading(bus, self._take, self._fail, self._woken)
+        self._thread = threading.Thread(target=self._reading.run, name=f"can {self.spec.text}", daemon=True)
         self._thread.start()
 
     def close(self) -> None:
@@ -165,6 +183,7 @@ class SharedBus:
         self._closing = True
         with contextlib.suppress(OSError):
             self._wake.send(b"x")
+        self._reading.stop()
         if self._thread is not threading.current_thread():
             self._thread.join(timeout=2)
         self._bus.close()
@@ -195,6 +214,10 @@ class SharedBus:
         """Raise the LinkFailure that the bus met, if any."""
         if self._failure is not None:
             raise self._failure
+
+    def next_of(self, queue: SimpleQueue[Thing], seconds: float) -> Thing:
+        """The next that the bus puts into a line's queue; raises Empty after ``seconds``."""
+        return self._reading.wait_for(queue, seconds)
 
     def send(self, frame: Frame) -> None:
         """Put one frame on the bus; raises LinkFailure."""
@@ -244,18 +267,6 @@ class SharedBus:
 
     # -- the loop, and what runs in it -----------------------------------------------------------------------------
 
-    def _receive(self) -> None:
-        try:
-            while not self._closing:
-                wait = 0.0 if self._bus.can_be_waited_for else _SHORT_SLICE
-                frame = self._bus.receive(wait)
-                if frame is not None:
-                    self._take(frame)
-                else:
-                    self._bus.wait(_ALIVE_SECONDS, self._woken)
-        except LinkFailure as failure:
-            self._fail(failure)
-
     def _fail(self, failure: LinkFailure) -> None:
         self._failure = self._failure or failure
         with self._lock:
@@ -285,7 +296,7 @@ class SharedBus:
                 self._first(line, frame)
             case 2:
                 self._consecutive(line, frame)
-            case 3:
+            case 3 if line.transaction >= 0:  # nobody waits for any other: they would only pile up
                 line.flows.put(frame.data)
 
     def _single(self, line: Line, frame: Frame) -> None:
@@ -293,7 +304,7 @@ class SharedBus:
         if not body:
             return
         if body[0] == line.transaction:
-            line.events.put(Event("whole", body))
+            line.events.put(Event("whole", body, frame.at))
         elif not self._gathered(line, frame, body[0]) and body[0] not in line.asked:
             self.rivals.unasked(line.node)
 
@@ -341,7 +352,7 @@ class SharedBus:
         match partial.take(frame.data):
             case "whole":
                 line.partial = None
-                line.events.put(Event("whole", bytes(partial.octets)))
+                line.events.put(Event("whole", bytes(partial.octets), frame.at))
             case "block":
                 self._reply(flow(line.node, self.own, CONTINUE, fd=partial.fd))
             case "torn":

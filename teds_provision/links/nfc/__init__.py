@@ -6,14 +6,13 @@ from teds_provision.lazy import lazy
 
 if TYPE_CHECKING:
     from teds_provision.links.nfc import (
-        exchange,
-        frontend,
         hints,
-        library,
         message,
+        nfcpy,
         pcsc,
         pieces,
         poller,
+        port,
         reader,
         tag,
         tnep,

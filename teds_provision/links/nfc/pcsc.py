@@ -12,7 +12,7 @@ from typing import Any, Final
 
 from teds_provision.errors import NoReader, UsageFailure
 from teds_provision.lazy import how_to_install
-from teds_provision.links.nfc.library import Type2TagCommandError, Type4ATag, nfc
+from teds_provision.links.nfc.nfcpy import Quiet, Type2TagCommandError, Type4ATag, nfc
 from teds_provision.links.nfc.tag import FieldLost, ReaderLost, ReaderTag, Type2, Type4Ndef
 from teds_provision.links.ports import Trace
 
@@ -70,7 +70,7 @@ def contactless(found: list[str]) -> list[str]:
 
 
 class PcscReader:
-    """An opened PC/SC reader, as ``links.nfc.frontend.Reader``; ``path`` is ``pcsc``, or ``pcsc:PART OF A NAME``."""
+    """An opened PC/SC reader, as ``links.nfc.reader.Reader``; ``path`` is ``pcsc``, or ``pcsc:PART OF A NAME``."""
 
     def __init__(self, path: str, trace: Trace | None = None) -> None:
         self._trace = trace
@@ -210,7 +210,7 @@ class _Apdus:
         return bytearray(self._card.transmit(_PRESENCE if command is None else bytes(command)))
 
 
-class _PcscType4(Type4ATag):  # type: ignore[misc]
+class _PcscType4(Quiet, Type4ATag):  # type: ignore[misc]
     """Type 4 behind a PC/SC reader."""
 
     NDEF = Type4Ndef

@@ -11,17 +11,21 @@ from contextlib import contextmanager
 from typing import Any
 
 from teds_provision.errors import Garbled, NodeSilent, NoReader
-from teds_provision.links.nfc.library import (
+from teds_provision.links.nfc.nfcpy import (
     NfcpyType2Ndef,
     NfcpyType4Ndef,
+    Quiet,
     Type2Tag,
     Type2TagCommandError,
     Type4ATag,
+    Type4TagCommandError,
     nfc,
 )
 
 _TRIES = 3  # of a read, before the message counts as unreadable
 _PRESENCE_WAIT = 0.06  # seconds that a Type 4 tag gets to say that it is still there
+_ANSWER = 78  # octets of an NDEF message with the shortest sealed answer (profile: wire, "NFC")
+_APDU_SECONDS = 5.0  # for one command of the tag and its answer: as long as a reply is waited for
 _FSC = (16, 24, 32, 40, 48, 64, 96, 128, 256)  # octets by FSCI (ISO/IEC 14443-4, table 1)
 
 
@@ -55,11 +59,47 @@ def translated() -> Iterator[None]:
 
 
 class Type4Ndef(NfcpyType4Ndef):  # type: ignore[misc]
-    """NDEF on Type 4: lengths that a short APDU can say, and the file selected once, not before every read."""
+    """NDEF on Type 4: lengths that a short APDU can say, and the file selected once, not before every read.
+
+    The first read after a write asks for the length of the message and for as much of it as the shortest sealed answer
+    has: most answers are no longer, and come with one command instead of two.
+    """
 
     _chosen: bytes | None = None
     _max_le: int
     _max_lc: int
+    _nlen_size: int
+    _capacity: int
+    _ahead = 0
+    _takes_more = True
+
+    def _read_ndef_data(self) -> bytearray | None:
+        ahead, self._ahead = self._ahead, 0
+        if not ahead:
+            octets: bytearray | None = super()._read_ndef_data()
+            return octets
+        try:
+            return self._read_from_start(ahead)
+        except Type4TagCommandError as error:
+            self._takes_more = error.errno <= 0  # a tag that lets nobody read beyond its message
+            return self._read_ndef_data()
+
+    def _read_from_start(self, ahead: int) -> bytearray | None:
+        head = self._nlen_size
+        octets = bytearray(self._read_binary(0, head + ahead))
+        if len(octets) < head:
+            return None
+        end = head + int.from_bytes(octets[:head], "big")
+        while len(octets) < end:
+            more = self._read_binary(len(octets), end - len(octets))
+            if not more:
+                return None
+            octets += more
+        return octets[head:end]
+
+    def _write_ndef_data(self, data: bytearray) -> None:
+        super()._write_ndef_data(data)
+        self._ahead = min(_ANSWER, self._capacity) if self._takes_more else 0
 
     def _select_fid(self, fid: bytes) -> bool | None:
         if self._chosen == bytes(fid):
@@ -78,7 +118,37 @@ class Type4Ndef(NfcpyType4Ndef):  # type: ignore[misc]
         return found
 
 
-class _Type4Tag(Type4ATag):  # type: ignore[misc]
+class _Patient:
+    """The front end for one command at a time: whatever the tag asks for, its answer is there by ``until``."""
+
+    def __init__(self, clf: Any) -> None:
+        self._clf = clf
+        self.until = 0.0  # time.monotonic()
+
+    def exchange(self, octets: bytes, timeout: float) -> Any:
+        left = self.until - time.monotonic()
+        if left <= 0:
+            raise Type4TagCommandError(nfc.tag.TIMEOUT_ERROR)
+        return self._clf.exchange(octets, min(timeout, left))
+
+
+class IsoDep(nfc.tag.tt4.IsoDepInitiator):  # type: ignore[misc]
+    """ISO-DEP, the reader's side, with an end: nfcpy follows a tag that says S(WTX), or R(ACK), or chains, for ever."""
+
+    def __init__(self, clf: Any, fsc: int, fwt: float) -> None:
+        self._air = _Patient(clf)
+        super().__init__(self._air, fsc, fwt)
+
+    def exchange(self, command: bytes | None, timeout: float | None = None) -> Any:
+        """One command; raises Type4TagCommandError after 5 s, and where a block of the answer is cut short."""
+        self._air.until = time.monotonic() + _APDU_SECONDS
+        try:
+            return super().exchange(command, timeout)
+        except IndexError as error:  # S(WTX) without its octet
+            raise Type4TagCommandError(nfc.tag.PROTOCOL_ERROR) from error
+
+
+class _Type4Tag(Quiet, Type4ATag):  # type: ignore[misc]
     """Type 4A, its answer to select read as ISO/IEC 14443-4 clause 5.2 lays it out (nfcpy takes fixed positions)."""
 
     NDEF = Type4Ndef
@@ -89,7 +159,7 @@ class _Type4Tag(Type4ATag):  # type: ignore[misc]
         fsdi = 8 if clf.max_recv_data_size >= 256 else 7
         fsci, fwi = _frame_limits(bytes(clf.exchange(bytearray((0xE0, fsdi << 4)), timeout=0.03)))
         fsc = min(_FSC[min(fsci, 8)], clf.max_send_data_size)
-        self._dep = nfc.tag.tt4.IsoDepInitiator(clf, fsc, 4096 / 13.56e6 * 2 ** (fwi if fwi < 15 else 4))
+        self._dep = IsoDep(clf, fsc, 4096 / 13.56e6 * 2 ** (fwi if fwi < 15 else 4))
         self._extended_length_support = False
 
     def _is_present(self) -> bool:

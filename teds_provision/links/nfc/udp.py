@@ -31,8 +31,7 @@ from collections.abc import Callable
 from typing import Any, Final
 
 from teds_provision.errors import UsageFailure
-from teds_provision.links.nfc.exchange import Frontend
-from teds_provision.links.nfc.library import UdpDevice, nfc
+from teds_provision.links.nfc.nfcpy import Frontend, UdpDevice, nfc
 
 DEFAULT_PORT: Final = 54321
 _LOOPBACK: Final = {"", "localhost", "127.0.0.1"}

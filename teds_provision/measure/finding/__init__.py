@@ -5,6 +5,6 @@ from typing import TYPE_CHECKING
 from teds_provision.lazy import lazy
 
 if TYPE_CHECKING:
-    from teds_provision.measure.finding import buses, lookout, sources
+    from teds_provision.measure.finding import air, asking, buses, lookout, sightings, sources
 else:
     __getattr__ = lazy(__name__)

@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-import threading
 import time
 from dataclasses import replace
 
 from teds_provision.errors import LinkFailure, NoNode
 from teds_provision.links.ble.port import BlePort
 from teds_provision.links.ports import Notice
-from teds_provision.measure.finding.lookout import LEAST, LOOK, MOST, Sighting, Sightings
+from teds_provision.measure.finding.asking import LEAST, Asking, Pace
+from teds_provision.measure.finding.lookout import LOOK
+from teds_provision.measure.finding.sightings import Sighting, Sightings
 from teds_provision.measure.hearing import SLICE, HeardStream, Hearing
 from teds_provision.measure.planning import BusTime
 from teds_provision.protocol.operation.can_frames import read_ble_frame
@@ -48,55 +49,30 @@ class AirHearing(Hearing):
                 looked = self._flush(looked, self._air.lost)
 
 
-class AirLookout:
+class AirLookout(Asking):
     """The look-out of one adapter, a thread until :meth:`close`: it looks only while somebody is missing, or on asking.
 
     Every node that advertises is connected to and asked, one after the other; those that are in use are left alone.
     """
 
+    LONGEST = ROUND
+
     def __init__(self, port: BlePort, sightings: Sightings, *, poll: float | None = None) -> None:
-        self.port, self._sightings, self._poll = port, sightings, poll
-        self._stop, self._asked = threading.Event(), threading.Event()
-        self._done = threading.Condition()
-        self._rounds = 0
-        self.failure: LinkFailure | None = None
-        self._thread = threading.Thread(target=self._run, name=f"look-out {port.place}", daemon=True)
-        self._thread.start()
-
-    def close(self) -> None:
-        """End the thread."""
-        self._stop.set()
-        self._asked.set()
-        self._thread.join(ROUND)
-
-    def poll(self, seconds: float | None) -> None:
-        """Look every so many seconds from now on; None: only while somebody is missing."""
-        self._poll = seconds
-
-    def discover(self, seconds: float = ROUND) -> None:
-        """Look now, and wait until that is done; raises LinkFailure where Bluetooth has failed."""
-        with self._done:
-            before = self._rounds
-            self._asked.set()
-            self._done.wait_for(lambda: self._rounds > before + 1 or self._stop.is_set(), seconds)
-        if self.failure is not None:
-            raise self.failure
+        self.port = port
+        super().__init__(port.place, sightings, poll)
 
     def _run(self) -> None:
-        looked, pause = 0.0, LEAST
+        pace = Pace(0.0)
         while not self._stop.is_set():
-            missing = self._sightings.missing()
-            since = time.monotonic() - looked
-            due = (missing and since >= pause) or (self._poll is not None and since >= self._poll)
-            if not (due or self._asked.is_set()):
-                pause = pause if missing else LEAST
+            wanted = self._asked.is_set()
+            if not pace.is_due(wanted=wanted, missing=self._sightings.missing(), poll=self._poll):
                 self._asked.wait(LOOK)
                 continue
-            self._asked.clear()
             self._look()
-            looked, pause = time.monotonic(), min(2 * pause, MOST)
+            pace.asked = time.monotonic()
 
     def _look(self) -> None:
+        self._begin()
         self.failure = None
         try:
             for contact in self.port.everyone(seconds=2 * LEAST, notice=_nothing):
@@ -106,9 +82,7 @@ class AirLookout:
             pass
         except LinkFailure as failure:
             self.failure = failure
-        with self._done:
-            self._rounds += 1
-            self._done.notify_all()
+        self._done()
 
 
 def air_time(time_: BusTime, mtu: int) -> BusTime:

@@ -13,7 +13,8 @@ from teds_provision.links.ble.port import BlePort
 from teds_provision.links.can.bus import Frame
 from teds_provision.links.can.port import CanPort
 from teds_provision.measure.finding.air import AirHearing, AirLookout, air_time
-from teds_provision.measure.finding.lookout import Lookout, Sighting, Sightings
+from teds_provision.measure.finding.lookout import Lookout
+from teds_provision.measure.finding.sightings import Sighting, Sightings
 from teds_provision.measure.hearing import CanHearing, Hearing
 from teds_provision.measure.orders import BusShare
 from teds_provision.measure.planning import BusTime
@@ -68,20 +69,18 @@ def bus_at(port: CanPort | BlePort, sightings: Sightings, *, poll: float | None)
 class Buses:
     """All of them; ``with Buses(ports) as buses:`` ends their threads. The ports are the caller's to close.
 
-    ``news`` is told each node that answers, from the look-out's thread; ``poll`` seconds between questions to
-    everybody, None: only while somebody is missing.
+    ``news`` is told each node that answers, from the look-out's thread.
     """
 
     def __init__(
         self,
         ports: Iterable[CanPort | BlePort] = (),
         *,
-        poll: float | None = None,
         news: Callable[[Sighting], None] = lambda _sighting: None,
         note: Callable[[str], None] = lambda _text: None,
     ) -> None:
         self.sightings = Sightings(news, note)
-        self._poll = poll
+        self._poll: float | None = None
         self._buses: dict[str, Bus] = {}
         for port in ports:
             self.add(port)
@@ -114,7 +113,7 @@ class Buses:
             bus.share.expect(uuids)
 
     def poll(self, seconds: float | None) -> None:
-        """Ask everybody so often from now on."""
+        """Ask everybody so often from now on; None (as at the beginning): only while somebody is missing."""
         self._poll = seconds
         for bus in self.all():
             bus.lookout.poll(seconds)

@@ -17,7 +17,7 @@ from teds_provision.measure.sinks.jsonl import JsonLinesSink
 from teds_provision.measure.sinks.mcap.recording import McapSink
 from teds_provision.measure.sinks.mqtt import MqttSink
 from teds_provision.measure.sinks.ros.ros1 import Ros1Sink
-from teds_provision.measure.sinks.ros.ros2 import Ros2Sink
+from teds_provision.measure.sinks.ros.sourced import ros2_sink
 from teds_provision.measure.sinks.text import TextSink
 
 __all__ = ["CommandTaker", "Sink", "ThreadedSink", "as_sink_failure", "open_sink"]
@@ -35,7 +35,7 @@ FILES: dict[str, Callable[[Path], Sink]] = {
 }
 SERVICES: dict[str, Callable[[str, CommandTaker | None], Sink]] = {
     "ros1": Ros1Sink,
-    "ros2": Ros2Sink,
+    "ros2": ros2_sink,
     "mqtt": MqttSink,
     "mqtts": MqttSink,
 }

@@ -11,8 +11,8 @@ import time
 from abc import ABC, abstractmethod
 from collections import deque
 from collections.abc import Callable, Sequence
-from dataclasses import replace
-from typing import Protocol
+from dataclasses import dataclass
+from typing import Literal, Protocol
 
 from teds_provision.errors import StoreFailure, TedsProvisionError
 from teds_provision.measure.blocks import Block, ChannelFacts, Command, GroupRows, NodeReport, SinkStats, StationFacts
@@ -23,6 +23,8 @@ CommandTaker = Callable[[Command], None]
 RECORDER_WAITING = 2_000_000  # values that a recorder may owe: some 200 MB, 40 s at 50,000 values a second
 LIVE_WAITING = 256  # items that a live sink may owe: newest wins
 TICK = 0.05  # seconds between looks at the clock while nothing comes
+RECORDER_LOOKS = 0.02  # seconds between looks of a recorder at what waits
+TOGETHER = 64  # items that a recorder takes at a time, at most
 CLOSING = 30.0  # seconds for a recorder to write what it owes
 
 
@@ -68,6 +70,26 @@ class Sink(Protocol):
         """Write out what is owed, end, give back what was opened. A second call does nothing."""
 
 
+@dataclass
+class _Tally:
+    """SinkStats while they grow: a frozen one for each item took longer than to write it."""
+
+    written: int = 0
+    dropped: int = 0
+    octets: int = 0
+    messages: int = 0
+    lag: float = 0.0
+    state: Literal["starting", "running", "waiting", "ended", "failed"] = "starting"
+    detail: str = ""
+    error: str = ""
+    hint: str = ""
+
+    def fail(self, error: str, hint: str) -> None:
+        """The first failure stays."""
+        if self.state != "failed":
+            self.state, self.error, self.hint = "failed", error, hint
+
+
 class ThreadedSink(ABC):
     """A sink whose work is done by one thread of its own; subclasses fill in four steps and the name.
 
@@ -84,7 +106,7 @@ class ThreadedSink(ABC):
         self._items: deque[tuple[float, int, Item]] = deque()
         self._owed = 0
         self._closing = False
-        self._stats = SinkStats()
+        self._tally = _Tally()
         self._thread: threading.Thread | None = None
 
     @property
@@ -96,7 +118,7 @@ class ThreadedSink(ABC):
     def stats(self) -> SinkStats:
         """A snapshot of the counters."""
         with self._lock:
-            return self._stats
+            return SinkStats(**vars(self._tally))
 
     def open(self, facts: Sequence[ChannelFacts], station: StationFacts) -> None:
         """Do what can fail at once, then start the thread. Raises TedsProvisionError."""
@@ -152,39 +174,32 @@ class ThreadedSink(ABC):
 
     def _count(self, *, written: int = 0, dropped: int = 0, octets: int = 0, messages: int = 0) -> None:
         with self._lock:
-            old = self._stats
-            self._stats = replace(
-                old,
-                written=old.written + written,
-                dropped=old.dropped + dropped,
-                octets=old.octets + octets,
-                messages=old.messages + messages,
-            )
+            tally = self._tally
+            tally.written += written
+            tally.dropped += dropped
+            tally.octets += octets
+            tally.messages += messages
 
-    def _say(self, state: str, detail: str = "") -> None:
+    def _say(self, state: Literal["running", "waiting", "ended"], detail: str = "") -> None:
         """Set the state that people see; a failure stays."""
         with self._lock:
-            if self._stats.state != "failed":
-                self._stats = replace(self._stats, state=state, detail=detail)  # type: ignore[arg-type]
+            if self._tally.state != "failed":
+                self._tally.state, self._tally.detail = state, detail
 
     def _fail(self, error: TedsProvisionError) -> None:
         with self._lock:
-            if self._stats.state != "failed":
-                self._stats = replace(self._stats, state="failed", error=error.message, hint=error.hint)
+            self._tally.fail(error.message, error.hint)
 
     def _put(self, item: Item, values: int) -> None:
         with self._lock:
-            if self._closing or self._stats.state == "failed":
+            if self._closing or self._tally.state == "failed":
                 return
             if self.recorder:
                 if self._owed + values > RECORDER_WAITING:
                     # Waiting would stop the measurement, dropping would leave a hole that nobody sees: so it ends.
-                    error = "The disk is too slow"
-                    self._stats = replace(
-                        self._stats,
-                        state="failed",
-                        error=f"{error}: {self.name} owes {self._owed} values. The recording has ended.",
-                        hint="Record to a faster disk, or fewer channels.",
+                    self._tally.fail(
+                        f"The disk is too slow: {self.name} owes {self._owed} values. The recording has ended.",
+                        "Record to a faster disk, or fewer channels.",
                     )
                     self._lock.notify_all()
                     return
@@ -192,7 +207,8 @@ class ThreadedSink(ABC):
                 self._drop_oldest()
             self._items.append((time.monotonic(), values, item))
             self._owed += values
-            self._lock.notify_all()
+            if not self.recorder:  # it looks by itself: to be woken for each block costs more than to write it
+                self._lock.notify_all()
 
     def _drop_oldest(self) -> None:
         """Of what waits, the oldest samples go; facts and reports stay, they are few."""
@@ -200,24 +216,28 @@ class ThreadedSink(ABC):
             if isinstance(item, Block | GroupRows):
                 del self._items[place]
                 self._owed -= values
-                self._stats = replace(self._stats, dropped=self._stats.dropped + values)
+                self._tally.dropped += values
                 return
         self._items.popleft()
 
-    def _next(self) -> tuple[Item | None, bool]:
-        """The next item, or None after TICK; and whether all is done."""
+    def _next(self) -> tuple[list[Item], bool]:
+        """What waits, or nothing after TICK; and whether all is done.
+
+        A recorder takes several at a time; of a live sink the others may still be dropped.
+        """
         with self._lock:
             if not self._items and not self._closing:
-                self._lock.wait(TICK)
-            if self._stats.state == "failed":
+                self._lock.wait(RECORDER_LOOKS if self.recorder else TICK)
+            if self._tally.state == "failed":
                 self._items.clear()
-                return None, True
+                return [], True
             if not self._items:
-                return None, self._closing
-            stamp, values, item = self._items.popleft()
-            self._owed -= values
-            self._stats = replace(self._stats, lag=time.monotonic() - stamp)
-            return item, False
+                return [], self._closing
+            count = min(len(self._items), TOGETHER if self.recorder else 1)
+            taken = [self._items.popleft() for _ in range(count)]
+            self._owed -= sum(values for _, values, _ in taken)
+            self._tally.lag = time.monotonic() - taken[0][0]
+        return [item for _, _, item in taken], False
 
     def _work(self) -> None:
         try:
@@ -236,11 +256,11 @@ class ThreadedSink(ABC):
         looked = time.monotonic()
         done = False
         while not done:
-            item, done = self._next()
-            if item is not None:
+            items, done = self._next()
+            for item in items:
                 self._take(item)
             now = time.monotonic()
-            if item is None or now - looked >= TICK:
+            if not items or now - looked >= TICK:
                 self._idle(now)
                 looked = now
 

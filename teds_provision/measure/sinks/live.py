@@ -23,6 +23,7 @@ import time
 from abc import abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -30,9 +31,10 @@ from teds_provision.measure.blocks import Block, ChannelFacts, Command, GroupRow
 from teds_provision.measure.sinks.base import CommandTaker, Item, ThreadedSink
 from teds_provision.measure.sinks.lines import facts_as_json
 from teds_provision.measure.sinks.meaning import VARIANCE_NOTE, Meaning, meaning_of, variance_of
-from teds_provision.measure.sinks.names import Topics
+from teds_provision.measure.sinks.names import Topics, slug
 from teds_provision.measure.sinks.vectors import Compound, FieldValue, compounds_of, is_range
 
+NODE = "teds_provision"
 BUDGET = 5000  # messages a second that one process bears (docs/ros.md)
 ROWS = 1000  # rows a second of an array, at most; a recorder takes all of them
 OK, WARN, ERROR, STALE = range(4)  # of diagnostic_msgs/DiagnosticStatus
@@ -80,6 +82,10 @@ class TopicSink(ThreadedSink):
         self.refused_commands = 0
 
     @abstractmethod
+    def _advertise(self, topic: str, kind: str) -> None:
+        """Make a topic known before its first message, so that whoever waits for it is there in time."""
+
+    @abstractmethod
     def _array(self, topic: str, stamp: float, names: Sequence[str], values: Sequence[float]) -> None:
         """One JointState; NaN where there is no value."""
 
@@ -107,6 +113,11 @@ class TopicSink(ThreadedSink):
     def _diagnose(self, stamp: float, statuses: Sequence[Status]) -> None:
         """One DiagnosticArray."""
 
+    @property
+    def _node(self) -> str:
+        """Name of the ROS node. ROS 1 ends a node whose name another one takes, so each measurement has its own."""
+        return "_".join(filter(None, (NODE, self._topics.station, slug(self._station.instance))))
+
     def _prepare(self, facts: tuple[ChannelFacts, ...], station: StationFacts) -> None:
         self._station = station
         self._topics = Topics(station)
@@ -118,6 +129,8 @@ class TopicSink(ThreadedSink):
 
     def write(self, block: Block) -> None:
         """Samples of one stream; what comes before its topics are due is left out here, not queued."""
+        if self._station.scalar_rate <= 0:
+            return
         scalars = self._scalars.get((block.uuid, block.stream, block.channels))
         if scalars is None or time.monotonic() >= scalars.due:
             super().write(block)
@@ -144,24 +157,30 @@ class TopicSink(ThreadedSink):
 
     def _announce(self, facts: Sequence[ChannelFacts]) -> None:
         """Metadata, parameters and command topics of channels; again when a way to the consumers opened anew."""
+        array = self._topics.of_group(self._station.group)
+        for topic in () if self._station.test_pattern else (array, f"{array}/age"):
+            self._advertise(topic, JOINT_STATE)
         by_node: dict[str, list[ChannelFacts]] = {one.uuid: [] for one in facts}
         for one in self._facts.values():
             if one.uuid in by_node:
                 by_node[one.uuid].append(one)
         for uuid, channels in by_node.items():
-            words = {
-                "uuid": uuid,
-                "station": self._station.name,
-                "clock": self._station.clock,
-                "test_pattern": self._station.test_pattern,
-                "variance": VARIANCE_NOTE,
-                "channels": [{**facts_as_json(one), "topic": self._topics.channel(*one.key)} for one in channels],
-            }
-            self._latched(self._topics.of_node(uuid, "teds"), json.dumps(words))
+            self._latched(self._topics.of_node(uuid, "teds"), json.dumps(self._metadata(uuid, channels)))
             for one in channels:
                 self._parameter(self._topics.channel(*one.key), facts_as_json(one))
                 if one.kind == "actuator" and self._commands is not None:
                     self._listen(f"{self._topics.channel(*one.key)}/cmd", one.uuid, one.number)
+
+    def _metadata(self, uuid: str, channels: Sequence[ChannelFacts]) -> dict[str, Any]:
+        """What a consumer has to know of a node's values, as plain data."""
+        return {
+            "uuid": uuid,
+            "station": self._station.name,
+            "clock": self._station.clock,
+            "test_pattern": self._station.test_pattern,
+            "variance": VARIANCE_NOTE,
+            "channels": [{**facts_as_json(one), "topic": self._topics.channel(*one.key)} for one in channels],
+        }
 
     def _block(self, block: Block) -> None:
         rate = self._station.scalar_rate
@@ -242,6 +261,9 @@ class TopicSink(ThreadedSink):
 
     def _statuses(self, rate: float) -> list[Status]:
         found = [self._status(report) for report in self._reports.values()]
+        for uuid in sorted({one.uuid for one in self._facts.values() if one.unsigned}):
+            name = f"{self._topics.node(uuid)}: datasheet"
+            found.append(Status(WARN, name, "nobody has signed it: raw values alone, which reach no topic", uuid))
         for one in self._facts.values():
             if one.overdue:
                 name = f"{self._topics.node(one.uuid)}: calibration of {one.label}"

@@ -2,8 +2,10 @@
 
 Topics: ``<station>/<node>`` carries the newest values of a node as one JSON object (not retained, QoS 0) at
 ``StationFacts.scalar_rate``; ``homeassistant/sensor/<uuid>/<channel>/config`` (retained) tells Home Assistant where to
-look; ``<station>/status`` is ``online`` or, by the broker's will, ``offline``. Values are in the unit for people (°C),
-for Home Assistant knows units by their signs. Nothing is subscribed: no actuator is moved by MQTT.
+look; ``<station>/<group>/status`` is ``online`` or, by the broker's will, ``offline``: each measurement has its own,
+for several may run and one that ends must not end the others. An entity is available while that is online and its node
+runs, so the last value of a node that is lost is not taken for one of now. Values are in the unit for people (°C), for
+Home Assistant knows units by their signs. Nothing is subscribed: no actuator is moved by MQTT.
 
 A password is read from the file that the URL names (``mqtt://user@host?password-file=PATH``): never from the URL.
 """
@@ -34,6 +36,7 @@ DISCOVERY = "homeassistant"
 PORTS = {"mqtt": 1883, "mqtts": 8883}
 KEEP_ALIVE = 15  # seconds: the broker says offline after one and a half of it
 WAITING = 1000  # messages that the library may hold for a slow broker
+RUNS = "{{ 'online' if value_json.state == 'running' else 'offline' }}"  # a template of Home Assistant
 DEVICE_CLASSES = {"°C": "temperature", "Pa": "pressure", "hPa": "pressure", "kPa": "pressure", "lx": "illuminance"}
 
 
@@ -76,11 +79,16 @@ class MqttSink(ThreadedSink):
             client.tls_set()
         if self._parts.username:
             client.username_pw_set(self._parts.username, self._password())
-        client.will_set(f"{self._topics.station}/status", "offline", qos=1, retain=True)
+        client.will_set(self._status, "offline", qos=1, retain=True)
         client.reconnect_delay_set(1, 30)
         client.on_connect = self._on_connect
         client.on_disconnect = self._on_disconnect
         self._client = client
+
+    @property
+    def _status(self) -> str:
+        """Topic that says whether this measurement is there."""
+        return "/".join(filter(None, (self._topics.station, slug(self._station.instance), "status")))
 
     def _password(self) -> str | None:
         if not self._password_file:
@@ -134,11 +142,14 @@ class MqttSink(ThreadedSink):
         if self._anew.is_set():
             self._anew.clear()
             self._say("running", f"connected to {self._parts.hostname}")
-            self._client.publish(f"{self._topics.station}/status", "online", qos=1, retain=True)
+            self._client.publish(self._status, "online", qos=1, retain=True)
             self._discover()
 
     def _discover(self) -> None:
         for one in self._facts.values():
+            if one.unsigned:  # raw values alone, which are none of anything: no sensor to show
+                continue
+            node = f"{self._topics.station}/{self._topics.node(one.uuid)}"
             device = {
                 "identifiers": [one.uuid],
                 "name": one.node or one.uuid,
@@ -150,9 +161,10 @@ class MqttSink(ThreadedSink):
             words = {
                 "name": one.label,
                 "unique_id": f"{one.uuid}_{one.number}",
-                "state_topic": f"{self._topics.station}/{self._topics.node(one.uuid)}",
+                "state_topic": node,
                 "value_template": f"{{{{ value_json.{self._field(one)} }}}}",
-                "availability_topic": f"{self._topics.station}/status",
+                "availability": [{"topic": self._status}, {"topic": f"{node}/state", "value_template": RUNS}],
+                "availability_mode": "all",
                 "state_class": "measurement",
                 "device": device,
                 **({"unit_of_measurement": sign} if sign else {}),
@@ -168,24 +180,27 @@ class MqttSink(ThreadedSink):
         if block.test_pattern or self._station.scalar_rate <= 0 or not len(block.time):
             return
         newest = self._newest.setdefault(block.uuid, {})
-        for column, number in enumerate(block.channels):
-            facts = self._facts.get((block.uuid, number), ChannelFacts(block.uuid, "", number, ""))
-            value: float | None = float(block.value[-1, column])
-            unit = self._units.get(facts.key)
-            if value is None or not math.isfinite(value):
-                value = None
-            elif unit is not None:
-                value = unit.from_si(value)
-            newest[self._field(facts)] = value
+        known = [self._facts.get((block.uuid, n), ChannelFacts(block.uuid, "", n, "")) for n in block.channels]
+        for column, facts in enumerate(known):
+            newest[self._field(facts)] = self._shown(facts, float(block.value[-1, column]))
         now = time.monotonic()
         if now >= self._due.get(block.uuid, 0.0):
             self._due[block.uuid] = now + 1 / self._station.scalar_rate
             values = {"time": round(float(block.time[-1]), 6), **newest}
+            if any(facts.unsigned for facts in known):
+                values["unsigned"] = True
             if self._connected.is_set():
                 self._publish(f"{self._topics.station}/{self._topics.node(block.uuid)}", values)
                 self._count(written=len(newest))
             else:
                 self._count(dropped=len(newest))
+
+    def _shown(self, facts: ChannelFacts, value: float) -> float | None:
+        """A value in people's unit, None where there is none."""
+        unit = self._units.get(facts.key)
+        if not math.isfinite(value):
+            return None
+        return value if unit is None else unit.from_si(value)
 
     def _publish(self, topic: str, words: dict[str, Any], *, qos: int = 0, retain: bool = False) -> None:
         octets = json.dumps(words, allow_nan=False).encode()
@@ -196,7 +211,7 @@ class MqttSink(ThreadedSink):
         if self._client is None:
             return
         if self._connected.is_set():
-            said = self._client.publish(f"{self._topics.station}/status", "offline", qos=1, retain=True)
+            said = self._client.publish(self._status, "offline", qos=1, retain=True)
             said.wait_for_publish(2.0)
         self._client.disconnect()
         self._client.loop_stop()

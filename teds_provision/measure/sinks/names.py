@@ -44,13 +44,15 @@ class Topics:
                     hint="Use letters, digits and single _, beginning with a letter; / between parts.",
                 )
         self._facts: dict[tuple[str, int], ChannelFacts] = {}
-        self._nodes: dict[str, str] = {}
+        self._own = {uuid: slug(name) for uuid, name in station.nodes.items()}  # what each node is called itself
+        self._nodes = _names_of_nodes(self._own)
         self._channels: dict[tuple[str, int], str] = {}
 
     def learn(self, facts: Iterable[ChannelFacts]) -> None:
         """Facts of channels; names of those that were known stay unless a namesake came."""
         self._facts.update((one.key, one) for one in facts)
-        self._nodes = _names_of_nodes({one.uuid: slug(one.node) for one in self._facts.values()})
+        self._own.update((one.uuid, slug(one.node)) for one in self._facts.values())
+        self._nodes = _names_of_nodes(self._own)
         self._channels = _names_of_channels(
             {key: slug(one.name) or f"ch{one.number}" for key, one in self._facts.items()}
         )

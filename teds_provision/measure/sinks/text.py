@@ -10,11 +10,12 @@ tabs. Channels that come later, or another datasheet, begin a new part: each fil
 from __future__ import annotations
 
 import json
+import math
 import re
 from collections.abc import Sequence
+from itertools import count
 from pathlib import Path
-
-import numpy as np
+from typing import Any
 
 from teds_provision.harmless import printable
 from teds_provision.measure.blocks import Block, ChannelFacts, NodeReport
@@ -22,7 +23,6 @@ from teds_provision.measure.sinks.base import Item
 from teds_provision.measure.sinks.files import FileSink
 from teds_provision.measure.sinks.lines import facts_as_json, iso
 
-EXACT = 2.0**53  # the integers below it are floats without loss
 FORMULA = ("=", "+", "-", "@")  # a cell that begins so would be computed by a spreadsheet
 
 
@@ -33,7 +33,7 @@ class TextSink(FileSink):
         super().__init__(path)
         self._comma = "," if path.suffix.lower() == ".csv" else "\t"
         self._columns: dict[tuple[str, int], int] = {}
-        self._templates: dict[tuple[str, tuple[int, ...], bool], str] = {}
+        self._templates: dict[tuple[str, tuple[int, ...], bool, str], tuple[str, list[int]]] = {}
         self._not_a_number = re.compile(f"(?<={self._comma})nan(?=[{self._comma}\n])")
 
     def _take(self, item: Item) -> None:
@@ -91,60 +91,48 @@ class TextSink(FileSink):
         self._count(written=block.value.size, octets=len(octets), messages=len(block.time))
 
     def _rows(self, block: Block) -> str:
-        n, c = block.value.shape
-        raw, integral = block.raw, block.raw.dtype.kind in "uib"
-        if raw.dtype.kind == "O" or (integral and raw.size and np.abs(raw.astype(np.float64)).max() >= EXACT):
-            return self._slow_rows(block)
-        template = self._template(block, integral)
-        cells = np.empty((n, 3 + 2 * c))
-        cells[:, 0] = block.time
-        cells[:, 1] = np.arange(block.index, block.index + n)
-        cells[:, 2] = np.nan if block.clock_error is None else block.clock_error
-        order = _order(block)
-        cells[:, 3 : 3 + c] = np.where(block.valid, block.value, np.nan)[:, order]
-        cells[:, 3 + c :] = raw[:, order]
-        text = (template * n) % tuple(cells.ravel().tolist())
-        return self._not_a_number.sub("", text) if np.isnan(cells).any() else text
+        raw, values, kind = _raw_values(block), block.value.tolist(), block.raw.dtype.kind
+        template, order = self._template(block, kind)
+        if order:
+            raw, values = ([[row[place] for place in order] for row in rows] for rows in (raw, values))
+        error = math.nan if block.clock_error is None else block.clock_error
+        text = "".join(
+            [
+                template % (instant, index, error, *row, *raws)
+                for index, instant, row, raws in zip(count(block.index), block.time.tolist(), values, raw, strict=False)
+            ]
+        )
+        return self._not_a_number.sub("", text) if "nan" in text else text
 
-    def _template(self, block: Block, integral: bool) -> str:
-        key = (f"{block.uuid}{block.test_pattern:d}", block.channels, integral)
+    def _template(self, block: Block, kind: str) -> tuple[str, list[int]]:
+        """Formats of a row, and the order of the block's columns in it where that is not theirs."""
+        key = (block.uuid, block.channels, block.test_pattern, kind)
         if key not in self._templates:
-            self._templates[key] = self._row(block, "%.6f", "%d", "%.3g", "%.12g", "%d" if integral else "%.17g")
+            form = {"f": "%.17g", "O": "%s"}.get(kind, "%d")
+            order = sorted(range(len(block.channels)), key=block.channels.__getitem__)
+            self._templates[key] = self._row(block, form), order if order != sorted(order) else []
         return self._templates[key]
 
-    def _row(self, block: Block, time: str, index: str, error: str, value: str, raw: str) -> str:
-        """A row of formats in the columns' order, which is that of _order()."""
+    def _row(self, block: Block, raw: str) -> str:
+        """A row of formats in the columns' order, which is by channel number."""
         width = len(self._columns)
         cells = [""] * (2 * width)
         for number in block.channels:
             place = self._columns[block.uuid, number]
-            cells[place], cells[width + place] = value, raw
+            cells[place], cells[width + place] = "%.12g", raw
         unsigned = any(self.facts[block.uuid, number].unsigned for number in block.channels)
         note = "test pattern" if block.test_pattern else "unsigned datasheet" if unsigned else ""
-        return self._comma.join([time, block.uuid, index, error, note, *cells]) + "\n"
+        return self._comma.join(["%.6f", block.uuid, "%d", "%.3g", note, *cells]) + "\n"
 
-    def _slow_rows(self, block: Block) -> str:
-        """Raw values beyond 53 bits, or octet strings: cell by cell."""
-        template = self._row(block, "%.6f", "%d", "%s", "%s", "%s")
-        error = "" if block.clock_error is None else f"{block.clock_error:.3g}"
-        rows, order = [], _order(block)
-        value, valid, raw = block.value[:, order], block.valid[:, order], block.raw[:, order]
-        for k, instant in enumerate(block.time.tolist()):
-            values = [
-                f"{value:.12g}" if good else ""
-                for value, good in zip(value[k].tolist(), valid[k].tolist(), strict=True)
-            ]
-            raws = [one.hex() if isinstance(one, bytes) else str(one) for one in raw[k].tolist()]
-            rows.append(template % (instant, block.index + k, error, *values, *raws))
-        return "".join(rows)
+
+def _raw_values(block: Block) -> list[list[Any]]:
+    rows: list[list[Any]] = block.raw.tolist()
+    if block.raw.dtype.kind == "O":  # beyond 64 bits, or octet strings
+        return [[one.hex() if isinstance(one, bytes) else one for one in row] for row in rows]
+    return rows
 
 
 def _heads(known: Sequence[ChannelFacts]) -> list[str]:
     names = [f"{one.node or one.uuid}/{one.label}" for one in known]
     values = [f"{name} [{one.unit}]" if one.unit else name for name, one in zip(names, known, strict=True)]
     return ["time", "uuid", "index", "clock_error", "note", *values, *(f"{name} raw" for name in names)]
-
-
-def _order(block: Block) -> list[int]:
-    """Columns of a block in the order of the file's: by channel number."""
-    return sorted(range(len(block.channels)), key=block.channels.__getitem__)

@@ -14,19 +14,22 @@ from contextlib import AbstractContextManager, ExitStack, contextmanager, suppre
 from dataclasses import dataclass, field
 from typing import Any, Final
 
-from teds_provision.errors import LinkFailure, NoNode, StoreFailure, TedsProvisionError
+from teds_provision.errors import LinkFailure, NodeBusy, NodeRefused, NoNode, StoreFailure, TedsProvisionError
 from teds_provision.links.ports import Notice
 from teds_provision.measure.acting import DEAD_MAN, Acting
+from teds_provision.measure.blocks import Command
 from teds_provision.measure.trusting import Trusted, open_trusted, require_whitelisted
 from teds_provision.ncap.live import Live
 from teds_provision.ncap.nodes.desk import Desk
 from teds_provision.ncap.nodes.turns import Turns
+from teds_provision.protocol.messages.frames import Reason
 from teds_provision.station.station import Station
 from teds_provision.talk.conversation import Conversation, SessionLost
 
 HOLD: Final = 1.0  # seconds, where a request does not say
 LONGEST: Final = 60.0
 _STARTING: Final = 15.0
+_OPENING, _LOOK = 5.0, 0.05  # seconds for a session that is being opened, and between looks at it
 Measured = Callable[[str], AbstractContextManager[Trusted | None]]
 
 
@@ -50,6 +53,7 @@ class _Held:
     safe: bool | None = None
     ended: bool = False
     let_go: bool = False
+    crossed: bool = False
 
 
 @dataclass
@@ -90,6 +94,18 @@ class Holding:
     def state(self, uuid: str, channel: int) -> dict[str, Any] | None:
         """What an actuator was told last, and whether it is known to be safe."""
         return self._last.get((uuid, channel))
+
+    def admits(self, command: Command) -> bool:
+        """Whether a set point that came by a topic may pass: not while a request holds its actuator. Told once."""
+        with self._guard:
+            held = self._held.get((command.uuid, command.channel))
+        if held is None or held.ended:
+            return True
+        if not held.crossed:
+            held.crossed = True
+            self._live.event("actuator", uuid=command.uuid, state="refused", channel=command.channel,
+                             why="A set point came by a topic while a request holds the actuator.")  # fmt: skip
+        return False
 
     def put(self, uuid: str, channel: int, value: float, unit: str | None, hold: float | None) -> dict[str, Any]:
         """Set and hold for ``hold`` seconds; again before they are over, it is held on. Returns when it was applied.
@@ -209,6 +225,7 @@ class Holding:
         acting: Acting | None = None
         unit: str | None = None
         answered = 0
+        self._until_there(held, session)
         try:
             while True:
                 with held.news:
@@ -234,6 +251,17 @@ class Holding:
                 held.safe = acting.safe
 
     @staticmethod
+    def _until_there(held: _Held, session: Measured) -> None:
+        """A measurement that was begun just now is opening its session."""
+        end = time.monotonic() + _OPENING
+        while time.monotonic() < end and not held.let_go:
+            with session(held.uuid) as trusted:
+                if trusted is not None:
+                    return
+            with held.news:
+                held.news.wait_for(lambda: held.let_go, _LOOK)
+
+    @staticmethod
     def _until_news(held: _Held, answered: int, pause: float) -> None:
         """Wait until the value has to be sent again, there is another one, or it is to be let go."""
         with held.news:
@@ -253,7 +281,16 @@ def _acting(trusted: Trusted, channel: int, order: _Order, *, claimed: bool) -> 
     acting = Acting(trusted, channel, unit=order.unit, dead_man=DEAD_MAN)
     acting.octets_of(order.value)
     if not claimed:
-        acting.__enter__()
+        try:
+            acting.__enter__()
+        except NodeRefused as refusal:
+            if refusal.reason != Reason.WRONG_STATE:
+                raise
+            # It is claimed in this very session: by the set points of a topic, which only a measurement takes.
+            raise NodeBusy(
+                f"Channel {channel} is driven by set points of a topic.",
+                hint="End what publishes them, then ask again.",
+            ) from refusal
     return acting
 
 

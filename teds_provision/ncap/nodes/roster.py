@@ -23,6 +23,8 @@ from teds_provision.teds.sheet import Channel, Sheet
 
 _READ_NOW: Final = "read now"
 MOST_SHOWN: Final = 1000
+MOST_GONE: Final = 200
+"""Nodes that left and that the store does not know, kept to be shown: in transparent mode anybody can make up more."""
 
 
 @dataclass
@@ -109,9 +111,17 @@ class Roster:
             seen.version += 1
             for name, value in facts.items():
                 setattr(seen, name, value)
+            if state == "left":
+                self._forget_strangers()
         if state is not None:
             told = {key: value for key, value in facts.items() if key in ("verdict", "problem", "place", "busy")}
             self._live.event("node", uuid=uuid, state=state, **told)
+
+    def _forget_strangers(self) -> None:
+        gone = [uuid for uuid, seen in self._seen.items() if not seen.present and uuid not in self._rows]
+        for uuid in gone[:-MOST_GONE]:
+            for kept in (self._seen, self._channels, self._texts):
+                kept.pop(uuid, None)
 
     def seen(self, uuid: str) -> Seen:
         """What the links say of a node."""
@@ -170,9 +180,11 @@ class Roster:
         """The first ``most`` of them; those that are there come first."""
         return [self.node(uuid) for uuid in self.uuids()[:most]]
 
-    def nodes_text(self, most: int = MOST_SHOWN) -> str:
+    def nodes_text(self, most: int = MOST_SHOWN, offset: int = 0) -> str:
         """The answer of GET /nodes as JSON; what did not change since is not put together again."""
-        return f'{{"nodes":[{",".join(map(self._text, self.uuids()[:most]))}]}}'
+        uuids = self.uuids()
+        shown = ",".join(map(self._text, uuids[offset : offset + most]))
+        return f'{{"nodes":[{shown}],"total":{len(uuids)}}}'
 
     def _text(self, uuid: str) -> str:
         with self._lock:

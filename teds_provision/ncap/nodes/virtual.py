@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import ctypes
 import json
+import os
 import re
 import secrets
 import shutil
@@ -28,9 +29,11 @@ from teds_provision.files import write_whole
 from teds_provision.ncap.live import Live
 from teds_provision.ncap.settings import own_source, with_source
 from teds_provision.node.described import create
+from teds_provision.node.sources.base import seconds_of
 from teds_provision.protocol.announce import default_can_address
 from teds_provision.protocol.keys import fingerprint
 from teds_provision.station.station import Station
+from teds_provision.steps.order import check_name
 from teds_provision.store.records import WhitelistEntry
 from teds_provision.teds.formats.placing import UUID_OCTETS, placed, stated_uuid
 from teds_provision.teds.profile import default_folders
@@ -41,6 +44,7 @@ _FACTS: Final = "virtual.json"
 _LOG: Final = "log"
 _CALIBRATION: Final = "calibration.toml"
 _SOURCES: Final = re.compile(r"noise\Z|(sine|ramp):[0-9.]+\Z|unix:/[^\0]+\Z|file:/[^\0]+\Z")
+_LONGEST_PERIOD: Final = 86_400.0
 _AGAIN, _LONGEST = 1.0, 30.0
 _ENDING: Final = 5.0
 MOST: Final = 100
@@ -120,10 +124,7 @@ class Virtuals:
 
         Raises UsageFailure, BadData, NotFound.
         """
-        if not _SOURCES.match(source):
-            raise UsageFailure(
-                f"{source!r} is no source.", hint="Use noise, sine:SECONDS, ramp:SECONDS, file:/PATH or unix:/PATH."
-            )
+        _check_source(source)
         if (content is None) == (profile is None):
             raise UsageFailure("A virtual transducer needs a datasheet or a profile.", hint="Give one of the two.")
         if len(self._all) >= MOST:
@@ -150,24 +151,32 @@ class Virtuals:
         folders = default_folders(self._station.home)
         flash = create(folder, uuid=uuid_, name=name, teds=teds, profile=profile, folders=folders)
         state = flash.load()
-        uuid = state.uuid.hex()
-        if uuid in self._all or self._station.nodes.is_known(state.uuid):
-            raise UsageFailure(
-                f"Node {uuid} is there already.",
-                hint="Take the UUID out of its Meta-TEDS: a new one is made.",
-            )
-        if state.can_address in self._addresses():
-            raise UsageFailure(
-                f"Another virtual transducer has CAN address 0x{state.can_address:02X}.",
-                hint="Take the UUID out of the datasheet's Meta-TEDS: one that fits is made.",
-            )
         sheet = Sheet.of_blocks(flash.hardware)
-        one = Virtual(uuid, name or sheet.meta.name, source, folder, len(sheet.channels))
+        one = Virtual(state.uuid.hex(), name or sheet.meta.name, source, folder, len(sheet.channels))
+        check_name(one.name or None)
+        self._require_free(state.uuid, state.can_address, one.name)
         if profile is not None and (lines := ideal_calibration(sheet)):
             write_whole(folder / _CALIBRATION, lines.encode())
         write_whole(folder / _FACTS, json.dumps({**one.as_json(), "profile": profile}).encode())
         self._whitelist(state.uuid, fingerprint(state.node_key), one.name)
         return one
+
+    def _require_free(self, uuid: bytes, address: int, name: str) -> None:
+        """Refuse a UUID, an address or a name that another node has: that one would be tried again for ever."""
+        if uuid.hex() in self._all or self._station.nodes.is_known(uuid):
+            raise UsageFailure(
+                f"Node {uuid.hex()} is there already.",
+                hint="Take the UUID out of its Meta-TEDS: a new one is made.",
+            )
+        if address in self._addresses():
+            raise UsageFailure(
+                f"Another virtual transducer has CAN address 0x{address:02X}.",
+                hint="Take the UUID out of the datasheet's Meta-TEDS: one that fits is made.",
+            )
+        if name and (others := self._station.nodes.all_named(name)):
+            raise UsageFailure(
+                f"Node {others[0].hex()} has the name {name!r} already.", hint="Give this one another name."
+            )
 
     def _addresses(self) -> set[int]:
         return {default_can_address(bytes.fromhex(uuid)) for uuid in self._all}
@@ -235,6 +244,7 @@ class Virtuals:
         while not self._stop.is_set() and one.uuid in self._all:
             words = [sys.executable, "-m", "teds_provision", "--json", "node", "run", str(one.folder)]
             words += ["--can", self.bus, "--source", one.source]
+            daemon = os.getpid()
             with log.open("wb") as errors:
                 process = one.process = subprocess.Popen(
                     words,
@@ -242,7 +252,7 @@ class Virtuals:
                     stdout=subprocess.PIPE,
                     stderr=errors,
                     process_group=0,  # Ctrl-C is for the daemon, which ends its nodes in order
-                    preexec_fn=_die_with_us,  # noqa: PLW1509 - one call of the system, nothing else
+                    preexec_fn=lambda: _die_with(daemon),  # noqa: PLW1509, B023 - two calls of the system, nothing else
                 )
             if self._stop.is_set() or one.uuid not in self._all:
                 _end(process)
@@ -291,6 +301,17 @@ def ideal_calibration(sheet: Sheet) -> str:
     return "\n".join(lines)
 
 
+def _check_source(text: str) -> None:
+    """Refuse what its process would refuse: that one would be started again and again."""
+    kind, _, rest = text.partition(":")
+    if not _SOURCES.match(text):
+        raise UsageFailure(
+            f"{text!r} is no source.", hint="Use noise, sine:SECONDS, ramp:SECONDS, file:/PATH or unix:/PATH."
+        )
+    if kind in ("sine", "ramp") and seconds_of(rest, kind) > _LONGEST_PERIOD:
+        raise UsageFailure(f"{text!r} takes longer than a day.", hint=f"Write seconds: {kind}:2.")
+
+
 def _end(process: subprocess.Popen[bytes] | None) -> None:
     if process is None or process.poll() is not None:
         return
@@ -301,9 +322,15 @@ def _end(process: subprocess.Popen[bytes] | None) -> None:
         process.kill()
 
 
-def _die_with_us() -> None:
-    """End when the daemon does, however it ends (prctl PR_SET_PDEATHSIG)."""
-    _LIBC.prctl(1, signal.SIGTERM)
+def _die_with(daemon: int) -> None:
+    """End when the daemon does, however it ends (prctl PR_SET_PDEATHSIG).
+
+    By SIGKILL, which a node survives as it survives a power cut: Python drops what a handler raises at a bad moment of
+    its start. A daemon that was gone before this call sends nothing any more.
+    """
+    _LIBC.prctl(1, signal.SIGKILL)
+    if os.getppid() != daemon:
+        os._exit(1)
 
 
 def _free_port() -> int:

@@ -16,14 +16,15 @@ from dataclasses import dataclass, field
 from typing import Any, Final, Protocol
 
 from teds_provision.errors import Frozen, LinkFailure, NodeBusy, TedsProvisionError
-from teds_provision.links import Contact, Notice, Port
+from teds_provision.links import Contact, Notice, Port, Trace
 from teds_provision.links.ble.port import BlePort
 from teds_provision.links.can.port import CanPort
 from teds_provision.links.opening import open_place
 from teds_provision.measure.finding.buses import Buses
-from teds_provision.measure.finding.lookout import Sighting
+from teds_provision.measure.finding.sightings import Sighting
 from teds_provision.measure.finding.sources import sole_user
 from teds_provision.ncap.live import Live
+from teds_provision.ncap.nodes.leaving import StillThere
 from teds_provision.ncap.nodes.looking import Look, as_problem, is_listed, look
 from teds_provision.ncap.nodes.roster import Roster, check_lines
 from teds_provision.ncap.nodes.turns import Turns
@@ -32,9 +33,14 @@ from teds_provision.talk.conversation import Conversation, SessionLost
 
 _log = logging.getLogger(__name__)
 WORKERS: Final = 4
+STRANGERS: Final = 2
+"""Threads that look at nodes which are not on the whitelist: those that are on it never wait for a stranger."""
+MOST_KNOWN: Final = 512
+"""Nodes that are taken to be on a bus: it has 239 addresses, but anybody may say another UUID each time."""
+TELL_STRANGERS: Final = 10.0  # seconds between two words about how many strangers there are
 FIRST_PAUSE, LAST_PAUSE = 1.0, 30.0
 LOOK_AGAIN: Final = 30.0  # seconds until a node that could not be looked at is looked at again
-POLL, POLL_PER_NODE = 2.0, 0.05  # seconds between questions to everybody: 5 % of a bus however many there are
+POLL: Final = 30.0  # seconds between questions to everybody on a bus (operation.md section 7)
 POLL_AIR: Final = 15.0
 GONE_POLLS: Final = 2.5
 LENDING: Final = 10.0
@@ -73,15 +79,19 @@ class Watch:
         taps: Taps,
         transparent: Callable[[], bool],
         buses: Buses,
+        trace: Trace | None = None,
     ) -> None:
         self.place = place
         self.state = LinkState(place)
         self.port: Port | None = None
         self._station, self._roster, self._live, self._turns = station, roster, live, turns
         self._taps, self._transparent, self._buses = taps, transparent, buses
+        self._trace = trace
         self._known: dict[str, Sighting] = {}
         self._stop, self._anew = threading.Event(), threading.Event()
         self._workers = ThreadPoolExecutor(WORKERS, thread_name_prefix=f"look {place[:20]}")
+        self._for_strangers = ThreadPoolExecutor(STRANGERS, thread_name_prefix=f"stranger {place[:20]}")
+        self._strangers_told, self._strangers_at = 0, -TELL_STRANGERS
         self._pending: set[str] = set()
         self._guard = threading.Lock()
         self._borrowers: set[int] = set()
@@ -100,7 +110,8 @@ class Watch:
     def join(self, seconds: float) -> None:
         """Wait for its end, and close the link."""
         self._thread.join(seconds)
-        self._workers.shutdown(wait=False, cancel_futures=True)
+        for workers in (self._workers, self._for_strangers):
+            workers.shutdown(wait=False, cancel_futures=True)
         port, self.port = self.port, None
         if port is not None:
             port.close()
@@ -116,7 +127,7 @@ class Watch:
         while not self._stop.is_set():
             try:
                 if self.port is None:
-                    self.port = open_place(self.place)
+                    self.port = open_place(self.place, self._trace)
                     pause = FIRST_PAUSE
                 self._say("up")
                 self._watch(self.port)
@@ -156,6 +167,8 @@ class Watch:
     def _watch_bus(self, port: CanPort | BlePort, poll: float) -> None:
         """The look-out tells of who answers (:meth:`saw`); here is seen who does not any more, and whether it works."""
         bus = self._buses.add(port)
+        bus.lookout.poll(poll)
+        asked = StillThere(port, self._is_held) if isinstance(port, CanPort) else None
         while not self._stop.is_set():
             if self._anew.is_set():
                 self._anew.clear()
@@ -166,16 +179,31 @@ class Watch:
             self._say("up" if failure is None else "down", failure)
             if isinstance(port, CanPort) and failure is None:
                 port.tell_of_rivals(self._notice)
-            every = max(poll, POLL_PER_NODE * len(self._known))
-            bus.lookout.poll(every)
-            self._see_who_left(GONE_POLLS * every + 1.0)
+            if asked is not None and failure is None:
+                self._ask_who_is_there(asked)
+            else:
+                self._see_who_left(GONE_POLLS * POLL_AIR)
+            self._tell_of_strangers()
             self._anew.wait(LOOK)
+
+    def _is_held(self, uuid: str) -> bool:
+        return self._turns.holder(uuid) is not None
+
+    def _ask_who_is_there(self, asked: StillThere) -> None:
+        for uuid, sighting in asked.look(dict(self._known)):
+            if sighting is not None:
+                self.saw(sighting)
+            elif not self._is_held(uuid):
+                self._gone(uuid)
 
     def saw(self, sighting: Sighting) -> None:
         """A node answered on this bus; called from the look-out's thread."""
         uuid, identity = sighting.uuid.hex(), sighting.identity
-        before = self._known.get(uuid)
+        before = self._known.pop(uuid, None)  # who was seen last stands last
         self._known[uuid] = sighting
+        if len(self._known) > MOST_KNOWN:
+            oldest, *_ = list(self._known)
+            self._gone(oldest)
         if before is not None:
             same = (before.address, before.identity.state) == (sighting.address, identity.state)
             seen = self._roster.seen(uuid)
@@ -187,10 +215,13 @@ class Watch:
     def _see_who_left(self, silence: float) -> None:
         now = time.monotonic()
         for uuid, last in list(self._known.items()):
-            if now - last.at < silence:
-                continue
-            self._known.pop(uuid, None)
-            self._notice(Notice("node-left", f"Node {uuid} does not answer any more.", uuid=last.uuid))
+            if now - last.at >= silence:
+                self._gone(uuid)
+
+    def _gone(self, uuid: str) -> None:
+        self._known.pop(uuid, None)
+        text = f"Node {uuid} does not answer any more."
+        self._notice(Notice("node-left", text, uuid=bytes.fromhex(uuid)))
 
     # -- a reader is one command's at a time ---------------------------------------------------------------------------
 
@@ -223,12 +254,8 @@ class Watch:
             port.close()
 
     def _notice(self, notice: Notice) -> None:
-        uuid = notice.uuid.hex() if notice.uuid is not None else ""
-        if notice.kind == "node-left" and uuid:
-            if self._roster.stranger(self.place, uuid, there=False):
-                return
-            if self._turns.holder(uuid) is None:
-                self._roster.note(uuid, "left", present=False)
+        if notice.kind == "node-left" and notice.uuid is not None:
+            self._left(notice.uuid.hex())
         elif notice.kind == "reader-lost":
             self._say("down", LinkFailure(notice.text))
             self._roster.forget_place(self.place)
@@ -236,7 +263,16 @@ class Watch:
             self._say("up")
         elif notice.kind == "waiting":
             self.state.waiting = notice.text
-        elif notice.kind != "retry" and notice.text != self.state.told:
+        elif notice.kind != "retry":
+            self._tell(notice)
+
+    def _left(self, uuid: str) -> None:
+        if not self._roster.stranger(self.place, uuid, there=False) and self._turns.holder(uuid) is None:
+            self._roster.note(uuid, "left", present=False)
+
+    def _tell(self, notice: Notice) -> None:
+        """Something else that a person should know of, once."""
+        if notice.text != self.state.told:
             self.state.told = notice.text
             self._live.event("link", place=self.place, state=notice.kind, text=notice.text)
 
@@ -259,15 +295,31 @@ class Watch:
             self._serve(contact)
             return
         if not self._wanted(contact):
-            if self._roster.stranger(self.place, uuid, there=True):
-                self._live.event("link", place=self.place, state="strangers", count=self._roster.strangers(self.place))
+            self._roster.stranger(self.place, uuid, there=True)
             return
         self._roster.note(uuid, "came", **facts)
         with self._guard:
             if uuid in self._pending:
                 return
             self._pending.add(uuid)
-        self._workers.submit(self._serve, contact)
+        listed = is_listed(self._station, contact.identity.uuid)
+        (self._workers if listed else self._for_strangers).submit(self._serve_known, contact)
+
+    def _serve_known(self, contact: Contact) -> None:
+        """Look at a node whose turn has come, if it is still there."""
+        uuid = contact.identity.uuid.hex()
+        if uuid in self._known:
+            self._serve(contact)
+            return
+        with self._guard:
+            self._pending.discard(uuid)
+
+    def _tell_of_strangers(self) -> None:
+        """How many there are that whitelist mode does not look at, where that is news, and not too often."""
+        count, now = self._roster.strangers(self.place), time.monotonic()
+        if count != self._strangers_told and now - self._strangers_at >= TELL_STRANGERS:
+            self._strangers_told, self._strangers_at = count, now
+            self._live.event("link", place=self.place, state="strangers", count=count)
 
     def _wanted(self, contact: Contact) -> bool:
         """Whether detection shows this node at all: whitelist mode shows others as a count."""

@@ -70,10 +70,13 @@ class Body:
 
     @classmethod
     async def of(cls, request: Request) -> Body:
-        """Read it; raises UsageFailure (422)."""
+        """Read it; raises UsageFailure (422), and Refusal (400) where a member comes twice (RFC 8259, section 4).
+
+        Of two members of one name each reader takes another: what was checked in front of us is not what we would do.
+        """
         octets = await request.body()
         try:
-            value = json.loads(octets) if octets else {}
+            value = json.loads(octets, object_pairs_hook=_once) if octets else {}
             json.dumps(value, ensure_ascii=False).encode()  # half a character pair is no text
         except (ValueError, RecursionError) as error:
             raise UsageFailure("The body is no JSON.") from error
@@ -122,3 +125,12 @@ class Body:
         """Raise UsageFailure where a member was not taken: a typing error must not be passed over."""
         if self._members:
             raise UsageFailure(f"Nobody knows {next(iter(self._members))!r} here.", hint="See openapi.json.")
+
+
+def _once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    members = dict(pairs)
+    if len(members) < len(pairs):
+        names = [name for name, _ in pairs]
+        twice = next(name for name in names if names.count(name) > 1)
+        raise Refusal(400, "usage", f"The member {twice[:64]!r} comes twice.", "Send each once.")
+    return members

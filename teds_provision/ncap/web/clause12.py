@@ -8,7 +8,6 @@ ReadData gives the last value of a node that is measured, in the SI unit of its 
 
 from __future__ import annotations
 
-import asyncio
 import base64
 import json
 from collections.abc import Callable
@@ -22,6 +21,7 @@ from starlette.routing import Route
 from teds_provision.errors import NotFound, TedsProvisionError, UsageFailure
 from teds_provision.harmless import printable
 from teds_provision.ncap.daemon import Daemon
+from teds_provision.ncap.web.threads import reading
 
 NO_ERROR, NO_SUCH, NO_VALUE, BAD_ARGUMENT, FAILED = 0, 1, 2, 3, 4
 Fields = dict[str, Any]
@@ -52,7 +52,7 @@ class Clause12:
             raise NotFound("There is no such path of clause 12 here.", hint=f"There is: {', '.join(self._resources)}.")
         given = {key.lower(): value for key, value in request.query_params.items()}
         try:
-            fields = {"errorCode": NO_ERROR, **await asyncio.to_thread(self._resources[name], given)}
+            fields = {"errorCode": NO_ERROR, **await reading(self._resources[name], given)}
         except NotFound as error:
             fields = {"errorCode": NO_SUCH, "errorMessage": error.message}
         except UsageFailure as error:

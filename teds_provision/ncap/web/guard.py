@@ -8,6 +8,7 @@ changes anything comes as JSON, which a form cannot send. The Unix socket has th
 from __future__ import annotations
 
 import asyncio
+import html
 import json
 import time
 from collections import deque
@@ -30,6 +31,7 @@ LARGEST_BODY: Final = 1 << 20
 _WRONG_TOKENS: Final = 10
 _WRONG_WITHIN: Final = 60.0
 _SLOWED: Final = 1.0
+_MOST_SLOWED: Final = 50  # at once; each of them holds one of the places that all requests share
 _SAFE: Final = frozenset({"GET", "HEAD", "OPTIONS"})
 _CSP: Final = (
     "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' data:; connect-src 'self'; "
@@ -100,6 +102,7 @@ class Guard:
     tokens: Tokens
     front: Front | None
     _wrong: deque[float] = field(default_factory=deque)
+    _slowed: int = 0
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """One request or WebSocket."""
@@ -124,7 +127,7 @@ class Guard:
             await self.app(scope, _limited(receive) if scope["type"] == "http" else receive, with_headers)
         except Refusal as refusal:
             if not begun:
-                await _refuse(scope, with_headers, refusal, html=_wants_html(scope))
+                await _refuse(scope, with_headers, refusal, as_page=_wants_html(scope))
 
     async def _caller(self, scope: Scope, headers: Mapping[str, str]) -> Caller:
         if self.front is None:
@@ -165,9 +168,17 @@ class Guard:
         if len(self._wrong) > _WRONG_TOKENS:
             if len(self._wrong) > 10 * _WRONG_TOKENS:
                 self._wrong.popleft()
-            await asyncio.sleep(_SLOWED)  # a right token is never slowed down: nobody can lock the others out
+            await self._slow_down()  # a right token is never slowed down: nobody can lock the others out
             return Refusal(429, "too-many", "Too many wrong tokens.", headers=((b"retry-after", b"60"),))
         return Refusal(401, "wrong-token", "This token is not good (any more).", "A new one: teds-provision ncap open")
+
+    async def _slow_down(self) -> None:
+        if self._slowed < _MOST_SLOWED:
+            self._slowed += 1
+            try:
+                await asyncio.sleep(_SLOWED)
+            finally:
+                self._slowed -= 1
 
 
 def _headers(scope: Scope) -> dict[str, str]:
@@ -177,6 +188,8 @@ def _headers(scope: Scope) -> dict[str, str]:
         if key in found and key in ("host", "origin", "content-length", "content-type", "authorization"):
             raise Refusal(400, "usage", f"The header {key} comes twice.")
         found[key] = value.decode("latin-1") if key not in found else f"{found[key]}; {value.decode('latin-1')}"
+    if "content-length" in found and "transfer-encoding" in found:  # RFC 9112, section 6.3: who reads which is unknown
+        raise Refusal(400, "usage", "A body has one length.", headers=((b"connection", b"close"),))
     return found
 
 
@@ -243,11 +256,11 @@ def _wants_html(scope: Scope) -> bool:
     return scope["type"] == "http" and scope["method"] == "GET" and b"text/html" in accept
 
 
-async def _refuse(scope: Scope, send: Send, refusal: Refusal, *, html: bool) -> None:
+async def _refuse(scope: Scope, send: Send, refusal: Refusal, *, as_page: bool) -> None:
     """Tell it as JSON, to a browser's address line as a plain page."""
-    if html and refusal.code:
+    if as_page and refusal.code:
         text = f"<!doctype html><html lang=en><meta charset=utf-8><title>{refusal.status}</title>"
-        text += f"<p>{refusal.message}<p>{refusal.hint}"
+        text += f"<p>{html.escape(refusal.message)}<p>{html.escape(refusal.hint)}"
         body, kind = text.encode(), b"text/html; charset=utf-8"
     else:
         told = {"code": refusal.code, "message": refusal.message, "hint": refusal.hint}

@@ -6,6 +6,7 @@ from dataclasses import dataclass, field
 from typing import Any, Final
 
 from teds_provision import __version__
+from teds_provision.ncap.nodes.roster import MOST_SHOWN
 from teds_provision.ncap.web.schemas import FLAG, INTEGER, SCHEMAS, Schema, listed, maybe, members, ref, text
 
 
@@ -24,6 +25,7 @@ class Operation:
 
 
 _NODES: Final = members("nodes", nodes=listed(ref("Node")))
+_SOME_NODES: Final = members("nodes total", nodes=listed(ref("Node")), total=INTEGER)
 _GROUPS: Final = members("groups", groups=listed(ref("Group")))
 _MEASUREMENTS: Final = members("measurements", measurements=listed(ref("Measurement")))
 _NAMES: Final = members("names", names=listed(ref("Name")))
@@ -36,7 +38,14 @@ OPERATIONS: Final = (
     Operation("GET", "/detection", "Which nodes are taken up.", _MODE),
     Operation("PUT", "/detection", "Change that, and look at all links anew.", _MODE, _MODE),
     Operation("POST", "/discover", "Ask every link now.", _NODES, _EMPTY),
-    Operation("GET", "/nodes", "Every node: those that are there first, a thousand at most.", _NODES),
+    Operation(
+        "GET", "/nodes", "Every node: those that are there first, a thousand at a time; total: how many there are.",
+        _SOME_NODES,
+        query={
+            "limit": {"type": "integer", "minimum": 1, "maximum": MOST_SHOWN},
+            "offset": {"type": "integer", "minimum": 0, "maximum": 10_000_000},
+        },
+    ),
     Operation("GET", "/nodes/{uuid}", "One node, by UUID, prefix or name.", ref("Node")),
     Operation(
         "GET", "/nodes/{uuid}/teds", "Its datasheet, decoded and checked; or as a document.", ref("Sheet"),
@@ -81,6 +90,9 @@ OPERATIONS: Final = (
             rate=maybe("number", minimum=0.001, maximum=1e6),
             kind=maybe("string", enum=["periodic", "event", "free", None]), trigger=FLAG,
             sinks=listed(text(description="ros1, ros2, mqtt://HOST, or the name of a file")),
+            actuators={"type": "boolean", "description": "may set points come by topics of ROS; true unless said"},
+            dead_man={"type": "integer", "minimum": 20, "maximum": 10000, "description": "ms, 1000 unless said"},
+            scalar_rate={"type": "number", "minimum": 0, "maximum": 1000, "description": "Hz, 10 unless said"},
         ),
         status=201,
     ),
@@ -115,7 +127,7 @@ OPERATIONS: Final = (
 )  # fmt: skip
 
 REFUSALS: Final = {
-    "400": "not HTTP as it should be",
+    "400": "not HTTP as it should be, or a member of the body comes twice",
     "401": "no token, or one that is not good",
     "403": "a foreign Origin, or a read-only token that changes something",
     "404": "no such thing",

@@ -14,18 +14,23 @@ from starlette.routing import Route
 from teds_provision.errors import NotFound, PolicyRefused, UsageFailure
 from teds_provision.ncap.daemon import Daemon
 from teds_provision.ncap.nodes.holding import LONGEST
+from teds_provision.ncap.nodes.roster import MOST_SHOWN
 from teds_provision.ncap.web.answers import Body
 from teds_provision.ncap.web.guard import CALLER, Caller
 from teds_provision.ncap.web.openapi import document
+from teds_provision.ncap.web.threads import changing, moving, reading
 from teds_provision.store import Choice, is_failure
-from teds_provision.teds.profile import default_folders, list_profiles, listed
+from teds_provision.teds.profile import default_folders, is_profile_name, list_profiles, listed
 
 Handler = Callable[[Request], Awaitable[Response]]
 _KINDS: Final = ("periodic", "event", "free")
 _MOST_ENTRIES: Final = 10_000
 _FASTEST: Final = 1e6
+_FASTEST_SCALAR: Final = 1000
 _LARGEST: Final = 1e300
 _LENT_LOOK: Final = 0.5
+_DIGITS: Final = 9  # of a number in a query; Python gives up on four thousand
+_FURTHEST: Final = 10_000_000
 
 
 class Resources:
@@ -85,7 +90,7 @@ class Resources:
     async def discover(self, request: Request) -> Response:
         """POST /discover."""
         (await Body.of(request)).done()
-        return JSONResponse({"nodes": await asyncio.to_thread(self._daemon.discover)})
+        return JSONResponse({"nodes": await changing(self._daemon.discover)})
 
     async def profiles(self, _request: Request) -> Response:
         """GET /profiles: the transducer types that can be built."""
@@ -162,9 +167,12 @@ class Resources:
 
     # -- nodes -------------------------------------------------------------------------------------------------------
 
-    async def nodes(self, _request: Request) -> Response:
-        """GET /nodes."""
-        return Response(await asyncio.to_thread(self._daemon.roster.nodes_text), media_type="application/json")
+    async def nodes(self, request: Request) -> Response:
+        """GET /nodes: ``limit`` of them from ``offset`` on, and ``total``."""
+        limit = _integer(request, "limit", MOST_SHOWN, MOST_SHOWN)
+        offset = _integer(request, "offset", 0, _FURTHEST, least=0)
+        text = await asyncio.to_thread(self._daemon.roster.nodes_text, limit, offset)
+        return Response(text, media_type="application/json")
 
     async def node(self, request: Request) -> Response:
         """GET /nodes/UUID."""
@@ -177,8 +185,8 @@ class Resources:
         if request.method == "GET":
             form = request.query_params.get("format")
             if form is None:
-                return JSONResponse(await asyncio.to_thread(sheets.as_json, uuid))
-            text, kind = await asyncio.to_thread(sheets.document, uuid, form)
+                return JSONResponse(await reading(sheets.as_json, uuid))
+            text, kind = await reading(sheets.document, uuid, form)
             disposition = f'attachment; filename="{uuid}.{form}"'
             return Response(text, media_type=kind, headers={"content-disposition": disposition})
         body = await Body.of(request)
@@ -187,7 +195,7 @@ class Resources:
         body.done()
         dry = request.query_params.get("dry_run", "0") not in ("0", "", "false")
         step = sheets.plan if dry else sheets.write
-        return JSONResponse(await asyncio.to_thread(lambda: step(uuid, content, accept=accept)))
+        return JSONResponse(await changing(lambda: step(uuid, content, accept=accept)))
 
     async def provision(self, request: Request) -> Response:
         """GET, POST /nodes/UUID/provision; UUID ``next``: whichever node is tapped next."""
@@ -200,7 +208,7 @@ class Resources:
         if body.take("cancel", bool, False):
             body.done()
             return JSONResponse(await asyncio.to_thread(runs.cancel, uuid))
-        profile, name = body.take("profile", str), body.take("name", str)
+        profile, name = _type_name(body), body.take("name", str)
         calibration, calibration_name = body.take("calibration", str), body.take("calibration_name", str)
         body.done()
 
@@ -228,9 +236,9 @@ class Resources:
         if value is None and hold != 0:
             raise UsageFailure("A set point is missing.", hint='Send {"value": …}, or {"hold": 0} to let go.')
         if value is None or hold == 0:
-            return JSONResponse(await asyncio.to_thread(self._daemon.holding.let_go, uuid, number))
+            return JSONResponse(await moving(self._daemon.holding.let_go, uuid, number))
         found = value
-        return JSONResponse(await asyncio.to_thread(lambda: self._daemon.holding.put(uuid, number, found, unit, hold)))
+        return JSONResponse(await moving(self._daemon.holding.put, uuid, number, found, unit, hold))
 
     # -- groups and measurements -------------------------------------------------------------------------------------
 
@@ -270,15 +278,19 @@ class Resources:
             "trigger": body.take("trigger", bool, False),
             "sinks": body.texts("sinks"),
             "channels": _numbers(body.take("channels", list, [])),
+            "actuators": body.take("actuators", bool, True),
         }
+        dead_man, scalar_rate = body.take("dead_man", int), body.number("scalar_rate", 0, _FASTEST_SCALAR)
+        asked |= {} if dead_man is None else {"dead_man": _dead_man(dead_man)}
+        asked |= {} if scalar_rate is None else {"scalar_rate": scalar_rate}
         body.done()
         if asked["kind"] not in (None, *_KINDS):
             raise UsageFailure(f"{asked['kind']!r} is no kind.", hint=f"Use {', '.join(_KINDS)}.")
-        return JSONResponse(await asyncio.to_thread(lambda: measuring.add(**asked)), 201)
+        return JSONResponse(await changing(lambda: measuring.add(**asked)), 201)
 
     async def measurement(self, request: Request) -> Response:
         """DELETE /measurements/ID."""
-        await asyncio.to_thread(self._daemon.measuring.delete, request.path_params["id"])
+        await changing(self._daemon.measuring.delete, request.path_params["id"])
         return JSONResponse({"measurements": await asyncio.to_thread(self._daemon.measuring.all)})
 
     # -- names, virtual transducers ----------------------------------------------------------------------------------
@@ -306,7 +318,7 @@ class Resources:
             "name": body.take("name", str),
             "source": body.take("source", str, "noise"),
             "content": body.take("content", str),
-            "profile": body.take("profile", str),
+            "profile": _type_name(body),
         }
         body.take("format", str)
         body.done()
@@ -317,30 +329,44 @@ class Resources:
                 "A source that is a file or a socket is named on this machine alone.",
                 hint="Use noise, sine:S or ramp:S.",
             )
-        return JSONResponse(await asyncio.to_thread(lambda: self._daemon.make_virtual(**asked)), 201)
+        return JSONResponse(await changing(lambda: self._daemon.make_virtual(**asked)), 201)
 
     async def one_virtual(self, request: Request) -> Response:
         """DELETE /virtual/UUID."""
         uuid = request.path_params["uuid"].lower()
         if uuid not in self._daemon.virtuals:
             raise NotFound(f"{uuid} is no virtual transducer of this station.")
-        await asyncio.to_thread(self._daemon.drop_virtual, uuid)
+        await changing(self._daemon.drop_virtual, uuid)
         return JSONResponse({"virtual": self._daemon.virtuals.all()})
 
 
-def _integer(request: Request, name: str, default: int, most: int) -> int:
+def _integer(request: Request, name: str, default: int, most: int, least: int = 1) -> int:
     text = request.query_params.get(name)
     if text is None:
         return default
-    if not text.isdecimal() or not 1 <= int(text) <= most:
-        raise UsageFailure(f"{name} has to be a whole number from 1 to {most}.")
+    if not (text.isascii() and text.isdecimal() and len(text) <= _DIGITS and least <= int(text) <= most):
+        raise UsageFailure(f"{name} has to be a whole number from {least} to {most}.")
     return int(text)
+
+
+def _type_name(body: Body) -> str | None:
+    """The name of a transducer type, never a path: what is wrong with a file is told with a piece of it."""
+    name: str | None = body.take("profile", str)
+    if name is not None and not is_profile_name(name):
+        raise UsageFailure(f"{name!r} is no name of a profile.", hint="GET /profiles lists them.")
+    return name
 
 
 def _numbers(values: list[Any]) -> tuple[int, ...]:
     if not all(isinstance(one, int) and not isinstance(one, bool) and 1 <= one <= 255 for one in values):
         raise UsageFailure("Channels are numbers from 1 to 255.")
     return tuple(values)
+
+
+def _dead_man(milliseconds: int) -> int:
+    if not 20 <= milliseconds <= 10_000:
+        raise UsageFailure(f"'dead_man' has to be from 20 to 10000 ms, not {milliseconds}.")
+    return milliseconds
 
 
 def _sentence(outcome: str, detail: dict[str, Any]) -> str:

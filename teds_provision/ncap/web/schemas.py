@@ -127,7 +127,7 @@ SCHEMAS: Final[dict[str, Schema]] = {
     ),
     "Group": members("name uuids measuring", name=text(), uuids=listed(UUID), measuring=FLAG),
     "Measurement": members(
-        "id group uuids rate kind trigger sinks state why nodes files",
+        "id group uuids rate kind trigger sinks actuators state why nodes files",
         id=text(),
         group=maybe("string"),
         uuids=listed(UUID),
@@ -136,6 +136,7 @@ SCHEMAS: Final[dict[str, Schema]] = {
         kind=maybe("string"),
         trigger=FLAG,
         sinks=listed(text()),
+        actuators={"type": "boolean", "description": "whether set points come by topics"},
         created=text(),
         state=text(enum=["starting", "waiting", "running", "failed", "ended"]),
         why=text(),

@@ -12,14 +12,11 @@ import uvicorn
 
 from teds_provision.errors import LinkFailure
 from teds_provision.ncap.settings import Settings
+from teds_provision.ncap.web.connections import MOST, Connection
 from teds_provision.ncap.web.guard import App
 
 _ENDING: Final = 2
 """Seconds that open requests have at the end."""
-
-
-_MOST: Final = 500
-"""Connections at once; more get 503, so that who opens them without end takes no memory without end."""
 
 
 class _Server(uvicorn.Server):
@@ -66,12 +63,12 @@ class Servers:
             lifespan="off",
             server_header=False,
             proxy_headers=False,
-            http="h11",
+            http=Connection,
             ws="websockets-sansio",
             ws_max_size=4096,
             ws_per_message_deflate=False,
             timeout_keep_alive=30,
-            limit_concurrency=_MOST,
+            limit_concurrency=4 * MOST,  # of requests; one of which the connection was ended counts for a moment more
             timeout_graceful_shutdown=_ENDING,
             h11_max_incomplete_event_size=32_768,
             ssl_certfile=tls.certificate if tls else None,

@@ -7,6 +7,7 @@ import heapq
 import itertools
 import logging
 import random
+import socket
 import threading
 import time
 from collections.abc import Callable
@@ -26,6 +27,7 @@ from teds_provision.protocol.operation.can_frames import drive_address, trigger_
 _IDENTIFY: Final = security_command(Function.IDENTIFY).encode()
 _SPREAD_SECONDS: Final = 0.05
 _IDLE: Final = 0.02
+"""Seconds that the loop waits at most on an interface that cannot be woken."""
 _LOOK_ROUND: Final = 0.05
 """Seconds between two looks at transfers that wait for the other side."""
 _FLOW_CONTROL: Final = 3
@@ -70,7 +72,9 @@ class CanServer:
         self._everyone_due: dict[Line, int] = {}
         self._number = itertools.count()
         self._lock = threading.RLock()
+        self._sending = threading.Lock()
         self._stop = threading.Event()
+        self._wake: socket.socket | None = None
         self._thread: threading.Thread | None = None
         if handler is not None:
             self.add(handler, counts_as_tapped=counts_as_tapped)
@@ -95,13 +99,15 @@ class CanServer:
         self._seat_of = {id(seat.handler): seat for seat in self._seats}
         self._find_seats()
         self._announce_all()
-        self._thread = threading.Thread(target=self._serve, name="can", daemon=True)
+        self._wake, woken = socket.socketpair()
+        self._thread = threading.Thread(target=self._serve, args=(woken,), name="can", daemon=True)
         self._thread.start()
 
     def stop(self) -> None:
         """Close the bus and end every line; never raises."""
         self._stop.set()
-        if self._thread is not None:
+        if self._thread is not None and self._wake is not None:
+            self._wake.close()  # which the loop notices at once
             self._thread.join(timeout=3)
             self._thread = None
         if self._crew is not None:
@@ -116,30 +122,40 @@ class CanServer:
             self._bus = None
 
     def send_data(self, handler: NodeHandler, identifier: int, data: bytes, *, fd: bool) -> None:
-        """Put a data frame of a node on the bus; raises LinkFailure where that is lost."""
+        """Put a data frame of a node on the bus; raises LinkFailure where that is lost.
+
+        The bus may take its time over it: what others send is heard meanwhile.
+        """
         with self._lock:
-            seat = self._seat_of.get(id(handler))
-            if seat is not None and self._bus is not None and not self._stop.is_set():
-                self._out(seat, Frame(identifier, data, fd))
+            seat, bus = self._seat_of.get(id(handler)), self._bus
+            if seat is None or bus is None or self._stop.is_set():
+                return
+            self._speaks(seat, identifier)
+        with self._sending:
+            bus.send(Frame(identifier, data, fd))
 
     # -- the loop --------------------------------------------------------------------------------------------------
 
-    def _serve(self) -> None:
-        reopen, came_back = _FIRST_REOPEN, time.monotonic()
-        while not self._stop.is_set():
-            try:
-                self._serve_one()
-            except LinkFailure:
-                with self._lock:
-                    self._lose_lines()
-                if time.monotonic() - came_back > 2 * _LAST_REOPEN:
-                    reopen = _FIRST_REOPEN
-                self._reopen(reopen)
-                reopen, came_back = min(2 * reopen, _LAST_REOPEN), time.monotonic()
+    def _serve(self, woken: socket.socket) -> None:
+        with woken:
+            reopen, came_back = _FIRST_REOPEN, time.monotonic()
+            while not self._stop.is_set():
+                try:
+                    self._serve_one(woken)
+                except LinkFailure:
+                    with self._lock:
+                        self._lose_lines()
+                    if time.monotonic() - came_back > 2 * _LAST_REOPEN:
+                        reopen = _FIRST_REOPEN
+                    self._reopen(reopen)
+                    reopen, came_back = min(2 * reopen, _LAST_REOPEN), time.monotonic()
 
-    def _serve_one(self) -> None:
+    def _serve_one(self, woken: socket.socket) -> None:
         assert self._bus is not None
-        frame = self._bus.receive(self._wait())
+        frame = self._bus.receive(0.0 if self._bus.can_be_waited_for else self._wait())
+        if frame is None and self._bus.can_be_waited_for:
+            self._bus.wait(self._wait(), woken)
+            frame = self._bus.receive(0.0)
         with self._lock:
             if frame is not None:
                 self._dispatch(frame)
@@ -188,15 +204,19 @@ class CanServer:
     def _out(self, seat: Seat, frame: Frame) -> None:
         """Put a node's frame on the bus; the other nodes of this process hear it as they hear those of the bus."""
         assert self._bus is not None
-        self._bus.send(frame)
-        source = frame.identifier & 0xFF
+        with self._sending:
+            self._bus.send(frame)
+        self._speaks(seat, frame.identifier)
+        if is_announce(frame.identifier):
+            self._announced(frame, seat)
+
+    def _speaks(self, seat: Seat, identifier: int) -> None:
+        source = identifier & 0xFF
         if source not in seat.spoken_from:
             seat.spoken_from.add(source)
             for other in self._seats:
                 if other is not seat:
                     other.claim.hear(source)
-        if is_announce(frame.identifier):
-            self._announced(frame, seat)
 
     # -- frames ----------------------------------------------------------------------------------------------------
 
@@ -234,15 +254,15 @@ class CanServer:
         while (body := pair.received()) is not None:
             if pair.waits_for_flow:
                 pair.stop_sending()  # whoever asks again has not taken that answer up
-            received = seat.measuring.tick() if seat.measuring is not None else 0
+            received = seat.measuring.tick(frame.at) if seat.measuring is not None else 0
             line.put(functools.partial(self._run_request, line, pair, Request(body, frame.fd, received)))
         self._note(seat, pair)
 
     def _measuring_frame(self, station: int, frame: Frame) -> None:
-        """A trigger, whose tick is taken at once for every node, or a Drive frame."""
+        """A trigger, whose tick is that of its arrival for every node, or a Drive frame."""
         if trigger_station(frame.identifier) == station:
-            told = [(seat.measuring, seat.measuring.tick()) for seat in self._seats if seat.measuring is not None]
-            for node, tick in told:
+            nodes = [seat.measuring for seat in self._seats if seat.measuring is not None]
+            for node, tick in [(node, node.tick(frame.at)) for node in nodes]:
                 node.trigger(link_name(station), frame.data, tick)
         elif (address := drive_address(frame.identifier)) is not None:
             for seat in self._at.get(address.node, ()):
@@ -291,7 +311,11 @@ class CanServer:
                 del self._everyone_due[line]
                 self._answer_everyone(seat, station, own, transaction, fd=fd)
 
-        self._at_time(time.monotonic() + random.uniform(0, _SPREAD_SECONDS), answer)
+        self._at_time(time.monotonic() + self._spread(), answer)
+
+    def _spread(self) -> float:
+        """Seconds to wait before an answer to everyone."""
+        return random.uniform(0, _SPREAD_SECONDS)
 
     def _answer_everyone(self, seat: Seat, station: int, own: int, transaction: bytes, *, fd: bool) -> None:
         """It leaves the stored reply alone."""

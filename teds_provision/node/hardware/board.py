@@ -8,8 +8,9 @@ from __future__ import annotations
 
 import math
 import threading
+import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Final
 
 from teds_provision.errors import BadData
@@ -33,7 +34,10 @@ _PPM: Final = 1e-6
 
 @dataclass(frozen=True)
 class Shown:
-    """What an actuator does: its raw number, the value in ``unit`` (None: nothing says), and whether it is safe."""
+    """What an actuator does: its raw number, the value in ``unit`` (None: nothing says), and whether it is safe.
+
+    ``time`` is when it began to, unix seconds.
+    """
 
     channel: int
     name: str
@@ -41,6 +45,7 @@ class Shown:
     unit: str
     raw: float
     safe: bool
+    time: float = field(default_factory=time.time, compare=False)
 
 
 class Board:

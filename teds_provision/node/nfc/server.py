@@ -9,7 +9,7 @@ from collections.abc import Callable
 from typing import Any, Literal
 
 from teds_provision.errors import NoReader, UsageFailure
-from teds_provision.links.nfc.library import nfc
+from teds_provision.links.nfc.nfcpy import nfc
 from teds_provision.links.nfc.udp import NodeDevice, address_of, frontend
 from teds_provision.node.handler import NodeHandler
 from teds_provision.node.nfc import type2 as nfc_type2

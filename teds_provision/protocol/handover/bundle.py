@@ -12,19 +12,21 @@ more members than the profile lists; they are passed over. One of ours is ``revo
 
 from __future__ import annotations
 
-import hashlib
-from collections.abc import Callable, Mapping, Sequence
+import json
+import sys
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from datetime import datetime, timedelta
-from typing import Any, Literal, cast
+from typing import Literal, cast
 
 from teds_provision.errors import BadData, NotAuthentic, PolicyRefused
 from teds_provision.protocol.agreement import key_id
 from teds_provision.protocol.handover import jose
-from teds_provision.protocol.handover.jwk import link_key_jwk, link_key_of, point_of, public_jwk
+from teds_provision.protocol.handover.jwk import link_key_of, point_of, public_jwk
 from teds_provision.protocol.handover.payload import LAST_U32, Members, fingerprints, is_label, time_text
 from teds_provision.protocol.handover.revocation import Revocation, open_revocations
-from teds_provision.protocol.handover.strict_json import decode_base64url, dump, encode_base64url, load_object
+from teds_provision.protocol.handover.sealing import PIECE, Sealing, Source, Unsealed, as_file, read_envelope, unseal
+from teds_provision.protocol.handover.strict_json import decode_base64url, dump, encode_base64url, load_long
 from teds_provision.protocol.keys import PrivateKey, fingerprint, is_point, station_key_message, verify
 
 FORMAT = "teds-handover/1"
@@ -32,8 +34,12 @@ TYPE = "teds-handover+jws"
 CONTENT_TYPE = "JWS"
 MAX_BUNDLE_OCTETS = 64 * 1024 * 1024
 """More is not read: about 80,000 nodes. Look at the size of a file before reading it."""
+_MAX_PAYLOAD_OCTETS = (MAX_BUNDLE_OCTETS - 128 * 1024) // 16 * 9
+"""What fits into one: base64url of base64url, after headers of at most 256 recipients."""
 CLOCK_TOLERANCE = timedelta(minutes=10)
 """How far a sender's clock may be ahead."""
+
+_quoted = json.encoder.encode_basestring_ascii
 
 Mode = Literal["copy", "move"]
 FindKey = Callable[[str], bytes | None]
@@ -55,6 +61,11 @@ class BundledNode:
     name: str | None = None
     groups: tuple[str, ...] = ()
     teds_sha256: str | None = None
+    kid: str = field(init=False, compare=False)
+    """KeyId of the link key in hex: asked for again and again."""
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "kid", key_id(self.key).hex())
 
 
 @dataclass(frozen=True)
@@ -108,14 +119,17 @@ class BundleHeader:
 
 
 def seal_bundle(payload: Bundle, sender: PrivateKey, recipients: Sequence[bytes]) -> bytes:
-    """Like :func:`seal_signed`, but returns the octets of the file alone."""
-    return seal_signed(payload, sender, recipients)[0]
+    """Like :func:`sealing`, whole: the octets of the file."""
+    made = sealing(payload, payload.nodes, len(payload.nodes), sender, recipients)
+    return b"".join([*made.body(), made.end()])
 
 
-def seal_signed(payload: Bundle, sender: PrivateKey, recipients: Sequence[bytes]) -> tuple[bytes, str]:
-    """Sign with ``sender`` and seal to the points ``recipients``.
+def sealing(
+    payload: Bundle, nodes: Iterable[BundledNode], count: int, sender: PrivateKey, recipients: Sequence[bytes]
+) -> Sealing:
+    """Sign with ``sender`` and seal to the points ``recipients``; ``count`` nodes come one by one, not in ``payload``.
 
-    Returns the octets of the file, and the SHA-256 of what was signed, which the receipt will name.
+    Its ``signed_sha256``, the digest of what was signed, is what the receipt will name.
 
     Raises BadData or PolicyRefused where the payload breaks a rule that :func:`open_bundle` would hold against it.
     """
@@ -126,19 +140,24 @@ def seal_signed(payload: Bundle, sender: PrivateKey, recipients: Sequence[bytes]
     if sorted(payload.to) != sorted(map(fingerprint, recipients)):
         raise BadData("The bundle names other recipients than the keys that it is sealed to.")
     _check_rules(payload)
-    for node in payload.nodes:
-        _check_writable(node)
     for point in recipients:
         _station_signature(payload, point)
-    signed = jose.sign_compact(_payload(payload), sender, typ=TYPE)
-    sealed = jose.encrypt(signed, recipients, cty=CONTENT_TYPE)
-    if len(sealed) > MAX_BUNDLE_OCTETS:
-        raise BadData(f"{len(payload.nodes)} nodes are too many for one bundle.", hint="Export them in groups.")
-    return sealed, hashlib.sha256(signed).hexdigest()
+    pieces = _payload_pieces(payload, nodes, count)
+    return Sealing(_within(pieces, count), sender, recipients, typ=TYPE, cty=CONTENT_TYPE)
+
+
+def _within(pieces: Iterable[bytes], count: int) -> Iterator[bytes]:
+    """Pieces of a payload; raises BadData where the bundle becomes longer than a reader takes."""
+    octets = 0
+    for piece in pieces:
+        octets += len(piece)
+        if octets > _MAX_PAYLOAD_OCTETS:
+            raise BadData(f"{count} nodes are too many for one bundle.", hint="Export them in groups.")
+        yield piece
 
 
 def open_bundle(
-    octets: bytes,
+    source: Source,
     recipient: PrivateKey,
     trusted: FindKey,
     now: datetime | None,
@@ -152,7 +171,7 @@ def open_bundle(
     Raises PolicyRefused (not for this station, expired, dated in the future, algorithm), NotAuthentic (unknown sender,
     signature, tag, SIG104, kid of a key) or BadData (form, ranges, count, an UUID twice).
     """
-    bundle, sender_key, signed_sha256 = _opened(octets, recipient, trusted, max_octets)
+    bundle, opened = _opened(source, recipient, trusted, max_octets)
     if fingerprint(recipient.point) not in bundle.to:
         raise PolicyRefused("The bundle does not name this station as a receiver, though it is sealed to it.")
     if now is not None:
@@ -160,12 +179,12 @@ def open_bundle(
     revocations, unknown = open_revocations(bundle.revoked, trusted)
     return OpenedBundle(
         bundle,
-        sender_key,
-        hashlib.sha256(octets).hexdigest(),
+        opened.signer,
+        opened.sha256,
         _station_signature(bundle, recipient.point),
         revocations,
         unknown,
-        signed_sha256,
+        opened.signed_sha256,
     )
 
 
@@ -181,33 +200,27 @@ def check_times(bundle: Bundle, now: datetime) -> None:
         )
 
 
-def peek_bundle(octets: bytes, *, max_octets: int = MAX_BUNDLE_OCTETS) -> BundleHeader:
+def peek_bundle(source: Source) -> BundleHeader:
     """Read the header and the recipients of a bundle without any key; raises BadData."""
-    header = jose.read_header(octets, max_octets=max_octets)
+    envelope = read_envelope(as_file(source), MAX_BUNDLE_OCTETS)
+    header = jose.header_of(envelope.document)
     return BundleHeader(
         header.algorithm,
         header.encryption,
         header.content_type,
         header.recipients,
-        len(octets),
-        hashlib.sha256(octets).hexdigest(),
+        envelope.octets,
+        envelope.sha256,
     )
 
 
-def _opened(octets: bytes, recipient: PrivateKey, trusted: FindKey, max_octets: int) -> tuple[Bundle, bytes, str]:
+def _opened(source: Source, recipient: PrivateKey, trusted: FindKey, max_octets: int) -> tuple[Bundle, Unsealed]:
     """Unseal, verify and read; each form of the payload is let go as soon as the next one is there."""
-    signed = jose.decrypt(octets, recipient, cty=CONTENT_TYPE, max_octets=max_octets)
-    verified = jose.verify_compact(signed, trusted, typ=TYPE, max_octets=max_octets)
-    signed_sha256 = hashlib.sha256(signed).hexdigest()
-    del signed
-    kid, signer, payload = verified.kid, verified.signer, verified.payload
-    del verified
-    members = load_object(payload, "The bundle")
-    del payload
-    bundle = _from_json(members)
-    if bundle.sender != kid:
+    opened = unseal(source, recipient, trusted, typ=TYPE, cty=CONTENT_TYPE, max_octets=max_octets)
+    bundle = _from_json(opened.payload)
+    if bundle.sender != opened.kid:
         raise NotAuthentic("The bundle names another sender than the one who signed it.")
-    return bundle, signer, signed_sha256
+    return bundle, opened
 
 
 def _check_rules(bundle: Bundle) -> None:
@@ -243,6 +256,10 @@ def _station_signature(bundle: Bundle, station: bytes) -> bytes | None:
 
 
 def _payload(bundle: Bundle) -> bytes:
+    return b"".join(_payload_pieces(bundle, bundle.nodes, len(bundle.nodes)))
+
+
+def _payload_pieces(bundle: Bundle, nodes: Iterable[BundledNode], count: int) -> Iterator[bytes]:
     """The JSON that is signed, node by node: ten thousand of them as objects would take many times its size."""
     members: dict[str, object] = {
         "format": FORMAT,
@@ -256,31 +273,43 @@ def _payload(bundle: Bundle) -> bytes:
         "station_signatures": {
             receiver: encode_base64url(signature) for receiver, signature in bundle.station_signatures.items()
         },
-        "count": len(bundle.nodes),
+        "count": count,
     }
-    octets = bytearray(dump(members)[:-1] + b',"nodes":[')
-    for number, node in enumerate(bundle.nodes):
-        octets += b"," * (number > 0) + dump(_node_to_json(node))
-    octets += b"]" + (b',"revoked":' + dump(list(bundle.revoked)) if bundle.revoked else b"") + b"}"
-    return bytes(octets)
+    yield dump(members)[:-1] + b',"nodes":['
+    seen: set[bytes] = set()
+    piece = bytearray()
+    for node in nodes:
+        _check_writable(node)
+        piece += b"," * bool(seen) + _node_to_json(node).encode("ascii")
+        seen.add(node.uuid)
+        if len(piece) >= PIECE:
+            yield bytes(piece)
+            piece.clear()
+    if len(seen) != count:
+        raise BadData(f"The bundle was to hold {count} different nodes, and holds {len(seen)}.")
+    yield bytes(piece) + b"]" + (b',"revoked":' + dump(list(bundle.revoked)) if bundle.revoked else b"") + b"}"
 
 
-def _node_to_json(node: BundledNode) -> dict[str, object]:
-    return {
-        "uuid": node.uuid.hex(),
-        "node_public_key": public_jwk(node.node_key),
-        "key": link_key_jwk(node.key, key_id(node.key)),
-        "epoch": node.epoch,
-        "sequence": node.sequence,
-        "profile": node.profile,
-        "name": node.name,
-        "groups": list(node.groups),
-        "teds_sha256": node.teds_sha256,
-    }
+def _node_to_json(node: BundledNode) -> str:
+    """Compact JSON of one node, put together by hand: an encoder takes three times as long, and there are thousands."""
+    x, y = encode_base64url(node.node_key[1:33]), encode_base64url(node.node_key[33:])
+    return (
+        f'{{"uuid":"{node.uuid.hex()}",'
+        f'"node_public_key":{{"kty":"EC","crv":"P-256","x":"{x}","y":"{y}"}},'
+        f'"key":{{"kty":"oct","k":"{encode_base64url(node.key)}","kid":"{node.kid}"}},'
+        f'"epoch":{node.epoch},"sequence":{node.sequence},'
+        f'"profile":{_text(node.profile)},"name":{_text(node.name)},'
+        f'"groups":[{",".join(map(_quoted, node.groups))}],"teds_sha256":{_text(node.teds_sha256)}}}'
+    )
 
 
-def _from_json(payload: dict[str, Any]) -> Bundle:
-    members = Members(payload, "The bundle")
+def _text(text: str | None) -> str:
+    return "null" if text is None else _quoted(text)
+
+
+def _from_json(payload: bytearray) -> Bundle:
+    read = _NodeReader()
+    members = Members(load_long(payload, "The bundle", "nodes", read.each), "The bundle")
     if members.get("format") != FORMAT:
         raise BadData(f"The bundle's format is not {FORMAT}.", hint="A newer teds-provision may read it.")
     mode = members.get("mode")
@@ -297,7 +326,7 @@ def _from_json(payload: dict[str, Any]) -> Bundle:
         expires=members.time("expires"),
         mode=cast(Mode, mode),
         ca=point_of(members.get("ca"), "The bundle's CA key"),
-        nodes=tuple(_node_from_json(node, number) for number, node in enumerate(nodes, 1)),
+        nodes=tuple(read.all_of(nodes)),
         station_signatures=_signatures(members.get("station_signatures")),
         revoked=tuple(_statement(text) for text in members.list_of("revoked", required=False)),
     )
@@ -305,29 +334,53 @@ def _from_json(payload: dict[str, Any]) -> Bundle:
     return bundle
 
 
-def _node_from_json(node: object, number: int) -> BundledNode:
-    """Read one node; a complaint names it by its place, counted from 1."""
-    try:
-        return _read_node(Members(node, "It"))
-    except (BadData, NotAuthentic) as error:
-        raise type(error)(f"Node {number} of the bundle cannot be taken. {error.message}") from error
+class _NodeReader:
+    """Reads the nodes one by one; a complaint names one by its place, counted from 1, and waits for its turn."""
+
+    def __init__(self) -> None:
+        self._number = 0
+        self._complaint: BadData | NotAuthentic | None = None
+
+    def each(self, node: object) -> BundledNode | None:
+        """Read the next node, None from the first on that cannot be read."""
+        self._number += 1
+        if self._complaint is None:
+            try:
+                return _read_node(Members(node, "It"))
+            except (BadData, NotAuthentic) as error:
+                text = f"Node {self._number} of the bundle cannot be taken. {error.message}"
+                self._complaint = type(error)(text)
+                self._complaint.__cause__ = error
+        return None
+
+    def all_of(self, nodes: list[BundledNode]) -> list[BundledNode]:
+        """Return what was read; raises the complaint."""
+        if self._complaint is not None:
+            raise self._complaint
+        return nodes
 
 
 def _read_node(members: Members) -> BundledNode:
     key, kid = link_key_of(members.get("key"), "Its link key")
-    if kid != key_id(key).hex():
-        raise NotAuthentic("The kid is not that of its link key.")
-    return BundledNode(
+    node = BundledNode(
         uuid=members.uuid("uuid"),
         node_key=point_of(members.get("node_public_key"), "Its public key"),
         key=key,
         epoch=members.u32("epoch", first=1),
         sequence=members.u32("sequence"),
-        profile=members.text_or_none("profile"),
+        profile=_shared(members.text_or_none("profile")),
         name=members.text_or_none("name"),
         groups=members.texts("groups"),
         teds_sha256=members.sha256_or_none("teds_sha256"),
     )
+    if kid != node.kid:
+        raise NotAuthentic("The kid is not that of its link key.")
+    return node
+
+
+def _shared(text: str | None) -> str | None:
+    """The same text object for all nodes of a profile: there are few profiles and many nodes."""
+    return None if text is None else sys.intern(text)
 
 
 def _signatures(value: object) -> dict[str, bytes]:

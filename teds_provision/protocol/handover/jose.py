@@ -11,36 +11,49 @@ The profile's rule that s must be low does not hold in JOSE: other people's sign
 
 from __future__ import annotations
 
+import hashlib
 import os
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from io import BytesIO
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from cryptography.exceptions import InvalidSignature, InvalidTag
 from cryptography.hazmat.primitives import hashes
 from cryptography.hazmat.primitives.asymmetric import ec
-from cryptography.hazmat.primitives.asymmetric.utils import encode_dss_signature
+from cryptography.hazmat.primitives.asymmetric.utils import Prehashed, encode_dss_signature
+from cryptography.hazmat.primitives.ciphers import Cipher
 from cryptography.hazmat.primitives.ciphers.aead import AESGCM
+from cryptography.hazmat.primitives.ciphers.algorithms import AES
+from cryptography.hazmat.primitives.ciphers.modes import GCM
 from cryptography.hazmat.primitives.kdf.concatkdf import ConcatKDFHash
 from cryptography.hazmat.primitives.keywrap import InvalidUnwrap, aes_key_unwrap, aes_key_wrap
 
 from teds_provision.errors import BadData, NotAuthentic, PolicyRefused
 from teds_provision.protocol.handover.jwk import point_of, public_jwk
 from teds_provision.protocol.handover.strict_json import (
+    Base64urlWriter,
     base64url,
     decode_base64url,
     dump,
     encode_base64url,
     load_object,
+    refuse_many,
+    separators,
     write_base64url,
 )
 from teds_provision.protocol.keys import SIGNATURE_OCTETS, PrivateKey, SoftwareKey, fingerprint, public_key
+
+if TYPE_CHECKING:
+    from cryptography.hazmat.primitives.ciphers import AEADDecryptionContext
 
 SIGNATURE_ALGORITHM = "ES256"
 KEY_ALGORITHM = "ECDH-ES+A256KW"
 CONTENT_ALGORITHM = "A256GCM"
 MAX_RECIPIENTS = 256
+
+NO_COMPACT_JWS = "A compact JWS has three parts."
+CHANGED_CONTENT = "The sealed content was changed: its tag does not fit."
 
 _KEY_OCTETS = 32
 _WRAPPED_OCTETS = _KEY_OCTETS + 8
@@ -49,7 +62,7 @@ _TAG_OCTETS = 16
 _MAX_HEADER_CHARACTERS = 8192
 _MAX_PARTY_INFO_OCTETS = 256
 # A JWE has about ten members per recipient; a flood of tiny values would cost a hundred times its size to parse.
-_MAX_SEPARATORS = 20 * MAX_RECIPIENTS
+MAX_SEPARATORS = 20 * MAX_RECIPIENTS
 
 FindKey = Callable[[str], bytes | None]
 """From a ``kid`` to the 65-octet point of a trusted key, None where there is none."""
@@ -76,12 +89,16 @@ class JweHeader:
 
 def sign_compact(payload: bytes, key: PrivateKey, *, typ: str) -> bytes:
     """Return a compact JWS: ES256, ``kid`` the fingerprint of ``key``."""
-    header = {"alg": SIGNATURE_ALGORITHM, "kid": fingerprint(key.point), "typ": typ}
     octets = BytesIO()
-    octets.write(base64url(dump(header)) + b".")
+    octets.write(signed_header(key, typ))
     write_base64url(octets, memoryview(payload))
     octets.write(b"." + base64url(key.sign(octets.getvalue())))
     return octets.getvalue()
+
+
+def signed_header(key: PrivateKey, typ: str) -> bytes:
+    """Return what a compact JWS of ``key`` begins with: the header and its dot."""
+    return base64url(dump({"alg": SIGNATURE_ALGORITHM, "kid": fingerprint(key.point), "typ": typ})) + b"."
 
 
 def verify_compact(octets: bytes, find_key: FindKey, *, typ: str, max_octets: int) -> Verified:
@@ -92,8 +109,20 @@ def verify_compact(octets: bytes, find_key: FindKey, *, typ: str, max_octets: in
     check_size(octets, max_octets, "The signed document")
     parts = octets.split(b".", 3)
     if len(parts) != 3:
-        raise BadData("A compact JWS has three parts.")
-    header = _header(parts[0], "The JWS header")
+        raise BadData(NO_COMPACT_JWS)
+    message = memoryview(octets)[: len(octets) - len(parts[2]) - 1]
+    kid, signer = check_signature(parts[0], parts[2], hashlib.sha256(message).digest(), find_key, typ)
+    return Verified(kid, signer, decode_base64url(parts[1], "The payload"))
+
+
+def check_signature(
+    header_text: bytes, signature_text: bytes, digest: bytes, find_key: FindKey, typ: str
+) -> tuple[str, bytes]:
+    """Check the header and the signature of a compact JWS; ``digest`` is the SHA-256 of what is signed.
+
+    Returns ``kid`` and point of the signer. Raises NotAuthentic, PolicyRefused or BadData.
+    """
+    header = _header(header_text, "The JWS header")
     _only(header, "alg", (SIGNATURE_ALGORITHM,), "signature algorithm")
     _no_extensions(header)
     if str(header.get("typ", "")).lower().removeprefix("application/") != typ:
@@ -107,49 +136,59 @@ def verify_compact(octets: bytes, find_key: FindKey, *, typ: str, max_octets: in
             f"Nobody trusted here has the key {kid[:16]!r} that signed this.",
             hint="Compare the fingerprint with its owner by voice, then: teds-provision trust add NAME FILE.",
         )
-    signature = decode_base64url(parts[2], "The signature")
-    if not _es256_good(signer, octets[: len(octets) - len(parts[2]) - 1], signature):
+    if not _es256_good(signer, digest, decode_base64url(signature_text, "The signature")):
         raise NotAuthentic(f"The signature does not verify under the key {kid[:16]}: the content was changed.")
-    return Verified(kid, signer, decode_base64url(parts[1], "The payload"))
+    return kid, signer
 
 
-def _es256_good(point: bytes, message: bytes, signature: bytes) -> bool:
+def _es256_good(point: bytes, digest: bytes, signature: bytes) -> bool:
     """RFC 7518 section 3.4: r ‖ s of 32 octets each; either s."""
     if len(signature) != SIGNATURE_OCTETS:
         return False
     der = encode_dss_signature(int.from_bytes(signature[:32], "big"), int.from_bytes(signature[32:], "big"))
     try:
-        public_key(point).verify(der, message, ec.ECDSA(hashes.SHA256()))
+        public_key(point).verify(der, digest, ec.ECDSA(Prehashed(hashes.SHA256())))
     except InvalidSignature:
         return False
     return True
 
 
-def encrypt(payload: bytes, recipients: Sequence[bytes], *, cty: str) -> bytes:
-    """Return a JWE in the General JSON serialization for the points ``recipients``; raises BadData for a bad point.
+class JweWriter:
+    """A JWE in the General JSON serialization, written a piece at a time: ``begin``, ``more`` of the payload, ``end``.
 
-    Algorithms and ``cty`` are in the protected header, ``kid`` (the fingerprint) and ``epk`` with each recipient.
+    Algorithms and ``cty`` are in the protected header, ``kid`` (the fingerprint) and ``epk`` with each recipient. The
+    tag comes last: without :meth:`end` nobody can open what was written. Raises BadData for a bad point.
     """
-    if not 1 <= len(recipients) <= MAX_RECIPIENTS:
-        raise BadData(f"A JWE here has 1 to {MAX_RECIPIENTS} recipients, not {len(recipients)}.")
-    protected = encode_base64url(dump({"alg": KEY_ALGORITHM, "cty": cty, "enc": CONTENT_ALGORITHM}))
-    content_key, iv = os.urandom(_KEY_OCTETS), os.urandom(_IV_OCTETS)
-    entries = [_recipient_entry(point, content_key) for point in recipients]
-    sealed = memoryview(AESGCM(content_key).encrypt(iv, payload, protected.encode()))
-    head = dump(
-        {
-            "protected": protected,
-            "recipients": entries,
-            "iv": encode_base64url(iv),
-            "tag": encode_base64url(bytes(sealed[-_TAG_OCTETS:])),
-        }
-    )
-    # Base64url needs no escape; a JSON writer, and a coder of it all at once, would copy the megabytes many times.
-    octets = BytesIO()
-    octets.write(head[:-1] + b',"ciphertext":"')
-    write_base64url(octets, sealed[:-_TAG_OCTETS])
-    octets.write(b'"}')
-    return octets.getvalue()
+
+    def __init__(self, recipients: Sequence[bytes], *, cty: str) -> None:
+        if not 1 <= len(recipients) <= MAX_RECIPIENTS:
+            raise BadData(f"A JWE here has 1 to {MAX_RECIPIENTS} recipients, not {len(recipients)}.")
+        protected = encode_base64url(dump({"alg": KEY_ALGORITHM, "cty": cty, "enc": CONTENT_ALGORITHM}))
+        content_key, iv = os.urandom(_KEY_OCTETS), os.urandom(_IV_OCTETS)
+        entries = [_recipient_entry(point, content_key) for point in recipients]
+        self._head = dump({"protected": protected, "recipients": entries, "iv": encode_base64url(iv)})
+        self._cipher = Cipher(AES(content_key), GCM(iv)).encryptor()
+        self._cipher.authenticate_additional_data(protected.encode())
+        self._text = Base64urlWriter()
+
+    def begin(self) -> bytes:
+        """Return what stands before the ciphertext."""
+        return self._head[:-1] + b',"ciphertext":"'  # base64url needs no escape
+
+    def more(self, payload: bytes | memoryview) -> bytes:
+        """Return the next characters of the ciphertext."""
+        return self._text.more(self._cipher.update(payload))
+
+    def end(self) -> bytes:
+        """Return the last characters of the ciphertext, and the tag."""
+        last = self._text.more(self._cipher.finalize()) + self._text.end()
+        return last + b'","tag":"' + base64url(self._cipher.tag) + b'"}'
+
+
+def encrypt(payload: bytes, recipients: Sequence[bytes], *, cty: str) -> bytes:
+    """Return a whole JWE for the points ``recipients``, see :class:`JweWriter`."""
+    jwe = JweWriter(recipients, cty=cty)
+    return jwe.begin() + jwe.more(payload) + jwe.end()
 
 
 def _recipient_entry(point: bytes, content_key: bytes) -> dict[str, object]:
@@ -175,7 +214,31 @@ def decrypt(octets: bytes, key: PrivateKey, *, cty: str, max_octets: int) -> byt
     anything is parsed. Raises NotAuthentic, PolicyRefused or BadData.
     """
     document = _document(octets, max_octets)
-    protected = document.get("protected")
+    content_key, seal = content_key_for(document, key, cty=cty)
+    ciphertext = decode_base64url(document.get("ciphertext"), "The ciphertext")
+    try:
+        return AESGCM(content_key).decrypt(seal.iv, ciphertext + seal.tag, seal.additional)
+    except InvalidTag as error:
+        raise NotAuthentic(CHANGED_CONTENT) from error
+
+
+@dataclass(frozen=True)
+class Seal:
+    """What opens a ciphertext beside its key: initialisation vector, tag, additional authenticated data."""
+
+    iv: bytes
+    tag: bytes
+    additional: bytes
+
+    def opener(self, content_key: bytes) -> AEADDecryptionContext:
+        """Decrypt a piece at a time; its ``finalize`` raises InvalidTag, and before that nothing may be believed."""
+        cipher = Cipher(AES(content_key), GCM(self.iv, self.tag)).decryptor()
+        cipher.authenticate_additional_data(self.additional)
+        return cipher
+
+
+def content_key_for(document: Mapping[str, Any], key: PrivateKey, *, cty: str) -> tuple[bytes, Seal]:
+    """Unwrap the content key of a JWE with the recipient's ``key``; raises as :func:`decrypt` does."""
     shared = _shared_header(document)
     own = fingerprint(key.point)
     named = False
@@ -187,7 +250,7 @@ def decrypt(octets: bytes, key: PrivateKey, *, cty: str, max_octets: int) -> byt
         _check_header(header, cty)
         content_key = _content_key(header, entry, key)
         if content_key is not None:
-            return _content(document, content_key, str(protected))
+            return content_key, _seal(document)
     if not named:
         raise PolicyRefused(
             f"This was not sealed for this station ({own[:16]}).",
@@ -198,7 +261,11 @@ def decrypt(octets: bytes, key: PrivateKey, *, cty: str, max_octets: int) -> byt
 
 def read_header(octets: bytes, *, max_octets: int) -> JweHeader:
     """Read what a JWE says in the clear, without any key; raises BadData."""
-    document = _document(octets, max_octets)
+    return header_of(_document(octets, max_octets))
+
+
+def header_of(document: Mapping[str, Any]) -> JweHeader:
+    """Read what a JWE that :func:`parse_document` gave says in the clear; raises BadData."""
     shared = _shared_header(document)
     headers = [
         _merged(shared, _mapping(entry.get("header"), "The header of a recipient")) for entry in _entries(document)
@@ -220,10 +287,14 @@ def check_size(octets: bytes, max_octets: int, what: str) -> None:
 
 def _document(octets: bytes, max_octets: int) -> dict[str, Any]:
     check_size(octets, max_octets, "The sealed document")
+    return parse_document(octets)
+
+
+def parse_document(octets: bytes) -> dict[str, Any]:
+    """Read the JSON of a JWE, whose size the caller has bounded; raises BadData."""
     if octets[:64].lstrip(b" \t\r\n")[:1] != b"{":
         raise BadData("This is not a JWE in a JSON serialization.")
-    if sum(octets.count(separator) for separator in (b",", b"[", b"{")) > _MAX_SEPARATORS:
-        raise BadData("This JSON has far more members than a JWE.")
+    refuse_many(separators(octets), MAX_SEPARATORS, "a JWE")
     return load_object(octets, "The sealed document")
 
 
@@ -274,19 +345,15 @@ def _party_info(header: Mapping[str, Any], name: str) -> bytes:
     return octets
 
 
-def _content(document: Mapping[str, Any], content_key: bytes, protected: str) -> bytes:
+def _seal(document: Mapping[str, Any]) -> Seal:
     iv, tag = decode_base64url(document.get("iv"), "The iv"), decode_base64url(document.get("tag"), "The tag")
     if len(iv) != _IV_OCTETS or len(tag) != _TAG_OCTETS:
         raise BadData(f"The iv has {_IV_OCTETS} octets and the tag {_TAG_OCTETS}; these have {len(iv)} and {len(tag)}.")
-    additional = protected
+    additional = str(document.get("protected"))
     if "aad" in document:
         decode_base64url(document["aad"], "The aad")
-        additional = f"{protected}.{document['aad']}"
-    ciphertext = decode_base64url(document.get("ciphertext"), "The ciphertext")
-    try:
-        return AESGCM(content_key).decrypt(iv, ciphertext + tag, additional.encode())
-    except InvalidTag as error:
-        raise NotAuthentic("The sealed content was changed: its tag does not fit.") from error
+        additional = f"{additional}.{document['aad']}"
+    return Seal(iv, tag, additional.encode())
 
 
 def _header(text: object, what: str) -> dict[str, Any]:

@@ -46,11 +46,6 @@ def _on_curve(x: int, y: int) -> bool:
     return x < _P and y < _P and (y * y - (x * x - 3) % _P * x - _B) % _P == 0
 
 
-def link_key_jwk(key: bytes, key_id: bytes) -> dict[str, str]:
-    """Return the JWK of a link key (16 octets); ``kid`` is keyId in hex. The result is secret."""
-    return {"kty": "oct", "k": encode_base64url(key), "kid": key_id.hex()}
-
-
 def link_key_of(jwk: object, what: str) -> tuple[bytes, str]:
     """Return a link key (16 octets) and the ``kid`` that it claims, in lower case; raises BadData."""
     if not isinstance(jwk, dict) or jwk.get("kty") != "oct":

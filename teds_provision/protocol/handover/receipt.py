@@ -59,15 +59,13 @@ def seal_receipt(receipt: Receipt, signer: PrivateKey) -> bytes:
     return jose.sign_compact(dump(members), signer, typ=TYPE)
 
 
-def open_receipt(
-    octets: bytes, trusted: Callable[[str], bytes | None], *, max_octets: int = MAX_RECEIPT_OCTETS
-) -> Receipt:
+def open_receipt(octets: bytes, trusted: Callable[[str], bytes | None]) -> Receipt:
     """Check a receipt; whether it answers a bundle of ours is for the caller to compare (id, digest, to).
 
     White space around it (an editor's last line) does no harm. Raises NotAuthentic, PolicyRefused or BadData.
     """
-    jose.check_size(octets, max_octets, "The receipt")
-    verified = jose.verify_compact(octets.strip(), trusted, typ=TYPE, max_octets=max_octets)
+    jose.check_size(octets, MAX_RECEIPT_OCTETS, "The receipt")
+    verified = jose.verify_compact(octets.strip(), trusted, typ=TYPE, max_octets=MAX_RECEIPT_OCTETS)
     members = Members(load_object(verified.payload, "The receipt"), "The receipt")
     if members.get("format") != FORMAT:
         raise BadData(f"The receipt's format is not {FORMAT}.")

@@ -7,13 +7,14 @@ counts each cause apart. No clock of its own: the caller hands in the bounds of 
 from __future__ import annotations
 
 from collections import deque
+from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Final, NamedTuple
 
 from teds_provision.errors import NotAuthentic
 from teds_provision.protocol.messages.frames import Command
 from teds_provision.protocol.operation.commands import NOT_VALID, TEST_PATTERN
-from teds_provision.protocol.operation.datagram import MOST_OCTETS, Layout, Sealer, counter_of, pattern, stream_key
+from teds_provision.protocol.operation.datagram import COUNTER_OCTETS, MOST_OCTETS, Layout, Sealer, pattern, stream_key
 from teds_provision.protocol.operation.stream_commands import SOON, WAITS, Kind, Subscribe, Subscribed, message_length
 
 START_WITHIN: Final = 10**9
@@ -128,7 +129,8 @@ class Counts:
     ``lost``: gaps of the counter, to the count that Stop gave. ``late``: counter not above the last good one (late,
     doubled, replayed). ``bad``: wrong tag. ``junk``: wrong length, or frames that make no message. ``future``: its
     first tick is later than now. ``stale``: too old. ``unasked``: a test pattern that was not asked for, or the other
-    way round. ``overflow``: held for a mark for too long.
+    way round. ``overflow``: held for a mark for too long. ``cut``: begun after the end that the station wanted, and
+    taken back by Stop before it had left.
     """
 
     good: int = 0
@@ -140,6 +142,7 @@ class Counts:
     stale: int = 0
     unasked: int = 0
     overflow: int = 0
+    cut: int = 0
 
 
 class Receiver:
@@ -164,37 +167,65 @@ class Receiver:
         self.last = -1
         self._sealer = Sealer(stream_key(message_key, reply.run))
         self._before = previous._sealer if previous is not None else None
-        self._oldest = 2 * plan.span + LATE_AFTER if oldest is None else oldest
-        self._length, self._n, self._period = plan.length, plan.subscribe.n, plan.subscribe.period
-        self._last_instant = plan.span - plan.subscribe.period
+        self._length = plan.length
+        self._n, self._period = plan.subscribe.n, plan.subscribe.period
+        # Of its last instant; a message is dated by its first one.
+        self._oldest = (2 * plan.span + LATE_AFTER if oldest is None else oldest) + plan.span - self._period
         self._timed = plan.subscribe.kind != Kind.PERIODIC
         self._pattern = TEST_PATTERN if plan.subscribe.test_pattern else 0
         self._held: deque[tuple[Message, TickBounds]] = deque()
 
     def take(self, octets: bytes, now: TickBounds) -> Message | None:
         """Open one message; None where it is dropped (see ``counts``) or held until :meth:`begin`."""
+        found = self.take_all(((octets, 0),), now)
+        return found[0] if found else None
+
+    def take_all(self, came: Iterable[tuple[bytes, int]], ahead: TickBounds) -> list[Message]:
+        """Open messages in the order in which they came, each with its time of arrival by the host's clock (ns).
+
+        ``ahead`` bounds what the node's tick is ahead of that clock. Gives the good ones that are not held.
+        """
+        good, length, opened, pattern = [], self._length, self._sealer.open, self._pattern
+        dated = self.start is not None or self._timed
+        for octets, at in came:
+            plain = opened(octets) if len(octets) == length else None
+            if plain is None:
+                self._unread(octets)
+                continue
+            counter = int.from_bytes(octets[:COUNTER_OCTETS], "big")
+            if counter != self.last + 1 and not self._jumps(counter):
+                continue
+            self.last = counter
+            message = self._read(counter, plain)
+            if message.flags & TEST_PATTERN != pattern:
+                self.counts.unasked += 1
+            elif not dated:
+                self._hold(message, TickBounds(at + ahead.low, at + ahead.high))
+            elif self._fresh(message.tick, at + ahead.low, at + ahead.high):
+                good.append(message)
+        self.counts.good += len(good)
+        return good
+
+    def _unread(self, octets: bytes) -> None:
+        """Another length than was computed, or a tag that is not of this run."""
         if len(octets) != self._length:
             self.counts.junk += 1
-            return None
-        counter = counter_of(octets)
-        plain = self._sealer.open(octets)
-        if plain is None:
-            if self._before is None or self._before.open(octets) is None:
-                self.counts.bad += 1
-            return None
+        elif self._before is None or self._before.open(octets) is None:
+            self.counts.bad += 1
+
+    def _jumps(self, counter: int) -> bool:
+        """Whether a counter that does not follow on is a later one: what it leaves out was lost."""
         if counter <= self.last:
             self.counts.late += 1
-            return None
+            return False
         self.counts.lost += counter - self.last - 1
-        self.last = counter
-        message = self._read(counter, plain)
-        if message.flags & TEST_PATTERN != self._pattern:
-            self.counts.unasked += 1
-            return None
-        if self.start is None and not self._timed:
-            self._hold(message, now)
-            return None
-        return message if self._fresh(message, now) else None
+        return True
+
+    def _read(self, counter: int, plain: bytes) -> Message:
+        index = counter * self._n
+        if self._timed:
+            return Message(counter, index, int.from_bytes(plain[1 : 1 + _TICK], "big"), plain[0], plain[1 + _TICK :])
+        return Message(counter, index, index * self._period + (self.start or 0), plain[0], plain[1:])
 
     def _hold(self, message: Message, now: TickBounds) -> None:
         """Keep a message whose time is not known yet; the oldest goes where there are too many."""
@@ -207,12 +238,26 @@ class Receiver:
         """The first instant of a stream that waited is known (mark + 10 ms): gives the messages held, where fresh."""
         self.start = start
         held, self._held = self._held, deque()
-        dated = [(message._replace(tick=start + message.tick), now) for message, now in held]
-        return [message for message, now in dated if self._fresh(message, now)]
+        dated = ((message._replace(tick=start + message.tick), now) for message, now in held)
+        good = [message for message, now in dated if self._fresh(message.tick, now.low, now.high)]
+        self.counts.good += len(good)
+        return good
 
-    def finish(self, counter: int) -> None:
-        """Stop gave the counter that the next message would have had: what is missing up to there was lost."""
-        self.counts.lost += max(0, counter - self.last - 1)
+    def begun(self, tick: int) -> int:
+        """How many messages of this run had begun by a tick (ns), by period and start; 0 where that is not known."""
+        if self.start is None or self.plan.subscribe.kind == Kind.EVENT:
+            return 0
+        return max(0, (tick - self.start) // self.plan.span + 1)
+
+    def finish(self, counter: int, wanted: int | None = None) -> None:
+        """Stop gave the counter that the next message would have had: what is missing up to there was lost.
+
+        Of the last ones only so far as the station wanted them, the first ``wanted`` of the run: what Stop itself took
+        back after the end of the measurement is ``cut``.
+        """
+        due = counter if wanted is None else min(counter, wanted)
+        self.counts.lost += max(0, due - self.last - 1)
+        self.counts.cut += counter - max(due, self.last + 1) if counter > self.last + 1 else 0
         self.last = max(self.last, counter - 1)
 
     def expected(self, message: Message) -> bytes:
@@ -225,18 +270,12 @@ class Receiver:
         )
         return b"".join(rows)
 
-    def _read(self, counter: int, plain: bytes) -> Message:
-        index = counter * self._n
-        if self._timed:
-            return Message(counter, index, int.from_bytes(plain[1 : 1 + _TICK], "big"), plain[0], plain[1 + _TICK :])
-        return Message(counter, index, index * self._period + (self.start or 0), plain[0], plain[1:])
-
-    def _fresh(self, message: Message, now: TickBounds) -> bool:
-        if message.tick > now.high:
+    def _fresh(self, tick: int, low: int, high: int) -> bool:
+        """Whether it is neither from the future nor too old, the node's tick between these; else it is counted."""
+        if tick > high:
             self.counts.future += 1
             return False
-        if message.tick + self._last_instant < now.low - self._oldest:
+        if tick < low - self._oldest:
             self.counts.stale += 1
             return False
-        self.counts.good += 1
         return True

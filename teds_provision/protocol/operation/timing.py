@@ -50,12 +50,6 @@ class ClockSample:
         middle, error = at + self.offset, self.error(at, own_drift=own_drift)
         return TickBounds(int(middle - error), int(middle + error) + 1)
 
-    def meets(self, other: ClockSample, *, own_drift: float = 0.0) -> bool:
-        """Whether the bounds of two exchanges meet; where they do not, the clock lies."""
-        at = max(self.answered, other.answered)
-        apart = abs(self.offset - other.offset)
-        return apart <= self.error(at, own_drift=own_drift) + other.error(at, own_drift=own_drift)
-
 
 class Token(NamedTuple):
     """T of one trigger, 8 octets that only the station knows; its commitment C goes to the nodes, T on the bus."""

@@ -11,7 +11,6 @@ from teds_provision.protocol.flash import Flash, FlashFailure, FlashMemory
 from teds_provision.protocol.keys import PrivateKey, SoftwareKey, Verify, prove_message, reset_message, verify
 from teds_provision.protocol.messages.frames import (
     COMMAND_HEADER,
-    COMMON,
     SECURITY,
     Command,
     Function,
@@ -29,7 +28,7 @@ from teds_provision.protocol.operation.streams import DataFrame
 from teds_provision.protocol.session import LAST_COUNTER, NodeSession, OneTime
 from teds_provision.protocol.tim.agreeing import Agreeing
 from teds_provision.protocol.tim.origin import Origin
-from teds_provision.protocol.tim.permission import Permission
+from teds_provision.protocol.tim.permission import Permission, of_teds
 from teds_provision.protocol.tim.sessions import Sessions
 from teds_provision.protocol.tim.teds_access import TedsAccess
 
@@ -177,6 +176,11 @@ class Tim:
         return self._role.next_frame_in() if self._role is not None else None
 
     @property
+    def streaming(self) -> bool:
+        """Whether a stream runs."""
+        return self._role is not None and self._role.streams.running
+
+    @property
     def missed(self) -> int:
         """Data messages that could not leave in time, since the start."""
         return self._role.streams.missed if self._role is not None else 0
@@ -241,7 +245,7 @@ class Tim:
 
     def _known(self, command: Command, origin: Origin) -> Reply:
         """Run a command that is permitted and whose length is right."""
-        if command.command_class == COMMON and command.function in set(TedsFunction):
+        if of_teds(command):
             return self._common(command, origin)
         security = self._security.get(command.function) if command.command_class == SECURITY else None
         if security is not None:

@@ -22,6 +22,8 @@ from teds_provision.protocol.operation.role import OperationRole
 from teds_provision.protocol.session import OPEN_OCTETS
 from teds_provision.protocol.tim.origin import Origin
 
+_FUNCTIONS: Final = frozenset(Function)
+_TEDS_FUNCTIONS: Final = frozenset(TedsFunction)
 _TAPPED: Final = frozenset({Function.REQUEST, Function.CONFIRM, Function.SET_CAN_ADDRESS})
 _MEASURING: Final = frozenset(range(Function.SAMPLE, Function.DRIVE + 1))
 _PLAIN_ALONE: Final = frozenset({Function.OPEN, Function.SEALED})
@@ -56,13 +58,13 @@ class Permission:
                 self._offered(command)
         elif origin.session is None:
             self._plain(command)
-        elif not self._measures(command) and not _of_teds(command):
+        elif not self._measures(command) and not of_teds(command):
             raise Refused(Reason.UNKNOWN_COMMAND)
         self._change(command, origin)
 
     def _known_security(self, command: Command) -> None:
         """Class 128 goes to channel 0; a function that nobody knows gets 1 in every state."""
-        if command.channel != 0 or command.function not in set(Function):
+        if command.channel != 0 or command.function not in _FUNCTIONS:
             raise Refused(Reason.UNKNOWN_COMMAND)
 
     def _offered(self, command: Command) -> None:
@@ -94,7 +96,7 @@ class Permission:
 
     def _plain(self, command: Command) -> None:
         """Other classes outside a session: Query and Read alone."""
-        if not _of_teds(command) or command.function not in (TedsFunction.QUERY, TedsFunction.READ):
+        if not of_teds(command) or command.function not in (TedsFunction.QUERY, TedsFunction.READ):
             raise Refused(Reason.NOT_PERMITTED)
         if command.function == TedsFunction.READ:
             self._hold_strangers_back()
@@ -124,6 +126,6 @@ class Permission:
         self._stranger_at = now
 
 
-def _of_teds(command: Command) -> bool:
+def of_teds(command: Command) -> bool:
     """Whether it is Query, Read, Write or Update."""
-    return command.command_class == COMMON and command.function in set(TedsFunction)
+    return command.command_class == COMMON and command.function in _TEDS_FUNCTIONS

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Literal
 
-from teds_provision.errors import NotAuthentic, PolicyRefused, TedsProvisionError
+from teds_provision.errors import NoNode, NotAuthentic, PolicyRefused, TedsProvisionError
 from teds_provision.steps.provision import Provisioned
 from teds_provision.steps.verify import require_authentic
 from teds_provision.store import utc_now
@@ -71,6 +71,8 @@ class Totals:
         if not self.failed and not self.skipped:
             return None
         told = f"{self.passed} passed, {self.failed} failed, {self.skipped} skipped."
+        if isinstance(self.worst, NoNode):  # told nowhere else: no board came whose error it would be
+            told = f"{told} {self.worst.message}"
         kind = type(self.worst) if self.worst is not None else PolicyRefused
         known = kind if kind.__init__ is TedsProvisionError.__init__ else PolicyRefused
         return known(told, hint="Run the same command again: it carries on with what is left.")

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Final
 
 from teds_provision.errors import NotWhitelisted, OtherKey, PolicyRefused, TedsProvisionError, UsageFailure
-from teds_provision.links import Contact, LinkSettings, open_port
+from teds_provision.links import Contact, LinkSettings, Port, open_port
 from teds_provision.protocol.messages.identity import NodeState
 from teds_provision.station.station import Station
 from teds_provision.steps.build import Confirm, nobody, propose
@@ -23,9 +23,9 @@ from teds_provision.steps.many.sheet import Row, read_sheet
 from teds_provision.steps.order import BuildOrder, Prepared, for_several, named_for, prepare
 from teds_provision.steps.provision import Accept, Provisioned, provision
 from teds_provision.steps.read import survey
-from teds_provision.talk.charge import Low, wait_for_charge
+from teds_provision.steps.write import Low, wait_for_charge
 from teds_provision.talk.conversation import Conversation, SessionLost
-from teds_provision.talk.meeting import meet, refuse_twins
+from teds_provision.talk.meeting import meet, refuse_twins, without_twins
 from teds_provision.talk.onward import onward
 from teds_provision.talk.progress import Reporter
 from teds_provision.talk.watching import Patience, watch_nodes
@@ -100,6 +100,17 @@ class Boards:
         self._boards: list[Board] = []
         self._began = time.monotonic()
 
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """What a person should know of the order, or of the rows of the sheet, before the first board comes."""
+        rows = self.progress.sheet.warnings if self.progress is not None else ()
+        return (*self.prepared.warnings, *rows)
+
+    def unlock(self) -> None:
+        """Open the vault (a passphrase may be asked for), unless nothing is left to do; raises StoreFailure."""
+        if self.progress is None or self.progress.open:
+            self._station.unlock()
+
     # -- one node --------------------------------------------------------------------------------------------------
 
     def one(self, questions: Questions) -> Provisioned:
@@ -139,6 +150,11 @@ class Boards:
         """The row that the next board may be of."""
         rows = self.progress.untried or self.progress.open if self.progress is not None else []
         return rows[0] if rows else None
+
+    def row(self, number: int) -> Row:
+        """The row of the sheet with that number, from 1."""
+        assert self.progress is not None
+        return self.progress.sheet.rows[number - 1]
 
     def many(self, questions: Questions) -> Iterator[Board]:
         """Provision board after board, or all at once; one that fails does not end it. At the end comes the report."""
@@ -184,24 +200,31 @@ class Boards:
         try:
             if not port.capabilities.many:
                 raise UsageFailure("--all is for a bus: a reader sees one node.", hint="Use --watch, tap after tap.")
-            found = refuse_twins(port.everyone(seconds=self._links.timeout, notice=self._reporter.notice))
+            everyone = port.everyone(seconds=self._links.timeout, notice=self._reporter.notice)
+            found = without_twins(everyone, self._reporter.notice)
             contacts = [contact for contact in found if self._is_meant(contact)]
             if not contacts:
                 self._require_known(found)
-            token = self._station.identity.keystore.startswith("pkcs11:")
-            workers = max(1, min(_TOKEN_WORKERS if token else port.capabilities.at_once, len(contacts)))
-            with ThreadPoolExecutor(workers, thread_name_prefix="node") as pool:
-                running = [pool.submit(self._board, contact, port.place, questions) for contact in contacts]
-                try:
-                    for done in as_completed(running):
-                        yield done.result()
-                        if self.stop.is_set():
-                            break
-                finally:
-                    for future in running:
-                        future.cancel()
+            yield from self._side_by_side(port, contacts, questions)
+            if not self.stop.is_set():
+                refuse_twins(everyone)  # the others are done, and what is not done is not passed over
         finally:
             port.close()
+
+    def _side_by_side(self, port: Port, contacts: list[Contact], questions: Questions) -> Iterator[Board]:
+        """Each of these nodes in a thread, as many at a time as the bus and the token bear, until ``stop`` is set."""
+        token = self._station.identity.keystore.startswith("pkcs11:")
+        workers = max(1, min(_TOKEN_WORKERS if token else port.capabilities.at_once, len(contacts)))
+        with ThreadPoolExecutor(workers, thread_name_prefix="node") as pool:
+            running = [pool.submit(self._board, contact, port.place, questions) for contact in contacts]
+            try:
+                for done in as_completed(running):
+                    yield done.result()
+                    if self.stop.is_set():
+                        break
+            finally:
+                for future in running:
+                    future.cancel()
 
     def _require_known(self, found: list[Contact]) -> None:
         """Raise NotWhitelisted where none of the nodes that answered is one of ours: nothing done is not all done."""
@@ -281,7 +304,7 @@ class Boards:
     def _note(self, board: Board) -> None:
         self._boards.append(board)
         if self.progress is not None and board.row is not None:
-            self.progress.note(self.progress.sheet.rows[board.row - 1], board)
+            self.progress.note(self.row(board.row), board)
 
 
 def _progress(station: Station, request: Request, order: BuildOrder) -> Progress | None:

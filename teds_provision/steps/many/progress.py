@@ -105,6 +105,7 @@ class Progress:
         attempted.seconds, attempted.time = round(board.seconds, 3), board.time
         attempted.message = board.failure.message if board.failure is not None else ""
         if board.done is not None:
+            attempted.message = attempted.message or " ".join(board.done.warnings)
             attempted.steps = {step.name: step.seconds for step in board.done.steps}
         self._tried = self._tried | {row.number}
         self.worst = worse(self.worst, board.failure)

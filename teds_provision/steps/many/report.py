@@ -6,6 +6,7 @@ import csv
 import html
 import io
 from collections.abc import Sequence
+from datetime import datetime
 from pathlib import Path
 from typing import Final
 
@@ -15,9 +16,10 @@ from teds_provision.steps.many.board import Totals
 from teds_provision.steps.many.progress import Progress
 
 _HEAD: Final = ("row", "uuid", "name", "profile", "result", "tries", "first_pass", "seconds", "time", "message")
+_RESULT: Final = _HEAD.index("result")
 _STYLE: Final = (
     "body{font:16px sans-serif;margin:2em}table{border-collapse:collapse}td,th{border:1px solid #999;padding:.3em .6em;"
-    "text-align:left}.passed{background:#cfc}.failed{background:#fcc}.skipped{background:#eee}"
+    "text-align:left;white-space:nowrap}td:last-child{white-space:normal}.passed{background:#cfc}.failed{background:#fcc}.skipped{background:#eee}"
 )
 
 
@@ -76,16 +78,37 @@ def _tame(cell: str) -> str:
 
 
 def _html(name: str, rows: Sequence[Sequence[str]], totals: Totals) -> str:
-    head = "".join(f"<th>{html.escape(cell)}</th>" for cell in _HEAD)
+    head = "".join(f"<th>{html.escape(cell.replace('_', ' '))}</th>" for cell in _HEAD)
     body = "".join(
-        f'<tr class="{html.escape(row[4])}">' + "".join(f"<td>{html.escape(cell)}</td>" for cell in row) + "</tr>\n"
+        f'<tr class="{html.escape(row[_RESULT])}">'
+        + "".join(f"<td>{html.escape(cell)}</td>" for cell in _for_people(row))
+        + "</tr>\n"
         for row in rows
     )
     sums = "".join(
-        f"<tr><th>{html.escape(what)}</th><td>{html.escape(value)}</td></tr>\n" for what, value in _totals(totals)
+        f"<tr><th>{html.escape(what)}</th><td>{html.escape(value)}</td></tr>\n" for what, value in _sums(totals)
     )
     return (
         f'<!DOCTYPE html>\n<html lang="en"><head><meta charset="utf-8"><title>{html.escape(name)}</title>'
         f"<style>{_STYLE}</style></head><body><h1>{html.escape(name)}</h1>\n<table>{sums}</table><p></p>"
         f"<table><tr>{head}</tr>\n{body}</table></body></html>\n"
     )
+
+
+def _sums(totals: Totals) -> list[tuple[str, str]]:
+    share = "none was tried" if totals.first_pass is None else f"{totals.first_pass:.1%}"
+    counts = [("passed", totals.passed), ("failed", totals.failed), ("skipped or not reached", totals.skipped)]
+    told = [(what, str(count)) for what, count in counts]
+    told += [("first-pass yield", share), ("seconds in all", f"{totals.seconds:.1f}")]
+    return told + [(f"seconds of {name}, mean", f"{seconds:.2f}") for name, seconds in totals.steps.items()]
+
+
+def _for_people(row: Sequence[str]) -> list[str]:
+    """The cells of a row with the time of day here; nothing where the board was not reached."""
+    cells = dict(zip(_HEAD, row, strict=True))
+    tried = bool(cells["time"])
+    cells["first_pass"] = ("yes" if cells["first_pass"] == "true" else "no") if tried else ""
+    cells["seconds"] = f"{float(cells['seconds']):.1f}" if tried else ""
+    if tried:
+        cells["time"] = datetime.fromisoformat(cells["time"]).astimezone().isoformat(sep=" ", timespec="seconds")
+    return list(cells.values())

@@ -18,6 +18,7 @@ from typing import Final
 
 from teds_provision.errors import BadData, TedsProvisionError
 from teds_provision.files import read_limited
+from teds_provision.station.label import read_label
 from teds_provision.station.station import Station
 from teds_provision.steps.order import BuildOrder, Prepared, prepare
 
@@ -25,6 +26,7 @@ MAX_SHEET_OCTETS: Final = 4 << 20
 MAX_ROWS: Final = 10_000
 COLUMNS: Final = ("uuid", "name", "profile", "calibration", "fingerprint")
 _SHOWN: Final = 20
+_DELIMITERS: Final = ",;\t"  # of equals the first
 _UUID = re.compile("[0-9a-f]{20}")
 _FINGERPRINT = re.compile("[0-9a-f]{32,64}")
 
@@ -45,6 +47,14 @@ class Row:
         """Whether the next board that nobody else is meant by takes this row."""
         return self.uuid is None and self.fingerprint is None
 
+    @property
+    def lacks_calibration(self) -> bool:
+        """Whether the type asks for a calibration and the row brings none; its board may have one from before."""
+        profile = self.prepared.profile
+        if profile is None or self.prepared.calibrations is not None:
+            return False
+        return any(channel.calibration.required for channel in profile.channels)
+
     def means(self, uuid: bytes, fingerprint: str) -> bool:
         """Whether this row names that board; a UUID with another key is for the pin to refuse."""
         if self.uuid is not None:
@@ -59,6 +69,17 @@ class Sheet:
     path: Path
     rows: tuple[Row, ...]
 
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """What a person should know before the first board, once for all rows of which it is true."""
+        found: dict[str, list[int]] = {}
+        for row in self.rows:
+            for warning in row.prepared.warnings:
+                found.setdefault(warning, []).append(row.number)
+            if row.lacks_calibration:
+                found.setdefault("the type asks for a calibration, and none is named.", []).append(row.number)
+        return tuple(f"Row{'s' if len(rows) > 1 else ''} {_numbers(rows)}: {why}" for why, rows in found.items())
+
 
 def read_sheet(station: Station, path: Path, order: BuildOrder) -> Sheet:
     """Read a sheet, and read, fit and guard all that it names; ``order`` is what rows get that leave it out.
@@ -68,33 +89,42 @@ def read_sheet(station: Station, path: Path, order: BuildOrder) -> Sheet:
     reading = _Reading(station, path, order)
     reading.read(read_limited(path, MAX_SHEET_OCTETS, "sheet of boards"))
     if reading.mistakes:
-        shown = "; ".join(reading.mistakes[:_SHOWN])
-        more = f"; and {len(reading.mistakes) - _SHOWN} more" if len(reading.mistakes) > _SHOWN else ""
+        mistakes = [f"{path.name}:{_numbers(lines)}: {why}" for why, lines in reading.mistakes.items()]
+        shown = "; ".join(mistakes[:_SHOWN])
+        more = f"; and {len(mistakes) - _SHOWN} more" if len(mistakes) > _SHOWN else ""
         raise BadData(f"{shown}{more}.", hint="Nothing was provisioned. Mend the sheet and run the same command again.")
     if not reading.rows:
         raise BadData(f"{path} has no row.", hint=f"A header ({', '.join(COLUMNS)}) and a line per board.")
     return Sheet(path, tuple(reading.rows))
 
 
+def _numbers(numbers: Sequence[int]) -> str:
+    """``2, 9, 16``; of many the first few, and how many more."""
+    more = f" and {len(numbers) - _SHOWN} more" if len(numbers) > _SHOWN else ""
+    return f"{', '.join(map(str, numbers[:_SHOWN]))}{more}"
+
+
 class _Reading:
     def __init__(self, station: Station, path: Path, order: BuildOrder) -> None:
         self.station, self.path, self.order = station, path, order
         self.rows: list[Row] = []
-        self.mistakes: list[str] = []
+        self.mistakes: dict[str, list[int]] = {}
+        self.count = 0
         self._seen: dict[tuple[str, str], int] = {}
         self._prepared: dict[BuildOrder, Prepared | str] = {}
 
     def wrong(self, line: int, why: str) -> None:
-        self.mistakes.append(f"{self.path.name}:{line}: {why}")
+        self.mistakes.setdefault(why, []).append(line)
+        self.count += 1
 
     def read(self, octets: bytes) -> None:
         try:
             text = octets.decode("utf-8-sig")
-        except UnicodeDecodeError:
-            self.wrong(1 + octets[:4096].count(b"\n"), "it is not UTF-8")
+        except UnicodeDecodeError as error:
+            self.wrong(1 + octets[: error.start].count(b"\n"), "it is not UTF-8 (a spreadsheet calls it: CSV UTF-8)")
             return
         first = text.partition("\n")[0]
-        delimiter = ";" if first.count(";") > first.count(",") else ","
+        delimiter = max(_DELIMITERS, key=first.count)
         table = csv.reader(io.StringIO(text, newline=""), delimiter=delimiter, strict=True)
         try:
             header = [cell.strip().lower() for cell in next(table, [])]
@@ -119,10 +149,11 @@ class _Reading:
         return not self.mistakes
 
     def _row(self, line: int, header: Sequence[str], cells: Sequence[str]) -> None:
-        before = len(self.mistakes)
+        before = self.count
         if len(cells) > len(header):
             self.wrong(line, f"{len(cells)} cells under {len(header)} columns")
         values = dict(zip(header, cells, strict=False))
+        self._take_label(line, values)
         uuid = self._digits(line, "uuid", values.get("uuid", ""), _UUID, "20 hex digits")
         pin = self._digits(line, "fingerprint", values.get("fingerprint", ""), _FINGERPRINT, "32 to 64 hex digits")
         prepared = self._order(line, values)
@@ -130,10 +161,23 @@ class _Reading:
             self._once(line, what, value or "")
         if uuid is not None and prepared is not None and prepared.order.name is not None:
             self._name_is_free(line, bytes.fromhex(uuid), prepared.order.name)
-        if len(self.mistakes) == before and prepared is not None:
+        if self.count == before and prepared is not None:
             digest = hashlib.sha256("\0".join(cells).encode()).hexdigest()
             number = len(self.rows) + 1
             self.rows.append(Row(number, line, bytes.fromhex(uuid) if uuid else None, pin, prepared, digest))
+
+    def _take_label(self, line: int, values: dict[str, str]) -> None:
+        """A label that was scanned into the cell of UUID or fingerprint says both; another cell may not contradict."""
+        for name in ("uuid", "fingerprint"):
+            label = read_label(values.get(name, ""))
+            if label is None:
+                continue
+            said = {"uuid": label[0].hex(), "fingerprint": label[1]}
+            other = "uuid" if name == "fingerprint" else "fingerprint"
+            digits = re.sub(r"[\s:-]", "", values.get(other, "")).lower().removeprefix("0x")
+            if digits and read_label(values[other]) is None and not said[other].startswith(digits):
+                self.wrong(line, f"{other}: {values[other][:48]!a}, and the label in {name} says {said[other]}")
+            values.update(said)
 
     def _digits(self, line: int, what: str, text: str, form: re.Pattern[str], rule: str) -> str | None:
         if not text:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import gc
 import multiprocessing
 import os
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Final
@@ -19,7 +19,7 @@ from teds_provision.steps.verify import Check, Verified, require_authentic, veri
 from teds_provision.teds.guard.guard import check_calibration
 from teds_provision.teds.image import Image
 
-ENDING: Final = "*.json"
+ENDING: Final = ".json"
 _FEW: Final = 50
 """So many are judged sooner than another process is ready."""
 _CHUNK: Final = 64
@@ -61,13 +61,23 @@ class Totals:
         self.files += 1
         word = verdict.verdict or "unreadable"
         self.verdicts[word] = self.verdicts.get(word, 0) + 1
-        if _WORST.index(verdict.exit_code) > _WORST.index(self.exit_code):
-            self.exit_code = verdict.exit_code
+        if verdict.exit_code:
+            self.exit_code = max(self.exit_code, verdict.exit_code, key=_WORST.index)
+
+    def join(self, others: Totals) -> None:
+        """Count in what was counted elsewhere."""
+        self.files += others.files
+        for word, count in others.verdicts.items():
+            self.verdicts[word] = self.verdicts.get(word, 0) + count
+        self.exit_code = max(self.exit_code, others.exit_code, key=_WORST.index)
 
     def to_json(self) -> dict[str, object]:
         """The last line."""
         return {"totals": {"files": self.files, **dict(sorted(self.verdicts.items()))}}
 
+
+Tell = Callable[[FileVerdict], str]
+"""The line of one file, as it is shown; called in whichever process judged it."""
 
 # From good to bad: a harmful calibration, a file that is not there or holds no image, one that is not authentic.
 _WORST: Final = (0, 6, 7, 3, 8, 1, 4)
@@ -81,42 +91,72 @@ def image_files(paths: Sequence[Path]) -> list[Path]:
     found: list[Path] = []
     for path in paths:
         if path.is_dir():
-            inside = sorted(file for file in path.rglob(ENDING) if file.is_file())
+            inside = sorted(_below(path), key=lambda file: file.split(os.sep))
             if not inside:
-                raise NotFound(f"There is no image ({ENDING}) in the folder {path}.")
-            found += inside
+                raise NotFound(f"There is no image (*{ENDING}) in the folder {path}.")
+            found += map(Path, inside)
         else:
             found.append(path)
     return list(dict.fromkeys(found))
 
 
-def verify_files(station: Station, files: Sequence[Path], *, processes: int | None = None) -> Iterator[FileVerdict]:
-    """Judge every file, in order; a fault of one is its verdict and stops no other.
+def _below(folder: Path) -> Iterator[str]:
+    """The images in a folder and its folders; as text, which costs half of what paths do where there are thousands."""
+    for place, _, names in os.walk(folder):
+        files = (os.path.join(place, name) for name in names if name.endswith(ENDING))
+        yield from filter(os.path.isfile, files)
 
-    More than a few files are shared among ``processes`` (as many as there are cores).
+
+def verify_files(
+    station: Station, files: Sequence[Path], tell: Tell, *, processes: int | None = None
+) -> Iterator[tuple[list[str], Totals]]:
+    """Judge every file, in order, some at a time: what ``tell`` says of each, and their totals.
+
+    A fault of one is its verdict and stops no other. More than a few files are shared among ``processes`` (as many as
+    there are cores), which tell of them too: sentences are quicker sent than verdicts with all their checks.
     """
     workers = min(processes or len(os.sched_getaffinity(0)), (len(files) + _CHUNK - 1) // _CHUNK)
-    judging = remember(station)
+    work = _Work(remember(station), tell, files)
     if len(files) <= _FEW or workers <= 1:
-        yield from (_judged(judging, path) for path in files)
+        yield from (work.done(range(at, at + 1)) for at in range(len(files)))
         return
+    yield work.done(range(1))  # what is loaded late is there before there are more processes
+    size = min(_CHUNK, max(1, (len(files) - 1) // (4 * workers)))
     context = multiprocessing.get_context("fork")  # what is remembered is simply there
-    with context.Pool(workers, initializer=_begin, initargs=(judging,)) as pool:
-        yield from pool.imap(_judge, files, chunksize=min(_CHUNK, max(1, len(files) // (4 * workers))))
+    with context.Pool(workers, initializer=_begin, initargs=(work,)) as pool:
+        yield from pool.imap(_done, (range(at, min(at + size, len(files))) for at in range(1, len(files), size)))
 
 
-_judging: Judging | None = None
+@dataclass(frozen=True)
+class _Work:
+    """What a process needs to judge files and to tell of them."""
+
+    judging: Judging
+    tell: Tell
+    files: Sequence[Path]
+
+    def done(self, places: range) -> tuple[list[str], Totals]:
+        """Judge the files at these places of the list, which every process has."""
+        lines, totals = [], Totals()
+        for place in places:
+            found = _judged(self.judging, self.files[place])
+            totals.add(found)
+            lines.append(self.tell(found))
+        return lines, totals
 
 
-def _begin(judging: Judging) -> None:
-    global _judging  # noqa: PLW0603 - set once, in a process of its own
-    _judging = judging
+_work: _Work | None = None
+
+
+def _begin(work: _Work) -> None:
+    global _work  # noqa: PLW0603 - set once, in a process of its own
+    _work = work
     gc.freeze()  # the whole program is there before the first image: not looked through again for each few of them
 
 
-def _judge(path: Path) -> FileVerdict:
-    assert _judging is not None
-    return _judged(_judging, path)
+def _done(places: range) -> tuple[list[str], Totals]:
+    assert _work is not None
+    return _work.done(places)
 
 
 def _judged(judging: Judging, path: Path) -> FileVerdict:

@@ -18,8 +18,7 @@ from teds_provision.steps.sign import known_image
 from teds_provision.steps.verify import Verified, require_authentic, session, unproven, verify_image
 from teds_provision.steps.verify_node import look_at_node, open_or_say_why, vouched
 from teds_provision.steps.visits.visit import at_node, node_or_image, read_image_file
-from teds_provision.steps.write import Written, write
-from teds_provision.talk.charge import Low, wait_for_charge
+from teds_provision.steps.write import Low, Written, wait_for_charge, write
 from teds_provision.talk.conversation import HEARD
 from teds_provision.talk.progress import Reporter
 from teds_provision.teds.image import Image

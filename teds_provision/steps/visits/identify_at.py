@@ -6,7 +6,8 @@ import threading
 from collections.abc import Iterator
 from dataclasses import dataclass
 
-from teds_provision.links import LinkSettings
+from teds_provision.errors import TedsProvisionError
+from teds_provision.links import LinkSettings, Notice
 from teds_provision.protocol.messages.identity import Identity
 from teds_provision.station.station import Station
 from teds_provision.steps.identify import Identified, describe, identify
@@ -41,16 +42,30 @@ def identify_at(
 ) -> Iterator[Came[Found]]:
     """Identify who is there, or (``watch``) whoever comes until ``stop``; ``add`` whitelists what proves its key.
 
-    Without ``watch`` an error is raised, with it it ends one node only.
+    With ``watch`` an error ends one node only. Without it that is so where another node was identified, and it is told
+    as a notice; else the first error is raised.
     """
     if add:
         station.unlock()  # before a node lies there: a pin is sealed by the vault
     if watch:
         yield from watch_nodes(links, lambda node: _one(station, node, add), reporter, stop or threading.Event())
         return
+    first: TedsProvisionError | None = None
+    identified = False
     with meet_everyone(links, reporter) as nodes:
         for node in nodes:
-            yield Came(node.uuid, links.places[0], 0.0, _one(station, node, add))
+            try:
+                found = _one(station, node, add)
+            except TedsProvisionError as error:
+                first = first or error
+                if len(nodes) > 1:
+                    text = f"Node {node.uuid.hex()} was not identified: {error.message}"
+                    reporter.notice(Notice("unfinished", text, uuid=node.uuid))
+                continue
+            identified = True
+            yield Came(node.uuid, links.places[0], 0.0, found)
+    if first is not None and not identified:
+        raise first
 
 
 def _one(station: Station, node: Conversation, add: bool) -> Found:

@@ -63,6 +63,10 @@ def node_or_image(station: Station, text: str) -> bytes | Image:
     try:
         return station.nodes.resolve(text)
     except NotFound:
+        if path.is_dir():
+            raise NotFound(f"{text} is a folder, and no node is known by that name.") from None
+        if path.exists():
+            raise NotFound(f"{text} is no regular file, and no node is known by that name.") from None
         if path.suffix or len(path.parts) > 1:
             raise NotFound(f"There is no file {text}, and no node is known by that name.") from None
         raise

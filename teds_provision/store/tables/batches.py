@@ -3,23 +3,39 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, fields
-from typing import Any
+from functools import lru_cache
+from itertools import islice
+from operator import attrgetter
+from typing import Any, Final, TypeVar
 
 from teds_provision.store.database import Database
 from teds_provision.store.records import Holder, KeyRecord, NodeRecord, Tombstone, WhitelistEntry
 
+PAGE: Final = 500
+"""Rows that are looked up, made or written at once."""
+Value = TypeVar("Value")
+
 _NODE_FIELDS = tuple(column.name for column in fields(NodeRecord))
-_FIELDS: dict[type[object], tuple[str, ...]] = {
-    kind: tuple(column.name for column in fields(kind)) for kind in (KeyRecord, WhitelistEntry, Holder, Tombstone)
-}
+_GROUPS, _SEAL = _NODE_FIELDS.index("groups"), _NODE_FIELDS.index("point_mac")
+_node_values = attrgetter(*_NODE_FIELDS)
+_key_values, _entry_values, _holder_values, _tombstone_values = (
+    attrgetter(*(column.name for column in fields(kind))) for kind in (KeyRecord, WhitelistEntry, Holder, Tombstone)
+)
 _NODES = f"INSERT OR REPLACE INTO nodes({', '.join(_NODE_FIELDS)}) VALUES({', '.join('?' * len(_NODE_FIELDS))})"
 _KEYS = (
     "INSERT INTO keys(uuid, epoch, key_id, state, slot, wrapped, source, created) VALUES(?,?,?,?,?,?,?,?)"
     " ON CONFLICT(uuid, key_id) DO NOTHING"
 )
 _SLOTS = "INSERT INTO key_slots VALUES(?, ?) ON CONFLICT(uuid) DO UPDATE SET last = max(last, excluded.last)"
+
+
+def pages(values: Iterable[Value], length: int = PAGE) -> Iterator[list[Value]]:
+    """Divide many values into pages, as many as one statement looks up at once."""
+    rest = iter(values)
+    while page := list(islice(rest, length)):
+        yield page
 
 
 @dataclass(frozen=True)
@@ -40,32 +56,43 @@ class BulkTables:
 
     _database: Database
 
-    def slots(self) -> dict[bytes, int]:
-        """Return the last slot given to each node's keys."""
-        return {bytes(uuid): int(last) for uuid, last in self._database.execute("SELECT uuid, last FROM key_slots")}
+    def slots_of(self, uuids: Sequence[bytes]) -> dict[bytes, int]:
+        """Return the last slot given to the keys of each of these nodes (a page of them)."""
+        places = ", ".join("?" * len(uuids))
+        rows = self._database.execute(f"SELECT uuid, last FROM key_slots WHERE uuid IN ({places})", uuids)
+        return {bytes(uuid): int(last) for uuid, last in rows}
 
-    def put_batch(self, batch: Batch) -> None:
-        """Add or replace all of it, or nothing; raises StoreFailure."""
+    def put_batch(
+        self,
+        batch: Batch,
+        seal_node: Callable[[NodeRecord], bytes | None] = lambda node: node.point_mac,
+        seal_entry: Callable[[WhitelistEntry], bytes | None] = lambda entry: entry.mac,
+    ) -> None:
+        """Add or replace all of it, or nothing, with seals made as it is written; raises StoreFailure."""
         many = self._database.execute_many
-        with self._database.transaction():
-            many(_NODES, (_node_row(record) for record in batch.nodes))
+        with self._database.together():
+            many(_NODES, (_node_row(record, seal_node(record)) for record in batch.nodes))
             many(
-                "INSERT OR REPLACE INTO whitelist VALUES(?, ?, ?, ?, ?, ?)", (_row(entry) for entry in batch.whitelist)
+                "INSERT OR REPLACE INTO whitelist VALUES(?, ?, ?, ?, ?, ?)",
+                ((*_entry_values(entry)[:-1], seal_entry(entry)) for entry in batch.whitelist),
             )
             many(_SLOTS, ((key.uuid, key.slot) for key in batch.keys))
-            many(_KEYS, (_row(key)[:-1] for key in batch.keys))
-            many("INSERT OR REPLACE INTO holders VALUES(?, ?, ?, ?)", (_row(holder) for holder in batch.holders))
-            many("INSERT OR REPLACE INTO tombstones VALUES(?, ?, ?, ?)", (_row(one) for one in batch.tombstones))
+            many(_KEYS, (_key_values(key)[:-1] for key in batch.keys))
+            many("INSERT OR REPLACE INTO holders VALUES(?, ?, ?, ?)", map(_holder_values, batch.holders))
+            many("INSERT OR REPLACE INTO tombstones VALUES(?, ?, ?, ?)", map(_tombstone_values, batch.tombstones))
 
     def remove_tombstones(self, uuids: Iterable[bytes]) -> None:
         """Take the tombstones of these nodes away."""
         self._database.execute_many("DELETE FROM tombstones WHERE uuid = ?", ((uuid,) for uuid in uuids))
 
 
-def _row(record: KeyRecord | WhitelistEntry | Holder | Tombstone) -> tuple[Any, ...]:
-    return tuple([getattr(record, name) for name in _FIELDS[type(record)]])
+@lru_cache(maxsize=256)
+def _listed(groups: tuple[str, ...]) -> str:
+    return json.dumps(groups)
 
 
-def _node_row(record: NodeRecord) -> tuple[Any, ...]:
-    groups = json.dumps(list(record.groups))
-    return tuple(groups if name == "groups" else getattr(record, name) for name in _NODE_FIELDS)
+def _node_row(record: NodeRecord, mac: bytes | None) -> list[Any]:
+    row = list(_node_values(record))
+    row[_GROUPS] = _listed(record.groups)
+    row[_SEAL] = mac
+    return row

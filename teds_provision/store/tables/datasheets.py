@@ -55,7 +55,7 @@ class DatasheetTables:
         Returns whether it was new. The oldest go when there are more than ten older ones.
         """
         row = datasheet_row(image, profile, utc_now())
-        with self._database.transaction():
+        with self._database.together():
             last = self._database.one(
                 "SELECT digest FROM datasheets WHERE uuid = ? ORDER BY row DESC LIMIT 1", (image.uuid,)
             )
@@ -71,7 +71,7 @@ class DatasheetTables:
 
     def put_history(self, records: list[DatasheetRecord]) -> None:
         """Keep datasheets of a node, oldest first, in place of those that are there (for restore)."""
-        with self._database.transaction():
+        with self._database.together():
             for uuid in {record.uuid for record in records}:
                 self._database.execute("DELETE FROM datasheets WHERE uuid = ?", (uuid,))
             for record in records:

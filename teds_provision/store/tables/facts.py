@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import fields
+from operator import attrgetter
 from typing import Any
 
 from teds_provision.store.database import Database
@@ -11,6 +12,8 @@ from teds_provision.store.records import Facts, Marks
 
 _FACTS = ", ".join(column.name for column in fields(Facts))
 _MARKS = ", ".join(column.name for column in fields(Marks))
+_NONE = Marks()
+_values = attrgetter(*(column.name for column in fields(Marks)))
 
 
 class FactTables:
@@ -18,12 +21,19 @@ class FactTables:
 
     _database: Database
 
+    _seen: tuple[tuple[int, int], Facts | None] | None = None
+    """The facts as they were read last, and the state of the file then: every step asks for them again and again."""
+
     def facts(self) -> Facts | None:
         """Return what the station knows of itself, None before init made anything."""
-        return self._database.read_one(Facts, f"SELECT {_FACTS} FROM station")
+        state = self._database.state()
+        if self._seen is None or self._seen[0] != state:
+            self._seen = state, self._database.read_one(Facts, f"SELECT {_FACTS} FROM station")
+        return self._seen[1]
 
     def put_facts(self, facts: Facts) -> None:
         """Keep the station's facts, all of them."""
+        self._seen = None
         values = tuple(getattr(facts, column.name) for column in fields(Facts))
         marks = ", ".join("?" * len(values))
         self._database.execute(f"INSERT OR REPLACE INTO station(one, {_FACTS}) VALUES(1, {marks})", values)
@@ -50,6 +60,11 @@ class FactTables:
         """Return the marks on a node; none of them is set on one without."""
         return self._database.read_one(Marks, f"SELECT {_MARKS} FROM marks WHERE uuid = ?", (uuid,)) or Marks()
 
+    def marks_of(self, uuids: Sequence[bytes]) -> dict[bytes, Marks]:
+        """Return the marks on those of these nodes (a page of them) that have one."""
+        places = ", ".join("?" * len(uuids))
+        return dict(self._database.read(_marked, f"SELECT uuid, {_MARKS} FROM marks WHERE uuid IN ({places})", uuids))
+
     def all_marks(self) -> dict[bytes, Marks]:
         """Return the marks on every node that has one."""
         return dict(self._database.read(_marked, f"SELECT uuid, {_MARKS} FROM marks"))
@@ -57,14 +72,11 @@ class FactTables:
     def put_marks(self, marks: Mapping[bytes, Marks]) -> None:
         """Keep the marks on nodes, in place of those that are there; a node without any has no row."""
         places = ", ".join("?" * (len(fields(Marks)) + 1))
-        rows = [(uuid, *_values(mark)) for uuid, mark in marks.items() if mark != Marks()]
-        with self._database.transaction():
-            self._database.execute_many("DELETE FROM marks WHERE uuid = ?", ((uuid,) for uuid in marks))
-            self._database.execute_many(f"INSERT INTO marks(uuid, {_MARKS}) VALUES({places})", rows)
-
-
-def _values(marks: Marks) -> tuple[Any, ...]:
-    return tuple(getattr(marks, column.name) for column in fields(Marks))
+        rows = ((uuid, *_values(mark)) for uuid, mark in marks.items() if mark != _NONE)
+        without = [(uuid,) for uuid, mark in marks.items() if mark == _NONE]
+        with self._database.together():
+            self._database.execute_many("DELETE FROM marks WHERE uuid = ?", without)
+            self._database.execute_many(f"INSERT OR REPLACE INTO marks(uuid, {_MARKS}) VALUES({places})", rows)
 
 
 def _marked(uuid: bytes, *row: Any) -> tuple[bytes, Marks]:

@@ -21,14 +21,14 @@ class HandoverTables:
 
     def trusted(self) -> list[TrustRecord]:
         """Return every trusted station and CA, by name."""
-        return self._database.read(TrustRecord, "SELECT * FROM trust ORDER BY name")
+        return list(self._database.recall(TrustRecord, "SELECT * FROM trust ORDER BY name"))
 
     def put_trust(self, record: TrustRecord) -> None:
         """Trust a key under a name; the same key and role under another name is renamed.
 
         Raises PolicyRefused if the name stands for another key or role: it must be removed first.
         """
-        with self._database.transaction():
+        with self._database.together():
             row = self._database.one("SELECT fingerprint, role FROM trust WHERE name = ?", (record.name,))
             if row and row != (record.fingerprint, record.role):
                 raise PolicyRefused(
@@ -49,7 +49,7 @@ class HandoverTables:
         Raises UsageFailure if the digits fit several keys.
         """
         digits = name_or_fingerprint.strip().lower()
-        with self._database.transaction():
+        with self._database.together():
             if self._database.change("DELETE FROM trust WHERE name = ?", (name_or_fingerprint,)):
                 return True
             if not re.fullmatch(f"[0-9a-f]{{{_MIN_FINGERPRINT_PREFIX},64}}", digits):
@@ -110,8 +110,8 @@ class HandoverTables:
 
     def holders(self, uuid: bytes | None = None) -> list[Holder]:
         """Return who else holds keys: of this node, or of all."""
-        statement = "SELECT * FROM holders WHERE ? IS NULL OR uuid = ? ORDER BY uuid, since, fingerprint"
-        return self._database.read(Holder, statement, (uuid, uuid))
+        which, values = ("", ()) if uuid is None else ("WHERE uuid = ?", (uuid,))  # by the index: there may be 100,000
+        return self._database.read(Holder, f"SELECT * FROM holders {which} ORDER BY uuid, since, fingerprint", values)
 
     def put_holder(self, holder: Holder) -> None:
         """Note that another station holds a key of this node."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
 from teds_provision.errors import NotFound
@@ -20,7 +20,12 @@ class KeyTables:
     def keys(self, uuid: bytes) -> list[KeyRecord]:
         """Return the keys of a node in the order to try them: newest pending first, the active one last."""
         statement = f"SELECT {_COLUMNS} FROM keys WHERE uuid = ? ORDER BY state = 'active', seq DESC"
-        return self._database.read(_key, statement, (uuid,))
+        return list(self._database.recall(_key, statement, (uuid,)))
+
+    def keys_of(self, uuids: Sequence[bytes]) -> list[KeyRecord]:
+        """Return the keys of these nodes (a page of them), in the order they came."""
+        places = ", ".join("?" * len(uuids))
+        return self._database.read(_key, f"SELECT {_COLUMNS} FROM keys WHERE uuid IN ({places}) ORDER BY seq", uuids)
 
     def next_slot(self, uuid: bytes) -> int:
         """Return a slot number that this node never had; to be asked before wrapping a new key."""
@@ -34,7 +39,7 @@ class KeyTables:
 
         ``record.seq`` is ignored, the store gives the next. Raises StoreFailure, also for a second active key.
         """
-        with self._database.transaction():
+        with self._database.together():
             self._database.execute(
                 "INSERT INTO key_slots VALUES(?, ?) ON CONFLICT(uuid) DO UPDATE SET last = max(last, excluded.last)",
                 (record.uuid, record.slot),
@@ -56,7 +61,7 @@ class KeyTables:
 
     def activate_key(self, uuid: bytes, key_id: str) -> None:
         """Make this key the active one; another active one goes, pending ones stay. Raises NotFound."""
-        with self._database.transaction():
+        with self._database.together():
             if not self._database.one("SELECT 1 FROM keys WHERE uuid = ? AND key_id = ?", (uuid, key_id)):
                 raise NotFound(f"The store has no key {key_id} of node {uuid.hex()}.")
             self._database.execute(
@@ -82,17 +87,27 @@ class KeyTables:
         """Give every key of every node, in the order they came, a page at a time."""
         return self._database.stream(_key, f"SELECT {_COLUMNS} FROM keys WHERE seq > ? ORDER BY seq LIMIT ?")
 
+    def each_key_name(self) -> Iterator[tuple[bytes, str, int, str]]:
+        """Give UUID, key id, epoch and state of every key, in the order they came, a page at a time."""
+        statement = "SELECT seq, uuid, key_id, epoch, state FROM keys WHERE seq > ? ORDER BY seq LIMIT ?"
+        return self._database.stream(_key_name, statement)
+
     def replace_keys(self, rewrap: Callable[[KeyRecord], bytes]) -> int:
         """Wrap every key anew (a change of the master key), all or none; returns how many.
 
         ``rewrap`` gets each record and returns the new wrapped octets; whatever it raises leaves all as it was.
         """
         count = 0
-        with self._database.transaction():
+        with self._database.together():
             for record in self.all_keys():
                 self._database.execute("UPDATE keys SET wrapped = ? WHERE seq = ?", (rewrap(record), record.seq))
                 count += 1
         return count
+
+
+def _key_name(seq: int, *row: Any) -> tuple[bytes, str, int, str]:
+    uuid, key_id, epoch, state = row
+    return uuid, key_id, epoch, state
 
 
 def _key(seq: int, *row: Any) -> KeyRecord:

@@ -35,14 +35,9 @@ class MeasurementTables:
         members = self._database.execute("SELECT uuid FROM group_members WHERE name = ? ORDER BY uuid", (name,))
         return Group(name, tuple(bytes(uuid) for (uuid,) in members), str(row[0]))
 
-    def groups_of(self, uuid: bytes) -> list[str]:
-        """Return the names of the groups that a node is in."""
-        rows = self._database.execute("SELECT name FROM group_members WHERE uuid = ? ORDER BY name", (uuid,))
-        return [str(name) for (name,) in rows]
-
     def put_group(self, group: Group) -> None:
         """Add a group, or replace its members."""
-        with self._database.transaction():
+        with self._database.together():
             self._database.execute(
                 "INSERT INTO groups VALUES(?, ?) ON CONFLICT(name) DO NOTHING", (group.name, group.created)
             )
@@ -93,6 +88,9 @@ class MeasurementTables:
             int(one.lasting),
             one.ends,
             one.created,
+            int(one.test_pattern),
+            int(one.unsigned),
+            one.require,
         )
         marks = ", ".join("?" * len(values))
         self._database.execute(f"INSERT OR REPLACE INTO measurements VALUES({marks})", values)
@@ -137,4 +135,6 @@ def _measurement(*row: Any) -> Measurement:
         actuators=bool(one.actuators),
         sinks=tuple(json.loads(row[10])),
         lasting=bool(one.lasting),
+        test_pattern=bool(one.test_pattern),
+        unsigned=bool(one.unsigned),
     )

@@ -4,20 +4,23 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import fields
+from functools import lru_cache
 from typing import Any
 
 from teds_provision.errors import NotFound, OtherKey, UsageFailure
 from teds_provision.store.database import Database
-from teds_provision.store.records import UUID_OCTETS, NodeRecord, WhitelistEntry
+from teds_provision.store.records import UUID_OCTETS, NodeRecord, Shown, WhitelistEntry
 
 _UUID_DIGITS = 2 * UUID_OCTETS
 _MIN_PREFIX = 4
 _PAGE = 500
 _SHOWN_CANDIDATES = 5
-_GROUPS = next(place for place, column in enumerate(fields(NodeRecord)) if column.name == "groups")
-_NODE_COLUMNS = ", ".join(column.name for column in fields(NodeRecord))
+_NODE_FIELDS = tuple(column.name for column in fields(NodeRecord))
+_GROUPS = _NODE_FIELDS.index("groups")
+_NODE_COLUMNS = ", ".join(_NODE_FIELDS)
+_REPLACE_NODE = f"INSERT OR REPLACE INTO nodes({_NODE_COLUMNS}) VALUES({', '.join('?' * len(_NODE_FIELDS))})"
 
 
 class NodeTables:
@@ -52,12 +55,12 @@ class NodeTables:
     def put_whitelist_entries(self, entries: Iterable[WhitelistEntry]) -> None:
         """Add or replace many entries at once, all or none."""
         rows = ((e.uuid, e.fingerprint, e.added, e.assurance, e.name, e.mac) for e in entries)
-        with self._database.transaction():
+        with self._database.together():
             self._database.execute_many("INSERT OR REPLACE INTO whitelist VALUES(?, ?, ?, ?, ?, ?)", rows)
 
     def put_seals(self, entries: Mapping[bytes, bytes | None], points: Mapping[bytes, bytes]) -> None:
         """Put the seals of whitelist entries and of nodes' identity keys beside them, by UUID."""
-        with self._database.transaction():
+        with self._database.together():
             many = self._database.execute_many
             many("UPDATE whitelist SET mac = ? WHERE uuid = ?", ((mac, uuid) for uuid, mac in entries.items()))
             many("UPDATE nodes SET point_mac = ? WHERE uuid = ?", ((mac, uuid) for uuid, mac in points.items()))
@@ -70,6 +73,32 @@ class NodeTables:
         """Return all nodes, by UUID."""
         return self._database.read(_node, f"SELECT {_NODE_COLUMNS} FROM nodes ORDER BY uuid")
 
+    def each_shown(self) -> Iterator[Shown]:
+        """Give identity key and verdict of all nodes, by UUID, a page at a time."""
+        after = b""
+        statement = "SELECT uuid, point, point_mac, verdict FROM nodes WHERE uuid > ? ORDER BY uuid LIMIT ?"
+        while page := self._database.read(Shown, statement, (after, _PAGE)):
+            yield from page
+            after = page[-1].uuid
+
+    def nodes_of(self, uuids: Sequence[bytes]) -> dict[bytes, NodeRecord]:
+        """Return what is known of these nodes (a page of them), by UUID."""
+        places = ", ".join("?" * len(uuids))
+        statement = f"SELECT {_NODE_COLUMNS} FROM nodes WHERE uuid IN ({places})"
+        return {record.uuid: record for record in self._database.read(_node, statement, uuids)}
+
+    def whitelist_of(self, uuids: Sequence[bytes]) -> dict[bytes, WhitelistEntry]:
+        """Return the entries of these nodes (a page of them), by UUID."""
+        places = ", ".join("?" * len(uuids))
+        statement = f"SELECT * FROM whitelist WHERE uuid IN ({places})"
+        return {entry.uuid: entry for entry in self._database.read(WhitelistEntry, statement, uuids)}
+
+    def bearers_of(self, names: Sequence[str]) -> dict[str, bytes]:
+        """Return who has each of these names (a page of them), in the nodes or in the whitelist."""
+        places = ", ".join("?" * len(names))
+        found = (f"SELECT name, uuid FROM {table} WHERE name IN ({places})" for table in ("whitelist", "nodes"))
+        return {name: bytes(uuid) for statement in found for name, uuid in self._database.execute(statement, names)}
+
     def node(self, uuid: bytes) -> NodeRecord | None:
         """Return what is known of this node."""
         return self._database.read_one(_node, f"SELECT {_NODE_COLUMNS} FROM nodes WHERE uuid = ?", (uuid,))
@@ -79,24 +108,24 @@ class NodeTables:
 
         Raises OtherKey if the record brings another identity key than the stored one.
         """
-        with self._database.transaction():
-            known = self.node(record.uuid)
-            if known and known.point and record.point and known.point != record.point:
-                raise OtherKey(
-                    f"Node {record.uuid.hex()} is known with another identity key than the one it shows now.",
-                    hint="Do not trust this node. If its chip was really replaced, it needs a new UUID.",
-                )
-            values: dict[str, Any] = {column.name: getattr(record, column.name) for column in fields(NodeRecord)}
-            values["groups"] = json.dumps(list(record.groups))
-            if known:
-                if record.point is None:
-                    values["point"], values["point_mac"] = known.point, known.point_mac
-                values["epoch"] = max(record.epoch, known.epoch)
-                values["sequence"] = max(record.sequence, known.sequence)
-            marks = ", ".join("?" * len(values))
-            self._database.execute(
-                f"INSERT OR REPLACE INTO nodes({_NODE_COLUMNS}) VALUES({marks})", tuple(values.values())
+        with self._database.together():
+            self.replace_node(record, self.node(record.uuid))
+
+    def replace_node(self, record: NodeRecord, known: NodeRecord | None) -> None:
+        """As :meth:`put_node`, inside a transaction in which ``known`` was read (None: there is no such node)."""
+        if known and known.point and record.point and known.point != record.point:
+            raise OtherKey(
+                f"Node {record.uuid.hex()} is known with another identity key than the one it shows now.",
+                hint="Do not trust this node. If its chip was really replaced, it needs a new UUID.",
             )
+        values: dict[str, Any] = {name: getattr(record, name) for name in _NODE_FIELDS}
+        values["groups"] = json.dumps(list(record.groups)) if record.groups else "[]"
+        if known:
+            if record.point is None:
+                values["point"], values["point_mac"] = known.point, known.point_mac
+            values["epoch"] = max(record.epoch, known.epoch)
+            values["sequence"] = max(record.sequence, known.sequence)
+        self._database.execute(_REPLACE_NODE, tuple(values.values()))
 
     def set_due(self, uuid: bytes, due: str | None) -> None:
         """Note the day (ISO 8601) on which the first calibration of a node ends, None where none does."""
@@ -156,10 +185,13 @@ class NodeTables:
 
 
 def _node(*row: Any) -> NodeRecord:
-    listed = row[_GROUPS]
-    groups = () if listed == "[]" else tuple(json.loads(listed))  # most nodes are in none, and there may be 100,000
-    values: tuple[Any, ...] = (*row[:_GROUPS], groups, *row[_GROUPS + 1 :])
+    values: tuple[Any, ...] = (*row[:_GROUPS], _groups(row[_GROUPS]), *row[_GROUPS + 1 :])
     return NodeRecord(*values)
+
+
+@lru_cache(maxsize=256)  # nodes may be 100,000, and groups are few
+def _groups(listed: str) -> tuple[str, ...]:
+    return tuple(json.loads(listed))
 
 
 def _by_name(name: str) -> tuple[str, tuple[str, str]]:

@@ -14,8 +14,10 @@ from teds_provision.store.database import Database
 from teds_provision.store.records import UUID_OCTETS
 
 _PAGE = 500
-_KNOWN = """(SELECT uuid FROM nodes UNION SELECT uuid FROM whitelist UNION SELECT uuid FROM keys
-    UNION SELECT uuid FROM tombstones UNION SELECT uuid FROM revocations)"""
+_TABLES = ("nodes", "whitelist", "keys", "tombstones", "revocations")
+_KNOWN = f"({' UNION '.join(f'SELECT uuid FROM {table}' for table in _TABLES)})"
+# table by table: SQLite would put the whole of _KNOWN together before it looks for one
+_IS_KNOWN = " OR ".join(f"EXISTS (SELECT 1 FROM {table} WHERE uuid = ?1)" for table in _TABLES)
 _NAME = "coalesce(n.name, w.name, '')"
 
 
@@ -101,8 +103,8 @@ class OverviewTables:
 
     def is_known(self, uuid: bytes) -> bool:
         """Say whether anything at all is known of a node."""
-        row = self._database.one(f"SELECT 1 FROM {_KNOWN} WHERE uuid = ? LIMIT 1", (uuid,))
-        return row is not None
+        row = self._database.one(f"SELECT {_IS_KNOWN}", (uuid,))
+        return row is not None and bool(row[0])
 
     def named(self, name: str) -> bytes | None:
         """Return the UUID of the one node of exactly this name, None where none or several have it."""

@@ -1,5 +1,7 @@
 """The general structure of every TEDS: Length ‖ data block of tuples ‖ Checksum (teds.md, "Frame, tuples, verdicts").
 
+:func:`shape_of` tells it from a bare data block and from a message, by the first octets alone.
+
 Everything is big-endian. ``Length`` counts the data block and the two checksum octets. The checksum is a plain sum and
 no security measure: it cannot see exchanged octets.
 """
@@ -7,12 +9,17 @@ no security measure: it cannot see exchanged octets.
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import NamedTuple
+from typing import Final, Literal, NamedTuple
+from zlib import adler32
 
 from teds_provision.errors import BadData
 
 TEDSID = 3
+_SUMMED = 256
 MINIMUM_OCTETS = 12  # Length 4, TEDSID tuple 6, Checksum 2
+
+Shape = Literal["framed", "block", "message"]
+_TEDSIDS: Final = (bytes([TEDSID, 4]), bytes([TEDSID, 5]))
 
 
 class RawTuple(NamedTuple):
@@ -25,7 +32,11 @@ class RawTuple(NamedTuple):
 
 def checksum(octets: bytes) -> int:
     """0xFFFF minus the sum of all octets modulo 65536 (Length included, checksum excluded)."""
-    return 0xFFFF - (sum(octets) & 0xFFFF)
+    # The lower half of Adler-32 is 1 plus the sum, modulo 65521, which 256 octets never reach: far quicker than sum().
+    if len(octets) <= _SUMMED:
+        return 0x10000 - (adler32(octets) & 0xFFFF)
+    pieces = [adler32(octets[at : at + _SUMMED]) & 0xFFFF for at in range(0, len(octets), _SUMMED)]
+    return 0xFFFF - (sum(pieces) - len(pieces) & 0xFFFF)
 
 
 def frame(block: bytes) -> bytes:
@@ -83,3 +94,45 @@ def teds_class(block: bytes) -> int | None:
     if block[1] == 5 and len(block) >= 7:
         return block[4]
     return None
+
+
+def shape_of(octets: bytes) -> Shape:
+    """What octets are: a TEDS with Length and checksum, a data block without, or a message around something.
+
+    A data block starts with a TEDSID (03 04 or 03 05). A message is recognised by a length in its header that fits to
+    the octet. Everything else is taken for a framed TEDS, however damaged.
+    """
+    if int.from_bytes(octets[:4], "big") == len(octets) - 4:
+        return "framed"
+    if octets[:2] in _TEDSIDS:
+        return "message" if _is_message(octets) else "block"
+    if octets[4:6] in _TEDSIDS:
+        return "framed"
+    return "message" if _is_message(octets) else "framed"
+
+
+def _is_message(octets: bytes) -> bool:
+    tedsid = octets[:2] in _TEDSIDS
+    if _is_service(octets) and not (tedsid and octets[3]):
+        return True
+    return not tedsid and (_is_command(octets) or _is_reply(octets))
+
+
+def _counts(octets: bytes, at: int) -> bool:
+    """Whether the u16 at ``at`` counts what follows it to the octet."""
+    return len(octets) >= at + 2 and int.from_bytes(octets[at : at + 2], "big") == len(octets) - at - 2
+
+
+def _is_service(octets: bytes) -> bool:
+    """A network service of 2024: type 1 to 9, id, message type 1 to 5, length."""
+    return _counts(octets, 3) and 1 <= octets[0] <= 9 and 1 <= octets[2] <= 5
+
+
+def _is_command(octets: bytes) -> bool:
+    """A command of 2007: channel u16, class 1 to 7 or a maker's, function, length."""
+    return _counts(octets, 4) and octets[3] != 0 and (1 <= octets[2] <= 7 or octets[2] >= 128)
+
+
+def _is_reply(octets: bytes) -> bool:
+    """A reply of 2007: flag 0 or 1, length."""
+    return _counts(octets, 1) and octets[0] <= 1

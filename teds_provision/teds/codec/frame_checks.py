@@ -6,8 +6,7 @@ from typing import Final
 
 from teds_provision.teds.codec.codes import AccessCode
 from teds_provision.teds.codec.frame import MINIMUM_OCTETS, TEDSID, checksum
-from teds_provision.teds.codec.model import Edition, Finding, Severity
-from teds_provision.teds.codec.recognition import MALFORMED_CODES
+from teds_provision.teds.codec.model import MALFORMED_CODES, Edition, Finding, Severity
 from teds_provision.teds.codec.tables import MANUFACTURER, ONLY_2024, Table, table
 
 MAX_OCTETS: Final = 16 << 20

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 from enum import StrEnum
 from fractions import Fraction
@@ -9,6 +10,11 @@ from typing import Final, Literal, NamedTuple
 
 Edition = Literal[2007, 2024]
 Severity = Literal["error", "warning", "note"]
+
+
+FRAME_CODES: Final = frozenset({"frame-length", "frame-checksum", "frame-trailing"})
+MALFORMED_CODES: Final = frozenset({"not-closed", "too-short", "too-large", "too-many"})
+"""Codes of findings that decide the verdict by themselves."""
 
 
 class Verdict(StrEnum):
@@ -22,6 +28,25 @@ class Verdict(StrEnum):
     BLOCK_CLEAN = "block-clean"
     BLOCK_NONCONFORMANT = "block-nonconformant"
     MESSAGE = "message"
+
+    @classmethod
+    def of(cls, framed: bool, findings: Iterable[Finding]) -> Verdict:
+        """Verdict from the errors found; warnings and notes do not count."""
+        frame = content = False
+        for finding in findings:
+            if finding.severity != "error":
+                continue
+            if finding.code in MALFORMED_CODES:
+                return cls.MALFORMED
+            if finding.code in FRAME_CODES:
+                frame = True
+            else:
+                content = True
+        if not framed:
+            return cls.BLOCK_NONCONFORMANT if content else cls.BLOCK_CLEAN
+        if frame:
+            return cls.FRAME_AND_CONTENT_BAD if content else cls.FRAME_BAD
+        return cls.CONTENT_NONCONFORMANT if content else cls.CLEAN
 
 
 @dataclass(frozen=True)

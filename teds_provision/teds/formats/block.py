@@ -42,9 +42,9 @@ def split_run(octets: bytes) -> list[bytes]:
     return pieces
 
 
-def with_class(octets: bytes, channel: int | None = None) -> Block:
+def with_class(octets: bytes) -> Block:
     """Block whose access code is the class that its TEDSID names."""
-    return Block(channel, class_of(octets), octets)
+    return Block(None, class_of(octets), octets)
 
 
 def is_run(blocks: Sequence[Block]) -> bool:

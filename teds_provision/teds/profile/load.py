@@ -6,6 +6,7 @@ import re
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from difflib import get_close_matches
+from functools import cache
 from pathlib import Path
 from typing import Final
 
@@ -29,6 +30,7 @@ class Listed:
     error: str = ""
 
 
+@cache
 def shipped_profiles() -> Path:
     """Folder of the profiles that come with the tool: inside the installed package, or of the checkout."""
     package = Path(__file__).resolve().parents[2]
@@ -78,9 +80,14 @@ def parse_profile(text: str, name: str = "profile") -> Profile:
     return profile
 
 
+def is_profile_name(text: str) -> bool:
+    """Whether ``find_profile`` takes this for a name, looked for in the folders, and never for a path."""
+    return _NAME.match(text) is not None and not text.endswith(".toml")
+
+
 def passed_over(name: str, folders: Sequence[Path]) -> tuple[str, ...]:
     """Sentences about files of that name which were not taken, because a folder before theirs has one."""
-    if _NAME.match(name) is None or name.endswith(".toml"):
+    if not is_profile_name(name):
         return ()
     found = [folder / f"{name}.toml" for folder in folders if (folder / f"{name}.toml").is_file()]
     return tuple(f"{other} was not used: {name} is {found[0]}. Give its path to use it." for other in found[1:])

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
+from functools import lru_cache
 from typing import Final
 
 from teds_provision.errors import BadData
@@ -134,6 +135,8 @@ class Profile:
     texts: tuple[TextProfile, ...] = ()
     abstract: bool = False
     warnings: tuple[str, ...] = field(default=())
+    composed: dict[tuple[object, ...], bytes] = field(init=False, default_factory=dict, repr=False, compare=False)
+    """TEDS that every node of this type has alike, as they were composed for the first one."""
 
     def channel(self, number: int) -> ChannelProfile | None:
         """Channel of that number, None where the type has none."""
@@ -173,8 +176,7 @@ def _build(
     blocks: dict[BlockId, bytes] = {(0, AccessCode.META): compose(AccessCode.META, meta, edition=edition)}
     for channel in profile.channels:
         given = calibration.get(channel.number)
-        fields = {**channel.fields, "CalKey": _calibration_key(channel, given)}
-        blocks[channel.number, AccessCode.CHANNEL] = compose(AccessCode.CHANNEL, fields, edition=edition)
+        blocks[channel.number, AccessCode.CHANNEL] = _described(profile, channel, given, edition)
         if given is not None:
             blocks[channel.number, AccessCode.CALIBRATION] = compose(
                 AccessCode.CALIBRATION, given.fields(edition), edition=edition
@@ -221,6 +223,17 @@ def _calibration_key(channel: ChannelProfile, given: Calibration | None) -> int:
     return _CAL_NONE if given is None else _CAL_SUPPLIED
 
 
+def _described(profile: Profile, channel: ChannelProfile, given: Calibration | None, edition: Edition) -> bytes:
+    """The TransducerChannel TEDS: one for all nodes of the type that are calibrated alike."""
+    key = _calibration_key(channel, given)
+    place = (channel.number, key, edition)
+    if place not in profile.composed:
+        fields = {**channel.fields, "CalKey": key}
+        profile.composed[place] = compose(AccessCode.CHANNEL, fields, edition=edition)
+    return profile.composed[place]
+
+
+@lru_cache(maxsize=64)
 def _name(name: str, edition: Edition) -> bytes:
     return compose(AccessCode.NAME, (("Format", USER_DEFINED_NAME), ("TCName", name)), edition=edition)
 

@@ -76,7 +76,7 @@ class Radio:
                 process.wait(5 if process is self._air else 0.1)
             except subprocess.TimeoutExpired:
                 process.kill()
-                process.wait(10)
+                process.wait(60)
             if process.stdout is not None:
                 process.stdout.close()
 

@@ -3,20 +3,15 @@
 from __future__ import annotations
 
 import json
-import random
-import socket
 from collections.abc import Callable, Iterator
-from contextlib import suppress
 from pathlib import Path
 
 import pytest
 
-from teds_provision.links import Contact, LinkSettings, Notice
+from teds_provision.links import LinkSettings, Notice
 from teds_provision.links.hints import BleAddress
-from teds_provision.links.ports import NFC
 from teds_provision.node import described
 from teds_provision.node.virtual import VirtualNode
-from teds_provision.protocol.messages.identity import Identity
 from teds_provision.station.station import Station as OpenStation
 from teds_provision.steps.build import BuildOrder
 from teds_provision.steps.identify import Identified
@@ -24,8 +19,9 @@ from teds_provision.steps.provision import Provisioned, provision
 from teds_provision.talk.conversation import Conversation
 from teds_provision.talk.meeting import meet
 from teds_provision.talk.progress import Silent, StepResult
-from tests.bench import make_station
+from tests.bench import make_station, on_reader
 from tests.e2e.desk import Desk, Station, results
+from tests.places import free_tcp_port
 
 from .conftest import ANGLE
 from .radio import Radio, needs_dbus
@@ -34,41 +30,15 @@ pytestmark = [pytest.mark.link, needs_dbus]
 Air = Callable[..., Radio]
 
 
-def free_tcp_port() -> int:
-    """A TCP port of 127.0.0.1 that nobody has."""
-    while True:
-        port = random.SystemRandom().randrange(10_000, 32_000)
-        with socket.socket() as probe, suppress(OSError):
-            probe.bind(("127.0.0.1", port))
-            return port
-
-
 def accept(_who: Identified) -> None:
     """Whoever it is."""
-
-
-class Tap:
-    """A node on the desk, tapped in memory."""
-
-    via = "nfc"
-    capabilities = NFC
-
-    def __init__(self, node: VirtualNode) -> None:
-        self._node = node
-
-    def exchange(self, frame: bytes) -> bytes:
-        return self._node.request("nfc", frame, tapped=True)
-
-    def close(self) -> None:
-        self._node.lost("nfc")
 
 
 def tapped_once(station: OpenStation, folder: Path) -> None:
     """Provision the node in ``folder`` at a tap, so that it has a key of ``station``."""
     described.create(folder, profile=ANGLE)
     node = VirtualNode(folder, exclusive=True)
-    contact = Contact(Identity.decode(node.identify()), Tap(node))
-    with Conversation(contact, notice=lambda _notice: None) as there:
+    with Conversation(on_reader(node), notice=lambda _notice: None) as there:
         provision(station, there, BuildOrder(profile=ANGLE), accept=accept, reporter=Silent())
     node.flash_file.release()
 
@@ -91,13 +61,6 @@ class CutsAt(Silent):
     def notice(self, notice: Notice) -> None:
         if notice.kind == "retry":
             self.notices.append(notice)
-
-
-@pytest.fixture
-def station(tmp_path: Path) -> Iterator[OpenStation]:
-    made = make_station(tmp_path / "home")
-    yield made
-    made.close()
 
 
 def over_the_air(station: OpenStation, reporter: Silent, order: BuildOrder) -> Provisioned:
@@ -187,11 +150,11 @@ def test_two_nodes_are_measured_over_the_air(desk: Desk, air: Air) -> None:
     bench = Station(desk, home)
     uuids = [json.loads((desk.folder / name / "flash.json").read_text())["flash"]["uuid"] for name in ("left", "right")]
     running = bench.start("--json", "measure", *uuids, "--ble", "auto", "--rate", "100", "--duration", "8")
-    running.wait_for(f'"event":"data","uuid":"{uuids[0]}"', 40)
-    running.wait_for(f'"event":"data","uuid":"{uuids[1]}"', 40)
+    running.wait_for(f'"event":"data","uuid":"{uuids[0]}"')
+    running.wait_for(f'"event":"data","uuid":"{uuids[1]}"')
     assert radio.do("counts")["held"] == 2
     radio.do("drop", 0)
-    done = running.end(60)
+    done = running.end()
     assert done.code == 0, done
     lines = [json.loads(line) for line in done.out.splitlines()]
     for node in lines[-1]["nodes"]:

@@ -1,9 +1,6 @@
 from __future__ import annotations
 
-import itertools
 import json
-import os
-import socket
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
@@ -12,22 +9,13 @@ from pathlib import Path
 import pytest
 
 from tests.links.can.hub import Hub
-
-_numbers = itertools.count()
-
-
-def free_udp_port() -> int:
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
-        probe.bind(("127.0.0.1", 0))
-        return int(probe.getsockname()[1])
+from tests.places import free_bus
 
 
 @pytest.fixture
 def group() -> str:
     """A multicast bus of this test's own, which no frame leaves."""
-    number = os.getpid() * 31 + next(_numbers)
-    address = f"239.{1 + number % 200}.{number // 200 % 250}.{1 + number // 50000 % 250}"
-    return f"udp_multicast:{address}?port={free_udp_port()}"
+    return free_bus()
 
 
 @pytest.fixture
@@ -61,7 +49,7 @@ def nodes() -> Iterator[Callable[..., None]]:
         process.stdin.close()
     for process in running:
         try:
-            process.wait(5)
+            process.wait(60)
         except subprocess.TimeoutExpired:
             process.kill()
             process.wait()

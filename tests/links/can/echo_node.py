@@ -22,6 +22,8 @@ class EchoNode:
         self.state = NodeState.FACTORY
         self.runs = 0
         self.pinned = False
+        self.free = threading.Event()  # a Write ends after ``delay`` and not before this
+        self.free.set()
         self.seen: list[tuple[str, bool]] = []
         self.links_lost: list[str] = []
 
@@ -34,6 +36,7 @@ class EchoNode:
             return b"\x01\x00\x00"
         self.runs += 1
         time.sleep(self.delay)
+        self.free.wait()
         if frame[2:4] == b"\x01\x7f":
             return b"\x01" + self.runs.to_bytes(2, "big")
         return frame[6:][::-1] or b"\x00"

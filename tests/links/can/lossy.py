@@ -19,8 +19,8 @@ import can
 import can.interfaces
 import can.util
 
-from teds_provision.links.can.echoes import Echoes
 from teds_provision.links.can.frame import Frame
+from teds_provision.links.can.wire.echoes import Echoes
 
 KINDS = ("loss", "double", "swap", "delay", "corrupt")
 

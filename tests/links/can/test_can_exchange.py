@@ -20,6 +20,7 @@ from teds_provision.node.can.server import CanServer
 from teds_provision.protocol.messages.identity import Identity, NodeState
 from tests.links.can.echo_node import EchoNode
 from tests.links.can.hub import Hub
+from tests.pace import best_of, until
 
 pytestmark = pytest.mark.link
 Start = Callable[..., None]
@@ -99,12 +100,13 @@ def test_an_exchange_takes_milliseconds(group: str, nodes: Start) -> None:
     with opened(group) as port:
         link = find(port).link
         link.exchange(write(b"warm"))
-        times = []
-        for _ in range(20):
+
+        def exchange() -> float:
             began = time.perf_counter()
             link.exchange(write(bytes(700)))
-            times.append(time.perf_counter() - began)
-    assert min(times) < 0.2, sorted(times)
+            return time.perf_counter() - began
+
+        best_of(100, 0.1, exchange)
 
 
 def test_a_hundred_exchanges_under_load(group: str, nodes: Start) -> None:
@@ -161,11 +163,42 @@ def test_watch_survives_a_bus_that_goes_away() -> None:
     port = CanPort(hub.spec)
     notices: list[str] = []
     stop = threading.Event()
-    threading.Timer(0.3, hub.close).start()
-    threading.Timer(2.5, stop.set).start()
-    assert list(port.watch(stop=stop, notice=lambda told: notices.append(told.kind))) == []
+    then = {"waiting": threading.Timer(0.3, hub.close), "reader-lost": threading.Timer(2.2, stop.set)}
+
+    def told(notice: Notice) -> None:
+        notices.append(notice.kind)
+        if (next_one := then.pop(notice.kind, None)) is not None:
+            next_one.start()
+
+    assert list(port.watch(stop=stop, notice=told)) == []
     assert notices == ["waiting", "reader-lost"]
     port.close()
+
+
+def test_a_node_pulled_in_the_middle_of_its_answer_holds_up_nobody_else() -> None:
+    """It was waited for a whole second in each round, in which the next board on the bus was not looked for."""
+    broken_off = {(0x18DAF121, 2), (0x18DA21F1, 0)}  # its consecutive frames; asked by itself it is silent
+    hub = Hub(lambda identifier, data: (identifier, data[0] >> 4) in broken_off)
+    stop = threading.Event()
+
+    def asked() -> int:
+        return sum(identifier == 0x18DBFFF1 for identifier, _ in list(hub.frames))
+
+    def between() -> float:
+        """Seconds from one question to everybody to the next but one."""
+        before, began = asked(), time.monotonic()
+        until(lambda: asked() >= before + 2)
+        return time.monotonic() - began
+
+    with serving(hub.spec, EchoNode(0x21)), opened(hub.spec) as port:
+        watch = threading.Thread(target=lambda: list(port.watch(stop=stop, notice=quiet)))
+        watch.start()
+        try:
+            best_of(5, 1.8, between)
+        finally:
+            stop.set()
+            watch.join()
+    hub.close()
 
 
 def test_two_nodes_under_one_address_are_a_conflict(hub: Hub) -> None:
@@ -199,10 +232,16 @@ def test_a_node_is_asked_first_where_it_is_thought_to_be(hub: Hub) -> None:
 
 def test_nobody_is_there(hub: Hub) -> None:
     with opened(hub.spec) as port:
-        began = time.monotonic()
-        with pytest.raises(NoNode, match=r"within 1\.2 s"):
-            find(port, seconds=1.2)
-        assert 1.0 < time.monotonic() - began < 3
+
+        def looked() -> float:
+            began = time.monotonic()
+            with pytest.raises(NoNode, match=r"within 1\.2 s"):
+                find(port, seconds=1.2)
+            took = time.monotonic() - began
+            assert took > 1.0
+            return took
+
+        best_of(5, 3.0, looked)
 
 
 def test_another_node_than_the_wanted_is_told_and_waited_past(hub: Hub) -> None:
@@ -268,29 +307,36 @@ def test_a_lost_consecutive_frame_is_made_good(hub: Hub, way: int) -> None:
 
 
 def test_a_reply_of_another_transaction_is_dropped(hub: Hub) -> None:
-    node = EchoNode(0x21, delay=0.2)
+    node = EchoNode(0x21, delay=0.5)
     with serving(hub.spec, node), opened(hub.spec) as port:
         link = find(port).link
+        forged: list[bytes] = []
 
         def forge() -> None:
+            until(lambda: node.runs)
             request = next(data for way, data in reversed(hub.frames) if way == 0x18DA21F1 and data[2:8] == COUNT)
-            hub.send(0x18DAF121, bytes([4, request[1] ^ 0x55]) + b"\xff\xff\xff\xcc\xcc\xcc")
+            forged.append(bytes([4, request[1] ^ 0x55]) + b"\xff\xff\xff\xcc\xcc\xcc")
+            hub.send(0x18DAF121, forged[0])
 
-        threading.Timer(0.1, forge).start()
+        forger = threading.Thread(target=forge)
+        forger.start()
         assert link.exchange(COUNT) == b"\x01\x00\x01"
+        forger.join()
+        assert forged
 
 
 def test_a_slow_command_of_one_station_does_not_hold_up_another(hub: Hub) -> None:
-    node = EchoNode(0x21, delay=1.0)
+    node = EchoNode(0x21)
+    node.free.clear()
     with serving(hub.spec, node), opened(hub.spec) as port, opened(hub.spec + "&source=0xF2") as other:
         slow, identity = find(port).link, b"\x00\x00\x80\x07\x00\x00"
         replies: list[bytes] = []
         thread = threading.Thread(target=lambda: replies.append(slow.exchange(write(bytes(500)))))
         thread.start()
-        time.sleep(0.3)
-        began = time.monotonic()
+        until(lambda: node.runs)
         assert find(other, address=0x21).link.exchange(identity)[3:] == node.identify()
-        assert time.monotonic() - began < 0.6
+        assert replies == []
+        node.free.set()
         thread.join()
         assert replies == [bytes(500)]
     assert {name for name, _ in node.seen} == {"can:f1", "can:f2"}

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import threading
 import time
 from collections import deque
 
@@ -10,10 +11,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from teds_provision.links.can.bus import Frame
+from teds_provision.links.can.bus import Bus, Frame
 from teds_provision.links.can.gathering import Gathering
 from teds_provision.links.can.isotp import Pair, addresses, padded, physical_id, read_single, single
-from teds_provision.links.can.pacing import Pacer, classic_bits, fd_seconds
+from teds_provision.links.can.spec import parse_spec
+from teds_provision.links.can.wire import pacing
+from teds_provision.links.can.wire.pacing import Pacer, classic_bits, fd_seconds
 
 STATION, NODE = 0xF1, 0x21
 
@@ -219,6 +222,47 @@ def test_bit_times_lie_within_those_of_the_standard() -> None:
     assert fd_seconds(0x18DA21F1, bytes(64), 500_000, 2_000_000) < 3 * classic_bits(0x18DA21F1, bytes(8)) / 500_000
 
 
+def bits_of(fields: str) -> str:
+    """Fields "value:width …" as bits, the highest first."""
+    return "".join(f"{int(value):0{width}b}" for value, width in (one.split(":") for one in fields.split()))
+
+
+def stuff_bits_of(bits: str) -> int:
+    """One more after five equal bits, stuffed bits counted in; read from ISO 11898-1 clause 10.5 bit by bit."""
+    out = ""
+    for bit in bits:
+        out += bit
+        if out[-5:] in ("00000", "11111"):
+            out += "10"[int(bit)]
+    return len(out) - len(bits)
+
+
+@given(st.integers(0, (1 << 29) - 1), st.binary(max_size=8))
+def test_classic_frames_are_as_long_as_counted_bit_by_bit(identifier: int, data: bytes) -> None:
+    base, extension = identifier >> 18, identifier & 0x3FFFF
+    fields = bits_of(f"0:1 {base}:11 3:2 {extension}:18 0:3 {len(data)}:4 " + " ".join(f"{one}:8" for one in data))
+    crc = 0
+    for bit in fields:
+        crc = (crc << 1 ^ (0x4599 if (crc >> 14 ^ int(bit)) & 1 else 0)) & 0x7FFF
+    fields += bits_of(f"{crc}:15")
+    assert classic_bits(identifier, data) == len(fields) + stuff_bits_of(fields) + 13
+
+
+@given(
+    st.integers(0, (1 << 29) - 1),
+    st.sampled_from([0, 3, 8, 12, 48, 64]).flatmap(lambda n: st.binary(min_size=n, max_size=n)),
+)
+def test_fd_frames_are_as_long_as_counted_bit_by_bit(identifier: int, data: bytes) -> None:
+    slow = bits_of(f"0:1 {identifier >> 18}:11 3:2 {identifier & 0x3FFFF}:18 0:1 1:1 0:1 1:1")
+    code = (*range(9), 12, 16, 20, 24, 32, 48, 64).index(len(data))
+    fast = bits_of(f"0:1 {code}:4 " + " ".join(f"{one}:8" for one in data))
+    stuffed = stuff_bits_of(slow)
+    crc, fixed = (17, 6) if len(data) <= 16 else (21, 7)
+    fast_bits = len(fast) + stuff_bits_of(slow + fast) - stuffed + 4 + crc + fixed
+    expected = (len(slow) + stuffed + 13) / 500_000 + fast_bits / 2_000_000
+    assert fd_seconds(identifier, data, 500_000, 2_000_000) == pytest.approx(expected)
+
+
 def test_a_paced_sender_takes_the_time_of_the_wire() -> None:
     pacer = Pacer(125_000, 2_000_000)
     began = time.perf_counter()
@@ -229,3 +273,65 @@ def test_a_paced_sender_takes_the_time_of_the_wire() -> None:
         >= pacer.busy_seconds
         == pytest.approx(20 * classic_bits(0x18DA21F1, bytes(8)) / 125_000)
     )
+
+
+def test_two_senders_on_one_paced_bus_take_turns(group: str) -> None:
+    """Each held back its own frames alone: 200 nodes seemed to need less time than the bus has."""
+    spec = parse_spec(f"{group}&pace=1&bitrate=125000")
+    senders = Bus(spec), Bus(spec)
+    frame = Frame(0x18DA21F1, bytes(8))
+    began = time.perf_counter()
+    threads = [threading.Thread(target=lambda bus=bus: [bus.send(frame) for _ in range(20)]) for bus in senders]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert time.perf_counter() - began >= 40 * classic_bits(frame.identifier, frame.data) / 125_000
+    wire = pacing.Wire(spec.wire)
+    for bus in senders:
+        bus.close()
+    assert wire._path.exists(), "somebody is still on it"
+    wire.close()
+    assert not wire._path.exists()
+
+
+class ByTheLibrary(Pair):
+    """A pair that never takes the short way for single frames."""
+
+    @property
+    def _is_busy(self) -> bool:
+        return True
+
+    @property
+    def sending(self) -> bool:
+        return True
+
+
+@given(st.binary(max_size=64), st.booleans())
+def test_a_single_frame_is_read_as_the_library_reads_it(data: bytes, fd: bool) -> None:
+    frame = Frame(physical_id(NODE, STATION), bytes([data[0] & 0xF]) + data[1:] if data else b"", fd)
+    bodies = []
+    for made in (Pair, ByTheLibrary):
+        pair = made(NODE, STATION, lambda _: None, fd=fd)
+        assert pair.take(frame)
+        bodies.append(pair.received())
+        assert pair.received() is None
+    assert bodies[0] == bodies[1]
+
+
+@given(st.binary(min_size=1, max_size=63), st.booleans())
+def test_a_single_frame_is_written_as_the_library_writes_it(body: bytes, fd: bool) -> None:
+    sent: list[list[Frame]] = []
+    for made in (Pair, ByTheLibrary):
+        frames: list[Frame] = []
+        made(NODE, STATION, frames.append, fd=fd).send(body)
+        sent.append(frames)
+    assert sent[0] == sent[1]
+
+
+def test_a_single_frame_in_the_middle_of_a_message_ends_it_and_comes_first() -> None:
+    wire = Wire()
+    wire.node.take(Frame(physical_id(NODE, STATION), bytes.fromhex("100a010203040506")))
+    wire.node.take(Frame(physical_id(NODE, STATION), single(b"abc")))
+    wire.node.take(Frame(physical_id(NODE, STATION), single(b"def")))
+    assert [wire.node.received() for _ in range(3)] == [b"abc", b"def", None]

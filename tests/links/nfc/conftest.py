@@ -3,7 +3,6 @@ from __future__ import annotations
 import json
 import os
 import selectors
-import socket
 import subprocess
 import sys
 import time
@@ -12,6 +11,8 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+
+from tests.places import free_reader
 
 ROOT = Path(__file__).resolve().parents[3]
 UUID = "0011223344556677AABB"
@@ -58,7 +59,7 @@ class Process:
 
     def end(self) -> None:
         self._process.terminate()
-        self._process.wait(10)
+        self._process.wait(60)
 
     def close(self) -> None:
         if self._process.poll() is None:
@@ -69,16 +70,10 @@ class Process:
 StartNode = Callable[..., Process]
 
 
-def free_path() -> str:
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
-        probe.bind(("127.0.0.1", 0))
-        return f"udp:localhost:{probe.getsockname()[1]}"
-
-
 @pytest.fixture
 def path() -> str:
     """A simulated reader that nobody else uses."""
-    return free_path()
+    return free_reader()
 
 
 @pytest.fixture

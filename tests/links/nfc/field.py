@@ -49,7 +49,7 @@ class Field:
 
     def close(self) -> None:
         self._stop.set()
-        self._thread.join(5)
+        self._thread.join(60)
         for one in (self._reader, *self._clients.values()):
             one.close()
         self._selector.close()

@@ -180,7 +180,7 @@ def main() -> None:
             print(json.dumps(done), flush=True)
     finally:
         pcscd.terminate()
-        pcscd.wait(10)
+        pcscd.wait(60)
 
 
 if __name__ == "__main__":

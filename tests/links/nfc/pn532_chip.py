@@ -24,7 +24,7 @@ import tty
 from pathlib import Path
 from typing import Any
 
-from teds_provision.links.nfc.library import nfc
+from teds_provision.links.nfc.nfcpy import nfc
 from teds_provision.links.nfc.udp import ReaderDevice, address_of
 
 ACK = bytes.fromhex("0000ff00ff00")

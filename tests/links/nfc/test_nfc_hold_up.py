@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import time
+
 import pytest
 
 from teds_provision.errors import Garbled, NodeSilent
-from teds_provision.links.nfc import message, tnep
+from teds_provision.links.nfc import message, tag, tnep
+from teds_provision.links.nfc.nfcpy import Type4TagCommandError
 from teds_provision.links.nfc.pieces import LONGEST_FRAME, Piece, Requester
 from teds_provision.links.nfc.poller import LONGEST, Poller
 
@@ -58,3 +61,33 @@ def test_no_reply_is_longer_than_the_longest_frame() -> None:
     with pytest.raises(Garbled, match="4094 is the most"):
         requester.take(Piece(1, LONGEST_FRAME + 1, 0, bytes(8), answer=True))
     assert requester.take(Piece(1, LONGEST_FRAME, 0, bytes(8), answer=True))
+
+
+class Stubborn:
+    """A front end whose tag says the same block to whatever it is asked."""
+
+    def __init__(self, block: bytes) -> None:
+        self.block, self.frames = block, 0
+
+    def exchange(self, octets: bytes, _timeout: float) -> bytes:
+        self.frames += 1
+        number = octets[0] & 1
+        return bytes([self.block[0] & 0xFE | number]) + self.block[1:] if self.block[0] < 0xC0 else self.block
+
+
+@pytest.mark.parametrize(
+    "block", [b"\xf2\x01", b"\xf2\x3b", b"\xf2", b"\xa2", b"\x12" + bytes(200)],
+    ids=["S(WTX)", "S(WTX) 59", "S(WTX) cut short", "R(ACK)", "chained"],
+)  # fmt: skip
+def test_a_tag_that_puts_off_its_answer_for_ever_is_given_up(block: bytes, monkeypatch: pytest.MonkeyPatch) -> None:
+    """nfcpy goes on for as long as the tag does: `identify --timeout 6` never ended, at full speed."""
+    monkeypatch.setattr(tag, "_APDU_SECONDS", 0.2)
+    air = Stubborn(block)
+    began = time.monotonic()
+    dep = tag.IsoDep(air, 64, 0.1)
+    if block == b"\xa2":
+        dep.pni = 1  # R(ACK) of the block before: send yours again
+        air.exchange = lambda octets, _timeout: bytes([0xA2 | ~octets[0] & 1])  # type: ignore[method-assign]
+    with pytest.raises(Type4TagCommandError):
+        dep.exchange(b"\x00\xa4\x04\x00")
+    assert time.monotonic() - began < 30

@@ -16,7 +16,7 @@ import pytest
 
 from teds_provision.errors import NoReader, UsageFailure
 from teds_provision.links.nfc import pcsc
-from teds_provision.links.nfc.frontend import open_reader
+from teds_provision.links.nfc.reader import open_reader
 from tests.bench import PASSPHRASE, make_station
 from tests.cli.shell import clean_environment
 
@@ -75,7 +75,7 @@ class Scene:
         assert self._process.stdin
         assert self._process.stdout
         self._process.stdin.close()
-        self._process.wait(20)
+        self._process.wait(60)
         self._process.stdout.close()
 
 

@@ -14,12 +14,14 @@ import pytest
 
 from teds_provision.errors import LinkFailure
 from teds_provision.links import Contact, LinkSettings, Notice, open_port
-from teds_provision.links.nfc import reader as reader_module
+from teds_provision.links.nfc import port as port_module
+from tests.pace import until
+from tests.places import free_reader
 
-from .conftest import UUID, StartNode, free_path
+from .conftest import UUID, StartNode
 from .field import Field
 from .pn533_chip import Chip
-from .test_nfc_usb import Node, chip, make_node, wait
+from .test_nfc_usb import Node, chip, make_node
 
 __all__ = ["chip", "make_node"]
 pytestmark = pytest.mark.link
@@ -56,10 +58,7 @@ class Watch:
         return contact.identity.uuid.hex().upper()
 
     def until(self, condition: Callable[[], bool], what: object = None) -> None:
-        end = time.monotonic() + 10
-        while not condition():
-            assert time.monotonic() < end, (what, self.told, self.notices[-3:])
-            time.sleep(0.005)
+        until(condition, lambda: (what, self.told, self.notices[-3:]))
 
     def left(self) -> int:
         return [notice.kind for notice in self.notices].count("node-left")
@@ -73,13 +72,13 @@ class Watch:
 
     def notices_it(self) -> None:
         """Give it time to find the board gone for good; one that was lifted while it was first read is not told of."""
-        until = time.monotonic() + (8.0 if self._using else 0.3)
-        while not self.told and time.monotonic() < until:
+        end = time.monotonic() + (8.0 if self._using else 0.3)
+        while not self.told and time.monotonic() < end:
             time.sleep(0.005)
 
     def end(self) -> None:
         self._stop.set()
-        self._thread.join(5)
+        self._thread.join(60)
         assert not self._thread.is_alive(), "the watch hangs"
         self._port.close()
 
@@ -87,8 +86,8 @@ class Watch:
 @pytest.fixture(autouse=True)
 def impatient(monkeypatch: pytest.MonkeyPatch) -> None:
     """A node that slips off is waited for only a moment, and is gone a moment later."""
-    monkeypatch.setattr(reader_module, "RETURN_WITHIN", 0.1)
-    monkeypatch.setattr(reader_module, "_DEBOUNCE", 0.1)
+    monkeypatch.setattr(port_module, "RETURN_WITHIN", 0.1)
+    monkeypatch.setattr(port_module, "_DEBOUNCE", 0.1)
 
 
 @pytest.fixture
@@ -102,7 +101,7 @@ def field() -> Iterator[Field]:
 def test_pulled_at_frames_all_over_an_exchange_between_two_processes(
     field: Field, start_node: StartNode, tag: str
 ) -> None:
-    paths = {UUID: free_path(), OTHER: free_path()}
+    paths = {UUID: free_reader(), OTHER: free_reader()}
     for uuid, path in paths.items():
         start_node(path=path, uuid=uuid, tag=tag, wt_int=4)
     watch = Watch(field.path)
@@ -149,7 +148,7 @@ def test_pulled_at_every_frame_below_a_usb_reader(chip: Chip, make_node: Callabl
             left[0] = number
             node.put_down()
             chip.answer = answer
-            wait(lambda: chip.answer is None)
+            until(lambda: chip.answer is None)
             if number % 2:
                 watch.notices_it()
             left[0] = 10**6

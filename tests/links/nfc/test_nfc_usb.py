@@ -11,11 +11,12 @@ import pytest
 
 from teds_provision.errors import NoNode, NoReader, UsageFailure
 from teds_provision.links import LinkSettings, Notice, open_port
-from teds_provision.links.nfc import frontend
-from teds_provision.links.nfc.reader import NfcPort
+from teds_provision.links.nfc import reader
+from teds_provision.links.nfc.port import NfcPort
 from teds_provision.node.nfc.tnep import TnepTag
 from teds_provision.node.nfc.type2 import Type2Memory
 from teds_provision.node.nfc.type4 import ATS, IsoDepTag, NdefApplication, Type4Memory
+from tests.pace import until
 
 from .conftest import UUID
 from .echo_node import Echo
@@ -74,13 +75,6 @@ def make_node(chip: Chip) -> Iterator[Callable[[str], Node]]:
         node.close()
 
 
-def wait(condition: Callable[[], bool], seconds: float = 6.0) -> None:
-    until = time.monotonic() + seconds
-    while not condition():
-        assert time.monotonic() < until
-        time.sleep(0.02)
-
-
 @pytest.mark.parametrize("tag", ["2", "4"])
 @pytest.mark.parametrize("path", ["usb", "usb:04e6", "usb:04e6:5591", "usb:001:005"])
 def test_frames_go_over_a_usb_reader(make_node: Callable[[str], Node], chip: Chip, tag: str, path: str) -> None:
@@ -117,22 +111,22 @@ def test_a_watch_survives_unplugging_and_plugging_in_elsewhere(make_node: Callab
     thread.start()
     try:
         node.put_down()
-        wait(lambda: len(visits) == 1)
+        until(lambda: len(visits) == 1)
         chip.plugged = False  # while the node lies on it
         node.take_away()
-        wait(lambda: "reader-lost" in [notice.kind for notice in notices])
+        until(lambda: "reader-lost" in [notice.kind for notice in notices])
         time.sleep(1.5)
         chip.plugged, chip.number = True, 6
-        wait(lambda: "reader-ready" in [notice.kind for notice in notices])
+        until(lambda: "reader-ready" in [notice.kind for notice in notices])
         node.put_down()
-        wait(lambda: len(visits) == 2)
+        until(lambda: len(visits) == 2)
         node.take_away()
-        wait(lambda: "node-left" in [notice.kind for notice in notices[-3:]])
+        until(lambda: "node-left" in [notice.kind for notice in notices[-3:]])
         chip.plugged = False  # while it waits
-        wait(lambda: [notice.kind for notice in notices].count("reader-lost") == 2)
+        until(lambda: [notice.kind for notice in notices].count("reader-lost") == 2)
     finally:
         stop.set()
-        thread.join(5)
+        thread.join(60)
         port.close()
     assert visits == [b"\x01dcba"] * 2
     kinds = [notice.kind for notice in notices]
@@ -214,7 +208,7 @@ def test_auto_takes_the_only_reader_and_names_it(make_node: Callable[[str], Node
 
 
 def test_auto_lists_several_readers(chip: Chip, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(frontend, "_usb_readers", lambda path: [(0x04E6, 0x5591, 1, 5), (0x054C, 0x06C3, 1, 6)])
+    monkeypatch.setattr(reader, "_usb_readers", lambda path: [(0x04E6, 0x5591, 1, 5), (0x054C, 0x06C3, 1, 6)])
     with pytest.raises(UsageFailure, match=r"2 readers are plugged in: usb:001:005, usb:001:006") as caught:
         open_port(LinkSettings(nfc="auto"))
     assert caught.value.exit_code == 2

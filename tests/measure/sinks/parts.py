@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from typing import Any
 
 import numpy as np
 from hypothesis import strategies as st
 
-from teds_provision.measure.blocks import Block, ChannelFacts, StationFacts
+from teds_provision.measure.blocks import Block, ChannelFacts, GroupRows, NodeReport, StationFacts
+from teds_provision.measure.sinks import Sink
 
 ARM = "8d4d9da65281f7000001"
 HAND = "8d4d9da65281f7000002"
@@ -84,3 +86,18 @@ def blocks(draw: st.DrawFn) -> Block:
     valid = draw(st.lists(st.lists(st.booleans(), min_size=c, max_size=c), min_size=n, max_size=n))
     channels = tuple(draw(st.lists(st.integers(1, 255), min_size=c, max_size=c, unique=True)))
     return block(raw, value, valid, channels=channels, index=draw(st.integers(0, 2**40)))
+
+
+def fill(sink: Sink, items: Iterable[Block | GroupRows | NodeReport | list[ChannelFacts]]) -> None:
+    """Give an open sink all of these, close it, and see that it took them."""
+    for item in items:
+        if isinstance(item, Block):
+            sink.write(item)
+        elif isinstance(item, GroupRows):
+            sink.write_group(item)
+        elif isinstance(item, NodeReport):
+            sink.report(item)
+        else:
+            sink.describe(item)
+    sink.close()
+    assert sink.stats.error == ""

@@ -27,7 +27,7 @@ from teds_provision.measure.blocks import Block, ChannelFacts, NodeReport, Stati
 from teds_provision.measure.sinks import open_sink
 from teds_provision.measure.sinks.mcap.recording import SAMPLES, TYPE
 from teds_provision.measure.sinks.mcap.recover import recover
-from tests.measure.sinks.parts import ANGLE, ARM, FORCE, HAND, STATION, block, blocks
+from tests.measure.sinks.parts import ANGLE, ARM, FORCE, HAND, STATION, block, blocks, fill
 
 
 def record(
@@ -38,15 +38,7 @@ def record(
 ) -> tuple[str, ...]:
     sink = open_sink(str(path))
     sink.open(facts, station)
-    for item in items:
-        if isinstance(item, Block):
-            sink.write(item)
-        elif isinstance(item, NodeReport):
-            sink.report(item)
-        else:
-            sink.describe(item)
-    sink.close()
-    assert sink.stats.error == ""
+    fill(sink, items)
     assert sink.stats.dropped == 0
     return sink.files
 
@@ -129,6 +121,18 @@ def test_every_block_comes_back_from_mcap_by_foreign_readers(one: Block) -> None
         raw = message.raw_float if one.raw.dtype.kind == "f" else message.raw
         np.testing.assert_array_equal(raw, one.raw[k])
         assert message.clock_error == one.clock_error
+
+
+def test_a_message_of_mcap_says_what_is_not_known_or_no_measurement_and_forgets_it_in_the_next(tmp_path: Path) -> None:
+    """The next message of the same stream begins anew; of the largest raw values the bits are kept."""
+    odd = block(np.array([[2**63 + 1]], dtype=np.uint64), [[np.nan]], [[False]], clock_error=None, test_pattern=True)
+    plain = block(np.array([[7]], dtype=np.uint64), [[0.5]], index=1)
+    record(tmp_path / "run.mcap", [odd, plain])
+    first, second = (message for _, message, _ in samples(tmp_path / "run.mcap"))
+    assert (first.raw.tolist(), second.raw.tolist()) == ([1 - 2**63], [7])
+    assert np.isnan([first.clock_error, *first.value]).all()
+    assert (first.test_pattern, second.test_pattern) == (True, False)
+    assert (second.clock_error, second.value.tolist()) == (1e-4, [0.5])
 
 
 @given(blocks())

@@ -16,12 +16,12 @@ from hypothesis import strategies as st
 
 from teds_provision.errors import UsageFailure
 from teds_provision.measure.blocks import Block, ChannelFacts, Command, GroupRows, NodeReport, StationFacts
-from teds_provision.measure.sinks.live import ERROR, OK, WARN, Status, TopicSink
+from teds_provision.measure.sinks.live import ERROR, JOINT_STATE, OK, WARN, Status, TopicSink
 from teds_provision.measure.sinks.meaning import Meaning, meaning_of, variance_of
 from teds_provision.measure.sinks.names import Topics, slug
 from teds_provision.measure.sinks.vectors import FieldValue, compounds_of, is_range
 from teds_provision.teds.units.units import parse_units
-from tests.measure.sinks.parts import ANGLE, ARM, FORCE, HAND, STATION, block
+from tests.measure.sinks.parts import ANGLE, ARM, FORCE, HAND, STATION, block, fill
 
 ROS_TOPIC = re.compile(r"/[A-Za-z][A-Za-z0-9_]*(/[A-Za-z][A-Za-z0-9_]*)*")
 
@@ -42,6 +42,15 @@ def test_namesakes_get_topics_of_their_own() -> None:
     topics.learn([ANGLE, replace(ANGLE, number=2), replace(FORCE, node="Arm"), replace(ANGLE, number=3, name="")])
     names = {topics.channel(*key) for key in ((ARM, 1), (ARM, 2), (ARM, 3), (HAND, 2))}
     assert len(names) == 4, names
+
+
+def test_a_node_has_its_name_before_it_was_asked() -> None:
+    """Its state is told while it is waited for: under the same topic, in MQTT for ever, as later."""
+    topics = Topics(replace(STATION, nodes={ARM: "arm", HAND: "Arm"}))
+    assert {topics.node(ARM), topics.node(HAND)} == {f"arm_{ARM}", f"arm_{HAND}"}
+    topics.learn([replace(ANGLE, node="arm"), replace(FORCE, node="Arm")])
+    assert {topics.node(ARM), topics.node(HAND)} == {f"arm_{ARM}", f"arm_{HAND}"}
+    assert Topics(replace(STATION, nodes={ARM: "arm", HAND: ""})).node(ARM) == "arm"
 
 
 def test_a_chosen_name_goes_before_a_made_one_and_must_be_one() -> None:
@@ -147,6 +156,10 @@ class Carrier(TopicSink):
         self.parameters: dict[str, object] = {}
         self.listens: list[tuple[str, str, int]] = []
         self.statuses: list[Status] = []
+        self.advertised: list[tuple[str, str]] = []
+
+    def _advertise(self, topic: str, kind: str) -> None:
+        self.advertised.append((topic, kind))
 
     def _array(self, topic: str, stamp: float, names: Sequence[str], values: Sequence[float]) -> None:
         self.arrays.append((topic, stamp, list(names), list(values)))
@@ -182,17 +195,7 @@ def carried(
 ) -> Carrier:
     sink = Carrier(commands)
     sink.open(facts, station)
-    for item in items:
-        if isinstance(item, Block):
-            sink.write(item)
-        elif isinstance(item, GroupRows):
-            sink.write_group(item)
-        elif isinstance(item, NodeReport):
-            sink.report(item)
-        else:
-            sink.describe(item)
-    sink.close()
-    assert sink.stats.error == ""
+    fill(sink, items)
     return sink
 
 
@@ -215,10 +218,25 @@ def test_an_invalid_value_has_no_scalar_message_and_is_nan_in_the_array() -> Non
     assert np.isnan(values[1])
 
 
+def test_an_unsigned_datasheet_is_told_in_diagnostics_and_metadata() -> None:
+    bare = ChannelFacts(ARM, "arm", 1, "angle", unsigned=True)
+    sink = carried([block([[1]], [[np.nan]], [[False]])], facts=[bare, FORCE])
+    assert sink.scalars == []
+    assert json.loads(sink.words["/bench/arm/teds"])["channels"][0]["unsigned"] is True
+    assert "unsigned" not in json.loads(sink.words["/bench/hand/teds"])["channels"][0]
+    [told] = [one for one in sink.statuses if "nobody has signed it" in one.message]
+    assert (told.level, told.hardware) == (1, ARM)
+
+
 def test_rows_faster_than_a_thousand_a_second_are_thinned_out() -> None:
     times = np.arange(100) / 10_000
     rows = GroupRows("crane", ((ARM, 1),), times, np.ones((100, 1)), np.zeros((100, 1)))
     assert len({stamp for _, stamp, _, _ in carried([rows]).arrays}) == 10
+
+
+def test_the_array_is_there_before_its_first_row_but_none_for_a_test_pattern() -> None:
+    assert carried([]).advertised == [("/bench/crane", JOINT_STATE), ("/bench/crane/age", JOINT_STATE)]
+    assert carried([], station=replace(STATION, test_pattern=True)).advertised == []
 
 
 def test_a_test_pattern_reaches_no_topic() -> None:

@@ -4,10 +4,8 @@ from __future__ import annotations
 
 import json
 import shutil
-import socket
 import subprocess
-import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -15,27 +13,21 @@ from typing import Any
 import pytest
 
 from teds_provision.errors import TedsProvisionError, UsageFailure
-from teds_provision.measure.blocks import NodeReport
+from teds_provision.measure.blocks import ChannelFacts, NodeReport
 from teds_provision.measure.sinks import open_sink
 from teds_provision.teds.units.units import parse_units
 from tests.measure.sinks.parts import ANGLE, ARM, FORCE, HAND, STATION, block
+from tests.pace import until
+from tests.places import free_tcp_port
 
 MOSQUITTO = shutil.which("mosquitto", path="/usr/sbin:/usr/bin:/usr/local/sbin")
+BARE = "8d4d9da65281f7000003"
 OIL = replace(FORCE, number=3, name="oil", unit="K", units=parse_units("K"))
-
-
-def until(what: Callable[[], object], seconds: float = 60.0) -> None:
-    end = time.monotonic() + seconds
-    while not what():
-        assert time.monotonic() < end, "it did not come to that"
-        time.sleep(0.05)
 
 
 class Broker:
     def __init__(self, folder: Path) -> None:
-        with socket.socket() as free:
-            free.bind(("127.0.0.1", 0))
-            self.port = free.getsockname()[1]
+        self.port = free_tcp_port()
         self.config = folder / "mosquitto.conf"
         self.config.write_text(f"listener {self.port} 127.0.0.1\nallow_anonymous true\n")
         self.process: subprocess.Popen[bytes] | None = None
@@ -76,7 +68,8 @@ class TestWithMosquitto:
     def test_a_late_comer_finds_every_channel_with_its_unit(self, broker: Broker) -> None:
         broker.start()
         sink = open_sink(f"mqtt://127.0.0.1:{broker.port}")
-        sink.open([ANGLE, OIL], STATION)
+        bare = ChannelFacts(BARE, "bare", 1, "angle", unsigned=True)
+        sink.open([ANGLE, OIL, bare], STATION)
         until(lambda: sink.stats.state == "running")
         sink.report(NodeReport(ARM, "lost", "no frame"))
         client, heard = broker.heard()
@@ -87,9 +80,16 @@ class TestWithMosquitto:
             assert config["unit_of_measurement"] == "°C"
             assert config["device_class"] == "temperature"
             assert config["value_template"] == "{{ value_json.oil_3 }}"
+            assert config["availability_mode"] == "all"
+            assert [one["topic"] for one in config["availability"]] == ["bench/status", "bench/hand/state"]
             warm = block([[7]], [[293.15]], uuid=HAND, channels=(3,))
             until(lambda: (sink.write(warm), config["state_topic"] in heard)[1])
             assert json.loads(heard[config["state_topic"]])["oil_3"] == pytest.approx(20.0)
+            assert "unsigned" not in json.loads(heard[config["state_topic"]])
+            raw = block([[7]], [[0.0]], [[False]], uuid=BARE)
+            until(lambda: (sink.write(raw), "bench/bare" in heard)[1])
+            assert json.loads(heard["bench/bare"]).items() >= {"angle_1": None, "unsigned": True}.items()
+            assert not any(BARE in topic for topic in heard), "no sensor is shown that has no values"
             assert heard["bench/status"] == "online"
             assert json.loads(heard["bench/arm/state"])["why"] == "no frame"
             sink.close()
@@ -99,6 +99,24 @@ class TestWithMosquitto:
             client.loop_stop()
             sink.close()
         assert sink.stats.error == ""
+
+    def test_a_measurement_that_ends_leaves_the_others_online(self, broker: Broker) -> None:
+        broker.start()
+        client, heard = broker.heard()
+        sinks = [open_sink(f"mqtt://127.0.0.1:{broker.port}") for _ in range(2)]
+        try:
+            for sink, group in zip(sinks, ("left arm", "right arm"), strict=True):
+                sink.open([ANGLE], replace(STATION, group=group, instance=group))
+            one, other = "bench/left_arm/status", "bench/right_arm/status"
+            until(lambda: heard.get(one) == heard.get(other) == "online")
+            sinks[0].close()
+            until(lambda: heard[one] == "offline")
+            assert heard[other] == "online"
+        finally:
+            client.disconnect()
+            client.loop_stop()
+            for sink in sinks:
+                sink.close()
 
     def test_a_broker_that_comes_late_and_dies_is_survived(self, broker: Broker) -> None:
         sink = open_sink(f"mqtt://127.0.0.1:{broker.port}")

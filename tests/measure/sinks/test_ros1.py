@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 import queue
 import signal
-import socket
 import subprocess
 import sys
 import time
@@ -22,6 +21,8 @@ from teds_provision.measure.sinks.ros import ros1_child
 from teds_provision.measure.sinks.ros.ros1 import Ros1Sink
 from teds_provision.teds.units.units import parse_units
 from tests.measure.sinks.parts import ANGLE, ARM, FORCE, HAND, STATION, block
+from tests.pace import until
+from tests.places import free_tcp_port
 
 pytestmark = [
     pytest.mark.system,
@@ -36,9 +37,7 @@ class Master:
     """Debian's rosmaster on a free port, with files of its own."""
 
     def __init__(self, folder: Path) -> None:
-        with socket.socket() as free:
-            free.bind(("127.0.0.1", 0))
-            self.port = free.getsockname()[1]
+        self.port = free_tcp_port()
         self.uri = f"http://127.0.0.1:{self.port}"
         self.environment = {
             "PATH": "/usr/bin:/bin",
@@ -75,13 +74,6 @@ def master(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Master]:
         monkeypatch.setenv(name, one.environment[name])
     yield one
     one.stop()
-
-
-def until(what: Callable[[], object], seconds: float = 60.0) -> None:
-    end = time.monotonic() + seconds
-    while not what():
-        assert time.monotonic() < end, "it did not come to that"
-        time.sleep(0.05)
 
 
 def ros1(master: Master, commands: Callable[[Command], None] | None = None) -> Ros1Sink:
@@ -252,3 +244,49 @@ def test_a_child_that_waits_for_a_master_ends_when_its_parent_was_killed() -> No
     while Path(f"/proc/{orphan}").exists():
         assert time.monotonic() < until, "the child outlives its parent"
         time.sleep(0.05)
+
+
+def test_two_stations_of_one_name_do_not_end_each_other(master: Master) -> None:
+    """The master ends the node whose name another one takes: it comes back under a name of its own, and both stay."""
+    master.start()
+    sinks = [ros1(master), ros1(master)]
+    try:
+        for sink in sinks:
+            sink.open([ANGLE, FORCE], STATION)
+        until(lambda: master.tool("rostopic", "info", "/bench/crane").count(" * /teds_provision_bench") == 2)
+        publishers = master.tool("rostopic", "info", "/bench/crane")
+        assert publishers.count(f"/teds_provision_bench_{os.getpid()} ") == 1, publishers
+    finally:
+        for sink in sinks:
+            sink.close()
+
+
+@pytest.fixture
+def subscriber(master: Master) -> Iterator[subprocess.Popen[str]]:
+    """A node that subscribed the group's rows before anybody published them."""
+    master.start()
+    command = ["/usr/bin/python3", "-s", str(Path(__file__).with_name("ros1_subscriber.py")), "/bench/crane"]
+    reader = subprocess.Popen(command, env=master.environment, stdout=subprocess.PIPE, text=True)
+    yield reader
+    reader.kill()
+    reader.wait()
+
+
+def test_a_subscriber_gets_every_row_from_the_first_on(master: Master, subscriber: subprocess.Popen[str]) -> None:
+    """Rows come in bursts of 20, as a thousand a second do, the first before he has connected; then it ends at once."""
+    assert subscriber.stdout is not None
+    while subscriber.stdout.readline() != "ready\n":  # before it stands that it waited for the master
+        assert subscriber.poll() is None
+    until(lambda: "/listener" in master.tool("rostopic", "info", "/bench/crane"))
+    sink = ros1(master)
+    sink.open([ANGLE, FORCE], STATION)
+    until(lambda: sink.stats.state == "running")
+    sent = list(range(400))
+    for burst in range(0, len(sent), 20):
+        values = np.array([[k, 1.0] for k in sent[burst : burst + 20]])
+        stamps = time.time() + 0.001 * np.arange(len(values))
+        sink.write_group(GroupRows("crane", ((ARM, 1), (HAND, 2)), stamps, values, values * 0))
+        time.sleep(0.02)
+    sink.close()
+    assert [int(subscriber.stdout.readline()) for _ in sent] == sent
+    assert sink.stats.dropped == 0

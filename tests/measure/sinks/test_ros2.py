@@ -9,6 +9,7 @@ import shutil
 import subprocess
 import threading
 import time
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -23,6 +24,7 @@ from teds_provision.measure.sinks import open_sink
 from teds_provision.measure.sinks.ros.ros2_types import HUMBLE_HASHES, TYPE_HASHES
 from teds_provision.teds.units.units import parse_units
 from tests.measure.sinks.parts import ANGLE, ARM, FORCE, HAND, STATION, block
+from tests.places import ros_domain
 
 HEADER = Path("/usr/include/fastdds/dds/domain/DomainParticipant.hpp")
 SOURCE = Path(__file__).with_name("fastdds_reader.cpp")
@@ -68,9 +70,10 @@ def reader(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture
-def domain(monkeypatch: pytest.MonkeyPatch) -> int:
+def domain(monkeypatch: pytest.MonkeyPatch) -> Iterator[int]:
     monkeypatch.delenv("CYCLONEDDS_URI", raising=False)
-    return 100 + os.getpid() % 100
+    with ros_domain() as number:
+        yield number
 
 
 class Seen:
@@ -168,7 +171,7 @@ class TestSeenByFastDds:
         assert words["channels"][0]["fingerprint"] == ANGLE.fingerprint, "a late comer gets the metadata"
         graph = decoded("ros_discovery_info", "rmw_dds_common/msg/ParticipantEntitiesInfo")
         [node] = graph.node_entities_info_seq
-        assert (node.node_namespace, node.node_name) == ("/bench", "teds_provision")
+        assert (node.node_namespace, node.node_name) == ("/bench", "teds_provision_bench")
         assert len(node.writer_gid_seq) >= 6
         assert len(node.reader_gid_seq) == 1
         assert len(graph.gid.data) == (24 if release == "humble" else 16)

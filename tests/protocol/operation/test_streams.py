@@ -401,6 +401,16 @@ def test_drive_messages_are_sets_and_feed_the_dead_men(wheel: Wheel) -> None:
     assert wheel.points == (100, 100)
 
 
+def test_a_fresh_drive_message_after_the_dead_man_moves_nothing_even_where_nobody_polled(wheel: Wheel) -> None:
+    """A node whose processor hung wakes up with a fresh message in its controller: its timer ran out before that."""
+    wheel.hear(wheel.message(1000, 1000))
+    wheel.bench.hardware.tick += 500 * MS
+    wheel.hear(wheel.message(2000, 2000))
+    assert wheel.points == (100, 100)
+    states = wheel.bench.operation().channels
+    assert states[4] == states[6] == (ChannelState.ACTUATOR | ChannelState.SAFE | ChannelState.STOPPED, 0)
+
+
 def test_a_drive_message_that_is_late_replayed_forged_or_too_much_moves_nothing(wheel: Wheel) -> None:
     bench = wheel.bench
     good = wheel.message(1000, 1000)

@@ -53,7 +53,7 @@ class McapSink(FileSink):
         self._writer: McapWriter | None = None
         self._opened = 0.0
         self._schemas: dict[str, int] = {}
-        self._streams: dict[tuple[str, int, tuple[int, ...], str], tuple[int, np.dtype[Any]]] = {}
+        self._streams: dict[tuple[str, int, tuple[int, ...], str], tuple[int, np.ndarray]] = {}
         self._strings: dict[str, int] = {}
         self._topics: Topics | None = None
 
@@ -143,7 +143,8 @@ class McapSink(FileSink):
         words["clock_error"] = report.clock_error
         self._string(f"/{self._names.station}/reports", json.dumps(words), report.time or time.time())
 
-    def _stream(self, block: Block) -> tuple[int, np.dtype[Any]]:
+    def _stream(self, block: Block) -> tuple[int, np.ndarray]:
+        """The topic of a stream, and a message of it in which all stands that is the same in each."""
         integral = block.raw.dtype.kind in "uib"
         key = (block.uuid, block.stream, block.channels, "i" if integral else "f")
         if key not in self._streams:
@@ -155,7 +156,7 @@ class McapSink(FileSink):
             topic = self._names.of_node(block.uuid, f"stream_{block.stream}")
             metadata = {"uuid": block.uuid, "channels": json.dumps(labels)}
             number = self._out.channel(topic, self._schemas[TYPE], metadata)
-            self._streams[key] = number, _layout(len(block.channels), integral)
+            self._streams[key] = number, _plain(number, len(block.channels), integral)
         return self._streams[key]
 
     def _block(self, block: Block) -> None:
@@ -166,23 +167,22 @@ class McapSink(FileSink):
                 [[one if isinstance(one, int | float) else np.nan for one in row] for row in raw.tolist()],
                 dtype=np.float64,
             )
-        channel, layout = self._stream(block)
+        channel, plain = self._stream(block)
+        n = len(block.time)
         nanoseconds = np.rint(block.time * 1e9).astype(np.uint64)
-        rows = np.zeros(len(block.time), dtype=layout)
-        n, c = block.value.shape
-        rows["code"], rows["length"], rows["channel"] = MESSAGE, layout.itemsize - 9, channel
-        rows["sequence"] = np.arange(block.index, block.index + n) & 0xFFFFFFFF
-        rows["logged"] = rows["published"] = nanoseconds
-        rows["cdr"] = np.frombuffer(_LITTLE_ENDIAN, dtype="<u4")[0]
+        rows = plain.repeat(n)
+        index = np.arange(block.index, block.index + n)
+        rows["sequence"] = index & 0xFFFFFFFF
+        rows["times"] = nanoseconds[:, None]
         rows["sec"], rows["nanosec"] = np.divmod(nanoseconds, 10**9)
-        rows["index"] = np.arange(block.index, block.index + n)
+        rows["index"] = index
         rows["tick"] = block.tick
-        rows["clock_error"] = np.nan if block.clock_error is None else block.clock_error
-        rows["test"] = block.test_pattern
-        rows["values"] = c
-        rows["value"] = np.where(block.valid, block.value, np.nan)
-        rows["raws" if layout["raw"].base.kind == "i" else "floats"] = c
-        rows["raw"] = raw.astype(np.int64) if layout["raw"].base.kind == "i" else raw
+        if block.clock_error is not None:
+            rows["clock_error"] = block.clock_error
+        if block.test_pattern:
+            rows["test"] = True
+        rows["value"] = block.value
+        rows["raw"] = raw.view(np.int64) if raw.dtype == np.uint64 else raw
         self._out.add_messages(channel, rows.tobytes(), nanoseconds.tolist())
         self._count(written=block.value.size, messages=n)
 
@@ -199,6 +199,16 @@ def _as_texts(facts: dict[str, Any]) -> dict[str, str]:
     return {name: value if isinstance(value, str) else json.dumps(value) for name, value in facts.items()}
 
 
+def _plain(channel: int, channels: int, integral: bool) -> np.ndarray:
+    """An array of one message record without its numbers; those of a block are as many copies of it."""
+    row = np.zeros(1, dtype=_layout(channels, integral))
+    row["code"], row["length"], row["channel"] = MESSAGE, row.dtype.itemsize - 9, channel
+    row["cdr"] = np.frombuffer(_LITTLE_ENDIAN, dtype="<u4")
+    row["clock_error"] = np.nan
+    row["values"] = row["raws" if integral else "floats"] = channels
+    return row
+
+
 def _layout(channels: int, integral: bool) -> np.dtype[Any]:
     """A message record of SAMPLES as a packed structure: CDR aligns to 8 octets, counted behind its first four."""
     head: list[tuple[str, str] | tuple[str, str, tuple[int]]] = [
@@ -206,8 +216,7 @@ def _layout(channels: int, integral: bool) -> np.dtype[Any]:
         ("length", "<u8"),
         ("channel", "<u2"),
         ("sequence", "<u4"),
-        ("logged", "<u8"),
-        ("published", "<u8"),
+        ("times", "<u8", (2,)),  # logged, published
         ("cdr", "<u4"),
         ("sec", "<i4"),
         ("nanosec", "<u4"),

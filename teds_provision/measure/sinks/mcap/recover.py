@@ -58,6 +58,8 @@ def recover(path: Path) -> Recovered:
             return _recover(file, path)
     except FileNotFoundError:
         raise NotFound(f"There is no file {path}.", hint="Name the recording that was cut.") from None
+    except IsADirectoryError:
+        raise BadData(f"{path} is a folder.", hint="Name one recording in it.") from None
     except OSError as error:
         raise as_sink_failure(error, str(path)) from error
 

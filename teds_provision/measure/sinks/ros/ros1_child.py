@@ -2,7 +2,8 @@
 
 Nothing of this package is imported here, and nothing but rospy beside the standard library: that Python has other
 versions of everything. Out go lines of JSON too: ready, and set points of actuators. It ends when stdin closes, and
-with exit code 3 when the master is gone or has been started anew (the parent then starts another one).
+with exit code 3 when the master is gone or has been started anew, 4 when another program took the node's name (the
+parent then starts another one).
 
 Lines in: ``{"op": "topic", "id": 1, "topic": "/a", "type": "std_msgs/Float64", "latch": false, "names": […]}``,
 ``{"op": "joint", "id": 1, "t": seconds, "v": […]}``, ``{"op": "value", "id", "t", "field", "frame", "v", "var"}``,
@@ -18,10 +19,16 @@ import os
 import sys
 import threading
 import time
+from contextlib import suppress
 from typing import Any
 
 WATCH = 1.0  # seconds between looks at the master
-NO_MASTER = 3
+NO_MASTER, NAME_TAKEN = 3, 4
+QUEUE = 1000  # messages that one subscriber may be behind: bursts of rows, and what a busy machine held up, fit
+MEETING = 1.0  # seconds for subscribers that the master knows of to connect
+KNOWN = 0.3  # seconds for which the master's list of subscribers is believed
+BURST, PAUSE = 20, 0.002  # messages that go at once, and the pause after them: else they fall out of a queue
+LEAVING = 1.0  # seconds for the last messages to leave
 
 
 def say(**words: object) -> None:
@@ -61,15 +68,76 @@ def watch_master(rosgraph: Any, name: str) -> None:
             os._exit(NO_MASTER)
 
 
-class Bridge:
-    """Publishers and subscribers by the parent's numbers."""
+def leave(reason: str) -> None:
+    """The master ends a node whose name another one takes: say why, where rospy would go on without a connection."""
+    if "same name" in reason:
+        os._exit(NAME_TAKEN)
 
-    def __init__(self, rospy: Any) -> None:
-        self.rospy = rospy
-        self.publishers: dict[int, tuple[Any, Any]] = {}
+
+class Outlet:
+    """A publisher. Its first messages wait for subscribers that the master knows of, MEETING seconds at most.
+
+    A subscriber connects some tenths of a second after the publisher was told of; rows of that time would be lost.
+    """
+
+    def __init__(self, publisher: Any, kind: Any, expected: int) -> None:
+        self.publisher, self.kind, self._expected = publisher, kind, expected
+        self._until = time.monotonic() + MEETING
+        self._waiting: list[Any] | None = [] if expected else None
+
+    def publish(self, message: Any) -> None:
+        """Now, or after those that wait."""
+        if self._waiting is None:
+            self.publisher.publish(message)
+            return
+        self._waiting.append(message)
+        self.met()
+
+    def met(self) -> bool:
+        """Whether nobody is waited for any more; then what waited has gone."""
+        if self._waiting is None:
+            return True
+        if time.monotonic() < self._until and self.publisher.get_num_connections() < self._expected:
+            return False
+        waiting, self._waiting = self._waiting, None
+        for k, message in enumerate(waiting, start=1):
+            self.publisher.publish(message)
+            if not k % BURST:
+                time.sleep(PAUSE)
+        return True
+
+    def sent(self) -> bool:
+        """Whether its connections have taken all of it; their queues are rospy's own."""
+        connections = getattr(self.publisher.impl, "connections", ()) if self.publisher.impl else ()
+        return not any(getattr(one, "_queue", ()) for one in connections)
+
+
+class Bridge:
+    """Publishers and subscribers by the parent's numbers; ``master`` knows who subscribes."""
+
+    def __init__(self, rospy: Any, master: Any) -> None:
+        self.rospy, self.master = rospy, master
+        self.publishers: dict[int, Outlet] = {}
         self.names: dict[int, list[str]] = {}
         self.types: dict[str, Any] = {}
         self.listening: dict[str, Any] = {}
+        self._subscribed: tuple[float, dict[str, int]] = (0.0, {})
+
+    def subscribers(self, topic: str) -> int:
+        """How many nodes subscribe it, as the master knows it; some of them may be dead."""
+        if time.monotonic() > self._subscribed[0] + KNOWN:
+            found = {}
+            with suppress(Exception):  # whatever a socket, or the master itself, throws at an XML-RPC client
+                found = {name: len(nodes) for name, nodes in self.master.getSystemState()[1]}
+            self._subscribed = time.monotonic(), found
+        return self._subscribed[1].get(topic, 0)
+
+    def end(self) -> None:
+        """Wait until what came has gone."""
+        end = time.monotonic() + MEETING + LEAVING
+        for ready in (Outlet.met, Outlet.sent):
+            while not all(map(ready, self.publishers.values())) and time.monotonic() < end:
+                time.sleep(PAUSE)
 
     def type_of(self, name: str) -> Any:
         """Message class of ``package/Type``."""
@@ -83,18 +151,16 @@ class Bridge:
         return self.rospy.Time.from_sec(seconds)
 
     def topic(self, line: dict[str, Any]) -> None:
-        """Advertise; a queue of 10, so that one slow subscriber holds up nobody."""
-        kind = self.type_of(line["type"])
-        self.publishers[line["id"]] = (
-            self.rospy.Publisher(line["topic"], kind, queue_size=10, latch=line["latch"]),
-            kind,
-        )
+        """Advertise; each subscriber has a queue of his own, so that a slow one holds up nobody."""
+        kind, latch = self.type_of(line["type"]), line["latch"]
+        made = self.rospy.Publisher(line["topic"], kind, queue_size=QUEUE, latch=latch)
+        self.publishers[line["id"]] = Outlet(made, kind, 0 if latch else self.subscribers(line["topic"]))
         self.names[line["id"]] = line.get("names", [])
 
     def joint(self, line: dict[str, Any]) -> None:
         """A row of a group."""
-        publisher, kind = self.publishers[line["id"]]
-        message = kind()
+        publisher = self.publishers[line["id"]]
+        message = publisher.kind()
         message.header.stamp = self.stamp(line["t"])
         message.name = self.names[line["id"]]
         message.position = [float("nan") if value is None else value for value in line["v"]]
@@ -102,8 +168,8 @@ class Bridge:
 
     def value(self, line: dict[str, Any]) -> None:
         """One value of a channel."""
-        publisher, kind = self.publishers[line["id"]]
-        message = kind()
+        publisher = self.publishers[line["id"]]
+        message = publisher.kind()
         setattr(message, line["field"], line["v"])
         if hasattr(message, "header"):
             message.header.stamp = self.stamp(line["t"])
@@ -114,8 +180,8 @@ class Bridge:
 
     def compound(self, line: dict[str, Any]) -> None:
         """A message of several values, its fields by path; what this distribution's type has not is left out."""
-        publisher, kind = self.publishers[line["id"]]
-        message = kind()
+        publisher = self.publishers[line["id"]]
+        message = publisher.kind()
         message.header.stamp = self.stamp(line["t"])
         message.header.frame_id = line["frame"]
         for path, value in line["v"].items():
@@ -129,13 +195,13 @@ class Bridge:
 
     def text(self, line: dict[str, Any]) -> None:
         """Words."""
-        publisher, kind = self.publishers[line["id"]]
-        publisher.publish(kind(line["v"]))
+        publisher = self.publishers[line["id"]]
+        publisher.publish(publisher.kind(line["v"]))
 
     def status(self, line: dict[str, Any]) -> None:
         """A DiagnosticArray."""
-        publisher, kind = self.publishers[line["id"]]
-        message = kind()
+        publisher = self.publishers[line["id"]]
+        message = publisher.kind()
         message.header.stamp = self.stamp(line["t"])
         entry, pair = self.type_of("diagnostic_msgs/DiagnosticStatus"), self.type_of("diagnostic_msgs/KeyValue")
         for level, name, text, hardware, values in line["v"]:
@@ -170,12 +236,14 @@ def main() -> None:
 
     wait_for_master(rosgraph)
     rospy.init_node(sys.argv[1], disable_signals=True, anonymous=False)
-    bridge = Bridge(rospy)
+    rospy.core.add_preshutdown_hook(leave)
+    bridge = Bridge(rospy, rosgraph.Master(rospy.get_name()))
     threading.Thread(target=watch_master, args=(rosgraph, rospy.get_name()), daemon=True).start()
     say(event="ready", node=rospy.get_name())
     for line in sys.stdin:
         words = json.loads(line)
         getattr(bridge, words["op"])(words)
+    bridge.end()
     rospy.signal_shutdown("the parent has ended")
     # Threads of rospy may hang on a subscriber that is gone; everything that had to go out has gone out.
     os._exit(0)

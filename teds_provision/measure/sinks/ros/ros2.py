@@ -30,18 +30,26 @@ else:  # cyclonedds: an extra
     ros2_types = late("teds_provision.measure.sinks.ros.ros2_types")
 
 GRAPH = "rmw_dds_common/ParticipantEntitiesInfo"
-NODE = "teds_provision"
 DISTRIBUTIONS = ("humble", "iron", "jazzy", "kilted", "lyrical", "rolling")
-HISTORY = 10
+HISTORY = 100  # messages that a reader may be behind: a burst of rows fits
+NEWEST = 10  # set points that may wait here
 BLOCKING_MS = 10  # how long a slow reliable reader may hold up a write, at most
 LISTENING = 0.2  # seconds between looks whether the end has come
 THIS_MACHINE = (
     "<CycloneDDS><Domain Id='any'><General><Interfaces><NetworkInterface name='lo' multicast='false'/></Interfaces>"
     "<AllowMulticast>false</AllowMulticast></General><Discovery><Peers><Peer address='127.0.0.1'/></Peers>"
-    "<ParticipantIndex>auto</ParticipantIndex><MaxAutoParticipantIndex>30</MaxAutoParticipantIndex></Discovery>"
+    "<SPDPInterval>2s</SPDPInterval><ParticipantIndex>auto</ParticipantIndex><MaxAutoParticipantIndex>30</MaxAutoParticipantIndex></Discovery>"
     "<Tracing><Verbosity>none</Verbosity></Tracing></Domain></CycloneDDS>"
 )
 _domains: dict[int, Any] = {}  # a domain is configured once in a process
+
+
+def domain_of(spec: str) -> int:
+    """The domain of ``ros2`` or ``ros2:DOMAIN``, else ROS_DOMAIN_ID's, else 0; raises UsageFailure."""
+    domain = spec.partition(":")[2] or os.environ.get("ROS_DOMAIN_ID", "0")
+    if not domain.isdecimal() or int(domain) > 232:
+        raise UsageFailure(f"{domain!r} is no ROS 2 domain.", hint="Name a number from 0 to 232: ros2:7")
+    return int(domain)
 
 
 class Ros2Sink(TopicSink):
@@ -49,10 +57,7 @@ class Ros2Sink(TopicSink):
 
     def __init__(self, spec: str, commands: CommandTaker | None = None) -> None:
         super().__init__("ROS 2", commands)
-        domain = spec.partition(":")[2] or os.environ.get("ROS_DOMAIN_ID", "0")
-        if not domain.isdecimal() or int(domain) > 232:
-            raise UsageFailure(f"{domain!r} is no ROS 2 domain.", hint="Name a number from 0 to 232: ros2:7")
-        self._domain = int(domain)
+        self._domain = domain_of(spec)
         self._distribution = os.environ.get("ROS_DISTRO", "jazzy")
         if self._distribution not in DISTRIBUTIONS:
             self._distribution = "jazzy"
@@ -86,7 +91,11 @@ class Ros2Sink(TopicSink):
             ) from error
         self._graph = self._new_writer(GRAPH, "ros_discovery_info", latched=True)
 
-    def _qos(self, kind: str, *, latched: bool) -> Any:
+    def _qos(self, kind: str, *, latched: bool, reading: bool = False) -> Any:
+        """What a writer offers, or a reader asks for.
+
+        A reader asks for best effort: it hears both kinds of writers, and no set point that was lost comes later.
+        """
         from cyclonedds.qos import Policy, Qos
         from cyclonedds.util import duration
 
@@ -94,9 +103,11 @@ class Ros2Sink(TopicSink):
         code = self._types.HUMBLE_HASHES.get(kind) if humble else None
         code = code or self._types.TYPE_HASHES[kind]
         return Qos(
-            Policy.Reliability.Reliable(duration(milliseconds=BLOCKING_MS)),
+            Policy.Reliability.BestEffort
+            if reading
+            else Policy.Reliability.Reliable(duration(milliseconds=BLOCKING_MS)),
             Policy.Durability.TransientLocal if latched else Policy.Durability.Volatile,
-            Policy.History.KeepLast(1 if latched else HISTORY),
+            Policy.History.KeepLast(1 if latched else NEWEST if reading else HISTORY),
             Policy.DataRepresentation(use_cdrv0_representation=True),
             Policy.Userdata(f"typehash=RIHS01_{code};".encode()),
         )
@@ -135,7 +146,7 @@ class Ros2Sink(TopicSink):
 
         node = info(
             node_namespace=f"/{self._topics.station}",
-            node_name=NODE,
+            node_name=self._node,
             reader_gid_seq=[of(reader) for reader, _, _ in self._readers.values()],
             writer_gid_seq=[of(writer) for writer in self._writers.values()],
         )
@@ -158,6 +169,9 @@ class Ros2Sink(TopicSink):
     def _header(self, stamp: float, frame: str = "") -> Any:
         seconds, nanoseconds = divmod(round(stamp * 1e9), 10**9)
         return self._types.Header(self._types.Time(seconds, nanoseconds), frame)
+
+    def _advertise(self, topic: str, kind: str) -> None:
+        self._writer(topic, kind)
 
     def _array(self, topic: str, stamp: float, names: Sequence[str], values: Sequence[float]) -> None:
         message = self._types.JointState(self._header(stamp), names, values, [], [])
@@ -191,7 +205,9 @@ class Ros2Sink(TopicSink):
         if topic in self._readers:
             return
         kind = "std_msgs/Float64"
-        reader = DataReader(self._participant, self._topic(kind, f"rt{topic}"), qos=self._qos(kind, latched=False))
+        reader = DataReader(
+            self._participant, self._topic(kind, f"rt{topic}"), qos=self._qos(kind, latched=False, reading=True)
+        )
         self._readers[topic] = (reader, uuid, channel)
         self._unshown = True
         if self._listener is None:
@@ -215,7 +231,7 @@ class Ros2Sink(TopicSink):
             try:
                 waiting.wait(duration(milliseconds=int(LISTENING * 1000)))
                 for reader, uuid, channel in list(self._readers.values()):
-                    for message in reader.take(N=HISTORY):
+                    for message in reader.take(N=NEWEST):
                         if isinstance(message, self._types.Float64):
                             self._command(uuid, channel, float(message.data))
             except DDSException:

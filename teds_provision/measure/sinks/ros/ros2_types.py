@@ -3,8 +3,13 @@
 Loaded late, by sinks.ros2 alone: Cyclone DDS is an extra. No postponed annotations here, for Cyclone reads them.
 """
 
+import struct
+import sys
+from array import array as packed
+from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import Final
+from functools import lru_cache
+from typing import Any, Final, cast
 
 from cyclonedds.idl import IdlStruct
 from cyclonedds.idl.types import array, float32, float64, int32, sequence, uint8, uint32
@@ -70,6 +75,44 @@ class JointState(IdlStruct, typename="sensor_msgs::msg::dds_::JointState_"):
     position: sequence[float64] = field(default_factory=list)
     velocity: sequence[float64] = field(default_factory=list)
     effort: sequence[float64] = field(default_factory=list)
+
+    def serialize(self, buffer: Any = None, endianness: Any = None, use_version_2: bool | None = None) -> bytes:
+        """The octets that Cyclone DDS makes of it, number by number and name by name: those of XCDR1 at once.
+
+        A group's row has hundreds of names, the same in every row; one by one they took most of a millisecond.
+        """
+        if buffer is not None or endianness is not None or use_version_2 is not False or sys.byteorder != "little":
+            octets: bytes = super().serialize(buffer, endianness, use_version_2)
+            return octets
+        stamp = self.header.stamp
+        octets = _STAMP.pack(b"\0\1\0\0", stamp.sec, stamp.nanosec)
+        # Cyclone's own word for a sequence says nothing of what is in it.
+        names, *numbers = cast("tuple[Sequence[Any], ...]", (self.name, self.position, self.velocity, self.effort))
+        octets += _names_in_cdr(self.header.frame_id, tuple(names))
+        for one in numbers:
+            octets += _numbers_in_cdr(one, len(octets) - _CDR_HEAD)
+        return octets
+
+
+_CDR_HEAD: Final = 4
+_STAMP: Final = struct.Struct("<4siI")
+
+
+@lru_cache(maxsize=64)
+def _names_in_cdr(frame: str, names: tuple[str, ...]) -> bytes:
+    """What stands between stamp and positions, each text at a multiple of four; the stamp has eight octets."""
+    return _text_in_cdr(frame) + struct.pack("<I", len(names)) + b"".join(map(_text_in_cdr, names))
+
+
+def _text_in_cdr(text: str) -> bytes:
+    octets = text.encode() + b"\0"
+    return struct.pack("<I", len(octets)) + octets + bytes(-len(octets) % 4)
+
+
+def _numbers_in_cdr(numbers: Sequence[float], at: int) -> bytes:
+    """A sequence of float64 that begins ``at`` so many octets of the message, a multiple of four."""
+    count = struct.pack("<I", len(numbers))
+    return count + bytes(-(at + 4) % 8) + packed("d", numbers).tobytes() if len(numbers) else count
 
 
 @dataclass

@@ -13,7 +13,8 @@ export const state = {
   refusal: null,
   status: null,
   loaded: false,
-  nodes: new Map(), // by UUID
+  nodes: new Map(), // by UUID; the first thousand
+  total: 0, // how many the station knows
   groups: [],
   measurements: [],
   virtual: [],
@@ -108,7 +109,8 @@ const LISTS = {
     }
   },
   nodes: async () => {
-    const { nodes } = await get("nodes");
+    const { nodes, total } = await get("nodes");
+    state.total = total ?? 0;
     state.nodes = new Map((nodes ?? []).map((wire) => [wire.uuid, shapes.node(wire)]));
     state.loaded = true;
   },

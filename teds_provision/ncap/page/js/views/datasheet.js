@@ -5,7 +5,7 @@ import { button, chip, empty, fill, h, say, trouble } from "../dom.js";
 import { count, nameOf, verdict } from "../format.js";
 import { curvePlot } from "../plot.js";
 import { on, refresh, state } from "../state.js";
-import { checkLine } from "./node.js";
+import { checkLine } from "./facts.js";
 import { WritePanel } from "./write.js";
 
 export class DatasheetTab {

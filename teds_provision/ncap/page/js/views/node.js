@@ -4,8 +4,8 @@ import { chip, fill, h, icon, keyed, text } from "../dom.js";
 import { grouped, nameOf, verdict } from "../format.js";
 import { on, state } from "../state.js";
 import { DatasheetTab } from "./datasheet.js";
+import { facts, checkLine } from "./facts.js";
 import { LiveTab } from "./values.js";
-import { facts } from "./nodes.js";
 import { ProvisionTab } from "./provision.js";
 
 const TABS = { live: ["Live", LiveTab], datasheet: ["Datasheet", DatasheetTab], provision: ["Provision", ProvisionTab] };
@@ -75,13 +75,4 @@ export class NodePanel {
     this.stop();
     this.open?.tab.end();
   }
-}
-
-const RESULTS = { passed: ["good", "good", "passed"], failed: ["bad", "bad", "failed"], skipped: ["plain", "ask", "skipped"] };
-
-/** One check of the security check, with its reason. */
-export function checkLine(check) {
-  if (check.print) return h("li", {}, h("span", { class: "check-name" }, "Fingerprint of its key"), h("code", { class: "print" }, grouped(check.print)));
-  const [tone, sign, words] = RESULTS[check.result] ?? RESULTS.skipped;
-  return h("li", {}, chip(tone, sign, words), h("span", { class: "check-name" }, check.name), check.why ? h("span", { class: "hint" }, check.why) : null);
 }

@@ -1,19 +1,15 @@
 // The nodes that are there, and the one that is open.
 
 import { chip, empty, fill, h, icon, keyed, text } from "../dom.js";
-import { age, channelName, count, nameOf, number, verdict } from "../format.js";
+import { channelName, count, nameOf, number, verdict } from "../format.js";
 import { isStale, lastOf, now, on, state } from "../state.js";
+import { facts } from "./facts.js";
 import { NodePanel } from "./node.js";
 import { ProvisionTab } from "./provision.js";
 
 const MARKED = 8000; // ms that a tapped node stays marked
 const SHOWN_VALUES = 3;
 const SEARCH_FROM = 7; // nodes
-const LINKS = { nfc: "NFC", can: "CAN", ble: "BLE", virtual: "Virtual" };
-
-/** What a link is called. */
-export const linkName = (link) => LINKS[link] ?? link ?? "no link";
-
 const order = (one, other) => Number(other.present ?? false) - Number(one.present ?? false) || nameOf(one).localeCompare(nameOf(other));
 
 export function nodesView(main, rest) {
@@ -42,7 +38,8 @@ export function nodesView(main, rest) {
     side.hidden = !any;
     search.hidden = state.nodes.size < SEARCH_FROM && !search.value;
     const strangers = state.status?.strangers ?? 0;
-    text(total, `${count(state.nodes.size, "node")}${strangers ? `, ${strangers} more not on the whitelist` : ""}`);
+    const shown = state.total > state.nodes.size ? `${state.nodes.size} of ${count(state.total, "node")}` : count(state.nodes.size, "node");
+    text(total, `${shown}${strangers ? `, ${strangers} more not on the whitelist` : ""}`);
     keyed(list, nodes, (node) => node.uuid, card, update);
     main.classList.toggle("one-open", Boolean(chosen[0]) && any);
     open();
@@ -142,27 +139,6 @@ export function nodesView(main, rest) {
 
 function card(node) {
   return h("li", { class: "card" }, h("a", { href: `#/nodes/${node.uuid}` }));
-}
-
-/** Link, state, battery, in words with signs. */
-export function facts(node) {
-  const out = [h("span", {}, icon(node.virtual ? "virtual" : (node.link ?? "ask")), node.virtual ? "Virtual" : linkName(node.link))];
-  if (node.present === false) out.push(h("span", { class: "warn" }, icon("clock"), node.seen ? `away, seen ${age(now() - node.seen)}` : "away"));
-  else if (node.busy) out.push(h("span", { class: "busy" }, icon("clock"), node.busy));
-  else if (node.mode === "measuring") out.push(h("span", { class: "busy" }, icon("wave"), "measuring"));
-  else if (node.state) out.push(h("span", {}, node.state));
-  if (node.whitelisted === false) out.push(h("span", { class: "warn" }, icon("warn"), "not on the whitelist"));
-  if (node.groups?.length) out.push(h("span", {}, icon("list"), node.groups.join(", ")));
-  if (node.power) out.push(power(node.power));
-  return out;
-}
-
-/** Battery and charging in words. */
-export function power(told) {
-  const level = typeof told.percent === "number" ? `${told.percent} %` : "level not known";
-  const words = { charging: "charging", wanted: "wants charging", full: "full", error: "charging error" }[told.charging];
-  const low = told.low || (typeof told.percent === "number" && told.percent < 10);
-  return h("span", { class: low ? "warn" : "" }, icon(told.charging === "charging" ? "charge" : "battery"), [level, words, low ? "low" : null].filter(Boolean).join(", "));
 }
 
 const strangersWords = (many) => `${count(many, "node")} answered, but not on the whitelist: lay one on the reader to take it in, or switch detection to Transparent to look at all.`;

@@ -4,7 +4,7 @@ import { change } from "../api.js";
 import { button, chip, empty, fill, h, icon, keyed, say, text, toast } from "../dom.js";
 import { channelName, clock, count, grouped, nameOf, short } from "../format.js";
 import { on, refresh, state } from "../state.js";
-import { linkName } from "./nodes.js";
+import { linkName } from "./facts.js";
 
 export function stationView(main) {
   const links = h("ul", { class: "lines" });

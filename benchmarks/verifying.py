@@ -1,0 +1,98 @@
+"""``verify DIR`` of many datasheets beside three ECDSA checks each by openssl on all cores (issue 13 row 10).
+
+Run: ``python -m benchmarks.verifying [COUNT]`` (default 10,000; half a minute). Ours is the shipped command from its
+start to its last line, its files in the page cache; theirs what ``openssl speed ecdsap256`` says of this machine now,
+times three, shared by its cores. Printed beside the wall: processor time of both, which a busy machine spoils less.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+import resource
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+from teds_provision.protocol.datasheet import NodeKeys, digests, sign_datasheet, unsigned_datasheet
+from teds_provision.protocol.keys import SoftwareKey, fingerprint, node_key_message
+from teds_provision.station.station import initialise
+from teds_provision.teds.codec import security
+from teds_provision.teds.image import SECURITY, Image
+from teds_provision.teds.profile import load_profile
+from teds_provision.vault import passphrase
+
+AIM = 1.5
+CHECKS = 3
+PROFILE = "magnetic-angular-position-sensor"
+
+
+def fill(folder: Path, home: Path, count: int) -> None:
+    """A station, and so many images that it signed for nodes with keys of their own."""
+    station, _ = initialise(
+        home, name="n", keystore="file", ask=lambda p, c: "correct horse battery", costs=passphrase.THROWAWAY
+    )
+    profile, credentials = load_profile(PROFILE), station.credentials()
+    folder.mkdir()
+    for number in range(count):
+        key, uuid = SoftwareKey.generate(), (1 + number).to_bytes(10, "big")
+        node = NodeKeys(uuid, key.point, key.sign(node_key_message(uuid, key.point)))
+        blocks = profile.build(uuid).blocks
+        hint = security.ca_hint(station.name, fingerprint(station.ca))
+        unsigned = unsigned_datasheet(
+            node, station.point, station.identity.signature, digests(blocks), ca=hint, sequence=1, key_epoch=1
+        )
+        image = Image(uuid, {**blocks, SECURITY: sign_datasheet(unsigned, uuid, credentials)})
+        (folder / f"{uuid.hex()}.json").write_text(image.to_json())
+    station.close()
+
+
+def ours(folder: Path, home: Path) -> tuple[float, float, str]:
+    """Seconds on the wall and of the processor, and the last line."""
+    command = [sys.executable, "-m", "teds_provision", "--home", str(home), "verify", str(folder)]
+    before, began = _used(), time.perf_counter()
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    return time.perf_counter() - began, _used() - before, (done.stdout.splitlines() or [done.stderr])[-1]
+
+
+def _used() -> float:
+    used = resource.getrusage(resource.RUSAGE_CHILDREN)
+    return used.ru_utime + used.ru_stime
+
+
+def one_check() -> float:
+    """Seconds of the processor that openssl takes for one check of a P-256 signature here and now."""
+    words = ["openssl", "speed", "-seconds", "2", "ecdsap256"]
+    told = subprocess.run(words, capture_output=True, text=True, check=True).stdout
+    found = re.search(r"nistp256\)\s+\S+s\s+(\S+)s", told)
+    if found is None:
+        raise SystemExit(f"openssl said something else:\n{told}")
+    return float(re.findall(r"(\d+\.\d)\s*$", told, re.MULTILINE)[-1]) ** -1
+
+
+def main(count: int) -> None:
+    """Make, verify twice (the first fills the page cache), and print."""
+    cores = len(os.sched_getaffinity(0))
+    with tempfile.TemporaryDirectory() as name:
+        folder, home = Path(name, "images"), Path(name, "home")
+        fill(folder, home, count)
+        runs = [ours(folder, home) for _ in range(3)]
+    wall, cpu, last = min(runs)
+    check = one_check()
+    floor = CHECKS * count * check
+    print(f"{last}  {wall:.2f} s, {cpu:.2f} s of the processor; load {os.getloadavg()[0]:.1f}")
+    print(
+        f"openssl: {1 / check:,.0f} checks a second a core; {CHECKS} × {count:,} on {cores} cores {floor / cores:.2f} s"
+    )
+    ratio = wall * cores / floor
+    print(f"verify DIR against that: {ratio:.2f} × (processor {cpu / floor:.2f} ×); aim {AIM}: {_met(ratio)}")
+
+
+def _met(ratio: float) -> str:
+    return "met" if ratio <= AIM else "MISSED"
+
+
+if __name__ == "__main__":
+    main(int(sys.argv[1]) if len(sys.argv) > 1 else 10_000)

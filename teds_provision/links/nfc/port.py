@@ -1,0 +1,353 @@
+"""NFC as a port: waits for taps on a reader and carries command frames to the node that lies there (profile.md, "NFC").
+
+nfcpy's ``connect`` is not used: it swallows OSError and Ctrl-C. One thread senses, activates and exchanges.
+"""
+
+from __future__ import annotations
+
+import secrets
+import threading
+import time
+from collections.abc import Callable, Iterator
+from typing import TypeGuard
+
+from teds_provision.errors import Garbled, LinkFailure, NodeSilent, NoNode, NoReader
+from teds_provision.links.nfc.pcsc import PcscReader
+from teds_provision.links.nfc.poller import Poller
+from teds_provision.links.nfc.reader import AUTO, Reader, open_reader
+from teds_provision.links.nfc.tag import FieldLost, ReaderLost
+from teds_provision.links.nfc.visit import Foreign, Visit, look
+from teds_provision.links.ports import NFC, Capabilities, Contact, Notice, NoticeSink, Trace
+from teds_provision.protocol.messages.identity import Identity
+
+REPEATS = 2  # of one transaction
+REPEAT_WITHIN = 15.0  # seconds
+RETURN_WITHIN = 3.0  # seconds that a node which slipped off has to come back in the middle of a transaction
+_PAUSE, _SHORT_PAUSE = 0.1, 0.03  # seconds between two polls of the field; the short one while boards are changed
+_CHANGING = 2.0  # seconds after a node left in which the next one is expected
+_REOPEN = 1.0  # seconds between two tries to open a lost reader
+_DEBOUNCE = 0.7  # seconds: the same node back within them was never away
+_LOOK_AGAIN = 1.0  # seconds until a tag that was not wanted is read anew
+
+
+def open_port(where: str, trace: Trace | None = None) -> NfcPort:
+    """Open the reader that ``where`` names, as ``--nfc`` does; empty or ``auto``: the one that is there.
+
+    Raises NoReader, UsageFailure.
+    """
+    return NfcPort(where or AUTO, trace)
+
+
+class NfcPort:
+    """A reader, on which nodes are found by tapping them. One tap at a time: calls from several threads take turns.
+
+    ``path`` is ``udp:localhost:PORT``, a path of nfcpy, or ``auto``. Raises NoReader when the reader cannot be opened,
+    UsageFailure where ``auto`` finds several.
+    """
+
+    def __init__(self, path: str, trace: Trace | None = None) -> None:
+        self.trace = trace
+        self._reader: Reader | PcscReader | None = open_reader(path, trace)
+        self._again = self._reader.again
+        self._named = f" ({self._reader.name} at {self._again})" if path == AUTO else ""
+        self.place = f"nfc:{self._again}"
+        self._transaction = secrets.randbelow(0x10000)
+        self._lost = False
+        self._failures = 0  # of the reader, since it last polled the field
+        self.turn = threading.RLock()
+
+    @property
+    def capabilities(self) -> Capabilities:
+        """What a reader can do."""
+        return NFC
+
+    @property
+    def via(self) -> str:
+        """``nfc``."""
+        return "nfc"
+
+    def find(
+        self, wanted: Callable[[Identity], bool], *, seconds: float, notice: NoticeSink, address: int | None = None
+    ) -> Contact:
+        """Wait for the tap of a node for which ``wanted`` is true.
+
+        Tags that are no nodes and nodes that are not wanted are named once through ``notice`` and waited past.
+        Raises NoNode after ``seconds``, NoReader when the reader is gone by then. ``address`` is of no use here.
+        """
+        until, told, never = time.monotonic() + seconds, "", threading.Event()
+        waiting = False
+        seen: Visit | Foreign | None = None
+        while (left := until - time.monotonic()) > 0:
+            seen = self._look(notice, never)
+            if isinstance(seen, Visit) and wanted(seen.identity):
+                return self._contact(seen, notice)
+            if seen is not None:
+                told = _tell(seen, told, notice)
+                self._stay(seen, never, _LOOK_AGAIN)
+                continue
+            if not waiting:
+                waiting = True
+                notice(Notice("waiting", f"Hold the node to the reader{self._named}.", left))
+            time.sleep(_PAUSE)
+        if self._reader is None:
+            raise NoReader("The reader was unplugged and did not come back.", hint="Plug it in again.")
+        if isinstance(seen, Visit):
+            raise NoNode(
+                f"Node {seen.identity.uuid.hex()} lies on the reader, and it is not the one that is meant.",
+                hint="Put the node there that you named, or name the one that lies there.",
+            )
+        raise NoNode(
+            f"The node was not held to the reader within {seconds:.0f} s.",
+            hint="Hold the node's NFC antenna flat on the reader, or give it more time with --timeout.",
+        )
+
+    def everyone(self, *, seconds: float, notice: NoticeSink) -> list[Contact]:
+        """The node that is tapped: a reader sees one at a time; see ``Port.everyone``."""
+        return [self.find(lambda _: True, seconds=seconds, notice=notice)]
+
+    def watch(self, *, stop: threading.Event, notice: NoticeSink) -> Iterator[Contact]:
+        """Yield each node that is held to the reader, once per visit, until ``stop`` is set (within 0.3 s).
+
+        A reader that is unplugged is opened again when it is back. A node counts as gone when it did not answer for
+        0.7 s.
+        """
+        here: bytes | None = None  # the node of the visit that is not over yet
+        link: NfcLink | None = None
+        gone_at, told = -_CHANGING, ""
+        waiting = Notice("waiting", f"Hold a node to the reader{self._named}.")
+        notice(waiting)
+        while not stop.is_set():
+            seen = self._look(notice, stop)
+            same = isinstance(seen, Visit) and seen.identity.uuid == here
+            if not same and _has_left(here, seen, gone_at):
+                notice(_left(here))
+                notice(waiting)
+                here = None
+            if seen is None:
+                stop.wait(_pause(gone_at))
+                continue
+            if isinstance(seen, Foreign):
+                told = _tell(seen, told, notice)
+                self._stay(seen, stop, _LOOK_AGAIN)
+                continue
+            told = ""
+            if not same:
+                here = seen.identity.uuid
+                link = NfcLink(self, seen, notice)
+                yield _contact(seen, link, self.trace)
+                link.close()
+                seen = link.visit
+            if link is not None and link.lost:  # whoever comes next is a new visit, the same node too
+                notice(_left(seen.identity.uuid))
+                notice(waiting)
+                here, link = None, None
+            else:
+                self._stay(seen, stop, None)
+            gone_at = time.monotonic()
+
+    def close(self) -> None:
+        """Switch the field off and release the reader; never raises."""
+        if self._reader is not None:
+            self._reader.close()
+            self._reader = None
+
+    def next_transaction(self) -> int:
+        """Return the next transaction number, u16; the first of a process is random."""
+        self._transaction = (self._transaction + 1) & 0xFFFF
+        return self._transaction
+
+    def back(self, uuid: bytes, seconds: float) -> Visit:
+        """Activate the node ``uuid`` anew; raises NodeSilent when it, or any node, is not there within ``seconds``."""
+        until = time.monotonic() + seconds
+        while True:
+            try:
+                seen = self._sense_and_look()
+            except FieldLost:
+                seen = None
+            if isinstance(seen, Visit) and seen.identity.uuid == uuid:
+                return seen
+            if isinstance(seen, Visit):
+                raise NodeSilent(
+                    f"The node moved away; another one ({seen.identity.uuid.hex()}) lies on the reader.",
+                    hint=f"Put node {uuid.hex()} back and run the command again.",
+                )
+            if time.monotonic() > until:
+                raise FieldLost
+            time.sleep(_PAUSE)
+
+    def reopen(self) -> None:
+        """Open the reader again after it failed; raises NoReader when it is gone."""
+        with self.turn:
+            if self._reader is None:
+                self._reader = open_reader(self._again, self.trace)
+
+    def lose_reader(self) -> None:
+        """Close a reader that failed, so that the next look opens it again."""
+        self.close()
+
+    def _contact(self, visit: Visit, notice: NoticeSink) -> Contact:
+        return _contact(visit, NfcLink(self, visit, notice), self.trace)
+
+    def _look(self, notice: NoticeSink, stop: threading.Event) -> Visit | Foreign | None:
+        """Poll once; None when nothing lies there or the reader is away (which is told once)."""
+        try:
+            with self.turn:
+                if self._reader is None:
+                    self._reader = open_reader(self._again, self.trace)
+                if self._lost:
+                    self._lost = False
+                    notice(Notice("reader-ready", f"The reader is back: {self._reader.name}."))
+                return self._sense_and_look()
+        except FieldLost:
+            return None
+        except NoReader as error:
+            self.lose_reader()
+            self._failures += 1
+            if self._failures == 1 and not self._lost:
+                return None  # one error alone: the next look opens it again, and nobody need know
+            if not self._lost:
+                self._lost = True
+                notice(Notice("reader-lost", f"{error.message} Waiting for it."))
+            stop.wait(_REOPEN)
+            return None
+
+    def _sense_and_look(self) -> Visit | Foreign | None:
+        with self.turn:
+            if self._reader is None:
+                raise ReaderLost("it was closed")
+            tag = self._reader.sense()
+            self._failures = 0
+            return None if tag is None else look(tag)
+
+    def _stay(self, seen: Visit | Foreign, stop: threading.Event, seconds: float | None) -> None:
+        """Wait until the tag does not answer (one miss: the next look finds who is there), at most ``seconds``."""
+        until = None if seconds is None else time.monotonic() + seconds
+        while not stop.is_set() and (until is None or time.monotonic() < until):
+            try:
+                with self.turn:
+                    if self._reader is None or not seen.tag.is_present:
+                        return
+            except ReaderLost:
+                return  # the next look finds out and says so
+            stop.wait(_SHORT_PAUSE)
+
+
+class NfcLink:
+    """The line to one node that lies on the reader; selects the service when it is first used."""
+
+    def __init__(self, port: NfcPort, visit: Visit, notice: NoticeSink) -> None:
+        self._port = port
+        self._notice = notice
+        self._poller: Poller | None = Poller(visit.tag, visit.service)
+        self.visit = visit
+        self._last = 0
+        self.lost = False
+        """Whether the node left in the middle of an exchange and did not come back in time."""
+
+    @property
+    def via(self) -> str:
+        """``nfc``."""
+        return "nfc"
+
+    @property
+    def capabilities(self) -> Capabilities:
+        """What a tap can do."""
+        return NFC
+
+    def exchange(self, frame: bytes) -> bytes:
+        """Send one whole command frame and return its whole reply frame.
+
+        A transaction that failed is repeated as it is, at most twice within 15 s; a node that left the field for a
+        moment is activated anew (its session is gone then, which the layer above notices by the reply), and a reader
+        that failed is opened again once. Raises NodeSilent, Garbled or NoReader.
+        """
+        with self._port.turn:
+            self._last = self._port.next_transaction()
+            return self._exchange(frame, self._last)
+
+    def again(self, frame: bytes) -> bytes:
+        """Send the last frame once more under its transaction; see ``Repeats.again``."""
+        with self._port.turn:
+            return self._exchange(frame, self._last)
+
+    def _exchange(self, frame: bytes, transaction: int) -> bytes:
+        started = time.monotonic()
+        reopened = False
+        attempt = 0
+        while True:
+            try:
+                poller = self._ready()  # a node that is gone for good ends it here
+                try:
+                    return poller.transact(transaction, frame)
+                except (NodeSilent, Garbled) as error:
+                    self._after(error)
+                    if attempt == REPEATS or time.monotonic() - started > REPEAT_WITHIN:
+                        raise
+                    self._notice(Notice("retry", f"{error.message} Trying again."))
+            except ReaderLost:
+                self._poller = None
+                self._port.lose_reader()
+                if reopened or attempt == REPEATS or time.monotonic() - started > REPEAT_WITHIN:
+                    raise
+                reopened = True  # one error alone is not worth a word
+                self._port.reopen()
+            except NoReader:
+                self._poller = None
+                self._port.lose_reader()
+                raise
+            attempt += 1
+
+    def close(self) -> None:
+        """Deselect the service, unless nothing was sent; never raises."""
+        try:
+            with self._port.turn:
+                if self._poller is not None:
+                    self._poller.deselect()
+        except LinkFailure:
+            self._poller = None
+
+    def _ready(self) -> Poller:
+        if self._poller is None:
+            self.lost = True
+            self.visit = self._port.back(self.visit.identity.uuid, RETURN_WITHIN)
+            self.lost = False
+            self._poller = Poller(self.visit.tag, self.visit.service)
+        return self._poller
+
+    def _after(self, error: LinkFailure) -> None:
+        """Choose how to go on: in the same activation while the tag still answers, else from a new one."""
+        if self._poller is not None and not isinstance(error, FieldLost) and self.visit.tag.is_present:
+            self._poller.restart()
+        else:
+            self._poller = None
+
+
+def _contact(visit: Visit, link: NfcLink, trace: Trace | None) -> Contact:
+    return Contact(visit.identity, link, visit.tag.uid, charging=visit.charging, ble=visit.ble, trace=trace)
+
+
+def _tell(seen: Visit | Foreign, told: str, notice: NoticeSink) -> str:
+    """Name a tag that is waited past, unless it was the last one named; return what was said."""
+    if isinstance(seen, Foreign):
+        text = seen.text
+        if text != told:
+            notice(Notice("foreign-tag", text))
+    else:
+        text = f"Node {seen.identity.uuid.hex()} is not the one that is waited for."
+        if text != told:
+            notice(Notice("waiting", text))
+    return text
+
+
+def _pause(gone_at: float) -> float:
+    """Seconds until the next look: short where nodes are being changed, so that none is waited for."""
+    return _SHORT_PAUSE if time.monotonic() - gone_at < _CHANGING else _PAUSE
+
+
+def _has_left(here: bytes | None, seen: Visit | Foreign | None, gone_at: float) -> TypeGuard[bytes]:
+    """Whether the node ``here``, which is not ``seen``, is gone: something else lies there, or nothing for a while."""
+    return here is not None and (seen is not None or time.monotonic() - gone_at > _DEBOUNCE)
+
+
+def _left(uuid: bytes) -> Notice:
+    return Notice("node-left", f"Node {uuid.hex()} was taken off the reader.", uuid=uuid)

@@ -1,0 +1,217 @@
+"""Actuators of a node in a measurement: set points that come by topics, applied in the node's session.
+
+An actuator is claimed when its first set point comes, not before (operation.md section 7), and the dead-man is fed by
+set points alone: when they stop, the node goes to its safe state by itself, and the next one claims it anew. A set
+point beyond the limits of the datasheet, or older than the dead-man, is refused and told; it is never changed. It is
+looked at again right before it leaves, because the session may have been busy. More than DRIVE_ABOVE set points a
+second to one actuator go as Drive messages, which need no reply.
+
+No late orders (operation.md section 2): a value that nobody answers is given up at the end of the dead-man, and no
+value leaves after it before the node has answered a Clock: its counter makes the older frame worthless.
+"""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections import deque
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from teds_provision.errors import LinkFailure, NodeRefused, TedsProvisionError
+from teds_provision.measure.acting import LEASE
+from teds_provision.measure.blocks import Block, Command
+from teds_provision.measure.clock import ClockMap
+from teds_provision.measure.trusting import Trusted, claim
+from teds_provision.protocol.messages.frames import Reason
+from teds_provision.protocol.operation.commands import write_data_set
+from teds_provision.protocol.operation.datagram import Layout
+from teds_provision.protocol.operation.driving import Driver
+from teds_provision.protocol.operation.stream_commands import CLOCK, Driven, drive
+from teds_provision.talk.conversation import SessionLost
+from teds_provision.teds.calibration.interpreter import ChannelInterpreter
+
+DRIVE_ABOVE = 50  # set points a second
+WATCHED = 10  # set points over which their rate is taken
+ECHO = 255  # number of the "stream" in which applied set points are echoed; nodes have 0 to 3
+
+
+@dataclass
+class _Actuator:
+    interpreter: ChannelInterpreter
+    claimed_until: float = 0.0
+    answered: float = 0.0  # when the node last said that it took a value
+    count: int = 0
+    came: deque[float] = field(default_factory=lambda: deque(maxlen=WATCHED))
+    driver: Driver | None = None
+
+    @property
+    def fast(self) -> bool:
+        """Whether set points come so fast that a reply to each would hold them up."""
+        full = len(self.came) == WATCHED
+        return full and self.came[-1] - self.came[0] < (WATCHED - 1) / DRIVE_ABOVE
+
+
+class Actuators:
+    """The actuators of one node in one session. ``take`` returns at once; the newest set point of each counts."""
+
+    def __init__(
+        self,
+        trusted: Trusted,
+        send: Callable[[bytes], None],
+        numbers: tuple[int, ...],
+        *,
+        dead_man: int,
+        clock: ClockMap,
+        turn: threading.Lock,
+        mapping: threading.Lock,
+        echo: Callable[[Block], None],
+        tell: Callable[[str], None],
+    ) -> None:
+        self._trusted, self._send_message = trusted, send
+        self._dead_man, self._clock, self._turn, self._mapping = dead_man, clock, turn, mapping
+        self._echo, self._tell = echo, tell
+        self._actuators = {number: _Actuator(ChannelInterpreter(trusted.sheet, number)) for number in numbers}
+        self._newest: dict[int, Command] = {}
+        self._news = threading.Condition()
+        self._stop = False
+        self._unsure = False  # whether a value may still be on its way
+        self.refused = 0
+        self._thread = threading.Thread(target=self._run, name=f"actuators {trusted.uuid[:8]}", daemon=True)
+        self._thread.start()
+
+    def take(self, command: Command) -> None:
+        """A set point in the SI unit of the datasheet."""
+        with self._news:
+            if command.channel in self._actuators and not self._stop:
+                self._newest[command.channel] = command
+                self._news.notify_all()
+
+    def close(self) -> None:
+        """Take no more; what is claimed is let go by the node's own end."""
+        with self._news:
+            self._stop = True
+            self._news.notify_all()
+        self._thread.join(2.0)
+
+    def _run(self) -> None:
+        while True:
+            with self._news:
+                while not self._newest and not self._stop:
+                    self._news.wait()
+                if self._stop:
+                    return
+                commands, self._newest = list(self._newest.values()), {}
+            for command in commands:
+                try:
+                    self._apply(command)
+                except SessionLost as lost:
+                    self._refuse(f"channel {command.channel}: the session was lost: {lost.cause.message}")
+                except TedsProvisionError as error:
+                    self._refuse(f"channel {command.channel}: {error.message}")
+
+    def _refuse(self, why: str) -> None:
+        self.refused += 1
+        self._tell(f"set point refused, {why.rstrip('.')}")
+
+    def _apply(self, command: Command) -> None:
+        actuator = self._actuators[command.channel]
+        one = actuator.interpreter
+        self._left(command)
+        value = one.unit.from_si(command.value)
+        beyond = one.beyond(value)
+        if beyond:
+            self._refuse(f"{beyond}")
+            return
+        octets = one.encode(value)
+        actuator.came.append(command.received)
+        with self._turn:
+            self._send(command, actuator, octets)
+        self._say(command.channel, actuator, octets)
+
+    def _left(self, command: Command) -> float:
+        """Seconds until a set point is too old; raises LinkFailure where it is."""
+        age = time.monotonic() - command.received
+        if age > self._dead_man / 1000:
+            raise LinkFailure(f"It is {age:.2f} s old; the dead-man is {self._dead_man} ms.")
+        return self._dead_man / 1000 - age
+
+    def _send(self, command: Command, actuator: _Actuator, octets: bytes) -> None:
+        self._left(command)
+        if self._unsure:
+            self._trusted.node.send(CLOCK, "to tell its time", within=self._dead_man / 1000)
+            self._unsure = False
+        now = time.monotonic()
+        if now >= actuator.claimed_until:
+            self._claim(command.channel, actuator)
+        alone = sum(1 for one in self._actuators.values() if one.claimed_until > now) <= 1
+        if not (actuator.fast and alone):
+            actuator.driver = None
+        # Nobody answers a Drive message, so now and then a value goes by command: a node that was cut off says so.
+        if actuator.fast and alone and now - actuator.answered < self._dead_man / 2000:
+            self._drive(command, actuator, octets)
+        else:
+            self._set(command, actuator, octets)
+            actuator.answered = time.monotonic()
+        actuator.claimed_until = time.monotonic() + self._dead_man / 1000
+
+    def _set(self, command: Command, actuator: _Actuator, octets: bytes) -> None:
+        try:
+            self._write(command, octets)
+        except NodeRefused as refusal:
+            actuator.claimed_until = 0.0
+            if refusal.reason != Reason.WRONG_STATE:
+                raise
+            # Its dead-man has run out meanwhile, by the node's clock: the way back is a new Operate.
+            self._claim(command.channel, actuator)
+            self._write(command, octets)
+        except LinkFailure:
+            self._unsure, actuator.claimed_until, actuator.driver = True, 0.0, None
+            raise
+
+    def _write(self, command: Command, octets: bytes) -> None:
+        words = write_data_set(command.channel, octets)
+        self._trusted.node.send(words, "to set the actuator", within=self._left(command))
+
+    def _claim(self, number: int, actuator: _Actuator) -> None:
+        actuator.driver = None
+        try:
+            claim(self._trusted, number, lease=LEASE, dead_man=self._dead_man)
+        except NodeRefused as refusal:
+            if refusal.reason != Reason.WRONG_STATE:  # it is claimed by this session still
+                raise
+
+    def _drive(self, command: Command, actuator: _Actuator, octets: bytes) -> None:
+        number = command.channel
+        if actuator.driver is None:
+            layout = Layout((number,), (len(octets),))
+            reply = Driven.decode(self._trusted.node.send(drive([number]), "to be driven"))
+            actuator.driver = Driver(layout, reply, self._trusted.node.message_key, dead_man=self._dead_man)
+        left = round(self._left(command) * 1e9)
+        with self._mapping:
+            now = self._clock.ticks_at(time.monotonic_ns())
+        message = actuator.driver.seal((octets,), now, hold=left)
+        self._send_message(message)
+
+    def _say(self, number: int, actuator: _Actuator, octets: bytes) -> None:
+        """Echo what was applied, as a sample of the actuator's channel."""
+        one = actuator.interpreter
+        raw = one.reader.raw(octets)
+        found = one.values(raw)
+        value = np.asarray(one.unit.to_si(found.value), dtype=np.float64)  # type: ignore[arg-type]
+        self._echo(
+            Block(
+                uuid=self._trusted.uuid,
+                stream=ECHO,
+                channels=(number,),
+                index=actuator.count,
+                time=np.array([time.time()]),
+                tick=np.array([0], dtype=np.uint64),
+                raw=raw.reshape(1, 1),
+                value=value.reshape(1, 1),
+                valid=np.isfinite(value).reshape(1, 1),
+            )
+        )
+        actuator.count += 1

@@ -1,0 +1,171 @@
+"""Who was seen, where and when, on all links of a process: what the look-outs tell, and what waiting threads ask for.
+
+What is seen is a hint: a session says who it is.
+"""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+from teds_provision.errors import LinkFailure, NoNode
+from teds_provision.links.ble.port import BlePort
+from teds_provision.links.can.finding import conflict_text
+from teds_provision.links.can.link import conflict
+from teds_provision.links.can.port import CanPort
+from teds_provision.links.ports import Contact
+from teds_provision.protocol.announce import Announce, uuid_crc
+from teds_provision.protocol.messages.identity import Identity
+
+RECENT = 30.0  # seconds for which a conflict of addresses is the reason why a node is not found
+MOST = 1024  # UUIDs that are kept: a bus has 239 addresses, and at each of them anybody can give himself a new one
+TWIN = 0.5  # seconds in which the node itself may answer as well, where one that says it is it was not
+
+
+@dataclass(frozen=True)
+class Sighting:
+    """A node that answered: where, as what it says it is, and when (time.monotonic). Nobody has proven any of it.
+
+    ``address`` is its CAN address, over the air the number of its connection.
+    """
+
+    identity: Identity
+    address: int
+    port: CanPort | BlePort
+    at: float
+
+    @property
+    def uuid(self) -> bytes:
+        """10 octets."""
+        return self.identity.uuid
+
+    def contact(self) -> Contact:
+        """A line to it."""
+        if isinstance(self.port, BlePort):
+            return Contact(self.identity, self.port.link(self.address), connection=self.address, trace=self.port.trace)
+        return Contact(self.identity, self.port.link(self.address), address=self.address, trace=self.port.trace)
+
+
+Place = tuple[str, int]
+
+
+@dataclass
+class Sightings:
+    """What the look-outs of all buses saw; :meth:`find` waits for one node. Thread-safe.
+
+    A UUID may answer at two places, as anyone can send an Identify: one that turned out wrong goes behind the others.
+    """
+
+    news: Callable[[Sighting], None] = lambda _sighting: None
+    note: Callable[[str], None] = lambda _text: None
+    _seen: dict[bytes, dict[Place, Sighting]] = field(default_factory=dict)
+    _wrong: dict[bytes, dict[Place, float]] = field(default_factory=dict)
+    _conflicts: dict[Place, float] = field(default_factory=dict)
+    _announced: dict[bytes, tuple[Place, Callable[[], None]]] = field(default_factory=dict)
+    _missing: dict[bytes, int] = field(default_factory=dict)
+    _turn: threading.Condition = field(default_factory=threading.Condition)
+
+    def saw(self, sighting: Sighting) -> None:
+        """Take what a look-out saw."""
+        with self._turn:
+            places = self._seen.pop(sighting.uuid, {})  # who was seen last stands last
+            places[sighting.port.place, sighting.address] = sighting
+            self._seen[sighting.uuid] = places
+            self._forget_the_oldest()
+            self._turn.notify_all()
+        self.news(sighting)
+
+    def conflict(self, place: str, address: int) -> None:
+        """Two nodes answer under one address: nothing is opened there."""
+        with self._turn:
+            self._conflicts[place, address] = time.monotonic()
+            for places in self._seen.values():
+                places.pop((place, address), None)
+            self._turn.notify_all()
+        self.note(conflict_text(address))
+
+    def on_announce(self, sighting: Sighting, tell: Callable[[], None]) -> None:
+        """Call ``tell``, which returns at once, when something announces itself as this node, or from its address."""
+        with self._turn:
+            self._announced[sighting.uuid] = ((sighting.port.place, sighting.address), tell)
+
+    def let_announce(self, uuid: bytes) -> None:
+        """Tell no more of it."""
+        with self._turn:
+            self._announced.pop(uuid, None)
+
+    def announced(self, place: str, announce: Announce) -> None:
+        """Take what a look-out heard; a hint that anyone can send."""
+        with self._turn:
+            told = [
+                tell
+                for uuid, (where, tell) in self._announced.items()
+                if where == (place, announce.address) or (where[0] == place and uuid_crc(uuid) == announce.crc)
+            ]
+        for tell in told:
+            tell()
+
+    def awaits(self, announce: Announce) -> bool:
+        """Whether somebody waits for the node that this says it is."""
+        with self._turn:
+            return any(uuid_crc(uuid) == announce.crc for uuid in self._missing)
+
+    def missing(self) -> bool:
+        """Whether somebody waits for a node."""
+        with self._turn:
+            return bool(self._missing)
+
+    def all(self) -> list[Sighting]:
+        """Every node that was seen, where it was seen last, by UUID."""
+        with self._turn:
+            return [max(places.values(), key=lambda one: one.at) for _, places in sorted(self._seen.items()) if places]
+
+    def find(self, uuid: bytes, *, seconds: float, stop: threading.Event, fresh: float = 0.0) -> Sighting:
+        """Wait for a node that was seen after ``fresh`` (time.monotonic); raises NoNode, AddressConflict."""
+        until = time.monotonic() + seconds
+        with self._turn:
+            self._missing[uuid] = self._missing.get(uuid, 0) + 1
+            try:
+                while True:
+                    found = self._best(uuid, fresh)
+                    if found is not None:
+                        return found
+                    left = until - time.monotonic()
+                    if left <= 0 or stop.is_set():
+                        raise self._nobody(uuid, seconds)
+                    self._turn.wait(min(left, 0.2))
+            finally:
+                self._missing[uuid] -= 1
+                if not self._missing[uuid]:
+                    del self._missing[uuid]
+
+    def wrong(self, sighting: Sighting) -> None:
+        """It was not that node, or it is gone from there: look again."""
+        place = (sighting.port.place, sighting.address)
+        with self._turn:
+            self._seen.get(sighting.uuid, {}).pop(place, None)
+            self._wrong.setdefault(sighting.uuid, {})[place] = time.monotonic()
+
+    def _forget_the_oldest(self) -> None:
+        while len(self._seen) > MOST:
+            del self._seen[next(uuid for uuid in self._seen if uuid not in self._announced)]
+
+    def _best(self, uuid: bytes, fresh: float) -> Sighting | None:
+        """Where to look for a node. A place that was wrong is not taken while another one may still answer."""
+        wrong, seen = self._wrong.get(uuid, {}), self._seen.get(uuid, {})
+        places = [one for one in seen.values() if one.at >= fresh]
+        best = min(places, key=lambda one: (wrong.get((one.port.place, one.address), 0.0), -one.at), default=None)
+        if best is None or (best.port.place, best.address) not in wrong or len(seen) == len(places):
+            return best
+        return best if time.monotonic() - best.at >= TWIN else None
+
+    def _nobody(self, uuid: bytes, seconds: float) -> LinkFailure:
+        recent = [address for (_, address), at in self._conflicts.items() if time.monotonic() - at < RECENT]
+        if recent:
+            return conflict(min(recent))
+        return NoNode(
+            f"Node {uuid.hex()} did not answer within {seconds:g} s.",
+            hint="Check its power, the bit rate and the address; teds-provision identify --via can lists who answers.",
+        )

@@ -1,0 +1,107 @@
+"""Streams of several nodes that begin together: by one trigger frame, or by a start time (operation.md sections 4, 5).
+
+*Start time*: every node has been asked for its clock; as soon as all are there (:data:`WAITING` after the first at
+most) one moment is chosen, and each is given the tick of its own clock that stands for it. *Trigger*: streams wait for
+a frame (``trigger.py``). A node that comes later begins when it comes.
+"""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Iterable
+
+from teds_provision.measure.clock import ClockMap
+from teds_provision.protocol.operation.stream_commands import SOON, WAITS
+
+WAITING = 2.0  # seconds that the first node waits for the others
+TOGETHER = 15.0  # seconds that a trigger waits for all nodes, from the first one that is ready
+AHEAD, AHEAD_EACH = 0.25, 0.04  # seconds from the choice of a start time to it, and more for each node
+
+
+class CommonStart:
+    """The one beginning of a measurement; each node asks :meth:`start` before it subscribes. Thread-safe."""
+
+    def __init__(self, uuids: Iterable[bytes], *, trigger: bool = False, waiting: float = WAITING) -> None:
+        self._coming = set(uuids)
+        self._alone = len(self._coming) < 2
+        self._trigger, self._waiting = trigger, waiting
+        self._triggered = False
+        self._at: float | None = None  # monotonic seconds of the start time, once it was chosen
+        self._first: float | None = None
+        self._turn = threading.Condition()
+        self._begun: dict[bytes, tuple[ClockMap, int]] = {}
+
+    def start(self, uuid: bytes, clock: ClockMap) -> int:
+        """What the node's Subscribe is to say; waits for the others. ``SOON`` where there is nobody to wait for."""
+        if self._trigger:
+            return SOON if self._triggered else WAITS
+        if self._alone:
+            return SOON
+        with self._turn:
+            self._coming.discard(uuid)
+            if self._at is None:
+                self._first = self._first or time.monotonic()
+                left = self._first + self._waiting - time.monotonic()
+                self._turn.wait_for(lambda: self._at is not None or not self._coming, max(0.0, left))
+            if self._at is None:
+                self._at = time.monotonic() + AHEAD + AHEAD_EACH * self._waited
+                self._turn.notify_all()
+            at = self._at
+        if time.monotonic() >= at or uuid in self._begun:
+            return SOON
+        tick = clock.tick_at(round(at * 1e9))
+        self._begun[uuid] = (clock, tick)
+        return tick
+
+    @property
+    def _waited(self) -> int:
+        return len(self._begun) + len(self._coming) + 1
+
+    def gone(self, uuid: bytes) -> None:
+        """A node that will not come: nobody waits for it any more."""
+        with self._turn:
+            self._coming.discard(uuid)
+            self._turn.notify_all()
+
+    def late(self, uuid: bytes) -> None:
+        """The node called its start too late: it begins by itself."""
+        self._begun.pop(uuid, None)
+
+    def until(self, start: int) -> float:
+        """Seconds from now to a start; 0 where it is soon, or waits."""
+        if start in (SOON, WAITS) or self._at is None:
+            return 0.0
+        return max(0.0, self._at - time.monotonic())
+
+    @property
+    def left(self) -> float | None:
+        """Seconds from now until the first values are taken; None where the trigger has not gone out yet."""
+        if self._trigger:
+            return 0.0 if self._triggered else None
+        return max(0.0, (self._at or 0.0) - time.monotonic())
+
+    @property
+    def apart(self) -> float:
+        """By how many seconds the beginnings differ, by the clocks as they are known now; 0.0 for one node."""
+        moments = [clock.host_of(tick) for clock, tick in self._begun.values()]
+        return max(moments) - min(moments) if moments else 0.0
+
+    # -- for the trigger -----------------------------------------------------------------------------------------------
+
+    def due(self, ready: int, all_of: int) -> bool:
+        """Whether the trigger is to go out now: all are ready, or the first has waited long enough for the rest."""
+        if not self._trigger or self._triggered:
+            return False
+        if ready and self._first is None:
+            self._first = time.monotonic()
+        late = self._first is not None and time.monotonic() - self._first > TOGETHER
+        return ready == all_of or late
+
+    def triggered(self) -> None:
+        """The trigger goes out: who comes later begins by itself."""
+        self._triggered = True
+
+    def begun(self, uuid: bytes, clock: ClockMap, tick: int) -> None:
+        """The node saw the trigger at this tick of its clock."""
+        self._begun[uuid] = (clock, tick)

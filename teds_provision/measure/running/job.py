@@ -1,0 +1,200 @@
+"""One measurement as the station keeps it: begun, carried on after a restart, ended in order.
+
+The way of `measure` and of `ncap run` alike:
+
+* ``station.measurements.keep(Measurement(...))`` says what is measured; ``due()`` what is to be carried on after a
+  start, ``of_group(NAME)`` what `measure NAME` carries on; ``forget(ID)`` deletes.
+* ``Buses(ports)`` hears the buses of the process, once for all measurements.
+* ``Job(station, kept)`` makes its sinks; ``run(buses, stop)`` measures on this thread until ``stop`` is set, or
+  ``start(buses)`` and ``stop()`` on a thread of its own, again and again after an error. While it runs, its nodes and
+  its group are held: ``station.measurements.is_running(uuid)``, PolicyRefused (6) for whoever wants them too.
+* ``job.measurement.session(uuid)`` is the session of a node that is measured, for one more command in between.
+
+What is kept is deleted when a measurement that is not ``lasting`` ends in order; after ``kill -9`` it is still there.
+"""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from pathlib import Path
+
+from teds_provision.errors import TedsProvisionError
+from teds_provision.measure.blocks import Command, StationFacts
+from teds_provision.measure.finding.buses import Buses
+from teds_provision.measure.orders import Wish
+from teds_provision.measure.runner import Ended, Measurement, Watcher
+from teds_provision.measure.running.requirements import Requirements
+from teds_provision.measure.sinks import CommandTaker, Sink, open_sink
+from teds_provision.protocol.operation.stream_commands import Kind
+from teds_provision.station.measurements import STATION
+from teds_provision.station.station import Station
+from teds_provision.store.records import Measurement as Kept
+from teds_provision.teds.fits import parse_require
+
+AGAIN, LONGEST = 1.0, 30.0  # seconds until a measurement that failed as a whole is begun again
+
+
+def whole_path(spec: str) -> str:
+    """The words for a sink as they can be kept: a file's path from the root on, whatever folder comes next time."""
+    return spec if spec.partition(":")[0] in _SERVICES else str(Path(spec).absolute())
+
+
+_SERVICES = frozenset({"ros1", "ros2", "mqtt", "mqtts"})
+
+
+class Job:
+    """One measurement: ``sinks`` are made (and opened by the run), ``ended`` is how the last run ended.
+
+    ``more`` makes the sinks beside those that are kept, anew for each run; it gets what takes set points of topics.
+    ``admits`` says of each set point whether it may pass; None: none may, whatever is kept. Raises UsageFailure where
+    a sink cannot be named so.
+    """
+
+    def __init__(
+        self,
+        station: Station,
+        kept: Kept,
+        *,
+        more: Callable[[CommandTaker | None], Sequence[Sink]] = lambda _take: (),
+        wish: Wish | None = None,
+        admits: Callable[[Command], bool] | None = lambda _command: True,
+    ) -> None:
+        self.station, self.kept = station, kept
+        self._moves = kept.actuators and admits is not None
+        self.wish = replace(wish_of(kept, wish or Wish(patient=True)), actuators=self._moves)
+        self._more, self._admits = more, admits
+        self._commands: Callable[[Command], None] = lambda _command: None
+        self.sinks = self._new_sinks()
+        self.measurement: Measurement | None = None
+        self.ended: Ended | None = None
+        self.error: TedsProvisionError | None = None
+        self._stop = threading.Event()
+        self._thread: threading.Thread | None = None
+
+    def run(
+        self,
+        buses: Buses,
+        stop: threading.Event,
+        *,
+        watcher: Watcher | None = None,
+        duration: float | None = None,
+    ) -> Ended:
+        """Measure until ``stop``, for ``duration`` seconds of data, or to the kept end; nodes and group are held.
+
+        Raises PolicyRefused where another measurement holds one of them, and what a sink's ``open`` raises.
+        """
+        uuids = self.station.measurements.nodes_of(self.kept)
+        name = self.kept.group or ", ".join(uuid.hex()[:8] for uuid in uuids[:3])
+        with self.station.measurements.running(uuids, group=self.kept.group, what=f"measure {name}"):
+            if self.kept.group is not None:
+                self.kept = self.station.measurements.begin(self.kept)
+            if duration is None and self.kept.ends is not None:
+                duration = max(0.1, self.kept.ends - time.time())
+            self.measurement = measurement = Measurement(
+                self.station, buses, uuids, self.wish, self.sinks, self._facts(), watcher or Watcher()
+            )
+            measurement.began = lambda: self._began(duration)
+            self._commands = measurement.command
+            try:
+                self.ended = measurement.run(stop, duration)
+            finally:  # however it ends in this process: only a process that dies leaves it to be carried on
+                self.measurement = None
+                if not self.kept.lasting:
+                    self.station.measurements.forget(self.kept.id)
+        return self.ended
+
+    def start(self, buses: Buses, watcher: Watcher | None = None) -> None:
+        """Measure on a thread of its own until :meth:`stop`, or to its end; begun again after what ends it."""
+        self._thread = threading.Thread(
+            target=self._carry_on, args=(buses, watcher), name=f"measurement {self.kept.id}", daemon=True
+        )
+        self._thread.start()
+
+    def stop(self, seconds: float = 15.0) -> None:
+        """End it in order: claims released, files closed. Returns when that is done, or after ``seconds``."""
+        self._stop.set()
+        if self._thread is not None:
+            self._thread.join(seconds)
+
+    @property
+    def alive(self) -> bool:
+        """Whether its thread still lives."""
+        return self._thread is not None and self._thread.is_alive()
+
+    def _carry_on(self, buses: Buses, watcher: Watcher | None) -> None:
+        pause = AGAIN
+        while not self._stop.is_set():
+            began = time.monotonic()
+            try:
+                self.ended = self.run(buses, self._stop, watcher=watcher)
+                self.error = self.ended.error
+                if self._over():
+                    return
+            except TedsProvisionError as error:
+                self.error = error
+            if time.monotonic() - began > LONGEST:
+                pause = AGAIN
+            self._stop.wait(pause)
+            pause = min(2 * pause, LONGEST)
+            self.sinks = self._new_sinks()
+
+    def _over(self) -> bool:
+        if self.kept.ends is None or self.kept.ends > time.time():
+            return False
+        self.station.measurements.forget(self.kept.id)
+        return True
+
+    def _began(self, duration: float | None) -> None:
+        """Its end is known from its first value on, and stands in the store, so that a restart does not move it."""
+        if duration is not None and self.kept.ends is None:
+            self.kept = replace(self.kept, ends=time.time() + duration)
+            if self.kept.id:
+                self.station.measurements.keep(self.kept)
+
+    def _facts(self) -> StationFacts:
+        first = next((uuid.hex()[:8] for uuid in self.kept.uuids), "")
+        uuids = self.station.measurements.nodes_of(self.kept)
+        records = filter(None, (self.station.nodes.get(uuid) for uuid in uuids))
+        return replace(
+            station_facts(self.station),
+            group=self.kept.group or "",
+            instance=self.kept.group or (first and f"n{first}"),
+            started=time.time(),
+            scalar_rate=self.kept.scalar_rate,
+            test_pattern=self.wish.test_pattern,
+            nodes={record.uuid.hex(): record.name or "" for record in records},
+        )
+
+    def _new_sinks(self) -> list[Sink]:
+        take = self._take if self._moves else None
+        return [*(open_sink(spec, take) for spec in self.kept.sinks), *self._more(take)]
+
+    def _take(self, command: Command) -> None:
+        """A set point that came by a topic."""
+        if self._admits is not None and self._admits(command):
+            self._commands(command)
+
+
+def wish_of(kept: Kept, more: Wish) -> Wish:
+    """What is asked of each node; ``more`` has what is not kept: patience, time-out, lease."""
+    return replace(
+        more,
+        channels=kept.channels,
+        rate=kept.rate,
+        kind=None if kept.kind is None else Kind[kept.kind.upper()],
+        trigger=kept.trigger,
+        actuators=kept.actuators,
+        dead_man=kept.dead_man,
+        test_pattern=kept.test_pattern,
+        unsigned=kept.unsigned,
+        require=Requirements(parse_require(kept.require, "--require")) if kept.require else None,
+    )
+
+
+def station_facts(station: Station) -> StationFacts:
+    """What the sinks are told of the station: its name, and the names that somebody chose."""
+    names = {(uuid.hex(), channel): name for (uuid, channel), name in station.measurements.names.items()}
+    return StationFacts(names.pop((STATION.hex(), 0), station.name), names=names)

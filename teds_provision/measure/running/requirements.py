@@ -1,0 +1,69 @@
+"""Whether the datasheets that were verified in the sessions suffice for the task (`measure --require`).
+
+A requirement may be met by any node of the group, so each node waits until the others have shown their datasheets
+(:data:`WAITING` at most), before anything is claimed. A node that comes back with another datasheet is judged anew.
+"""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Iterable, Sequence
+from typing import Any
+
+from teds_provision.errors import PolicyRefused
+from teds_provision.teds.fits import Fit, Requirement, judge, met
+from teds_provision.teds.sheet import Sheet
+
+WAITING = 10.0  # seconds from the first datasheet on
+
+
+class Requirements:
+    """Requirements against the nodes of one measurement. Thread-safe; ``fits`` is what was found last."""
+
+    def __init__(self, requirements: Sequence[Requirement], *, waiting: float = WAITING) -> None:
+        self._requirements, self._waiting = tuple(requirements), waiting
+        self._sheets: dict[bytes, Sheet] = {}
+        self._coming: set[bytes] = set()
+        self._until: float | None = None
+        self._turn = threading.Condition()
+        self.fits: list[dict[str, Any]] = []
+
+    def expect(self, uuids: Iterable[bytes]) -> None:
+        """These nodes will show a datasheet."""
+        with self._turn:
+            self._coming.update(uuids)
+
+    def gone(self, uuid: bytes) -> None:
+        """One that will not show any, after all."""
+        with self._turn:
+            self._coming.discard(uuid)
+            self._turn.notify_all()
+
+    def offer(self, uuid: bytes, sheet: Sheet, stop: threading.Event) -> None:
+        """The datasheet that a node has now; returns where all of them suffice. Raises PolicyRefused (6)."""
+        with self._turn:
+            self._sheets[uuid] = sheet
+            self._coming.discard(uuid)
+            self._turn.notify_all()
+            self._until = self._until or time.monotonic() + self._waiting
+            while self._coming and not stop.is_set() and (left := self._until - time.monotonic()) > 0:
+                self._turn.wait(min(left, 0.2))
+            unmet = self._judge()
+        if unmet:
+            raise PolicyRefused(
+                f"The datasheets do not suffice for: {', '.join(unmet)}.",
+                hint="See the reasons: nodes --fits, or --json.",
+            )
+
+    def _judge(self) -> list[str]:
+        self.fits, unmet = [], []
+        for requirement in self._requirements:
+            found: list[Fit] = []
+            for uuid, sheet in sorted(self._sheets.items()):
+                for fit in judge(requirement, sheet):
+                    found.append(fit)
+                    self.fits.append({"uuid": uuid.hex(), "channel": fit.channel, "result": fit.result, "why": fit.why})
+            if not met(requirement, found):
+                unmet.append(requirement.subject)
+        return unmet

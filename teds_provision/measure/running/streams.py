@@ -1,0 +1,132 @@
+"""The streams of one node and the clock that its samples are timed by: subscribed, heard, stopped, added up."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable
+from contextlib import suppress
+
+from teds_provision.errors import TedsProvisionError
+from teds_provision.measure.blocks import Block
+from teds_provision.measure.clock import ClockMap, Monotone, Wall
+from teds_provision.measure.finding.buses import Bus
+from teds_provision.measure.hearing import HeardStream
+from teds_provision.measure.interpreter import StreamInterpreter
+from teds_provision.measure.orders import StreamTotals
+from teds_provision.measure.trusting import Trusted, ask_clock
+from teds_provision.protocol.operation.stream_commands import Clock, Kind, decode_stopped, stop
+from teds_provision.protocol.operation.subscription import Plan, Receiver
+from teds_provision.talk.conversation import SessionLost
+
+UNSIGNED = "nobody has signed the datasheet: raw values alone"
+SILENT = 2.0  # seconds without a good message, beside three messages' time: then the node is lost
+
+
+class NodeStreams:
+    """``running`` are the streams that are heard now, ``totals`` what became of all runs, ``clock`` the present map.
+
+    ``mapping`` guards the clock's map, which the hearing thread reads and feeds.
+    """
+
+    def __init__(self, wall: Wall, deliver: Callable[[Block], None]) -> None:
+        self.clock = ClockMap()
+        self.mapping = threading.Lock()
+        self.running: dict[int, HeardStream] = {}
+        self.totals: dict[int, StreamTotals] = {}
+        self._wall, self._deliver = wall, deliver
+        self._monotone: dict[int, Monotone] = {}
+
+    def new_session(self) -> None:
+        """Nothing is known of the node's clock: it may have started anew."""
+        with self.mapping:
+            self.clock = ClockMap()
+
+    def tell_time(self, trusted: Trusted) -> Clock:
+        """One Clock: sends and waits without the map's lock, which the hearing thread needs."""
+        reply, exchange = ask_clock(trusted.node)
+        with self.mapping:
+            self.clock.exchange(exchange)
+        return reply
+
+    def subscribe(self, bus: Bus, trusted: Trusted, plan: Plan, address: int, *, ahead: float = 0.0) -> None:
+        """Ask for a stream and hear it; its first sample is taken ``ahead`` seconds from now."""
+        number = plan.subscribe.stream
+        payload = trusted.node.send(plan.command(), "to stream")
+        with self.mapping:
+            reply = plan.accept(payload, self.clock.ticks_at(time.monotonic_ns()))
+        before = self.running.get(number)
+        receiver = Receiver(
+            plan, reply, trusted.node.message_key, previous=before.receiver if before is not None else None
+        )
+        monotone = self._monotone.setdefault(number, Monotone())
+        interpreter = StreamInterpreter(
+            trusted.sheet,
+            plan,
+            reply.run,
+            self.clock,
+            self._wall,
+            monotone,
+            raw_only=UNSIGNED if trusted.unsigned else "",
+        )
+        assembly = bus.assembly(plan.length)
+        heard = HeardStream(receiver, assembly, interpreter, self.clock, self.mapping, self._deliver)
+        heard.heard += ahead
+        self.running[number] = heard
+        self.totals.setdefault(number, StreamTotals(plan.layout.channels, plan.subscribe.period / 1e9))
+        bus.hearing.register(address, number, heard)
+
+    def stop(self, bus: Bus, trusted: Trusted | None, address: int) -> None:
+        """Stop each in order, so that its counter tells what was lost at the end; without a session hear no more.
+
+        First the messages that are being filled may come: the samples until now are all wanted, and Stop takes back
+        what has not left (operation.md section 4).
+        """
+        wanted = {number: heard.ending() for number, heard in self.running.items()} if trusted is not None else {}
+        for number, due in wanted.items():
+            self.running[number].hear_out(due)
+        for number, heard in list(self.running.items()):
+            if trusted is not None:
+                with suppress(TedsProvisionError, SessionLost):
+                    counter = decode_stopped(trusted.node.send(stop(number), "to stop a stream"))
+                    due = min(counter, wanted[number]) if wanted[number] else counter
+                    heard.hear_out(due)
+                    heard.receiver.finish(counter, due)
+            bus.hearing.forget(address, number)
+            self.totals[number].add(heard)
+        self.running.clear()
+
+    def first_sample(self) -> float:
+        """When the last of its streams takes its first sample (monotonic seconds); 0.0 where none has a start."""
+        with self.mapping:
+            starts = [one.receiver.start for one in list(self.running.values())]
+            return max((self.clock.host_of(start) for start in starts if start is not None), default=0.0)
+
+    def summed(self) -> list[StreamTotals]:
+        """What became of each stream until now."""
+        return [past.with_run(self.running.get(number)) for number, past in self.totals.items()]
+
+    # -- whether the node is still there -----------------------------------------------------------------------------
+
+    def _steady(self) -> list[HeardStream]:
+        """Streams whose messages come all the time: events may be silent for ever, and so may what waits."""
+        return [
+            one
+            for one in self.running.values()
+            if one.receiver.plan.subscribe.kind != Kind.EVENT and one.receiver.start is not None
+        ]
+
+    def every(self) -> float | None:
+        """Seconds in which a message comes for sure while the node is there; None where nobody can say."""
+        return min((3 * one.receiver.plan.span / 1e9 for one in self._steady()), default=None)
+
+    def heard_since(self, moment: float) -> bool:
+        """Whether a good message came after ``moment`` (time.monotonic)."""
+        return any(one.heard > moment for one in self.running.values())
+
+    def silent(self, now: float) -> float:
+        """Seconds of silence where that is too long, else 0.0."""
+        for one in self._steady():
+            if now - one.heard > SILENT + 3 * one.receiver.plan.span / 1e9:
+                return now - one.heard
+        return 0.0

@@ -1,0 +1,86 @@
+"""The trigger: streams wait, one frame goes out on each bus, each node says at which tick it saw it (operation.md, 5).
+
+Streams begin 10 ms after that mark. A node whose mark does not meet the time of sending is stopped and named.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Sequence
+
+from teds_provision.errors import TedsProvisionError
+from teds_provision.links.can.frame import Frame
+from teds_provision.links.can.port import CanPort
+from teds_provision.measure.keeper import NodeKeeper
+from teds_provision.measure.running.common_start import CommonStart
+from teds_provision.measure.trusting import Trusted
+from teds_provision.protocol.operation.can_frames import trigger_identifier
+from teds_provision.protocol.operation.stream_commands import Action
+from teds_provision.protocol.operation.subscription import TickBounds
+from teds_provision.protocol.operation.timing import START_AFTER_MARK, Token, mark_is_honest
+from teds_provision.talk.conversation import SessionLost
+
+TRIGGER_LIFE = 30  # seconds
+HELD_BACK = 10_000_000  # ns: a controller may hold a frame back while others win arbitration; a node in a busy process
+# sees it late. The bounds alone are below a millisecond, and would turn away nodes that tell the truth as they know it.
+
+
+def pull(common_start: CommonStart, keepers: Sequence[NodeKeeper], note: Callable[[str], None]) -> None:
+    """Arm every node, send a frame on each bus, read each node's mark: it must meet the time of sending."""
+    common_start.triggered()
+    token = Token.draw()
+    armed = _arm(token, keepers, note)
+    ports = {keeper.bus.place: keeper.bus.port for keeper, _ in armed if keeper.bus is not None}
+    sent = {place: _send(port, token) for place, port in ports.items() if isinstance(port, CanPort)}
+    for keeper, trusted in armed:
+        if keeper.bus is None or keeper.bus.place not in sent:
+            continue
+        mark = _mark(keeper, trusted, *sent[keeper.bus.place], note)
+        if mark is None:
+            continue
+        common_start.begun(keeper.uuid, keeper.streams.clock, mark)
+        for heard in list(keeper.streams.running.values()):
+            heard.begin(mark + START_AFTER_MARK)
+
+
+def _send(port: CanPort, token: Token) -> tuple[int, int]:
+    """The trigger on one bus; between which two times (monotonic ns) it went out."""
+    before = time.monotonic_ns()
+    port.send(Frame(trigger_identifier(port.spec.source), token.octets))
+    return before, time.monotonic_ns() + HELD_BACK
+
+
+def _arm(token: Token, keepers: Sequence[NodeKeeper], note: Callable[[str], None]) -> list[tuple[NodeKeeper, Trusted]]:
+    """The nodes that wait for the trigger now."""
+    armed = []
+    for keeper in keepers:
+        trusted = keeper.trusted
+        if trusted is None or not keeper.ever_ran:
+            continue
+        try:
+            with keeper.turn:
+                trusted.node.send(token.arm(Action.START, TRIGGER_LIFE).command(), "to wait for the trigger")
+            armed.append((keeper, trusted))
+        except (TedsProvisionError, SessionLost) as error:
+            note(f"Node {keeper.uuid.hex()} does not take the trigger: {error}")
+    return armed
+
+
+def _mark(keeper: NodeKeeper, trusted: Trusted, before: int, after: int, note: Callable[[str], None]) -> int | None:
+    """The tick at which the node saw the trigger, which went out between two times (monotonic ns).
+
+    None where it does not say, or names a moment at which the frame was not on the bus; such a node is stopped.
+    """
+    try:
+        with keeper.turn:
+            mark = keeper.streams.tell_time(trusted).mark
+    except (TedsProvisionError, SessionLost) as error:
+        note(f"Node {keeper.uuid.hex()} did not say when it saw the trigger: {error}")
+        return None
+    with keeper.streams.mapping:
+        low, high = keeper.streams.clock.ticks_at(before).low, keeper.streams.clock.ticks_at(after).high
+    if not mark or not mark_is_honest(mark, TickBounds(low, high)):
+        note(f"Node {keeper.uuid.hex()} names another moment for the trigger: it is not begun.")
+        keeper.stop()
+        return None
+    return mark

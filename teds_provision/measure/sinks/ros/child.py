@@ -1,0 +1,220 @@
+"""ROS by a child process: topics, parameters, metadata and set points as lines of JSON through two pipes.
+
+A child, because rospy and rclpy want the Python and the libraries that ROS came with, throw away log handlers, and
+block for ever where there is no master. If it dies it is started anew (1 s, doubling to 30 s), and everything is
+advertised again. What is measured meanwhile is counted as dropped; the measurement goes on.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+import select
+import signal
+import subprocess
+import threading
+import time
+from abc import abstractmethod
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
+
+from teds_provision.measure.blocks import Block, GroupRows
+from teds_provision.measure.sinks.base import CommandTaker, Item
+from teds_provision.measure.sinks.live import DIAGNOSTICS, JOINT_STATE, STRING, Status, TopicSink
+from teds_provision.measure.sinks.meaning import Meaning
+from teds_provision.measure.sinks.vectors import FieldValue
+
+NO_MASTER, NAME_TAKEN = 3, 4  # exit codes of a child whose master is gone, whose name another program took
+STUCK = 2.0  # seconds without a taken octet: then the child is dead, whatever its process says
+ENDING = 5.0  # seconds for the child to publish what it has, and end
+BACK_OFF = (1.0, 30.0)
+COMPLAINT = 200  # characters of the last line of stderr that are told
+
+
+class ChildSink(TopicSink):
+    """What the sinks by a child have in common; ``library`` is the Python package that works there."""
+
+    def __init__(self, name: str, library: str, commands: CommandTaker | None) -> None:
+        super().__init__(name, commands)
+        self._library = library
+        self._child: subprocess.Popen[bytes] | None = None
+        self._ready = threading.Event()
+        self._announced = False  # to this child
+        self._heard = self._complaint = self._suffix = ""
+        self._numbers: dict[tuple[str, tuple[str, ...]], int] = {}
+        self._again = 0.0
+        self._pause = BACK_OFF[0]
+
+    @abstractmethod
+    def _program(self) -> list[str]:
+        """The child: its Python, and its script."""
+
+    @abstractmethod
+    def _environment(self) -> dict[str, str]:
+        """The child's."""
+
+    def _begin(self) -> None:
+        self._start()
+
+    def _start(self) -> None:
+        self._stop(0.0)
+        self._numbers = {}
+        self._announced = False
+        self._complaint = ""
+        self._ready.clear()
+        self._child = subprocess.Popen(
+            [*self._program(), self._node + self._suffix],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,  # warnings; the last line is told where the child dies
+            env=self._environment(),
+            start_new_session=True,  # a Ctrl-C at the terminal is for the parent, which ends its child in order
+        )
+        assert self._child.stdin is not None
+        os.set_blocking(self._child.stdin.fileno(), False)
+        for hear in (self._hear, self._hear_complaints):
+            threading.Thread(target=hear, args=(self._child,), name=f"{self.name} child", daemon=True).start()
+        self._say("waiting", f"{self._library} is starting")
+
+    def _hear(self, child: subprocess.Popen[bytes]) -> None:
+        """The child's lines, on a thread of their own."""
+        assert child.stdout is not None
+        for line in child.stdout:
+            try:
+                words = json.loads(line)
+            except ValueError:
+                continue
+            if words.get("event") == "ready":
+                self._ready.set()
+            elif words.get("event") == "waiting":
+                self._heard = f"waits for a ROS master at {words.get('master')}"
+            elif words.get("event") == "command":
+                self._command(words["uuid"], words["channel"], float(words["value"]))
+        child.stdout.close()
+
+    def _hear_complaints(self, child: subprocess.Popen[bytes]) -> None:
+        """What it writes to stderr: read, so that it never waits for us; the last line is kept."""
+        assert child.stderr is not None
+        for line in child.stderr:
+            self._complaint = line.decode(errors="replace").strip()[:COMPLAINT] or self._complaint
+        child.stderr.close()
+
+    def _take(self, item: Item) -> None:
+        if self._up():
+            super()._take(item)
+        elif isinstance(item, Block | GroupRows):
+            self._count(dropped=int(item.value.size))
+        else:
+            self._learn(item)
+
+    def _idle(self, now: float) -> None:
+        if self._up():
+            super()._idle(now)
+
+    def _up(self) -> bool:
+        """Whether there is a child with a master; starts one when it is time."""
+        now = time.monotonic()
+        child = self._child
+        if child is not None and child.poll() is None:
+            if not self._ready.is_set():
+                if self._heard:
+                    self._say("waiting", self._heard)
+                return False
+            if not self._announced:
+                self._announced = True
+                self._say("running")
+                self._pause = BACK_OFF[0]
+                self._announce(tuple(self._facts.values()))
+            return self._child is not None
+        if child is not None:
+            self._lost(self._cause(child.returncode))
+        elif now >= self._again:
+            self._start()
+        return False
+
+    def _cause(self, code: int) -> str:
+        """Why a child ended; after another program took its name, the next one has a name that nobody else has."""
+        if code == NO_MASTER:
+            return "the ROS master is gone"
+        if code == NAME_TAKEN:
+            self._suffix = f"_{os.getpid()}"
+            return f"another program took the name /{self._node}"
+        return f"{self._library} died" + (f" ({self._complaint})" if self._complaint else "")
+
+    def _lost(self, why: str) -> None:
+        self._stop(0.0)
+        self._again = time.monotonic() + self._pause
+        self._say("waiting", f"{why}; tried again in {self._pause:.0f} s")
+        self._pause = min(2 * self._pause, BACK_OFF[1])
+
+    def _send(self, **words: object) -> None:
+        """One line to the child; a child that takes nothing for STUCK seconds is given up."""
+        child = self._child
+        if child is None or child.stdin is None:
+            return
+        octets = memoryview(json.dumps(words, separators=(",", ":")).encode() + b"\n")
+        end = time.monotonic() + STUCK
+        try:
+            while octets:
+                left = end - time.monotonic()
+                if left <= 0 or not select.select([], [child.stdin], [], left)[1]:
+                    self._lost(f"{self._library} takes nothing any more")
+                    return
+                octets = octets[os.write(child.stdin.fileno(), octets) :]
+        except (BrokenPipeError, BlockingIOError):
+            self._lost(f"{self._library} died")
+
+    def _number(self, topic: str, kind: str, *, latch: bool = False, names: Sequence[str] = ()) -> int:
+        key = topic, tuple(names)
+        if key not in self._numbers:
+            self._numbers[key] = len(self._numbers)
+            number = self._numbers[key]
+            self._send(op="topic", id=number, topic=topic, type=kind, latch=latch, names=list(names))
+            return number
+        return self._numbers[key]
+
+    def _advertise(self, topic: str, kind: str) -> None:
+        self._number(topic, kind)
+
+    def _array(self, topic: str, stamp: float, names: Sequence[str], values: Sequence[float]) -> None:
+        number = self._number(topic, JOINT_STATE, names=names)
+        self._send(op="joint", id=number, t=stamp, v=[value if math.isfinite(value) else None for value in values])
+
+    def _scalar(self, topic: str, meaning: Meaning, stamp: float, frame: str, value: float, variance: float) -> None:
+        number = self._number(topic, meaning.type)
+        self._send(op="value", id=number, t=stamp, field=meaning.field, frame=frame, v=value, var=variance)
+
+    def _fields(self, topic: str, kind: str, stamp: float, frame: str, fields: Mapping[str, FieldValue]) -> None:
+        self._send(op="compound", id=self._number(topic, kind), t=stamp, frame=frame, v=dict(fields))
+
+    def _latched(self, topic: str, words: str) -> None:
+        self._send(op="text", id=self._number(topic, STRING, latch=True), v=words)
+
+    def _parameter(self, name: str, value: object) -> None:
+        self._send(op="param", key=name, value=value)
+
+    def _listen(self, topic: str, uuid: str, channel: int) -> None:
+        self._send(op="listen", topic=topic, uuid=uuid, channel=channel)
+
+    def _diagnose(self, stamp: float, statuses: Sequence[Status]) -> None:
+        number = self._number("/diagnostics", DIAGNOSTICS)
+        entries = [[one.level, one.name, one.message, one.hardware, one.values] for one in statuses]
+        self._send(op="status", id=number, t=stamp, v=entries)
+
+    def _stop(self, patience: float) -> None:
+        child, self._child = self._child, None
+        if child is None:
+            return
+        if child.stdin is not None:
+            with suppress(OSError):
+                child.stdin.close()
+        try:
+            child.wait(patience)
+        except subprocess.TimeoutExpired:
+            with suppress(ProcessLookupError):
+                os.killpg(child.pid, signal.SIGKILL)
+            child.wait()
+
+    def _finish(self) -> None:
+        self._stop(ENDING if self._ready.is_set() else 0.5)

@@ -1,0 +1,191 @@
+"""Runs on the Python of the ROS 2 that the user sourced, as a child of the sink: lines of JSON become rclpy messages.
+
+Nothing of this package is imported here, and nothing but rclpy and its messages beside the standard library. The lines
+are those of :mod:`ros1_child`. It ends when stdin closes. API of rclpy from Humble on: https://docs.ros.org/en/jazzy/p/rclpy/
+"""
+
+from __future__ import annotations
+
+import importlib
+import json
+import os
+import sys
+import threading
+from typing import Any
+
+HISTORY = 100  # messages that a reader may be behind: a burst of rows fits
+
+
+def say(**words: object) -> None:
+    """One line to the parent."""
+    with _OUT:
+        sys.stdout.write(json.dumps(words) + "\n")
+        sys.stdout.flush()
+
+
+_OUT = threading.Lock()
+
+
+def plain(value: Any) -> Any:
+    """A value as a parameter may have it: lists of one type, no null, no table."""
+    if isinstance(value, list):
+        kinds = {type(one) for one in value}
+        if kinds <= {int, float}:
+            return [float(one) for one in value]
+        return value if kinds in ({str}, {bool}) else json.dumps(value)
+    return value if isinstance(value, bool | int | float | str) else json.dumps(value)
+
+
+class Bridge:
+    """Publishers, subscriptions and parameters of one node, by the parent's numbers."""
+
+    def __init__(self, rclpy: Any, node: Any) -> None:
+        self.rclpy, self.node = rclpy, node
+        self.publishers: dict[int, tuple[Any, Any]] = {}
+        self.names: dict[int, list[str]] = {}
+        self.types: dict[str, Any] = {}
+        self.listening: dict[str, Any] = {}
+        self._own = False
+        node.add_on_set_parameters_callback(self._may_set)
+
+    def _may_set(self, _parameters: Any) -> Any:
+        """Parameters are facts of datasheets: nobody sets them from outside."""
+        answer = importlib.import_module("rcl_interfaces.msg").SetParametersResult()
+        answer.successful = self._own
+        answer.reason = "" if self._own else "a fact of a signed datasheet"
+        return answer
+
+    def type_of(self, name: str) -> Any:
+        """Message class of ``package/Type``."""
+        if name not in self.types:
+            package, _, kind = name.partition("/")
+            self.types[name] = getattr(importlib.import_module(package + ".msg"), kind)
+        return self.types[name]
+
+    def qos(self, *, latched: bool, reading: bool = False) -> Any:
+        """Metadata for late comers; the rest reliable with a short history. Set points: best effort hears both."""
+        from rclpy import qos
+
+        return qos.QoSProfile(
+            history=qos.HistoryPolicy.KEEP_LAST,
+            depth=1 if latched or reading else HISTORY,
+            reliability=qos.ReliabilityPolicy.BEST_EFFORT if reading else qos.ReliabilityPolicy.RELIABLE,
+            durability=qos.DurabilityPolicy.TRANSIENT_LOCAL if latched else qos.DurabilityPolicy.VOLATILE,
+        )
+
+    def topic(self, line: dict[str, Any]) -> None:
+        """Advertise."""
+        kind = self.type_of(line["type"])
+        made = self.node.create_publisher(kind, line["topic"], self.qos(latched=line["latch"]))
+        self.publishers[line["id"]] = made, kind
+        self.names[line["id"]] = line.get("names", [])
+
+    def message(self, line: dict[str, Any]) -> tuple[Any, Any]:
+        """The publisher of a line, and an empty message with its header."""
+        publisher, kind = self.publishers[line["id"]]
+        message = kind()
+        if hasattr(message, "header"):
+            nanoseconds = round(line["t"] * 1e9)
+            message.header.stamp.sec, message.header.stamp.nanosec = divmod(nanoseconds, 10**9)
+            message.header.frame_id = line.get("frame", "")
+        return publisher, message
+
+    def joint(self, line: dict[str, Any]) -> None:
+        """A row of a group."""
+        publisher, message = self.message(line)
+        message.name = self.names[line["id"]]
+        message.position = [float("nan") if value is None else float(value) for value in line["v"]]
+        publisher.publish(message)
+
+    def value(self, line: dict[str, Any]) -> None:
+        """One value of a channel."""
+        publisher, message = self.message(line)
+        setattr(message, line["field"], float(line["v"]))
+        if hasattr(message, "variance"):
+            message.variance = float(line["var"])
+        publisher.publish(message)
+
+    def compound(self, line: dict[str, Any]) -> None:
+        """A message of several values, its fields by path; what this distribution's type has not is left out."""
+        publisher, message = self.message(line)
+        for path, value in line["v"].items():
+            *way, last = path.split(".")
+            part = message
+            for name in way:
+                part = getattr(part, name)
+            if hasattr(part, last):
+                setattr(part, last, value)
+        publisher.publish(message)
+
+    def text(self, line: dict[str, Any]) -> None:
+        """Words."""
+        publisher, message = self.message(line)
+        message.data = line["v"]
+        publisher.publish(message)
+
+    def status(self, line: dict[str, Any]) -> None:
+        """A DiagnosticArray; rclpy has an octet as bytes of length 1."""
+        publisher, message = self.message(line)
+        entry, pair = self.type_of("diagnostic_msgs/DiagnosticStatus"), self.type_of("diagnostic_msgs/KeyValue")
+        message.status = [
+            entry(
+                level=bytes([level]), name=name, message=text, hardware_id=hardware,
+                values=[pair(key=key, value=value) for key, value in values],
+            )
+            for level, name, text, hardware, values in line["v"]
+        ]  # fmt: skip
+        publisher.publish(message)
+
+    def param(self, line: dict[str, Any]) -> None:
+        """Facts of a channel: parameters ``station.node.channel.fact`` of this node, by its parameter services."""
+        from rclpy.parameter import Parameter
+
+        descriptor = importlib.import_module("rcl_interfaces.msg").ParameterDescriptor(dynamic_typing=True)
+        self._own = True
+        try:
+            for fact, given in line["value"].items():
+                name, value = f"{line['key'].strip('/').replace('/', '.')}.{fact}", plain(given)
+                if self.node.has_parameter(name):
+                    self.node.set_parameters([Parameter(name, value=value)])
+                else:
+                    self.node.declare_parameter(name, value, descriptor)
+        finally:
+            self._own = False
+
+    def listen(self, line: dict[str, Any]) -> None:
+        """Set points of an actuator, newest only."""
+        uuid, channel = line["uuid"], line["channel"]
+        if line["topic"] in self.listening:
+            return
+
+        def came(message: Any) -> None:
+            say(event="command", uuid=uuid, channel=channel, value=repr(message.data))
+
+        kind, asked = self.type_of("std_msgs/Float64"), self.qos(latched=False, reading=True)
+        self.listening[line["topic"]] = self.node.create_subscription(kind, line["topic"], came, asked)
+
+
+def main() -> None:
+    """Be a node, carry lines."""
+    import rclpy
+    from rclpy.executors import SingleThreadedExecutor
+
+    rclpy.init()
+    node = rclpy.create_node(sys.argv[1])
+    bridge = Bridge(rclpy, node)
+    executor = SingleThreadedExecutor()
+    executor.add_node(node)
+    threading.Thread(target=executor.spin, daemon=True).start()
+    say(event="ready", node=node.get_name())
+    for line in sys.stdin:
+        words = json.loads(line)
+        getattr(bridge, words["op"])(words)
+    executor.shutdown(1.0)
+    node.destroy_node()
+    rclpy.shutdown()
+    # Threads of a middleware may hang on a peer that is gone; everything that had to go out has gone out.
+    os._exit(0)
+
+
+if __name__ == "__main__":
+    main()

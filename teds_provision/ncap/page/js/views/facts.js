@@ -1,0 +1,40 @@
+// Facts about a node that several views show: its link, its state, its power, one line of its security check.
+
+import { chip, h, icon } from "../dom.js";
+import { age, grouped } from "../format.js";
+import { now } from "../state.js";
+
+const LINKS = { nfc: "NFC", can: "CAN", ble: "BLE", virtual: "Virtual" };
+
+const RESULTS = { passed: ["good", "good", "passed"], failed: ["bad", "bad", "failed"], skipped: ["plain", "ask", "skipped"] };
+
+/** What a link is called. */
+export const linkName = (link) => LINKS[link] ?? link ?? "no link";
+
+/** Link, state, battery, in words with signs. */
+export function facts(node) {
+  const out = [h("span", {}, icon(node.virtual ? "virtual" : (node.link ?? "ask")), node.virtual ? "Virtual" : linkName(node.link))];
+  if (node.present === false) out.push(h("span", { class: "warn" }, icon("clock"), node.seen ? `away, seen ${age(now() - node.seen)}` : "away"));
+  else if (node.busy) out.push(h("span", { class: "busy" }, icon("clock"), node.busy));
+  else if (node.mode === "measuring") out.push(h("span", { class: "busy" }, icon("wave"), "measuring"));
+  else if (node.state) out.push(h("span", {}, node.state));
+  if (node.whitelisted === false) out.push(h("span", { class: "warn" }, icon("warn"), "not on the whitelist"));
+  if (node.groups?.length) out.push(h("span", {}, icon("list"), node.groups.join(", ")));
+  if (node.power) out.push(power(node.power));
+  return out;
+}
+
+/** Battery and charging in words. */
+function power(told) {
+  const level = typeof told.percent === "number" ? `${told.percent} %` : "level not known";
+  const words = { charging: "charging", wanted: "wants charging", full: "full", error: "charging error" }[told.charging];
+  const low = told.low || (typeof told.percent === "number" && told.percent < 10);
+  return h("span", { class: low ? "warn" : "" }, icon(told.charging === "charging" ? "charge" : "battery"), [level, words, low ? "low" : null].filter(Boolean).join(", "));
+}
+
+/** One check of the security check, with its reason. */
+export function checkLine(check) {
+  if (check.print) return h("li", {}, h("span", { class: "check-name" }, "Fingerprint of its key"), h("code", { class: "print" }, grouped(check.print)));
+  const [tone, sign, words] = RESULTS[check.result] ?? RESULTS.skipped;
+  return h("li", {}, chip(tone, sign, words), h("span", { class: "check-name" }, check.name), check.why ? h("span", { class: "hint" }, check.why) : null);
+}

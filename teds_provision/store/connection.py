@@ -1,0 +1,283 @@
+"""Statements and transactions on one connection to SQLite: waited for, undone whole, errors translated.
+
+``synchronous=FULL``: a commit that returned has reached the disk, unless it was said that it may come later, and a
+process killed at any instant leaves the last commit.
+"""
+
+from __future__ import annotations
+
+import os
+import threading
+import time
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import AbstractContextManager, contextmanager, suppress
+from pathlib import Path
+from types import TracebackType
+from typing import TYPE_CHECKING, Any, Final, TypeVar
+
+from teds_provision.errors import BadData, StoreFailure, TedsProvisionError
+from teds_provision.lazy import late
+from teds_provision.store.failures import BUSY_SECONDS, as_store_failure, damaged
+
+if TYPE_CHECKING:
+    import sqlite3
+else:  # loaded with the first store: --help does not wait for it
+    sqlite3 = late("sqlite3")
+
+QUIET_SECONDS: Final = 0.3
+"""For so long SQLite waits by itself for another process; then it is said, and tried again."""
+WAITING: Final = "synchronous=FULL"
+_Given = TypeVar("_Given")
+
+
+class Connection:
+    """Statements and re-entrant transactions. Safe to share between threads."""
+
+    def __init__(self, path: Path, connection: sqlite3.Connection) -> None:
+        self.path = path
+        self._connection = connection
+        self._lock = threading.RLock()
+        self._depth = 0
+        self._steady: int | None = None
+        self._reader: int | None = None
+        self._taken_back = 0
+        self._added = False
+        self._spoilt = False
+        self.later = 0
+        """How many commits did not wait for the disk."""
+        self._settled = 0
+        self.notice: Callable[[str], object] | None = None
+        """Told, in a sentence, what a change of the store waits for."""
+        self._frozen: StoreFailure | None = None
+        """Why nothing can be written; what is read then comes from a private copy."""
+
+    def execute(self, statement: str, values: Sequence[Any] = ()) -> list[tuple[Any, ...]]:
+        """Run one statement and return all its rows; raises StoreFailure."""
+        with self._lock:
+            try:  # not by _run(): every step makes dozens of statements
+                return self._connection.execute(statement, values).fetchall()
+            except (sqlite3.Error, OSError, UnicodeError) as error:
+                if not self._is_to_wait(error):
+                    raise self._told(error) from error
+            return self._wait_for(lambda: self._connection.execute(statement, values).fetchall())
+
+    def add(self, statement: str, values: Sequence[Any] = ()) -> None:
+        """Run an INSERT of one new row: the transaction around it is sure to write to the disk; raises StoreFailure."""
+        self.execute(statement, values)
+        self._added = True
+
+    def change(self, statement: str, values: Sequence[Any] = ()) -> int:
+        """Run one statement and return how many rows it changed; raises StoreFailure."""
+        return self._run(lambda: self._connection.execute(statement, values).rowcount)
+
+    def execute_many(self, statement: str, rows: Iterable[Sequence[Any]]) -> None:
+        """Run one statement with each row of values, all or none; raises StoreFailure."""
+        with self.together(), self._translated():
+            self._connection.executemany(statement, rows)
+
+    def _run(self, run: Callable[[], _Given]) -> _Given:
+        with self._lock:
+            try:
+                return run()
+            except (sqlite3.Error, OSError, UnicodeError) as error:
+                if not self._is_to_wait(error):
+                    raise self._told(error) from error
+            return self._wait_for(run)
+
+    def _wait_for(self, run: Callable[[], _Given]) -> _Given:
+        """Try once more, again and again; say what is waited for and until when."""
+        until = time.monotonic() + BUSY_SECONDS
+        if self.notice is not None:
+            self.notice(f"Waiting up to {BUSY_SECONDS:.0f} s for another process that is writing to the store.")
+        while True:
+            try:
+                return run()
+            except (sqlite3.Error, OSError, UnicodeError) as error:
+                if not self._is_to_wait(error) or time.monotonic() >= until:
+                    raise self._told(error) from error
+
+    def _is_to_wait(self, error: Exception) -> bool:
+        """Whether another process holds the file: inside a transaction nobody else does."""
+        code = getattr(error, "sqlite_errorcode", 0) & 0xFF
+        return not self._depth and code in (sqlite3.SQLITE_BUSY, sqlite3.SQLITE_LOCKED)
+
+    def version(self) -> int:
+        """Return a number that changes when another connection has changed the file."""
+        return int(self.execute("PRAGMA data_version")[0][0])
+
+    def state(self) -> tuple[int, int]:
+        """Return what changes when another connection has changed the file, or this one took changes back.
+
+        Equal ones, and no change of one's own between them: what was read is still so.
+        """
+        with self._lock:
+            held = self._depth or self._reader == threading.get_ident()
+            if self._steady is None or not held:  # no other one changes it while this one does
+                self._steady = self.version()
+            return self._steady, self._taken_back
+
+    @contextmanager
+    def reading(self) -> Iterator[None]:
+        """What was read before and not changed by this process counts as it was when the block began, in this thread.
+
+        For many questions at one moment, with no waiting in between: whether another process has changed something is
+        asked once. Changes inside it are made, and seen, as ever.
+        """
+        with self._lock:
+            mine = self._reader is None
+            if mine:
+                self._reader, self._steady = threading.get_ident(), None
+        try:
+            yield
+        finally:
+            if mine:
+                self._reader = None
+
+    def transaction(self, *, later: bool = False) -> AbstractContextManager[None]:
+        """All or nothing: BEGIN IMMEDIATE, COMMIT, or ROLLBACK when anything is raised; inside another, a savepoint.
+
+        It is on the disk when the block ends; ``later``: when a later one is, or after :meth:`settle`. A loss of power
+        until then undoes it whole, and never without those that came after it.
+        """
+        return Transaction(self, later=later)
+
+    def together(self) -> AbstractContextManager[None]:
+        """All or nothing, as :meth:`transaction`; inside another one a part of it, without a savepoint of its own.
+
+        What fails in it after a change takes the whole with it: where that error is caught and the rest goes on, the
+        end undoes everything and raises StoreFailure.
+        """
+        return Transaction(self, apart=False)
+
+    def settle(self, through: int | None = None) -> None:
+        """Wait until all commits, or the first ``through`` of those that did not wait, are on the disk.
+
+        Raises StoreFailure.
+        """
+        with self._lock:
+            if (self.later if through is None else through) <= self._settled:
+                return
+            try:
+                log = os.open(self.path.with_name(self.path.name + "-wal"), os.O_RDWR | os.O_NOFOLLOW | os.O_CLOEXEC)
+                try:
+                    os.fdatasync(log)  # of any descriptor: all that was written to the file
+                finally:
+                    os.close(log)
+            except OSError as error:
+                raise as_store_failure(error, self.path) from error
+            self._settled = self.later
+
+    def enter(self, block: Transaction) -> None:
+        """Begin a block; for :class:`Transaction` alone."""
+        self._lock.acquire()
+        try:
+            if self._frozen is not None:
+                raise self._frozen
+            block.level, block.spoilt = self._depth, self._spoilt
+            if block.level == 0:
+                self._begin(block.later)
+            elif block.apart:
+                self.execute(f"SAVEPOINT s{block.level}")
+            else:
+                block.changes = self._connection.total_changes
+            self._depth += 1
+        except BaseException:
+            self._lock.release()
+            raise
+
+    def _begin(self, later: bool) -> None:
+        if later:  # written to the log in its order, and not waited for
+            self.execute("PRAGMA synchronous=NORMAL")
+        try:
+            self.execute("BEGIN IMMEDIATE")
+        except BaseException:  # also where it was interrupted between BEGIN and the block that would roll it back
+            with suppress(sqlite3.Error):
+                if self._connection.in_transaction:
+                    self._connection.execute("ROLLBACK")
+            if later:
+                self.execute(f"PRAGMA {WAITING}")
+            raise
+        self._steady, self._added = None, False
+
+    def leave(self, block: Transaction, *, failed: bool) -> None:
+        """End a block; for :class:`Transaction` alone. Raises StoreFailure where it cannot be kept."""
+        try:
+            if failed:
+                self._undo(block)
+            else:
+                try:
+                    self._conclude(block)
+                except BaseException:
+                    self._undo(block)
+                    raise
+        finally:
+            self._depth = block.level
+            self._steady = self._steady if block.level else None
+            try:
+                if block.later and block.level == 0:
+                    self.later += 1
+                    self.execute(f"PRAGMA {WAITING}")
+            finally:
+                self._lock.release()
+
+    def _conclude(self, block: Transaction) -> None:
+        if self._spoilt and not block.spoilt and (block.apart or block.level == 0):
+            raise StoreFailure("A part of this change failed, so all of it was undone.", hint="Run it again.")
+        if block.level == 0:
+            self.execute("COMMIT")
+            if self._added and not block.later:  # the log, and all that was written to it before, is on the disk
+                self._settled = self.later
+        elif block.apart:
+            self.execute(f"RELEASE s{block.level}")
+
+    def _undo(self, block: Transaction) -> None:
+        """Take back what a block changed: by itself, or with the block that it is a part of."""
+        self._taken_back += 1
+        if block.level and not block.apart:
+            self._spoilt = self._spoilt or self._connection.total_changes != block.changes
+            return
+        name = f"s{block.level}"
+        for statement in (f"ROLLBACK TO {name}", f"RELEASE {name}") if block.level else ("ROLLBACK",):
+            with suppress(sqlite3.Error):  # SQLite may have rolled back by itself (disk full)
+                self._connection.execute(statement)
+        self._spoilt = block.spoilt
+
+    def _damaged(self) -> StoreFailure:
+        return damaged(self.path)
+
+    @contextmanager
+    def _translated(self) -> Iterator[None]:
+        try:
+            yield
+        except (sqlite3.Error, OSError, UnicodeError) as error:
+            raise self._told(error) from error
+
+    def _told(self, error: Exception) -> TedsProvisionError:
+        """What is raised in place of an error of SQLite, of the system, or of a text."""
+        if isinstance(error, UnicodeDecodeError):  # SQLite quotes what it found in a damaged file
+            return self._damaged()
+        if isinstance(error, sqlite3.Error | OSError):
+            if self._frozen is not None and getattr(error, "sqlite_errorcode", 0) & 0xFF == sqlite3.SQLITE_READONLY:
+                return self._frozen
+            return as_store_failure(error, self.path)
+        return BadData("A name or text is not valid UTF-8.", hint="Give it in UTF-8.")  # from a command line
+
+
+class Transaction:
+    """One ``with`` block of :meth:`Connection.transaction` or :meth:`Connection.together`."""
+
+    __slots__ = ("_connection", "apart", "changes", "later", "level", "spoilt")
+
+    def __init__(self, connection: Connection, *, later: bool = False, apart: bool = True) -> None:
+        self._connection = connection
+        self.later, self.apart = later, apart
+        self.level = self.changes = 0
+        self.spoilt = False
+
+    def __enter__(self) -> None:
+        self._connection.enter(self)
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._connection.leave(self, failed=kind is not None)

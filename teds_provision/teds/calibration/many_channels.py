@@ -1,0 +1,186 @@
+"""Many channels of one form at once: what :class:`ChannelInterpreter` gives for each, in one pass over all.
+
+A stream brings a few samples of many channels, and numpy's cost is then that of its calls. Channels of unsigned
+integers of one width, each with at most one input, are laid side by side: their curves become one table, padded to the
+longest. The results are those of the interpreters to the last bit.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any, Final
+
+import numpy as np
+
+from teds_provision.teds.calibration.interpreter import ChannelInterpreter
+from teds_provision.teds.calibration.model import Calibration
+from teds_provision.teds.calibration.samples import DataModel
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    Floats = NDArray[np.float64]
+
+_WORD: Final = 8
+_FAR_FROM_OVERFLOW: Final = 1e100
+_MOST_SEGMENTS: Final = 64
+"""Longer tables are searched channel by channel: here each boundary is compared."""
+_MOST_KNOWN: Final = 1 << 16
+"""Raw values of all channels together that are calibrated beforehand, half a megabyte: one channel of 16 bits, or 256
+of 8. Then a message is looked up, and its curves are not computed."""
+
+
+class ManyChannels:
+    """Channels side by side; make one with :meth:`of`. Values are in SI units, NaN where not valid."""
+
+    def __init__(self, channels: Sequence[ChannelInterpreter], usable: Sequence[bool]) -> None:
+        self._lay_curves([one.channel.calibration for one in channels])
+        self._scale = np.array([one.unit.scale for one in channels])
+        self._offset = np.array([one.unit.offset for one in channels])
+        self._same = np.array([one.shown_as_computed for one in channels])
+        self._converts = not self._same.all()
+        self._most = np.array([_most(one) for one in channels])
+        self._floor, self._ceiling = (np.array(ends) for ends in zip(*(one.accepted for one in channels), strict=True))
+        self._usable = None if all(usable) else np.array(usable)
+        self._width = channels[0].octets
+        self._columns = np.arange(len(channels))
+        self._prepare()
+
+    def _prepare(self) -> None:
+        """What can be left out, since it changes nothing: a call of numpy costs as much for few samples as for many."""
+        self._form = np.dtype(f">u{self._width}") if self._width in (1, 2, 4, 8) else None
+        self._native = np.dtype(np.int64 if self._width < _WORD else np.uint64)
+        self._may_be_more = bool((self._most < 2.0 ** (8 * self._width) - 1).any())
+        self._curves = np.concatenate([self._offsets[None], self._terms])
+        self._lowest, self._highest = self._curves[:, None, :, 0], self._curves[:, None, :, -1]
+        self._plain = [self._bare(row) for row in self._lowest[:, 0]] if self._inner.shape[1] == 0 else None
+        self._lows, self._highs = self._bare(self._floor), self._bare(self._ceiling)
+        self._bounded = bool(np.isfinite(self._floor).all() and np.isfinite(self._ceiling).all())
+        self._shifted = bool(self._zero.any())
+        self._scaled = bool((self._scale != 1.0).any() or self._offset.any())
+        # The largest value that a curve may take: where it is far from the largest number, nothing can overflow.
+        reach = 2.0 ** (8 * self._width) + np.abs(self._offsets).max()
+        with np.errstate(all="ignore"):
+            largest = sum(np.abs(term).max() * reach**power for power, term in enumerate(self._terms))
+        self._tame = bool(largest < _FAR_FROM_OVERFLOW)
+        self._known: Floats | None = None
+        possible = 1 << 8 * self._width
+        if possible * len(self._columns) <= _MOST_KNOWN:
+            every = np.repeat(np.arange(possible)[:, None], len(self._columns), axis=1)
+            self._known = np.ascontiguousarray(self.values(every)[0].T).ravel()
+            self._places = self._columns * possible if len(self._columns) > 1 else None
+
+    @staticmethod
+    def _bare(row: Floats) -> Floats | float:
+        """A number for each channel; of one channel the number itself, which numpy takes in half the time."""
+        return float(row[0]) if len(row) == 1 else row
+
+    def _lay_curves(self, curves: Sequence[Calibration | None]) -> None:
+        """The curves as one table; a channel without one gives its raw values (one segment, C = [0, 1])."""
+        parts = [curve.inputs[0] for curve in curves if curve is not None]
+        segments = max((part.segments for part in parts), default=1)
+        degree = max([1, *(part.degree for part in parts)])  # steps have 0: then the second coefficient is 0
+        count = len(curves)
+        self._inner = np.full((count, segments - 1), np.inf)
+        self._offsets = np.zeros((count, segments))
+        self._terms = np.zeros((degree + 1, count, segments))
+        self._zero = np.zeros(count)
+        self._own_scale, self._own_offset = np.ones(count), np.zeros(count)
+        for row, curve in enumerate(curves):
+            if curve is None:
+                self._terms[1, row, :] = 1.0
+            else:
+                self._lay_curve(row, curve)
+
+    def _lay_curve(self, row: int, curve: Calibration) -> None:
+        part = curve.inputs[0]
+        own = part.segments
+        self._inner[row, : own - 1] = part.boundaries[1:-1]
+        self._offsets[row, :own] = part.offsets
+        table = np.asarray(curve.coefficients, dtype=np.float64).reshape(own, part.degree + 1)
+        self._terms[: part.degree + 1, row, :own] = table.T
+        self._zero[row] = curve.zero_offset
+        self._own_scale[row], self._own_offset[row] = curve.unit.scale, curve.unit.offset
+
+    @classmethod
+    def of(cls, channels: Sequence[ChannelInterpreter], usable: Sequence[bool]) -> ManyChannels | None:
+        """Side by side, or None where they are not of one form; those that are not ``usable`` give no values."""
+        widths = {one.octets for one in channels}
+        if len(widths) != 1 or max(widths) > _WORD:
+            return None
+        return cls(channels, usable) if all(map(_can_stand_beside, channels)) else None
+
+    def raw(self, octets: bytes) -> NDArray[Any]:
+        """Raw values (int64, of 8 octets uint64), instants × channels, of instants one after another in a message."""
+        if self._form is not None:
+            return np.frombuffer(octets, self._form).astype(self._native).reshape(-1, len(self._columns))
+        rows = np.frombuffer(octets, dtype=np.uint8).reshape(-1, len(self._columns), self._width)
+        padded = np.zeros((len(rows), len(self._columns), _WORD), dtype=np.uint8)
+        padded[:, :, _WORD - self._width :] = rows
+        return padded.view(">u8")[:, :, 0].astype(self._native)
+
+    def values(self, raw: NDArray[Any]) -> tuple[Floats, NDArray[np.bool_]]:
+        """Values in SI units, and which are valid."""
+        if self._known is not None:
+            value: Floats = self._known.take(raw if self._places is None else raw + self._places)
+            return value, value == value  # noqa: PLR0124  NaN alone is not itself
+        numbers = raw.astype(np.float64)
+        if self._tame:
+            return self._valued(numbers, self._curved(numbers))
+        with np.errstate(over="ignore", invalid="ignore"):
+            return self._valued(numbers, self._curved(numbers))
+
+    def _curved(self, numbers: Floats) -> Floats:
+        """What the curves give for raw numbers, in their own units."""
+        offset, *terms = self._plain or self._segments(numbers)
+        distance = numbers - offset
+        total: Floats = terms[-1] * distance
+        for term in terms[-2:0:-1]:
+            total += term
+            total *= distance
+        total += terms[0]
+        if self._shifted:
+            total += self._zero
+        return total
+
+    def _segments(self, numbers: Floats) -> Floats:
+        """Of each number's segment: its offset, then its coefficients, (degree + 2) × instants × channels."""
+        if self._inner.shape[1] == 1:
+            return np.where(numbers >= self._inner[:, 0], self._highest, self._lowest)
+        segment = (numbers[:, :, None] >= self._inner).sum(axis=2)
+        found: Floats = self._curves[:, self._columns, segment]
+        return found
+
+    def _valued(self, numbers: Floats, total: Floats) -> tuple[Floats, NDArray[np.bool_]]:
+        """Curved values converted to the channels' units, judged by their limits, and in SI units."""
+        if self._converts:
+            converted = (total * self._own_scale + self._own_offset - self._offset) / self._scale
+            total = np.where(self._same, total, converted)
+        valid = total >= self._lows
+        valid &= total <= self._highs
+        if not self._bounded:
+            valid &= np.isfinite(total)
+        if self._may_be_more:
+            valid &= numbers <= self._most
+        if self._usable is not None:
+            valid &= self._usable
+        if self._scaled:
+            total = total * self._scale + self._offset
+        if np.count_nonzero(valid) < valid.size:
+            total[~valid] = np.nan
+        return total, valid
+
+
+def _most(one: ChannelInterpreter) -> float:
+    """The largest raw value that counts."""
+    bound = one.reader.form.raw_range
+    return math.inf if bound is None else bound[1]
+
+
+def _can_stand_beside(one: ChannelInterpreter) -> bool:
+    """A sensor of unsigned integers with a curve over its own raw value, of not too many segments, or none."""
+    if one.reader.form.model != DataModel.UNSIGNED or one.channel.actuator or one.others:
+        return False
+    curve = one.channel.calibration
+    return curve is None or (len(curve.inputs) == 1 and curve.inputs[0].segments <= _MOST_SEGMENTS)

@@ -1,0 +1,170 @@
+"""The file of a backup: private, whole, opened by passphrase or recovery key, and told apart from every damage."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import subprocess
+import threading
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from teds_provision.backup import sealed_file as backup_file
+from teds_provision.backup.restore import open_present
+from teds_provision.backup.sealed_file import SealedFile, Sealer
+from teds_provision.errors import (
+    BadData,
+    NotAuthentic,
+    PolicyRefused,
+    WrongPassphrase,
+)
+from teds_provision.protocol.keys import SoftwareKey
+from teds_provision.station.station import Station
+from teds_provision.store import (
+    NodeRecord,
+    Store,
+)
+from teds_provision.store import dump as rows
+from tests.backup.backups import (
+    ONE,
+    POINT,
+    TWO,
+    back_up,
+    copy_of,
+    opened,
+    opened_octets,
+    restored_into,
+)
+
+
+def test_the_file_is_private_whole_and_tells_nothing_secret(station: Station, tmp_path: Path) -> None:
+    path = tmp_path / "station.backup"
+    done = back_up(station, path)
+    octets = path.read_bytes()
+    assert (done.nodes, done.keys, done.sealed_to, done.warnings) == (2, 3, "passphrase", ())
+    assert path.stat().st_mode & 0o777 == 0o600
+    head = json.loads(octets.split(b"\n", 1)[0])
+    assert set(head) == {"format", "store", "station", "created", "key", "sha256"}
+    assert station.vault.secret_material().encode() not in octets
+    assert ONE not in octets
+    assert ONE.hex().encode() not in octets
+    assert [left.name for left in tmp_path.iterdir() if left.name.startswith(".")] == []
+    assert "material" not in repr(opened(path))
+
+
+def test_a_wrong_passphrase_and_every_kind_of_damage_are_told_apart(station: Station, tmp_path: Path) -> None:
+    path = tmp_path / "station.backup"
+    back_up(station, path)
+    octets = path.read_bytes()
+    with pytest.raises(WrongPassphrase):
+        opened_octets(tmp_path, octets, "other words here")
+    step = max(1, len(octets) // 150)
+    for place_ in range(0, len(octets) - 1, step):
+        changed = bytearray(octets)
+        changed[place_] ^= 1
+        with pytest.raises((NotAuthentic, BadData)):
+            opened_octets(tmp_path, bytes(changed))
+    with pytest.raises((BadData, NotAuthentic)):
+        opened_octets(tmp_path, octets + b"more")
+    for length in (0, 1, 70, len(octets) // 2, len(octets) - 2):
+        with pytest.raises(BadData):
+            opened_octets(tmp_path, octets[:length])
+
+
+def test_who_recomputes_the_digest_still_needs_the_passphrase(station: Station, tmp_path: Path) -> None:
+    path = tmp_path / "station.backup"
+    back_up(station, path)
+    line, chunks = path.read_bytes().split(b"\n", 1)
+    document = json.loads(line)
+    document.pop("sha256")
+    document["created"] = "2030-01-01T00:00:00Z"
+    forged = backup_file.dump({**document, "sha256": backup_file.digest_of(document)})
+    with pytest.raises(WrongPassphrase):
+        opened_octets(tmp_path, forged + b"\n" + chunks)
+
+
+@pytest.mark.parametrize("octets", [b"", b"{}", b"[]", b"\0" * 1000, b'{"format": "teds-image/1"}', b"{" * 100_000])
+def test_what_is_no_backup_is_bad_data(tmp_path: Path, octets: bytes) -> None:
+    (tmp_path / "b").write_bytes(octets)
+    with pytest.raises(BadData):
+        SealedFile(tmp_path / "b")
+
+
+def test_a_recovery_key_opens_it_and_no_other(station: Station, tmp_path: Path) -> None:
+    recovery, path = SoftwareKey.generate(), tmp_path / "station.backup"
+    back_up(station, path, recovery.point)
+    sealed = SealedFile(path)
+    assert sealed.is_for_key
+    with sealed.open_with_key(recovery) as content:
+        assert content.point == station.point
+    with pytest.raises(PolicyRefused, match="sealed to the recovery key"):
+        sealed.open_with_key(SoftwareKey.generate())
+    path.write_bytes(path.read_bytes().replace(b'"tag":"', b'"tag":"A', 1))
+    with pytest.raises((NotAuthentic, BadData)):
+        SealedFile(path).open_with_key(recovery)
+
+
+def test_a_backup_that_another_key_has_signed_is_not_the_stations(station: Station, tmp_path: Path) -> None:
+    """Whoever has the public recovery key can seal something; it must not pass for this station."""
+    recovery, path, forger = SoftwareKey.generate(), tmp_path / "station.backup", SoftwareKey.generate()
+    back_up(station, path, recovery.point)
+    sealer = Sealer(recovery=recovery.point)
+    with SealedFile(path).open_with_key(recovery) as real, path.open("wb") as file:
+        backup_file.write(file, real, rows.dump(real.copy), forger, sealer)
+    with pytest.raises(NotAuthentic, match="not signed"):
+        SealedFile(path).open_with_key(recovery)
+    with copy_of(station, tmp_path) as real, path.open("wb") as file:
+        backup_file.write(file, replace(real, point=forger.point), rows.dump(real.copy), forger, sealer)
+    forged = SealedFile(path).open_with_key(recovery)
+    with pytest.raises(PolicyRefused, match=r"the store in .* is of station"):
+        open_present(station.home, forged)
+    with pytest.raises(NotAuthentic):
+        restored_into(tmp_path / "new", forged)
+    assert not (tmp_path / "new" / "store.sqlite3").exists()
+
+
+@pytest.mark.system
+def test_the_jose_tool_opens_a_backup_with_the_recovery_key(station: Station, tmp_path: Path) -> None:
+    if shutil.which("jose") is None:
+        pytest.skip("the Debian package jose is not installed (scripts/install-test-packages)")
+    from teds_provision.protocol.handover.jwk import public_jwk
+    from teds_provision.protocol.handover.strict_json import encode_base64url
+
+    recovery = SoftwareKey.generate()
+    back_up(station, tmp_path / "b", recovery.point)
+    jwk = {**public_jwk(recovery.point), "d": encode_base64url(recovery.secret())}
+    (tmp_path / "k.jwk").write_text(json.dumps(jwk))
+    line = (tmp_path / "b").read_bytes().split(b"\n", 1)[0]
+    (tmp_path / "key.jwe").write_text(json.dumps(json.loads(line)["key"]))
+    words = ["jose", "jwe", "dec", "-i", str(tmp_path / "key.jwe"), "-k", str(tmp_path / "k.jwk")]
+    own = subprocess.run(words, capture_output=True, check=True, timeout=60).stdout
+    with SealedFile(tmp_path / "b").open_with_content_key(own) as content:
+        assert content.store == station.id
+
+
+def test_a_backup_taken_while_the_store_is_written_is_one_moment(station: Station, tmp_path: Path) -> None:
+    stop, home = threading.Event(), station.home
+
+    def write() -> None:
+        with Store.open(home) as store:
+            number = 10
+            while not stop.is_set():
+                number += 1
+                with store.transaction():
+                    for uuid in (ONE, TWO):
+                        store.put_node(NodeRecord(uuid, POINT, sequence=number))
+                stop.wait(0.002)  # SQLite's writers wait their turn without a queue
+
+    writer = threading.Thread(target=write)
+    writer.start()
+    try:
+        for _ in range(20):
+            with copy_of(station, tmp_path) as content:
+                sequences = {record.sequence for record in content.copy.nodes()}
+                assert len(sequences) == 1
+                assert content.copy.audit.check().intact
+    finally:
+        stop.set()
+        writer.join()

@@ -1,0 +1,194 @@
+"""What is in a backup: chunks of any length, other versions, rows from anybody."""
+
+from __future__ import annotations
+
+import io
+import json
+import os
+from pathlib import Path
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from teds_provision.backup.chunks import CHUNK_OCTETS, ChunkReader, ChunkWriter
+from teds_provision.backup.restore import merge_sealed, rebuild
+from teds_provision.backup.sealed_file import SealedFile
+from teds_provision.errors import (
+    BadData,
+    NotAuthentic,
+    StoreFailure,
+    WrongPassphrase,
+)
+from teds_provision.protocol.keys import SoftwareKey
+from teds_provision.station.station import Station
+from teds_provision.store import (
+    Draft,
+    WhitelistEntry,
+)
+from teds_provision.store import dump as rows
+from teds_provision.store.schema import SCHEMA_VERSION
+from teds_provision.teds.image import Image
+from teds_provision.vault import forget_vaults
+from teds_provision.vault.passphrase import THROWAWAY
+from tests.backup.backups import (
+    FIXTURES,
+    SEALED,
+    TWO,
+    ask,
+    back_up,
+    keys_of,
+    opened,
+    opened_octets,
+)
+
+
+def test_a_store_of_several_chunks_goes_out_and_comes_back(station: Station, tmp_path: Path) -> None:
+    filler = {(0, 1): os.urandom(100_000)}
+    with station.transaction():
+        for number in range(40):
+            station._store.put_draft(Draft(uuid := number.to_bytes(10, "big"), Image(uuid, filler)))
+    done = back_up(station, tmp_path / "b")
+    assert done.octets > 3 * CHUNK_OCTETS
+    octets = (tmp_path / "b").read_bytes()
+    with opened(tmp_path / "b") as content:
+        assert list(rows.dump(content.copy))[1:] != []
+        draft = content.copy.draft((39).to_bytes(10, "big"))
+        assert draft is not None
+        assert draft.image.blocks == filler
+    head = octets.index(b"\n") + 1
+    full = CHUNK_OCTETS + 16
+    first, second = octets[head : head + full], octets[head + full : head + 2 * full]
+    assert len(first) == len(second) == full
+    swapped = octets[:head] + second + first + octets[head + 2 * full :]
+    dropped = octets[:head] + first + octets[head + 2 * full :]
+    doubled = octets[:head] + first + first + octets[head + full :]
+    cut_at_a_chunk = octets[: head + 2 * full]
+    ended_early = cut_at_a_chunk + b"teds-backup end\n"
+    for changed in (swapped, dropped, doubled, cut_at_a_chunk, ended_early):
+        with pytest.raises((NotAuthentic, BadData)):
+            opened_octets(tmp_path, changed)
+
+
+def test_a_chunk_of_another_backup_of_the_same_station_does_not_fit(station: Station, tmp_path: Path) -> None:
+    back_up(station, tmp_path / "a")
+    back_up(station, tmp_path / "b")
+    (head, _), (_, chunks) = ((tmp_path / name).read_bytes().split(b"\n", 1) for name in "ab")
+    with pytest.raises(NotAuthentic):
+        opened_octets(tmp_path, head + b"\n" + chunks)
+
+
+@pytest.mark.parametrize("length", [0, 1, CHUNK_OCTETS - 1, CHUNK_OCTETS, CHUNK_OCTETS + 1, 2 * CHUNK_OCTETS])
+def test_any_length_goes_through_the_chunks(length: int) -> None:
+    key, context, out = os.urandom(32), b"context", io.BytesIO()
+    writer = ChunkWriter(out, key, context)
+    writer.write(b"x" * length)
+    writer.end()
+    reader = ChunkReader(io.BytesIO(out.getvalue()), key, context)
+    assert reader.read(length) == b"x" * length
+    reader.require_end()
+    assert reader.digest.digest() == writer.digest.digest()
+    with pytest.raises(BadData):
+        reader.read(1)
+    with pytest.raises(NotAuthentic):
+        ChunkReader(io.BytesIO(out.getvalue()), key, b"other").require_end()
+
+
+def test_backups_of_version_1_still_open(tmp_path: Path) -> None:
+    """Made by version 1's own code: a station named "version one" with two nodes and their keys."""
+    with SealedFile(FIXTURES / "version-1.backup").open_with_passphrase(SEALED) as content:
+        assert (content.name, len(content.copy.nodes())) == ("version one", 2)
+        done = rebuild(tmp_path / "home", content, ask, costs=THROWAWAY)
+    assert (done.back["nodes"], done.rotations_due) == (2, 2)
+    again = Station.open(tmp_path / "home", ask=ask)
+    assert keys_of(again, TWO) == [(1, "active", bytes([2]) * 16)]
+    again.close()
+    recovery = SoftwareKey.from_secret(bytes(31) + b"\x07")
+    with SealedFile(FIXTURES / "version-1-recovery.backup").open_with_key(recovery) as content:
+        assert len(content.copy.nodes()) == 2
+    with pytest.raises(WrongPassphrase):
+        SealedFile(FIXTURES / "version-1.backup").open_with_passphrase("other words here")
+
+
+def test_what_a_backup_of_version_1_brings_into_a_sealed_store_is_sealed(tmp_path: Path) -> None:
+    with SealedFile(FIXTURES / "version-1.backup").open_with_passphrase(SEALED) as content:
+        rebuild(tmp_path / "home", content, ask, costs=THROWAWAY)
+        forget_vaults()
+        station = Station.open(tmp_path / "home", ask=ask)
+        station.unlock()  # takes it over
+        lost = station.pins.whitelist()[0].uuid
+        station.pins.remove(lost)
+    with SealedFile(FIXTURES / "version-1.backup").open_with_passphrase(SEALED) as content:
+        done = merge_sealed(station._store, content, station.vault, ask)
+    assert done.back["whitelist"] == 1
+    assert list(station.seals.all_broken()) == []
+    assert station.pins.entry(lost) is not None
+    station._store.put_whitelist(WhitelistEntry(b"\xee" * 10))  # by another program
+    station.pins.remove(lost)
+    with SealedFile(FIXTURES / "version-1.backup").open_with_passphrase(SEALED) as content:
+        merge_sealed(station._store, content, station.vault, ask)
+    assert f"the whitelist entry of {'ee' * 10}" in list(station.seals.all_broken())
+    station.close()
+
+
+class Octets:
+    """Octets as a dump is read from."""
+
+    def __init__(self, octets: bytes) -> None:
+        self._octets = io.BytesIO(octets)
+
+    def read(self, size: int) -> bytes:
+        octets = self._octets.read(size)
+        if len(octets) < size:
+            raise BadData("too early")
+        return octets
+
+    def read_line(self, limit: int) -> bytes:
+        return self._octets.readline(limit).rstrip(b"\n")
+
+
+def test_a_dump_comes_back_row_for_row(station: Station) -> None:
+    first = b"".join(station.rows())
+    with rows.load(Octets(first)) as copy:
+        assert b"".join(rows.dump(copy)) == first
+
+
+def head(tables: dict[str, list[str]], schema: object = SCHEMA_VERSION) -> bytes:
+    return json.dumps({"schema": schema, "tables": tables}).encode() + b"\n"
+
+
+@pytest.mark.parametrize(
+    "octets",
+    [
+        b"",
+        b"[]\n",
+        b'{"schema": 1}\n',
+        b'{"schema": true, "tables": {}}\n',
+        head({"sqlite_schema": ["name"]}) + b"\xff\0\0\0\0",
+        head({"x; DROP TABLE keys": ["a"]}) + b"\xff\0\0\0\0",
+        head({"meta": ["name", "value", "more"]}) + b"\xff\0\0\0\0",
+        head({"meta": ["name", "value"]}),
+        head({"meta": ["name", "value"]}) + b"\0\xff\xff\xff\xff",
+        head({"meta": ["name", "value"]}) + b"\7\0\0\0\0",
+        head({"meta": ["name", "value"]}) + b"\0\0\0\0\2\0\0\xff\0\0\0\0",  # NULL where none may be
+        head({"meta": ["name", "value"]}) + b"\0\0\0\0\1\0\xff\0\0\0\0",  # a value too few
+        head({"meta": ["name", "value"]}) + b"\0\0\0\0\5\2\0\0\1\0\xff\0\0\0\0",  # a text longer than its row
+        head({"meta": ["name", "value"]}) + b"\xff\0\0\0\0",  # no identifier
+    ],
+)
+def test_rows_that_are_none_are_bad_data(octets: bytes) -> None:
+    with pytest.raises((BadData, StoreFailure)):
+        rows.load(Octets(octets))
+
+
+@given(st.binary(max_size=200))
+def test_no_octets_make_a_dump_raise_anything_foreign(octets: bytes) -> None:
+    with pytest.raises((BadData, StoreFailure)):
+        rows.load(Octets(head({"meta": ["name", "value"], "nodes": []}) + octets))
+    with pytest.raises((BadData, StoreFailure)):
+        rows.load(Octets(head({"meta": ["name", "value"]}) + octets))
+
+
+def test_a_newer_schema_is_not_guessed_at() -> None:
+    with pytest.raises(StoreFailure, match="knows up to"):
+        rows.load(Octets(head({}, SCHEMA_VERSION + 1) + b"\xff\0\0\0\0"))

@@ -1,0 +1,111 @@
+"""What backup and restore tell, and what a restored station may not do."""
+
+from __future__ import annotations
+
+import sqlite3
+from contextlib import closing
+from dataclasses import replace
+from datetime import UTC, datetime
+from pathlib import Path
+
+import pytest
+
+from teds_provision.backup.backup import backup
+from teds_provision.backup.content import Head
+from teds_provision.backup.restore import rebuild
+from teds_provision.errors import (
+    PolicyRefused,
+    StoreFailure,
+    StoreLocked,
+    UsageFailure,
+)
+from teds_provision.station.station import Station
+from teds_provision.store import (
+    StoreLock,
+)
+from teds_provision.vault.passphrase import THROWAWAY
+from tests.backup.backups import (
+    ONE,
+    POINT,
+    TWO,
+    ask,
+    back_up,
+    copy_of,
+    opened,
+    restored_into,
+)
+
+
+def test_after_a_restore_every_key_has_to_be_rotated_by_a_person(station: Station, tmp_path: Path) -> None:
+    back_up(station, tmp_path / "b")
+    done = restored_into(tmp_path / "new", opened(tmp_path / "b"))
+    assert done.rotations_due == 2
+    again = Station.open(tmp_path / "new", ask=ask)
+    for uuid in (ONE, TWO):
+        assert "restored from a backup" in (again.keys.rotation_due(uuid) or "")
+        with pytest.raises(PolicyRefused, match="restored from a backup"):
+            again.policy.require_not_restored(uuid)
+    again.keys.rotated(ONE)
+    again.policy.require_not_restored(ONE)
+    again.close()
+
+
+def test_no_module_path_goes_into_a_backup_or_comes_out_of_one(station: Station, tmp_path: Path) -> None:
+    with copy_of(station, tmp_path) as content:
+        evil = replace(content, keystore="pkcs11:token=x?module-path=/tmp/evil.so")
+        for asked in (None, "file"):
+            with pytest.raises((UsageFailure, PolicyRefused)):
+                rebuild(tmp_path / "new", evil, ask, keystore=asked)
+        with pytest.raises(UsageFailure, match="no such keystore"):
+            rebuild(tmp_path / "new", replace(content, keystore="other"), ask)
+    assert not (tmp_path / "new").exists()
+
+
+def test_a_backup_beside_a_stuck_writer_says_so_and_leaves_no_file(
+    station: Station, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    told: list[str] = []
+    held = station.lock("provision")
+    monkeypatch.setattr(
+        Station, "lock", lambda self, command, notice: StoreLock(self.home, command=command, wait=1.0, notice=notice)
+    )
+    before = station.audit_log.check().count
+    with held, pytest.raises(StoreLocked):
+        backup(station, tmp_path / "b", ask, costs=THROWAWAY, notice=told.append)
+    assert len(told) == 1
+    assert "provision" in told[0]
+    assert not (tmp_path / "b").exists()
+    assert station.audit_log.check().count == before
+
+
+def test_a_backup_that_does_not_open_again_is_not_kept(
+    station: Station, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("teds_provision.backup.sealed_file.MAX_OCTETS", 1000)
+    with pytest.raises(StoreFailure, match="does not open again"):
+        back_up(station, tmp_path / "b")
+    assert list(tmp_path.glob("*b")) == []
+    assert station.audit_log.check().count == 1 + 1  # init and ready
+
+
+def test_the_age_of_a_backup() -> None:
+    made = Head("id", POINT, "n", "2026-01-01T00:00:00Z", "file", "")
+    assert made.age_days(datetime(2026, 1, 13, 12, tzinfo=UTC)) == 12
+    assert replace(made, created="yesterday").age_days() == 0
+
+
+def test_a_backup_beside_a_writer_of_the_file_itself_says_what_it_waits_for(
+    station: Station, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Not one of our commands: a program that holds SQLite's own lock."""
+    told: list[str] = []
+    station.notice = told.append
+    monkeypatch.setattr("teds_provision.store.connection.BUSY_SECONDS", 0.5)
+    with closing(sqlite3.connect(station.home / "store.sqlite3", isolation_level=None)) as other:
+        other.execute("BEGIN IMMEDIATE")
+        with pytest.raises(StoreLocked):
+            back_up(station, tmp_path / "b")
+        assert told == ["Waiting up to 0 s for another process that is writing to the store."]
+        assert not (tmp_path / "b").exists()
+        other.execute("ROLLBACK")
+    assert back_up(station, tmp_path / "b").nodes == 2

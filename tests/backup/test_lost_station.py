@@ -1,0 +1,98 @@
+"""A lost station comes back whole from its backup, and never over another one."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import pytest
+
+from teds_provision.backup.restore import open_present
+from teds_provision.errors import (
+    NotFound,
+    StoreFailure,
+)
+from teds_provision.station.station import Station
+from teds_provision.store import (
+    Store,
+)
+from teds_provision.store.snapshot import place
+from teds_provision.vault import forget_vaults
+from tests.backup.backups import (
+    ONE,
+    POINT,
+    TWO,
+    ask,
+    back_up,
+    copy_of,
+    keys_of,
+    opened,
+    restored_into,
+)
+
+
+def test_an_empty_home_becomes_the_station_again(station: Station, tmp_path: Path) -> None:
+    path, home = tmp_path / "station.backup", tmp_path / "new" / "home"
+    back_up(station, path)
+    before = {uuid: keys_of(station, uuid) for uuid in (ONE, TWO)}
+    done = restored_into(home, opened(path))
+    assert (done.action, done.keystore) == ("rebuilt", "file")
+    assert done.back["keys"] == 3
+    assert (home / "store.sqlite3").stat().st_mode & 0o777 == 0o600
+    assert home.stat().st_mode & 0o777 == 0o700
+    forget_vaults()
+    again = Station.open(home, ask=ask)
+    assert (again.fingerprint, again.ca, again.id) == (station.fingerprint, station.ca, station.id)
+    assert {uuid: keys_of(again, uuid) for uuid in (ONE, TWO)} == before
+    assert again.identity.certify(POINT) == station.identity.certify(POINT)
+    assert again.audit_log.check().intact
+    again.close()
+
+
+def test_killed_between_vault_and_store_the_same_command_carries_on(
+    station: Station, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path, home = tmp_path / "station.backup", tmp_path / "new"
+    back_up(station, path)
+    with monkeypatch.context() as patch:
+        patch.setattr("teds_provision.backup.restore.place", lambda *_: (_ for _ in ()).throw(KeyboardInterrupt))
+        with pytest.raises(KeyboardInterrupt):
+            restored_into(home, opened(path))
+    with pytest.raises(NotFound):
+        Station.open(home, ask=ask)
+    restored_into(home, opened(path))
+    again = Station.open(home, ask=ask)
+    assert len(keys_of(again, TWO)) == 2
+    again.close()
+
+
+def test_a_damaged_store_is_kept_under_another_name(station: Station, tmp_path: Path) -> None:
+    path, home = tmp_path / "station.backup", station.home
+    back_up(station, path)
+    station.close()
+    (home / "store.sqlite3").write_bytes(b"\0" * 8192)
+    for end in ("-wal", "-shm"):
+        (home / f"store.sqlite3{end}").unlink(missing_ok=True)
+    content = opened(path)
+    assert open_present(home, content) is None
+    done = restored_into(home, content)
+    assert done.set_aside is not None
+    assert done.set_aside.read_bytes() == b"\0" * 8192
+    again = Station.open(home, ask=ask)
+    assert keys_of(again, ONE)[0][0] == 1
+    again.close()
+
+
+def test_a_store_is_never_put_over_another(station: Station, tmp_path: Path) -> None:
+    with copy_of(station, tmp_path) as content, pytest.raises(StoreFailure, match="already"):
+        place(content.copy, station.home)
+
+
+def test_a_log_left_by_a_lost_store_is_not_replayed_into_the_restored_one(station: Station, tmp_path: Path) -> None:
+    path, home = tmp_path / "station.backup", tmp_path / "new"
+    back_up(station, path)
+    home.mkdir(mode=0o700)
+    (home / "store.sqlite3-wal").write_bytes(os.urandom(5000))
+    restored_into(home, opened(path))
+    with Store.open(home) as store:
+        assert store.damage() is None

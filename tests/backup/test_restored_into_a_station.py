@@ -1,0 +1,278 @@
+"""A backup restored into a living station: what is missing comes back, nothing goes back."""
+
+from __future__ import annotations
+
+import shutil
+import sqlite3
+from contextlib import closing
+from pathlib import Path
+
+import pytest
+
+from teds_provision.backup.backup import backup
+from teds_provision.backup.restore import complete_vault, merge, open_present, rebuild
+from teds_provision.errors import (
+    PolicyRefused,
+    UsageFailure,
+    VaultFailure,
+)
+from teds_provision.protocol.keys import SoftwareKey
+from teds_provision.station.station import Station, initialise
+from teds_provision.store import (
+    Holder,
+    NodeRecord,
+    Revocation,
+    Store,
+    Tombstone,
+    WhitelistEntry,
+)
+from teds_provision.store.snapshot import Relation, place
+from teds_provision.vault import forget_vaults
+from teds_provision.vault.passphrase import THROWAWAY
+from teds_provision.vault.software import SoftwareVault
+from tests.backup.backups import (
+    NEW,
+    ONE,
+    POINT,
+    SEALED,
+    TWO,
+    add_key,
+    ask,
+    back_up,
+    copy_of,
+    keys_of,
+    opened,
+)
+
+from ..bench import make_station
+from ..vault.softhsm import PIN, loaded, unload
+
+
+def test_restoring_the_present_state_is_nothing_to_do(station: Station, tmp_path: Path) -> None:
+    back_up(station, tmp_path / "b")
+    count = station.audit_log.check().count
+    done = merge(station._store, opened(tmp_path / "b"), dry_run=False)
+    assert (done.action, done.relation, done.back) == ("nothing", Relation.OLDER, {})
+    assert station.audit_log.check().count == count
+
+
+def test_an_older_state_brings_back_what_is_missing_and_nothing_goes_back(station: Station, tmp_path: Path) -> None:
+    back_up(station, tmp_path / "b")
+    store = station._store
+    store.remove_whitelist(ONE)
+    store.remove_trust("owner")
+    add_key(station, ONE, 2)  # rotated since: the key of epoch 1 is gone
+    store.put_node(NodeRecord(ONE, POINT, epoch=2, sequence=9))
+    add_key(station, NEW, 1)
+    store.put_whitelist(WhitelistEntry(NEW, assurance="tap"))
+    store.put_tombstone(Tombstone(TWO, "cd" * 32, "id"))
+    station.audit("sign", ONE, "done")
+    before = {uuid: keys_of(station, uuid) for uuid in (ONE, TWO, NEW)}
+    plan = merge(store, opened(tmp_path / "b"), dry_run=True)
+    assert store.whitelisted(ONE) is None
+    done = merge(store, opened(tmp_path / "b"), dry_run=False)
+    assert done == plan
+    assert done.relation is Relation.OLDER
+    assert done.back == {"whitelist": 1, "trust in ca owner": 1}
+    assert "older keys left out: 1" in done.kept
+    assert "nodes whose epoch or sequence is higher now: 1" in done.kept
+    assert "nodes moved away since: 1" in done.kept
+    known = store.node(ONE)
+    assert known is not None
+    assert (known.epoch, known.sequence) == (2, 9)
+    assert {uuid: keys_of(station, uuid) for uuid in (ONE, TWO, NEW)} == before
+    assert store.tombstone(TWO) is not None
+    assert store.whitelisted(NEW) is not None
+    assert store.audit.check().intact
+
+
+def test_a_revoked_node_stays_revoked_and_off_the_whitelist(station: Station, tmp_path: Path) -> None:
+    back_up(station, tmp_path / "b")
+    station.policy.deny(Revocation(ONE, None, "stolen", "{}"))
+    station.pins.remove(ONE)
+    station.keys.remove(ONE)
+    station.audit("revoke", ONE, "done")
+    done = merge(station._store, opened(tmp_path / "b"), dry_run=False)
+    assert done.action == "nothing"
+    assert station.pins.entry(ONE) is None
+    assert station.keys.of(ONE) == []
+    assert "revocations made since: 1" in done.kept
+
+
+def test_keys_given_up_since_are_not_brought_back(station: Station, tmp_path: Path) -> None:
+    back_up(station, tmp_path / "b")
+    station.keys.remove(ONE)
+    station.audit("decommission", ONE, "done")
+    merge(station._store, opened(tmp_path / "b"), dry_run=False)
+    assert station.keys.of(ONE) == []
+
+
+def test_a_node_that_was_pinned_anew_keeps_its_new_key(station: Station, tmp_path: Path) -> None:
+    station.pins.put(WhitelistEntry(ONE, "ab" * 32, assurance="tap"))
+    back_up(station, tmp_path / "b")
+    station.pins.remove(ONE)
+    station.pins.let_go(ONE)
+    other = SoftwareKey.generate().point
+    station.nodes.remember(ONE, point=other)
+    station.audit("identify", ONE, "proven")
+    done = merge(station._store, opened(tmp_path / "b"), dry_run=False)
+    known = station.nodes.get(ONE)
+    assert known is not None
+    assert known.point == other
+    assert station.pins.entry(ONE) is None
+    assert "whitelist entries pinned to another key now: 1" in done.kept
+
+
+def test_a_newer_state_brings_a_rolled_back_store_forward(station: Station, tmp_path: Path) -> None:
+    home, stale = station.home, tmp_path / "stale"
+    with copy_of(station, tmp_path) as content:
+        stale.mkdir(mode=0o700)
+        place(content.copy, stale)
+    shutil.copy(home / "vault.json", stale / "vault.json")
+    new_key = add_key(station, ONE, 2)
+    station.nodes.put(NodeRecord(ONE, POINT, epoch=2, sequence=9, verdict="authentic"))
+    station._store.put_tombstone(Tombstone(TWO, "cd" * 32, "id"))
+    station.keys.put_holder(Holder(ONE, "cd" * 32))
+    station.audit("sign", ONE, "done")
+    back_up(station, tmp_path / "b")
+    old = Station.open(stale, ask=ask)
+    done = merge(old._store, opened(tmp_path / "b"), dry_run=False)
+    assert done.relation is Relation.NEWER
+    known = old.nodes.get(ONE)
+    assert known is not None
+    assert (known.epoch, known.sequence) == (2, 9)
+    assert next(key for _, _, key in keys_of(old, ONE)) == new_key
+    assert [state for _, state, _ in keys_of(old, ONE)] == ["pending", "active"]  # an Open decides
+    assert old.policy.tombstone(TWO) is not None
+    assert old.keys.holders(ONE)[0].fingerprint == "cd" * 32
+    assert old.audit_log.check().intact
+    assert [entry.act for entry in old.audit_log.entries()][-2:] == ["sign", "restore"]
+    assert merge(old._store, opened(tmp_path / "b"), dry_run=False).action == "nothing"
+    old.close()
+
+
+def test_states_that_went_different_ways_keep_both_sides_newest(station: Station, tmp_path: Path) -> None:
+    stale = tmp_path / "stale"
+    with copy_of(station, tmp_path) as content:
+        stale.mkdir(mode=0o700)
+        place(content.copy, stale)
+    shutil.copy(station.home / "vault.json", stale / "vault.json")
+    add_key(station, ONE, 4)
+    station.audit("agree", ONE, "done")
+    back_up(station, tmp_path / "b")
+    other = Station.open(stale, ask=ask)
+    add_key(other, TWO, 7)
+    other.audit("agree", TWO, "done")
+    done = merge(other._store, opened(tmp_path / "b"), dry_run=False)
+    assert done.relation is Relation.DIVERGED
+    assert {epoch for epoch, _, _ in keys_of(other, ONE)} == {1, 4}
+    assert {epoch for epoch, _, _ in keys_of(other, TWO)} == {7}
+    assert other.audit_log.check().intact
+    other.close()
+
+
+def test_the_backup_of_another_station_is_refused(station: Station, tmp_path: Path) -> None:
+    back_up(station, tmp_path / "b")
+    other = make_station(tmp_path / "other")
+    with pytest.raises(PolicyRefused, match=r"the store in .* is of station") as caught:
+        open_present(tmp_path / "other", opened(tmp_path / "b"))
+    assert caught.value.exit_code == 6
+    other.close()
+
+
+def software(station: Station) -> SoftwareVault:
+    assert isinstance(station.vault, SoftwareVault)
+    return station.vault
+
+
+def test_master_keys_of_the_backup_join_those_of_the_vault(station: Station, tmp_path: Path) -> None:
+    """The master key was changed since: keys from before and after have to open."""
+    back_up(station, tmp_path / "b")
+    software(station).add_master()
+    software(station).retire_masters()
+    software(station).drop_ca()
+    forget_vaults()
+    vault = complete_vault(station._store, opened(tmp_path / "b"), ask)
+    assert isinstance(vault, SoftwareVault)
+    assert len(vault._material.masters.keys) == 2
+    assert vault.ca() is None  # it was taken out since, and stays out
+
+
+def test_a_vault_that_lacks_nothing_is_left_as_it_is(station: Station, tmp_path: Path) -> None:
+    back_up(station, tmp_path / "b")
+    software(station).drop_ca()
+    before = (station.home / "vault.json").read_bytes()
+    forget_vaults()
+    assert complete_vault(station._store, opened(tmp_path / "b"), ask).ca() is None
+    assert (station.home / "vault.json").read_bytes() == before
+
+
+def test_a_lost_vault_comes_back_beside_its_store(station: Station, tmp_path: Path) -> None:
+    back_up(station, tmp_path / "b")
+    (station.home / "vault.json").unlink()
+    forget_vaults()
+    assert complete_vault(station._store, opened(tmp_path / "b"), ask).identity().point == station.point
+    again = Station.open(station.home, ask=ask)
+    assert keys_of(again, ONE)[0][0] == 1
+    again.close()
+
+
+def test_marks_on_nodes_do_not_go_back_and_come_forward(station: Station, tmp_path: Path) -> None:
+    """For example that a rotation is due: an older backup that does not know it must not lift it."""
+    station.keys.demand_rotation(ONE, "before")
+    back_up(station, tmp_path / "old")
+    station.keys.demand_rotation(ONE, "due")
+    station.keys.demand_rotation(TWO, "due")
+    station.audit("test", ONE, "marked")
+    merge(station._store, opened(tmp_path / "old"), dry_run=False)
+    assert station.keys.rotation_due(ONE) == "due"
+    back_up(station, tmp_path / "new")
+    stale = tmp_path / "stale"
+    with opened(tmp_path / "old") as content:
+        stale.mkdir(mode=0o700)
+        place(content.copy, stale)
+    with Store.open(stale) as store:
+        done = merge(store, opened(tmp_path / "new"), dry_run=False)
+        assert done.relation is Relation.NEWER
+        assert (store.marks(ONE).rotation, store.marks(TWO).rotation) == ("due", "due")
+
+
+def test_a_key_that_the_vault_does_not_open_is_told_when_backing_up(station: Station, tmp_path: Path) -> None:
+    with closing(sqlite3.connect(station.home / "store.sqlite3")) as connection, connection:
+        connection.execute("UPDATE keys SET wrapped = zeroblob(60) WHERE uuid = ? AND epoch = 1", (ONE,))
+    assert "1 keys in the store do not open" in back_up(station, tmp_path / "b").warnings[0]
+
+
+@pytest.mark.system
+def test_a_token_keeps_its_keys_and_opens_the_restored_station(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    forget_vaults()
+    uri = loaded(tmp_path, monkeypatch, ("bench",))["bench"]
+
+    def pin(prompt: str, confirm: bool) -> str:
+        return SEALED if "backup" in prompt else PIN
+
+    try:
+        station, _ = initialise(tmp_path / "home", name="bench", keystore=uri, ask=pin)
+        key = add_key(station, ONE, 1)
+        done = backup(station, tmp_path / "b", pin, costs=THROWAWAY)
+        assert "cannot leave the token" in done.warnings[0]
+        content = opened(tmp_path / "b")
+        with pytest.raises(PolicyRefused, match="in a token"):
+            rebuild(tmp_path / "file", content, pin, keystore="file", costs=THROWAWAY)
+        forget_vaults()
+        with pytest.raises(UsageFailure, match="which module"):
+            rebuild(tmp_path / "new", content, pin)
+        assert rebuild(tmp_path / "new", content, pin, keystore=uri).keystore == uri
+        again = Station.open(tmp_path / "new", ask=pin)
+        assert keys_of(again, ONE) == [(1, "active", key)]
+        again.close()
+        station.close()
+    finally:
+        forget_vaults()
+        unload()
+
+
+def test_a_passphrase_that_is_none_is_refused_before_anything_is_written(station: Station, tmp_path: Path) -> None:
+    with pytest.raises(VaultFailure, match="too short"):
+        backup(station, tmp_path / "b", lambda prompt, confirm: "short", costs=THROWAWAY)
+    assert not (tmp_path / "b").exists()

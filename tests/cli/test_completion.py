@@ -1,0 +1,136 @@
+"""Completion as people have it: the real shells, on a terminal, with names that others chose."""
+
+from __future__ import annotations
+
+import os
+import pty
+import select
+import shutil
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from .shell import call, clean_environment
+
+UUID = "8d4d9da65281f7000000"
+HOSTILE = 'crane, a:b \'s \\x & $(touch ran) `touch ran` "arm"'
+ROOT = Path(__file__).resolve().parents[2]
+_SECONDS = 60.0
+
+BASH = """
+PS1='ready> '
+eval "$(teds-provision completion bash)"
+teds-provision() { printf '%s\\n' "$@" > got; exit; }
+"""
+ZSH = """
+PS1='ready> '
+autoload -Uz compinit; compinit -u -D
+eval "$(teds-provision completion zsh)"
+teds-provision() { printf '%s\\n' "$@" > got; exit; }
+"""
+FISH = """
+function fish_prompt; printf 'ready> '; end
+teds-provision completion fish | source
+function teds-provision; printf '%s\\n' $argv > got; exit; end
+"""
+
+
+def offered(home: Path, line: str) -> list[str]:
+    """The words that bash is offered for the end of a line."""
+    asked = {
+        "_TEDS_PROVISION_COMPLETE": "bash_complete",
+        "COMP_WORDS": line,
+        "COMP_CWORD": str(len(line.split(" ")) - 1),
+        "TEDS_PROVISION_HOME": str(home),
+    }
+    words = [sys.executable, "-m", "teds_provision"]
+    done = subprocess.run(words, env=clean_environment() | asked, capture_output=True, text=True, check=True)
+    return done.stdout.split("\n")[:-1] if done.stdout.strip() else []
+
+
+class Typed:
+    """A shell on a terminal, in a folder of its own, that knows the program by its name."""
+
+    def __init__(self, shell: str, folder: Path, home: Path) -> None:
+        program = folder / "bin" / "teds-provision"
+        program.parent.mkdir()
+        program.write_text(f'#!/bin/sh\nexec {sys.executable} -m teds_provision "$@"\n')
+        program.chmod(0o755)
+        text = {"bash": BASH, "zsh": ZSH, "fish": FISH}[shell]
+        start = folder / (".zshrc" if shell == "zsh" else "start")
+        start.write_text(text)
+        words = {
+            "bash": ["bash", "--rcfile", str(start), "-i"],
+            "zsh": ["zsh", "-i"],
+            "fish": ["fish", "--no-config", "-i", "-C", f"source {start}"],
+        }[shell]
+        places = {"HOME": str(folder), "ZDOTDIR": str(folder), "PYTHONPATH": str(ROOT), "TERM": "xterm"}
+        path = f"{program.parent}:{os.environ['PATH']}"
+        environment = clean_environment(TEDS_PROVISION_HOME=str(home), PATH=path, LANG="C.UTF-8", **places)
+        self.master, terminal = pty.openpty()
+        words = ["setsid", "--ctty", *words]  # so that the shell is in charge of the terminal
+        self.process = subprocess.Popen(
+            words, stdin=terminal, stdout=terminal, stderr=terminal, cwd=folder, env=environment
+        )
+        os.close(terminal)
+        self.seen = b""
+
+    def read_until(self, mark: bytes | None) -> None:
+        """Read until the shell has shown ``mark``, or (None) has ended; fails after a minute."""
+        until = time.monotonic() + _SECONDS
+        while mark is None or mark not in self.seen:
+            assert select.select([self.master], [], [], max(0.0, until - time.monotonic()))[0], self.seen
+            try:
+                octets = os.read(self.master, 4096)
+            except OSError:  # the other end was closed
+                octets = b""
+            if not octets:
+                assert mark is None, self.seen
+                return
+            self.seen += octets
+
+    def type(self, keys: str) -> None:
+        os.write(self.master, keys.encode())
+
+    def close(self) -> None:
+        os.close(self.master)
+        if self.process.poll() is None:
+            self.process.kill()
+        self.process.wait()
+
+
+@pytest.mark.parametrize(
+    ("shell", "begun"), [("bash", "cra"), ("bash", "'cra"), ("bash", '"cra'), ("zsh", "cra"), ("fish", "cra")]
+)
+def test_a_name_is_inserted_as_one_word_and_runs_nothing(home: Path, tmp_path: Path, shell: str, begun: str) -> None:
+    """bash was given it bare: with spaces it was several words, and ``$(…)`` of a name ran on Enter."""
+    if shutil.which(shell) is None or shutil.which("setsid") is None:
+        pytest.skip(f"{shell} or setsid is not installed")
+    assert call(home, "whitelist", "add", UUID, "--name", HOSTILE).code == 0
+    folder = tmp_path / "desk"
+    folder.mkdir()
+    typed = Typed(shell, folder, home)
+    try:
+        typed.read_until(b"ready> ")
+        typed.type(f"teds-provision verify {begun}\t")
+        typed.read_until(b"arm")
+        typed.type("\n")
+        typed.read_until(None)
+    finally:
+        typed.close()
+    assert (folder / "got").read_text().splitlines() == ["verify", HOSTILE]
+    assert not (folder / "ran").exists()
+
+
+def test_names_of_groups_stations_and_files_are_offered_where_they_are_meant(home: Path) -> None:
+    assert call(home, "whitelist", "add", UUID, "--name", "finger").code == 0
+    assert call(home, "group", "create", "left hand", UUID).code == 0
+    for line in ("measure lef", "group add lef", "nodes --group lef"):
+        assert offered(home, f"teds-provision {line}") == ["plain,left hand"], line
+    for line in ("show bun", "show --diff a", "measure x --to run", "verify none"):
+        assert offered(home, f"teds-provision {line}") == [f"file,{line.split()[-1]}"], line
+    assert offered(home, "teds-provision profile show accel") == ["plain,accelerometer"]
+    assert offered(home, "teds-provision group create lef") == []

@@ -1,0 +1,107 @@
+"""What an operator at a batch sees: one screen of 24 lines, drawn anew when a board is begun and when it ends."""
+
+from __future__ import annotations
+
+import io
+from dataclasses import dataclass
+
+import pytest
+from rich.console import Console
+
+from teds_provision.cli.steps.screen import OperatorScreen, Watched
+from teds_provision.errors import NodeSilent, TedsProvisionError
+from teds_provision.steps.many.board import Board, Declined
+from teds_provision.steps.many.sheet import Row
+from teds_provision.steps.order import BuildOrder, Prepared
+from teds_provision.talk.progress import Silent
+
+UUID = bytes.fromhex("8d4d9da65281f7000000")
+LONG = "the left knee of the third robot in hall B, at the very end of the row, behind the crane, and then to the right"
+
+
+@dataclass
+class Batch:
+    """Fifty boards; the next one is named by its order, its UUID or its key."""
+
+    passed: int = 0
+    next_row: Row | None = None
+
+    def __len__(self) -> int:
+        return 50
+
+    def row(self, number: int) -> Row:
+        return row(number)
+
+
+def row(number: int, *, name: str = LONG, uuid: bytes | None = None, fingerprint: str | None = None) -> Row:
+    return Row(number, number + 1, uuid, fingerprint, Prepared(BuildOrder(name=name)), "")
+
+
+class Terminal:
+    """A screen of 80 by 24 characters, and the text of its last drawing."""
+
+    def __init__(self, batch: Batch) -> None:
+        self.out = io.StringIO()
+        console = Console(
+            file=self.out, force_terminal=True, force_interactive=False, width=80, height=24, color_system=None
+        )
+        self.screen = OperatorScreen(console, batch)
+
+    @property
+    def lines(self) -> list[str]:
+        return [line.rstrip() for line in self.out.getvalue().rpartition("\x1b[H")[2].splitlines()]
+
+
+def failed(number: int, error: TedsProvisionError) -> Board:
+    return Board(UUID, 12.3, error=error, row=number, time="2026-11-22T12:34:56Z")
+
+
+@pytest.mark.parametrize(
+    ("next_row", "told"),
+    [
+        (row(7, name="knee"), ">>> TAP THE BOARD FOR ROW 7  knee"),
+        (row(7, name="", uuid=UUID), f">>> TAP ANY BOARD OF THE SHEET, e.g. {UUID.hex()}"),
+        (row(7, name="", fingerprint="ab" * 16), ">>> TAP ANY BOARD OF THE SHEET, e.g. key abababababababab"),
+        (None, ">>> ALL BOARDS ARE DONE."),
+    ],
+    ids=["order", "uuid", "label", "done"],
+)
+def test_it_says_what_to_do_now(next_row: Row | None, told: str) -> None:
+    assert told in Terminal(Batch(next_row=next_row)).lines
+
+
+def test_while_a_board_is_worked_on_nothing_says_pass_of_the_one_before() -> None:
+    """Else an operator takes the board away: the large letters were those of the last one."""
+    terminal = Terminal(Batch(next_row=row(1)))
+    reporter = Watched(Silent())
+    reporter.begun = terminal.screen.begun
+    terminal.screen.ended(failed(1, NodeSilent("It is silent.")))
+    ended = terminal.lines
+    assert any(line.startswith(">>> TAKE IT OFF. TAP THE BOARD FOR ROW 1") for line in ended)
+    reporter.started("identify")
+    assert ">>> KEEP THE BOARD ON THE READER" in terminal.lines
+    assert terminal.lines[:5] != ended[:5]
+    seen = len(terminal.out.getvalue())
+    reporter.started("agree")
+    assert len(terminal.out.getvalue()) == seen  # once for each board
+
+
+def test_the_worst_board_of_many_fits_on_24_lines_with_its_cause_and_cure() -> None:
+    terminal = Terminal(Batch(passed=48, next_row=row(1)))
+    error = NodeSilent("The node does not answer any more. " * 9, hint="Put it back, and hold it flat.")
+    for number in range(1, 8):
+        terminal.screen.ended(failed(number, error))
+    lines = terminal.lines
+    assert len(lines) <= 22  # below them stand a notice and the line of what is waited for
+    assert max(map(len, lines)) <= 80
+    assert sum("FAILED" in line for line in lines) == 5
+    assert all(UUID.hex() in line for line in lines if "FAILED" in line)
+    assert terminal.out.getvalue().count("\a") == 7
+
+
+def test_cause_and_cure_of_a_failure_are_both_told() -> None:
+    terminal = Terminal(Batch(next_row=row(1)))
+    terminal.screen.ended(failed(3, NodeSilent("The node is silent.", hint="Put it back.")))
+    assert "The node is silent. → Put it back." in terminal.lines
+    terminal.screen.ended(failed(3, Declined("You said no.")))
+    assert any("SKIPPED" in line for line in terminal.lines)

@@ -1,0 +1,98 @@
+"""What the program loads before it says anything: a person waits for each module, each time."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+
+import pytest
+
+from .shell import unmeasured_environment
+
+OURS = {
+    "teds_provision",
+    "teds_provision.__main__",
+    "teds_provision.cli",
+    "teds_provision.cli.configuration",
+    "teds_provision.cli.context",
+    "teds_provision.cli.globals",
+    "teds_provision.cli.main",
+    "teds_provision.cli.option_names",
+    "teds_provision.cli.stdout",
+    "teds_provision.cli.table",
+    "teds_provision.cli.terminal",
+    "teds_provision.errors",
+    "teds_provision.harmless",
+    "teds_provision.lazy",
+    "teds_provision.protocol",
+    "teds_provision.station",
+    "teds_provision.vault",
+}
+NEEDLESS = {"bz2", "difflib", "ipaddress", "json", "lzma", "pathlib", "shlex", "shutil", "tomllib", "urllib.parse"}
+
+
+def _python(code: str, columns: str) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(
+        [sys.executable, "-c", code],
+        capture_output=True,
+        text=True,
+        check=True,
+        timeout=60,
+        env={**unmeasured_environment(), "COLUMNS": columns},
+        stdin=subprocess.DEVNULL,
+    )
+
+
+def loaded(*words: str) -> set[str]:
+    """Modules that a run of these words loads beside those of a bare ``import click``."""
+    code = (
+        "import sys, click\n"
+        "before = set(sys.modules)\n"
+        f"sys.argv = ['teds-provision', *{list(words)!r}]\n"
+        "from teds_provision.__main__ import main\n"
+        "try:\n"
+        "    main()\n"
+        "except SystemExit as end:\n"
+        "    assert not end.code, end.code\n"
+        "finally:\n"
+        "    print(*sorted(set(sys.modules) - before), file=sys.stderr)\n"
+    )
+    done = _python(code, "100")
+    return set(done.stderr.split())
+
+
+def test_help_loads_the_command_line_and_nothing_else() -> None:
+    modules = loaded("--help")
+    assert {name for name in modules if name.split(".")[0] == "teds_provision"} == OURS
+    assert modules & NEEDLESS == set()
+
+
+def test_the_version_loads_nothing_of_the_command_line() -> None:
+    modules = loaded("--version")
+    assert {name for name in modules if name.split(".")[0] == "teds_provision"} == {
+        "teds_provision",
+        "teds_provision.__main__",
+    }
+
+
+@pytest.mark.parametrize("columns", ["0", "20", "60", "80", "97", "300", "many"])
+def test_help_is_as_wide_as_click_makes_it(columns: str) -> None:
+    """The sections and the width are written without click's own wrapping: both must come to the same text."""
+    code = (
+        "import sys\n"
+        "import click\n"
+        "from teds_provision.cli.main import LazyGroup, SECTIONS, COMMANDS, cli, run\n"
+        "def rows(self, ctx, formatter):\n"
+        "    width = max(map(len, COMMANDS))\n"
+        "    for title, entries in SECTIONS.items():\n"
+        "        with formatter.section(title):\n"
+        "            formatter.write_dl([(name.ljust(width), entry.help) for name, entry in entries.items()])\n"
+        "run(['--help'])\n"
+        "print('=====')\n"
+        "LazyGroup.format_commands = rows\n"
+        "cli.main(['--help'], prog_name='teds-provision', standalone_mode=False)\n"
+    )
+    done = _python(code, columns)
+    ours, _, clicks = done.stdout.partition(f"====={os.linesep}")
+    assert ours == clicks

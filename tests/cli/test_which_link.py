@@ -1,0 +1,69 @@
+"""Which link a measuring command takes, where more than one is named: what was typed here goes before what is kept."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import click
+import pytest
+
+from teds_provision.cli.configuration import Defaults
+from teds_provision.cli.measure.values import over_the_bus
+from teds_provision.cli.options import link_options
+from teds_provision.errors import TedsProvisionError
+from teds_provision.links import LinkSettings
+from teds_provision.steps import sign
+
+from .shell import call
+
+READER, BUS, AIR = "usb", "socketcan:can0", "hci0"
+
+
+def taken(kept: dict[str, str], *typed: str, streams: bool) -> str:
+    """The link of a command with these options in config.toml, and those on its line."""
+    found: list[LinkSettings] = []
+
+    @click.command()
+    @link_options
+    def probe(links: LinkSettings) -> None:
+        found.append(over_the_bus(links, streams=streams))
+
+    probe.main(list(typed), default_map=Defaults(kept), standalone_mode=False)
+    return found[0].via
+
+
+def test_a_bus_that_is_named_is_meant() -> None:
+    both = {"nfc": READER, "can": BUS}
+    for kept, typed, streams, via in (
+        ({}, ["--can", BUS], False, "can"),
+        ({"can": BUS}, [], False, "can"),
+        (both, [], False, "nfc"),
+        (both, [], True, "can"),  # a reader carries no streams
+        (both, ["--can", BUS], False, "can"),
+        ({"nfc": READER}, ["--can", BUS], False, "can"),
+        (both, ["--nfc", READER], False, "nfc"),
+        (both, ["--via", "nfc"], True, "nfc"),
+        (both, ["--via", "can"], False, "can"),
+        ({"can": BUS}, ["--nfc", READER], False, "nfc"),
+        ({"can": BUS}, ["--ble", AIR], False, "ble"),
+        ({"nfc": READER, "ble": AIR}, [], True, "ble"),
+        ({}, ["--nfc", READER, "--ble", AIR], False, "ble"),  # the reader for the tap, the air for the rest
+    ):
+        assert taken(kept, *typed, streams=streams) == via, (kept, typed, streams)
+
+
+def test_measure_takes_the_bus_that_is_kept_beside_a_reader(home: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("TEDS_PROVISION_NFC", "udp:127.0.0.1:9")
+    monkeypatch.setenv("TEDS_PROVISION_CAN", "socketcan:can7")
+    told = call(home, "--json", "measure", "8d4d9da65281f7000000", "--timeout", "1")
+    assert "Streams need a bus" not in told.out
+    assert told.code == 5
+
+
+def test_a_clock_that_no_datasheet_can_hold_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    """TimeInstance has 32 bits of seconds: until 2106."""
+    monkeypatch.setattr(sign.time, "time_ns", lambda: (1 << 32) * 1_000_000_000)
+    with pytest.raises(TedsProvisionError, match="clock"):
+        sign._now()
+    monkeypatch.setattr(sign.time, "time_ns", lambda: ((1 << 32) - 1) * 1_000_000_000)
+    assert sign._now() == b"\xff\xff\xff\xff\0\0\0\0"

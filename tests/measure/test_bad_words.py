@@ -1,0 +1,71 @@
+"""What is typed wrongly: cause, cure and exit code; and a consumer that is not there, which everybody hears of."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from tests.measure.hall import Hall, events, of
+from tests.places import free_tcp_port
+
+pytestmark = pytest.mark.link
+
+
+@pytest.fixture(scope="module")
+def hall(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Hall]:
+    made = Hall(tmp_path_factory.mktemp("words"), {"g": "gripper"})
+    try:
+        made.nodes["g"].start()
+        yield made
+    finally:
+        made.close()
+
+
+def test_what_is_wrong_is_said_and_what_to_do(hall: Hall, tmp_path: Path) -> None:
+    g, nothing = hall.nodes["g"].uuid, tmp_path / "nothing.toml"
+    nothing.write_text("")
+    cases = [
+        (("measure", g, "--mqtt", "http://x"), 2, "names no broker"),
+        (("measure", g, "--mqtt", "mqtt://me:secret@x"), 2, "password-file"),
+        (("measure", g, "--channel", "y"), 2, "no number of a channel"),
+        (("measure", g, "--channel", "1", "--duration", "1"), 8, "no sensor"),
+        (("measure", g, "--to", "run.xyz"), 2, ".csv"),
+        (("measure", g, "--to", tmp_path / "no" / "run.csv", "--duration", "1"), 7, "its folder is not there"),
+        (("measure", g, "--require", nothing), 8, "asks for nothing"),
+        (("set", g, "x", "1"), 2, "no number of a channel"),
+        (("set", g, "1", "-0.5"), 6, "beyond the limits"),  # a value, and no option
+        (("set", g, "1", "0.05", "--hodl", "3"), 2, "--hodl"),
+        (("set", g, "2", "1", "--hold", "0.1"), 8, "no actuator"),
+        (("set", g, "1", "1", "--unit", "kelvin"), 8, "no unit of channel 1"),
+        (("sample", g, "x"), 2, "no number of a channel"),
+    ]
+    wrong = []
+    for words, code, text in cases:
+        outcome = hall.station.start("--json", *words, "--can", hall.can).end()
+        said = json.dumps(events(outcome.out)[-1:], ensure_ascii=False)
+        if outcome.code != code or text not in said or "Traceback" in outcome.err:
+            wrong.append((words, outcome.code, said))
+    assert wrong == []
+
+
+@pytest.mark.parametrize(
+    "words", [("measure", "recover"), ("measure", "recover", "."), ("measure", "recover", "none.mcap")]
+)
+def test_recover_names_what_it_is(hall: Hall, words: tuple[str, ...]) -> None:
+    codes = {2: "Name one recording", 8: "is a folder", 3: "There is no file"}
+    outcome = hall.station.start("--json", *words).end()
+    assert codes[outcome.code] in outcome.out
+
+
+def test_a_broker_that_is_not_there_is_told_and_what_it_cost(hall: Hall) -> None:
+    place = f"mqtt://127.0.0.1:{free_tcp_port()}"
+    lines = hall.measure(hall.nodes["g"].uuid, "--rate", 10, "--duration", 5, "--mqtt", place)
+    [told] = [line for line in lines if line["event"] == "sink"]
+    assert (told["state"], told["sink"]) == ("waiting", "mqtt://127.0.0.1")
+    assert "waits for the broker" in told["why"]
+    [sink] = lines[-1]["sinks"]
+    assert (sink["written"], sink["dropped"] > 0) == (0, True)
+    assert of(lines, channel=2), "the measurement goes on"

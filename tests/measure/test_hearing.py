@@ -1,0 +1,123 @@
+"""A stream as it is heard: whatever comes together, the same samples come out, each with its own time."""
+
+from __future__ import annotations
+
+import threading
+import time
+from dataclasses import asdict
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from teds_provision.measure.blocks import Block
+from teds_provision.measure.clock import ClockMap, Exchange, Monotone, Wall
+from teds_provision.measure.hearing import GATHER, HeardStream
+from teds_provision.measure.interpreter import StreamInterpreter
+from teds_provision.protocol.operation.can_frames import Assembly
+from teds_provision.protocol.operation.datagram import Sealer, stream_key
+from teds_provision.protocol.operation.stream_commands import Kind, Subscribed
+from teds_provision.protocol.operation.subscription import Plan, Receiver
+from teds_provision.teds.calibration import fit
+from tests.teds.test_interpreter import sheet_of
+
+KEY, MS, SECOND = bytes(32), 1_000_000, 10**9
+CURVES = {
+    1: fit([(0, 0.0), (65535, 10.0)], "linear", channel=1),
+    2: fit([(0, 0.0), (30000, 5.0), (65535, 10.0)], "table", channel=2),
+}
+SHEET = sheet_of("tactile-finger-sensor", CURVES)
+WALL = Wall(1.8e9)
+
+
+class Scene:
+    """A stream of two channels, n = 3 at 1 kHz, whose node's clock stood at 1 s when the host's stood at ``base``."""
+
+    def __init__(self, kind: Kind = Kind.PERIODIC, period: int = MS) -> None:
+        self.plan = Plan.of(0, ((1, 2), (2, 2)), n=3, period=period, kind=kind)
+        self.base = time.monotonic_ns() - 3600 * SECOND
+        clock = ClockMap()
+        clock.exchange(Exchange(self.base, self.base + 2000, SECOND + 500, SECOND + 1500, 1, 20))
+        self.clock, self.blocks = clock, list[Block]()
+        receiver = Receiver(self.plan, Subscribed(1, self.plan.length, SECOND), KEY)
+        interpreter = StreamInterpreter(SHEET, self.plan, 1, clock, WALL, Monotone())
+        assembly = Assembly(self.plan.length, fd=True)
+        self.heard = HeardStream(receiver, assembly, interpreter, clock, threading.Lock(), self.blocks.append)
+        self._sealer = Sealer(stream_key(KEY, 1))
+
+    def message(self, counter: int, flags: int = 0) -> bytes:
+        raws = np.random.default_rng(counter).integers(0, 65536, 6).astype(">u2").tobytes()
+        free = (SECOND + counter * 3 * MS + 17).to_bytes(8, "big") if self.plan.subscribe.kind == Kind.FREE else b""
+        return self._sealer.seal(counter, bytes([flags]) + free + raws)
+
+    def arrival(self, counter: int) -> int:
+        return self.base + (counter + 1) * self.plan.span
+
+    def samples(self) -> dict[str, list[object]]:
+        """All blocks laid end to end."""
+        rows = {"index": [one.index + k for one in self.blocks for k in range(len(one.time))]}
+        for name in ("time", "tick", "raw", "value", "valid"):
+            rows[name] = np.concatenate([getattr(one, name) for one in self.blocks]).tolist() if self.blocks else []
+        return rows  # type: ignore[return-value]
+
+
+@pytest.mark.parametrize("kind", [Kind.PERIODIC, Kind.FREE])
+@given(st.lists(st.tuples(st.integers(0, 3), st.booleans(), st.booleans()), min_size=1, max_size=30), st.integers(0, 4))
+@settings(max_examples=60, deadline=None)
+def test_together_or_one_by_one_the_same_samples(kind: Kind, steps: list[tuple[int, bool, bool]], bent: int) -> None:
+    """Gaps, doubles and forged messages between good ones; batches end where the second flag says so."""
+    one_by_one, together = Scene(kind), Scene(kind)
+    counter = 0
+    for number, (step, ends, invalid) in enumerate(steps):
+        counter += step  # 0: a double of the one before
+        octets = one_by_one.message(counter, flags=int(invalid))
+        if number % 5 == bent:
+            octets = octets[:-1] + bytes([octets[-1] ^ 1])
+        for scene in (one_by_one, together):
+            scene.heard.whole(octets, scene.arrival(counter))
+        one_by_one.heard.finish()
+        if ends:
+            together.heard.finish()
+    together.heard.finish()
+    assert asdict(together.heard.receiver.counts) == asdict(one_by_one.heard.receiver.counts)
+    alone, all_at_once = one_by_one.samples(), together.samples()
+    for name in ("index", "tick", "raw", "valid"):
+        assert all_at_once[name] == alone[name]
+    np.testing.assert_array_equal(all_at_once["value"], alone["value"])
+    true = [tick / 1e9 - 1 + (scene.base / 1e9 + 1.8e9) for scene, tick in ((together, t) for t in all_at_once["tick"])]  # type: ignore[operator]
+    assert all_at_once["time"] == pytest.approx(true, abs=2e-5)
+
+
+def test_what_waited_for_12_ms_is_handed_on_and_not_before() -> None:
+    scene = Scene()
+    scene.heard.whole(scene.message(0), scene.arrival(0))
+    now = time.monotonic()
+    scene.heard.flush(now)
+    assert not scene.blocks
+    scene.heard.whole(scene.message(1), scene.arrival(1))
+    scene.heard.flush(now + GATHER)
+    (block,) = scene.blocks
+    assert (block.index, len(block.time)) == (0, 6)
+
+
+def test_a_message_that_no_other_will_join_is_handed_on_at_once() -> None:
+    """At 100 Hz the next message of two instants comes in 20 ms: to wait for it would only be late."""
+    scene = Scene(period=10 * MS)
+    assert not scene.heard.due
+    scene.heard.whole(scene.message(0), scene.arrival(0))
+    assert scene.heard.due
+    quick = Scene()
+    quick.heard.whole(quick.message(0), quick.arrival(0))
+    assert not quick.heard.due
+
+
+def test_a_period_of_the_block_is_one_of_the_nodes_clock_mapped() -> None:
+    """What the clock's map says of each tick, to the microsecond that the numbers of the wall clock hold."""
+    scene = Scene()
+    for counter in range(400):
+        scene.heard.whole(scene.message(counter), scene.arrival(counter))
+        if counter % 7 == 6:
+            scene.heard.finish()
+    for block in scene.blocks:
+        assert block.time == pytest.approx(WALL.unix(scene.clock.host(block.tick)), abs=1e-6)

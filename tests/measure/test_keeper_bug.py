@@ -1,0 +1,35 @@
+"""A bug of ours while a node is measured: told with the node, never taken for an end in order."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+
+from teds_provision.measure.blocks import NodeReport
+from teds_provision.measure.clock import Wall
+from teds_provision.measure.keeper import NodeKeeper
+from teds_provision.measure.orders import Events, Wish
+from teds_provision.measure.running.common_start import CommonStart
+
+UUID = bytes(range(10))
+
+
+def test_a_foreign_exception_ends_the_node_with_an_error(monkeypatch: pytest.MonkeyPatch) -> None:
+    reports: list[NodeReport] = []
+    events = Events(lambda _block: None, lambda _facts: None, reports.append)
+    buses: Any = SimpleNamespace(all=list)
+    keeper = NodeKeeper(None, buses, UUID, Wish(), Wall.now(), events, CommonStart([UUID]))  # type: ignore[arg-type]
+
+    def broken() -> None:
+        raise ValueError("cannot convert float NaN to integer")
+
+    monkeypatch.setattr(keeper, "_once", broken)
+    keeper.start()
+    keeper.join(60)
+    assert keeper.done.is_set()
+    assert keeper.error is not None
+    assert (keeper.error.code, keeper.error.exit_code) == ("bug", 1)
+    assert reports[-1].state == "refused"
+    assert "ValueError" in reports[-1].why

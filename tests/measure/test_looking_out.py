@@ -1,0 +1,141 @@
+"""How often a look-out asks (operation.md section 7), over a bus that writes every frame down; and who has left."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections import Counter
+from collections.abc import Iterator
+from contextlib import suppress
+from typing import Any
+
+import pytest
+
+from teds_provision.errors import AddressConflict, LinkFailure
+from teds_provision.links.can.port import CanPort
+from teds_provision.measure.finding.lookout import Lookout
+from teds_provision.measure.finding.sightings import Sighting, Sightings
+from teds_provision.ncap.nodes.leaving import AT_ONCE, CHECK, StillThere
+from teds_provision.protocol.announce import uuid_crc
+from teds_provision.protocol.messages.identity import Identity
+from tests.links.can.conftest import hub, nodes  # noqa: F401  fixtures
+from tests.links.can.hub import Hub
+from tests.links.can.test_can_loss import Start
+from tests.measure.test_lookout import ONE, seen
+
+pytestmark = pytest.mark.link
+ADDRESSES = list(range(0x21, 0x21 + 20))
+
+
+def asked(bus: Hub) -> Counter[int]:
+    """How often each address was asked by itself; 0: everybody."""
+    found = Counter[int]()
+    for identifier, data in list(bus.frames):
+        if identifier >> 8 == 0x18DBFF:
+            found[0] += 1
+        elif identifier >> 16 == 0x18DA and identifier & 0xFF == 0xF1 and data[0] == 7:
+            found[identifier >> 8 & 0xFF] += 1
+    return found
+
+
+@pytest.fixture
+def lookout(hub: Hub, nodes: Start) -> Iterator[Lookout]:  # noqa: F811
+    nodes(hub.spec, *ADDRESSES)
+    port = CanPort(hub.spec)
+    made = Lookout(port, Sightings(), poll=30.0)
+    made.discover()
+    yield made
+    made.close()
+    port.close()
+
+
+def announce(bus: Hub, address: int, crc: bytes = b"\xaa\xbb\xcc\xdd") -> None:
+    bus.send(0x1CFF0000 | address, bytes([1, 2]) + crc + bytes(2))
+
+
+def test_who_announces_itself_is_asked_once_in_ten_seconds_and_five_a_second_over_all(
+    lookout: Lookout,
+    hub: Hub,  # noqa: F811
+) -> None:
+    hub.frames.clear()
+    began = time.monotonic()
+    while (passed := time.monotonic() - began) < 2.0:
+        for address in ADDRESSES:
+            announce(hub, address)
+        time.sleep(0.05)
+    found = asked(hub)
+    assert found[0] == 0, "nobody asks the whole bus because somebody sends Announce"
+    assert set(found.values()) == {1}, found
+    assert 5 <= sum(found.values()) <= 5 * passed + 1
+
+
+def test_a_node_that_somebody_waits_for_is_looked_for_at_once(lookout: Lookout, hub: Hub) -> None:  # noqa: F811
+    stop = threading.Event()
+
+    def wait() -> None:
+        with suppress(LinkFailure):
+            lookout._sightings.find(ONE, seconds=20, stop=stop)
+
+    waiting = threading.Thread(target=wait)
+    waiting.start()
+    while not lookout._sightings.missing():
+        time.sleep(0.001)
+    time.sleep(1.5)  # the question to everybody a second after the last one, because somebody is missing
+    hub.frames.clear()
+    announce(hub, 0x21, uuid_crc(ONE).to_bytes(4, "big"))
+    end = time.monotonic() + 1.0
+    while not asked(hub)[0]:
+        assert time.monotonic() < end
+        time.sleep(0.01)
+    stop.set()
+    waiting.join()
+
+
+class Bus:
+    """Answers Identify as it is told to: ``says`` by address."""
+
+    place = "can:x"
+
+    def __init__(self, **says: Any) -> None:
+        self.says: dict[int, Any] = {int(name[1:]): what for name, what in says.items()}
+        self.questions: list[tuple[int, float]] = []
+
+    def identify(self, address: int, *, seconds: float) -> Identity | None:
+        self.questions.append((address, seconds))
+        said = self.says.get(address)
+        if isinstance(said, list):
+            said = said.pop(0)
+        if isinstance(said, Exception):
+            raise said
+        return said  # type: ignore[no-any-return]
+
+
+def last_heard(uuid: bytes, address: int, ago: float) -> Sighting:
+    return seen(uuid, address, at=time.monotonic() - ago)
+
+
+def asks(bus: Bus, known: dict[str, Sighting], held: str = "") -> dict[str, bool]:
+    port: Any = bus
+    found = StillThere(port, lambda uuid: uuid == held).look(known)
+    return {uuid: sighting is not None for uuid, sighting in found}
+
+
+def test_a_node_is_gone_when_it_does_not_answer_twice_and_not_before() -> None:
+    uuids = {number: bytes([number]) * 10 for number in range(1, 6)}
+    known = {uuid.hex(): last_heard(uuid, number, 2 * CHECK) for number, uuid in uuids.items()}
+    known["fresh"] = last_heard(ONE, 9, CHECK / 2)
+    other = seen(b"\x63" * 10, 3).identity
+    bus = Bus(a1=None, a2=[None, seen(uuids[2], 2).identity], a3=other, a4=AddressConflict("two"), a5=LinkFailure("x"))
+    names = {number: uuid.hex() for number, uuid in uuids.items()}
+    assert asks(bus, known) == {
+        names[1]: False, names[2]: True, names[3]: False, names[4]: True, names[5]: False,
+    }  # fmt: skip
+    assert [question for question in bus.questions if question[0] == 1] == [(1, 1.0), (1, 3.0)]
+    assert 9 not in dict(bus.questions), "one that was heard of lately is left in peace"
+
+
+def test_who_is_held_is_not_asked_and_no_more_than_five_are_at_once() -> None:
+    uuids = [bytes([number]) * 10 for number in range(1, 12)]
+    known = {uuid.hex(): last_heard(uuid, number, 2 * CHECK + number) for number, uuid in enumerate(uuids, 1)}
+    found = asks(Bus(), known, held=uuids[-1].hex())
+    assert list(found) == [uuid.hex() for uuid in reversed(uuids[-1 - AT_ONCE : -1])]

@@ -1,0 +1,222 @@
+"""The daemon and ROS: set points by topics with the safety of `measure`, and several measurements side by side."""
+
+from __future__ import annotations
+
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from teds_provision import client
+from teds_provision.trace.reading import read_trace
+from tests.e2e.desk import ROOT
+from tests.measure.hall import Hall
+from tests.measure.sinks.test_ros1 import Master, master, pytestmark  # noqa: F401  the fixture, and what it needs
+from tests.measure.test_actuator_safety import DEAD_MAN, TOPIC, Journal, Ros1, Ros2, children, hall_on, ros_of, time_of
+from tests.ncap.service import Service, verified
+from tests.pace import until
+
+Publishers = list[subprocess.Popen[bytes]]
+
+
+@pytest.fixture
+def hall(tmp_path: Path) -> Iterator[Hall]:
+    with hall_on(tmp_path) as made:
+        yield made
+
+
+@pytest.fixture(params=["ros1", "ros2"])
+def ros(request: pytest.FixtureRequest, master: Master) -> Iterator[Ros1 | Ros2]:  # noqa: F811
+    with ros_of(request.param, master) as made:
+        yield made
+
+
+@pytest.fixture
+def publishers() -> Iterator[Publishers]:
+    """Publishers that a test starts; none outlives it."""
+    started: Publishers = []
+    yield started
+    for one in started:
+        one.kill()
+        one.wait()
+
+
+@contextmanager
+def listening(hall: Hall, ros: Ros1 | Ros2, *words: object, measured: bool = True, **more: Any) -> Iterator[Service]:
+    """A daemon that publishes to this ROS, and measures the gripper with a dead-man of half a second."""
+    hall.desk.links = type(hall.desk.links)(hall.desk.links.nfc, hall.can)
+    service = Service(hall.desk, hall.station, (*ros.words, *words)).start(environment=ros.environment)
+    uuid = hall.nodes["g"].uuid
+    assert verified(service, uuid)["verdict"] == "authentic"
+    if measured:
+        with service.client() as asked:
+            body = {"uuids": [uuid], "rate": 20, "dead_man": int(DEAD_MAN * 1000), **more}
+            asked.request("POST", "/measurements", body)
+            until(lambda: (asked.node(uuid)["measuring"] or {}).get("state") == "running", "it is not measured")
+    yield service
+
+
+def set_points(ros: Ros1 | Ros2, value: float) -> subprocess.Popen[bytes]:
+    """A publisher of another value than the usual one, ten times a second."""
+    if isinstance(ros, Ros2):
+        module = [sys.executable, "-m", "tests.measure.sinks.ros2_publisher", str(ros.domain), TOPIC, str(value)]
+        return subprocess.Popen(module, env=ros.environment, cwd=ROOT)
+    words = ["pub", "-r", "10", TOPIC, "std_msgs/Float64", str(value)]
+    command = ["/usr/bin/python3", "/usr/bin/rostopic", *words]
+    return subprocess.Popen(command, env=ros.master.environment, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+
+
+def test_set_points_move_it_and_whatever_dies_it_is_safe(hall: Hall, ros: Ros1 | Ros2, publishers: Publishers) -> None:
+    with listening(hall, ros) as service:
+        journal = Journal.of(hall)
+        publishers.append(ros.publish())
+        journal.moves()
+        # The consumer dies.
+        died = time.time()
+        publishers[-1].kill()
+        journal.is_safe(died)
+        # The node hangs for longer than its dead-man; what was sent meanwhile moves nothing when it wakes.
+        publishers.append(ros.publish())
+        journal.moves(died)
+        journal.node.signal(signal.SIGSTOP)
+        time.sleep(DEAD_MAN)
+        publishers[-1].kill()
+        time.sleep(2 * DEAD_MAN)
+        lives = time.time()
+        journal.node.signal(signal.SIGCONT)
+        journal.is_safe(lives)
+        time.sleep(2 * DEAD_MAN)
+        assert all(line["safe"] for line in journal.states() if time_of(line) >= lives), "an order of before"
+        # The daemon is killed, with its consumer alive.
+        publishers.append(ros.publish())
+        journal.moves(lives)
+        killed = time.time()
+        service.kill()
+        journal.is_safe(killed)
+
+
+def test_beyond_the_limits_nothing_moves_and_the_node_says_why(
+    hall: Hall, ros: Ros1 | Ros2, publishers: Publishers
+) -> None:
+    with listening(hall, ros) as service, service.client() as asked:
+        publishers.append(set_points(ros, 5.0))
+        until(lambda: "limits" in (asked.node(hall.nodes["g"].uuid)["measuring"] or {}).get("why", ""), "no word of it")
+        assert all(line["safe"] for line in Journal.of(hall).states())
+        service.end()
+
+
+def test_a_request_and_a_topic_do_not_pull_at_one_actuator(
+    hall: Hall, ros: Ros1 | Ros2, publishers: Publishers
+) -> None:
+    """Who came first has it: the other one is refused and told, and has it when the first one lets go."""
+    path = f"/nodes/{hall.nodes['g'].uuid}/channels/1"
+    with listening(hall, ros) as service, service.client() as asked:
+        journal = Journal.of(hall)
+        asked.request("PUT", path, {"value": 0.02, "hold": 60})
+        journal.moves()
+        publishers.append(set_points(ros, 0.05))
+        assert service.process is not None
+        service.process.wait_for('"state": "refused"', 60)
+        time.sleep(DEAD_MAN)
+        assert {round(line["value"], 2) for line in journal.states() if not line["safe"]} == {0.02}
+        asked.request("PUT", path, {"hold": 0})
+        until(lambda: any(round(line["value"], 2) == 0.05 for line in journal.states()), "the topic has it now")
+
+        def refused() -> client.ApiError | None:  # a publisher that stands still for a dead-man has lost its claim
+            try:
+                asked.request("PUT", path, {"value": 0.03, "hold": 0.1})
+            except client.ApiError as error:
+                return error
+            return None
+
+        error = until(refused, "a request takes it from a topic")
+        assert (error.status, "set points of a topic" in error.message) == (423, True), error
+        service.end()
+
+
+def test_off_the_whitelist_it_is_let_go_and_measured_on(hall: Hall, ros: Ros1 | Ros2, publishers: Publishers) -> None:
+    """A person takes it off the list by a command beside the daemon, while a topic drives it."""
+    uuid = hall.nodes["g"].uuid
+    with listening(hall, ros, "--detection", "transparent") as service, service.client() as asked:
+        journal = Journal.of(hall)
+        publishers.append(ros.publish())
+        journal.moves()
+        hall.station.ask("whitelist", "remove", uuid, "--yes")
+        until(lambda: journal.states()[-1]["safe"], "it still moves")
+        until(lambda: (asked.node(uuid)["measuring"] or {}).get("state") == "running", "it is not measured on")
+        time.sleep(2 * DEAD_MAN)
+        assert journal.states()[-1]["safe"]
+        service.end()
+
+
+@pytest.mark.parametrize("how", ["daemon", "measurement", "whitelist"])
+def test_without_leave_nobody_listens(hall: Hall, master: Master, publishers: Publishers, how: str) -> None:  # noqa: F811
+    master.start()
+    ros = Ros1(master)
+    if how == "whitelist":
+        hall.station.ask("whitelist", "remove", hall.nodes["g"].uuid, "--yes")
+    words = {"daemon": ["--no-actuators"], "whitelist": ["--detection", "transparent"]}.get(how, [])
+    more = {"actuators": False} if how == "measurement" else {}
+    with listening(hall, ros, *words, **more) as service:
+        until(lambda: "/bench/g/opening" in master.tool("rostopic", "list").split(), "no topic")
+        assert TOPIC not in master.tool("rostopic", "list").split()
+        publishers.append(ros.publish())
+        time.sleep(2 * DEAD_MAN)
+        assert all(line["safe"] for line in Journal.of(hall).states())
+        service.end()
+
+
+def test_two_measurements_are_two_nodes_of_ros_and_neither_ends_the_other(tmp_path: Path, master: Master) -> None:  # noqa: F811
+    """ROS 1 shuts a node down whose name another one takes."""
+    master.start()
+    ros = Ros1(master)
+    hall = Hall(tmp_path, {"g": "gripper", "h": "gripper"})
+    try:
+        for node in hall.nodes.values():
+            node.start()
+        with listening(hall, ros, measured=False) as service, service.client() as asked:
+            for name, node in hall.nodes.items():
+                verified(service, node.uuid)
+                asked.request("POST", "/groups", {"name": f"group {name}", "uuids": [node.uuid]})
+                asked.request("POST", "/measurements", {"group": f"group {name}", "rate": 20})
+
+            def sinks() -> list[dict[str, Any]]:
+                return [one for one in asked.request("GET", "/status")["sinks"] if one["written"] > 200]
+
+            until(lambda: len(sinks()) == 2, "both publish", 60)
+            assert service.process is not None
+            began = children(service.process.process.pid, "ros1_child.py")
+            nodes = master.tool("rosnode", "list").split() if Path("/usr/bin/rosnode").exists() else []
+            assert not nodes or {"/teds_provision_bench_group_g", "/teds_provision_bench_group_h"} <= set(nodes)
+            before = {one["measurement"]: one["written"] for one in sinks()}
+            until(lambda: all(one["written"] > before[one["measurement"]] + 100 for one in sinks()), "both go on", 60)
+            assert children(service.process.process.pid, "ros1_child.py") == began
+            assert len(began) == 2
+            service.end()
+    finally:
+        hall.close()
+
+
+def test_a_trace_has_frames_and_opened_messages_of_every_session(hall: Hall, tmp_path: Path) -> None:
+    file = tmp_path / "daemon.trace"
+    hall.desk.links = type(hall.desk.links)(hall.desk.links.nfc, hall.can)
+    service = Service(hall.desk, hall.station, ("--trace", file)).start()
+    uuid = hall.nodes["g"].uuid
+    verified(service, uuid)
+    with service.client() as asked:
+        asked.request("POST", "/measurements", {"uuids": [uuid], "rate": 20})
+        until(lambda: (asked.node(uuid)["measuring"] or {}).get("state") == "running", "it is not measured")
+    service.end()
+    assert file.stat().st_mode & 0o777 == 0o600
+    records = list(read_trace(file))
+    opened = {record.command.partition(" (")[0] for record in records if record.sealed and record.opened is not None}
+    assert {"Subscribe", "Clock", "Stop"} <= opened, opened
+    assert any(record.layer == "frame" for record in records)
+    refused = hall.station.refuses("ncap", "run", "--trace", file, code=2)
+    assert str(file) in refused["message"], "a trace is never written over"

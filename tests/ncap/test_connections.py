@@ -1,0 +1,126 @@
+"""Who opens connections and says nothing, or says it slowly: he loses them, and keeps nobody out."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Awaitable, Callable
+
+import pytest
+
+from teds_provision.ncap.web import connections, server
+from teds_provision.ncap.web.guard import CALLER, Receive, Scope, Send
+
+Pair = tuple[asyncio.StreamReader, asyncio.StreamWriter]
+GET = b"GET / HTTP/1.1\r\nHost: x\r\n"
+PUT = b"PUT / HTTP/1.1\r\nHost: x\r\nContent-Length: 4\r\n\r\n"
+KNOWN = b"GET /known HTTP/1.1\r\nHost: x\r\n\r\n"
+PATIENCE = 20.0
+
+
+async def echo(scope: Scope, receive: Receive, send: Send) -> None:
+    if scope["path"] == "/known":
+        scope[CALLER] = "somebody with a token"
+    body = b""
+    while (message := await receive())["type"] == "http.request":
+        body += message["body"]
+        if not message["more_body"]:
+            break
+    length = [(b"content-length", str(len(body)).encode())]
+    await send({"type": "http.response.start", "status": 200, "headers": length})
+    await send({"type": "http.response.body", "body": body})
+
+
+def served(work: Callable[[Callable[[], Awaitable[Pair]]], Awaitable[None]]) -> None:
+    """Run it against a server on loopback."""
+
+    async def run() -> None:
+        listener = server.listen("127.0.0.1", 0)
+        port = listener.getsockname()[1]
+        servers = server.Servers()
+        await servers.serve(echo, listener)
+        try:
+            await asyncio.wait_for(work(lambda: asyncio.open_connection("127.0.0.1", port)), 60)
+        finally:
+            await servers.stop()
+
+    asyncio.run(run())
+
+
+async def is_ended(pair: Pair) -> bool:
+    try:
+        return await asyncio.wait_for(pair[0].read(1), PATIENCE) == b""
+    except ConnectionResetError:
+        return True
+
+
+async def answer(pair: Pair, octets: bytes) -> bytes:
+    pair[1].write(octets)
+    return await asyncio.wait_for(pair[0].readline(), PATIENCE)
+
+
+def test_a_head_and_a_body_that_do_not_end_cost_the_connection(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(connections, "HEAD", 0.2)
+    monkeypatch.setattr(connections, "BODY", 0.2)
+
+    async def work(connect: Callable[[], Awaitable[Pair]]) -> None:
+        mute, head, body, second = [await connect() for _ in range(4)]
+        head[1].write(GET + b"X: ")
+        body[1].write(PUT + b"ab")
+        assert await answer(second, GET + b"\r\n") == b"HTTP/1.1 200 OK\r\n"
+        await second[0].readuntil(b"\r\n\r\n")
+        second[1].write(GET)  # of its second request half a head
+        for what, pair in {"mute": mute, "head": head, "body": body, "second head": second}.items():
+            assert await is_ended(pair), what
+
+    served(work)
+
+
+def test_the_time_of_a_head_is_not_the_time_of_a_body_nor_of_the_work(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(connections, "HEAD", 0.2)
+
+    async def work(connect: Callable[[], Awaitable[Pair]]) -> None:
+        pair = await connect()
+        pair[1].write(PUT + b"ab")
+        await asyncio.sleep(0.5)
+        assert await answer(pair, b"cd") == b"HTTP/1.1 200 OK\r\n"
+
+    served(work)
+
+
+def test_silent_connections_make_room_for_the_next_one(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(connections, "MOST", 20)
+    monkeypatch.setattr(server, "MOST", 20)
+
+    async def work(connect: Callable[[], Awaitable[Pair]]) -> None:
+        mute = [await connect() for _ in range(40)]
+        for _, writer in mute:
+            writer.write(GET)
+        pair = await connect()
+        assert await answer(pair, GET + b"\r\n") == b"HTTP/1.1 200 OK\r\n"
+        assert await is_ended(mute[0]), "the oldest goes first"
+
+    served(work)
+
+
+def test_slow_bodies_without_a_token_keep_nobody_out_and_end_nobodys_connection(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Five hundred of them, each with one octet of its body, were 503 for everybody else."""
+    monkeypatch.setattr(connections, "MOST", 20)
+    monkeypatch.setattr(server, "MOST", 20)
+
+    async def work(connect: Callable[[], Awaitable[Pair]]) -> None:
+        browser = await connect()
+        assert await answer(browser, KNOWN) == b"HTTP/1.1 200 OK\r\n"
+        slow = []
+        for _ in range(60):
+            slow.append(await connect())
+            slow[-1][1].write(PUT + b"a")
+        for _ in range(3):
+            pair = await connect()
+            assert await answer(pair, KNOWN) == b"HTTP/1.1 200 OK\r\n"
+        assert await is_ended(slow[0]), "the oldest goes first"
+        await browser[0].readuntil(b"\r\n\r\n")
+        assert await answer(browser, KNOWN) == b"HTTP/1.1 200 OK\r\n"
+
+    served(work)

@@ -1,0 +1,110 @@
+"""Somebody on the bus says a new UUID each time: the daemon neither grows nor loses the nodes beside him."""
+
+from __future__ import annotations
+
+import json
+import threading
+from collections.abc import Iterator
+from contextlib import suppress
+from http.client import HTTPException
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from teds_provision.ncap.nodes.roster import MOST_GONE, Roster
+from tests.e2e.desk import ANGLE
+from tests.measure.hall import Hall, events
+from tests.ncap.service import Service, until
+from tests.strangers.attackers import Attacker, always_new, silent_strangers
+from tests.strangers.wire import of_spec
+
+STRANGERS = range(60, 100)
+
+
+class Silence:
+    """Nobody listens."""
+
+    def event(self, *_words: Any, **_facts: Any) -> None: ...
+
+    def last(self, *_words: Any) -> None: ...
+
+
+def test_nodes_that_left_and_are_not_known_are_forgotten_but_the_latest() -> None:
+    nothing: Any = None
+    silence: Any = Silence()
+    roster = Roster(nothing, silence)
+    roster.note("a" * 20, "came", present=True, looked=1.0)
+    for number in range(5 * MOST_GONE):
+        uuid = f"{number:020x}"
+        roster.note(uuid, "came", present=True, looked=1.0)
+        roster.note(uuid, "left", present=False)
+    assert len(roster.uuids()) == MOST_GONE + 1
+    assert not roster.known(f"{0:020x}")
+    assert {"a" * 20, uuid} <= set(roster.uuids())
+
+
+@pytest.fixture(scope="module")
+def hall(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Hall]:
+    made = Hall(tmp_path_factory.mktemp("crowds"), {"a": ANGLE})
+    yield made
+    made.close()
+
+
+@pytest.mark.link
+def test_a_node_of_the_whitelist_does_not_wait_for_strangers(hall: Hall, tmp_path: Path) -> None:
+    """Forty that answer nothing but Identify had kept every worker for minutes."""
+    group, port = of_spec(hall.desk.links.can)
+    service = Service(hall.desk, hall.station, ("--detection", "transparent"))
+    with Attacker(group, port, silent_strangers(STRANGERS)):
+        asked = service.start().client()
+        until(lambda: sum(one["present"] for one in asked.nodes()) == len(STRANGERS))
+        hall.nodes["a"].start(can=hall.desk.links.can)
+        until(lambda: asked.node(hall.nodes["a"].uuid)["verdict"] == "authentic")
+        waiting = sum(one["verdict"] is None and one["problem"] is None for one in asked.nodes())
+        assert waiting > len(STRANGERS) / 2, "the strangers still waited when it had been looked at"
+    service.end()
+    hall.nodes["a"].kill()
+
+
+@pytest.mark.link
+def test_the_count_of_strangers_is_told_now_and_then(hall: Hall) -> None:
+    """Each new UUID was a line of the log: with five a second half a million a day."""
+    group, port = of_spec(hall.desk.links.can)
+    service = Service(hall.desk, hall.station, ("--detection", "whitelist"))
+    said: list[bytes] = []
+    with Attacker(group, port, always_new(STRANGERS, said)):
+        asked = service.start().client()
+        until(lambda: len(said) > 2 * len(STRANGERS) and asked.status()["strangers"])
+    assert service.process is not None
+    service.end()
+    told = [line for line in events(service.process.out) if line.get("state") == "strangers"]
+    assert 1 <= len(told) < 10, json.dumps(told)
+
+
+@pytest.mark.link
+def test_reads_of_a_node_that_does_not_answer_hold_up_no_other_request(hall: Hall) -> None:
+    """Six of them, with a token that may only read, had stopped the whole API: status, other tokens, set points."""
+    service = Service(hall.desk, hall.station, ("--detection", "whitelist"))
+    node = hall.nodes["a"].start(can=hall.desk.links.can)
+    asked = service.start().client()
+    until(lambda: asked.node(node.uuid)["verdict"] == "authentic")
+    reader = {"Authorization": f"Bearer {service.token('reader', '--read-only')}"}
+    writer = {"Authorization": f"Bearer {service.token('writer')}", "Content-Type": "application/json"}
+    node.kill()
+    read: list[int] = []
+
+    def ask() -> None:
+        with suppress(OSError, HTTPException):  # the daemon ended
+            read.append(service.raw("GET", f"/api/v1/nodes/{node.uuid}/teds", reader).status)
+
+    readers = [threading.Thread(target=ask, daemon=True) for _ in range(12)]
+    for one in readers:
+        one.start()
+    until(lambda: asked.node(node.uuid)["busy"] or asked.status(), "it is being read")
+    assert service.raw("GET", "/api/v1/status", writer).status == 200
+    assert service.raw("PUT", f"/api/v1/nodes/{node.uuid}/channels/1", writer, '{"hold": 0}').status < 500
+    assert not read, "a node that is silent is waited for, and all of this was answered before"
+    service.kill()
+    for one in readers:
+        one.join(60)

@@ -1,0 +1,48 @@
+"""How long something takes, on a machine that does other things as well.
+
+A rule about time is held by what a busy machine cannot change: the CPU that the work costs, or the best of some tries.
+Whoever waits for something that has to come waits ``PATIENCE``.
+"""
+
+from __future__ import annotations
+
+import os
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import TypeVar
+
+T = TypeVar("T")
+
+PATIENCE = 60.0  # seconds; what comes at all comes by then, on any machine
+
+
+@contextmanager
+def costs_at_most(seconds: float) -> Iterator[None]:
+    """What is done under it takes no more of this process's CPU than that; what others take is not counted."""
+    began = time.process_time()
+    yield
+    took = time.process_time() - began
+    assert took < seconds, f"{took:.3f} s of CPU"
+
+
+def best_of(tries: int, limit: float, attempt: Callable[[], float]) -> None:
+    """Try until ``attempt``, which gives the seconds that it took, took less than ``limit``; once if all is quiet."""
+    took: list[float] = []
+    while not took or took[-1] >= limit:
+        assert len(took) < tries, f"{took} s, never less than {limit} s"
+        took.append(attempt())
+
+
+def crowded() -> bool:
+    """Whether so much else runs that a node of ours has no processor in time: more than three tasks for each core."""
+    return os.getloadavg()[0] > 3 * (os.cpu_count() or 1)
+
+
+def until(found: Callable[[], T], why: object = "", seconds: float = PATIENCE) -> T:
+    """Wait until ``found`` gives something true, and return it; ``why`` (or what it gives) is what to say if not."""
+    end = time.monotonic() + seconds
+    while not (value := found()):
+        assert time.monotonic() < end, (why() if callable(why) else why) or f"still {value!r}"
+        time.sleep(0.02)
+    return value

@@ -1,0 +1,68 @@
+"""Ports, buses and domains of a test's own, however many workers and checkouts run on this machine at once."""
+
+from __future__ import annotations
+
+import fcntl
+import os
+import random
+import socket
+import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+
+_OF_OURS = range(10_000, 32_000)  # below those that the system deals out to others a moment later
+_dice = random.SystemRandom()
+
+
+def _free(kind: socket.SocketKind) -> int:
+    while True:
+        port = _dice.choice(_OF_OURS)
+        with socket.socket(socket.AF_INET, kind) as probe, suppress(OSError):
+            probe.bind(("127.0.0.1", port))
+            return port
+
+
+def free_udp_port() -> int:
+    """A UDP port of 127.0.0.1 that nobody has."""
+    return _free(socket.SOCK_DGRAM)
+
+
+def free_tcp_port() -> int:
+    """A TCP port of 127.0.0.1 that nobody has."""
+    return _free(socket.SOCK_STREAM)
+
+
+def free_group() -> str:
+    """A multicast group of one's own: a bus is bound to its group, so no look at a port shows whether it is taken.
+
+    Two tests on one bus are two stations: the one that is late hears of the other one's nodes that a tap is needed.
+    """
+    return "239." + ".".join(str(_dice.randrange(1, 250)) for _ in range(3))
+
+
+def free_bus() -> str:
+    """A CAN bus over multicast that nobody else is on."""
+    return f"udp_multicast:{free_group()}?port={free_udp_port()}"
+
+
+def free_reader() -> str:
+    """A simulated NFC reader that nobody else uses."""
+    return f"udp:localhost:{free_udp_port()}"
+
+
+@contextmanager
+def ros_domain() -> Iterator[int]:
+    """A ROS domain that nobody else is in while it is held: there are few, and in one everybody sees every topic."""
+    numbers = list(range(100, 200))
+    _dice.shuffle(numbers)
+    for number in numbers:
+        place = Path(tempfile.gettempdir()) / f"teds-provision-tests-{os.getuid()}-ros-domain-{number}"
+        with place.open("w") as held:
+            try:
+                fcntl.flock(held, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except BlockingIOError:
+                continue
+            yield number
+            return
+    raise AssertionError("Every ROS domain from 100 to 199 is in use.")

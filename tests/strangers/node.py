@@ -1,0 +1,538 @@
+"""A stranger's node: a firmware written from the contract alone, in one loop, on CAN.
+
+Usage: python -m tests.strangers.node FILE. FILE is JSON: bus (group, port, fd, address), uuid, key, epoch, sequence,
+identity (private scalar), teds {"channel,code": hex}, channels {number: {kind, octets, shortest, bears}}, fault.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import signal
+import struct
+import sys
+import time
+import zlib
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import can
+from cryptography.exceptions import InvalidTag
+from cryptography.hazmat.primitives.asymmetric import ec
+
+from tests.strangers.crypto import CURVE, Keys, key_id, mac, message, opened, point, seal, signature, unseal
+from tests.strangers.wire import Wire, pieces
+
+MAX = 2048
+SENSOR, EVENT, ACTUATOR = "sensor", "event sensor", "actuator"
+DRIFT, STEP = 50, 1000
+
+
+class No(Exception):
+    """A refusal."""
+
+    def __init__(self, reason: int) -> None:
+        super().__init__(reason)
+        self.reason = reason
+
+
+def need(good: object, reason: int) -> None:
+    if not good:
+        raise No(reason)
+
+
+@dataclass
+class Stream:
+    """One run."""
+
+    kind: int
+    n: int
+    gap: int
+    period: int
+    start: int | None
+    channels: list[int]
+    run: int
+    key: bytes
+    length: int
+    pattern: bool
+    counter: int = 0
+    sent: int = 0
+
+
+@dataclass
+class Session:
+    """One session of a station; claims by channel: until when its dead-man runs, 0 for a sensor."""
+
+    station: int
+    keys: Keys
+    last: int = 0
+    claims: dict[int, int] = field(default_factory=dict)
+    dead_men: dict[int, int] = field(default_factory=dict)
+    lease: int = 10
+    heard: int = 0
+    streams: dict[int, Stream] = field(default_factory=dict)
+    runs: int = 0
+    mark: int = 0
+    armed: dict[int, tuple[bytes, int]] = field(default_factory=dict)
+    drive: tuple[list[int], bytes, int] | None = None
+    driven: int = -1
+    coming: bytes = b""
+    segment: int = 0
+
+
+class Node:
+    """The whole of it."""
+
+    def __init__(self, given: dict[str, Any]) -> None:
+        self.given = given
+        self.uuid, self.key = bytes.fromhex(given["uuid"]), bytes.fromhex(given["key"])
+        self.identity = ec.derive_private_key(int(given["identity"], 16), CURVE)
+        self.teds = {tuple(map(int, name.split(","))): bytes.fromhex(said) for name, said in given["teds"].items()}
+        self.channels = {int(number): facts for number, facts in given["channels"].items()}
+        self.fault = given.get("fault", "")
+        self.began = time.monotonic_ns() - 10**9
+        self.c = int.from_bytes(os.urandom(8), "big")
+        self.sessions: dict[int, Session] = {}
+        self.half: dict[int, Session] = {}
+        self.stored: dict[int, tuple[bytes, bytes]] = {}
+        self.points = {n: bytes(one["octets"]) for n, one in self.channels.items() if one["kind"] == ACTUATOR}
+        self.safe = dict.fromkeys(self.points, True)
+        self.stopped = dict.fromkeys(self.points, False)
+        self.fresh: Session | None = None
+        bus = given["bus"]
+        self.address, self.fd = bus["address"], bus["fd"]
+        self.wire = Wire(bus["group"], bus["port"], self.address, self.fd, self.take, self.other)
+
+    def tick(self) -> int:
+        return time.monotonic_ns() - self.began
+
+    # -- frames --------------------------------------------------------------------------------------------------------
+
+    def announce(self) -> None:
+        crc = zlib.crc32(self.uuid).to_bytes(4, "big")
+        self.wire.put(0x1CFF0000 | self.address, bytes([1, 2]) + crc + bytes(2))
+
+    def take(self, peer: int, body: bytes, fd: bool) -> None:
+        if peer in self.stored and self.stored[peer][0] == body:
+            self.wire.send(peer, self.stored[peer][1], fd)
+            return
+        reply = body[:1] + self.answer(peer, body[1:])
+        if body[3:4] == b"\x80" and body[4:5] not in (b"\7", b"\x08", b"\x0b"):
+            self.stored[peer] = (body, reply)
+        self.wire.send(peer, reply, fd)
+
+    def other(self, frame: can.Message) -> None:
+        identifier, data = frame.arbitration_id, bytes(frame.data)
+        if identifier >> 8 == 0x18DBFF and data[:1] == b"\7":
+            self.wire.turn(int.from_bytes(os.urandom(1), "big") / 256 * 0.05)
+            self.wire.send(identifier & 0xFF, data[1:2] + self.answer(identifier & 0xFF, data[2:8]), frame.is_fd)
+        elif identifier >> 8 == 0x18FF00 and len(data) == 8:
+            self.triggered(identifier & 0xFF, data, frame.timestamp)
+        elif identifier >> 8 == 0x18EF00 | self.address:
+            self.drive_frame(identifier & 0xFF, data)
+
+    def answer(self, peer: int, frame: bytes, session: Session | None = None) -> bytes:
+        try:
+            need(len(frame) >= 6 and len(frame) - 6 == int.from_bytes(frame[4:6], "big"), 4)
+            channel, class_, function = struct.unpack(">HBB", frame[:4])
+            said = self.run(peer, channel, class_, function, frame[6:], session)
+        except No as refusal:
+            return bytes([0, 0, 1, refusal.reason])
+        return b"\1" + len(said).to_bytes(2, "big") + said
+
+    def run(
+        self, peer: int, channel: int, class_: int, function: int, payload: bytes, session: Session | None
+    ) -> bytes:
+        if class_ == 1 and function in (1, 2):
+            return self.read(channel, function, payload)
+        if class_ == 128:
+            need(channel == 0, 1)
+            plain = {7: self.hello, 8: self.prove, 11: self.list}
+            if function in plain:
+                return plain[function](payload)
+            if session is None:
+                need(function in (3, 4), 3 if function in (1, 2, 5, 9, 10, *range(12, 21)) else 1)
+                return self.open(peer, payload) if function == 3 else self.sealed(peer, payload)
+        need(session is not None, 3)
+        assert session is not None
+        return self.inner(session, channel, class_, function, payload)
+
+    # -- what needs no session -----------------------------------------------------------------------------------------
+
+    def hello(self, payload: bytes) -> bytes:
+        need(not payload, 4)
+        numbers = struct.pack(">BIIHB", 2, self.given["epoch"], self.given["sequence"], MAX, self.address)
+        return b"\1" + self.uuid + numbers
+
+    def prove(self, payload: bytes) -> bytes:
+        need(len(payload) == 32, 4)
+        return signature(self.identity, b"TEDS1 prove\0" + self.uuid + payload)
+
+    def list(self, _payload: bytes) -> bytes:
+        return b"".join(struct.pack(">HB", *name) for name in sorted(self.teds))
+
+    def read(self, channel: int, function: int, payload: bytes) -> bytes:
+        need(len(payload) == (1 if function == 1 else 5), 4)
+        octets = self.teds.get((channel, payload[0]))
+        if function == 1:
+            there = octets is not None
+            attributes = (0 if there else 2) | (64 if payload[0] == 128 else 0)
+            size, check = (len(octets), int.from_bytes(octets[-2:], "big")) if octets is not None else (0, 0)
+            return struct.pack(">BBIHI", attributes, 0, size, check, MAX)
+        need(octets is not None, 18)
+        assert octets is not None
+        offset = min(int.from_bytes(payload[1:], "big"), len(octets))
+        return offset.to_bytes(4, "big") + octets[offset : offset + 900]
+
+    def open(self, peer: int, payload: bytes) -> bytes:
+        need(len(payload) in (0, 89), 4)
+        c = self.c.to_bytes(8, "big")
+        if not payload:
+            return c
+        es, proof = payload[8:73], payload[73:]
+        need(payload[:8] == key_id(self.key), 16)
+        need(proof == mac(self.key, b"station open", self.uuid, c, es), 12)
+        self.c = (self.c + 1) % 2**64
+        own = ec.generate_private_key(CURVE)
+        en = point(own)
+        keys = Keys.of(self.key, self.uuid, own, es, es, en)
+        self.half[peer] = Session(peer, keys)
+        return en + keys.tag(self.key, es, en)
+
+    def sealed(self, peer: int, payload: bytes) -> bytes:
+        tried = [one for one in (self.sessions.get(peer), self.half.get(peer)) if one is not None]
+        need(tried, 2)
+        need(len(payload) >= 36, 4)
+        for one in tried:
+            try:
+                counter, inner = unseal(one.keys.down, payload)
+            except (InvalidTag, ValueError):
+                continue
+            need(counter > one.last, 13)
+            if one is self.half.get(peer):
+                if peer in self.sessions:
+                    self.end(self.sessions[peer])
+                self.sessions[peer] = self.half.pop(peer)
+            one.last, one.heard = counter, self.tick()
+            return seal(one.keys.up, counter, self.answer(peer, inner, one))
+        raise No(12)
+
+    # -- inner commands ------------------------------------------------------------------------------------------------
+
+    def inner(self, one: Session, channel: int, class_: int, function: int, payload: bytes) -> bytes:
+        does = {
+            (4, 1): self.operate, (4, 2): self.idle, (3, 1): self.value_of, (3, 2): self.set_one,
+            (1, 5): self.self_test,
+        }.get((class_, function))  # fmt: skip
+        if does is not None:
+            return does(one, channel, payload)
+        need(class_ == 128, 1)
+        named = {
+            5: self.close, 12: self.sample, 13: self.set_many, 14: self.subscribe, 15: self.stop, 16: self.clock,
+            17: self.arm, 18: self.power, 19: self.operation, 20: self.begin_drive,
+        }.get(function)  # fmt: skip
+        need(named is not None, 1)
+        assert named is not None
+        return named(one, payload)
+
+    def close(self, one: Session, _payload: bytes) -> bytes:
+        self.end(one)
+        return b""
+
+    def end(self, one: Session) -> None:
+        """The session is over: its claims and streams with it."""
+        self.let_go(one, list(one.claims))
+        self.sessions = {peer: other for peer, other in self.sessions.items() if other is not one}
+
+    def let_go(self, one: Session, channels: list[int]) -> None:
+        for channel in channels:
+            if one.claims.pop(channel, None) is not None and channel in self.points:
+                self.make_safe(channel)
+        one.streams = {n: s for n, s in one.streams.items() if set(s.channels) <= one.claims.keys()}
+        if one.drive is not None and not set(one.drive[0]) <= one.claims.keys():
+            one.drive = None
+
+    def make_safe(self, channel: int) -> None:
+        self.safe[channel], self.points[channel] = True, bytes(len(self.points[channel]))
+        self.tell(channel)
+
+    def tell(self, channel: int) -> None:
+        print(
+            json.dumps({"channel": channel, "raw": self.points[channel].hex(), "safe": self.safe[channel]}), flush=True
+        )
+
+    def operate(self, one: Session, channel: int, payload: bytes) -> bytes:
+        sensors = [n for n, facts in self.channels.items() if facts["kind"] != ACTUATOR]
+        need(channel in self.channels or (channel == 0 and sensors), 1)
+        actuator = channel in self.points
+        need(len(payload) == (19 if actuator else 17), 4)
+        need(payload[:16] == hashlib.sha256(self.teds[0, 128]).digest()[:16], 6)
+        lease, dead_man = payload[16], int.from_bytes(payload[17:], "big")
+        need(1 <= lease <= 60 and (not actuator or 20 <= dead_man <= 10_000), 19)
+        if actuator:
+            for other in self.sessions.values():
+                need(channel not in other.claims, 2 if other is one else 17)
+            one.dead_men[channel] = dead_man * 10**6
+            self.stopped[channel] = False
+            self.make_safe(channel)
+        for n in [channel] if channel else sensors:
+            one.claims[n] = self.tick() if actuator else 0
+        one.lease = lease
+        return b""
+
+    def idle(self, one: Session, channel: int, payload: bytes) -> bytes:
+        need(not payload, 4)
+        self.let_go(one, [channel] if channel else list(one.claims))
+        return b""
+
+    def raw(self, channel: int, tick: int) -> bytes:
+        """A sensor's sample: the milliseconds of the tick."""
+        octets = self.channels[channel]["octets"]
+        return (tick // 10**6 % 2 ** (8 * octets)).to_bytes(octets, "big")
+
+    def value_of(self, one: Session, channel: int, payload: bytes) -> bytes:
+        need(len(payload) == 4, 4)
+        need(channel in one.claims, 2)
+        need(payload == bytes(4), 19)
+        return payload + (self.points[channel] if channel in self.points else self.raw(channel, self.tick()))
+
+    def sample(self, one: Session, payload: bytes) -> bytes:
+        need(0 < len(payload) <= 64 and len(set(payload)) == len(payload) and 0 not in payload, 4)
+        need(set(payload) <= one.claims.keys(), 2)
+        need(not set(payload) & self.points.keys(), 3)
+        tick = self.tick()
+        return tick.to_bytes(8, "big") + b"\0" + b"".join(self.raw(n, tick) for n in payload)
+
+    def set_one(self, one: Session, channel: int, payload: bytes) -> bytes:
+        need(channel not in self.points or len(payload) == 4 + len(self.points[channel]), 4)
+        need(channel in one.claims, 2)
+        need(channel in self.points, 3)
+        need(payload[:4] == bytes(4) and self.bears(channel, payload[4:]), 19)
+        self.apply(one, {channel: payload[4:]})
+        return b""
+
+    def bears(self, channel: int, octets: bytes) -> bool:
+        low, high = self.channels[channel]["bears"]
+        return bool(low <= int.from_bytes(octets, "big") <= high)
+
+    def apply(self, one: Session, values: dict[int, bytes]) -> None:
+        for channel, octets in values.items():
+            self.points[channel], self.safe[channel] = octets, False
+            one.claims[channel] = self.tick()
+            self.tell(channel)
+
+    def set_many(self, one: Session, payload: bytes) -> bytes:
+        values: dict[int, bytes] = {}
+        while payload:
+            need(payload[0] in self.channels, 2)
+            need(payload[0] in self.points, 3)
+            size = len(self.points[payload[0]])
+            need(payload[0] not in values and len(payload) > size, 4)
+            values[payload[0]], payload = payload[1 : 1 + size], payload[1 + size :]
+        need(values, 4)
+        need(values.keys() <= one.claims.keys(), 2)
+        need(all(self.bears(n, octets) for n, octets in values.items()), 19)
+        self.apply(one, values)
+        return b""
+
+    def self_test(self, _one: Session, _channel: int, payload: bytes) -> bytes:
+        need(len(payload) == 1, 4)
+        need(payload == b"\0", 19)
+        return b""
+
+    def power(self, _one: Session, payload: bytes) -> bytes:
+        need(not payload, 4)
+        return struct.pack(">BBHhb", 0, 0xFF, 0xFFFF, 0x7FFF, 0x7F)
+
+    def operation(self, one: Session, payload: bytes) -> bytes:
+        need(not payload, 4)
+        out = b""
+        for n, facts in sorted(self.channels.items()):
+            others = [other for other in self.sessions.values() if other is not one and n in other.claims]
+            state = 1 * (n in self.points) | 2 * (n in one.claims) | 4 * bool(others) | 8 * (facts["kind"] == EVENT)
+            state |= 16 * self.safe.get(n, False) | 32 * self.stopped.get(n, False)
+            by = max([other.station for other in others] + [one.station] * (n in one.claims), default=0)
+            out += bytes([n, state, by])
+        return bytes([any(other.claims for other in self.sessions.values())]) + out
+
+    def clock(self, one: Session, payload: bytes) -> bytes:
+        need(not payload, 4)
+        now = self.tick()
+        lie = 10**9 if self.fault == "clock jumps" and now > 4 * 10**9 else 0
+        sent = now - 10**8 if self.fault == "clock runs back" else now + lie
+        return struct.pack(">QQQIHI", now + lie, sent, one.mark, STEP, DRIFT, one.driven % 2**32)
+
+    def arm(self, one: Session, payload: bytes) -> bytes:
+        need(len(payload) == 18, 4)
+        need(payload[16] <= 60 and payload[17] <= 2, 19)
+        one.armed.pop(payload[17], None)
+        if payload[16]:
+            one.armed[payload[17]] = (payload[:16], self.tick() + payload[16] * 10**9)
+        return b""
+
+    def triggered(self, station: int, token: bytes, at: float) -> None:
+        # The mark is the tick at the frame's end: by the kernel's time stamp, not by when this thread came to it.
+        now, one = self.tick() - max(0, round((time.time() - at) * 1e9)), self.sessions.get(station)
+        if one is None:
+            return
+        c = hashlib.sha256(b"TEDS1 trigger\0" + token).digest()[:16]
+        for action, (wanted, until) in list(one.armed.items()):
+            if wanted != c or now > until:
+                continue
+            del one.armed[action]
+            one.mark = now
+            for stream in one.streams.values():
+                if action == 1 and stream.start is None:
+                    stream.start = now + 10**7
+            if action == 2:
+                moving = [n for n in one.claims if n in self.points]
+                self.stopped |= dict.fromkeys(moving, True)
+                self.let_go(one, moving)
+
+    # -- streams -------------------------------------------------------------------------------------------------------
+
+    def subscribe(self, one: Session, payload: bytes) -> bytes:
+        need(len(payload) > 21, 4)
+        number, kind, n, gap, period, start = struct.unpack(">BBBHQQ", payload[:21])
+        channels, pattern, kind = list(payload[21:]), bool(kind & 128), kind & 127
+        need(number <= 3 and kind <= 2 and n and len(channels) <= 16 and len(set(channels)) == len(channels), 4)
+        need(0 not in channels and (kind != 1 or (n == 1 and len(channels) == 1)), 4)
+        need(set(channels) <= one.claims.keys(), 2)
+        need(not set(channels) & self.points.keys(), 3)
+        need(all((self.channels[c]["kind"] == EVENT) == (kind == 1) or kind == 2 for c in channels), 19)
+        need(max(self.channels[c]["shortest"] for c in channels) <= period <= 10**12, 19)
+        length = 13 + n * sum(self.channels[c]["octets"] for c in channels) + 8 * (kind > 0)
+        need(length <= 240, 10)
+        count = sum(1 for _ in pieces(bytes(length), self.fd))
+        need(count * max(gap, 1) * 10**9 <= 10**6 * n * period, 21)
+        now = self.tick()
+        need(start in (0, 2**64 - 1) or now < start <= now + 60 * 10**9, 20)
+        one.runs += 1
+        began = start or now + 5 * 10**6
+        one.streams[number] = Stream(
+            kind, n, gap, period, None if start == 2**64 - 1 else began, channels, one.runs, one.keys.run(one.runs),
+            length, pattern,
+        )  # fmt: skip
+        self.fresh = one
+        extra = {"another length": (1, 0), "another start": (0, 5 * 10**9)}.get(self.fault, (0, 0))
+        return struct.pack(">HHQ", one.runs, length + extra[0], (began + extra[1]) % 2**64)
+
+    def stop(self, one: Session, payload: bytes) -> bytes:
+        need(len(payload) == 1, 4)
+        need(payload[0] in one.streams, 2)
+        return one.streams.pop(payload[0]).counter.to_bytes(4, "big")
+
+    def pump(self) -> None:
+        """Send what is due, and end what has run out."""
+        now = self.tick()
+        for one in list(self.sessions.values()):
+            late = [n for n, since in one.claims.items() if n in self.points and now - since >= one.dead_men[n]]
+            self.stopped |= dict.fromkeys(late, True)
+            self.let_go(one, late)
+            if now - one.heard > one.lease * 10**9:
+                self.let_go(one, list(one.claims))
+            for number, stream in list(one.streams.items()):
+                if stream.start is not None:
+                    self.due(one, number, stream, now)
+
+    def due(self, one: Session, number: int, stream: Stream, now: int) -> None:
+        assert stream.start is not None
+        first = stream.start + stream.counter * stream.n * stream.period
+        last = first + (stream.n - 1) * stream.period
+        hurry = 10**10 if self.fault == "from the future" else 0
+        if now + hurry < last:
+            return
+        instants = [first + i * stream.period for i in range(stream.n)]
+        body = bytes([128 * stream.pattern | (0x3E if self.fault == "reserved flags" else 0)])
+        body += instants[0].to_bytes(8, "big") if stream.kind else b""
+        for i, tick in enumerate(instants):
+            for c in stream.channels:
+                size = self.channels[c]["octets"]
+                k = stream.counter * stream.n + i
+                body += ((k + c) % 2 ** (8 * size)).to_bytes(size, "big") if stream.pattern else self.raw(c, tick)
+        octets = message(stream.key, stream.counter, body)
+        if self.fault == "wrong tag" and stream.counter % 2:
+            octets = octets[:-1] + bytes([octets[-1] ^ 1])
+        self.send_data(one, number, octets, stream)
+        stream.counter += 1
+
+    def send_data(self, one: Session, number: int, octets: bytes, stream: Stream) -> None:
+        for segment, data in pieces(octets, self.fd):
+            if self.fault == "a segment is missing" and stream.counter % 3 == 1 and segment == 1:
+                continue
+            identifier = 0x1CFF0000 | ((one.station & 7) * 32 + number * 8 + segment) << 8 | self.address
+            self.wire.put(identifier, data, self.fd)
+            time.sleep(stream.gap / 10**6)
+        if self.fault == "replay" and stream.counter == 5:
+            self.kept = octets
+        if self.fault == "replay" and stream.counter > 5 and stream.counter % 4 == 0:
+            for segment, data in pieces(self.kept, self.fd):
+                identifier = 0x1CFF0000 | ((one.station & 7) * 32 + number * 8 + segment) << 8 | self.address
+                self.wire.put(identifier, data, self.fd)
+
+    # -- Drive ---------------------------------------------------------------------------------------------------------
+
+    def begin_drive(self, one: Session, payload: bytes) -> bytes:
+        need(0 < len(payload) <= 16 and len(set(payload)) == len(payload) and 0 not in payload, 4)
+        need(set(payload) <= one.claims.keys(), 2)
+        need(set(payload) <= self.points.keys(), 3)
+        one.runs += 1
+        length = 16 + sum(len(self.points[n]) for n in payload)
+        one.drive, one.driven = (list(payload), one.keys.run(one.runs, drive=True), length), -1
+        return struct.pack(">HH", one.runs, length)
+
+    def drive_frame(self, station: int, data: bytes) -> None:
+        one = self.sessions.get(station)
+        if one is None or one.drive is None or not data:
+            return
+        channels, key, length = one.drive
+        if data[0] == 0:
+            one.coming, one.segment = b"", 0
+        elif data[0] != one.segment:
+            one.segment = -1
+        if one.segment < 0:
+            return
+        one.coming += data[1:]
+        one.segment = one.segment % 7 + 1
+        if len(one.coming) < length:
+            return
+        octets, one.coming, one.segment = one.coming[:length], b"", -1
+        try:
+            counter, plain = opened(key, octets)
+        except InvalidTag:
+            return
+        if counter <= one.driven:
+            return
+        one.driven = counter
+        left = (int.from_bytes(plain[:4], "big") - self.tick() // 1000) % 2**32
+        if left * 1000 > min(one.dead_men[n] for n in channels):
+            return
+        values, rest = {}, plain[4:]
+        for n in channels:
+            size = len(self.points[n])
+            values[n], rest = rest[:size], rest[size:]
+        if all(self.bears(n, octets) for n, octets in values.items()):
+            self.apply(one, values)
+
+    def loop(self) -> None:
+        """Until it is ended."""
+        announced = False
+        while True:
+            self.wire.turn(0.002)
+            self.pump()
+            if not announced:
+                self.announce()
+                announced = True
+
+
+def main() -> None:
+    signal.signal(signal.SIGTERM, lambda *_: os._exit(0))
+    node = Node(json.loads(Path(sys.argv[1]).read_text()))
+    print(json.dumps({"ready": True}), flush=True)
+    node.loop()
+
+
+if __name__ == "__main__":
+    main()

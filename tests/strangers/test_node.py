@@ -1,0 +1,272 @@
+"""A stranger's node under the product's commands: `verify`, `sample`, `set`, `mode`, `measure`; good and faulty."""
+
+from __future__ import annotations
+
+import itertools
+import json
+import signal
+import sys
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Any
+
+import pytest
+
+from teds_provision.node.flash_file import FlashFile
+from teds_provision.teds.image import Image
+from teds_provision.teds.sheet import Kind, Sheet
+from tests.e2e.desk import ANGLE, Running
+from tests.measure.hall import Hall, events, of, ran
+from tests.strangers.wire import of_spec
+
+pytestmark = pytest.mark.link
+KINDS = {Kind.SENSOR: "sensor", Kind.EVENT_SENSOR: "event sensor", Kind.ACTUATOR: "actuator"}
+
+
+@dataclass
+class Stranger:
+    """A node of the hall, played by a stranger's firmware."""
+
+    hall: Hall
+    name: str
+    fd: bool
+    address: int
+    process: Running | None = None
+
+    @property
+    def can(self) -> str:
+        return self.hall.can if self.fd else self.hall.desk.links.can
+
+    @property
+    def uuid(self) -> str:
+        return self.hall.nodes[self.name].uuid
+
+    def start(self, fault: str = "", *, program: str = "tests.strangers.node") -> Stranger:
+        file = FlashFile(self.hall.folder / self.name)
+        flash, document = file.load(), json.loads(file.path.read_text())
+        file.release()
+        sheet = Sheet.of(Image(flash.uuid, dict(flash.blocks)))
+        channels = {
+            one.number: {
+                "kind": KINDS[Kind(one.kind)],
+                "octets": one.sample.octets,
+                "shortest": int(one.period * 1e9 * (1 - 1e-6)) if one.period > 0 else 1,
+                "bears": [0, 4095],
+            }
+            for one in sheet.channels
+            if one.kind is not None and one.sample is not None
+        }
+        group, port = of_spec(self.hall.desk.links.can)
+        given = {
+            "bus": {"group": group, "port": port, "fd": self.fd, "address": self.address},
+            "uuid": flash.uuid.hex(), "key": flash.key.hex() if flash.key else "", "epoch": flash.epoch,
+            "sequence": flash.sequence, "identity": document["key"], "channels": channels, "fault": fault,
+            "teds": {f"{channel},{code}": octets.hex() for (channel, code), octets in flash.blocks.items()},
+        }  # fmt: skip
+        plan = self.hall.folder / f"{self.name}.json"
+        plan.write_text(json.dumps(given))
+        self.process = self.hall.desk.start(plan, program=(sys.executable, "-m", program))
+        self.process.wait_for('"ready": true')
+        return self
+
+    def end(self) -> None:
+        if self.process is not None:
+            self.process.process.kill()
+            self.process.end()
+            self.process = None
+
+    def told(self) -> list[dict[str, Any]]:
+        assert self.process is not None
+        self.process.read(0.1)
+        return [line for line in events(self.process.out) if "safe" in line]
+
+
+@pytest.fixture(scope="module")
+def hall(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Hall]:
+    made = Hall(tmp_path_factory.mktemp("strangers"), {"a": ANGLE, "g": "gripper"})
+    yield made
+    made.close()
+
+
+@pytest.fixture(params=[False, True], ids=["classic", "fd"])
+def angle(hall: Hall, request: pytest.FixtureRequest) -> Iterator[Stranger]:
+    made = Stranger(hall, "a", request.param, 0x31)
+    yield made
+    made.end()
+
+
+@pytest.fixture
+def fd_angle(hall: Hall) -> Iterator[Stranger]:
+    made = Stranger(hall, "a", True, 0x31)
+    yield made
+    made.end()
+
+
+@pytest.fixture
+def classic_angle(hall: Hall) -> Iterator[Stranger]:
+    made = Stranger(hall, "a", False, 0x31)
+    yield made
+    made.end()
+
+
+@pytest.fixture
+def gripper(hall: Hall) -> Iterator[Stranger]:
+    made = Stranger(hall, "g", True, 0x32)
+    yield made
+    made.end()
+
+
+def steps(line: dict[str, Any]) -> set[int]:
+    raw = line["raw"]
+    return {(after - before) % 65536 for before, after in itertools.pairwise(raw)}
+
+
+def measured(node: Stranger, *words: object, code: int = 0) -> list[dict[str, Any]]:
+    return node.hall.measure(node.uuid, *words, can=node.can, code=code)
+
+
+def test_it_is_verified_sampled_and_measured(angle: Stranger) -> None:
+    angle.start()
+    station = angle.hall.station
+    assert station.ask("verify", angle.uuid, "--via", "can", "--can", angle.can)["verdict"] == "authentic"
+    assert station.ask("mode", angle.uuid, "--can", angle.can)["mode"] == "configuration"
+    [taken] = station.ask("sample", angle.uuid, "--can", angle.can)["samples"]
+    assert taken["valid"] is True
+    lines = measured(angle, "--rate", 50, "--duration", 2)
+    data = of(lines)
+    [stream] = lines[-1]["nodes"][0]["streams"]
+    assert ran(lines) == ["running", "ended"]
+    assert stream["bad"] == 0, stream
+    assert stream["samples"] + stream["lost"] + stream["late"] >= 80
+    # The firmware's sample is the millisecond of its tick: 20 between two instants, whatever its clock.
+    assert {step for line in data for step in steps(line)} <= {20}
+    for line in data:
+        for raw, value in zip(line["raw"], line["value"], strict=True):
+            assert value == pytest.approx(raw / 65535 * 6.2814, abs=2e-3)
+    assert stream["clock_error"] < 0.1
+    assert station.ask("mode", angle.uuid, "--can", angle.can)["mode"] == "configuration"
+
+
+@pytest.mark.parametrize("words", [["--kind", "free"], ["--trigger"], ["--test-pattern"]], ids=lambda words: words[-1])
+def test_other_kinds_of_streams(fd_angle: Stranger, words: list[str]) -> None:
+    fd_angle.start()
+    lines = measured(fd_angle, "--rate", 50, "--duration", 1, *words)
+    [stream] = lines[-1]["nodes"][0]["streams"]
+    assert stream["bad"] == 0, lines[-1]
+    assert {step for line in of(lines) for step in steps(line)} <= ({1} if "--test-pattern" in words else {20})
+
+
+def test_a_stranger_among_our_own(fd_angle: Stranger, gripper: Stranger) -> None:
+    """Two strangers' nodes and two of our stations on one bus: none disturbs another."""
+    fd_angle.start()
+    gripper.start()
+    other = fd_angle.hall.copy("twin")
+    first = fd_angle.hall.begin(fd_angle.uuid, gripper.uuid, "--rate", 40, "--trigger")
+    first.wait_for('"event":"data"')
+    second = fd_angle.hall.begin(fd_angle.uuid, "--rate", 25, can=f"{fd_angle.can}&source=0xF3", station=other)
+    second.wait_for('"index":20')
+    for running in (second, first):
+        running.signal(signal.SIGTERM)
+        lines = events(running.end().out)
+        assert "lost" not in ran(lines)
+        for node in lines[-1]["nodes"]:
+            for stream in node["streams"]:
+                assert stream["bad"] == 0, node
+                assert stream["late"] <= 0.1 * stream["messages"], node  # too old on a machine that is busy
+                assert stream["samples"] > 0
+
+
+def test_a_strangers_actuator_is_set_and_left_safe(gripper: Stranger) -> None:
+    gripper.start()
+    station = gripper.hall.station
+    acting = station.start("--json", "set", gripper.uuid, 1, 0.05, "--dead-man", 500, "--can", gripper.can)
+    acting.wait_for('"applied"')
+    time.sleep(1.0)
+    assert not gripper.told()[-1]["safe"], "fed for twice its dead-man"
+    state = station.ask("mode", gripper.uuid, "--can", f"{gripper.can}&source=0xF5")["channels"][0]
+    assert state["claimant"] == 0xF1
+    acting.signal(signal.SIGTERM)
+    assert acting.end().out.splitlines()[-1] == '{"event": "end", "safe": true}'
+    acting = station.start("--json", "set", gripper.uuid, 1, 0.05, "--dead-man", 500, "--can", gripper.can)
+    acting.wait_for('"applied"')
+    acting.process.kill()
+    end = time.monotonic() + 5
+    while not gripper.told()[-1]["safe"]:
+        assert time.monotonic() < end
+    station.ask("set", gripper.uuid, 1, 99, "--can", gripper.can, code=6)
+
+
+def test_a_node_that_is_reset_in_the_middle_is_measured_on(fd_angle: Stranger) -> None:
+    fd_angle.start()
+    running = fd_angle.hall.begin(fd_angle.uuid, "--rate", 50)
+    running.wait_for('"index":20')
+    fd_angle.end()
+    fd_angle.start()
+    until = time.monotonic() + 30
+    while running.out.count('"state":"running"') < 2:
+        assert time.monotonic() < until
+        running.read(0.1)
+    running.read(0.5)
+    running.signal(signal.SIGTERM)
+    outcome = running.end()
+    assert outcome.code == 0
+    assert {step for line in of(events(outcome.out)) for step in steps(line)} <= {20}
+
+
+FAULTS = {
+    "wrong tag": lambda end: end["bad"] > 0,
+    "replay": lambda end: end["late"] > 0,
+    "a segment is missing": lambda end: end["lost"] > 0,
+    "from the future": lambda end: end["bad"] > 0,  # those that were late enough have become true meanwhile
+    "reserved flags": lambda end: end["bad"] == 0 and end["samples"] > 0,
+}
+
+
+@pytest.mark.parametrize("fault", FAULTS)
+def test_a_fault_is_counted_and_no_value_is_false(classic_angle: Stranger, fault: str) -> None:
+    """Classic frames, four a message, so that segments can be missing."""
+    node = classic_angle.start(fault)
+    running = node.hall.begin(node.uuid, "--rate", 400, "--duration", 2, can=node.can)
+    outcome = running.end()
+    lines = events(outcome.out)
+    assert {step for line in of(lines) for step in steps(line)} <= {2, 3}, "2.5 ms between two instants"
+    indices = [line["index"] for line in of(lines)]
+    assert indices == sorted(set(indices))
+    [stream] = lines[-1]["nodes"][0]["streams"]
+    assert FAULTS[fault](stream), (stream, outcome.err)
+
+
+@pytest.mark.parametrize("fault", ["clock runs back", "clock at the end of time"])
+def test_no_sample_has_the_time_of_a_clock_that_lies(fd_angle: Stranger, fault: str) -> None:
+    """`sample` gave the hour at which the node had started, or ended with a bug."""
+    fd_angle.start(fault, program="tests.strangers.liar")
+    before = time.time()
+    [taken] = fd_angle.hall.station.ask("sample", fd_angle.uuid, "--can", fd_angle.can)["samples"]
+    assert before - 1 < taken["time"] < time.time() + 1
+
+
+@pytest.mark.parametrize("lie", ["counter far ahead", "ticks at the end of time", "every message twice"])
+def test_a_node_that_lies_about_its_messages_gives_no_value_twice_or_at_a_false_time(
+    fd_angle: Stranger, lie: str
+) -> None:
+    fd_angle.start(lie, program="tests.strangers.liar")
+    before = time.time()
+    data = of(measured(fd_angle, "--rate", 50, "--duration", 1, "--kind", "free"))
+    assert bool(data) != (lie == "ticks at the end of time")
+    indices, times = [line["index"] for line in data], [at for line in data for at in line["time"]]
+    assert indices == sorted(set(indices))
+    assert times == sorted(times)
+    assert all(before - 5 < at < time.time() + 1 for at in times)
+
+
+@pytest.mark.parametrize("fault", ["another length", "another start", "clock runs back"])
+def test_a_node_that_contradicts_itself_is_reported(fd_angle: Stranger, fault: str) -> None:
+    fd_angle.start(fault)
+    lines = measured(fd_angle, "--rate", 50, "--duration", 1, code=0 if fault == "clock runs back" else 4)
+    whys = [line["why"] for line in lines if line["event"] == "status" and line["why"]]
+    assert whys, lines
+    if fault == "clock runs back":
+        assert any("clock" in why for why in whys)
+    else:
+        assert of(lines) == []

@@ -1,0 +1,101 @@
+"""Channels side by side give what each interpreter gives alone, to the last bit."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from teds_provision.teds import Sheet
+from teds_provision.teds.calibration import ChannelInterpreter, fit
+from teds_provision.teds.calibration.many_channels import ManyChannels
+from teds_provision.teds.calibration.samples import SampleForm
+from teds_provision.teds.units.units import parse_unit
+from tests.teds.test_interpreter import sheet_of
+
+CURVES = {
+    1: fit([(0, 0.0), (65535, 10.0)], "linear", channel=1),
+    2: fit([(n * 1000, 0.0001 * n**2) for n in range(60)], "table", channel=2),
+    3: fit([(n * 4000, 0.04 * n**2) for n in range(16)], "polynomial", channel=3),
+    4: fit([(0, 1.0), (20000, 3.0), (40000, 9.0)], "steps", channel=4),
+}
+
+
+def sheet(unit: str = "N") -> Sheet:
+    """Twelve taxels: four with different calibrations (one in another unit, one offset), the others with none."""
+    curves = dict(CURVES)
+    curves[3] = replace(curves[3], unit=parse_unit(unit))
+    curves[4] = replace(curves[4], zero_offset=0.25)
+    return sheet_of("tactile-finger-sensor", curves)
+
+
+@pytest.mark.parametrize("unit", ["N", "mN"])
+@given(st.lists(st.lists(st.integers(0, 65535), min_size=12, max_size=12), min_size=1, max_size=6))
+@settings(max_examples=60)
+def test_side_by_side_is_one_by_one(unit: str, raw: list[list[int]]) -> None:
+    known = sheet(unit)
+    channels = [ChannelInterpreter(known, number) for number in range(1, 13)]
+    usable = [not one.problem for one in channels]
+    many = ManyChannels.of(channels, usable)
+    assert many is not None
+    octets = np.array(raw, dtype=">u2").view(np.uint8).reshape(len(raw), 24)
+    raws = many.raw(octets.tobytes())
+    np.testing.assert_array_equal(raws, raw)
+    value, valid = many.values(raws)
+    for column, one in enumerate(channels):
+        alone = one.values(one.reader.raw(octets[:, 2 * column : 2 * column + 2]))
+        np.testing.assert_array_equal(valid[:, column], alone.valid)
+        np.testing.assert_array_equal(value[:, column], alone.value * one.unit.scale + one.unit.offset)
+
+
+@pytest.mark.parametrize("number", [1, 2, 3, 4])
+def test_every_value_that_a_channel_can_have_is_calibrated_beforehand(number: int) -> None:
+    """One channel of 16 bits, some values of which lie beyond SigBits and beyond its limits.
+
+    Steps alone, without a channel of another degree beside them, once gave their offset's multiple.
+    """
+    known = sheet("mN")
+    first = known.channel(number)
+    assert first is not None
+    assert first.sample is not None
+    narrow = replace(first, sample=replace(first.sample, bits=15), high=2.0)
+    one = ChannelInterpreter(replace(known, channels=(narrow,)), number)
+    many = ManyChannels.of([one], [True])
+    assert many is not None
+    octets = np.arange(65536).astype(">u2")
+    value, valid = many.values(many.raw(octets.tobytes()))
+    alone = one.values(one.reader.raw(octets.view(np.uint8).reshape(-1, 2)))
+    assert 0 < np.count_nonzero(alone.valid) < 65536
+    np.testing.assert_array_equal(valid[:, 0], alone.valid)
+    np.testing.assert_array_equal(value[:, 0], one.unit.to_si(alone.value))
+
+
+@given(st.lists(st.lists(st.integers(0, 255), min_size=4, max_size=4), min_size=1, max_size=6), st.booleans())
+@settings(max_examples=30)
+def test_channels_of_8_bits_are_looked_up_each_in_its_own(raw: list[list[int]], last: bool) -> None:
+    known = sheet()
+    small = [replace(one, sample=SampleForm(0, 1)) for one in known.channels[:4]]
+    channels = [ChannelInterpreter(replace(known, channels=tuple(small)), number) for number in range(1, 5)]
+    many = ManyChannels.of(channels, [True, True, True, last])
+    assert many is not None
+    octets = np.array(raw, dtype=np.uint8)
+    value, valid = many.values(many.raw(octets.tobytes()))
+    for column, one in enumerate(channels):
+        alone = one.values(one.reader.raw(octets[:, column : column + 1]))
+        usable = last or column < 3
+        np.testing.assert_array_equal(valid[:, column], alone.valid & usable)
+        np.testing.assert_array_equal(value[:, column], one.unit.to_si(alone.value) if usable else np.nan)
+
+
+def test_channels_of_other_forms_stay_alone() -> None:
+    known = sheet()
+    channels = [ChannelInterpreter(known, number) for number in (1, 2)]
+    assert ManyChannels.of(channels, [True, True]) is not None
+    (first, *rest) = known.channels
+    wider = replace(known, channels=(replace(first, sample=SampleForm(0, 3), calibration=None), *rest))
+    assert ManyChannels.of([ChannelInterpreter(wider, number) for number in (1, 2)], [True, True]) is None
+    floats = replace(known, channels=(replace(first, sample=SampleForm(1, 4), calibration=None), *rest))
+    assert ManyChannels.of([ChannelInterpreter(floats, 1)], [True]) is None

@@ -1,0 +1,109 @@
+"""docs/extending.md is followed word for word in a copy of the package: what comes out keeps the rules and works."""
+
+from __future__ import annotations
+
+import json
+import re
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from tests.bench import make_station
+from tests.cli.shell import clean_environment
+
+pytestmark = pytest.mark.slow
+ROOT = Path(__file__).parent.parent
+BLOCK = re.compile(
+    r"^```python\n# (new: |after in |instead in |at the end of )([^\n:]+)(?:: ([^\n]*))?\n(.*?)^```$", re.M | re.S
+)
+
+
+def follow(page: str, folder: Path) -> list[str]:
+    """Do what each block says; the files that were touched."""
+    touched = []
+    for how, name, line, text in BLOCK.findall(page):
+        path = folder / name
+        touched.append(name)
+        if how == "new: ":
+            path.parent.mkdir(exist_ok=True)
+            path.write_text(f"{line}{text}")
+            continue
+        before = path.read_text()
+        if how == "at the end of ":
+            path.write_text(f"{before}\n\n{text}")
+            continue
+        assert before.count(f"{line}\n") == 1, f"{name} has no such line: {line}"
+        path.write_text(before.replace(f"{line}\n", f"{line}\n{text}" if how == "after in " else text))
+    return touched
+
+
+@pytest.fixture(scope="module")
+def copy(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("house")
+    for part in ("teds_provision", "tests", "scripts", "docs", "profiles"):
+        shutil.copytree(ROOT / part, folder / part, ignore=shutil.ignore_patterns("__pycache__"))
+    for file in ("pyproject.toml", "Makefile"):
+        shutil.copy(ROOT / file, folder)
+    follow((ROOT / "docs" / "extending.md").read_text(), folder)
+    return folder
+
+
+def run(copy: Path, *words: object) -> subprocess.CompletedProcess[str]:
+    """Run Python over the copy."""
+    return subprocess.run(
+        [sys.executable, *map(str, words)],
+        cwd=copy,
+        env=clean_environment(PYTHONPATH=str(copy)),
+        capture_output=True,
+        text=True,
+        timeout=110,
+        check=False,
+    )
+
+
+def test_every_block_of_the_page_is_an_example() -> None:
+    page = (ROOT / "docs" / "extending.md").read_text()
+    assert len(BLOCK.findall(page)) == page.count("```python") > 10
+
+
+def test_what_comes_out_keeps_the_rules(copy: Path) -> None:
+    done = run(
+        copy, "-m", "pytest", "-q", "-p", "no:cacheprovider", "tests/test_architecture.py", "tests/test_house.py"
+    )
+    assert done.returncode == 0, done.stdout[-3000:]
+    page = (ROOT / "docs" / "extending.md").read_text()
+    touched = sorted({name for _, name, *_ in BLOCK.findall(page)})
+    done = run(copy, "-m", "ruff", "check", *touched)
+    assert done.returncode == 0, done.stdout + done.stderr
+    done = run(copy, "-m", "ruff", "format", "--check", *touched)
+    assert done.returncode == 0, done.stdout + done.stderr
+
+
+def test_the_command_the_link_and_the_check_are_there(copy: Path, tmp_path: Path) -> None:
+    make_station(tmp_path / "home").close()
+    program = ("-m", "teds_provision", "--home", tmp_path / "home", "--json")
+    assert json.loads(run(copy, *program, "nameless").stdout) == {"uuids": []}
+    assert "nameless" in run(copy, *program, "--help").stdout
+    missing = run(copy, *program, "identify", "--via", "serial")
+    assert (missing.returncode, json.loads(missing.stdout)["error"]["code"]) == (5, "no-reader")
+    assert "serial-lines" in run(copy, *program, "doctor").stdout
+
+
+def test_the_sink_the_source_and_the_class_work(copy: Path, tmp_path: Path) -> None:
+    code = f"""
+from teds_provision.measure.sinks import open_sink
+from teds_provision.node.sources import make_source
+from teds_provision.teds import decode, compose
+from tests.measure.sinks.parts import ANGLE, STATION, block, fill
+sink = open_sink({str(tmp_path / "run.tsv")!r})
+sink.open([ANGLE], STATION)
+fill(sink, [block([[10], [20]])])
+print(open(sink.files[0]).read().split()[3::4])
+print(make_source("still", [], print).at(1, 0.0))
+print(decode(compose(200, {{"BatchNo": 7}})).get("BatchNo"))
+"""
+    done = run(copy, "-c", code)
+    assert done.stdout.splitlines() == ["['1', '2']", "None", "7"], done.stderr[-2000:]
