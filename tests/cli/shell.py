@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import atexit
+import functools
 import io
 import json
 import os
@@ -10,10 +12,15 @@ import sys
 from contextlib import redirect_stderr, redirect_stdout
 from dataclasses import dataclass
 from pathlib import Path
+from tempfile import TemporaryFile
 from typing import Any
 
 from teds_provision.cli.main import run
 from tests.bench import PASSPHRASE
+from tests.zygote import FIRST_FD, Forked, Zygote, forkable
+
+ROOT = Path(__file__).resolve().parents[2]
+PROGRAM = (sys.executable, "-m", "teds_provision")
 
 
 @dataclass(frozen=True)
@@ -64,25 +71,57 @@ def unmeasured_environment() -> dict[str, str]:
     return {name: value for name, value in clean_environment().items() if not name.startswith("COVERAGE_")}
 
 
-def spawn(*words: object, passphrase: str | None = None, environment: dict[str, str] | None = None) -> Outcome:
-    """Run the program as a process of its own; ``passphrase`` is given through --passphrase-fd."""
-    command = [sys.executable, "-m", "teds_provision"]
+@functools.cache
+def zygote() -> Zygote:
+    """The zygote of this test process: made at the first need, ended with it."""
+    made = Zygote(clean_environment())
+    atexit.register(made.close)
+    return made
+
+
+def begin(
+    *words: object,
+    out: int,
+    err: int,
+    passphrase: str | None = None,
+    environment: dict[str, str] | None = None,
+    cwd: Path | None = None,
+    program: tuple[str, ...] = PROGRAM,
+) -> Forked | subprocess.Popen[bytes]:
+    """Start the program as a process of its own that writes to two files; the passphrase goes by --passphrase-fd.
+
+    By a fork of the zygote where nobody could tell, else by starting an interpreter.
+    """
     read, write = os.pipe()
-    if passphrase is not None:
-        command += ["--passphrase-fd", str(read)]
-        os.write(write, passphrase.encode() + b"\n")
+    asked = environment if environment is not None else clean_environment()
+    fork = program == PROGRAM and forkable(asked, zygote().environment)
+    given = [] if passphrase is None else ["--passphrase-fd", str(FIRST_FD if fork else read)]
+    os.write(write, (passphrase or "").encode() + b"\n")
     os.close(write)
+    whole, folder = [*given, *map(str, words)], cwd or Path.cwd()
     try:
-        done = subprocess.run(
-            [*command, *map(str, words)],
+        if fork:
+            return zygote().run(PROGRAM[-1], whole, asked, out=out, err=err, given=(read,), cwd=folder)
+        return subprocess.Popen(
+            [*program, *whole],
             stdin=subprocess.DEVNULL,
-            capture_output=True,
-            text=True,
-            timeout=60,
-            check=False,
+            stdout=out,
+            stderr=err,
             pass_fds=(read,),
-            env=environment or clean_environment(),
+            env=asked,
+            cwd=folder,
         )
     finally:
         os.close(read)
-    return Outcome(done.returncode, done.stdout, done.stderr)
+
+
+def spawn(*words: object, passphrase: str | None = None, environment: dict[str, str] | None = None) -> Outcome:
+    """Run the program as a process of its own to its end; ``passphrase`` is given through --passphrase-fd."""
+    with TemporaryFile() as out, TemporaryFile() as err:
+        done = begin(*words, passphrase=passphrase, environment=environment, out=out.fileno(), err=err.fileno())
+        try:
+            code = done.wait(60)
+        finally:
+            done.kill()
+        said = [os.pread(file.fileno(), os.fstat(file.fileno()).st_size, 0).decode() for file in (out, err)]
+    return Outcome(code, *said)

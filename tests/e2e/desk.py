@@ -9,7 +9,6 @@ import selectors
 import signal
 import sqlite3
 import subprocess
-import sys
 import time
 from contextlib import closing
 from dataclasses import dataclass, field
@@ -19,12 +18,10 @@ from typing import Any
 from teds_provision.node.described import create
 from teds_provision.store import Store
 from tests.bench import PASSPHRASE
-from tests.cli.shell import Outcome, clean_environment
+from tests.cli.shell import PROGRAM, ROOT, Outcome, begin
 from tests.pace import PATIENCE, until
 from tests.places import free_bus, free_reader
 
-ROOT = Path(__file__).resolve().parents[2]
-PROGRAM = (sys.executable, "-m", "teds_provision")
 ANGLE = "magnetic-angular-position-sensor"
 FINGER = "tactile-finger-sensor"
 _TIMES = re.compile(r"\d{4}-\d\d-\d\dT[\d:.]+Z?")
@@ -63,27 +60,19 @@ class Running:
         cwd: Path = ROOT,
         program: tuple[str, ...] = PROGRAM,
     ) -> None:
-        read, write = os.pipe()
-        given = [] if passphrase is None else ["--passphrase-fd", str(read)]
-        os.write(write, (passphrase or "").encode() + b"\n")
-        os.close(write)
+        self.stdout, out = os.pipe()
+        self.stderr, err = os.pipe()
         try:
-            self.process = subprocess.Popen(
-                [*program, *given, *map(str, words)],
-                stdin=subprocess.DEVNULL,
-                stdout=subprocess.PIPE,
-                stderr=subprocess.PIPE,
-                pass_fds=(read,),
-                env=environment or clean_environment(),
-                cwd=cwd,
+            self.process = begin(
+                *words, passphrase=passphrase, environment=environment, cwd=cwd, program=program, out=out, err=err
             )
         finally:
-            os.close(read)
+            os.close(out)
+            os.close(err)
         self.out = self.err = ""
         self._selector = selectors.DefaultSelector()
-        for stream in (self.process.stdout, self.process.stderr):
-            assert stream is not None
-            os.set_blocking(stream.fileno(), False)
+        for stream in (self.stdout, self.stderr):
+            os.set_blocking(stream, False)
             self._selector.register(stream, selectors.EVENT_READ)
 
     def read(self, seconds: float) -> bool:
@@ -94,7 +83,7 @@ class Running:
             came = came or bool(octets)
             if not octets:
                 self._selector.unregister(key.fileobj)
-            elif key.fileobj is self.process.stdout:
+            elif key.fd == self.stdout:
                 self.out += octets.decode()
             else:
                 self.err += octets.decode()
@@ -136,9 +125,8 @@ class Running:
             self.process.kill()
         self.process.wait(PATIENCE)
         self._selector.close()
-        for stream in (self.process.stdout, self.process.stderr):
-            assert stream is not None
-            stream.close()
+        for stream in (self.stdout, self.stderr):
+            os.close(stream)
 
 
 class Desk:

@@ -20,7 +20,7 @@ from teds_provision.vault.passphrase import THROWAWAY
 from tests.cli.shell import clean_environment
 from tests.e2e.desk import Links
 from tests.faults.acts import NEXT, UUID
-from tests.faults.zygote import FIRST_FD, Child, Zygote
+from tests.zygote import FIRST_FD, Child, Zygote
 
 PASSPHRASE = "correct horse battery"
 READY = 60.0

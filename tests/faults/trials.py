@@ -22,10 +22,11 @@ from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 
+from tests.cli.shell import clean_environment
 from tests.faults.acts import UUID, Act
 from tests.faults.desk import Desk, Ended, States, ended
 from tests.faults.disk import build_library, put_back
-from tests.faults.zygote import Child, Zygote, first_of
+from tests.zygote import Child, Zygote, first_of
 
 CUTS = ("kill", "torn")
 HANGS = 120.0
@@ -84,7 +85,7 @@ class Bench:
         self.folder = folder
         self.library = build_library(folder)
         (folder / "states").mkdir()
-        self.zygote = Zygote(self.library)
+        self.zygote = Zygote(clean_environment(), self.library)
         self.states = States(folder / "states", self.zygote)
         self._cores = threading.Semaphore(jobs)
 

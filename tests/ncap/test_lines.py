@@ -17,8 +17,7 @@ def test_who_reads_the_first_line_alone_stops_nothing(desk: Desk) -> None:
     service = Service(desk, desk.station()).start()
     running = service.process
     assert running is not None
-    assert running.process.stdout is not None
-    fcntl.fcntl(running.process.stdout.fileno(), fcntl.F_SETPIPE_SZ, SMALLEST_PIPE)
+    fcntl.fcntl(running.stdout, fcntl.F_SETPIPE_SZ, SMALLEST_PIPE)
     with service.client() as asked:
         for k in range(300):
             asked.request("PUT", "/detection", {"mode": ("transparent", "whitelist")[k % 2]})

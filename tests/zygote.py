@@ -1,11 +1,14 @@
 """Processes of the program that cost a fork instead of a start: one process imports everything once and waits.
 
-A trial of the fault bench runs the program five times; without this most of its time is Python importing the same
-modules. The zygote runs under cut.c's library with no fault set, has one thread and no open file of anybody's; a child
-of it gets its own environment, files and folder, lets the library begin anew (``faults_begin``), runs the module as
-``python -m`` would, and ends as a Python process ends.
+Most of what a short command takes is Python importing the same modules; the suite starts some 1,500 of them, a trial of
+the fault bench five. The zygote has one thread and no open file of anybody's; a child of it gets its own environment,
+files and folder, runs the module as ``python -m`` would, and ends as a Python process ends. Under cut.c's library (the
+fault bench) the library begins anew in each child (``faults_begin``).
 
-As a program: python -m tests.faults.zygote FD (the control socket that its parent holds the other end of).
+What such a child cannot show is how the program starts: what it imports, what the interpreter makes of its environment,
+how much memory it takes. Tests of that start an interpreter; ``forkable`` tells environments that only a start obeys.
+
+As a program: python -m tests.zygote FD (the control socket that its parent holds the other end of).
 """
 
 from __future__ import annotations
@@ -31,9 +34,7 @@ from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from tests.cli.shell import clean_environment
-
-ROOT = Path(__file__).resolve().parents[2]
+ROOT = Path(__file__).resolve().parents[1]
 # What the commands of the bench import late: foreign and heavy. Seen by comparing sys.modules before and after each.
 FOREIGN = (
     "can",
@@ -55,33 +56,60 @@ LARGEST = 1 << 17
 
 
 @dataclass
-class Child:
-    """One process: its id, what it wrote, and how it ended."""
+class Forked:
+    """A process of the zygote, as ``subprocess.Popen`` has one: its id, and how it ended (minus the signal)."""
 
     pid: int
     status: int  # a pipe: the wait status comes here as text when it has ended
-    out: int  # a file in memory, or the reading end of a pipe
-    err: int
-    code: int | None = None
+    returncode: int | None = field(default=None, init=False)
 
     def poll(self) -> int | None:
-        """The exit code (minus the signal), or None while it runs."""
-        return self._wait(0)
+        """The exit code, or None while it runs."""
+        return self._ended(0)
 
-    def wait(self, seconds: float) -> int:
-        """The exit code; kills it and raises TimeoutExpired where it has not ended after ``seconds``."""
-        code = self._wait(seconds)
+    def wait(self, timeout: float) -> int:
+        """The exit code; raises TimeoutExpired."""
+        code = self._ended(timeout)
         if code is None:
-            self.kill()
-            raise subprocess.TimeoutExpired(str(self.pid), seconds)
+            raise subprocess.TimeoutExpired(str(self.pid), timeout)
         return code
+
+    def send_signal(self, number: int) -> None:
+        """Send it a signal, unless it has ended."""
+        if self.poll() is None:
+            with suppress(ProcessLookupError):
+                os.kill(self.pid, number)
+
+    def kill(self) -> None:
+        """End it at once."""
+        self.send_signal(signal.SIGKILL)
+
+    def _ended(self, seconds: float) -> int | None:
+        if self.returncode is None and _readable(self.status, seconds):
+            self.returncode = os.waitstatus_to_exitcode(int(os.read(self.status, 64) or b"9"))
+            os.close(self.status)
+        return self.returncode
+
+
+@dataclass
+class Child(Forked):
+    """One whose output is kept: what it wrote."""
+
+    out: int  # a file in memory, or the reading end of a pipe
+    err: int
+
+    def wait(self, timeout: float) -> int:
+        """The exit code; kills it and raises TimeoutExpired where it has not ended after ``timeout``."""
+        try:
+            return super().wait(timeout)
+        except subprocess.TimeoutExpired:
+            self.kill()
+            raise
 
     def kill(self) -> None:
         """End it at once, and wait for that."""
-        if self.poll() is None:
-            with suppress(ProcessLookupError):
-                os.kill(self.pid, signal.SIGKILL)
-            self._wait(30)
+        super().kill()
+        self._ended(30)
 
     def stdout(self) -> str:
         """What it wrote to a file in memory."""
@@ -104,13 +132,8 @@ class Child:
     def close(self) -> None:
         """End it and give its files back."""
         self.kill()
-        for each in (self.status, self.out, self.err):
-            os.close(each)
-
-    def _wait(self, seconds: float) -> int | None:
-        if self.code is None and _readable(self.status, seconds):
-            self.code = os.waitstatus_to_exitcode(int(os.read(self.status, 64) or b"9"))
-        return self.code
+        os.close(self.out)
+        os.close(self.err)
 
 
 def first_of(one: Child, other: Child, seconds: float) -> Child | None:
@@ -119,35 +142,62 @@ def first_of(one: Child, other: Child, seconds: float) -> Child | None:
     with selectors.PollSelector() as poll:
         for child in (one, other):
             poll.register(child.status, selectors.EVENT_READ)
-        while one.code is None and other.code is None:
+        while one.returncode is None and other.returncode is None:
             left = until - time.monotonic()
             if left <= 0 or not poll.select(left):
                 return None
             one.poll()
             other.poll()
-    return one if one.code is not None else other
+    return one if one.returncode is not None else other
 
 
 @dataclass
 class Zygote:
     """The parent's end: starts the program again and again, from any thread."""
 
-    library: Path
-    _lock: threading.Lock = field(default_factory=threading.Lock)
+    environment: dict[str, str]  # in which it imports
+    library: Path | None = None  # what is to be loaded before the system's own
+    _lock: threading.Lock = field(default_factory=threading.Lock, init=False)
 
     def __post_init__(self) -> None:
         ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         for end in (ours, theirs):
             end.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, LARGEST)
         self._control = ours
+        more = {"LD_PRELOAD": str(self.library)} if self.library else {}
         with theirs:
             self._process = subprocess.Popen(
-                [sys.executable, "-m", "tests.faults.zygote", str(theirs.fileno())],
+                [sys.executable, "-m", "tests.zygote", str(theirs.fileno())],
                 stdin=subprocess.DEVNULL,
+                stdout=subprocess.DEVNULL,
                 pass_fds=(theirs.fileno(),),
-                env=clean_environment(LD_PRELOAD=str(self.library)),
+                env=self.environment | more | {"OPENBLAS_NUM_THREADS": "1"},  # threads would not outlive a fork
                 cwd=ROOT,
             )
+
+    def run(
+        self,
+        module: str,
+        words: list[str],
+        environment: dict[str, str],
+        *,
+        out: int,
+        err: int,
+        given: tuple[int, ...] = (),
+        cwd: Path = ROOT,
+    ) -> Forked:
+        """Run ``python -m module words`` with its output to two files; ``given`` become descriptors 3, 4 … there."""
+        nothing = os.open(os.devnull, os.O_RDONLY)
+        status, told = os.pipe()
+        facts = {"module": module, "words": words, "environment": environment, "cwd": str(cwd), "umask": _umask()}
+        try:
+            with self._lock:
+                socket.send_fds(self._control, [json.dumps(facts).encode()], [told, nothing, out, err, *given])
+        finally:
+            os.close(told)
+            os.close(nothing)
+        assert _readable(status, 60), "the zygote does not answer"
+        return Forked(int(os.read(status, 16)), status)
 
     def start(
         self,
@@ -158,27 +208,38 @@ class Zygote:
         *,
         piped: bool = False,
     ) -> Child:
-        """Run ``python -m module words``; ``given`` become descriptors 3, 4 … there, ``piped``: stdout is a pipe."""
-        nothing = os.open(os.devnull, os.O_RDONLY)
+        """The same with output that is kept in memory; ``piped``: stdout is a pipe."""
         err = os.memfd_create("stderr", os.MFD_CLOEXEC)
         out, written = os.pipe() if piped else (os.memfd_create("stdout", os.MFD_CLOEXEC),) * 2
-        status, told = os.pipe()
-        request = json.dumps({"module": module, "words": words, "environment": environment}).encode()
         try:
-            with self._lock:
-                socket.send_fds(self._control, [request], [told, nothing, written, err, *given])
+            begun = self.run(module, words, environment, out=written, err=err, given=given)
         finally:
-            os.close(told)
-            os.close(nothing)
             if piped:
                 os.close(written)
-        assert _readable(status, 60), "the zygote does not answer"
-        return Child(int(os.read(status, 16)), status, out, err)
+        return Child(begun.pid, begun.status, out, err)
 
     def close(self) -> None:
         """End it; it ends its children."""
         self._control.close()
         self._process.wait(60)
+
+
+_OBEYED_LATE = ("TEDS_PROVISION", "XDG_", "DBUS_", "PYTEST_")
+_ALSO = {"COLUMNS", "HOME", "LINES", "NO_COLOR", "PATH", "TERM", "TMPDIR"}
+
+
+def forkable(asked: dict[str, str], before: dict[str, str]) -> bool:
+    """Whether a fork obeys this environment: no name differs but those that the program reads, and that as it works."""
+    if "COVERAGE_PROCESS_START" in asked or "COVERAGE_PROCESS_CONFIG" in asked:
+        return False
+    differ = {name for name in asked.keys() | before.keys() if asked.get(name) != before.get(name)}
+    return all(name in _ALSO or name.startswith(_OBEYED_LATE) for name in differ)
+
+
+def _umask() -> int:
+    now = os.umask(0o077)
+    os.umask(now)
+    return now
 
 
 def _readable(fd: int, seconds: float) -> bool:
@@ -199,6 +260,8 @@ class _Request:
     module: str
     words: list[str]
     environment: dict[str, str]
+    cwd: str
+    umask: int
     files: tuple[int, ...]  # status pipe, stdin, stdout, stderr, and what else is given
 
 
@@ -244,9 +307,14 @@ def _become(request: _Request) -> None:
     for number, each in enumerate(high):
         os.dup2(each, number)
     os.closerange(512, max(high) + 1)
+    under_faults = os.environ.get("LD_PRELOAD")
     os.environ.clear()
     os.environ.update(request.environment)
-    ctypes.CDLL(None).faults_begin()
+    os.chdir(request.cwd)
+    os.umask(request.umask)
+    signal.signal(signal.SIGINT, signal.default_int_handler)
+    if under_faults:
+        ctypes.CDLL(None).faults_begin()
     sys.argv = [request.module, *request.words]
     code = 0
     try:
@@ -283,6 +351,7 @@ def _import_all() -> None:
 def main() -> None:
     """Import, then serve; in a child: run what was asked for."""
     control = socket.socket(fileno=int(sys.argv[1]))
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # of a terminal: for the tests, which end this one
     _import_all()
     assert threading.active_count() == 1
     gc.collect()
