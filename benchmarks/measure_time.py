@@ -27,9 +27,9 @@ import numpy as np
 from teds_provision.links.can.port import CanPort
 from teds_provision.measure.blocks import Block
 from teds_provision.measure.finding.buses import Buses
-from teds_provision.measure.orders import Wish
 from teds_provision.measure.runner import Watcher
 from teds_provision.measure.running.job import Job
+from teds_provision.measure.wish import Wish
 from teds_provision.node.can.server import CanServer
 from teds_provision.node.described import create
 from teds_provision.node.hardware.board import Board
@@ -37,7 +37,7 @@ from teds_provision.node.pulse import Pulse
 from teds_provision.node.virtual import VirtualNode
 from teds_provision.protocol.operation.streams import DataFrame
 from teds_provision.station.station import Station, initialise
-from teds_provision.steps.order import BuildOrder
+from teds_provision.steps.build_order import BuildOrder
 from teds_provision.steps.provision import provision
 from teds_provision.store import Measurement
 from teds_provision.talk.conversation import Conversation

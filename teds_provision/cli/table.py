@@ -75,7 +75,7 @@ SECTIONS: Final[dict[str, dict[str, Entry]]] = {
     },
     "Try it": {
         "demo": Entry("station.demo", "demo", "Two stations and a virtual node on this machine, start to end."),
-        "node": Entry("node.node", "node", "A virtual transducer: create, run; check a board."),
+        "node": Entry("node.group", "node", "A virtual transducer: create, run; check a board."),
     },
 }
 

@@ -15,18 +15,18 @@ from teds_provision.lazy import late
 from teds_provision.links import can
 from teds_provision.station.station import Station
 from teds_provision.steps.agree import agree
+from teds_provision.steps.build_order import BuildOrder
 from teds_provision.steps.identify import identify
-from teds_provision.steps.order import BuildOrder
 from teds_provision.steps.provision import provision
 from teds_provision.steps.verify import require_authentic
 from teds_provision.talk.meeting import meet
 
 if TYPE_CHECKING:
-    from teds_provision.measure import acting, blocks, finding, orders, runner, sinks, trusting
+    from teds_provision.measure import blocks, finding, held_actuator, runner, sinks, trusting, wish
 else:  # numpy and what measuring needs are loaded when the demo gets there
-    acting, blocks, finding, orders, runner, sinks, trusting = (
+    blocks, finding, held_actuator, runner, sinks, trusting, wish = (
         late(f"teds_provision.measure.{name}")
-        for name in ("acting", "blocks", "finding", "orders", "runner", "sinks", "trusting")
+        for name in ("blocks", "finding", "held_actuator", "runner", "sinks", "trusting", "wish")
     )
 
 GRIPPER = "gripper"
@@ -81,9 +81,9 @@ def measure_group(demo: Demo, station: Station, uuids: tuple[bytes, ...]) -> Non
         try:
             sink = sinks.open_sink(str(file))
             facts = blocks.StationFacts(station.name, group="robot", started=time.time())
-            wish = orders.Wish(rate=RATE, timeout=15.0)
+            asked = wish.Wish(rate=RATE, timeout=15.0)
             with finding.buses.Buses([port]) as buses:
-                ended = runner.Measurement(station, buses, uuids, wish, [sink], facts).run(threading.Event(), SECONDS)
+                ended = runner.Measurement(station, buses, uuids, asked, [sink], facts).run(threading.Event(), SECONDS)
         finally:
             port.close()
         if ended.error is not None:
@@ -116,7 +116,7 @@ def move_gripper(demo: Demo, station: Station, uuid: bytes) -> None:
     with demo.steps.step("set") as step:
         with meet(station, demo.over("can"), uuid, demo.reporter) as node:
             trusted = trusting.open_trusted(station, node)
-            with acting.Acting(trusted, 1, unit="mm") as hand:
+            with held_actuator.HeldActuator(trusted, 1, unit="mm") as hand:
                 applied = hand.apply(OPENING)
                 time.sleep(min(hand.pause, _HALF_WAY))
                 hand.apply(OPENING)

@@ -9,7 +9,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Final
 
-from teds_provision.doctor.doctor import Finding, Place, Result, check
+from teds_provision.doctor.registry import Finding, Place, Result, check
 from teds_provision.errors import NoReader, UsageFailure
 from teds_provision.links.ble.bluez import AdapterFacts, adapters
 from teds_provision.links.ble.spec import BleSpec, parse_spec

@@ -8,7 +8,7 @@ from datetime import UTC, datetime
 from typing import Any, Final
 
 from teds_provision import teds
-from teds_provision.doctor.doctor import Finding, Place, check
+from teds_provision.doctor.registry import Finding, Place, check
 from teds_provision.errors import StoreChanged, StoreFailure, VaultFailure
 from teds_provision.station.station import Station
 from teds_provision.store import Store

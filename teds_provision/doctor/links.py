@@ -16,7 +16,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, Final
 
-from teds_provision.doctor.doctor import Finding, Place, Result, check
+from teds_provision.doctor.registry import Finding, Place, Result, check
 from teds_provision.errors import LinkFailure, NoReader, UsageFailure
 from teds_provision.links import can as can_room
 from teds_provision.links import nfc as nfc_room

@@ -13,7 +13,7 @@ from typing import Final
 
 from teds_provision import store as store_room
 from teds_provision import vault
-from teds_provision.doctor.doctor import Finding, Place, check
+from teds_provision.doctor.registry import Finding, Place, check
 from teds_provision.errors import StoreFailure
 
 _MIN_PYTHON: Final = (3, 11)

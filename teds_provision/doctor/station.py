@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Final
 
 from teds_provision import vault as vault_room
-from teds_provision.doctor.doctor import Finding, Place, check
+from teds_provision.doctor.registry import Finding, Place, check
 from teds_provision.errors import NoKeyring, StoreFailure, VaultFailure
 from teds_provision.store import Choice, Store
 from teds_provision.vault.agent import asking

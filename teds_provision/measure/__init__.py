@@ -6,23 +6,23 @@ from teds_provision.lazy import lazy
 
 if TYPE_CHECKING:
     from teds_provision.measure import (
-        acting,
-        actuators,
         blocks,
         clock,
         facts,
         finding,
         grid,
         hearing,
+        held_actuator,
         interpreter,
         keeper,
-        orders,
         planning,
         runner,
         running,
         sampling,
         sinks,
+        topic_actuators,
         trusting,
+        wish,
     )
 else:
     __getattr__ = lazy(__name__)

@@ -24,16 +24,16 @@ from teds_provision.errors import (
     StoreFailure,
     TedsProvisionError,
 )
-from teds_provision.measure.actuators import Actuators
 from teds_provision.measure.blocks import Command, NodeReport, State
 from teds_provision.measure.clock import AT_FIRST, Wall
 from teds_provision.measure.finding.buses import Bus, Buses
 from teds_provision.measure.finding.sightings import Sighting
-from teds_provision.measure.orders import Events, Wish
 from teds_provision.measure.planning import BusTime, Plans, plan_node, sensors_of
 from teds_provision.measure.running.common_start import CommonStart
 from teds_provision.measure.running.streams import NodeStreams
+from teds_provision.measure.topic_actuators import TopicActuators
 from teds_provision.measure.trusting import Standing, Trusted, claim, open_trusted
+from teds_provision.measure.wish import Events, Wish
 from teds_provision.protocol.messages.frames import Reason
 from teds_provision.protocol.operation.commands import idle
 from teds_provision.protocol.operation.stream_commands import SOON
@@ -84,7 +84,7 @@ class NodeKeeper:
         self._lost_at = 0.0
         self._sighting: Sighting | None = None  # where it was last
         self._halved = 0
-        self._driven: Actuators | None = None
+        self._driven: TopicActuators | None = None
         self._told = ""
         self._thread = threading.Thread(target=self._run, name=f"node {uuid.hex()[:8]}", daemon=True)
 
@@ -245,8 +245,8 @@ class NodeKeeper:
         for number in [0] if whole else [one.number for one in channels]:
             claim(trusted, number, lease=self._wish.lease)
 
-    def _take_up(self, bus: Bus, trusted: Trusted, actuators: list[Channel], address: int) -> Actuators:
-        return Actuators(
+    def _take_up(self, bus: Bus, trusted: Trusted, actuators: list[Channel], address: int) -> TopicActuators:
+        return TopicActuators(
             trusted,
             functools.partial(bus.drive, address),
             tuple(sorted(one.number for one in actuators)),

@@ -7,8 +7,9 @@ are slowed to what fits, and ``Plans.slowed`` says so.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+import threading
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, field, replace
 
 from teds_provision.errors import BadData, PolicyRefused
 from teds_provision.protocol.operation.budget import BLE_OVERHEAD, MOST_LOAD, bus_load, frames, share
@@ -24,6 +25,7 @@ LONGEST = 10**12  # ns, the contract's
 MILLION = 10**6
 NODE_SHARE = 0.5  # of the node's own budget: room for commands between data frames
 MOST_GAP = 2_000  # µs
+SAYING = 1.0  # seconds that a node waits for the others to say what they want of the bus
 AIR_MESSAGES = 160.0  # notifications a second that an adapter is trusted with, all connections together
 
 
@@ -53,6 +55,58 @@ class BusTime:
     def fd(self) -> bool:
         """Whether data goes in frames of 64 octets."""
         return self.data_bitrate is not None
+
+
+@dataclass
+class BusShare:
+    """How much of a bus this station's streams take; nodes ask for their share one after another.
+
+    ``expected`` are the nodes of the measurement. What those that do not stream yet want (``wanted``; a full part where
+    it is not known) is kept free for them, so that the first node does not take the room of the second.
+    """
+
+    time: BusTime
+    expected: set[bytes] = field(default_factory=set)
+    taken: dict[bytes, float] = field(default_factory=dict)
+    wanted: dict[bytes, float] = field(default_factory=dict)
+    lock: threading.Condition = field(default_factory=threading.Condition)
+
+    def others(self, uuid: bytes, *, sharing: bool = False) -> BusTime:
+        """The bus as one node sees it; ``sharing`` leaves the nodes that are still to come their fair part."""
+        used = sum(load for key, load in self.taken.items() if key != uuid)
+        if sharing:
+            used += self._kept(uuid, MOST_LOAD - used)
+        return replace(self.time, taken=used)
+
+    def want(self, uuid: bytes, load: float) -> None:
+        """Say what a node would take of an empty bus, then wait (:data:`SAYING` at most) for the others to say it."""
+        with self.lock:
+            self.wanted[uuid] = load
+            self.lock.notify_all()
+            self.lock.wait_for(lambda: self.expected <= self.wanted.keys(), SAYING)
+
+    def expect(self, uuids: Iterable[bytes]) -> None:
+        """More nodes are to come."""
+        with self.lock:
+            self.expected.update(uuids)
+
+    def gone(self, uuid: bytes) -> None:
+        """A node that ended for good, or is on another bus, wants nothing any more."""
+        with self.lock:
+            self.expected.discard(uuid)
+            self.wanted.pop(uuid, None)
+            self.lock.notify_all()
+
+    def _kept(self, uuid: bytes, room: float) -> float:
+        """What is kept for others of ``room``: whoever wants less than an equal part gets it, the rest share evenly."""
+        coming = [self.wanted.get(key, MOST_LOAD) for key in self.expected - {uuid} - self.taken.keys()]
+        left, level, kept = room, math.inf, len(coming) + 1
+        for want in sorted([*coming, self.wanted.get(uuid, MOST_LOAD)]):
+            if want > left / kept:
+                level = left / kept
+                break
+            left, kept = left - want, kept - 1
+        return sum(min(want, level) for want in coming)
 
 
 @dataclass(frozen=True)

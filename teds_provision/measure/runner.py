@@ -21,11 +21,11 @@ from teds_provision.measure.clock import Wall
 from teds_provision.measure.finding.buses import Buses
 from teds_provision.measure.grid import Grid
 from teds_provision.measure.keeper import NodeKeeper
-from teds_provision.measure.orders import Events, Wish
 from teds_provision.measure.running import trigger
 from teds_provision.measure.running.common_start import CommonStart
 from teds_provision.measure.sinks import Sink
 from teds_provision.measure.trusting import Trusted
+from teds_provision.measure.wish import Events, Wish
 from teds_provision.station.station import Station
 
 BEAT = 0.02  # seconds between rows of the group

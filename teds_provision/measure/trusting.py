@@ -22,6 +22,9 @@ from teds_provision.steps.verify_node import look_in_session
 from teds_provision.talk.conversation import Conversation
 from teds_provision.teds.sheet import Channel, Sheet
 
+LEASE = 10  # seconds that a claim holds without a word of this station
+DEAD_MAN = 1000  # milliseconds without a set point after which an actuator is safe
+
 
 @dataclass(frozen=True)
 class Trusted:

@@ -16,12 +16,11 @@ from typing import Any, Final
 from teds_provision.errors import NodeBusy, NotFound, TedsProvisionError, UsageFailure
 from teds_provision.measure.blocks import ChannelFacts, Command, NodeReport
 from teds_provision.measure.finding.buses import Buses
-from teds_provision.measure.orders import DEAD_MAN
 from teds_provision.measure.planning import period_of, sensors_of
 from teds_provision.measure.runner import Watcher
 from teds_provision.measure.running.job import Job
 from teds_provision.measure.sinks import Sink, open_sink
-from teds_provision.measure.trusting import Trusted
+from teds_provision.measure.trusting import DEAD_MAN, Trusted
 from teds_provision.ncap.live import Live
 from teds_provision.ncap.nodes.looking import as_problem
 from teds_provision.ncap.nodes.roster import Roster

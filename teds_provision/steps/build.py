@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 from teds_provision.errors import BadData, NotFound, PolicyRefused
 from teds_provision.protocol import datasheet
 from teds_provision.station.station import Station
-from teds_provision.steps.order import BuildOrder, Prepared, compose, guard, merged, named_for, own_name, prepare
+from teds_provision.steps.build_order import BuildOrder, Prepared, compose, guard, merged, named_for, own_name, prepare
 from teds_provision.steps.read import Survey
 from teds_provision.steps.sign import known_image, known_node_keys, unsigned_security
 from teds_provision.steps.verify import Known, Verified, verify_image

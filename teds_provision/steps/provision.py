@@ -16,8 +16,8 @@ from teds_provision.protocol.messages.identity import NodeState
 from teds_provision.station.station import Station
 from teds_provision.steps.agree import Agreed, agree
 from teds_provision.steps.build import BuildOrder, Confirm, Proposal, nobody, propose
+from teds_provision.steps.build_order import Prepared, named_for, no_profile, prepare
 from teds_provision.steps.identify import Identified, identify
-from teds_provision.steps.order import Prepared, named_for, no_profile, prepare
 from teds_provision.steps.read import Survey, survey
 from teds_provision.steps.sign import Signed, sign
 from teds_provision.steps.verify import Verified

@@ -16,10 +16,10 @@ from pathlib import Path
 import pytest
 
 import teds_provision.links
-from teds_provision.doctor import doctor
 from teds_provision.doctor import machine as doctor_machine
-from teds_provision.doctor.doctor import CHECKS, Finding, Place, examine, exit_code
+from teds_provision.doctor import registry
 from teds_provision.doctor.links import READERS
+from teds_provision.doctor.registry import CHECKS, Finding, Place, examine, exit_code
 from teds_provision.doctor.station import holds_private_key
 from teds_provision.protocol.keys import SoftwareKey, to_pem
 from teds_provision.store import Draft, Facts, KeyRecord, Marks, NodeRecord, Store, StoreLock, WhitelistEntry
@@ -278,7 +278,7 @@ def test_a_check_that_breaks_is_a_finding_and_the_others_run(place: Place, monke
         yield
 
     list(examine(place))
-    monkeypatch.setitem(doctor.CHECKS, "clock", ("machine", broken))
+    monkeypatch.setitem(registry.CHECKS, "clock", ("machine", broken))
     found = by_name(place)
     assert (found["clock"].result, "fell over" in found["clock"].why) == ("failed", True)
     assert "keys folder" in found

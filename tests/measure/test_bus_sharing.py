@@ -6,8 +6,7 @@ import threading
 
 import pytest
 
-from teds_provision.measure.orders import BusShare
-from teds_provision.measure.planning import BusTime, Plans, plan_node
+from teds_provision.measure.planning import BusShare, BusTime, Plans, plan_node
 from teds_provision.protocol.operation.budget import MOST_LOAD
 from teds_provision.teds.channel import Channel, Kind, SampleForm, Timing
 

@@ -10,8 +10,8 @@ import pytest
 from teds_provision.measure.blocks import NodeReport
 from teds_provision.measure.clock import Wall
 from teds_provision.measure.keeper import NodeKeeper
-from teds_provision.measure.orders import Events, Wish
 from teds_provision.measure.running.common_start import CommonStart
+from teds_provision.measure.wish import Events, Wish
 
 UUID = bytes(range(10))
 

@@ -86,7 +86,7 @@ def measure(
     kept = _asked(group, uuids, [*files, *ros, *filter(None, [mqtt])], wished | {"require": _requirements(require)})
     if group and duration is None:
         kept = _carried_on(app, station, kept)
-    job = measure_room.running.job.Job(station, kept, wish=measure_room.orders.Wish(timeout=links.timeout))
+    job = measure_room.running.job.Job(station, kept, wish=measure_room.wish.Wish(timeout=links.timeout))
     for uuid in uuids:
         station.unlock(uuid)
     _tell_end(app, _run(app, job, links, uuids, duration), job.wish.require)

@@ -215,26 +215,26 @@ def set_value(
         trusted_node(app, station, links, uuid) as trusted,
         ending(stop),
     ):
-        acting = measure.acting.Acting(trusted, channel, unit=unit, dead_man=dead_man)
-        acting.octets_of(value)  # the limits, before anything is claimed
-        station.audit("set", uuid, "begun", channel=channel, value=value, unit=acting.unit.text)
-        with acting:
+        actuator = measure.held_actuator.HeldActuator(trusted, channel, unit=unit, dead_man=dead_man)
+        actuator.octets_of(value)  # the limits, before anything is claimed
+        station.audit("set", uuid, "begun", channel=channel, value=value, unit=actuator.unit.text)
+        with actuator:
             until = None if hold is None else time.monotonic() + hold
             told = False
             while True:
-                applied = acting.apply(value)
+                applied = actuator.apply(value)
                 if not told:
                     told = True
                     app.emit({"applied": applied.as_json()}, f"Channel {channel}: {applied.value:g} {applied.unit}")
-                left = acting.pause if until is None else min(acting.pause, until - time.monotonic())
+                left = actuator.pause if until is None else min(actuator.pause, until - time.monotonic())
                 if left <= 0 or stop.wait(left):
                     break
-    station.audit("set", uuid, "done", channel=channel, safe=acting.safe)
-    if acting.safe is None:
+    station.audit("set", uuid, "done", channel=channel, safe=actuator.safe)
+    if actuator.safe is None:
         raise LinkFailure(
             "The node did not say that its actuator is safe.", hint="Its dead-man brings it there; look: mode UUID."
         )
-    app.emit({"event": "end", "safe": acting.safe}, "safe" if acting.safe else "NOT in its safe state")
+    app.emit({"event": "end", "safe": actuator.safe}, "safe" if actuator.safe else "NOT in its safe state")
 
 
 @contextmanager

@@ -38,7 +38,7 @@ def demo(app: App, *, page: bool, http: str | None) -> None:
         return
     if http is not None:
         raise UsageFailure("--http belongs to --page.", hint="Run: teds-provision demo --page --http 127.0.0.1:8351")
-    done = demo_room.demo.run_demo(reporter_for(app), lambda text: app.note(f"\n{text}"))
+    done = demo_room.story.run_demo(reporter_for(app), lambda text: app.note(f"\n{text}"))
     steps = [{"name": step.name, "result": step.result, "seconds": step.seconds} for step in done.steps]
     app.emit(
         {"uuid": done.uuid.hex(), "steps": steps, "verdict": done.verdict},

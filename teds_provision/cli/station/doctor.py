@@ -19,7 +19,7 @@ from teds_provision.errors import BadData
 if TYPE_CHECKING:
     from rich.console import Console
 
-    from teds_provision.doctor.doctor import Finding
+    from teds_provision.doctor.registry import Finding
 
 _STYLES = {"ok": "green", "warning": "yellow", "failed": "bold red", "skipped": "dim"}
 
@@ -40,13 +40,13 @@ def doctor(app: App, nfc: str | None, can: str | None, ble: str | None) -> None:
     group = root.command
     settings = known_settings(group) if isinstance(group, click.Group) else None
     ask = app.ask_secret if app.has_passphrase else None
-    place = doctor_room.doctor.Place(
+    place = doctor_room.registry.Place(
         app.home, nfc, can, ble, settings=settings, ask=ask, bad_value=partial(_bad_value, app, root)
     )
-    found = list(doctor_room.doctor.examine(place))
+    found = list(doctor_room.registry.examine(place))
     findings = [finding for _, finding in found]
     checks = [{"name": one.name, "result": one.result, "why": one.why, "fix": one.fix} for one in findings]
-    code = doctor_room.doctor.exit_code(found)
+    code = doctor_room.registry.exit_code(found)
     counts = {word: sum(one.result == word for one in findings) for word in _STYLES}
     app.emit({"checks": checks, **counts}, lambda console: _print(console, findings))
     app.note(", ".join(f"{count} {word}" for word, count in counts.items()) + ".")

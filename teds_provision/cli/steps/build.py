@@ -29,7 +29,7 @@ def order_options(function: Function) -> Function:
     def with_order(*args: Any, profile: Any, calibration: Any, no_calibration: bool, name: Any, **rest: Any) -> Any:
         accepted = rest.pop("accept_calibration")
         return function(
-            *args, order=steps.order.BuildOrder(profile, calibration, name, no_calibration, accepted), **rest
+            *args, order=steps.build_order.BuildOrder(profile, calibration, name, no_calibration, accepted), **rest
         )
 
     options = [

@@ -16,8 +16,7 @@ from teds_provision.measure.finding.air import AirHearing, AirLookout, air_time
 from teds_provision.measure.finding.lookout import Lookout
 from teds_provision.measure.finding.sightings import Sighting, Sightings
 from teds_provision.measure.hearing import CanHearing, Hearing
-from teds_provision.measure.orders import BusShare
-from teds_provision.measure.planning import BusTime
+from teds_provision.measure.planning import BusShare, BusTime
 from teds_provision.protocol.messages.ble import LEAST_MTU
 from teds_provision.protocol.operation.can_frames import Assembly, DriveAddress, cut
 

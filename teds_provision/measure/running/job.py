@@ -24,10 +24,10 @@ from pathlib import Path
 from teds_provision.errors import TedsProvisionError
 from teds_provision.measure.blocks import Command, StationFacts
 from teds_provision.measure.finding.buses import Buses
-from teds_provision.measure.orders import Wish
 from teds_provision.measure.runner import Ended, Measurement, Watcher
 from teds_provision.measure.running.requirements import Requirements
 from teds_provision.measure.sinks import CommandTaker, Sink, open_sink
+from teds_provision.measure.wish import Wish
 from teds_provision.protocol.operation.stream_commands import Kind
 from teds_provision.station.measurements import STATION
 from teds_provision.station.station import Station

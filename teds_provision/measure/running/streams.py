@@ -6,6 +6,7 @@ import threading
 import time
 from collections.abc import Callable
 from contextlib import suppress
+from dataclasses import dataclass, replace
 
 from teds_provision.errors import TedsProvisionError
 from teds_provision.measure.blocks import Block
@@ -13,7 +14,6 @@ from teds_provision.measure.clock import ClockMap, Monotone, Wall
 from teds_provision.measure.finding.buses import Bus
 from teds_provision.measure.hearing import HeardStream
 from teds_provision.measure.interpreter import StreamInterpreter
-from teds_provision.measure.orders import StreamTotals
 from teds_provision.measure.trusting import Trusted, ask_clock
 from teds_provision.protocol.operation.stream_commands import Clock, Kind, decode_stopped, stop
 from teds_provision.protocol.operation.subscription import Plan, Receiver
@@ -21,6 +21,39 @@ from teds_provision.talk.conversation import SessionLost
 
 UNSIGNED = "nobody has signed the datasheet: raw values alone"
 SILENT = 2.0  # seconds without a good message, beside three messages' time: then the node is lost
+
+
+@dataclass
+class StreamTotals:
+    """What became of one stream over all its runs."""
+
+    channels: tuple[int, ...]
+    period: float
+    messages: int = 0
+    samples: int = 0
+    lost: int = 0
+    late: int = 0
+    bad: int = 0
+    invalid: int = 0
+    clock_error: float | None = None
+
+    def add(self, heard: HeardStream) -> None:
+        """Count a run."""
+        counts = heard.receiver.counts
+        self.messages += counts.good
+        self.samples += heard.samples
+        self.lost += counts.lost
+        self.late += counts.late + counts.stale + counts.overflow
+        self.bad += counts.bad + counts.junk + counts.future + counts.unasked + heard.wrong_pattern
+        self.invalid += heard.invalid
+        self.clock_error = heard.bound if heard.bound is not None else self.clock_error
+
+    def with_run(self, heard: HeardStream | None) -> StreamTotals:
+        """These totals with those of the run that still goes on; themselves stay as they are."""
+        sums = replace(self)
+        if heard is not None:
+            sums.add(heard)
+        return sums
 
 
 class NodeStreams:

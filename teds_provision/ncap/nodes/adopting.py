@@ -16,8 +16,8 @@ from teds_provision.ncap.nodes.virtual import Virtuals
 from teds_provision.protocol.messages.identity import NodeState
 from teds_provision.station.station import Station
 from teds_provision.steps.agree import agree
+from teds_provision.steps.build_order import BuildOrder
 from teds_provision.steps.identify import identify
-from teds_provision.steps.order import BuildOrder
 from teds_provision.steps.provision import newcomer, provision
 from teds_provision.steps.verify import Verified
 from teds_provision.steps.visits.sheet_file import write_sheet

@@ -16,8 +16,8 @@ from typing import Any, Final
 
 from teds_provision.errors import LinkFailure, NodeBusy, NodeRefused, NoNode, StoreFailure, TedsProvisionError
 from teds_provision.links.ports import Notice
-from teds_provision.measure.acting import DEAD_MAN, Acting
 from teds_provision.measure.blocks import Command
+from teds_provision.measure.held_actuator import HeldActuator
 from teds_provision.measure.trusting import Trusted, open_trusted, require_whitelisted
 from teds_provision.ncap.live import Live
 from teds_provision.ncap.nodes.desk import Desk
@@ -222,7 +222,7 @@ class Holding:
 
     def _hold(self, held: _Held, session: Measured) -> None:
         """Claim, feed until it is let go or nobody asks again, let go."""
-        acting: Acting | None = None
+        actuator: HeldActuator | None = None
         unit: str | None = None
         answered = 0
         self._until_there(held, session)
@@ -235,20 +235,20 @@ class Holding:
                 with session(held.uuid) as trusted:
                     if trusted is None:
                         raise LinkFailure("The node is not there now.", hint="See /nodes.")
-                    if acting is None or order.unit != unit:
-                        acting, unit = _acting(trusted, held.channel, order, claimed=acting is not None), order.unit
-                    applied = acting.apply(order.value)
+                    if actuator is None or order.unit != unit:
+                        actuator, unit = _claimed(trusted, held.channel, order, again=actuator is not None), order.unit
+                    applied = actuator.apply(order.value)
                 answered = order.number
                 with held.news:
                     held.applied, held.answered = applied.as_json(), order.number
                     held.news.notify_all()
                 self._tell(held, safe=False)
-                self._until_news(held, answered, acting.pause)
+                self._until_news(held, answered, actuator.pause)
         finally:
-            if acting is not None:
+            if actuator is not None:
                 with session(held.uuid):
-                    acting.__exit__(None, None, None)
-                held.safe = acting.safe
+                    actuator.__exit__(None, None, None)
+                held.safe = actuator.safe
 
     @staticmethod
     def _until_there(held: _Held, session: Measured) -> None:
@@ -276,13 +276,13 @@ class Holding:
                          channel=held.channel, **facts)  # fmt: skip
 
 
-def _acting(trusted: Trusted, channel: int, order: _Order, *, claimed: bool) -> Acting:
+def _claimed(trusted: Trusted, channel: int, order: _Order, *, again: bool) -> HeldActuator:
     """The actuator, claimed; the limits are looked at before anything is claimed."""
-    acting = Acting(trusted, channel, unit=order.unit, dead_man=DEAD_MAN)
-    acting.octets_of(order.value)
-    if not claimed:
+    actuator = HeldActuator(trusted, channel, unit=order.unit)
+    actuator.octets_of(order.value)
+    if not again:
         try:
-            acting.__enter__()
+            actuator.__enter__()
         except NodeRefused as refusal:
             if refusal.reason != Reason.WRONG_STATE:
                 raise
@@ -291,7 +291,7 @@ def _acting(trusted: Trusted, channel: int, order: _Order, *, claimed: bool) -> 
                 f"Channel {channel} is driven by set points of a topic.",
                 hint="End what publishes them, then ask again.",
             ) from refusal
-    return acting
+    return actuator
 
 
 def _quiet(_notice: Notice) -> None:

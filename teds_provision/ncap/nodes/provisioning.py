@@ -23,8 +23,8 @@ from teds_provision.ncap.nodes.looking import as_problem
 from teds_provision.ncap.nodes.roster import Roster, check_lines
 from teds_provision.protocol.messages.frames import Reason
 from teds_provision.station.station import Station
+from teds_provision.steps.build_order import BuildOrder, prepare
 from teds_provision.steps.identify import Identified
-from teds_provision.steps.order import BuildOrder, prepare
 from teds_provision.steps.provision import Provisioned, provision
 from teds_provision.steps.verify import require_authentic
 from teds_provision.talk.conversation import Conversation, SessionLost

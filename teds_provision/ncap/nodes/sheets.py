@@ -13,8 +13,8 @@ from teds_provision.ncap.nodes.desk import Desk
 from teds_provision.ncap.nodes.roster import Roster, check_lines
 from teds_provision.station.station import Station
 from teds_provision.steps.agree import session_if_keyed
+from teds_provision.steps.build_order import guard
 from teds_provision.steps.identify import identify
-from teds_provision.steps.order import guard
 from teds_provision.steps.read import read_identity, read_image
 from teds_provision.steps.verify import Verified, known_of, session, verify_image
 from teds_provision.steps.visits.sheet_file import SheetPlan, plan_sheet, write_sheet

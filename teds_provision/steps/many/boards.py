@@ -15,12 +15,12 @@ from teds_provision.links import Contact, LinkSettings, Port, open_port
 from teds_provision.protocol.messages.identity import NodeState
 from teds_provision.station.station import Station
 from teds_provision.steps.build import Confirm, nobody, propose
+from teds_provision.steps.build_order import BuildOrder, Prepared, for_several, named_for, prepare
 from teds_provision.steps.identify import Identified, examine
 from teds_provision.steps.many.board import Board, Totals, worse
 from teds_provision.steps.many.progress import Progress, mean_steps
 from teds_provision.steps.many.report import check_report, write_report
 from teds_provision.steps.many.sheet import Row, read_sheet
-from teds_provision.steps.order import BuildOrder, Prepared, for_several, named_for, prepare
 from teds_provision.steps.provision import Accept, Provisioned, provision
 from teds_provision.steps.read import survey
 from teds_provision.steps.write import Low, wait_for_charge

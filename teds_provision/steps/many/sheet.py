@@ -20,7 +20,7 @@ from teds_provision.errors import BadData, TedsProvisionError
 from teds_provision.files import read_limited
 from teds_provision.station.label import read_label
 from teds_provision.station.station import Station
-from teds_provision.steps.order import BuildOrder, Prepared, prepare
+from teds_provision.steps.build_order import BuildOrder, Prepared, prepare
 
 MAX_SHEET_OCTETS: Final = 4 << 20
 MAX_ROWS: Final = 10_000

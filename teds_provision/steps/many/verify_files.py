@@ -16,7 +16,7 @@ from teds_provision.limits import LIMITS
 from teds_provision.station.station import Station
 from teds_provision.steps.judging import Judging, remember
 from teds_provision.steps.verify import Check, Verified, require_authentic, verify_image
-from teds_provision.teds.guard.guard import check_calibration
+from teds_provision.teds.guard.findings import check_calibration
 from teds_provision.teds.image import Image
 
 ENDING: Final = ".json"

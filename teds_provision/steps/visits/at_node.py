@@ -11,7 +11,7 @@ from teds_provision.links import LINKS, LinkSettings
 from teds_provision.station.station import Station
 from teds_provision.steps.address import set_address
 from teds_provision.steps.agree import Agreed, agree
-from teds_provision.steps.order import guard, own_name
+from teds_provision.steps.build_order import guard, own_name
 from teds_provision.steps.read import read_image
 from teds_provision.steps.reset import ResetReceipt, reset_node
 from teds_provision.steps.sign import known_image

@@ -8,7 +8,7 @@ from teds_provision.errors import NotFound
 from teds_provision.links import LinkSettings
 from teds_provision.protocol.datasheet import NodeKeys
 from teds_provision.station.station import Station
-from teds_provision.steps.order import guard
+from teds_provision.steps.build_order import guard
 from teds_provision.steps.read import survey
 from teds_provision.steps.sign import sign
 from teds_provision.steps.visits.visit import at_node

@@ -10,7 +10,7 @@ from teds_provision.errors import NotFound, UsageFailure
 from teds_provision.links import LinkSettings
 from teds_provision.station.station import Station
 from teds_provision.steps.agree import require_session
-from teds_provision.steps.order import guard
+from teds_provision.steps.build_order import guard
 from teds_provision.steps.read import survey
 from teds_provision.steps.sign import Signed, known_image, known_node_keys, sign
 from teds_provision.steps.visits.visit import node_or_image

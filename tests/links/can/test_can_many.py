@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 from teds_provision.doctor import links as doctor
-from teds_provision.doctor.doctor import Place
+from teds_provision.doctor.registry import Place
 from teds_provision.errors import LinkFailure, UsageFailure
 from teds_provision.links import LINKS, LinkSettings, Notice, open_place, open_port
 from teds_provision.links.can.bus import Bus, Frame

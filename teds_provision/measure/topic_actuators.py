@@ -21,10 +21,9 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from teds_provision.errors import LinkFailure, NodeRefused, TedsProvisionError
-from teds_provision.measure.acting import LEASE
 from teds_provision.measure.blocks import Block, Command
 from teds_provision.measure.clock import ClockMap
-from teds_provision.measure.trusting import Trusted, claim
+from teds_provision.measure.trusting import LEASE, Trusted, claim
 from teds_provision.protocol.messages.frames import Reason
 from teds_provision.protocol.operation.commands import write_data_set
 from teds_provision.protocol.operation.datagram import Layout
@@ -54,7 +53,7 @@ class _Actuator:
         return full and self.came[-1] - self.came[0] < (WATCHED - 1) / DRIVE_ABOVE
 
 
-class Actuators:
+class TopicActuators:
     """The actuators of one node in one session. ``take`` returns at once; the newest set point of each counts."""
 
     def __init__(

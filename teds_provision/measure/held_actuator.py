@@ -1,6 +1,6 @@
 """Operating one actuator: a set point, kept alive by the loop that computes it, and the safe state at the end.
 
-The dead-man (operation.md section 2) is fed only by :meth:`Acting.apply`, which sends a value. No thread keeps it
+The dead-man (operation.md section 2) is fed only by :meth:`HeldActuator.apply`, which sends a value. No thread keeps it
 alive: whatever dies, the node brings its actuator to its safe state within the dead-man. A value that nobody answers
 is sent again after a quarter and a half of the dead-man, and given up at its end.
 """
@@ -16,15 +16,12 @@ import numpy as np
 
 from teds_provision.errors import BadData, LinkFailure, PolicyRefused, TedsProvisionError
 from teds_provision.measure.sinks.lines import plain
-from teds_provision.measure.trusting import Trusted, claim, operation
+from teds_provision.measure.trusting import DEAD_MAN, LEASE, Trusted, claim, operation
 from teds_provision.protocol.operation.commands import ChannelState, idle, write_data_set
 from teds_provision.talk.conversation import SessionLost
 from teds_provision.teds.calibration.interpreter import ChannelInterpreter
 from teds_provision.teds.sheet import Channel
 from teds_provision.teds.units.units import WrittenUnit, parse_unit
-
-LEASE = 10  # seconds
-DEAD_MAN = 1000  # milliseconds
 
 
 @dataclass(frozen=True)
@@ -55,8 +52,8 @@ def unit_for(channel: Channel, text: str | None) -> WrittenUnit:
     return unit
 
 
-class Acting:
-    """One claimed actuator: ``with Acting(…) as acting: acting.apply(value)`` again and again; let go at the end."""
+class HeldActuator:
+    """One claimed actuator: ``with HeldActuator(…) as hand: hand.apply(value)`` again and again; let go at the end."""
 
     def __init__(self, trusted: Trusted, number: int, *, unit: str | None = None, dead_man: int = DEAD_MAN) -> None:
         channel = trusted.channel(number)
@@ -78,7 +75,7 @@ class Acting:
             raise PolicyRefused(beyond, hint="The limits of the signed datasheet are kept.")
         return one.encode(own)
 
-    def __enter__(self) -> Acting:
+    def __enter__(self) -> HeldActuator:
         claim(self._trusted, self.channel.number, lease=LEASE, dead_man=self._dead_man)
         return self
 
