@@ -14,15 +14,7 @@ import pytest
 
 from teds_provision import files
 from teds_provision.errors import BadData, NotFound, StoreFailure, UsageFailure, VaultFailure
-from teds_provision.files import (
-    SHARED,
-    holds,
-    private_folder,
-    read_limited,
-    whole_file,
-    write_new,
-    write_whole,
-)
+from teds_provision.files import SHARED, holds, private_folder, read_limited, whole_file, write_new, write_whole
 
 
 def names(folder: Path) -> list[str]:

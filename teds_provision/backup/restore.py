@@ -12,26 +12,12 @@ from pathlib import Path
 
 from teds_provision.backup.content import Content
 from teds_provision.backup.merge import Merge
-from teds_provision.errors import (
-    NotAuthentic,
-    PolicyRefused,
-    StoreFailure,
-    UsageFailure,
-    VaultFailure,
-    WrongPassphrase,
-)
+from teds_provision.errors import NotAuthentic, PolicyRefused, StoreFailure, UsageFailure, VaultFailure, WrongPassphrase
 from teds_provision.protocol.keys import fingerprint
 from teds_provision.station.node_keys import RESTORED
 from teds_provision.station.station import Station
 from teds_provision.store import Store, StoreLock
-from teds_provision.store.snapshot import (
-    Relation,
-    is_damage,
-    place,
-    relation,
-    set_aside,
-    totals,
-)
+from teds_provision.store.snapshot import Relation, is_damage, place, relation, set_aside, totals
 from teds_provision.vault import Ask, Vault, create_vault, node_key_context, open_vault
 from teds_provision.vault.passphrase import PRODUCT, Costs
 

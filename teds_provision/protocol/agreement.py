@@ -16,14 +16,7 @@ from cryptography.hazmat.primitives.kdf.hkdf import HKDF
 
 from teds_provision.errors import BadData, Garbled, NotAuthentic, OtherKey, PolicyRefused
 from teds_provision.protocol.fingerprints import same_key
-from teds_provision.protocol.keys import (
-    PrivateKey,
-    SoftwareKey,
-    fingerprint,
-    is_point,
-    node_key_good,
-    public_key,
-)
+from teds_provision.protocol.keys import PrivateKey, SoftwareKey, fingerprint, is_point, node_key_good, public_key
 from teds_provision.protocol.messages.frames import Command, Function, security_command
 from teds_provision.teds.codec import security
 

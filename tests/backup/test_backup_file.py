@@ -14,29 +14,12 @@ import pytest
 from teds_provision.backup import sealed_file as backup_file
 from teds_provision.backup.restore import open_present
 from teds_provision.backup.sealed_file import SealedFile, Sealer
-from teds_provision.errors import (
-    BadData,
-    NotAuthentic,
-    PolicyRefused,
-    WrongPassphrase,
-)
+from teds_provision.errors import BadData, NotAuthentic, PolicyRefused, WrongPassphrase
 from teds_provision.protocol.keys import SoftwareKey
 from teds_provision.station.station import Station
-from teds_provision.store import (
-    NodeRecord,
-    Store,
-)
+from teds_provision.store import NodeRecord, Store
 from teds_provision.store import dump as rows
-from tests.backup.backups import (
-    ONE,
-    POINT,
-    TWO,
-    back_up,
-    copy_of,
-    opened,
-    opened_octets,
-    restored_into,
-)
+from tests.backup.backups import ONE, POINT, TWO, back_up, copy_of, opened, opened_octets, restored_into
 
 
 def test_the_file_is_private_whole_and_tells_nothing_secret(station: Station, tmp_path: Path) -> None:

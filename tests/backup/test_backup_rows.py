@@ -14,33 +14,16 @@ from hypothesis import strategies as st
 from teds_provision.backup.chunks import CHUNK_OCTETS, ChunkReader, ChunkWriter
 from teds_provision.backup.restore import merge_sealed, rebuild
 from teds_provision.backup.sealed_file import SealedFile
-from teds_provision.errors import (
-    BadData,
-    NotAuthentic,
-    StoreFailure,
-    WrongPassphrase,
-)
+from teds_provision.errors import BadData, NotAuthentic, StoreFailure, WrongPassphrase
 from teds_provision.protocol.keys import SoftwareKey
 from teds_provision.station.station import Station
-from teds_provision.store import (
-    Draft,
-    WhitelistEntry,
-)
+from teds_provision.store import Draft, WhitelistEntry
 from teds_provision.store import dump as rows
 from teds_provision.store.schema import SCHEMA_VERSION
 from teds_provision.teds.image import Image
 from teds_provision.vault import forget_vaults
 from teds_provision.vault.passphrase import THROWAWAY
-from tests.backup.backups import (
-    FIXTURES,
-    SEALED,
-    TWO,
-    ask,
-    back_up,
-    keys_of,
-    opened,
-    opened_octets,
-)
+from tests.backup.backups import FIXTURES, SEALED, TWO, ask, back_up, keys_of, opened, opened_octets
 
 
 def test_a_store_of_several_chunks_goes_out_and_comes_back(station: Station, tmp_path: Path) -> None:

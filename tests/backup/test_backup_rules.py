@@ -13,27 +13,11 @@ import pytest
 from teds_provision.backup.backup import backup
 from teds_provision.backup.content import Head
 from teds_provision.backup.restore import rebuild
-from teds_provision.errors import (
-    PolicyRefused,
-    StoreFailure,
-    StoreLocked,
-    UsageFailure,
-)
+from teds_provision.errors import PolicyRefused, StoreFailure, StoreLocked, UsageFailure
 from teds_provision.station.station import Station
-from teds_provision.store import (
-    StoreLock,
-)
+from teds_provision.store import StoreLock
 from teds_provision.vault.passphrase import THROWAWAY
-from tests.backup.backups import (
-    ONE,
-    POINT,
-    TWO,
-    ask,
-    back_up,
-    copy_of,
-    opened,
-    restored_into,
-)
+from tests.backup.backups import ONE, POINT, TWO, ask, back_up, copy_of, opened, restored_into
 
 
 def test_after_a_restore_every_key_has_to_be_rotated_by_a_person(station: Station, tmp_path: Path) -> None:

@@ -8,27 +8,12 @@ from pathlib import Path
 import pytest
 
 from teds_provision.backup.restore import open_present
-from teds_provision.errors import (
-    NotFound,
-    StoreFailure,
-)
+from teds_provision.errors import NotFound, StoreFailure
 from teds_provision.station.station import Station
-from teds_provision.store import (
-    Store,
-)
+from teds_provision.store import Store
 from teds_provision.store.snapshot import place
 from teds_provision.vault import forget_vaults
-from tests.backup.backups import (
-    ONE,
-    POINT,
-    TWO,
-    ask,
-    back_up,
-    copy_of,
-    keys_of,
-    opened,
-    restored_into,
-)
+from tests.backup.backups import ONE, POINT, TWO, ask, back_up, copy_of, keys_of, opened, restored_into
 
 
 def test_an_empty_home_becomes_the_station_again(station: Station, tmp_path: Path) -> None:

@@ -11,38 +11,15 @@ import pytest
 
 from teds_provision.backup.backup import backup
 from teds_provision.backup.restore import complete_vault, merge, open_present, rebuild
-from teds_provision.errors import (
-    PolicyRefused,
-    UsageFailure,
-    VaultFailure,
-)
+from teds_provision.errors import PolicyRefused, UsageFailure, VaultFailure
 from teds_provision.protocol.keys import SoftwareKey
 from teds_provision.station.station import Station, initialise
-from teds_provision.store import (
-    Holder,
-    NodeRecord,
-    Revocation,
-    Store,
-    Tombstone,
-    WhitelistEntry,
-)
+from teds_provision.store import Holder, NodeRecord, Revocation, Store, Tombstone, WhitelistEntry
 from teds_provision.store.snapshot import Relation, place
 from teds_provision.vault import forget_vaults
 from teds_provision.vault.passphrase import THROWAWAY
 from teds_provision.vault.software import SoftwareVault
-from tests.backup.backups import (
-    NEW,
-    ONE,
-    POINT,
-    SEALED,
-    TWO,
-    add_key,
-    ask,
-    back_up,
-    copy_of,
-    keys_of,
-    opened,
-)
+from tests.backup.backups import NEW, ONE, POINT, SEALED, TWO, add_key, ask, back_up, copy_of, keys_of, opened
 
 from ..bench import make_station
 from ..vault.softhsm import PIN, loaded, unload

@@ -17,16 +17,7 @@ from pathlib import Path
 
 import pytest
 
-from teds_provision.store import (
-    Group,
-    Holder,
-    KeyRecord,
-    NodeRecord,
-    Revocation,
-    Store,
-    Tombstone,
-    WhitelistEntry,
-)
+from teds_provision.store import Group, Holder, KeyRecord, NodeRecord, Revocation, Store, Tombstone, WhitelistEntry
 
 from .shell import call, clean_environment
 

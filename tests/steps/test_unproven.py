@@ -15,14 +15,7 @@ import pytest
 from teds_provision.errors import AddressConflict, NodeRefused, NotAuthentic, PolicyRefused, Unproven
 from teds_provision.links import Contact, LinkSettings, Notice
 from teds_provision.links.ports import CAN, Capabilities
-from teds_provision.protocol.messages.frames import (
-    COMMON,
-    Function,
-    Reason,
-    Reply,
-    refusal,
-    security_command,
-)
+from teds_provision.protocol.messages.frames import COMMON, Function, Reason, Reply, refusal, security_command
 from teds_provision.protocol.messages.identity import Identity, NodeState
 from teds_provision.station.station import Station
 from teds_provision.steps.agree import require_session

@@ -9,15 +9,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Final
 
-from teds_provision.protocol.messages.frames import (
-    COMMON,
-    SECURITY,
-    Command,
-    Function,
-    Reason,
-    Refused,
-    TedsFunction,
-)
+from teds_provision.protocol.messages.frames import COMMON, SECURITY, Command, Function, Reason, Refused, TedsFunction
 from teds_provision.protocol.operation.role import OperationRole
 from teds_provision.protocol.session import OPEN_OCTETS
 from teds_provision.protocol.tim.origin import Origin

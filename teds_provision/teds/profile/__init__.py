@@ -15,13 +15,7 @@ from teds_provision.teds.profile.load import (
     passed_over,
     shipped_profiles,
 )
-from teds_provision.teds.profile.model import (
-    BuiltDatasheet,
-    CalibrationDemand,
-    ChannelProfile,
-    Profile,
-    TextProfile,
-)
+from teds_provision.teds.profile.model import BuiltDatasheet, CalibrationDemand, ChannelProfile, Profile, TextProfile
 from teds_provision.teds.profile.reader import Problem
 from teds_provision.teds.profile.template import template
 

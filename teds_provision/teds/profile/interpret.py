@@ -6,18 +6,8 @@ from typing import Final
 
 from teds_provision.teds.codec.codes import AccessCode
 from teds_provision.teds.profile.channels import channels_of
-from teds_provision.teds.profile.keys import (
-    META_GROUPS,
-    META_KEYS,
-    PHY_KEYS,
-    Key,
-    Kind,
-)
-from teds_provision.teds.profile.model import (
-    Pairs,
-    Profile,
-    TextProfile,
-)
+from teds_provision.teds.profile.keys import META_GROUPS, META_KEYS, PHY_KEYS, Key, Kind
+from teds_provision.teds.profile.model import Pairs, Profile, TextProfile
 from teds_provision.teds.profile.reader import Problems, Section
 from teds_provision.teds.profile.source import Table
 

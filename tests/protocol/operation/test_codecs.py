@@ -27,14 +27,7 @@ from teds_provision.protocol.operation.can_frames import (
     trigger_identifier,
     trigger_station,
 )
-from teds_provision.protocol.operation.commands import (
-    ChannelState,
-    Operate,
-    Operation,
-    Power,
-    Sampled,
-    decode_data_set,
-)
+from teds_provision.protocol.operation.commands import ChannelState, Operate, Operation, Power, Sampled, decode_data_set
 from teds_provision.protocol.operation.datagram import DriveValues, Layout, Sealer, drive_length, pattern
 from teds_provision.protocol.operation.hardware import Port, port_of
 from teds_provision.protocol.operation.stream_commands import (

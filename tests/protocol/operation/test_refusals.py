@@ -17,16 +17,7 @@ from teds_provision.protocol.operation.commands import (
     write_data_set,
 )
 from teds_provision.protocol.operation.hardware import Port
-from teds_provision.protocol.operation.stream_commands import (
-    CLOCK,
-    WAITS,
-    Action,
-    Arm,
-    Kind,
-    Subscribe,
-    drive,
-    stop,
-)
+from teds_provision.protocol.operation.stream_commands import CLOCK, WAITS, Action, Arm, Kind, Subscribe, drive, stop
 
 from .bench import DIGEST, MS, SECOND, Bench, channel_teds, channels
 

@@ -11,13 +11,7 @@ from functools import cache
 from teds_provision.teds.codec.codes import MANUFACTURER, ONLY_2024, TEXT_BASED, AccessCode
 from teds_provision.teds.codec.tables import phy_text_security, standard
 from teds_provision.teds.codec.tables.calibration import calibration_table
-from teds_provision.teds.codec.tables.field_spec import (
-    NAMES,
-    OCTETS,
-    FieldSpec,
-    Table,
-    name_of,
-)
+from teds_provision.teds.codec.tables.field_spec import NAMES, OCTETS, FieldSpec, Table, name_of
 
 __all__ = ["MANUFACTURER", "NAMES", "OCTETS", "ONLY_2024", "TEXT_BASED", "FieldSpec", "Table", "name_of", "table"]
 
