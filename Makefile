@@ -32,9 +32,12 @@ types: $(VENV)/.dev
 	$(BIN)/mypy
 
 # One more than cores: almost half of the time that a test takes is waiting for a node, a reader, a lock.
+# What holds a rule about time then runs alone.
 WORKERS ?= 3
+USUAL := not soak and not machine
 unit: $(VENV)/.dev
-	$(BIN)/python -m pytest -n $(WORKERS) --dist worksteal -rs
+	$(BIN)/python -m pytest -n $(WORKERS) --dist worksteal -rs -m '$(USUAL) and not realtime'
+	$(BIN)/python -m pytest -rsR -m '$(USUAL) and realtime'
 
 # The inner loop: the rooms without a link or a process, the rules of the house, one case of each link, one provisioning
 # by command. CONTRIBUTING.md says what that leaves out.

@@ -11,6 +11,9 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
+from teds_provision.protocol.announce import default_can_address
+
+OF_NODES = range(2, 60)  # CAN addresses of nodes that a test makes; what it puts beside them, it puts elsewhere
 _OF_OURS = range(10_000, 32_000)  # below those that the system deals out to others a moment later
 _dice = random.SystemRandom()
 
@@ -44,6 +47,19 @@ def free_group() -> str:
 def free_bus() -> str:
     """A CAN bus over multicast that nobody else is on."""
     return f"udp_multicast:{free_group()}?port={free_udp_port()}"
+
+
+def new_uuid(taken: set[int]) -> bytes:
+    """A random UUID whose default CAN address lies in ``OF_NODES`` and is not ``taken``; it is from now on.
+
+    A node's default address follows from its UUID, so two random ones in 239 share it, or meet a stranger of the test.
+    """
+    while True:
+        uuid = os.urandom(10)
+        address = default_can_address(uuid)
+        if address in OF_NODES and address not in taken:
+            taken.add(address)
+            return uuid
 
 
 def free_reader() -> str:

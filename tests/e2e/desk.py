@@ -20,7 +20,7 @@ from teds_provision.store import Store
 from tests.bench import PASSPHRASE
 from tests.cli.shell import PROGRAM, ROOT, Outcome, begin
 from tests.pace import PATIENCE, until
-from tests.places import free_bus, free_reader
+from tests.places import free_bus, free_reader, new_uuid
 
 ANGLE = "magnetic-angular-position-sensor"
 FINGER = "tactile-finger-sensor"
@@ -137,6 +137,7 @@ class Desk:
         self.prepared = prepared
         self.links = Links()
         self.running: list[Running] = []
+        self._addresses: set[int] = set()  # of its nodes
 
     def start(self, *words: object, **more: Any) -> Running:
         """Start the program."""
@@ -145,8 +146,8 @@ class Desk:
 
     def clear(self) -> None:
         """End all that runs."""
-        for process in self.running:
-            process.close()
+        while self.running:
+            self.running.pop().close()
 
     def station(self, name: str = "bench") -> Station:
         """A station with keys of its own, prepared once and copied for each test."""
@@ -156,7 +157,7 @@ class Desk:
 
     def node(self, name: str = "node", *, uuid: str | None = None, called: str = "") -> Node:
         """A new node in factory state, made in this process: what the command does is in tests/node."""
-        made = create(self.folder / name, uuid=bytes.fromhex(uuid) if uuid else None, name=called)
+        made = create(self.folder / name, uuid=bytes.fromhex(uuid) if uuid else new_uuid(self._addresses), name=called)
         made.release()
         return Node(self, self.folder / name, made.load().uuid.hex())
 

@@ -22,6 +22,7 @@ from teds_provision.talk.progress import Silent
 from tests.bench import make_station, on_reader
 from tests.e2e.desk import ANGLE, Desk, Running
 from tests.e2e.desk import Station as Commands
+from tests.places import new_uuid
 
 CALIBRATIONS = {
     ANGLE: "# date: 2026-10-01\nraw,value [degree]\n0,0\n65535,359.9\n",
@@ -30,10 +31,10 @@ CALIBRATIONS = {
 FAULTY = (sys.executable, "-m", "tests.measure.faulty_node")
 
 
-def provisioned(station: Station, folder: Path, type_: str, name: str) -> str:
+def provisioned(station: Station, folder: Path, type_: str, name: str, uuid: bytes | None = None) -> str:
     """Make a node of this type, and provision it; its UUID. ``keyed:TYPE`` gets a key, and no datasheet is signed."""
     keyed, type_ = type_.startswith("keyed:"), type_.removeprefix("keyed:")
-    create(folder, name=name, profile=type_)
+    create(folder, uuid=uuid, name=name, profile=type_)
     node = VirtualNode(folder)
     calibration = folder / "calibration.csv"
     calibration.write_text(CALIBRATIONS[type_])
@@ -94,9 +95,10 @@ class Hall:
         self.desk = Desk(self.folder, prepared)
         self.can = f"{self.desk.links.can}&fd=1"
         with_keys = make_station(prepared / "bench", "bench")
+        addresses: set[int] = set()
         try:
             for name, type_ in self.types.items():
-                uuid = provisioned(with_keys, self.folder / name, type_, name)
+                uuid = provisioned(with_keys, self.folder / name, type_, name, new_uuid(addresses))
                 self.nodes[name] = Placed(self, self.folder / name, uuid)
         finally:
             with_keys.close()
