@@ -71,6 +71,20 @@ def unmeasured_environment() -> dict[str, str]:
     return {name: value for name, value in clean_environment().items() if not name.startswith("COVERAGE_")}
 
 
+def python(code: str, *words: str, **variables: str) -> Outcome:
+    """Run code in a Python of its own, which coverage does not measure; fails where the code does."""
+    done = subprocess.run(
+        [sys.executable, "-c", code, *words],
+        stdin=subprocess.DEVNULL,
+        capture_output=True,
+        text=True,
+        timeout=60,
+        check=True,
+        env=unmeasured_environment() | variables,
+    )
+    return Outcome(done.returncode, done.stdout, done.stderr)
+
+
 @functools.cache
 def zygote() -> Zygote:
     """The zygote of this test process: made at the first need, ended with it."""

@@ -5,9 +5,7 @@ from __future__ import annotations
 import importlib.util
 import json
 import os
-import pty
 import re
-import select
 import signal
 import subprocess
 import sys
@@ -19,48 +17,13 @@ import pytest
 from teds_provision import __version__
 from teds_provision.cli.table import COMMANDS, GROUPS
 from tests.bench import PASSPHRASE
+from tests.terminal import on_terminal
 
-from .shell import Outcome, call, clean_environment, spawn, unmeasured_environment
+from .shell import Outcome, call, clean_environment, python, spawn
 
 ONE = "8d4d9da65281f7000000"
 PRESENT = [name for name, entry in COMMANDS.items() if importlib.util.find_spec(f"teds_provision.cli.{entry.module}")]
 HEAVY = ("nfc", "can", "isotp", "keyring", "rich", "cryptography", "pint", "numpy", "matplotlib", "pkcs11", "sqlite3")
-
-
-def on_terminal(
-    home: Path,
-    *words: object,
-    answers: bytes = b"",
-    passphrase: str | None = None,
-    environment: dict[str, str] | None = None,
-) -> tuple[int, str, str]:
-    """Run with a terminal as stdin, stdout and stderr in pipes; returns exit code, stdout and stderr."""
-    master, terminal = pty.openpty()
-    read, write = os.pipe()
-    os.write(write, (passphrase or "").encode() + b"\n")
-    os.close(write)
-    given = ["--passphrase-fd", str(read)] if passphrase is not None else []
-    process = subprocess.Popen(
-        [sys.executable, "-m", "teds_provision", "--home", str(home), *given, *map(str, words)],
-        stdin=terminal,
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        env=environment or clean_environment(),
-        start_new_session=True,
-        pass_fds=(read,),
-    )
-    os.close(read)
-    os.close(terminal)
-    try:
-        if answers:
-            assert process.stderr is not None
-            assert select.select([process.stderr], [], [], 30)[0], "nothing was asked"
-            os.write(master, answers)
-        out, err = process.communicate(timeout=60)
-    finally:
-        process.kill()
-        os.close(master)
-    return process.returncode, out.decode(), err.decode()
 
 
 # -- help --------------------------------------------------------------------------------------------------------------
@@ -75,10 +38,9 @@ def test_help_and_version_load_nothing_heavy(words: list[str]) -> None:
         "except SystemExit: pass\n"
         f"print([name for name in {HEAVY!r} if name in sys.modules], file=sys.stderr)"
     )
-    command, quiet = [sys.executable, "-c", code, *words], unmeasured_environment()
-    done = subprocess.run(command, capture_output=True, text=True, check=True, timeout=60, env=quiet)
-    assert done.stderr.strip() == "[]"
-    assert done.stdout
+    done = python(code, *words)
+    assert done.err.strip() == "[]"
+    assert done.out
 
 
 def test_version_is_told() -> None:
@@ -284,57 +246,30 @@ def test_a_config_that_is_no_toml_is_bad_data(home: Path) -> None:
 
 def test_a_question_can_be_answered_on_a_terminal(home: Path) -> None:
     call(home, "whitelist", "add", ONE)
-    code, _, err = on_terminal(home, "whitelist", "remove", ONE, answers=b"n\n")
-    assert (code, "[y/N]" in err, "You said no" in err) == (6, True, True)
-    code, out, _ = on_terminal(home, "whitelist", "remove", ONE, answers=b"y\n", passphrase=PASSPHRASE)
-    assert (code, "is off the whitelist" in out) == (0, True)
+    words = ("whitelist", "remove", ONE)
+    told = on_terminal(home, *words, streams=["stdin"], answers=["n"])
+    assert (told.code, "[y/N]" in told.err, "You said no" in told.err) == (6, True, True)
+    told = on_terminal(home, *words, streams=["stdin"], answers=["y"], passphrase=PASSPHRASE)
+    assert (told.code, "is off the whitelist" in told.out) == (0, True)
 
 
 @pytest.mark.parametrize("words", [["--no-input"], ["--json"]])
 def test_no_input_and_json_never_ask(home: Path, words: list[str]) -> None:
     call(home, "whitelist", "add", ONE)
-    code, out, err = on_terminal(home, *words, "whitelist", "remove", ONE)
-    assert code == 6
-    assert "--yes" in out + err
-    code, out, err = on_terminal(home, *words, "backup", home / "b")
-    assert code == 7
-    assert "--passphrase-fd" in out + err
+    told = on_terminal(home, *words, "whitelist", "remove", ONE, streams=["stdin"])
+    assert told.code == 6
+    assert "--yes" in told.out + told.err
+    told = on_terminal(home, *words, "backup", home / "b", streams=["stdin"])
+    assert told.code == 7
+    assert "--passphrase-fd" in told.out + told.err
 
 
 def test_a_passphrase_that_is_typed_is_not_shown(home: Path, tmp_path: Path) -> None:
-    from tests.bench import PASSPHRASE
-
-    master, terminal = pty.openpty()
-    process = subprocess.Popen(
-        [sys.executable, "-m", "teds_provision", "--home", str(home), "backup", str(tmp_path / "b")],
-        stdin=terminal,
-        stdout=terminal,
-        stderr=terminal,
-        env=clean_environment(),
-        start_new_session=True,
-    )
-    os.close(terminal)
-    shown, answered = b"", 0
-    answers = [PASSPHRASE, "the words of the backup", "the words of the backup"]
-    try:
-        until = time.monotonic() + 40
-        while process.poll() is None and time.monotonic() < until:
-            if select.select([master], [], [], 0.2)[0]:
-                try:
-                    shown += os.read(master, 4096)
-                except OSError:
-                    break
-                # a new prompt: the line break after an answer is none, and what is typed before a prompt is thrown away
-                if answers and shown[answered:].strip().endswith(b":"):
-                    os.write(master, answers.pop(0).encode() + b"\n")
-                    answered = len(shown)
-        process.wait(60)
-    finally:
-        process.kill()
-        os.close(master)
-    assert process.returncode == 0, shown
-    assert PASSPHRASE.encode() not in shown
-    assert b"the words of the backup" not in shown
+    words = "the words of the backup"
+    told = on_terminal(home, "backup", tmp_path / "b", answers=[PASSPHRASE, words, words])
+    assert told.code == 0, told
+    assert PASSPHRASE not in told.screen
+    assert words not in told.screen
 
 
 @pytest.mark.parametrize(("line", "code"), [(b"", "wrong-passphrase"), (b"\n", "wrong-passphrase")])

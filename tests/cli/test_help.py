@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import shlex
-import subprocess
-import sys
 from collections.abc import Iterator
 from contextlib import ExitStack
 
@@ -14,7 +12,7 @@ import pytest
 from teds_provision.cli.main import cli
 from teds_provision.cli.table import COMMANDS, GROUPS
 
-from .shell import clean_environment, spawn, unmeasured_environment
+from .shell import clean_environment, python, spawn
 
 HEAVY = ("nfc", "can", "isotp", "keyring", "rich", "cryptography", "pint", "numpy", "matplotlib", "pkcs11", "sqlite3")
 PROGRAM = "teds-provision"
@@ -120,16 +118,9 @@ def test_the_help_of_no_command_loads_anything_heavy() -> None:
         "    assert run([*words, '--help']) == 0, words\n"
         f"print([name for name in {HEAVY!r} if name in sys.modules], file=sys.stderr)\n"
     )
-    done = subprocess.run(
-        [sys.executable, "-c", code],
-        capture_output=True,
-        text=True,
-        check=True,
-        timeout=60,
-        env=unmeasured_environment(),
-    )
-    assert done.stderr.strip() == "[]"
-    assert done.stdout.count("Usage: ") == len(ALL)
+    done = python(code)
+    assert done.err.strip() == "[]"
+    assert done.out.count("Usage: ") == len(ALL)
 
 
 @pytest.mark.parametrize(("words", "path"), [([], PROGRAM), (["trust"], f"{PROGRAM} trust")], ids=["none", "group"])

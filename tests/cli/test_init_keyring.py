@@ -32,14 +32,7 @@ WORDS = "four random words here"
 
 @pytest.fixture
 def session(tmp_path: Path) -> Session:
-    import shutil
-
-    for program in ("dbus-run-session", "gnome-keyring-daemon"):
-        if shutil.which(program) is None:
-            pytest.skip(f"{program} is missing: scripts/install-test-packages installs it")
-    home = tmp_path / "user"
-    home.mkdir(mode=0o700)
-    made = Session(home)
+    made = Session.of_user(tmp_path / "user")
     made.environment["PYTHONPATH"] = str(Path(__file__).parents[2])
     return made
 

@@ -2,16 +2,11 @@
 
 from __future__ import annotations
 
-import fcntl
 import json
-import os
-import pty
 import signal
 import sqlite3
-import struct
 import subprocess
 import sys
-import termios
 import time
 from contextlib import closing
 from datetime import datetime
@@ -21,6 +16,7 @@ from zoneinfo import ZoneInfo
 import pytest
 
 from teds_provision.store import Store
+from tests.terminal import on_terminal
 
 from .shell import call, clean_environment
 
@@ -157,22 +153,9 @@ def test_times_are_shown_in_local_time_with_offset(home: Path, monkeypatch: pyte
 
 def test_a_terminal_of_80_columns_cuts_nothing_off(home: Path) -> None:
     call(home, "whitelist", "add", ONE, "--name", "a rather long name of a finger", "--fingerprint", "ab" * 32)
-    ours, theirs = pty.openpty()
-    fcntl.ioctl(theirs, termios.TIOCSWINSZ, struct.pack("HHHH", 24, 80, 0, 0))
-    with subprocess.Popen(
-        [sys.executable, "-m", "teds_provision", "--home", str(home), "log"],
-        stdin=theirs, stdout=theirs, stderr=subprocess.DEVNULL, env=clean_environment(TERM="xterm"),
-    ) as process:  # fmt: skip
-        os.close(theirs)
-        said = b""
-        while True:
-            try:
-                said += os.read(ours, 4096)
-            except OSError:
-                break
-        assert process.wait(60) == 0
-    os.close(ours)
-    lines = said.decode().splitlines()
+    told = on_terminal(home, "log", columns=80, environment=clean_environment(TERM="xterm"))
+    assert told.code == 0
+    lines = told.screen.splitlines()
     assert max(map(len, lines)) <= 80
     assert any(ONE in line and "whitelist" in line and "added" in line for line in lines)
-    assert "assurance" in said.decode()
+    assert "assurance" in told.screen

@@ -3,23 +3,16 @@
 from __future__ import annotations
 
 import csv
-import fcntl
 import json
-import os
-import pty
-import struct
-import subprocess
-import sys
-import termios
-from contextlib import suppress
 from datetime import date
 from pathlib import Path
 
 import pytest
 
 from teds_provision.store import Group, Holder, KeyRecord, NodeRecord, Revocation, Store, Tombstone, WhitelistEntry
+from tests.terminal import on_terminal
 
-from .shell import call, clean_environment
+from .shell import call, python
 
 ONE, TWO = bytes.fromhex("8d4d9da65281f7000000"), bytes.fromhex("8d4e9da65281f7000001")
 POINT = bytes.fromhex("04") + bytes(range(64))
@@ -172,9 +165,9 @@ def test_due_counts_days_from_today_and_what_is_overdue(fleet: Path) -> None:
 
 def test_a_narrow_terminal_drops_columns_and_never_a_digit(fleet: Path) -> None:
     for columns in (80, 60, 40, 24):
-        code, out, _ = on_terminal_of(fleet, columns, "nodes")
-        assert code == 0
-        lines = out.splitlines()
+        told = on_terminal(fleet, "nodes", columns=columns)
+        assert told.code == 0
+        lines = told.screen.splitlines()
         assert all(len(line) <= columns for line in lines)
         assert sum(("aa" * 10) in line for line in lines) == 1, columns
         assert ("remarks" in lines[0]) == (columns >= 80), lines[0]
@@ -200,22 +193,4 @@ def test_listing_loads_no_cryptography_and_decodes_no_teds(home: Path) -> None:
         f"for words in (['nodes'], ['log', '--last', '1']): run(['--home', {str(home)!r}, *words])\n"
         f"print([name for name in {heavy!r} if name in sys.modules])"
     )
-    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True, timeout=60)
-    assert done.stdout.splitlines()[-1] == "[]"
-
-
-def on_terminal_of(home: Path, columns: int, *words: str) -> tuple[int, str, str]:
-    """Run with stdout on a terminal of so many columns."""
-    master, side = pty.openpty()
-    fcntl.ioctl(side, termios.TIOCSWINSZ, struct.pack("HHHH", 40, columns, 0, 0))
-    command = [sys.executable, "-m", "teds_provision", "--home", str(home), *words]
-    environment = {name: value for name, value in clean_environment().items() if name not in ("COLUMNS", "LINES")}
-    process = subprocess.Popen(command, stdin=side, stdout=side, stderr=subprocess.PIPE, env=environment)
-    os.close(side)
-    out = b""
-    with suppress(OSError):  # EIO: the other side is closed
-        while part := os.read(master, 65536):
-            out += part
-    _, err = process.communicate(timeout=60)
-    os.close(master)
-    return process.returncode, out.decode().replace("\r\n", "\n"), err.decode()
+    assert python(script).out.splitlines()[-1] == "[]"

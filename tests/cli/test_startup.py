@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 import os
-import subprocess
-import sys
 
 import pytest
 
-from .shell import unmeasured_environment
+from .shell import python
 
 OURS = {
     "teds_provision",
@@ -32,18 +30,6 @@ OURS = {
 NEEDLESS = {"bz2", "difflib", "ipaddress", "json", "lzma", "pathlib", "shlex", "shutil", "tomllib", "urllib.parse"}
 
 
-def _python(code: str, columns: str) -> subprocess.CompletedProcess[str]:
-    return subprocess.run(
-        [sys.executable, "-c", code],
-        capture_output=True,
-        text=True,
-        check=True,
-        timeout=60,
-        env={**unmeasured_environment(), "COLUMNS": columns},
-        stdin=subprocess.DEVNULL,
-    )
-
-
 def loaded(*words: str) -> set[str]:
     """Modules that a run of these words loads beside those of a bare ``import click``."""
     code = (
@@ -58,8 +44,7 @@ def loaded(*words: str) -> set[str]:
         "finally:\n"
         "    print(*sorted(set(sys.modules) - before), file=sys.stderr)\n"
     )
-    done = _python(code, "100")
-    return set(done.stderr.split())
+    return set(python(code, COLUMNS="100").err.split())
 
 
 def test_help_loads_the_command_line_and_nothing_else() -> None:
@@ -93,6 +78,5 @@ def test_help_is_as_wide_as_click_makes_it(columns: str) -> None:
         "LazyGroup.format_commands = rows\n"
         "cli.main(['--help'], prog_name='teds-provision', standalone_mode=False)\n"
     )
-    done = _python(code, columns)
-    ours, _, clicks = done.stdout.partition(f"====={os.linesep}")
+    ours, _, clicks = python(code, COLUMNS=columns).out.partition(f"====={os.linesep}")
     assert ours == clicks

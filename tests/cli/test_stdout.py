@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
-import pty
 import subprocess
 import sys
 from pathlib import Path
@@ -15,6 +13,7 @@ from teds_provision.harmless import harmless, harmless_json, printable
 from teds_provision.store import NodeRecord, Store
 from tests.bench import PASSPHRASE
 from tests.cli.shell import call, clean_environment
+from tests.terminal import on_terminal
 
 UUID = bytes.fromhex("8d4d9da65281f7000000")
 
@@ -96,26 +95,12 @@ def test_cleaned_text_steers_nothing_and_json_still_says_the_same() -> None:
 def test_a_name_that_steers_terminals_is_cleaned_on_one(home: Path, words: tuple[str, ...]) -> None:
     with Store.open(home) as store:
         store.put_node(NodeRecord(UUID, name=STEERING, profile=STEERING, verdict=STEERING))
-    main, side = pty.openpty()
-    command = [sys.executable, "-m", "teds_provision", "--home", str(home), *words]
     environment = clean_environment(TERM="xterm", NO_COLOR="1", COLUMNS="200")
-    done = subprocess.Popen(command, stdout=side, stderr=side, stdin=subprocess.DEVNULL, env=environment)
-    os.close(side)
-    octets = b""
-    while True:
-        try:
-            part = os.read(main, 65536)
-        except OSError:
-            break
-        if not part:
-            break
-        octets += part
-    assert done.wait(timeout=60) == 0
-    os.close(main)
-    text = octets.decode()
-    assert "red" in text
+    told = on_terminal(home, *words, environment=environment)
+    assert told.code == 0
+    assert "red" in told.screen
     for character in ("\x9b", "\u202e", "\x07", "\x1b[31m"):
-        assert character not in text
+        assert character not in told.screen
 
 
 # -- memory ------------------------------------------------------------------------------------------------------------

@@ -11,8 +11,9 @@ from cryptography.hazmat.primitives.serialization import Encoding, NoEncryption,
 from teds_provision.handover.trust import spoken
 from teds_provision.protocol.keys import SoftwareKey, fingerprint, to_pem
 from tests.bench import PASSPHRASE
+from tests.terminal import on_terminal
 
-from .shell import Outcome, call, spawn
+from .shell import Outcome, call, python, spawn
 
 KEY = SoftwareKey(51)
 DIGITS = fingerprint(KEY.point)
@@ -110,42 +111,22 @@ def test_the_ca_key_away_and_back(home: Path, tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("words", [["trust"], ["export-keys"], ["import-keys"], ["handover"], ["revoke"], ["init"]])
 def test_help_loads_no_cryptography(words: list[str]) -> None:
-    import subprocess
-    import sys
-
     script = (
         "import sys\nfrom teds_provision.cli.main import run\n"
         f"code = run({[*words, '--help']!r})\n"
         "heavy = {'cryptography', 'nfc', 'can', 'keyring', 'rich', 'numpy', 'pint'} & set(sys.modules)\n"
         "print('HEAVY', sorted(heavy), code)"
     )
-    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True, timeout=60)
-    assert done.stdout.splitlines()[-1] == "HEAVY [] 0"
-    assert "Examples:" in done.stdout
+    done = python(script)
+    assert done.out.splitlines()[-1] == "HEAVY [] 0"
+    assert "Examples:" in done.out
 
 
 def test_each_key_of_a_folder_is_asked_for(home: Path, pem: Path) -> None:
-    import os
-    import subprocess
-    import sys
-
     (pem.parent / "west.pem").write_text(to_pem(SoftwareKey(53).point))
-    main, side = os.openpty()
-    os.write(main, b"n\ny\n")
-    read, write = os.pipe()
-    os.write(write, PASSPHRASE.encode() + b"\n")
-    os.close(write)
-    program = [sys.executable, "-m", "teds_provision", "--home", str(home), "--passphrase-fd", str(read)]
-    command = [*program, "trust", "add", "--from", str(pem.parent)]
-    try:
-        done = subprocess.run(
-            command, stdin=side, capture_output=True, text=True, timeout=60, check=False, pass_fds=(read,)
-        )
-    finally:
-        os.close(read)
-        os.close(main)
-        os.close(side)
-    assert done.returncode == 0, done
-    assert spoken(DIGITS) in done.stderr
-    assert done.stdout == "Trusted from now on: west.\n"
+    words = ("trust", "add", "--from", pem.parent)
+    done = on_terminal(home, *words, streams=["stdin"], answers=["n", "y"], passphrase=PASSPHRASE)
+    assert done.code == 0, done
+    assert spoken(DIGITS) in done.err
+    assert done.out == "Trusted from now on: west.\n"
     assert [one["name"] for one in call(home, "--json", "trust", "list").json["trusted"]] == ["west"]

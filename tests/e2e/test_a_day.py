@@ -4,18 +4,16 @@ from __future__ import annotations
 
 import csv
 import json
-import os
-import pty
 import signal
-import subprocess
 from pathlib import Path
 from typing import Any
 
 import pytest
 
 from tests.cli.shell import Outcome, clean_environment
+from tests.terminal import on_terminal
 
-from .desk import ANGLE, FINGER, PROGRAM, Desk, Node, Station, results
+from .desk import ANGLE, FINGER, Desk, Node, Station, results
 
 pytestmark = pytest.mark.link
 
@@ -35,41 +33,11 @@ def lines_of(outcome: Outcome) -> list[Any]:
     return [json.loads(line) for line in outcome.out.splitlines()]
 
 
-def on_a_terminal(station: Station, *words: object, answers: list[bytes]) -> tuple[int, str]:
-    """Run a command on a pseudo-terminal, answer its questions in turn; exit code and all that was shown."""
-    ours, theirs = pty.openpty()
-    read, write = os.pipe()
-    os.write(write, (station.passphrase or "").encode() + b"\n")
-    os.close(write)
-    process = subprocess.Popen(
-        [*PROGRAM, "--home", str(station.home), "--passphrase-fd", str(read), *map(str, words)],
-        stdin=theirs,
-        stdout=theirs,
-        stderr=theirs,
-        pass_fds=(read,),
-        env=clean_environment(TERM="xterm"),
-    )
-    os.close(theirs)
-    os.close(read)
-    said = b""
-    waiting = list(answers)
-    try:
-        while True:
-            try:
-                octets = os.read(ours, 4096)
-            except OSError:  # the other end is closed
-                break
-            if not octets:
-                break
-            said += octets
-            if waiting and said.count(b"[y/N]") > len(answers) - len(waiting):
-                os.write(ours, waiting.pop(0))
-        process.wait(60)
-    finally:
-        process.kill()
-        process.wait()
-        os.close(ours)
-    return process.returncode, said.decode(errors="replace")
+def on_a_terminal(station: Station, *words: object, answer: str) -> tuple[int, str]:
+    """Run a command on a terminal, answer its question; exit code and all that was shown."""
+    environment = clean_environment(TERM="xterm")
+    told = on_terminal(station.home, *words, answers=[answer], passphrase=station.passphrase, environment=environment)
+    return told.code, told.screen
 
 
 # -- what is written is what was asked for -----------------------------------------------------------------------------
@@ -86,7 +54,7 @@ def test_a_trial_build_is_not_written_by_the_next_plain_provision(station: Stati
     assert told["error"]["code"] == "not-named"
     assert any("only a trial" in change for change in told["changes"]), told
     assert node.octets == before
-    code, said = on_a_terminal(station, "provision", *links, answers=[b"n\n"])
+    code, said = on_a_terminal(station, "provision", *links, answer="n")
     assert code == 6
     assert "only a trial" in said
     assert "Interrupted" not in said
@@ -95,7 +63,7 @@ def test_a_trial_build_is_not_written_by_the_next_plain_provision(station: Stati
     assert set(results(station.provision("nfc")).values()) == {"done", "nothing to do"}
     assert node.octets == before
     station.ask("build", node.uuid, "--profile", ANGLE, "--name", "wanted after all")
-    code, said = on_a_terminal(station, "provision", *links, answers=[b"y\n"])
+    code, said = on_a_terminal(station, "provision", *links, answer="y")
     assert code == 0, said
     assert station.ask("identify", *links)["name"] == "wanted after all"
 
@@ -252,12 +220,12 @@ def test_no_at_the_question_skips_the_board(station: Station, node: Node, tmp_pa
     node.start()
     file = sheet(tmp_path / "boards.csv", {"profile": ANGLE, "name": "a"})
     words = ["provision", "--batch", file, "--timeout", "10", *station.desk.links.over("nfc")]
-    code, said = on_a_terminal(station, *words, answers=[b"n\n"])
+    code, said = on_a_terminal(station, *words, answer="n")
     assert code == 6
     assert "1 skipped" in said
     assert "\a" in said
     assert node.flash["key"] is None
-    code, said = on_a_terminal(station, *words, answers=[b"y\n"])
+    code, said = on_a_terminal(station, *words, answer="y")
     assert code == 0, said
     assert "1 passed" in said
 

@@ -3,17 +3,15 @@
 from __future__ import annotations
 
 import json
-import os
-import pty
-import subprocess
 from pathlib import Path
 from typing import Any
 
 import pytest
 
 from tests.cli.shell import clean_environment
+from tests.terminal import on_terminal
 
-from .desk import ANGLE, FINGER, PROGRAM, Desk, Node, Station
+from .desk import ANGLE, FINGER, Desk, Node, Station
 
 pytestmark = pytest.mark.link
 
@@ -90,34 +88,11 @@ def test_a_person_is_asked_on_a_terminal_and_may_say_no(station: Station, node: 
     """On a real pseudo-terminal: the question names UUID and key; "n" ends with 6, node and whitelist as before."""
     node.start()
     before = node.octets
-    ours, theirs = pty.openpty()
-    read, write = os.pipe()
-    os.write(write, (station.passphrase or "").encode() + b"\n")
-    os.close(write)
-    words = ["--home", str(station.home), "--passphrase-fd", str(read), "provision", "--profile", ANGLE]
-    process = subprocess.Popen(
-        [*PROGRAM, *words, *station.desk.links.over("nfc")],
-        stdin=theirs,
-        stdout=subprocess.PIPE,
-        stderr=theirs,
-        pass_fds=(read,),
-        env=clean_environment(TERM="xterm"),
-    )
-    os.close(theirs)
-    os.close(read)
-    said = b""
-    try:
-        while b"[y/N]" not in said:
-            said += os.read(ours, 4096)
-        os.write(ours, b"n\n")
-        out, _ = process.communicate(timeout=60)
-    finally:
-        process.kill()
-        process.wait()
-        os.close(ours)
-    assert node.uuid.encode() in said
-    assert process.returncode == 6
-    assert out == b""
+    words = ("provision", "--profile", ANGLE, *station.desk.links.over("nfc"))
+    told = on_terminal(station.home, *words, streams=["stdin", "stderr"], answers=["n"], passphrase=station.passphrase)
+    assert node.uuid in told.screen
+    assert told.code == 6
+    assert told.out == ""
     assert node.octets == before
     assert station.ask("whitelist", "list")["whitelist"] == []
 

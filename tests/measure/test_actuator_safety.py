@@ -107,6 +107,19 @@ class Journal:
         took = time_of(found[0]) - since if found else 0.0
         assert took <= self.dead_man + BUSY, f"in its safe state after {took:.3f} s"
 
+    def forgets_while_it_hangs(self, publisher: subprocess.Popen[bytes]) -> float:
+        """The publisher dies while the node hangs; what it sent meanwhile moves nothing. When the node woke (unix)."""
+        self.node.signal(signal.SIGSTOP)
+        time.sleep(DEAD_MAN)  # one goes by command in every half dead-man: it waits for its answer now
+        publisher.kill()
+        time.sleep(CUT)
+        lives = time.time()
+        self.node.signal(signal.SIGCONT)
+        self.is_safe(lives)
+        time.sleep(CUT)
+        assert all(line["safe"] for line in self.states() if time_of(line) >= lives), "an order of before"
+        return lives
+
 
 def time_of(line: dict[str, Any]) -> float:
     return datetime.fromisoformat(line["time"]).timestamp()
@@ -295,15 +308,7 @@ def test_by_topics_consumer_node_and_station_may_die(
     journal.is_safe(lives)
     journal.moves(lives)
     # The consumer dies while the node hangs: what was sent meanwhile moves nothing when it wakes.
-    journal.node.signal(signal.SIGSTOP)
-    time.sleep(DEAD_MAN)  # one goes by command in every half dead-man: it waits for its answer now
-    publishers[-1].kill()
-    time.sleep(CUT)
-    lives = time.time()
-    journal.node.signal(signal.SIGCONT)
-    journal.is_safe(lives)
-    time.sleep(CUT)
-    assert all(line["safe"] for line in journal.states() if time_of(line) >= lives), "an order of before"
+    lives = journal.forgets_while_it_hangs(publishers[-1])
     # The station is killed, with its consumer alive.
     publishers.append(ros.publish())
     journal.moves(lives + CUT)

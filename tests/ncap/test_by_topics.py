@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import signal
 import subprocess
 import sys
 import time
@@ -18,7 +17,7 @@ from teds_provision.trace.reading import read_trace
 from tests.e2e.desk import ROOT
 from tests.measure.hall import Hall
 from tests.measure.sinks.test_ros1 import Master, master, pytestmark  # noqa: F401  the fixture, and what it needs
-from tests.measure.test_actuator_safety import DEAD_MAN, TOPIC, Journal, Ros1, Ros2, children, hall_on, ros_of, time_of
+from tests.measure.test_actuator_safety import DEAD_MAN, TOPIC, Journal, Ros1, Ros2, children, hall_on, ros_of
 from tests.ncap.service import Service, verified
 from tests.pace import until
 
@@ -84,15 +83,7 @@ def test_set_points_move_it_and_whatever_dies_it_is_safe(hall: Hall, ros: Ros1 |
         # The node hangs for longer than its dead-man; what was sent meanwhile moves nothing when it wakes.
         publishers.append(ros.publish())
         journal.moves(died)
-        journal.node.signal(signal.SIGSTOP)
-        time.sleep(DEAD_MAN)
-        publishers[-1].kill()
-        time.sleep(2 * DEAD_MAN)
-        lives = time.time()
-        journal.node.signal(signal.SIGCONT)
-        journal.is_safe(lives)
-        time.sleep(2 * DEAD_MAN)
-        assert all(line["safe"] for line in journal.states() if time_of(line) >= lives), "an order of before"
+        lives = journal.forgets_while_it_hangs(publishers[-1])
         # The daemon is killed, with its consumer alive.
         publishers.append(ros.publish())
         journal.moves(lives)

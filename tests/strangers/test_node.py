@@ -8,6 +8,7 @@ import signal
 import sys
 import time
 from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any
 
@@ -89,32 +90,37 @@ def hall(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Hall]:
     made.close()
 
 
+@contextmanager
+def played(hall: Hall, name: str, address: int, *, fd: bool) -> Iterator[Stranger]:
+    made = Stranger(hall, name, fd, address)
+    try:
+        yield made
+    finally:
+        made.end()
+
+
 @pytest.fixture(params=[False, True], ids=["classic", "fd"])
 def angle(hall: Hall, request: pytest.FixtureRequest) -> Iterator[Stranger]:
-    made = Stranger(hall, "a", request.param, 0x31)
-    yield made
-    made.end()
+    with played(hall, "a", 0x31, fd=request.param) as made:
+        yield made
 
 
 @pytest.fixture
 def fd_angle(hall: Hall) -> Iterator[Stranger]:
-    made = Stranger(hall, "a", True, 0x31)
-    yield made
-    made.end()
+    with played(hall, "a", 0x31, fd=True) as made:
+        yield made
 
 
 @pytest.fixture
 def classic_angle(hall: Hall) -> Iterator[Stranger]:
-    made = Stranger(hall, "a", False, 0x31)
-    yield made
-    made.end()
+    with played(hall, "a", 0x31, fd=False) as made:
+        yield made
 
 
 @pytest.fixture
 def gripper(hall: Hall) -> Iterator[Stranger]:
-    made = Stranger(hall, "g", True, 0x32)
-    yield made
-    made.end()
+    with played(hall, "g", 0x32, fd=True) as made:
+        yield made
 
 
 def steps(line: dict[str, Any]) -> set[int]:

@@ -132,6 +132,15 @@ class Session:
             "LC_ALL": "C.UTF-8",
         }
 
+    @classmethod
+    def of_user(cls, home: Path) -> Session:
+        """A user of this machine who never logged in before; skips the test where no keyring is installed."""
+        for program in ("dbus-run-session", "gnome-keyring-daemon"):
+            if shutil.which(program) is None:
+                pytest.skip(f"{program} is missing: scripts/install-test-packages installs it")
+        home.mkdir(mode=0o700)
+        return cls(home)
+
     def run(self, snippet: str, *, password: str | None = "login", bus: tuple[str, ...] = ()) -> dict[str, Any]:
         unlock = (
             ""
@@ -183,12 +192,7 @@ def attempt(action):
 
 @pytest.fixture
 def session(tmp_path: Path) -> Session:
-    for program in ("dbus-run-session", "gnome-keyring-daemon"):
-        if shutil.which(program) is None:
-            pytest.skip(f"{program} is missing: scripts/install-test-packages installs it")
-    home = tmp_path / "user"
-    home.mkdir(mode=0o700)
-    return Session(home)
+    return Session.of_user(tmp_path / "user")
 
 
 MAKE = """

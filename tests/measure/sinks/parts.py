@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+import signal
 from collections.abc import Iterable
 from typing import Any
 
@@ -10,6 +12,8 @@ from hypothesis import strategies as st
 
 from teds_provision.measure.blocks import Block, ChannelFacts, GroupRows, NodeReport, StationFacts
 from teds_provision.measure.sinks import Sink
+from teds_provision.measure.sinks.ros.child import ChildSink
+from tests.pace import until
 
 ARM = "8d4d9da65281f7000001"
 HAND = "8d4d9da65281f7000002"
@@ -101,3 +105,11 @@ def fill(sink: Sink, items: Iterable[Block | GroupRows | NodeReport | list[Chann
             sink.describe(item)
     sink.close()
     assert sink.stats.error == ""
+
+
+def kill_child(sink: ChildSink) -> None:
+    """End the process that publishes, as a crash of it would, and wait until the sink has seen it."""
+    child = sink._child
+    assert child is not None
+    os.kill(child.pid, signal.SIGKILL)
+    until(lambda: sink.stats.state == "waiting")

@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import json
-import os
 import queue
 import shlex
-import signal
 import sys
 import time
 from dataclasses import dataclass, replace
@@ -23,7 +21,7 @@ from teds_provision.measure.sinks.ros import sourced
 from teds_provision.measure.sinks.ros.ros2 import Ros2Sink
 from teds_provision.measure.sinks.ros.sourced import RclpySink
 from teds_provision.teds.units.units import parse_units
-from tests.measure.sinks.parts import ANGLE, ARM, FORCE, HAND, STATION, block
+from tests.measure.sinks.parts import ANGLE, ARM, FORCE, HAND, STATION, block, kill_child
 from tests.pace import until
 
 STANDIN = Path(__file__).with_name("rclpy_standin")
@@ -135,10 +133,7 @@ def test_a_child_that_dies_is_started_anew(ros: Sourced) -> None:
     assert isinstance(sink, RclpySink)
     sink.open([ANGLE], STATION)
     until(lambda: sink.stats.state == "running")
-    child = sink._child
-    assert child is not None
-    os.kill(child.pid, signal.SIGKILL)
-    until(lambda: sink.stats.state == "waiting")
+    kill_child(sink)
     assert "rclpy died" in sink.stats.detail
     until(lambda: sink.stats.state == "running")
     until(lambda: len([one for one in ros.notes("publisher") if one["topic"] == "/bench/arm/teds"]) == 2)

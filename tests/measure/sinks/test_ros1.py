@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import queue
-import signal
 import subprocess
 import sys
 import time
@@ -20,7 +19,7 @@ from teds_provision.measure.sinks import open_sink
 from teds_provision.measure.sinks.ros import ros1_child
 from teds_provision.measure.sinks.ros.ros1 import Ros1Sink
 from teds_provision.teds.units.units import parse_units
-from tests.measure.sinks.parts import ANGLE, ARM, FORCE, HAND, STATION, block
+from tests.measure.sinks.parts import ANGLE, ARM, FORCE, HAND, STATION, block, kill_child
 from tests.pace import until
 from tests.places import free_tcp_port
 
@@ -201,10 +200,7 @@ def test_a_master_and_a_child_that_die_are_survived(master: Master) -> None:
     sink = ros1(master)
     sink.open([ANGLE], STATION)
     until(lambda: sink.stats.state == "running")
-    child = sink._child
-    assert child is not None
-    os.kill(child.pid, signal.SIGKILL)
-    until(lambda: sink.stats.state == "waiting")
+    kill_child(sink)
     until(lambda: sink.stats.state == "running")
     master.stop()
     until(lambda: sink.stats.state == "waiting")

@@ -1,0 +1,102 @@
+"""The program on a pseudo-terminal: what a person sees there, and answers that are typed where it asks."""
+
+from __future__ import annotations
+
+import fcntl
+import os
+import pty
+import selectors
+import struct
+import subprocess
+import sys
+import termios
+import time
+from collections.abc import Collection, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from tests.cli.shell import clean_environment
+
+PATIENCE = 60.0
+STREAMS = ("stdin", "stdout", "stderr")
+
+
+@dataclass(frozen=True)
+class Shown:
+    """How a command ended; ``screen`` is what stood on the terminal, ``out`` and ``err`` what went elsewhere."""
+
+    code: int
+    screen: str
+    out: str
+    err: str
+
+
+def on_terminal(
+    home: Path,
+    *words: object,
+    streams: Collection[str] = STREAMS,
+    answers: Sequence[str] = (),
+    passphrase: str | None = None,
+    columns: int | None = None,
+    environment: dict[str, str] | None = None,
+) -> Shown:
+    """Run a command with these streams on a terminal, the others in pipes; each answer is typed at a prompt of its own.
+
+    A prompt ends with a colon, maybe with "[y/N]" before it; what is typed earlier the program throws away.
+    """
+    ours, theirs = pty.openpty()
+    read, write = os.pipe()
+    os.write(write, (passphrase or "").encode() + b"\n")
+    os.close(write)
+    if columns is not None:
+        fcntl.ioctl(theirs, termios.TIOCSWINSZ, struct.pack("HHHH", 40, columns, 0, 0))
+    given = ["--passphrase-fd", str(read)] if passphrase is not None else []
+    elsewhere = {"stdin": subprocess.DEVNULL, "stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
+    ends: dict[str, Any] = {name: theirs if name in streams else other for name, other in elsewhere.items()}
+    process = subprocess.Popen(
+        [sys.executable, "-m", "teds_provision", "--home", str(home), *given, *map(str, words)],
+        pass_fds=(read,),
+        env=environment or clean_environment(),
+        start_new_session=True,
+        **ends,
+    )
+    os.close(theirs)
+    os.close(read)
+    try:
+        seen = _conversation(ours, process, list(answers))
+        code = process.wait(PATIENCE)
+    finally:
+        process.kill()
+        process.wait()
+        os.close(ours)
+        for pipe in filter(None, (process.stdout, process.stderr)):
+            pipe.close()
+    return Shown(
+        code, *(seen[name].decode(errors="replace").replace("\r\n", "\n") for name in ("screen", "out", "err"))
+    )
+
+
+def _conversation(ours: int, process: subprocess.Popen[bytes], answers: list[str]) -> dict[str, bytes]:
+    """Read everything until the program has closed it all; type an answer wherever it asks."""
+    seen, answered = dict.fromkeys(("screen", "out", "err"), b""), dict.fromkeys(("screen", "out", "err"), 0)
+    until = time.monotonic() + PATIENCE
+    with selectors.DefaultSelector() as selector:
+        for name, place in (("screen", ours), ("out", process.stdout), ("err", process.stderr)):
+            if place is not None:
+                selector.register(place, selectors.EVENT_READ, name)
+        while selector.get_map():
+            found = selector.select(max(0.0, until - time.monotonic()))
+            assert found, ("the program says nothing more, and does not end", seen)
+            for key, _ in found:
+                try:
+                    octets = os.read(key.fd, 65536)
+                except OSError:  # EIO: the other end of the terminal is closed
+                    octets = b""
+                if not octets:
+                    selector.unregister(key.fileobj)
+                seen[key.data] += octets
+                if answers and seen[key.data][answered[key.data] :].strip().endswith(b":"):
+                    answered[key.data] = len(seen[key.data])
+                    os.write(ours, answers.pop(0).encode() + b"\n")
+    return seen
