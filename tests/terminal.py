@@ -49,15 +49,18 @@ def on_terminal(
     read, write = os.pipe()
     os.write(write, (passphrase or "").encode() + b"\n")
     os.close(write)
+    variables = environment or clean_environment()
     if columns is not None:
         fcntl.ioctl(theirs, termios.TIOCSWINSZ, struct.pack("HHHH", 40, columns, 0, 0))
+        # What the variables say would count more than the terminal itself.
+        variables = {name: value for name, value in variables.items() if name not in ("COLUMNS", "LINES")}
     given = ["--passphrase-fd", str(read)] if passphrase is not None else []
     elsewhere = {"stdin": subprocess.DEVNULL, "stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
     ends: dict[str, Any] = {name: theirs if name in streams else other for name, other in elsewhere.items()}
     process = subprocess.Popen(
         [sys.executable, "-m", "teds_provision", "--home", str(home), *given, *map(str, words)],
         pass_fds=(read,),
-        env=environment or clean_environment(),
+        env=variables,
         start_new_session=True,
         **ends,
     )

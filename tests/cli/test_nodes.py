@@ -165,7 +165,7 @@ def test_due_counts_days_from_today_and_what_is_overdue(fleet: Path) -> None:
 
 def test_a_narrow_terminal_drops_columns_and_never_a_digit(fleet: Path) -> None:
     for columns in (80, 60, 40, 24):
-        told = on_terminal(fleet, "nodes", columns=columns)
+        told = on_terminal(fleet, "nodes", streams=["stdin", "stdout"], columns=columns)
         assert told.code == 0
         lines = told.screen.splitlines()
         assert all(len(line) <= columns for line in lines)
