@@ -53,10 +53,12 @@ class Choice:
 
 
 FAILED = (
-    "failed", "refused", "error", "not authentic", "unproven", "unsigned", "other key", "read-back differs",
-    "interrupted", "skipped", "lost",
+    "failed", "refused", "error", "unproven", "unsigned", "other key", "read-back differs", "interrupted", "skipped",
+    "lost", "declined",
+    "not-", "not ", "no-", "node-", "other-key", "address-conflict", "frozen", "garbled", "link", "store", "vault",
+    "wrong-passphrase", "usage", "bad-data", "bug",
 )  # fmt: skip
-"""How the outcome of an act begins that did not do what it should."""
+"""How the outcome of an act begins that did not do what it should: words, and the codes of the errors that end one."""
 
 
 def is_failure(outcome: str) -> bool:

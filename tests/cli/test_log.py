@@ -15,6 +15,9 @@ from zoneinfo import ZoneInfo
 
 import pytest
 
+from teds_provision.errors import TedsProvisionError
+from teds_provision.steps.build import NotNamed
+from teds_provision.steps.many.board import Declined
 from teds_provision.store import Store
 from tests.terminal import on_terminal
 
@@ -118,6 +121,24 @@ def test_entries_are_found_by_time_act_outcome_and_node(home: Path) -> None:
     assert totals == {"entries": 3, "failed": 2, "acts": {"verify": 3}}
     assert "2 failed" in call(home, "log", "--act", "verify").err
     assert call(home, "log", "--today", "--since", "2h").code == 2
+
+
+def errors(kind: type[TedsProvisionError] = TedsProvisionError) -> set[str]:
+    """The code of every error of the tree, those that rooms add to it too."""
+    return {kind.code}.union(*map(errors, kind.__subclasses__()))
+
+
+def test_what_ended_with_an_error_of_any_kind_is_among_the_failed(home: Path) -> None:
+    """A "no" at the question, a board of another owner, one that fell silent: they were left out."""
+    codes = errors() | {NotNamed.code, Declined.code}
+    assert {"declined", "not-named", "node-refused", "node-silent", "not-whitelisted", "bad-data"} <= codes
+    with Store.open(home) as store:
+        for code in sorted(codes):
+            store.audit.append("provision", bytes.fromhex(ONE), code)
+        for outcome in ("done", "begun", "pending", "active", "nothing", "authentic", "new passphrase", "locked"):
+            store.audit.append("provision", bytes.fromhex(TWO), outcome)
+    assert acts(home, "--failed") == [f"provision {code}" for code in sorted(codes)]
+    assert call(home, "--json", "log").json["totals"]["failed"] == len(codes)
 
 
 def test_a_part_of_the_log_is_checked_from_its_first_entry_on(home: Path) -> None:
