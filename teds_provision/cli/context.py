@@ -28,6 +28,8 @@ if TYPE_CHECKING:
 else:
     json = late("json")
 
+_BEHIND = " [y/N]: "
+
 
 class App:
     """One run of the command line. Results go to stdout, everything else to stderr."""
@@ -125,13 +127,13 @@ class App:
         """Say something on stderr, unless --quiet (or fewer ``-v`` than ``level``); not with --json."""
         if not self.quiet and not self.json and self.verbose >= level:
             self.live_line()
-            print(harmless(text), file=sys.stderr, flush=True)
+            say(text)
 
     def warn(self, text: str) -> None:
         """Warn on stderr, also with --json; only --quiet silences it."""
         self.live_line()
         if not self.quiet:
-            print(harmless(f"Warning: {text}"), file=sys.stderr, flush=True)
+            say(f"Warning: {text}")
 
     def fail_line(self, error: TedsProvisionError, **of: object) -> None:
         """Tell an error that does not end the command (``--watch``): one JSON object, or a line on stderr.
@@ -147,7 +149,7 @@ class App:
             where = ", ".join(f"row {value}" if name == "row" else str(value) for name, value in known.items())
             at = f" ({where})" if where else ""
             told_lines = f"Error{at}: {error.message}" + (f"\n  → {error.hint}" if error.hint else "")
-            print(harmless(told_lines), file=sys.stderr, flush=True)
+            say(told_lines)
 
     # -- asking ----------------------------------------------------------------------------------------------------
 
@@ -173,25 +175,24 @@ class App:
     def ask(self, question: str) -> bool:
         """Ask a person, yes or no; nothing that a node or a file brought steers the terminal."""
         self.live_line()
-        return click.confirm(harmless(question), err=True)
+        return click.confirm(_asked(question), err=True)
 
     def ask_for_key(self, question: str, fingerprint: str) -> bool:
         """Ask a person whether a key counts: yes, no, or its digits (32 to 64, or a scanned label), held against it."""
         self.live_line()
         while True:
-            said = click.prompt(
-                f"{harmless(question)} (or its digits) [y/N]", default="n", show_default=False, err=True
-            ).strip()
+            asked = _asked(f"{question} (or its digits) [y/N]")
+            said = click.prompt(asked, default="n", show_default=False, err=True).strip()
             if said.lower() in ("y", "yes", "n", "no"):
                 return said.lower().startswith("y")
             label = station_room.label.read_label(said)
             digits = label[1] if label is not None else protocol.fingerprints.read_fingerprint(said)
             if digits is not None and not protocol.fingerprints.same_key(digits, fingerprint):
-                print("These are the digits of another key.", file=sys.stderr, flush=True)
+                say("These are the digits of another key.")
                 return False
             if digits is not None:
                 return True
-            print("Answer y or n, or give 32 to 64 digits of the fingerprint.", file=sys.stderr, flush=True)
+            say("Answer y or n, or give 32 to 64 digits of the fingerprint.")
 
     @property
     def has_passphrase(self) -> bool:
@@ -218,7 +219,7 @@ class App:
                 hint=f"Give it through a file descriptor: {instead}.",
             )
         self.live_line()
-        answer: str = click.prompt(harmless(prompt), hide_input=True, confirmation_prompt=confirm, err=True)
+        answer: str = click.prompt(_asked(prompt), hide_input=True, confirmation_prompt=confirm, err=True)
         return answer
 
     # -- the station -----------------------------------------------------------------------------------------------
@@ -240,6 +241,16 @@ class App:
         self.live_line()
         while self._closers:
             self._closers.pop()()
+
+
+def say(text: str) -> None:
+    """Say something on stderr; what others wrote steers no terminal, and no word is broken at its edge."""
+    print(terminal.folding.folded(harmless(text), sys.stderr), file=sys.stderr, flush=True)
+
+
+def _asked(question: str) -> str:
+    """A question as it is shown, with room for what click puts behind it."""
+    return terminal.folding.folded(harmless(question), sys.stderr, spare=len(_BEHIND))
 
 
 def nowhere(stream: TextIO) -> None:

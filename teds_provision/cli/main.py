@@ -15,11 +15,10 @@ import click
 from teds_provision import __version__
 from teds_provision.cli import terminal
 from teds_provision.cli.configuration import PARAMETERS, Defaults, as_parameters, config_path, read_config
-from teds_provision.cli.context import App, nowhere
+from teds_provision.cli.context import App, nowhere, say
 from teds_provision.cli.globals import in_front
 from teds_provision.cli.table import COMMANDS, SECTIONS
 from teds_provision.errors import BadData, NotFound, StoreFailure, TedsProvisionError
-from teds_provision.harmless import harmless
 from teds_provision.lazy import late
 
 if TYPE_CHECKING:
@@ -308,4 +307,4 @@ def _fail(arguments: list[str], exit_code: int, code: str, message: str, hint: s
 
 def _say(text: str) -> None:
     with contextlib.suppress(OSError):
-        print(harmless(text), file=sys.stderr, flush=True)
+        say(text)

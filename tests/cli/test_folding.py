@@ -1,0 +1,90 @@
+"""Plain lines on a terminal of 80 columns: none is longer, and no word is broken at its edge."""
+
+from __future__ import annotations
+
+import fcntl
+import os
+import pty
+import struct
+import subprocess
+import sys
+import termios
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TextIO
+
+from hypothesis import given
+from hypothesis import strategies as st
+
+from teds_provision.cli.terminal.folding import folded
+
+from .shell import clean_environment
+
+COLUMNS = 80
+
+
+@contextmanager
+def terminal(columns: int) -> Iterator[TextIO]:
+    ours, theirs = pty.openpty()
+    fcntl.ioctl(theirs, termios.TIOCSWINSZ, struct.pack("HHHH", 24, columns, 0, 0))
+    with open(theirs, "w") as stream:
+        yield stream
+    os.close(ours)
+
+
+def shown(home: Path, *words: object) -> list[str]:
+    """What a command says on a terminal, line by line as it was sent."""
+    ours, theirs = pty.openpty()
+    fcntl.ioctl(theirs, termios.TIOCSWINSZ, struct.pack("HHHH", 24, COLUMNS, 0, 0))
+    with subprocess.Popen(
+        [sys.executable, "-m", "teds_provision", "--home", str(home), *map(str, words)],
+        stdin=subprocess.DEVNULL, stdout=theirs, stderr=theirs, env=clean_environment(TERM="xterm"),
+    ):  # fmt: skip
+        os.close(theirs)
+        said = b""
+        while True:
+            try:
+                said += os.read(ours, 4096)
+            except OSError:
+                break
+    os.close(ours)
+    return said.decode().splitlines()
+
+
+def test_an_error_and_its_hint_are_broken_between_words(home: Path) -> None:
+    """A word in the middle of a line went on in the next one."""
+    lines = shown(home, "provision", "--watch", "--name", "the same name for every board", "--profile", "load-cell")
+    assert lines[0].startswith("Error: Every node would get the name")
+    assert len(lines) > 2, lines
+    assert max(map(len, lines)) <= COLUMNS, lines
+    assert "Put {uuid} or {n} into --name, or say which board gets which in a sheet: --batch FILE." in " ".join(
+        line.strip() for line in lines
+    )
+
+
+def test_what_goes_into_a_pipe_is_one_line() -> None:
+    with open(os.devnull, "w") as pipe:
+        assert folded("word " * 40, pipe) == "word " * 40
+
+
+def test_lines_that_continue_stand_under_their_beginning() -> None:
+    with terminal(40) as stream:
+        assert folded("  → Hold the node's antenna flat on the reader, or say --timeout.", stream) == (
+            "  → Hold the node's antenna flat on the\n    reader, or say --timeout."
+        )
+        assert folded("  a  table's  row", stream) == "  a  table's  row"
+
+
+def test_a_command_that_is_shown_is_copied_whole() -> None:
+    command = f"teds-provision whitelist add 8d4d9da65281f7000000 --fingerprint {'ab' * 32}"
+    with terminal(COLUMNS) as stream:
+        assert folded(f"  → Add --yes, or: {command}", stream).splitlines() == ["  → Add --yes, or:", f"    {command}"]
+
+
+@given(st.lists(st.text("abcé ", min_size=1, max_size=70), min_size=1, max_size=20))
+def test_no_word_is_lost_or_broken(words: list[str]) -> None:
+    with terminal(COLUMNS) as stream:
+        lines = folded(" ".join(words), stream).splitlines()
+    assert " ".join(lines).split() == " ".join(words).split()
+    assert all(len(line) <= COLUMNS for line in lines)
