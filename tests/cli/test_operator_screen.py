@@ -25,6 +25,10 @@ class Batch:
 
     passed: int = 0
     next_row: Row | None = None
+    had: str | None = None
+
+    def board_of(self, row: Row) -> str | None:
+        return self.had
 
     def __len__(self) -> int:
         return 50
@@ -68,6 +72,12 @@ def failed(number: int, error: TedsProvisionError) -> Board:
 )
 def test_it_says_what_to_do_now(next_row: Row | None, told: str) -> None:
     assert told in Terminal(Batch(next_row=next_row)).lines
+
+
+def test_a_board_that_did_not_pass_is_asked_for_by_its_uuid() -> None:
+    """Another one that is held there gets the next free row, whatever the operator took it for."""
+    told = f">>> TAP BOARD {UUID.hex()} AGAIN FOR ROW 7  knee"
+    assert told in Terminal(Batch(next_row=row(7, name="knee"), had=UUID.hex())).lines
 
 
 def test_while_a_board_is_worked_on_nothing_says_pass_of_the_one_before() -> None:

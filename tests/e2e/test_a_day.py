@@ -204,6 +204,32 @@ def test_a_sheet_gives_each_board_its_own_and_carries_on(desk: Desk, station: St
     assert (again.code, list(again.json)) == (0, ["totals"])
 
 
+def test_a_name_that_another_node_has_takes_no_row(desk: Desk, station: Station, tmp_path: Path) -> None:
+    """The row was bound to the first board that came, before its name was looked at."""
+    owner, stranger = desk.node("owner").start(), desk.node("stranger")
+    links = desk.links.over("nfc")
+    station.provision("nfc", "-p", ANGLE, "--name", "left knee")
+    owner.stop()
+    rows = [{"name": name, "profile": ANGLE} for name in ("left knee", "right knee")]
+    words = ["--json", "provision", "--batch", sheet(tmp_path / "boards.csv", *rows), "--yes", *links, "--timeout"]
+    stranger.start()
+    outcome = station.run(*words, "5")
+    line, last = lines_of(outcome)
+    assert (outcome.code, line["row"], line["uuid"], line["error"]["code"]) == (6, 1, stranger.uuid, "refused")
+    assert owner.uuid in line["error"]["message"]
+    assert stranger.flash["key"] is None
+    stranger.stop()
+    owner.start()
+    batch = station.start(*words, "55")
+    (line,) = batch.wait_for_lines(1)
+    assert (line["row"], line["uuid"], line["name"]) == (1, owner.uuid, "left knee")
+    owner.stop()
+    stranger.start()
+    outcome = batch.end()
+    line = lines_of(outcome)[1]
+    assert (outcome.code, line["row"], line["uuid"], line["name"]) == (0, 2, stranger.uuid, "right knee")
+
+
 def test_a_label_pins_the_key_before_the_tap(station: Station, node: Node, tmp_path: Path) -> None:
     node.start()
     file = sheet(tmp_path / "boards.csv", {"uuid": node.uuid, "profile": ANGLE, "fingerprint": "ab" * 32})

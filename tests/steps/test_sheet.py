@@ -69,6 +69,55 @@ def test_a_label_scanned_into_a_cell_says_uuid_and_key(station: Station, tmp_pat
         read(station, tmp_path, f"{columns}\n{label},a,{'ab' * (len(same) // 2)}\n")
 
 
+def board_of(number: int) -> bytes:
+    return bytes([number]) * 10
+
+
+def test_rows_go_to_boards_in_the_order_of_the_taps_and_to_a_spare_at_last(station: Station, tmp_path: Path) -> None:
+    """A board that failed keeps its row for another try; its spare was told that no row is left."""
+    progress = Progress(station.home, read(station, tmp_path, "name\na\nb\nc\n"))
+    for number, error in ((1, None), (2, NodeSilent("It was pulled.")), (3, None)):
+        row = progress.row_for(board_of(number), "")
+        assert row is not None
+        assert row.number == number
+        progress.take(row, board_of(number))
+        progress.rows[number].result = "failed" if error else "passed"
+        if error:
+            progress.note(row, Board(board_of(number), 1.0, error=error, row=number))
+    progress.save()
+    again = Progress(station.home, progress.sheet)
+    assert [row.number for row in again.open] == [2]
+    assert again.next_row is not None
+    assert again.board_of(again.next_row) == board_of(2).hex()
+    for board in (2, 9):  # the same one again, or its spare
+        row = again.row_for(board_of(board), "")
+        assert row is not None
+        assert row.number == 2
+    assert again.row_for(board_of(9), "", busy={2}) is None, "another reader is at work on it"
+
+
+def test_a_spare_gets_no_row_before_those_that_had_no_board(station: Station, tmp_path: Path) -> None:
+    progress = Progress(station.home, read(station, tmp_path, "name\na\nb\n"))
+    progress.take(progress.sheet.rows[0], board_of(1))
+    progress.note(progress.sheet.rows[0], Board(board_of(1), 1.0, error=NodeSilent("It was pulled."), row=1))
+    row = progress.row_for(board_of(2), "")
+    assert row is not None
+    assert row.number == 2
+
+
+def test_a_board_that_is_turned_away_takes_no_row(station: Station, tmp_path: Path) -> None:
+    """Row 1 was bound to the first board that came; whoever has the name in fact got the name of row 2."""
+    progress = Progress(station.home, read(station, tmp_path, "name\na\nb\nc\n"))
+    first, second, _ = progress.sheet.rows
+    progress.turn_away(first, board_of(1))
+    progress.note(first, Board(board_of(1), 1.0, error=NodeSilent("Its name is another's."), row=1))
+    assert progress.row_for(board_of(1), "") is first, "held there again it is tried for the same row"
+    assert progress.row_for(board_of(2), "") is second
+    assert progress.next_row is second
+    later = Progress(station.home, progress.sheet)
+    assert later.row_for(board_of(5), "") is later.sheet.rows[0], "nobody has it"
+
+
 def test_a_batch_to_which_no_board_came_says_so(station: Station, tmp_path: Path) -> None:
     """It said "0 passed, 0 failed, 2 skipped", and not why."""
     progress = Progress(station.home, read(station, tmp_path, "name\na\nb\n"))

@@ -77,6 +77,9 @@ class Told(Protocol):
     def row(self, number: int) -> Row:
         """The row of that number."""
 
+    def board_of(self, row: Row) -> str | None:
+        """UUID of the board that had a row before."""
+
 
 class Screen(Protocol):
     """Where the end of each board is shown; ``tells``: so that nothing else needs to be printed of it."""
@@ -201,7 +204,9 @@ class OperatorScreen:
             return "ALL BOARDS ARE DONE."
         name = row.prepared.order.name or ""
         if row.by_order:
-            return harmless(f"TAP THE BOARD FOR ROW {row.number}  {name}".rstrip())
+            had = self._boards.board_of(row)
+            board = "THE BOARD" if had is None else f"BOARD {had} AGAIN"
+            return harmless(f"TAP {board} FOR ROW {row.number}  {name}".rstrip())
         which = row.uuid.hex() if row.uuid is not None else f"key {(row.fingerprint or '')[:16]}"
         return harmless(f"TAP ANY BOARD OF THE SHEET, e.g. {which}  {name}".rstrip())
 

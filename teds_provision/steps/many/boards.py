@@ -148,8 +148,11 @@ class Boards:
     @property
     def next_row(self) -> Row | None:
         """The row that the next board may be of."""
-        rows = self.progress.untried or self.progress.open if self.progress is not None else []
-        return rows[0] if rows else None
+        return self.progress.next_row if self.progress is not None else None
+
+    def board_of(self, row: Row) -> str | None:
+        """UUID of the board that had this row before, None where none had."""
+        return self.progress.board_of(row) if self.progress is not None else None
 
     def row(self, number: int) -> Row:
         """The row of the sheet with that number, from 1."""
@@ -284,11 +287,15 @@ class Boards:
         )
 
     def _for(self, who: Identified) -> Prepared:
-        """What this board gets; raises PolicyRefused for one that the sheet does not know, OtherKey."""
+        """What this board gets; raises PolicyRefused (the sheet does not know it, its name is another's), OtherKey.
+
+        Whoever is refused here has not taken a row.
+        """
         if self.progress is None:
             return self.prepared
         with self._turn:
-            row = self.progress.row_for(who.uuid, who.fingerprint)
+            busy = {row.number for uuid, row in self._rows.items() if uuid != who.uuid}
+            row = self.progress.row_for(who.uuid, who.fingerprint, busy=busy)
             if row is None:
                 raise PolicyRefused(f"No row of the sheet is left for board {who.uuid.hex()}.", hint="Lay it aside.")
             self._rows[who.uuid] = row
@@ -298,6 +305,11 @@ class Boards:
                     f"says {row.fingerprint[:32]}.",
                     hint="Compare the label of this board; it may be another one under the same UUID.",
                 )
+            try:
+                named_for(self._station, who.uuid, row.prepared)
+            except TedsProvisionError:
+                self.progress.turn_away(row, who.uuid)
+                raise
             self.progress.take(row, who.uuid)
         return row.prepared
 

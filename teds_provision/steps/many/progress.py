@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 from collections import Counter
+from collections.abc import Collection
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any, Final
@@ -46,6 +47,8 @@ class Progress:
         kept = self._kept()
         self.rows = {row.number: self._of(row, kept.get(str(row.number))) for row in sheet.rows}
         self.worst: TedsProvisionError | None = None
+        self._tried: frozenset[int] = frozenset()
+        self._turned_away: dict[int, str] = {}
 
     def _kept(self) -> dict[str, Any]:
         try:
@@ -80,14 +83,30 @@ class Progress:
         """The open rows that nobody tried in this run."""
         return [row for row in self.open if row.number not in self._tried]
 
-    _tried: frozenset[int] = frozenset()
+    @property
+    def next_row(self) -> Row | None:
+        """The row that the next board may be of."""
+        rows = self.untried or self.open
+        return rows[0] if rows else None
 
-    def row_for(self, uuid: bytes, fingerprint: str) -> Row | None:
-        """The row of a board: that which names it or had it before, else the next in the order of the taps."""
+    def row_for(self, uuid: bytes, fingerprint: str, *, busy: Collection[int] = ()) -> Row | None:
+        """The row of a board: that which names it or had it before, else the next in the order of the taps.
+
+        One that had no board goes before one whose board did not pass: that is for a spare, once nothing else is left.
+        ``busy`` are the numbers of the rows on which another reader is at work.
+        """
         for row in self.sheet.rows:
-            if row.means(uuid, fingerprint) or (row.by_order and self.rows[row.number].uuid == uuid.hex()):
+            if row.means(uuid, fingerprint) or (row.by_order and self.board_of(row) == uuid.hex()):
                 return row
-        return next((row for row in self.sheet.rows if row.by_order and self.rows[row.number].uuid is None), None)
+        rows = [row for row in self.open if row.by_order and row.number not in busy]
+        return min(rows, key=self._lateness, default=None)
+
+    def _lateness(self, row: Row) -> tuple[bool, bool]:
+        return self.rows[row.number].uuid is not None, row.number in self._tried
+
+    def board_of(self, row: Row) -> str | None:
+        """The board that has the row, or was turned away from it in this run; None where there was none."""
+        return self.rows[row.number].uuid or self._turned_away.get(row.number)
 
     def take(self, row: Row, uuid: bytes) -> None:
         """Note that this board is the row's, before anything is done with it."""
@@ -95,6 +114,10 @@ class Progress:
         if attempted.uuid != uuid.hex():
             attempted.uuid = uuid.hex()
             self.save()
+
+    def turn_away(self, row: Row, uuid: bytes) -> None:
+        """Note that this board was not given what the row says; the row stays free, and is tried again with it."""
+        self._turned_away[row.number] = uuid.hex()
 
     def note(self, row: Row, board: Board) -> None:
         """Note how a board ended."""
