@@ -101,14 +101,15 @@ def begin(
     environment: dict[str, str] | None = None,
     cwd: Path | None = None,
     program: tuple[str, ...] = PROGRAM,
+    fork: bool = True,
 ) -> Forked | subprocess.Popen[bytes]:
     """Start the program as a process of its own that writes to two files; the passphrase goes by --passphrase-fd.
 
-    By a fork of the zygote where nobody could tell, else by starting an interpreter.
+    By a fork of the zygote where nobody could tell, else (and without ``fork``) by starting an interpreter.
     """
     read, write = os.pipe()
     asked = environment if environment is not None else clean_environment()
-    fork = program == PROGRAM and forkable(asked, zygote().environment)
+    fork = fork and program == PROGRAM and forkable(asked, zygote().environment)
     given = [] if passphrase is None else ["--passphrase-fd", str(FIRST_FD if fork else read)]
     os.write(write, (passphrase or "").encode() + b"\n")
     os.close(write)

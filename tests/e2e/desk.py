@@ -12,6 +12,7 @@ import subprocess
 import time
 from contextlib import closing
 from dataclasses import dataclass, field
+from io import FileIO
 from pathlib import Path
 from typing import Any
 
@@ -59,20 +60,20 @@ class Running:
         environment: dict[str, str] | None = None,
         cwd: Path = ROOT,
         program: tuple[str, ...] = PROGRAM,
+        fork: bool = True,
     ) -> None:
-        self.stdout, out = os.pipe()
-        self.stderr, err = os.pipe()
+        (read, out), (other, err) = os.pipe(), os.pipe()
+        self.stdout, self.stderr = FileIO(read), FileIO(other)
+        how: dict[str, Any] = {"environment": environment, "cwd": cwd, "program": program, "fork": fork}
         try:
-            self.process = begin(
-                *words, passphrase=passphrase, environment=environment, cwd=cwd, program=program, out=out, err=err
-            )
+            self.process = begin(*words, passphrase=passphrase, out=out, err=err, **how)
         finally:
             os.close(out)
             os.close(err)
         self.out = self.err = ""
         self._selector = selectors.DefaultSelector()
         for stream in (self.stdout, self.stderr):
-            os.set_blocking(stream, False)
+            os.set_blocking(stream.fileno(), False)
             self._selector.register(stream, selectors.EVENT_READ)
 
     def read(self, seconds: float) -> bool:
@@ -83,7 +84,7 @@ class Running:
             came = came or bool(octets)
             if not octets:
                 self._selector.unregister(key.fileobj)
-            elif key.fd == self.stdout:
+            elif key.fileobj is self.stdout:
                 self.out += octets.decode()
             else:
                 self.err += octets.decode()
@@ -126,7 +127,7 @@ class Running:
         self.process.wait(PATIENCE)
         self._selector.close()
         for stream in (self.stdout, self.stderr):
-            os.close(stream)
+            stream.close()
 
 
 class Desk:

@@ -214,7 +214,7 @@ def test_a_name_that_another_node_has_takes_no_row(desk: Desk, station: Station,
     words = ["--json", "provision", "--batch", sheet(tmp_path / "boards.csv", *rows), "--yes", *links, "--timeout"]
     stranger.start()
     outcome = station.run(*words, "5")
-    line, last = lines_of(outcome)
+    line, _ = lines_of(outcome)
     assert (outcome.code, line["row"], line["uuid"], line["error"]["code"]) == (6, 1, stranger.uuid, "refused")
     assert owner.uuid in line["error"]["message"]
     assert stranger.flash["key"] is None

@@ -20,7 +20,8 @@ from teds_provision.client import ApiError
 from teds_provision.ncap.settings import own_source
 from teds_provision.store import Store
 from tests.bench import make_station
-from tests.e2e.desk import ANGLE, Desk, Node, Station, clean_environment, limited
+from tests.cli.shell import clean_environment
+from tests.e2e.desk import ANGLE, Desk, Node, Station, limited
 from tests.ncap.service import Service, verified, virtual
 from tests.pace import best_of, until
 
