@@ -1,6 +1,8 @@
 """For all tests: hypothesis without deadlines (machines are shared), the same examples on every run of the gate.
 
 ``station`` and ``board`` are a fresh desk for each test; rooms whose stations are others have fixtures of their own.
+What a whole module shares is visited by each of its tests (``SHARED``): what a test leaves there is ended after it,
+however it ended, so that one failure is one failure.
 
 At the gate (``CI`` is set) a test marked ``system`` that is skipped has failed: what it needs is to be installed there.
 """
@@ -10,6 +12,7 @@ from __future__ import annotations
 import os
 import signal
 from collections.abc import Generator, Iterator
+from contextlib import ExitStack, nullcontext
 from pathlib import Path
 
 import pytest
@@ -19,6 +22,8 @@ from teds_provision.station.station import Station
 from tests.bench import Board, make_station
 
 AT_THE_GATE = os.environ.get("CI", "").lower() not in ("", "0", "false")
+
+SHARED = ("hall", "bench", "lab")  # fixtures of a module whose value says ``visited``
 
 settings.register_profile("desk", deadline=None, print_blob=True)
 settings.register_profile("quick", deadline=None, print_blob=True, max_examples=20)
@@ -51,6 +56,17 @@ def pytest_runtest_makereport(item: pytest.Item) -> Generator[None, pytest.TestR
         why = report.longrepr[2] if isinstance(report.longrepr, tuple) else report.longrepr
         report.outcome, report.longrepr = "failed", f"skipped at the gate, where nothing may be missing: {why}"
     return report
+
+
+@pytest.fixture(autouse=True)
+def nothing_left(request: pytest.FixtureRequest) -> Iterator[None]:
+    """Put what the module shares back in order after each test that has it."""
+    with ExitStack() as stack:
+        for name in SHARED:
+            if name in request.fixturenames:
+                visited = getattr(request.getfixturevalue(name), "visited", None)
+                stack.enter_context(visited() if visited is not None else nullcontext())
+        yield
 
 
 @pytest.fixture

@@ -6,7 +6,6 @@ Whoever waits for something that has to come waits ``PATIENCE``.
 
 from __future__ import annotations
 
-import os
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -34,9 +33,15 @@ def best_of(tries: int, limit: float, attempt: Callable[[], float]) -> None:
         took.append(attempt())
 
 
-def crowded() -> bool:
-    """Whether so much else runs that a node of ours has no processor in time: more than three tasks for each core."""
-    return os.getloadavg()[0] > 3 * (os.cpu_count() or 1)
+def succeeds(tries: int, attempt: Callable[[], object]) -> None:
+    """Try until ``attempt`` finds nothing wrong (it gives something false), ``tries`` times at most.
+
+    For what a busy machine may spoil, once: a defect spoils it each time.
+    """
+    wrong: list[object] = []
+    while not wrong or wrong[-1]:
+        assert len(wrong) < tries, wrong
+        wrong.append(attempt())
 
 
 def until(found: Callable[[], T], why: object = "", seconds: float = PATIENCE) -> T:

@@ -1,4 +1,4 @@
-"""Ports, buses and domains of a test's own, however many workers and checkouts run on this machine at once."""
+"""Ports, buses, domains and UUIDs of a test's own, however many workers and checkouts run on this machine at once."""
 
 from __future__ import annotations
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import codecs
 import json
 import os
 import re
@@ -10,6 +11,7 @@ import signal
 import sqlite3
 import subprocess
 import time
+from collections.abc import Collection
 from contextlib import closing
 from dataclasses import dataclass, field
 from io import FileIO
@@ -25,6 +27,7 @@ from tests.places import free_bus, free_reader, new_uuid
 
 ANGLE = "magnetic-angular-position-sensor"
 FINGER = "tactile-finger-sensor"
+_UTF8 = codecs.getincrementaldecoder("utf-8")
 _TIMES = re.compile(r"\d{4}-\d\d-\d\dT[\d:.]+Z?")
 
 
@@ -71,6 +74,7 @@ class Running:
             os.close(out)
             os.close(err)
         self.out = self.err = ""
+        self._read_out, self._read_err = _UTF8(), _UTF8()  # a pipe may break a letter in two
         self._selector = selectors.DefaultSelector()
         for stream in (self.stdout, self.stderr):
             os.set_blocking(stream.fileno(), False)
@@ -85,9 +89,9 @@ class Running:
             if not octets:
                 self._selector.unregister(key.fileobj)
             elif key.fileobj is self.stdout:
-                self.out += octets.decode()
+                self.out += self._read_out.decode(octets)
             else:
-                self.err += octets.decode()
+                self.err += self._read_err.decode(octets)
         return came
 
     def wait_for(self, text: str, seconds: float = PATIENCE) -> None:
@@ -106,7 +110,7 @@ class Running:
             assert time.monotonic() < end, f"not {count} lines: {self.out!r} {self.err!r}"
             assert self._selector.get_map(), f"ended before line {count}: {self.out!r} {self.err!r}"
             self.read(0.1)
-        return [json.loads(line) for line in self.out.splitlines()]
+        return [json.loads(line) for line in self.out.split("\n")[:-1]]  # the next one may have come in part
 
     def end(self, seconds: float = PATIENCE) -> Outcome:
         """Wait for its end by itself."""
@@ -116,13 +120,18 @@ class Running:
         code = self.process.wait(max(0.1, end - time.monotonic()))
         return Outcome(code, self.out, self.err)
 
+    @property
+    def runs(self) -> bool:
+        """Whether it has not ended yet."""
+        return self.process.poll() is None
+
     def signal(self, number: int) -> None:
         """Send it a signal."""
         self.process.send_signal(number)
 
     def close(self) -> None:
         """End it, whatever it does."""
-        if self.process.poll() is None:
+        if self.runs:
             self.process.kill()
         self.process.wait(PATIENCE)
         self._selector.close()
@@ -138,17 +147,19 @@ class Desk:
         self.prepared = prepared
         self.links = Links()
         self.running: list[Running] = []
-        self._addresses: set[int] = set()  # of its nodes
+        self.addresses: set[int] = set()  # of its nodes
 
     def start(self, *words: object, **more: Any) -> Running:
         """Start the program."""
         self.running.append(Running(*words, **more))
         return self.running[-1]
 
-    def clear(self) -> None:
-        """End all that runs."""
-        while self.running:
-            self.running.pop().close()
+    def clear(self, but: Collection[Running | None] = ()) -> None:
+        """End all that runs, but what is named: a test that failed leaves nothing to the next one."""
+        for process in self.running:
+            if process not in but:
+                process.close()
+        self.running[:] = [process for process in self.running if process in but]
 
     def station(self, name: str = "bench") -> Station:
         """A station with keys of its own, prepared once and copied for each test."""
@@ -156,9 +167,13 @@ class Desk:
         subprocess.run(["cp", "-a", str(self.prepared / name), str(home)], check=True)
         return Station(self, home)
 
+    def new_uuid(self) -> bytes:
+        """A random UUID of a node that keeps its default address beside the others of this desk."""
+        return new_uuid(self.addresses)
+
     def node(self, name: str = "node", *, uuid: str | None = None, called: str = "") -> Node:
         """A new node in factory state, made in this process: what the command does is in tests/node."""
-        made = create(self.folder / name, uuid=bytes.fromhex(uuid) if uuid else new_uuid(self._addresses), name=called)
+        made = create(self.folder / name, uuid=bytes.fromhex(uuid) if uuid else self.new_uuid(), name=called)
         made.release()
         return Node(self, self.folder / name, made.load().uuid.hex())
 

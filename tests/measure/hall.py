@@ -5,6 +5,8 @@ from __future__ import annotations
 import json
 import shutil
 import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -22,7 +24,6 @@ from teds_provision.talk.progress import Silent
 from tests.bench import make_station, on_reader
 from tests.e2e.desk import ANGLE, Desk, Running
 from tests.e2e.desk import Station as Commands
-from tests.places import new_uuid
 
 CALIBRATIONS = {
     ANGLE: "# date: 2026-10-01\nraw,value [degree]\n0,0\n65535,359.9\n",
@@ -57,10 +58,11 @@ class Placed:
     folder: Path
     uuid: str
     process: Running | None = None
+    bus: str = ""
 
     def start(self, *words: object, can: str = "", fault: str = "") -> Placed:
         """Power on: the product's node, or one with a fault."""
-        bus = can or self.hall.can
+        bus = self.bus = can or self.bus or self.hall.can
         if fault:
             program, given = FAULTY, [fault, bus, self.folder, *words]
         else:
@@ -68,6 +70,11 @@ class Placed:
         self.process = self.hall.desk.start(*given, **({"program": program} if program else {}))
         self.process.wait_for('"ready": true')
         return self
+
+    @property
+    def runs(self) -> bool:
+        """Whether it is powered."""
+        return self.process is not None and self.process.runs
 
     def kill(self) -> None:
         """Cut its power."""
@@ -95,10 +102,9 @@ class Hall:
         self.desk = Desk(self.folder, prepared)
         self.can = f"{self.desk.links.can}&fd=1"
         with_keys = make_station(prepared / "bench", "bench")
-        addresses: set[int] = set()
         try:
             for name, type_ in self.types.items():
-                uuid = provisioned(with_keys, self.folder / name, type_, name, new_uuid(addresses))
+                uuid = provisioned(with_keys, self.folder / name, type_, name, self.desk.new_uuid())
                 self.nodes[name] = Placed(self, self.folder / name, uuid)
         finally:
             with_keys.close()
@@ -108,9 +114,22 @@ class Hall:
         """End all that runs."""
         self.desk.clear()
 
+    @contextmanager
+    def visited(self) -> Iterator[None]:
+        """One test in a hall that several share, however it ends: what it began ends, who was powered is so again."""
+        powered = [node for node in self.nodes.values() if node.runs]
+        there = list(self.desk.running)
+        try:
+            yield
+        finally:
+            self.desk.clear(but=[*there, *(node.process for node in powered if node.runs)])
+            for node in powered:
+                if not node.runs:
+                    node.start()  # on the bus that it was on
+
     def copy(self, name: str) -> Commands:
-        """A second home with the same keys: another machine that holds a copy."""
-        shutil.copytree(self.desk.prepared / "bench", self.folder / name)
+        """A second home with the same keys, as they are now: another machine that holds a copy."""
+        shutil.copytree(self.station.home, self.folder / name, ignore=shutil.ignore_patterns("measuring", "*.sock"))
         return Commands(self.desk, self.folder / name)
 
     def begin(self, *words: object, can: str = "", station: Commands | None = None, **more: Any) -> Running:
@@ -122,6 +141,11 @@ class Hall:
         outcome = self.begin(*words, **more).end()
         assert outcome.code == code, outcome
         return events(outcome.out)
+
+    def address(self, name: str) -> int:
+        """Where a node is on the bus now: a stranger may have moved it."""
+        told = self.ask("identify", "--via", "can")
+        return int(next(one["can_address"] for one in told["nodes"] if one["uuid"] == self.nodes[name].uuid))
 
     def ask(self, *words: object, code: int = 0) -> Any:
         """Another command on the bus, to its end."""

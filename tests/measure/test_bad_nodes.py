@@ -9,6 +9,7 @@ import signal
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -16,13 +17,13 @@ import pytest
 from tests.e2e.desk import ANGLE
 from tests.measure.faulty_node import FAULTS
 from tests.measure.hall import FAULTY, Hall, events, of, states
-from tests.pace import crowded
 
 pytestmark = pytest.mark.link
 RATE = 20
 SCALE = 6.281440 / 65535  # rad: the calibration of these nodes
 METRES = 0.110 / 4095  # of the gripper's opening
 SECONDS = 8.0
+TRIES = 4
 
 
 @dataclass
@@ -45,6 +46,12 @@ class Seen:
     def data(self) -> list[dict[str, Any]]:
         return of(self.lines) or of(self.lines, channel=2)
 
+    @property
+    def is_undisturbed(self) -> bool:
+        """Whether it was measured from its beginning to the end, and left out a tenth of its messages at most."""
+        missing = self.count("lost") + self.count("late")
+        return self.states == ["waiting", "running", "ended"] and missing <= 0.1 * self.count("messages")
+
     def count(self, what: str) -> int:
         """A counter over all its streams."""
         return sum(stream[what] for stream in self.end["streams"])
@@ -52,37 +59,51 @@ class Seen:
 
 @pytest.fixture(scope="module")
 def seen(tmp_path_factory: pytest.TempPathFactory) -> Iterator[dict[str, Seen]]:
+    """What was seen of all of them; once more where the machine itself disturbed the two that must not be disturbed."""
     hall = Hall(tmp_path_factory.mktemp("bad"), {**dict.fromkeys(FAULTS, ANGLE), "out_of_range": "gripper"})
     try:
-        process = hall.desk.start(
-            hall.can, *(f"{fault}={hall.nodes[fault].folder}" for fault in FAULTS), program=FAULTY
-        )
-        process.wait_for('"ready": true')
-        uuids = {hall.nodes[fault].uuid: fault for fault in FAULTS}
-        file = hall.folder / "bad.jsonl"
-        running = hall.begin(*uuids, "--rate", RATE, "--to", file)
-        running.wait_for('"event":"data"')
-        until = time.monotonic() + SECONDS
-        while time.monotonic() < until or not _all_told(running.out):
-            running.read(0.1)
-            assert time.monotonic() < until + 60, running.out[-3000:]
-        running.signal(signal.SIGTERM)
-        outcome = running.end()
-        lines = events(outcome.out)
-        end = lines[-1]
-        assert end["event"] == "end", outcome
-        assert outcome.code != 0, "some of them never measured, and the exit code says so"
-        yield {
-            uuids[node["uuid"]]: Seen([line for line in lines if line.get("uuid") == node["uuid"]], node)
-            for node in end["nodes"]
-        }
+        for number in range(TRIES):
+            found = measured_together(hall, hall.folder / f"bad{number}.jsonl")
+            if all(found[name].is_undisturbed for name in ("good", "junk")):
+                break
+        yield found
     finally:
         hall.close()
 
 
-def _all_told(text: str) -> bool:
-    """Whether what takes its time has happened: the silent one is lost, the lying clock is told."""
-    return all(words in text for words in ("No message of the node came", "its clock lies", "not authentic"))
+def measured_together(hall: Hall, file: Path) -> dict[str, Seen]:
+    """Every node under one measurement, until all that takes its time has happened."""
+    process = hall.desk.start(hall.can, *(f"{fault}={hall.nodes[fault].folder}" for fault in FAULTS), program=FAULTY)
+    process.wait_for('"ready": true')
+    uuids = {hall.nodes[fault].uuid: fault for fault in FAULTS}
+    running = hall.begin(*uuids, "--rate", RATE, "--to", file)
+    running.wait_for('"event":"data"')
+    until = time.monotonic() + SECONDS
+    while time.monotonic() < until or not _all_told(running.out, hall.nodes["forgets"].uuid):
+        running.read(0.1)
+        assert time.monotonic() < until + 60, running.out[-3000:]
+    running.signal(signal.SIGTERM)
+    outcome = running.end()
+    lines = events(outcome.out)
+    end = lines[-1]
+    assert end["event"] == "end", outcome
+    assert outcome.code != 0, "some of them never measured, and the exit code says so"
+    process.close()
+    return {
+        uuids[node["uuid"]]: Seen([line for line in lines if line.get("uuid") == node["uuid"]], node)
+        for node in end["nodes"]
+    }
+
+
+def _all_told(text: str, forgetful: str) -> bool:
+    """Whether what takes its time has happened: one is lost, the lying clock told, the forgetful one is back."""
+    told = all(words in text for words in ("No message of the node came", "its clock lies", "not authentic"))
+    return told and states(of_node(text, forgetful)).count("running") >= 2
+
+
+def of_node(text: str, uuid: str) -> list[dict[str, Any]]:
+    """The lines of states of one node."""
+    return events("".join(line for line in text.splitlines(keepends=True) if uuid in line and '"status"' in line))
 
 
 def test_every_fault_is_here_and_the_good_node_is_not_disturbed(seen: dict[str, Seen]) -> None:
@@ -92,8 +113,7 @@ def test_every_fault_is_here_and_the_good_node_is_not_disturbed(seen: dict[str, 
     assert good.states == ["waiting", "running", "ended"]
     assert (good.count("bad"), good.count("invalid")) == (0, 0)
     assert good.count("samples") + good.count("lost") + good.count("late") >= 5 * RATE
-    share = 1.0 if crowded() else 0.1  # of its messages that it left out itself; a busy machine costs that much
-    assert good.count("lost") + good.count("late") <= share * good.count("messages"), good.end
+    assert good.count("lost") + good.count("late") <= 0.1 * good.count("messages"), good.end
     assert "error" not in good.end
 
 

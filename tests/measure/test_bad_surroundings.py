@@ -13,6 +13,8 @@ import pytest
 from tests.e2e.desk import ANGLE, Running, limited
 from tests.links.can.hub import Hub
 from tests.measure.hall import Hall, events, of, states
+from tests.pace import PATIENCE
+from tests.places import free_tcp_port
 
 pytestmark = pytest.mark.link
 
@@ -40,8 +42,8 @@ def rows(file: Path) -> int:
 
 
 def test_a_bus_that_dies_is_opened_again_when_it_is_back(hall: Hall) -> None:
-    hub = Hub()
-    port = hub.port
+    port = free_tcp_port()  # not one that the system may deal out to others while it is closed
+    hub = Hub(port=port)
     try:
         hall.nodes["a"].start(can=hub.spec)
         running = hall.begin(hall.nodes["a"].uuid, "--rate", 20, can=hub.spec)
@@ -87,7 +89,7 @@ def test_a_reader_that_stalls_holds_up_no_recording(hall: Hall, tmp_path: Path) 
     file = tmp_path / "run.csv"
     running = hall.begin(hall.nodes["a"].uuid, "--rate", 500, "--to", file)
     running.wait_for('"event":"data"')
-    until = time.monotonic() + 30  # nobody reads its lines from here on: the pipe is full after a second
+    until = time.monotonic() + PATIENCE  # nobody reads its lines from here on: the pipe is full after a second
     before = rows(file)
     while rows(file) < before + 2000:
         assert time.monotonic() < until, "the recording went on"

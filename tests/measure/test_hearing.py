@@ -91,12 +91,13 @@ def test_together_or_one_by_one_the_same_samples(kind: Kind, steps: list[tuple[i
 
 def test_what_waited_for_12_ms_is_handed_on_and_not_before() -> None:
     scene = Scene()
+    before = time.monotonic()
     scene.heard.whole(scene.message(0), scene.arrival(0))
-    now = time.monotonic()
-    scene.heard.flush(now)
+    after = time.monotonic()
+    scene.heard.flush(before + GATHER * 0.99)
     assert not scene.blocks
     scene.heard.whole(scene.message(1), scene.arrival(1))
-    scene.heard.flush(now + GATHER)
+    scene.heard.flush(after + GATHER)
     (block,) = scene.blocks
     assert (block.index, len(block.time)) == (0, 6)
 

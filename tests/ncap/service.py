@@ -88,7 +88,7 @@ class Service:
             "--json", "ncap", "run", "--http", "127.0.0.1:0", "--can", self.desk.links.can, *self.words, *more, **how
         )
         [ready, *_] = self.process.wait_for_lines(1)
-        assert ready["ready"] is True, ready
+        assert ready.get("ready") is True, ready
         self.url = ready["url"]
         return self
 

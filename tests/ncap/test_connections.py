@@ -9,12 +9,12 @@ import pytest
 
 from teds_provision.ncap.web import connections, server
 from teds_provision.ncap.web.guard import CALLER, Receive, Scope, Send
+from tests.pace import PATIENCE
 
 Pair = tuple[asyncio.StreamReader, asyncio.StreamWriter]
 GET = b"GET / HTTP/1.1\r\nHost: x\r\n"
 PUT = b"PUT / HTTP/1.1\r\nHost: x\r\nContent-Length: 4\r\n\r\n"
 KNOWN = b"GET /known HTTP/1.1\r\nHost: x\r\n\r\n"
-PATIENCE = 20.0
 
 
 async def echo(scope: Scope, receive: Receive, send: Send) -> None:
@@ -39,7 +39,7 @@ def served(work: Callable[[Callable[[], Awaitable[Pair]]], Awaitable[None]]) -> 
         servers = server.Servers()
         await servers.serve(echo, listener)
         try:
-            await asyncio.wait_for(work(lambda: asyncio.open_connection("127.0.0.1", port)), 60)
+            await asyncio.wait_for(work(lambda: asyncio.open_connection("127.0.0.1", port)), 2 * PATIENCE)
         finally:
             await servers.stop()
 
@@ -59,11 +59,12 @@ async def answer(pair: Pair, octets: bytes) -> bytes:
 
 
 def test_a_head_and_a_body_that_do_not_end_cost_the_connection(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(connections, "HEAD", 0.2)
-    monkeypatch.setattr(connections, "BODY", 0.2)
-
     async def work(connect: Callable[[], Awaitable[Pair]]) -> None:
-        mute, head, body, second = [await connect() for _ in range(4)]
+        second = await connect()
+        await asyncio.sleep(0.05)  # the server has it
+        monkeypatch.setattr(connections, "HEAD", 0.2)  # for whoever comes, and whoever has been answered, from now on
+        monkeypatch.setattr(connections, "BODY", 0.2)
+        mute, head, body = [await connect() for _ in range(3)]
         head[1].write(GET + b"X: ")
         body[1].write(PUT + b"ab")
         assert await answer(second, GET + b"\r\n") == b"HTTP/1.1 200 OK\r\n"
@@ -76,12 +77,12 @@ def test_a_head_and_a_body_that_do_not_end_cost_the_connection(monkeypatch: pyte
 
 
 def test_the_time_of_a_head_is_not_the_time_of_a_body_nor_of_the_work(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(connections, "HEAD", 0.2)
+    monkeypatch.setattr(connections, "HEAD", 1.0)
 
     async def work(connect: Callable[[], Awaitable[Pair]]) -> None:
         pair = await connect()
         pair[1].write(PUT + b"ab")
-        await asyncio.sleep(0.5)
+        await asyncio.sleep(1.2)
         assert await answer(pair, b"cd") == b"HTTP/1.1 200 OK\r\n"
 
     served(work)

@@ -51,14 +51,6 @@ def hall(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Hall]:
     made.close()
 
 
-@pytest.fixture(autouse=True)
-def nothing_is_left(request: pytest.FixtureRequest) -> Iterator[None]:
-    """End what a test started, so that one that fails takes no other with it."""
-    yield
-    if "hall" in request.fixturenames:
-        request.getfixturevalue("hall").close()
-
-
 @pytest.mark.link
 def test_a_node_of_the_whitelist_does_not_wait_for_strangers(hall: Hall, tmp_path: Path) -> None:
     """Forty that answer nothing but Identify had kept every worker for minutes."""

@@ -22,6 +22,7 @@ from teds_provision.ncap.web.guard import Guard, Message, Receive, Refusal, Scop
 from teds_provision.ncap.web.tokens import Tokens
 from tests.e2e.desk import PASSPHRASE, Desk
 from tests.ncap.service import Answer, Service, virtual
+from tests.pace import PATIENCE
 
 pytestmark = pytest.mark.link
 JSON = {"Content-Type": "application/json"}
@@ -149,7 +150,7 @@ def test_a_body_of_two_lengths_is_refused_and_nothing_behind_it_is_a_request(
     head = f"Host: 127.0.0.1:{service.port}\r\nAuthorization: {bearer['Authorization']}\r\n"
     both = "Content-Type: application/json\r\nContent-Length: 4\r\nTransfer-Encoding: chunked\r\n"
     hidden = f"GET /api/v1/status HTTP/1.1\r\n{head}\r\n"
-    with socket.create_connection(("127.0.0.1", service.port), 20) as peer:
+    with socket.create_connection(("127.0.0.1", service.port), PATIENCE) as peer:
         peer.sendall(f"PUT /api/v1/detection HTTP/1.1\r\n{head}{both}\r\n0\r\n\r\n{hidden}".encode())
         answers = b"".join(iter(lambda: peer.recv(65536), b""))
     assert answers.count(b"HTTP/1.1 ") == 1, answers
@@ -209,8 +210,12 @@ def test_the_login_works_once_and_leaves_a_cookie_that_scripts_cannot_read(servi
 
 def websocket(service: Service, headers: dict[str, str], origin: str | None = None) -> Any:
     return connect(
-        f"ws://127.0.0.1:{service.port}/api/v1/live", additional_headers=headers, origin=origin, compression=None
-    )  # type: ignore[arg-type]
+        f"ws://127.0.0.1:{service.port}/api/v1/live",
+        additional_headers=headers,
+        origin=origin,  # type: ignore[arg-type]
+        compression=None,
+        open_timeout=PATIENCE,
+    )
 
 
 def test_a_websocket_is_held_against_the_same_list(service: Service, bearer: dict[str, str]) -> None:
@@ -228,12 +233,13 @@ def test_a_websocket_is_held_against_the_same_list(service: Service, bearer: dic
         assert refused.value.response.status_code == status, what
     for headers, origin in ((mine, own), (bearer, None)):
         with websocket(service, headers, origin) as live:
-            assert json.loads(live.recv(5))["type"] == "hello"
+            assert json.loads(live.recv(PATIENCE))["type"] == "hello"
 
 
-def test_ten_wrong_tokens_are_slowed_down_and_a_right_one_never(
-    service: Service, bearer: dict[str, str | None]
-) -> None:
+def test_ten_wrong_tokens_are_slowed_down_and_a_right_one_never(desk: Desk) -> None:
+    """At a daemon of its own: for a minute after it every wrong token is 429 there, also those of other tests."""
+    service = Service(desk, desk.station()).start()
+    bearer = {"Authorization": f"Bearer {service.token('script')}"}
     wrong = {"Authorization": "Bearer guess"}
     answers = [service.raw("GET", "/api/v1/status", wrong) for _ in range(11)]
     assert (answers[-1].status, answers[-1].headers["retry-after"]) == (429, "60")
@@ -314,6 +320,6 @@ def test_another_host_needs_tls_and_a_name(desk: Desk, tmp_path: Path) -> None:
     )
     with urllib.request.urlopen(request, context=context, timeout=60) as answer:
         assert answer.status == 200
-    with socket.create_connection(("127.0.0.1", int(port)), 5) as plain:
+    with socket.create_connection(("127.0.0.1", int(port)), PATIENCE) as plain:
         plain.sendall(b"GET / HTTP/1.1\r\nHost: localhost\r\n\r\n")
         assert not plain.recv(100).startswith(b"HTTP/1.1 200")

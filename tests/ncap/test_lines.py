@@ -23,7 +23,7 @@ def test_who_reads_the_first_line_alone_stops_nothing(desk: Desk) -> None:
             asked.request("PUT", "/detection", {"mode": ("transparent", "whitelist")[k % 2]})
         until(lambda: asked.request("GET", "/status")["detection"] == "whitelist")
     running.signal(signal.SIGTERM)
-    assert running.process.wait(30) == 0
+    assert running.process.wait(60) == 0
 
 
 def test_what_waits_is_told_at_the_end(desk: Desk) -> None:

@@ -7,6 +7,7 @@ import shutil
 import signal
 import socket
 import subprocess
+import threading
 import time
 from collections.abc import Iterator
 from contextlib import closing, suppress
@@ -23,9 +24,10 @@ from tests.bench import make_station
 from tests.cli.shell import clean_environment
 from tests.e2e.desk import ANGLE, Desk, Node, Station, limited
 from tests.ncap.service import Service, verified, virtual
-from tests.pace import best_of, until
+from tests.pace import best_of, succeeds, until
 
 pytestmark = pytest.mark.link
+LONG = ("--dead-man", 10_000)  # so that a machine that stands still for a while ends nothing
 CALIBRATION = "# date: 2026-10-01\nraw,value [degree]\n0,0\n65535,359.9\n"
 
 
@@ -35,7 +37,8 @@ class Lab:
     def __init__(self, desk: Desk) -> None:
         self.desk, self.service = desk, Service(desk, desk.station())
         folder = desk.folder / "angle"
-        made = desk.start("--json", "node", "create", folder, "--profile", ANGLE, "--name", "angle").end()
+        words = ["--profile", ANGLE, "--name", "angle", "--uuid", desk.new_uuid().hex()]
+        made = desk.start("--json", "node", "create", folder, *words).end()
         self.node = Node(desk, folder, made.json["uuid"])
         self.power()
         calibration = desk.folder / "angle.csv"
@@ -200,20 +203,27 @@ def test_a_link_that_is_missing_is_tried_again_and_holds_up_nobody(lab: Lab) -> 
 
 
 def test_the_command_line_works_beside_it_at_the_same_node(lab: Lab) -> None:
+    station, over = lab.service.station, lab.desk.links.over("can")
     lab.service.start()
     lab.measure()
-    station, over = lab.service.station, lab.desk.links.over("can")
-    before = lab.state()["measuring"]
-    assert station.ask("verify", lab.node.uuid, *over)["verdict"] == "authentic"
-    assert station.ask("read", lab.node.uuid, *over)
-    assert station.ask("sample", lab.node.uuid, *over)["samples"][0]["valid"] is True
-    after = lab.flows()["measuring"]
-    assert after["state"] == "running"
-    assert after["samples"] > before["samples"]
     assert lab.service.process is not None
-    lab.service.process.read(0.1)
-    told = [json.loads(line) for line in lab.service.process.out.splitlines()]
-    assert "lost" not in {line["state"] for line in told if line.get("event") == "node"}, "its session was never ended"
+    process = lab.service.process
+
+    def lost() -> int:
+        """How often its session was ended under three commands; a machine that stands still may end it, once."""
+        process.read(0.1)
+        told = process.out.rfind("\n") + 1
+        before = lab.flows()["measuring"]
+        assert station.ask("verify", lab.node.uuid, *over)["verdict"] == "authentic"
+        assert station.ask("read", lab.node.uuid, *over)
+        assert station.ask("sample", lab.node.uuid, *over)["samples"][0]["valid"] is True
+        until(lambda: (node := lab.flows()["measuring"])["state"] == "running" and node["samples"] > before["samples"])
+        while process.read(0.1):
+            pass
+        lines = [json.loads(line) for line in process.out[told : process.out.rfind("\n") + 1].splitlines()]
+        return sum(line.get("event") == "node" and line["state"] == "lost" for line in lines)
+
+    succeeds(3, lost)
     lab.service.end()
 
 
@@ -273,7 +283,7 @@ def test_an_actuator_that_another_command_holds_is_423(desk: Desk) -> None:
     with service.client() as asked:
         place = next(link["place"] for link in asked.status()["links"] if link["virtual"])
         bus = place.removeprefix("can:").partition("&source=")[0]
-        held = service.station.start("--json", "set", uuid, 1, 0.05, "--via", "can", "--can", bus)
+        held = service.station.start("--json", "set", uuid, 1, 0.05, *LONG, "--via", "can", "--can", bus)
         held.wait_for('"applied"')
         with pytest.raises(ApiError) as refused:
             asked.set(uuid, 1, 0.02)
@@ -337,21 +347,24 @@ def test_two_daemons_on_one_bus_measure_their_own_nodes(lab: Lab, prepared: Path
 
 
 def test_systemd_hears_when_it_is_ready_that_it_lives_and_when_it_ends(desk: Desk) -> None:
-    where = desk.folder / "notify"
+    where, heard = desk.folder / "notify", list[bytes]()
     with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as systemd:
         systemd.bind(str(where))
-        systemd.settimeout(30)
+        systemd.settimeout(60)
+
+        def listen() -> None:  # all the time: a socket that is full holds up whoever writes to it
+            while b"STOPPING=1" not in heard:
+                heard.append(systemd.recv(100))
+
+        listening = threading.Thread(target=listen, daemon=True)
+        listening.start()
         environment = clean_environment() | {"NOTIFY_SOCKET": str(where), "WATCHDOG_USEC": "200000"}
         service = Service(desk, desk.station()).start(environment=environment)
-        heard = {systemd.recv(100) for _ in range(4)}
-        assert {b"READY=1", b"WATCHDOG=1"} <= heard
+        until(lambda: {b"READY=1", b"WATCHDOG=1"} <= set(heard), heard)
+        assert b"STOPPING=1" not in heard
         service.end()
-        systemd.setblocking(False)
-        rest = b""
-        with suppress(BlockingIOError):
-            while True:
-                rest += systemd.recv(100)
-        assert b"STOPPING=1" in rest
+        listening.join(60)
+    assert heard[-1] == b"STOPPING=1"
 
 
 @pytest.mark.skipif(shutil.which("systemd-analyze") is None, reason="systemd is not installed")

@@ -88,7 +88,8 @@ class Lab:
     def create(self, name: str, type_: str) -> Node:
         """A virtual node in factory state, from a transducer type; not powered."""
         folder = self.desk.folder / name
-        made = self.desk.start("--json", "node", "create", folder, "--name", name, "--profile", type_).end()
+        words = ["--name", name, "--profile", type_, "--uuid", self.desk.new_uuid().hex()]
+        made = self.desk.start("--json", "node", "create", folder, *words).end()
         assert made.code == 0, made
         node = self.nodes[name] = Node(self.desk, folder, made.json["uuid"])
         return node

@@ -15,6 +15,7 @@ import pytest
 
 from tests.e2e.desk import Links, Running
 from tests.node.measuring_station import KEY, keyed_node
+from tests.places import new_uuid
 from tests.strangers.station import Refused, Station, identify
 from tests.strangers.wire import of_spec
 
@@ -30,11 +31,12 @@ class Floor:
     def __init__(self, folder: Path, fd: bool) -> None:
         self.folder, self.fd = folder, fd
         self.can = Links().can
+        self.addresses: set[int] = set()
         self.group, self.port = of_spec(self.can)
         self._stack = ExitStack()
 
     def run(self, profile: str, source: str = "ramp:2") -> Running:
-        keyed_node(self.folder / profile, profile=profile)
+        keyed_node(self.folder / profile, profile=profile, uuid=new_uuid(self.addresses))
         spec = self.can + ("&fd=1" if self.fd else "")
         process = Running("--json", "node", "run", self.folder / profile, "--can", spec, "--source", source)
         self._stack.callback(process.close)
