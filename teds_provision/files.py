@@ -139,6 +139,16 @@ def read_limited(
     return octets
 
 
+def read_text(path: Path, max_octets: int, what: str, *, failure: type[TedsProvisionError] = NotFound) -> str:
+    """Return the text of a UTF-8 file without a mark in front of it; raises as :func:`read_limited`, and BadData."""
+    octets = read_limited(path, max_octets, what, failure=failure)
+    try:
+        return octets.decode("utf-8-sig")
+    except UnicodeDecodeError as error:
+        line = octets[: error.start].count(b"\n") + 1
+        raise BadData(f"{path}:{line}: the text is not UTF-8.", hint="Save the file as UTF-8.") from error
+
+
 def open_to_read(path: Path) -> BinaryIO:
     """Open a file to read from; raises NotFound where it is not there or cannot be read."""
     with _told(path, NotFound):

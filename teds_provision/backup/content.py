@@ -9,17 +9,25 @@ from types import TracebackType
 from typing import Any, Final
 
 from teds_provision import __version__
-from teds_provision.errors import BadData
+from teds_provision.errors import BadData, NotAuthentic
 from teds_provision.protocol.handover.strict_json import dump, load_object
 from teds_provision.protocol.keys import fingerprint, is_point
 from teds_provision.store import Store
 
+MAX_HEAD_OCTETS: Final = 64 * 1024
 _TEXTS: Final = ("store", "station", "point", "name", "created", "keystore", "material")
 
 
 def digest_of(document: dict[str, Any]) -> str:
     """What stands as ``sha256`` in the clear part of a file: over all the rest of it."""
     return hashlib.sha256(dump(document)).hexdigest()
+
+
+def check_digest(document: dict[str, Any]) -> None:
+    """Raise NotAuthentic where a file's ``sha256`` is not over the rest of it: so damage is told from a wrong key."""
+    rest = {name: value for name, value in document.items() if name != "sha256"}
+    if document.get("sha256") != digest_of(rest):
+        raise NotAuthentic("The backup was damaged or changed: its digest does not fit.", hint="Take another copy.")
 
 
 def context_of(clear: dict[str, Any], form: str) -> bytes:

@@ -17,6 +17,7 @@ from teds_provision.protocol.keys import fingerprint
 from teds_provision.station.node_keys import RESTORED
 from teds_provision.station.station import Station
 from teds_provision.store import Store, StoreLock
+from teds_provision.store.home import has_store
 from teds_provision.store.snapshot import Relation, is_damage, place, relation, set_aside, totals
 from teds_provision.vault import Ask, Vault, create_vault, node_key_context, open_vault
 from teds_provision.vault.passphrase import PRODUCT, Costs
@@ -47,7 +48,7 @@ def open_present(home: Path, content: Content) -> Store | None:
 
     Raises PolicyRefused where it is the store of another station, StoreFailure where it cannot be used otherwise.
     """
-    if not (home / "store.sqlite3").exists():
+    if not has_store(home):
         return None
     try:
         store = Store.open(home)
@@ -93,7 +94,7 @@ def rebuild(home: Path, content: Content, ask: Ask, *, keystore: str | None = No
             due = _demand_rotations(copy, content, ask)
             detail = {"created": content.created, "keystore": vault.kind, "rotations_due": due}
             copy.audit.append("restore", None, "rebuilt", detail)
-        aside = set_aside(home) if (home / "store.sqlite3").exists() else None
+        aside = set_aside(home) if has_store(home) else None
         place(copy, home)
     return Restored("rebuilt", None, totals(copy), (), kind, aside, due)
 

@@ -20,7 +20,7 @@ from typing import Any, BinaryIO, Final
 
 from teds_provision.backup import version_1
 from teds_provision.backup.chunks import KEY_OCTETS, ChunkReader, ChunkWriter
-from teds_provision.backup.content import Content, Head, context_of, digest_of
+from teds_provision.backup.content import MAX_HEAD_OCTETS, Content, Head, check_digest, context_of, digest_of
 from teds_provision.errors import BadData, NotAuthentic, NotFound, PolicyRefused
 from teds_provision.protocol.handover import jose
 from teds_provision.protocol.handover.strict_json import dump, load_object
@@ -34,7 +34,6 @@ KEY_TYPE: Final = "teds-backup-key"
 MAX_OCTETS: Final = 16 << 30
 """More is neither written nor read: about ten times what 100,000 nodes need."""
 _LABEL: Final = b"TEDS1 backup\0"
-_MAX_HEAD_OCTETS: Final = 64 * 1024
 _MAX_LINE_OCTETS: Final = 256 * 1024
 _CLEAR: Final = ("format", "store", "station", "created")
 
@@ -135,14 +134,12 @@ class SealedFile:
     def _checked_head(self) -> dict[str, Any]:
         """The members in the clear, held against their digest."""
         assert self._head is not None
-        document = {name: value for name, value in self._head.items() if name != "sha256"}
-        if self._head.get("sha256") != digest_of(document):
-            raise NotAuthentic("The backup was damaged or changed: its digest does not fit.", hint="Take another copy.")
+        check_digest(self._head)
         return {name: self._head.get(name) for name in _CLEAR}
 
 
 def _content(chunks: ChunkReader, bound: bytes, clear: dict[str, Any]) -> Content:
-    head = Head.read(chunks.read_line(_MAX_HEAD_OCTETS), FORMAT)
+    head = Head.read(chunks.read_line(MAX_HEAD_OCTETS), FORMAT)
     if (head.store, head.station, head.created) != (clear["store"], clear["station"], clear["created"]):
         raise NotAuthentic("The backup says outside that it is of another station than it is inside.")
     copy = load_rows(chunks)

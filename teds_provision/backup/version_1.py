@@ -14,7 +14,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Final
 
-from teds_provision.backup.content import Head, context_of, digest_of
+from teds_provision.backup.content import MAX_HEAD_OCTETS, Head, check_digest, context_of
 from teds_provision.errors import BadData, NotAuthentic, NotFound, PolicyRefused
 from teds_provision.protocol.handover import jose
 from teds_provision.protocol.handover.strict_json import decode_base64url, load_object
@@ -24,7 +24,6 @@ from teds_provision.vault import passphrase as sealing
 FORMAT: Final = "teds-backup/1"
 MAX_OCTETS: Final = 512 * 1024 * 1024
 TYP: Final = "teds-backup+jws"
-_MAX_HEAD_OCTETS: Final = 64 * 1024
 
 
 @dataclass(frozen=True)
@@ -59,9 +58,7 @@ def is_for_key(octets: bytes) -> bool:
 def open_with_passphrase(octets: bytes, passphrase: str) -> Content:
     """Open a file; raises BadData, NotAuthentic (damaged or changed), WrongPassphrase, VaultFailure."""
     document = _document(octets)
-    digest = document.pop("sha256", None)
-    if digest != digest_of(document):
-        raise NotAuthentic("The backup was damaged or changed: its digest does not fit.", hint="Take another copy.")
+    check_digest(document)
     clear = {name: document.get(name) for name in ("format", "store", "station", "created")}
     sealed = document.get("sealed")
     if not isinstance(sealed, dict):
@@ -94,7 +91,7 @@ def _verified(inner: bytes) -> Content:
 
 
 def _parsed(payload: bytes) -> Content:
-    end = payload.find(b"\n", 0, _MAX_HEAD_OCTETS)
+    end = payload.find(b"\n", 0, MAX_HEAD_OCTETS)
     if end < 0:
         raise BadData("The content of the backup has no head.")
     head = Head.read(payload[:end], FORMAT)

@@ -10,6 +10,7 @@ from teds_provision.errors import BadData, Garbled, NodeSilent, NotAuthentic
 from teds_provision.links import Contact
 from teds_provision.protocol.agreement import Credentials
 from teds_provision.protocol.messages.frames import (
+    IDENTIFY,
     Command,
     Function,
     Reason,
@@ -22,13 +23,12 @@ from teds_provision.protocol.messages.frames import (
 from teds_provision.protocol.messages.identity import Identity, NodeState
 from teds_provision.protocol.messages.words import answered, named, told
 from teds_provision.protocol.session import StationSession
+from teds_provision.talk.conversation import BUSY_PAUSE, BUSY_SECONDS
 from teds_provision.teds.codec import security
 from teds_provision.teds.codec.security import SecurityTeds
 from teds_provision.teds.image import SECURITY as SECURITY_TEDS
 from teds_provision.teds.image import BlockId
 
-_BUSY_PAUSE: Final = 0.25
-_BUSY_SECONDS: Final = 10.0
 _LARGEST_TEDS: Final = 1 << 20
 
 
@@ -51,13 +51,13 @@ class Probe:
         ``inside`` is the command that is sealed in them. Raises NodeSilent where not even Identify is answered.
         """
         opened = None if inside is None else inside.encode()
-        until = time.monotonic() + _BUSY_SECONDS
+        until = time.monotonic() + BUSY_SECONDS
         while True:
             self.contact.note("out", frame, what, sealed=inside is not None, opened=opened)
             try:
                 raw = self.contact.link.exchange(frame)
             except NodeSilent:
-                self.contact.link.exchange(security_command(Function.IDENTIFY).encode())
+                self.contact.link.exchange(IDENTIFY.encode())
                 raise RuleBroken(f"{what}: no reply, and every command gets one.") from None
             try:
                 reply = decode_reply(raw)
@@ -69,7 +69,7 @@ class Probe:
                 return reply
             if time.monotonic() >= until:
                 raise NotApplicable(f"{what}: the node is busy (17).")
-            time.sleep(_BUSY_PAUSE)
+            time.sleep(BUSY_PAUSE)
 
     def plain(self, command: Command) -> Reply:
         """Send a plain command."""
@@ -156,7 +156,7 @@ class Probe:
     def identity(self) -> Identity:
         """Identify, asked now."""
         try:
-            return Identity.decode(self.good(security_command(Function.IDENTIFY)))
+            return Identity.decode(self.good(IDENTIFY))
         except BadData as error:
             raise RuleBroken(f"Identify (128.7): {error.message}") from None
 

@@ -12,6 +12,7 @@ from teds_provision.protocol.agreement import key_id
 from teds_provision.protocol.keys import POINT_OCTETS, SoftwareKey
 from teds_provision.protocol.messages.frames import (
     COMMON,
+    IDENTIFY,
     SECURITY,
     Command,
     Function,
@@ -21,8 +22,6 @@ from teds_provision.protocol.messages.frames import (
 )
 from teds_provision.protocol.messages.words import named, told
 from teds_provision.protocol.session import OPEN_OCTETS, StationSession, open_mac
-
-_IDENTIFY = security_command(Function.IDENTIFY)
 
 
 def _ask(probe: Probe) -> bytes:
@@ -72,7 +71,7 @@ def open_point(probe: Probe) -> str:
 def open_tag(probe: Probe) -> str:
     """En is a point, the tag shows that the node holds the key, and a sealed command gets a sealed reply."""
     probe.open()
-    inside, outside = probe.sealed_good(_IDENTIFY), probe.good(_IDENTIFY)
+    inside, outside = probe.sealed_good(IDENTIFY), probe.good(IDENTIFY)
     holds(inside == outside, "Identify says another thing in the session than outside it.")
     return "a good tag; Identify the same inside and outside"
 
@@ -92,29 +91,29 @@ def open_one_time(probe: Probe) -> str:
 def open_beside(probe: Probe) -> str:
     """A new Open leaves the session alone until a good frame comes under it; then the old one is over."""
     old = probe.open()
-    probe.sealed_good(_IDENTIFY)
+    probe.sealed_good(IDENTIFY)
     new = probe.open()
-    good = probe.plain(old.seal(_IDENTIFY))
+    good = probe.plain(old.seal(IDENTIFY))
     holds(good.ok, f"Sealed (128.4) in a session beside a half-open Open: success is due, {told(good)} came.")
     old.unseal(good.payload)
     probe.session = new
-    probe.sealed_good(_IDENTIFY)
-    return demand(probe.plain(old.seal(_IDENTIFY)), Reason.BAD_TAG, "Sealed (128.4) in the session that was replaced")
+    probe.sealed_good(IDENTIFY)
+    return demand(probe.plain(old.seal(IDENTIFY)), Reason.BAD_TAG, "Sealed (128.4) in the session that was replaced")
 
 
 @rule("sealed-counter", "Sessions", Stage.SESSION)
 def sealed_counter(probe: Probe) -> str:
     """Gaps are fine; a counter that was used, a lower one and 0 get 13; the session goes on."""
     session = probe.open()
-    last = session.seal(_IDENTIFY, counter=9)
+    last = session.seal(IDENTIFY, counter=9)
     session.unseal(probe.good(last).ljust(36, b"\0"))
     demand(probe.plain(last), Reason.REPLAY, "Sealed (128.4), the same frame a second time")
     for counter in (8, 0):
         demand(
-            probe.plain(session.seal(_IDENTIFY, counter=counter)), Reason.REPLAY, f"Sealed (128.4), counter {counter}"
+            probe.plain(session.seal(IDENTIFY, counter=counter)), Reason.REPLAY, f"Sealed (128.4), counter {counter}"
         )
     demand(probe.plain(session.seal(security_command(Function.LIST), counter=9)), Reason.REPLAY, "Sealed, 9 again")
-    probe.sealed_good(_IDENTIFY)
+    probe.sealed_good(IDENTIFY)
     return "13 for the same frame, for 8, 0, and for another command under 9"
 
 
@@ -122,9 +121,9 @@ def sealed_counter(probe: Probe) -> str:
 def sealed_tag(probe: Probe) -> str:
     """Too short gets 4, a wrong tag 12; a bad frame ends nothing."""
     session = probe.open()
-    probe.sealed_good(_IDENTIFY)
+    probe.sealed_good(IDENTIFY)
     probe.refused(security_command(Function.SEALED, bytes(35)), Reason.BAD_FORM)
-    good = session.seal(_IDENTIFY)
+    good = session.seal(IDENTIFY)
     bad = good.payload[:-1] + bytes([good.payload[-1] ^ 1])
     seen = probe.refused(security_command(Function.SEALED, bad), Reason.BAD_TAG, "one bit of the tag wrong")
     session.unseal(probe.good(good))
@@ -134,12 +133,12 @@ def sealed_tag(probe: Probe) -> str:
 @rule("sealed-padding", "Sessions", Stage.SESSION)
 def sealed_padding(probe: Probe) -> str:
     """A frame whose tag is good and whose PKCS #7 padding is not gets 12; it ends nothing."""
-    session, frame = probe.open(), _IDENTIFY.encode()
-    probe.sealed_good(_IDENTIFY)
+    session, frame = probe.open(), IDENTIFY.encode()
+    probe.sealed_good(IDENTIFY)
     room = 16 - len(frame)
     for padding in (bytes(room), b"\0" * (room - 1) + bytes([room]), bytes([17]) * room):
         seen = demand(probe.plain(session.seal_padded(frame + padding)), Reason.BAD_TAG, f"padding {padding.hex()}")
-    probe.sealed_good(_IDENTIFY)
+    probe.sealed_good(IDENTIFY)
     return seen
 
 
@@ -168,13 +167,13 @@ def repetition(probe: Probe) -> str:
     link = probe.contact.link
     if not isinstance(link, Repeats):
         raise NotApplicable("This link cannot send a request again.")
-    frame = probe.open().seal(_IDENTIFY).encode()
-    contact, words = probe.contact, f"{named(_IDENTIFY)}, for repeating"
-    contact.note("out", frame, words, sealed=True, opened=_IDENTIFY.encode())
+    frame = probe.open().seal(IDENTIFY).encode()
+    contact, words = probe.contact, f"{named(IDENTIFY)}, for repeating"
+    contact.note("out", frame, words, sealed=True, opened=IDENTIFY.encode())
     first = link.exchange(frame)
     contact.note("in", first, f"reply to {words}", sealed=True)
     for _ in range(2):
-        contact.note("out", frame, f"{words}, again", sealed=True, opened=_IDENTIFY.encode())
+        contact.note("out", frame, f"{words}, again", sealed=True, opened=IDENTIFY.encode())
         second = link.again(frame)
         contact.note("in", second, f"reply to {words}, again", sealed=True)
         holds(second == first, f"Sealed (128.4) repeated: the stored reply is due, {told(decode_reply(second))} came.")
@@ -187,4 +186,4 @@ def close(probe: Probe) -> str:
     session = probe.open()
     probe.sealed_good(security_command(Function.CLOSE))
     probe.session = None
-    return demand(probe.plain(session.seal(_IDENTIFY)), Reason.WRONG_STATE, "Sealed (128.4) after Close")
+    return demand(probe.plain(session.seal(IDENTIFY)), Reason.WRONG_STATE, "Sealed (128.4) after Close")

@@ -34,7 +34,7 @@ INTERRUPTED, BROKEN_PIPE = 130, 141
 _NO_NAMES: Final = frozenset({errno.ENAMETOOLONG, errno.ELOOP, errno.ENOTDIR})
 """What the system says of a name that somebody gave, wherever it is first looked at."""
 _FULL: Final = frozenset({errno.ENOSPC, errno.EDQUOT, errno.EIO, errno.EBADF})
-_COMPLETE = "_TEDS_PROVISION_COMPLETE"
+COMPLETE = "_TEDS_PROVISION_COMPLETE"
 _WIDEST, _NARROWEST = 100, 50
 
 
@@ -161,7 +161,7 @@ def cli(ctx: click.Context, /, as_json: bool, **options: Any) -> None:
 
 def run(arguments: list[str]) -> int:
     """Run one command line; returns the exit code. Every error is told in at most three lines."""
-    asked = os.environ.get(_COMPLETE)
+    asked = os.environ.get(COMPLETE)
     if asked:
         return _complete(asked)
     try:
@@ -243,7 +243,7 @@ def _complete(instruction: str) -> int:
     from click.shell_completion import shell_complete
 
     LazyGroup.teachers.append(terminal.completing.teach)
-    return shell_complete(cli, {}, "teds-provision", _COMPLETE, instruction)
+    return shell_complete(cli, {}, "teds-provision", COMPLETE, instruction)
 
 
 def _help_instead(arguments: list[str], error: click.exceptions.NoArgsIsHelpError) -> int:

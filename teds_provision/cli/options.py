@@ -62,26 +62,23 @@ class Number(click.FloatRange):
 class WholeNumber(click.IntRange):
     """A whole number within bounds; says so where it is none."""
 
+    means = "whole number"
+
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
         """Read a whole number; raises BadParameter."""
         if isinstance(value, str) and not value.strip().lstrip("+-").isdecimal():
-            self.fail(f"{value!r} is no whole number.", param, ctx)
+            self.fail(f"{value!r} is no {self.means}.", param, ctx)
         return super().convert(value, param, ctx)
 
 
-class Channel(click.IntRange):
+class Channel(WholeNumber):
     """The number of a TransducerChannel, 1 to 255; says so where it is none."""
 
     name = "channel"
+    means = "number of a channel, 1 to 255"
 
     def __init__(self) -> None:
         super().__init__(1, 255)
-
-    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
-        """Read a number; raises BadParameter."""
-        if isinstance(value, str) and not value.strip().lstrip("+-").isdecimal():
-            self.fail(f"{value!r} is no number of a channel, 1 to 255.", param, ctx)
-        return super().convert(value, param, ctx)
 
 
 class Seconds(Number):

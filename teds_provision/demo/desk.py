@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import socket
 from collections.abc import Callable
 from contextlib import ExitStack
 from dataclasses import dataclass, field
@@ -10,6 +9,7 @@ from pathlib import Path
 
 from teds_provision.errors import NotAuthentic
 from teds_provision.links import LinkSettings
+from teds_provision.links.loopback import free_port
 from teds_provision.station.station import Station
 from teds_provision.steps.agree import require_session
 from teds_provision.steps.identify import identify
@@ -33,8 +33,8 @@ class Demo:
 
     def __post_init__(self) -> None:
         self.steps = Steps(self.reporter)
-        self.nfc = f"udp:127.0.0.1:{_free_port()}"
-        self.can = f"udp_multicast:239.74.163.2?port={_free_port()}"
+        self.nfc = f"udp:127.0.0.1:{free_port()}"
+        self.can = f"udp_multicast:239.74.163.2?port={free_port()}"
 
     def over(self, via: str) -> LinkSettings:
         """Link options of a station in this demo."""
@@ -51,10 +51,3 @@ def verify_from(demo: Demo, station: Station, what: str) -> None:
         if verified.verdict != "authentic":
             raise NotAuthentic(f"The demo's node is {verified.verdict} as seen from {station.name}.")
         step.detail = f"{station.name} finds it {verified.verdict}, key epoch {held.record.epoch}"
-
-
-def _free_port() -> int:
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
-        probe.bind(("127.0.0.1", 0))
-        port: int = probe.getsockname()[1]
-        return port

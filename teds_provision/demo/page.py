@@ -16,13 +16,14 @@ import sys
 import tempfile
 import time
 from collections.abc import Callable, Iterator
-from contextlib import closing, contextmanager
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 
 from teds_provision import client, vault
 from teds_provision.errors import LinkFailure, TedsProvisionError
+from teds_provision.links.loopback import free_port
 from teds_provision.station.station import initialise
 
 RATE: Final = 50.0
@@ -51,13 +52,13 @@ def page_demo(say: Callable[[str], None], http: str | None = None) -> Iterator[P
     """Run it for the length of the block; the folder is gone afterwards. Raises what its commands raise."""
     folder = Path(tempfile.mkdtemp(prefix="teds-provision-page-"))
     try:
-        home, secret, nfc = folder / "home", secrets.token_hex(16), f"udp:127.0.0.1:{_free(socket.SOCK_DGRAM)}"
+        home, secret, nfc = folder / "home", secrets.token_hex(16), f"udp:127.0.0.1:{free_port()}"
         say("A base station with keys of its own, in a folder that is thrown away.")
         station, _ = initialise(
             home, name="bench", keystore="file", ask=lambda prompt, confirm: secret, costs=vault.passphrase.THROWAWAY
         )
         station.close()
-        where = http or f"127.0.0.1:{_free(socket.SOCK_STREAM)}"
+        where = http or f"127.0.0.1:{free_port(socket.SOCK_STREAM)}"
         with _daemon(home, secret, "--http", where, "--nfc", nfc), client.connect(home=home) as api:
             say("Three virtual transducers: made, provisioned and verified by the station, then measured as one group.")
             _measured(api)
@@ -131,9 +132,3 @@ def _failure(said: bytes) -> TedsProvisionError:
         return TedsProvisionError(str(error["message"]), hint=str(error["hint"]))
     except (ValueError, KeyError, TypeError):
         return TedsProvisionError("The base station of the demo did not start.")
-
-
-def _free(kind: socket.SocketKind) -> int:
-    with closing(socket.socket(socket.AF_INET, kind)) as probe:
-        probe.bind(("127.0.0.1", 0))
-        return int(probe.getsockname()[1])

@@ -12,8 +12,8 @@ from teds_provision.doctor.registry import Finding, Place, check
 from teds_provision.errors import StoreChanged, StoreFailure, VaultFailure
 from teds_provision.station.station import Station
 from teds_provision.store import Store
+from teds_provision.store.home import has_store
 
-_STORE: Final = "store.sqlite3"
 _SHOWN: Final = 5
 
 
@@ -88,7 +88,7 @@ def profiles(place: Place) -> Iterator[Finding]:
 @check("store file", "store")
 def store_file(place: Place) -> Iterator[Finding]:
     """Is the store there where the vault is: one without the other is a loss."""
-    if (place.home / "vault.json").exists() and not (place.home / _STORE).exists():
+    if (place.home / "vault.json").exists() and not has_store(place.home):
         why = f"The vault is in {place.home}, and its store is gone: names, pins and wrapped keys of every node."
         yield Finding("store file", "failed", why, "teds-provision restore FILE (a backup)")
 
@@ -96,7 +96,7 @@ def store_file(place: Place) -> Iterator[Finding]:
 @check("nodes", "store")
 def nodes(place: Place) -> Iterator[Finding]:
     """What waits for somebody: calibrations that have ended, names twice, drafts, nodes never verified, rotations."""
-    if not (place.home / _STORE).exists():
+    if not has_store(place.home):
         return
     with Store.open(place.home) as opened:
         tally = opened.tally(datetime.now(UTC).strftime("%Y-%m-%d"))
@@ -118,7 +118,7 @@ def nodes(place: Place) -> Iterator[Finding]:
 @check("seals", "store")
 def seals(place: Place) -> Iterator[Finding]:
     """Do the rows that decide whom the station believes carry its seal; only where the passphrase is given."""
-    if not (place.home / _STORE).exists():
+    if not has_store(place.home):
         return
     if place.ask is None:
         why = "Pins and trust are checked where the vault opens; no passphrase was given."

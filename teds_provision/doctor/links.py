@@ -20,6 +20,7 @@ from teds_provision.doctor.registry import Finding, Place, Result, check
 from teds_provision.errors import LinkFailure, NoReader, UsageFailure
 from teds_provision.links import can as can_room
 from teds_provision.links import nfc as nfc_room
+from teds_provision.links.loopback import free_port
 
 READERS: Final = {
     (0x054C, 0x0193): "Sony PN531",
@@ -233,7 +234,7 @@ def _bitrate(place: Place, name: str) -> tuple[int, str]:
 def can_loopback(place: Place) -> Iterator[Finding]:
     """Do frames of a simulated bus come back, without leaving this machine (hop limit 0)."""
     channel = f"239.74.{os.getpid() >> 8 & 255}.{os.getpid() & 255 or 1}"
-    arrived, why, fix = _self_test(f"udp_multicast:{channel}?hop_limit=0&port={_free_port()}")
+    arrived, why, fix = _self_test(f"udp_multicast:{channel}?hop_limit=0&port={free_port()}")
     told = "Simulated buses (udp_multicast:) can be used." if arrived else why
     yield Finding("can loopback", "ok" if arrived else "warning", told, fix)
 
@@ -298,9 +299,3 @@ def _shown(place: Place, node: Path) -> str:
         return f"{shown} (mode {stat.S_IMODE(node.stat().st_mode):04o})"
     except OSError:
         return shown
-
-
-def _free_port() -> int:
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
-        probe.bind(("127.0.0.1", 0))
-        return int(probe.getsockname()[1])

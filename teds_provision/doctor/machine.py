@@ -15,6 +15,7 @@ from teds_provision import store as store_room
 from teds_provision import vault
 from teds_provision.doctor.registry import Finding, Place, check
 from teds_provision.errors import StoreFailure
+from teds_provision.store.home import has_store
 
 _MIN_PYTHON: Final = (3, 11)
 _LIBRARIES: Final = {
@@ -127,7 +128,7 @@ def clock(place: Place) -> Iterator[Finding]:
 
 
 def _last_entry(place: Place) -> datetime | None:
-    if not (place.home / "store.sqlite3").exists():
+    if not has_store(place.home):
         return None
     try:
         with store_room.Store.open(place.home) as store:

@@ -16,9 +16,9 @@ from teds_provision import vault as vault_room
 from teds_provision.doctor.registry import Finding, Place, check
 from teds_provision.errors import NoKeyring, StoreFailure, VaultFailure
 from teds_provision.store import Choice, Store
+from teds_provision.store.home import has_store
 from teds_provision.vault.agent import asking
 
-_STORE: Final = "store.sqlite3"
 _LOCK: Final = "store.lock"
 _MIN_FREE: Final = 64 * 1024 * 1024
 _BACKUP_DAYS: Final = 90
@@ -68,7 +68,7 @@ def disk(place: Place) -> Iterator[Finding]:
 @check("store", "store")
 def store(place: Place) -> Iterator[Finding]:
     """Is the store whole, does its audit log hold, does anyone hold it, and is there a backup."""
-    if not (place.home / _STORE).exists():
+    if not has_store(place.home):
         yield Finding("store", "skipped", _NO_STATION, _INIT)
         return
     with Store.open(place.home) as opened:
@@ -204,7 +204,7 @@ def _file_vault(place: Place) -> Finding:
 
 
 def _keystore(place: Place) -> str | None:
-    if not (place.home / _STORE).exists():
+    if not has_store(place.home):
         return None
     try:
         with Store.open(place.home) as opened:

@@ -18,6 +18,7 @@ from teds_provision.protocol.handover.strict_json import decode_base64url, dump,
 from teds_provision.protocol.keys import PrivateKey, SoftwareKey, fingerprint, station_key_message, verify
 from teds_provision.station.station import Station
 from teds_provision.store import Store, StoreLock
+from teds_provision.store.home import has_store
 
 if TYPE_CHECKING:
     from teds_provision.vault import Ask, Vault
@@ -130,7 +131,7 @@ def adopt_certificate(home: Path, certificate: Certificate, *, ask: Ask) -> Stat
 
     Raises NotFound (no station asked here), PolicyRefused (a certificate for another key, or another CA already).
     """
-    if not (home / "store.sqlite3").exists():
+    if not has_store(home):
         raise NotFound("No station has asked for a certificate here.", hint="First: init --request FILE")
     station = Station(Store.open(home), ask)
     try:

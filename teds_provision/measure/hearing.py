@@ -20,7 +20,7 @@ from teds_provision.links.can.port import CanPort
 from teds_provision.measure.blocks import Block
 from teds_provision.measure.clock import ClockMap
 from teds_provision.measure.interpreter import StreamInterpreter
-from teds_provision.protocol.operation.can_frames import Assembly
+from teds_provision.protocol.operation.can_frames import DATA, Assembly
 from teds_provision.protocol.operation.subscription import Message, Receiver
 
 SLICE = 0.004  # seconds between looks at what waits
@@ -28,7 +28,7 @@ REST = 0.003  # seconds that frames gather on one bus: to be woken for each of t
 GATHER = 0.012  # seconds that messages wait to be opened and calibrated together: of a tick's 20 ms to its sink
 HEARD_OUT = 0.25  # seconds for the last message that is wanted to come and to be looked at
 MOST_HELD = 50_000  # frames: some seconds of a full bus
-_DATA, _MASK = 0x1CFF0000, 0x1FFF0000
+_MASK = 0x1FFF0000
 _STREAM = 0x18FF  # of an identifier: node and stream
 
 
@@ -205,7 +205,7 @@ class CanHearing(Hearing):
         super().__init__(port.place)
 
     def _wanted(self, frame: Frame) -> bool:
-        return frame.identifier & _MASK == _DATA and frame.identifier >> 13 & 7 == self._own & 7
+        return frame.identifier & _MASK == DATA and frame.identifier >> 13 & 7 == self._own & 7
 
     def _hear(self) -> None:
         with self._port.bus().listen(self._wanted, most=MOST_HELD) as ear:

@@ -8,6 +8,8 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
+REPLY_SECONDS, REPEAT_SECONDS, TRIES = 5.0, 15.0, 3
+"""A station waits 5 s for a reply, and repeats its request at most twice, within 15 s."""
 KEEP_SECONDS = 20.0
 _IDEMPOTENT = {(128, 7), (128, 8), (128, 11), (1, 1), (1, 2)}
 

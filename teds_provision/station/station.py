@@ -39,6 +39,7 @@ from teds_provision.station.policy import Policy
 from teds_provision.station.seals import Seals
 from teds_provision.store import AuditLog, NodeTurn, Store, StoreLock
 from teds_provision.store.dump import dump
+from teds_provision.store.home import has_store
 
 if TYPE_CHECKING:
     from teds_provision.protocol import agreement, keys
@@ -79,7 +80,7 @@ class Station:
 
         ``ask`` gives a passphrase when the vault opens, ``tell`` gets what the user has to know then.
         """
-        if not (home / "store.sqlite3").exists():
+        if not has_store(home):
             raise not_initialised(home)
         station = cls(Store.open(home), ask, tell)
         if not station.identity.is_complete():

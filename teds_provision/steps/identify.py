@@ -12,7 +12,7 @@ from teds_provision import teds
 from teds_provision.errors import BadData, NodeRefused, NoKeyring, NotAuthentic, WrongPassphrase
 from teds_provision.harmless import printable
 from teds_provision.protocol.fingerprints import is_whole
-from teds_provision.protocol.keys import fingerprint, node_key_good, prove_message, verify
+from teds_provision.protocol.keys import CHALLENGE_OCTETS, fingerprint, node_key_good, prove_message, verify
 from teds_provision.protocol.messages.frames import Function, security_command
 from teds_provision.protocol.messages.identity import NodeState
 from teds_provision.station.station import Station
@@ -22,8 +22,6 @@ from teds_provision.talk.conversation import Conversation
 from teds_provision.teds.codec import security
 from teds_provision.teds.codec.codes import AccessCode
 from teds_provision.teds.image import SECURITY, Image
-
-CHALLENGE_OCTETS = 32
 
 
 @dataclass(frozen=True)

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 from teds_provision.errors import BadData, Garbled, NodeRefused
 from teds_provision.protocol.messages.frames import (
+    IDENTIFY,
     Attribute,
     Command,
     Function,
@@ -122,7 +123,7 @@ def read_image(node: Conversation, *, initial: bytes | None = None) -> Image:
 
 def read_identity(node: Conversation) -> Identity:
     """Ask Identify again, inside the session where one is open (then it is authentic)."""
-    identity = Identity.decode(node.ask(security_command(Function.IDENTIFY), "to identify itself"))
+    identity = Identity.decode(node.ask(IDENTIFY, "to identify itself"))
     if identity.uuid != node.uuid:
         raise Garbled(f"The node called itself {node.uuid.hex()} before and {identity.uuid.hex()} now.")
     if node.sealed:

@@ -6,12 +6,12 @@ import os
 from dataclasses import dataclass
 
 from teds_provision.errors import NotAuthentic
-from teds_provision.protocol.keys import reset_message, verify
+from teds_provision.protocol.keys import CHALLENGE_OCTETS, reset_message, verify
 from teds_provision.protocol.messages.frames import Function, security_command
 from teds_provision.protocol.messages.identity import NodeState
 from teds_provision.station.station import Station
 from teds_provision.steps.agree import require_session
-from teds_provision.steps.identify import CHALLENGE_OCTETS, Identified
+from teds_provision.steps.identify import Identified
 from teds_provision.steps.read import read_identity
 from teds_provision.talk.conversation import Conversation, SessionLost
 

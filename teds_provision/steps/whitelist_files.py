@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from teds_provision.errors import BadData
-from teds_provision.files import read_limited
+from teds_provision.files import read_text
 from teds_provision.limits import load_json
 from teds_provision.protocol.fingerprints import read_fingerprint, same_key
 from teds_provision.store.records import UUID_OCTETS
@@ -104,7 +104,7 @@ def read_whitelist(path: Path, form: str | None = None) -> list[Listed]:
 
     Raises NotFound, or BadData that names file, line and field of every mistake (the first ten in full).
     """
-    text = _text(path)
+    text = read_text(path, MAX_FILE_OCTETS, "whitelist")
     if not text.strip():
         raise BadData(f"{path} is empty: it lists no node.", hint="Give XML, CSV (a line of column names) or JSON.")
     form = form or _form_of(path, text)
@@ -129,15 +129,6 @@ def require_name(name: str | None) -> None:
 
 def _is_name(name: str | None) -> bool:
     return name is None or (len(name) <= _MAX_NAME and name.isprintable())
-
-
-def _text(path: Path) -> str:
-    octets = read_limited(path, MAX_FILE_OCTETS, "whitelist")
-    try:
-        return octets.decode("utf-8-sig")
-    except UnicodeDecodeError as error:
-        line = octets[: error.start].count(b"\n") + 1
-        raise BadData(f"{path}:{line}: the text is not UTF-8.", hint="Save the file as UTF-8.") from error
 
 
 def _form_of(path: Path, text: str) -> str:

@@ -17,7 +17,7 @@ from teds_provision.lazy import late
 from teds_provision.store.connection import QUIET_SECONDS, WAITING, Connection
 from teds_provision.store.failures import BUSY_SECONDS, as_store_failure, is_no_place_to_write
 from teds_provision.store.frozen import open_copy
-from teds_provision.store.home import prepare_file, prepare_home
+from teds_provision.store.home import FILE_NAME, prepare_file, prepare_home
 from teds_provision.store.migration import carry
 from teds_provision.store.schema import APPLICATION_ID, SCHEMA_VERSION, STEPS_TO
 
@@ -27,8 +27,8 @@ else:  # loaded with the first store: --help does not wait for it
     sqlite3 = late("sqlite3")
 
 
-FILE_NAME = "store.sqlite3"
-_PAGE = 500
+PAGE = 500
+"""Rows that are looked up, read or written at once."""
 _REMEMBERED = 100
 _Record = TypeVar("_Record")
 
@@ -68,7 +68,7 @@ class Database(Connection):
             raise as_store_failure(error, path) from error
         database = cls(path, connection)
         try:
-            database._set_up(create=create)
+            database.set_up(create=create)
         except BaseException:
             connection.close()
             raise
@@ -141,7 +141,7 @@ class Database(Connection):
         The statement has two marks, for the number to go on after and for the page's length, and its first column is
         that number, growing.
         """
-        while rows := self.execute(statement, (after, _PAGE)):
+        while rows := self.execute(statement, (after, PAGE)):
             for row in rows:
                 if not isinstance(row[0], int) or row[0] <= after:
                     raise self._damaged()
@@ -152,7 +152,8 @@ class Database(Connection):
                     raise self._damaged() from error
                 yield record
 
-    def _set_up(self, *, create: bool) -> None:
+    def set_up(self, *, create: bool) -> None:
+        """Bring a connection into order: its journal, its schema, its pragmas. Raises StoreFailure."""
         self._check_version(create=create)
         self._write_ahead()
         self._bring_in_order(create=create)

@@ -12,13 +12,11 @@ import re
 import struct
 from collections.abc import Iterator
 from contextlib import suppress
-from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, Protocol
 
 from teds_provision.errors import BadData, StoreFailure
 from teds_provision.lazy import late
-from teds_provision.store.audit import AuditLog
-from teds_provision.store.database import FILE_NAME, Database
+from teds_provision.store.database import PAGE
 from teds_provision.store.schema import APPLICATION_ID, SCHEMA_VERSION, STEPS_TO
 from teds_provision.store.store import Store
 
@@ -30,7 +28,6 @@ else:  # loaded with the first store: --help does not wait for it
 
 MAX_RECORD_OCTETS: Final = 128 << 20
 _MAX_HEAD_OCTETS: Final = 64 * 1024
-_PAGE_ROWS: Final = 500
 _CACHE_KIB: Final = 64 * 1024
 _END: Final = 255
 _HEAD: Final = struct.Struct(">BI")
@@ -65,7 +62,7 @@ def dump(store: Store) -> Iterator[bytes]:
             yield json.dumps({"schema": version, "tables": tables}, separators=(",", ":")).encode() + b"\n"
             for number, (table, columns) in enumerate(tables.items()):
                 rows = connection.execute(f"SELECT {', '.join(columns)} FROM {table}")
-                while page := rows.fetchmany(_PAGE_ROWS):
+                while page := rows.fetchmany(PAGE):
                     yield b"".join(_record(number, row) for row in page)
             yield _HEAD.pack(_END, 0)
         finally:
@@ -83,12 +80,8 @@ def load(source: RowSource) -> Store:
         for pragma in (f"cache_size=-{_CACHE_KIB}", "journal_mode=OFF", "synchronous=OFF", "trusted_schema=OFF"):
             connection.execute(f"PRAGMA {pragma}")
         _fill(connection, source)
-        database = Database(Path("backup", FILE_NAME), connection)
-        database._set_up(create=False)
-        store = Store(database)
-        store.id = store._identifier(create=False)
-        store.audit = AuditLog(database, store.id)
-        if store.damage() is not None or connection.execute("PRAGMA foreign_key_check").fetchone():
+        store = Store.of_backup(connection)
+        if connection.execute("PRAGMA foreign_key_check").fetchone():
             raise BadData("The store in the backup is damaged.")
     except (sqlite3.IntegrityError, sqlite3.DataError, UnicodeDecodeError) as error:
         connection.close()
@@ -157,7 +150,7 @@ def _pages(source: RowSource, widths: list[int]) -> Iterator[tuple[int, list[tup
     current, page = 0, list[tuple[Any, ...]]()
     while True:
         number, length = _HEAD.unpack(source.read(_HEAD.size))
-        if page and (number != current or len(page) >= _PAGE_ROWS):
+        if page and (number != current or len(page) >= PAGE):
             yield current, page
             page = []
         if number == _END and length == 0:

@@ -6,8 +6,16 @@ import os
 import stat
 from contextlib import suppress
 from pathlib import Path
+from typing import Final
 
 from teds_provision.errors import StoreFailure
+
+FILE_NAME: Final = "store.sqlite3"
+
+
+def has_store(home: Path) -> bool:
+    """Whether a store lies here, usable or not."""
+    return (home / FILE_NAME).exists()
 
 
 def prepare_home(home: Path, *, create: bool) -> None:

@@ -11,9 +11,8 @@ from typing import TYPE_CHECKING, Final
 from teds_provision.errors import BadData, StoreFailure
 from teds_provision.files import whole_draft
 from teds_provision.lazy import late
-from teds_provision.store.audit import AuditLog
-from teds_provision.store.database import FILE_NAME, Database
 from teds_provision.store.failures import as_store_failure
+from teds_provision.store.home import FILE_NAME
 from teds_provision.store.store import Store
 
 if TYPE_CHECKING:
@@ -47,13 +46,7 @@ def load(octets: bytes) -> Store:
     connection = sqlite3.connect(":memory:", isolation_level=None, check_same_thread=False)
     try:
         connection.deserialize(octets)
-        database = Database(Path("backup", FILE_NAME), connection)
-        database._set_up(create=False)
-        store = Store(database)
-        store.id = store._identifier(create=False)
-        store.audit = AuditLog(database, store.id)
-        if store.damage() is not None:
-            raise BadData("The store in the backup is damaged.")
+        store = Store.of_backup(connection)
     except sqlite3.Error as error:
         connection.close()
         raise BadData("The backup holds no store that can be read.") from error

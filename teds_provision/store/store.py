@@ -7,11 +7,12 @@ from collections.abc import Callable
 from contextlib import AbstractContextManager
 from pathlib import Path
 from types import TracebackType
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
-from teds_provision.errors import StoreFailure
+from teds_provision.errors import BadData, StoreFailure
 from teds_provision.store.audit import AuditLog
 from teds_provision.store.database import Database
+from teds_provision.store.home import FILE_NAME
 from teds_provision.store.tables.batches import BulkTables
 from teds_provision.store.tables.datasheets import DatasheetTables
 from teds_provision.store.tables.facts import FactTables
@@ -20,6 +21,9 @@ from teds_provision.store.tables.keys import KeyTables
 from teds_provision.store.tables.measurements import MeasurementTables
 from teds_provision.store.tables.nodes import NodeTables
 from teds_provision.store.tables.overview import OverviewTables
+
+if TYPE_CHECKING:
+    import sqlite3
 
 _ID_OCTETS = 16
 
@@ -47,12 +51,29 @@ class Store(
         Raises StoreFailure: missing, damaged, of a newer version, not ours, no permission, no space.
         """
         database = Database.open(home, create=create)
-        store = cls(database)
         try:
-            store.id = store._identifier(create=create)
+            return cls._identified(database, create=create)
         except BaseException:
             database.close()
             raise
+
+    @classmethod
+    def of_backup(cls, connection: sqlite3.Connection) -> Store:
+        """The store in a private database that a backup was unpacked to; an older schema is brought forward.
+
+        Raises BadData where it is damaged, StoreFailure. The connection stays open then.
+        """
+        database = Database(Path("backup", FILE_NAME), connection)
+        database.set_up(create=False)
+        store = cls._identified(database)
+        if store.damage() is not None:
+            raise BadData("The store in the backup is damaged.")
+        return store
+
+    @classmethod
+    def _identified(cls, database: Database, *, create: bool = False) -> Store:
+        store = cls(database)
+        store.id = store._identifier(create=create)
         store.audit = AuditLog(database, store.id)
         return store
 

@@ -11,14 +11,22 @@ from types import TracebackType
 from teds_provision.errors import Garbled, LinkFailure, NodeRefused, NodeSilent, TedsProvisionError
 from teds_provision.links import Contact, Notice
 from teds_provision.links.ports import Link, NoticeSink, Prompt
-from teds_provision.protocol.messages.frames import Command, Function, Reason, Reply, decode_reply, security_command
+from teds_provision.protocol.messages.frames import (
+    IDENTIFY,
+    Command,
+    Function,
+    Reason,
+    Reply,
+    decode_reply,
+    security_command,
+)
 from teds_provision.protocol.messages.identity import Identity
 from teds_provision.protocol.messages.words import answered, asked
 from teds_provision.protocol.session import StationSession
 
 _log = logging.getLogger(__name__)
-_BUSY_PAUSE = 0.25
-_BUSY_SECONDS = 10.0
+BUSY_PAUSE, BUSY_SECONDS = 0.25, 10.0
+"""A node that is busy is asked again, after a pause, and not for ever."""
 _REOPENINGS = 2
 _REPEATS = 5
 """How often a command that does no harm is sent again on a link that loses frames."""
@@ -268,14 +276,14 @@ class Conversation:
         if not self._is_noisy:
             return False
         try:
-            self._exchange(security_command(Function.IDENTIFY))
+            self._exchange(IDENTIFY)
         except LinkFailure:
             return False
         return True
 
     def _exchange(self, command: Command, inside: Command | None = None, within: float | None = None) -> Reply:
         """Send a command, again while the node is busy; ``inside`` is what is sealed in it."""
-        until = time.monotonic() + (_BUSY_SECONDS if within is None else 0.0)
+        until = time.monotonic() + (BUSY_SECONDS if within is None else 0.0)
         while True:
             frame = command.encode()
             self._trace_sent(frame, command, inside)
@@ -287,7 +295,7 @@ class Conversation:
             if reply.ok or reply.reason != Reason.BUSY or time.monotonic() >= until:
                 return reply
             self._notice(Notice("retry", "The node is busy with another station", until - time.monotonic()))
-            time.sleep(_BUSY_PAUSE)
+            time.sleep(BUSY_PAUSE)
 
     # The messages are encoded once more for the trace, so these look whether there is one.
 

@@ -21,6 +21,8 @@ from teds_provision.teds.units.units import WrittenUnit, display_unit, format_va
 
 NOT_STATED: Final = math.nan
 """Stands for a number that the TEDS do not give, or call not available: IEEE 1451.0 writes NaN for that itself."""
+ROUNDING: Final = 4 * 2.0**-23
+"""Limits and coefficients are Float32: a value this much of the limit beyond it is not beyond it."""
 
 
 class Kind(IntEnum):

@@ -19,6 +19,7 @@ from typing import Final, Literal
 
 from teds_provision.errors import BadData
 from teds_provision.limits import LIMITS, check_size, check_toml
+from teds_provision.teds.channel import ROUNDING
 from teds_provision.teds.codec.model import Units
 from teds_provision.teds.sheet import Channel, Sheet
 from teds_provision.teds.units.names import NAMED, RATIO
@@ -66,7 +67,6 @@ _TERM: Final = re.compile(
     r"\s*([-+]?(?:[0-9]{1,20}(?:\.[0-9]{0,20})?|\.[0-9]{1,20})(?:[eE][-+]?[0-9]{1,3})?)\s*([^\s0-9.].*)?\Z"
 )
 _HERTZ: Final = NAMED["1/s"]
-_ROUNDING: Final = 4 * 2.0**-23
 
 
 @dataclass(frozen=True)
@@ -215,7 +215,7 @@ def _meets(term: Term, has: float, channel: Channel) -> bool:
         return True
     difference = term.what in ("range", "uncertainty")
     asked = term.unit.difference_to_si(term.value) if difference else term.unit.to_si(term.value)
-    slack = _ROUNDING * max(abs(has), abs(asked))
+    slack = ROUNDING * max(abs(has), abs(asked))
     # That a range reaches down to a value: its low end is not above it. All other bounds read as they are written.
     match term.operator:
         case ">=":
@@ -230,7 +230,7 @@ def _meets(term: Term, has: float, channel: Channel) -> bool:
 
 def _every_angle(channel: Channel) -> bool:
     """Whether a channel covers a full turn, which reaches every angle."""
-    return channel.units == NAMED["rad"] and channel.high - channel.low >= 2 * math.pi * (1 - _ROUNDING)
+    return channel.units == NAMED["rad"] and channel.high - channel.low >= 2 * math.pi * (1 - ROUNDING)
 
 
 def _shown(term: Term, has: float, channel: Channel) -> str:

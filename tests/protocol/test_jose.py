@@ -199,7 +199,7 @@ def test_what_is_no_compact_jws(token):
 def test_a_long_header_and_a_long_document_are_refused_unread():
     with pytest.raises(BadData, match="longer than"):
         verified(signed(header(pad="x" * 9000)))
-    with pytest.raises(BadData, match="are not read"):
+    with pytest.raises(BadData, match=r"at most [0-9]+ are read"):
         verified(b"a" * (LIMIT + 1))
 
 

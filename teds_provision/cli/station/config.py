@@ -12,6 +12,7 @@ import click
 from teds_provision.cli import terminal
 from teds_provision.cli.configuration import as_parameters, config_path, read_config
 from teds_provision.cli.context import App, pass_app
+from teds_provision.cli.main import COMPLETE
 from teds_provision.cli.option_names import OPTIONS
 from teds_provision.cli.options import COMMAND_SETTINGS, command, examples
 from teds_provision.errors import BadData
@@ -20,7 +21,6 @@ if TYPE_CHECKING:
     from rich.console import Console
 
 _PREFIX = "TEDS_PROVISION_"
-_COMPLETE = "_TEDS_PROVISION_COMPLETE"
 
 
 @click.group(
@@ -127,5 +127,5 @@ def completion(app: App, shell: str) -> None:
     In bash: eval "$(teds-provision completion bash)"
     """
     root = click.get_current_context().find_root().command
-    script = terminal.completing.SHELLS[shell](root, {}, "teds-provision", _COMPLETE).source()
+    script = terminal.completing.SHELLS[shell](root, {}, "teds-provision", COMPLETE).source()
     app.emit({"shell": shell, "script": script}, lambda console: print(script))

@@ -8,6 +8,7 @@ from teds_provision.cli.context import App, pass_app
 from teds_provision.cli.options import command, dry_run_option, link_options, yes_option
 from teds_provision.cli.rendering import reporter_for
 from teds_provision.links import LinkSettings
+from teds_provision.protocol.announce import LAST_ADDRESS
 from teds_provision.steps import visits
 
 
@@ -17,7 +18,7 @@ def _address(_ctx: click.Context, _parameter: click.Parameter, text: str) -> int
         number = int(text, 0)
     except ValueError:
         number = 0
-    if not 1 <= number <= 239:
+    if not 1 <= number <= LAST_ADDRESS:
         raise click.BadParameter("a CAN address is 1 to 239 (0x01 to 0xEF).")
     return number
 

@@ -3,22 +3,20 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 import click
 
 from teds_provision import steps
 from teds_provision import teds as teds_room
 from teds_provision.cli.context import App, pass_app
-from teds_provision.cli.options import command, dry_run_option, yes_option
+from teds_provision.cli.options import Function, command, dry_run_option, yes_option
 from teds_provision.errors import UsageFailure
 from teds_provision.files import SHARED, read_limited, write_whole
 
 MAX_INPUT_OCTETS = 32 << 20
-
-Function = TypeVar("Function", bound=Callable[..., Any])
 
 
 def order_options(function: Function) -> Function:

@@ -10,11 +10,8 @@ from teds_provision.links.ble import troubles
 from teds_provision.links.ble.connection import Connection, ConnectionLost, NotConnected
 from teds_provision.links.ble.loop import Loop
 from teds_provision.links.ports import BLE, Capabilities, Notice, NoticeSink
+from teds_provision.protocol.repetition import REPEAT_SECONDS, REPLY_SECONDS, TRIES
 
-REPLY_SECONDS: Final = 5.0
-REPEAT_SECONDS: Final = 15.0
-TRIES: Final = 3
-"""A request is repeated at most twice, within 15 s (profile.md, "Repetition")."""
 _FIRST_PAUSE, _LAST_PAUSE = 0.3, 2.0
 
 

@@ -22,10 +22,9 @@ from teds_provision.links.ble.loop import Loop
 from teds_provision.links.ble.remembered import Remembered, cache_file
 from teds_provision.links.ble.spec import parse_spec
 from teds_provision.links.ports import BLE, Capabilities, Contact, Notice, NoticeSink, Trace
-from teds_provision.protocol.messages.frames import Function, decode_reply, security_command
+from teds_provision.protocol.messages.frames import IDENTIFY, decode_reply
 from teds_provision.protocol.messages.identity import Identity, NodeState
 
-_IDENTIFY: Final = security_command(Function.IDENTIFY).encode()
 _ROUND_SECONDS: Final = 2.0
 _SILENCE_SECONDS: Final = 1.5
 """Nobody new for so long: everyone was seen. Nodes advertise every 0.1 to 1 s."""
@@ -251,7 +250,7 @@ class BlePort:
         link = self._link(address, notice)
         in_use = link.connection.is_up
         try:
-            identity = Identity.decode(decode_reply(link.exchange(_IDENTIFY)).payload)
+            identity = Identity.decode(decode_reply(link.exchange(IDENTIFY.encode())).payload)
         except NoReader:
             raise
         except (LinkFailure, NodeRefused) as error:

@@ -12,13 +12,12 @@ from teds_provision.errors import AddressConflict
 from teds_provision.links.can.finding import Found, ask_all, conflict_text, settle
 from teds_provision.links.can.spec import CanSpec
 from teds_provision.links.ports import Notice, NoticeSink
+from teds_provision.protocol.announce import is_announce
 from teds_provision.protocol.messages.identity import Identity, NodeState
 
 if TYPE_CHECKING:
     from teds_provision.links.can.shared import Ear, SharedBus
 
-_ANNOUNCE: Final = 0x1CFF0000
-_ANNOUNCE_MASK: Final = 0x1FFFFF00
 _GONE_SECONDS: Final = 3.0
 """A node that has been silent for so long has left."""
 _SILENCE_SECONDS: Final = 0.055
@@ -107,7 +106,7 @@ class Arrivals:
         bus = self._port.bus()
         if bus is not self._bus:
             self._bus = bus
-            self._ear = bus.listen(lambda frame: frame.identifier & _ANNOUNCE_MASK == _ANNOUNCE, most=256)
+            self._ear = bus.listen(lambda frame: is_announce(frame.identifier), most=256)
 
     def _one(self, address: int, clashing: set[int]) -> Iterator[tuple[int, Identity]]:
         try:

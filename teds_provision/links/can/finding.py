@@ -13,10 +13,9 @@ from teds_provision.links.can.gathering import Gathering
 from teds_provision.links.can.isotp import FUNCTIONAL, single
 from teds_provision.links.can.link import conflict
 from teds_provision.links.can.shared import Asked, SharedBus
-from teds_provision.protocol.messages.frames import Function, decode_reply, security_command
+from teds_provision.protocol.messages.frames import IDENTIFY, decode_reply
 from teds_provision.protocol.messages.identity import Identity
 
-IDENTIFY: Final = security_command(Function.IDENTIFY).encode()
 SILENCE_SECONDS: Final = 0.3
 LONGEST_SECONDS: Final = 3.0
 """A station listens until 300 ms of silence, 3 s at most (profile.md, "CAN")."""
@@ -58,7 +57,7 @@ def ask_all(
     """
     fd = bus.spec.fd
     with bus.gather(transaction) as asked:
-        body = bytes([transaction]) + IDENTIFY
+        body = bytes([transaction]) + IDENTIFY.encode()
         bus.send(Frame(FUNCTIONAL | bus.own, single(body, fd=fd), fd))
         told: set[int] = set()
         for node in _news(bus, asked, silence, longest):
@@ -119,7 +118,7 @@ def ask_one(ask: Callable[[bytes], bytes]) -> Identity | None:
     torn = 0
     while torn < 2:
         try:
-            return read_identity(ask(IDENTIFY))
+            return read_identity(ask(IDENTIFY.encode()))
         except (NodeSilent, BadData):
             return None
         except Garbled:

@@ -13,11 +13,8 @@ from teds_provision.links.can.isotp import physical_id, single
 from teds_provision.links.can.shared import Line, SharedBus
 from teds_provision.links.can.transfer import OVERFLOW, WAIT, consecutive_frames, first_frame, gap_seconds
 from teds_provision.links.ports import CAN, Capabilities
+from teds_provision.protocol.repetition import REPEAT_SECONDS, REPLY_SECONDS, TRIES
 
-REPLY_SECONDS: Final = 5.0
-REPEAT_SECONDS: Final = 15.0
-TRIES: Final = 3
-"""A reply is awaited 5 s; a request is repeated at most twice, within 15 s (profile.md, "Repetition")."""
 _SHARES: Final = (0.3, 0.7, 1.0)
 _LOSSY_SHARES: Final = (0.06, 0.24, 1.0)
 """Parts of the 5 s after which a request goes out again, on a bus that loses nothing and on one that lost a frame in

@@ -29,7 +29,6 @@ from teds_provision.links.can.spec import LAST_NODE, parse_spec
 from teds_provision.links.ports import CAN, Capabilities, Contact, Notice, NoticeSink, Trace
 from teds_provision.protocol.messages.identity import Identity
 
-ANNOUNCE: Final = 0x1CFF0000
 """Identifier of an Announce, its node in the last octet (profile.md, "CAN")."""
 _HELLO_SECONDS: Final = 1.0
 _GUESS_SECONDS: Final = 0.1

@@ -13,7 +13,7 @@ from teds_provision.links.hints import BleAddress, Charging, ChargingState
 from teds_provision.links.nfc.message import Record
 
 OUT_OF_BAND: Final = b"application/vnd.bluetooth.le.oob"
-_MIME: Final = 2
+MIME: Final = 2
 _AD_ADDRESS: Final = 0x1B
 _MODES: Final = ("static", "negotiated", "full", "reserved")
 _STATUS_FIELDS: Final = (
@@ -140,7 +140,7 @@ def _milliseconds(exponent: int) -> int:
 def ble_address(records: Sequence[Record]) -> BleAddress | None:
     """The device address of a Bluetooth LE out-of-band record, None where there is none that can be read."""
     for record in records:
-        if record.tnf == _MIME and record.type.lower() == OUT_OF_BAND:
+        if record.tnf == MIME and record.type.lower() == OUT_OF_BAND:
             for kind, data in _structures(record.payload):
                 if kind == _AD_ADDRESS and len(data) == 7:
                     return BleAddress(data[5::-1], bool(data[6] & 1))

@@ -18,7 +18,7 @@ PATIENCE = 5.0  # seconds that a station goes on reading
 LONGEST_INTERVAL = 0.032  # seconds between two reads past N_wait, doubling up to this
 LONGEST = 120.0  # seconds that one transaction may take, however the node spins it out
 _REREADS = 3  # of a torn message
-_STATUS_OCTETS = len(message.encode([tnep.status(0)]))
+STATUS_OCTETS = len(message.encode([tnep.status(0)]))
 
 
 class Mailbox(Protocol):
@@ -54,7 +54,7 @@ class Poller:
         Raises NodeSilent when no answer came in time, Garbled when the node's messages stay unreadable or do not fit.
         """
         octets = room(self._service.max_ndef)
-        if room(self._service.max_ndef, _STATUS_OCTETS) < 1:
+        if room(self._service.max_ndef, STATUS_OCTETS) < 1:
             raise Garbled(
                 f"The node takes NDEF messages of at most {self._service.max_ndef} octets, too short for the profile."
             )

@@ -18,14 +18,13 @@ from teds_provision.links.can.frame import Frame
 from teds_provision.links.can.port import CanPort
 from teds_provision.measure.finding.asking import LEAST, Asking, Pace
 from teds_provision.measure.finding.sightings import Sighting, Sightings
-from teds_provision.protocol.announce import Announce, is_announce
+from teds_provision.protocol.announce import LAST_ADDRESS, Announce, is_announce
 from teds_provision.protocol.messages.identity import Identity
 
-POLL = 30.0  # seconds between questions to everybody, where that was asked for
+POLL = 30.0  # seconds between questions to everybody, where that was asked for (operation.md section 7)
 EACH, ALL = 10.0, 0.2  # seconds between questions to one address that announces itself, and to any of them
 PATIENCE = 0.5  # seconds for the answer of one that has just announced itself
 AWAITED = 0.25  # seconds between questions to everybody, where something announces itself as a node that is missing
-ADDRESSES = 239  # of nodes on a bus, at most
 LOOK = 0.05  # seconds between looks at who waits
 
 
@@ -36,7 +35,7 @@ class Lookout(Asking):
 
     def __init__(self, port: CanPort, sightings: Sightings, *, poll: float | None = None) -> None:
         self.port = port
-        self._announcers: deque[int] = deque(maxlen=ADDRESSES)
+        self._announcers: deque[int] = deque(maxlen=LAST_ADDRESS)
         self._asked_at: dict[int, float] = {}
         super().__init__(port.place, sightings, poll)
 

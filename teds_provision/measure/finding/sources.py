@@ -15,12 +15,13 @@ from teds_provision.links import LinkSettings
 from teds_provision.links.can.frame import Frame
 from teds_provision.links.can.port import CanPort
 from teds_provision.links.can.spec import CanSpec, parse_spec
+from teds_provision.protocol.operation.can_frames import DATA
 from teds_provision.station.station import Station
 from teds_provision.store.lock import Mark, Taken
 
 LISTENING = 0.25  # seconds in which the data of somebody else's streams to our address is heard
 SIGN_OF_LIFE = 4.0  # seconds in which whoever reads it sends something: lease / 3 is 3.3 s unless he says otherwise
-_DATA, _MASK = 0x1CFF0000, 0x1FFF0000
+_MASK = 0x1FFF0000
 
 
 @contextmanager
@@ -71,7 +72,7 @@ def _require_alone(port: CanPort) -> None:
     bus, own = port.bus(), port.spec.source & 7
 
     def ours(frame: Frame) -> bool:
-        return frame.identifier & _MASK == _DATA and frame.identifier >> 13 & 7 == own
+        return frame.identifier & _MASK == DATA and frame.identifier >> 13 & 7 == own
 
     with bus.listen(ours, most=64) as ear:
         if ear.get(LISTENING) is None:

@@ -14,7 +14,6 @@ import re
 import secrets
 import shutil
 import signal
-import socket
 import subprocess
 import sys
 import threading
@@ -26,6 +25,7 @@ from typing import Any, Final
 
 from teds_provision.errors import NotFound, UsageFailure
 from teds_provision.files import write_whole
+from teds_provision.links.loopback import free_port
 from teds_provision.ncap.live import Live
 from teds_provision.ncap.settings import own_source, with_source
 from teds_provision.node.described import create
@@ -79,7 +79,7 @@ class Virtuals:
         self._guard = threading.Lock()
         self._stop = threading.Event()
         self._all: dict[str, Virtual] = {}
-        self._port = _free_port()
+        self._port = free_port()
         for folder in sorted(self._home.glob("*/")):
             with suppress(OSError, ValueError, KeyError):
                 facts = json.loads((folder / _FACTS).read_text())
@@ -331,9 +331,3 @@ def _die_with(daemon: int) -> None:
     _LIBC.prctl(1, signal.SIGKILL)
     if os.getppid() != daemon:
         os._exit(1)
-
-
-def _free_port() -> int:
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
-        probe.bind(("127.0.0.1", 0))
-        return int(probe.getsockname()[1])

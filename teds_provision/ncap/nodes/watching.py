@@ -21,6 +21,7 @@ from teds_provision.links.ble.port import BlePort
 from teds_provision.links.can.port import CanPort
 from teds_provision.links.opening import open_place
 from teds_provision.measure.finding.buses import Buses
+from teds_provision.measure.finding.lookout import POLL
 from teds_provision.measure.finding.sightings import Sighting
 from teds_provision.measure.finding.sources import sole_user
 from teds_provision.ncap.live import Live
@@ -40,7 +41,6 @@ MOST_KNOWN: Final = 512
 TELL_STRANGERS: Final = 10.0  # seconds between two words about how many strangers there are
 FIRST_PAUSE, LAST_PAUSE = 1.0, 30.0
 LOOK_AGAIN: Final = 30.0  # seconds until a node that could not be looked at is looked at again
-POLL: Final = 30.0  # seconds between questions to everybody on a bus (operation.md section 7)
 POLL_AIR: Final = 15.0
 GONE_POLLS: Final = 2.5
 LENDING: Final = 10.0

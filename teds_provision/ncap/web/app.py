@@ -15,6 +15,7 @@ from starlette.staticfiles import StaticFiles
 from starlette.types import Scope
 from starlette.websockets import WebSocket, WebSocketDisconnect
 
+from teds_provision.client import API
 from teds_provision.errors import NotFound, TedsProvisionError
 from teds_provision.ncap.daemon import Daemon
 from teds_provision.ncap.live import Listener
@@ -25,7 +26,6 @@ from teds_provision.ncap.web.guard import Refusal
 from teds_provision.ncap.web.resources import Resources
 
 PAGE: Final = Path(__file__).parent.parent / "page"
-API: Final = "/api/v1"
 MOST_LISTENERS: Final = 200
 
 

@@ -21,10 +21,9 @@ from teds_provision.node.can.seat import Line, Request, Seat, link_name
 from teds_provision.node.can.workers import Crew
 from teds_provision.node.handler import Measuring, NodeHandler
 from teds_provision.protocol.announce import Announce, is_announce
-from teds_provision.protocol.messages.frames import Function, Reply, security_command
+from teds_provision.protocol.messages.frames import IDENTIFY, Reply
 from teds_provision.protocol.operation.can_frames import drive_address, trigger_station
 
-_IDENTIFY: Final = security_command(Function.IDENTIFY).encode()
 _SPREAD_SECONDS: Final = 0.05
 _IDLE: Final = 0.02
 """Seconds that the loop waits at most on an interface that cannot be woken."""
@@ -234,7 +233,7 @@ class CanServer:
     def _from_station(self, station: int, frame: Frame) -> None:
         if frame.identifier & 0x1FFFFF00 == FUNCTIONAL:
             body = read_single(frame.data)
-            if body is not None and body[1:] == _IDENTIFY:  # nothing else that is asked of everyone is answered
+            if body is not None and body[1:] == IDENTIFY.encode():  # nothing else that is asked of everyone is answered
                 for seat in self._seats:
                     self._everyone(seat, station, body[:1], fd=frame.fd)
             return

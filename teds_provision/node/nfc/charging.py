@@ -11,12 +11,11 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Final
 
+from teds_provision.links.nfc.hints import MIME, OUT_OF_BAND
 from teds_provision.links.nfc.message import WELL_KNOWN, Record
 from teds_provision.protocol.operation.commands import Power, PowerFlag
 
 CAPABILITY, STATUS, POLLER = b"WLCCAP", b"WLCSTAI", b"WLCINF"
-MIME: Final = 2
-OUT_OF_BAND: Final = b"application/vnd.bluetooth.le.oob"
 _VERSION: Final = 0x20
 _STATIC, _BATTERY_FULL = 0x00, 0x80
 _REPEAT_WAITS: Final = bytes((0x09, 0x1E, 0x03, 0x0A))

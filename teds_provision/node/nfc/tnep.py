@@ -15,12 +15,12 @@ from typing import Protocol
 from teds_provision.errors import Garbled
 from teds_provision.links.nfc import message, tnep
 from teds_provision.links.nfc.pieces import Piece, Responder, room
+from teds_provision.links.nfc.poller import STATUS_OCTETS
 from teds_provision.node.handler import NodeHandler
 from teds_provision.node.nfc.charging import NO_EXTRAS, Extras, is_poller_information
 from teds_provision.protocol.repetition import Repetition
 
 LINE = "nfc"
-_STATUS_OCTETS = len(message.encode([tnep.status(0)]))
 
 
 class Memory(Protocol):
@@ -139,7 +139,7 @@ class TnepTag:
             payload = tnep.external(records, tnep.TIM_TYPE)
             if payload is None or not self._selected:
                 return message.encode([tnep.status(tnep.PROTOCOL_ERROR)])
-            piece = self._responder.answer(Piece.decode(payload), room(self._memory.max_ndef, _STATUS_OCTETS))
+            piece = self._responder.answer(Piece.decode(payload), room(self._memory.max_ndef, STATUS_OCTETS))
         except Garbled:
             return message.encode([tnep.status(tnep.GARBLED_REQUEST)])
         return message.encode([tnep.status(tnep.SUCCESS), tnep.payload_record(piece.encode())])

@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Final
 
 from teds_provision.errors import BadData, UsageFailure
-from teds_provision.files import read_limited
+from teds_provision.files import read_text
 from teds_provision.node.sources.base import Generated, Place, Reading, Tell
 
 MOST_OCTETS: Final = 256 << 20
@@ -81,10 +81,7 @@ def _rows(path: Path, lines: list[tuple[int, str]], fields: list[list[str]]) -> 
 
 def _lines(path: Path) -> list[tuple[int, str]]:
     """Numbered lines without comments and empty ones: the first line and at least one row."""
-    try:
-        text = read_limited(path, MOST_OCTETS, "file of values").decode("utf-8-sig")
-    except UnicodeDecodeError as error:
-        raise BadData(f"{path} is no text: octet {error.start} is not UTF-8.") from error
+    text = read_text(path, MOST_OCTETS, "file of values")
     lines = [(number, line) for number, line in enumerate(text.splitlines(), 1) if line.strip() and line[0] != "#"]
     if len(lines) < 2:
         raise BadData(f"{path} holds no row of values.", hint="First line: t,NAME,NAME …; then a row for each instant.")

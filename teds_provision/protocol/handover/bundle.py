@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import json
 import sys
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from datetime import datetime, timedelta
 from typing import Literal, cast
@@ -22,6 +22,7 @@ from typing import Literal, cast
 from teds_provision.errors import BadData, NotAuthentic, PolicyRefused
 from teds_provision.protocol.agreement import key_id
 from teds_provision.protocol.handover import jose
+from teds_provision.protocol.handover.jose import FindKey
 from teds_provision.protocol.handover.jwk import link_key_of, point_of, public_jwk
 from teds_provision.protocol.handover.payload import LAST_U32, Members, fingerprints, is_label, time_text
 from teds_provision.protocol.handover.revocation import Revocation, open_revocations
@@ -42,7 +43,6 @@ CLOCK_TOLERANCE = timedelta(minutes=10)
 _quoted = json.encoder.encode_basestring_ascii
 
 Mode = Literal["copy", "move"]
-FindKey = Callable[[str], bytes | None]
 
 
 @dataclass(frozen=True, slots=True)

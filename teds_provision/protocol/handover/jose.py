@@ -30,6 +30,7 @@ from cryptography.hazmat.primitives.kdf.concatkdf import ConcatKDFHash
 from cryptography.hazmat.primitives.keywrap import InvalidUnwrap, aes_key_unwrap, aes_key_wrap
 
 from teds_provision.errors import BadData, NotAuthentic, PolicyRefused
+from teds_provision.limits import check_size
 from teds_provision.protocol.handover.jwk import point_of, public_jwk
 from teds_provision.protocol.handover.strict_json import (
     Base64urlWriter,
@@ -106,7 +107,7 @@ def verify_compact(octets: bytes, find_key: FindKey, *, typ: str, max_octets: in
 
     The payload is decoded only under a good signature. Raises NotAuthentic, PolicyRefused or BadData.
     """
-    check_size(octets, max_octets, "The signed document")
+    check_size(len(octets), max_octets, "the signed document")
     parts = octets.split(b".", 3)
     if len(parts) != 3:
         raise BadData(NO_COMPACT_JWS)
@@ -279,14 +280,8 @@ def header_of(document: Mapping[str, Any]) -> JweHeader:
     )
 
 
-def check_size(octets: bytes, max_octets: int, what: str) -> None:
-    """Raise BadData where there are more octets than the caller will read."""
-    if len(octets) > max_octets:
-        raise BadData(f"{what} has {len(octets)} octets; more than {max_octets} are not read.")
-
-
 def _document(octets: bytes, max_octets: int) -> dict[str, Any]:
-    check_size(octets, max_octets, "The sealed document")
+    check_size(len(octets), max_octets, "the sealed document")
     return parse_document(octets)
 
 

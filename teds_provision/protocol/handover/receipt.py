@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from datetime import datetime
 
 from teds_provision.errors import BadData, NotAuthentic
+from teds_provision.limits import check_size
 from teds_provision.protocol.handover import jose
 from teds_provision.protocol.handover.payload import Members, time_text
 from teds_provision.protocol.handover.strict_json import dump, load_object
@@ -64,7 +65,7 @@ def open_receipt(octets: bytes, trusted: Callable[[str], bytes | None]) -> Recei
 
     White space around it (an editor's last line) does no harm. Raises NotAuthentic, PolicyRefused or BadData.
     """
-    jose.check_size(octets, MAX_RECEIPT_OCTETS, "The receipt")
+    check_size(len(octets), MAX_RECEIPT_OCTETS, "the receipt")
     verified = jose.verify_compact(octets.strip(), trusted, typ=TYPE, max_octets=MAX_RECEIPT_OCTETS)
     members = Members(load_object(verified.payload, "The receipt"), "The receipt")
     if members.get("format") != FORMAT:

@@ -19,6 +19,7 @@ from typing import Any, BinaryIO
 from cryptography.exceptions import InvalidTag
 
 from teds_provision.errors import BadData, NotAuthentic
+from teds_provision.limits import check_size
 from teds_provision.protocol.handover.jose import (
     CHANGED_CONTENT,
     MAX_SEPARATORS,
@@ -158,8 +159,7 @@ def read_envelope(file: BinaryIO, max_octets: int) -> Envelope:
     run; so it is no matter in which member, or in which piece of the file, it begins.
     """
     size = file.seek(0, os.SEEK_END)
-    if size > max_octets:
-        raise BadData(f"The sealed document has {size} octets; more than {max_octets} are not read.")
+    check_size(size, max_octets, "the sealed document")
     file.seek(0)
     outline = _Outline()
     while outline.octets < size and (piece := file.read(min(size - outline.octets, PIECE))):

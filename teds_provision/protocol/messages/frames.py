@@ -131,9 +131,17 @@ def refusal(reason: Reason) -> Reply:
     return Reply(False, bytes([reason]))
 
 
+READ_OVERHEAD: Final = 46
+"""Octets of a longest message that a reply to Read in a session does not carry: its frame, its seal, its offset."""
+
+
 def security_command(function: Function, payload: bytes = b"") -> Command:
     """A command of class 128; they all go to channel 0."""
     return Command(0, SECURITY, function, payload)
+
+
+IDENTIFY: Final = security_command(Function.IDENTIFY)
+"""128.7: who are you. Changes nothing, so it is asked of everyone, and whenever it is not clear who is there."""
 
 
 def query_teds(channel: int, access_code: int) -> Command:

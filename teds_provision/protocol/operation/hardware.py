@@ -14,7 +14,6 @@ from teds_provision.protocol.operation.commands import Power
 from teds_provision.teds.codec.decode import decode
 from teds_provision.teds.sheet import Kind, channel_from
 
-_CHANNEL_CODE: Final = 3
 _MILLION: Final = 10**6
 _LONGEST: Final = 1e6
 """Seconds that stand for every longer SPeriod, infinity too: no stream has such a period."""

@@ -15,6 +15,7 @@ from teds_provision.protocol.messages.frames import (
     COMMON,
     EITHER,
     OPERATE,
+    READ_OVERHEAD,
     SECURITY,
     Command,
     Function,
@@ -48,10 +49,9 @@ from teds_provision.protocol.operation.hardware import ChannelHardware, Hardware
 from teds_provision.protocol.operation.stream_role import StreamRole, demand
 from teds_provision.protocol.operation.streams import DataFrame
 from teds_provision.protocol.session import NodeSession
+from teds_provision.teds.codec.codes import AccessCode
 from teds_provision.teds.sheet import Kind
 
-READ_OVERHEAD: Final = 46
-_CHANNEL_CODE: Final = 3
 _OFFSET_OCTETS: Final = 4
 
 
@@ -322,7 +322,7 @@ class OperationRole:
         return octets, valid and not self._hardware.testing(channel)
 
     def _channel_teds(self, channel: int) -> bytes | None:
-        return self._flash().teds((channel, _CHANNEL_CODE))
+        return self._flash().teds((channel, AccessCode.CHANNEL))
 
     def _fits(self, channel: int) -> bool:
         return teds_fits(self._hardware.channels[channel], self._channel_teds(channel))

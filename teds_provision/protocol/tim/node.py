@@ -5,10 +5,18 @@ from __future__ import annotations
 import os
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Final
 
+from teds_provision.protocol.announce import LAST_ADDRESS
 from teds_provision.protocol.flash import Flash, FlashFailure, FlashMemory
-from teds_provision.protocol.keys import PrivateKey, SoftwareKey, Verify, prove_message, reset_message, verify
+from teds_provision.protocol.keys import (
+    CHALLENGE_OCTETS,
+    PrivateKey,
+    SoftwareKey,
+    Verify,
+    prove_message,
+    reset_message,
+    verify,
+)
 from teds_provision.protocol.messages.frames import (
     COMMAND_HEADER,
     SECURITY,
@@ -31,9 +39,6 @@ from teds_provision.protocol.tim.origin import Origin
 from teds_provision.protocol.tim.permission import Permission, of_teds
 from teds_provision.protocol.tim.sessions import Sessions
 from teds_provision.protocol.tim.teds_access import TedsAccess
-
-CHALLENGE_OCTETS: Final = 32
-LAST_CAN_ADDRESS: Final = 239
 
 
 @dataclass
@@ -345,7 +350,7 @@ class Tim:
 
     def _set_can_address(self, payload: bytes, origin: Origin) -> bytes:
         _length(payload, 1)
-        if not 1 <= payload[0] <= LAST_CAN_ADDRESS:
+        if not 1 <= payload[0] <= LAST_ADDRESS:
             raise Refused(Reason.BAD_FORM)
         self._commit(replace(self._flash, can_address=payload[0]))
         self._taken_address = None

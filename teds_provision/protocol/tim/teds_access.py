@@ -8,13 +8,19 @@ from teds_provision.protocol.commit import verified_commit
 from teds_provision.protocol.datasheet import can_be_stored, passes_own_check
 from teds_provision.protocol.flash import Flash
 from teds_provision.protocol.keys import Verify, verify
-from teds_provision.protocol.messages.frames import Attribute, Command, Reason, Refused, Reply, TedsStatus
+from teds_provision.protocol.messages.frames import (
+    READ_OVERHEAD,
+    Attribute,
+    Command,
+    Reason,
+    Refused,
+    Reply,
+    TedsStatus,
+)
+from teds_provision.teds.codec.codes import MANUFACTURER, TEXT_BASED
 from teds_provision.teds.image import SECURITY, BlockId
 
-READ_OVERHEAD = 46
 REQUEST_REPLY_OVERHEAD = 78
-TEXT_CODES = frozenset({2, 4, 6, 10, 11, 14, 15})
-MANUFACTURER_CODES = 128
 
 Staging = dict[BlockId, bytes]
 
@@ -81,9 +87,9 @@ class TedsAccess:
 
     def _status(self, flash: Flash, block: BlockId, teds: bytes | None) -> TedsStatus:
         attributes = 0
-        if block[1] >= MANUFACTURER_CODES:
+        if block[1] >= MANUFACTURER:
             attributes |= Attribute.MANUFACTURER
-        if block[1] in TEXT_CODES:
+        if block[1] in TEXT_BASED:
             attributes |= Attribute.TEXT
         if block in flash.read_only:
             attributes |= Attribute.READ_ONLY

@@ -2,28 +2,23 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, fields
-from functools import lru_cache
 from itertools import islice
 from operator import attrgetter
-from typing import Any, Final, TypeVar
+from typing import Any, TypeVar
 
-from teds_provision.store.database import Database
+from teds_provision.store.database import PAGE, Database
 from teds_provision.store.records import Holder, KeyRecord, NodeRecord, Tombstone, WhitelistEntry
+from teds_provision.store.tables.nodes import GROUPS, NODE_FIELDS, REPLACE_ENTRY, REPLACE_NODE, listed
 
-PAGE: Final = 500
-"""Rows that are looked up, made or written at once."""
 Value = TypeVar("Value")
 
-_NODE_FIELDS = tuple(column.name for column in fields(NodeRecord))
-_GROUPS, _SEAL = _NODE_FIELDS.index("groups"), _NODE_FIELDS.index("point_mac")
-_node_values = attrgetter(*_NODE_FIELDS)
+_SEAL = NODE_FIELDS.index("point_mac")
+_node_values = attrgetter(*NODE_FIELDS)
 _key_values, _entry_values, _holder_values, _tombstone_values = (
     attrgetter(*(column.name for column in fields(kind))) for kind in (KeyRecord, WhitelistEntry, Holder, Tombstone)
 )
-_NODES = f"INSERT OR REPLACE INTO nodes({', '.join(_NODE_FIELDS)}) VALUES({', '.join('?' * len(_NODE_FIELDS))})"
 _KEYS = (
     "INSERT INTO keys(uuid, epoch, key_id, state, slot, wrapped, source, created) VALUES(?,?,?,?,?,?,?,?)"
     " ON CONFLICT(uuid, key_id) DO NOTHING"
@@ -71,9 +66,9 @@ class BulkTables:
         """Add or replace all of it, or nothing, with seals made as it is written; raises StoreFailure."""
         many = self._database.execute_many
         with self._database.together():
-            many(_NODES, (_node_row(record, seal_node(record)) for record in batch.nodes))
+            many(REPLACE_NODE, (_node_row(record, seal_node(record)) for record in batch.nodes))
             many(
-                "INSERT OR REPLACE INTO whitelist VALUES(?, ?, ?, ?, ?, ?)",
+                REPLACE_ENTRY,
                 ((*_entry_values(entry)[:-1], seal_entry(entry)) for entry in batch.whitelist),
             )
             many(_SLOTS, ((key.uuid, key.slot) for key in batch.keys))
@@ -86,13 +81,8 @@ class BulkTables:
         self._database.execute_many("DELETE FROM tombstones WHERE uuid = ?", ((uuid,) for uuid in uuids))
 
 
-@lru_cache(maxsize=256)
-def _listed(groups: tuple[str, ...]) -> str:
-    return json.dumps(groups)
-
-
 def _node_row(record: NodeRecord, mac: bytes | None) -> list[Any]:
     row = list(_node_values(record))
-    row[_GROUPS] = _listed(record.groups)
+    row[GROUPS] = listed(record.groups)
     row[_SEAL] = mac
     return row

@@ -10,17 +10,17 @@ from functools import lru_cache
 from typing import Any
 
 from teds_provision.errors import NotFound, OtherKey, UsageFailure
-from teds_provision.store.database import Database
+from teds_provision.store.database import PAGE, Database
 from teds_provision.store.records import UUID_OCTETS, NodeRecord, Shown, WhitelistEntry
 
 _UUID_DIGITS = 2 * UUID_OCTETS
 _MIN_PREFIX = 4
-_PAGE = 500
 _SHOWN_CANDIDATES = 5
-_NODE_FIELDS = tuple(column.name for column in fields(NodeRecord))
-_GROUPS = _NODE_FIELDS.index("groups")
-_NODE_COLUMNS = ", ".join(_NODE_FIELDS)
-_REPLACE_NODE = f"INSERT OR REPLACE INTO nodes({_NODE_COLUMNS}) VALUES({', '.join('?' * len(_NODE_FIELDS))})"
+NODE_FIELDS = tuple(column.name for column in fields(NodeRecord))
+GROUPS = NODE_FIELDS.index("groups")
+_NODE_COLUMNS = ", ".join(NODE_FIELDS)
+REPLACE_NODE = f"INSERT OR REPLACE INTO nodes({_NODE_COLUMNS}) VALUES({', '.join('?' * len(NODE_FIELDS))})"
+REPLACE_ENTRY = "INSERT OR REPLACE INTO whitelist VALUES(?, ?, ?, ?, ?, ?)"
 
 
 class NodeTables:
@@ -36,7 +36,7 @@ class NodeTables:
         """Give all entries, by UUID, a page at a time; holds no lock between pages."""
         after = b""
         while page := self._database.read(
-            WhitelistEntry, "SELECT * FROM whitelist WHERE uuid > ? ORDER BY uuid LIMIT ?", (after, _PAGE)
+            WhitelistEntry, "SELECT * FROM whitelist WHERE uuid > ? ORDER BY uuid LIMIT ?", (after, PAGE)
         ):
             yield from page
             after = page[-1].uuid
@@ -48,7 +48,7 @@ class NodeTables:
     def put_whitelist(self, entry: WhitelistEntry) -> None:
         """Add or replace the entry of a node; policy (a pinned key stays) is the caller's."""
         self._database.execute(
-            "INSERT OR REPLACE INTO whitelist VALUES(?, ?, ?, ?, ?, ?)",
+            REPLACE_ENTRY,
             (entry.uuid, entry.fingerprint, entry.added, entry.assurance, entry.name, entry.mac),
         )
 
@@ -56,7 +56,7 @@ class NodeTables:
         """Add or replace many entries at once, all or none."""
         rows = ((e.uuid, e.fingerprint, e.added, e.assurance, e.name, e.mac) for e in entries)
         with self._database.together():
-            self._database.execute_many("INSERT OR REPLACE INTO whitelist VALUES(?, ?, ?, ?, ?, ?)", rows)
+            self._database.execute_many(REPLACE_ENTRY, rows)
 
     def put_seals(self, entries: Mapping[bytes, bytes | None], points: Mapping[bytes, bytes]) -> None:
         """Put the seals of whitelist entries and of nodes' identity keys beside them, by UUID."""
@@ -77,7 +77,7 @@ class NodeTables:
         """Give identity key and verdict of all nodes, by UUID, a page at a time."""
         after = b""
         statement = "SELECT uuid, point, point_mac, verdict FROM nodes WHERE uuid > ? ORDER BY uuid LIMIT ?"
-        while page := self._database.read(Shown, statement, (after, _PAGE)):
+        while page := self._database.read(Shown, statement, (after, PAGE)):
             yield from page
             after = page[-1].uuid
 
@@ -118,14 +118,14 @@ class NodeTables:
                 f"Node {record.uuid.hex()} is known with another identity key than the one it shows now.",
                 hint="Do not trust this node. If its chip was really replaced, it needs a new UUID.",
             )
-        values: dict[str, Any] = {name: getattr(record, name) for name in _NODE_FIELDS}
-        values["groups"] = json.dumps(list(record.groups)) if record.groups else "[]"
+        values: dict[str, Any] = {name: getattr(record, name) for name in NODE_FIELDS}
+        values["groups"] = listed(record.groups)
         if known:
             if record.point is None:
                 values["point"], values["point_mac"] = known.point, known.point_mac
             values["epoch"] = max(record.epoch, known.epoch)
             values["sequence"] = max(record.sequence, known.sequence)
-        self._database.execute(_REPLACE_NODE, tuple(values.values()))
+        self._database.execute(REPLACE_NODE, tuple(values.values()))
 
     def set_due(self, uuid: bytes, due: str | None) -> None:
         """Note the day (ISO 8601) on which the first calibration of a node ends, None where none does."""
@@ -170,12 +170,8 @@ class NodeTables:
             named = f"SELECT name, lower(hex(uuid)) FROM {table} WHERE name >= ? AND name < ? ORDER BY name LIMIT ?"
             found.update((name, uuid) for name, uuid in self._database.execute(named, (text, upper, most)))
             if re.fullmatch("[0-9a-f]{0,20}", digits):
-                low, high = (
-                    bytes.fromhex(digits.ljust(_UUID_DIGITS, "0")),
-                    bytes.fromhex(digits.ljust(_UUID_DIGITS, "f")),
-                )
                 within = f"SELECT lower(hex(uuid)), name FROM {table} WHERE uuid BETWEEN ? AND ? LIMIT ?"
-                rows = self._database.execute(within, (low, high, most))
+                rows = self._database.execute(within, (*_bounds(digits), most))
                 found.update((uuid, name or found.get(uuid, "")) for uuid, name in rows)
         return sorted(found.items())[:most]
 
@@ -185,11 +181,17 @@ class NodeTables:
 
 
 def _node(*row: Any) -> NodeRecord:
-    values: tuple[Any, ...] = (*row[:_GROUPS], _groups(row[_GROUPS]), *row[_GROUPS + 1 :])
+    values: tuple[Any, ...] = (*row[:GROUPS], _groups(row[GROUPS]), *row[GROUPS + 1 :])
     return NodeRecord(*values)
 
 
 @lru_cache(maxsize=256)  # nodes may be 100,000, and groups are few
+def listed(groups: tuple[str, ...]) -> str:
+    """The groups of a node, as its row has them."""
+    return json.dumps(groups)
+
+
+@lru_cache(maxsize=256)
 def _groups(listed: str) -> tuple[str, ...]:
     return tuple(json.loads(listed))
 
@@ -199,9 +201,13 @@ def _by_name(name: str) -> tuple[str, tuple[str, str]]:
 
 
 def _by_prefix(digits: str) -> tuple[str, tuple[bytes, bytes, bytes, bytes]]:
-    low = bytes.fromhex(digits.ljust(_UUID_DIGITS, "0"))
-    high = bytes.fromhex(digits.ljust(_UUID_DIGITS, "f"))
     statement = (
         "SELECT uuid FROM nodes WHERE uuid BETWEEN ? AND ? UNION SELECT uuid FROM whitelist WHERE uuid BETWEEN ? AND ?"
     )
+    low, high = _bounds(digits)
     return statement, (low, high, low, high)
+
+
+def _bounds(digits: str) -> tuple[bytes, bytes]:
+    """The lowest and the highest UUID that begins with these digits."""
+    return bytes.fromhex(digits.ljust(_UUID_DIGITS, "0")), bytes.fromhex(digits.ljust(_UUID_DIGITS, "f"))

@@ -10,10 +10,9 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
-from teds_provision.store.database import Database
+from teds_provision.store.database import PAGE, Database
 from teds_provision.store.records import UUID_OCTETS
 
-_PAGE = 500
 _TABLES = ("nodes", "whitelist", "keys", "tombstones", "revocations")
 _KNOWN = f"({' UNION '.join(f'SELECT uuid FROM {table}' for table in _TABLES)})"
 # table by table: SQLite would put the whole of _KNOWN together before it looks for one
@@ -77,8 +76,8 @@ class OverviewTables:
 
     def overview(self, uuids: Sequence[bytes]) -> Iterator[Known]:
         """Give what is known of these nodes, in their order, a page at a time; holds no lock between pages."""
-        for first in range(0, len(uuids), _PAGE):
-            yield from self._page(uuids[first : first + _PAGE])
+        for first in range(0, len(uuids), PAGE):
+            yield from self._page(uuids[first : first + PAGE])
 
     def tally(self, today: str) -> Tally:
         """Return the nodes that wait for somebody; ``today`` is a day, ISO 8601."""

@@ -10,13 +10,14 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING
 
 from teds_provision.errors import BadData
 from teds_provision.lazy import late
 from teds_provision.teds.calibration.formula import PreparedCurve, PreparedInverse
 from teds_provision.teds.calibration.reading import SampleReader
 from teds_provision.teds.calibration.samples import Range, SampleForm
+from teds_provision.teds.channel import ROUNDING
 from teds_provision.teds.sheet import Channel, Sheet
 from teds_provision.teds.units.units import WrittenUnit
 
@@ -29,9 +30,6 @@ if TYPE_CHECKING:
     Floats = NDArray[np.float64]
 else:
     np = late("numpy")
-
-_ROUNDING: Final = 4 * 2.0**-23
-"""Limits and coefficients are Float32: a value this much of the limit beyond it is not beyond it."""
 
 
 @dataclass(frozen=True)
@@ -73,8 +71,8 @@ class ChannelInterpreter:
         self.uncertainty = self._uncertainty()
         slack = self.uncertainty or 0.0
         low, high = self.limits
-        self._floor = low - slack - _ROUNDING * abs(low) if math.isfinite(low) else -math.inf
-        self._ceiling = high + slack + _ROUNDING * abs(high) if math.isfinite(high) else math.inf
+        self._floor = low - slack - ROUNDING * abs(low) if math.isfinite(low) else -math.inf
+        self._ceiling = high + slack + ROUNDING * abs(high) if math.isfinite(high) else math.inf
 
     @property
     def octets(self) -> int:
@@ -147,7 +145,7 @@ class ChannelInterpreter:
     def beyond(self, value: float) -> str:
         """Why a value may not be set, as a sentence; "" where the limits of the datasheet allow it."""
         low, high = self.limits
-        if math.isfinite(value) and low - _ROUNDING * abs(low) <= value <= high + _ROUNDING * abs(high):
+        if math.isfinite(value) and low - ROUNDING * abs(low) <= value <= high + ROUNDING * abs(high):
             return ""
         text = f"{low:.6g} to {high:.6g} {self.unit.text}".strip()
         return f"{value:g} {self.unit.text} is beyond the limits of channel {self.channel.number}, {text}."

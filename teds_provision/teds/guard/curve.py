@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Final
 from teds_provision.lazy import late
 from teds_provision.teds.calibration.formula import evaluate
 from teds_provision.teds.calibration.model import Calibration, CalibrationInput
+from teds_provision.teds.calibration.samples import Range
 from teds_provision.teds.codec.model import Units
 from teds_provision.teds.image import BlockId
 from teds_provision.teds.sheet import described
@@ -29,8 +30,6 @@ GRID: Final = 250_000
 TERMS: Final = 50_000_000
 """Terms of the formula that are computed for one curve of several inputs, at most."""
 FLOAT32_STEP: Final = 2.0**-23
-
-Range = tuple[float, float]
 
 
 @dataclass(frozen=True)

@@ -13,8 +13,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Final
 
+from teds_provision import files
 from teds_provision.errors import BadData, StoreFailure
-from teds_provision.files import read_limited
 from teds_provision.limits import LIMITS, check_depth, check_toml
 
 KeyPath = tuple[str | int, ...]
@@ -158,12 +158,7 @@ def _shown(path: KeyPath) -> str:
 
 def read_text(path: Path) -> str:
     """Text of a small UTF-8 file; raises NotFound, BadData or StoreFailure naming it."""
-    octets = read_limited(path, LIMITS.text_file, "profile or calibration", failure=StoreFailure)
-    try:
-        return octets.decode("utf-8-sig")
-    except UnicodeDecodeError as error:
-        line = octets[: error.start].count(b"\n") + 1
-        raise BadData(f"{path}:{line}: the text is not UTF-8.", hint="Save the file as UTF-8.") from error
+    return files.read_text(path, LIMITS.text_file, "profile or calibration", failure=StoreFailure)
 
 
 def walk(table: Table) -> Iterator[tuple[str, Item]]:
