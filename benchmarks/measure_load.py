@@ -13,7 +13,6 @@ import argparse
 import itertools
 import os
 import resource
-import socket
 import subprocess
 import sys
 import tempfile
@@ -30,6 +29,7 @@ from teds_provision.links.can.bus import Bus, Frame
 from teds_provision.links.can.port import CanPort
 from teds_provision.links.can.spec import parse_spec
 from teds_provision.links.can.wire.pacing import sharp_timers
+from teds_provision.links.loopback import free_port
 from teds_provision.measure.blocks import Block, StationFacts
 from teds_provision.measure.clock import ClockMap, Exchange, Monotone, Wall
 from teds_provision.measure.facts import facts_of
@@ -232,7 +232,7 @@ class Machine:
 def run(nodes: int, seconds: float, folder: Path, targets: Sequence[str] = TARGETS) -> Load:
     """One size."""
     load = Load(nodes, seconds)
-    specs = [f"udp_multicast:239.74.163.{20 + number}?port={_free_port()}&fd=1" for number in range(2)]
+    specs = [f"udp_multicast:239.74.163.{20 + number}?port={free_port()}&fd=1" for number in range(2)]
     sinks = [open_sink(name if ":" in name else str(folder / name)) for name in targets]
     began, messages = time.monotonic_ns() + 8 * SECOND, int(seconds * RATE / N)
     machine = Machine(nodes, began, sinks, load)
@@ -309,12 +309,6 @@ def _by_thread() -> dict[str, float]:
 def _megabytes() -> float:
     pages = int(Path("/proc/self/statm").read_text().split()[1])
     return pages * resource.getpagesize() / 1e6
-
-
-def _free_port() -> int:
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as free:
-        free.bind(("127.0.0.1", 0))
-        return int(free.getsockname()[1])
 
 
 def main() -> None:

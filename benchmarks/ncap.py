@@ -23,8 +23,9 @@ from typing import Any
 from websockets.sync.client import connect
 
 from benchmarks.commands import PROVISION, Rows, finished, started, station
-from benchmarks.provisioning import free_port, nodes
+from benchmarks.provisioning import nodes
 from teds_provision import client
+from teds_provision.links.loopback import free_port
 
 RATE = 100.0
 _EVERY = 60.0

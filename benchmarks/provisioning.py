@@ -16,7 +16,6 @@ import argparse
 import operator
 import os
 import secrets
-import socket
 import statistics
 import subprocess
 import sys
@@ -30,6 +29,7 @@ from typing import Any, NamedTuple
 
 from benchmarks import limits
 from teds_provision.links import Capabilities, Contact, LinkSettings, Notice, open_port
+from teds_provision.links.loopback import free_port
 from teds_provision.protocol.announce import default_can_address
 from teds_provision.station.station import Station, initialise
 from teds_provision.steps.build import BuildOrder
@@ -340,13 +340,6 @@ def main(words: list[str] | None = None) -> None:
             f" of which {waited} wait for the disk; aim 10 ms, 8 commits: {met}"
         )
         station.close()
-
-
-def free_port() -> int:
-    """A UDP port that nobody uses now."""
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
-        probe.bind(("127.0.0.1", 0))
-        return int(probe.getsockname()[1])
 
 
 if __name__ == "__main__":

@@ -22,8 +22,8 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from benchmarks.provisioning import free_port
 from teds_provision.links import LinkSettings
+from teds_provision.links.loopback import free_port
 from teds_provision.station.station import Station, initialise
 from teds_provision.steps.build import BuildOrder
 from teds_provision.steps.identify import Identified

@@ -22,8 +22,9 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from benchmarks.provisioning import PROFILE, free_port
+from benchmarks.provisioning import PROFILE
 from teds_provision.links.can.wire.pacing import classic_bits, fd_seconds
+from teds_provision.links.loopback import free_port
 from teds_provision.protocol.operation.can_frames import cut
 
 RATE = 10_000

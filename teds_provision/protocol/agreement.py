@@ -14,9 +14,9 @@ from dataclasses import dataclass, field
 from cryptography.hazmat.primitives import hashes
 from cryptography.hazmat.primitives.kdf.hkdf import HKDF
 
-from teds_provision.errors import BadData, Garbled, NotAuthentic, OtherKey, PolicyRefused
+from teds_provision.errors import Garbled, NotAuthentic, OtherKey, PolicyRefused
 from teds_provision.protocol.fingerprints import same_key
-from teds_provision.protocol.keys import PrivateKey, SoftwareKey, fingerprint, is_point, node_key_good, public_key
+from teds_provision.protocol.keys import PrivateKey, SoftwareKey, fingerprint, is_point, node_key_good
 from teds_provision.protocol.messages.frames import Command, Function, security_command
 from teds_provision.teds.codec import security
 
@@ -186,10 +186,4 @@ class NodeAgreement:
 
 def good_point(point: bytes, own: bytes) -> bool:
     """Strict decoding of a point: on the curve, not infinity, not one's own."""
-    if point == own:
-        return False
-    try:
-        public_key(point)
-    except BadData:
-        return False
-    return True
+    return point != own and is_point(point)

@@ -59,7 +59,7 @@ def open_ends_the_session(patch: Patch) -> None:
 
 
 def any_address(patch: Patch) -> None:
-    patch.setattr(node, "LAST_CAN_ADDRESS", 255)
+    patch.setattr(node, "LAST_ADDRESS", 255)
 
 
 def nonce_twice(patch: Patch) -> None:

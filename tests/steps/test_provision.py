@@ -149,8 +149,8 @@ def test_a_session_lost_in_the_middle_starts_the_staging_over(station: Station, 
 def test_a_node_that_is_always_busy_ends_with_the_link(
     station: Station, board: Board, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("teds_provision.talk.conversation._BUSY_SECONDS", 0.3)
-    monkeypatch.setattr("teds_provision.talk.conversation._BUSY_PAUSE", 0.05)
+    monkeypatch.setattr("teds_provision.talk.conversation.BUSY_SECONDS", 0.3)
+    monkeypatch.setattr("teds_provision.talk.conversation.BUSY_PAUSE", 0.05)
     busy = bytes([0, 0, 1, Reason.BUSY])
     with pytest.raises(TedsProvisionError):
         run(station, board, MemoryLink(board, tamper=lambda n, reply: busy))
