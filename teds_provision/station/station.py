@@ -58,6 +58,7 @@ class Station:
         self._ask = ask
         self._vault: Vault | None = None
         self._turn, self._held = threading.RLock(), 0
+        self._opening = threading.RLock()
         self._run = threading.local()
         self.notice: Callable[[str], object] = lambda text: None
         """Told in one sentence whom this station waits for."""
@@ -134,8 +135,10 @@ class Station:
 
     def _opened(self) -> Vault:
         if self._vault is None:
-            keystore = self.identity.keystore
-            self.adopt(vaults.open_vault(self.home, self.id, keystore, self._ask, agent=self.use_agent))
+            with self._opening:  # of several threads one asks for the passphrase
+                if self._vault is None:
+                    keystore = self.identity.keystore
+                    self.adopt(vaults.open_vault(self.home, self.id, keystore, self._ask, agent=self.use_agent))
         assert self._vault is not None
         return self._vault
 

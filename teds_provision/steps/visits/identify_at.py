@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
 from teds_provision.errors import TedsProvisionError
@@ -53,19 +54,39 @@ def identify_at(
     first: TedsProvisionError | None = None
     identified = False
     with meet_everyone(links, reporter) as nodes:
-        for node in nodes:
-            try:
-                found = _one(station, node, add)
-            except TedsProvisionError as error:
-                first = first or error
-                if len(nodes) > 1:
-                    text = f"Node {node.uuid.hex()} was not identified: {error.message}"
-                    reporter.notice(Notice("unfinished", text, uuid=node.uuid))
+        for node, found in _side_by_side(nodes, lambda node: _one(station, node, add)):
+            if isinstance(found, Found):
+                identified = True
+                yield Came(node.uuid, links.places[0], 0.0, found)
                 continue
-            identified = True
-            yield Came(node.uuid, links.places[0], 0.0, found)
+            first = first or found
+            if len(nodes) > 1:
+                text = f"Node {node.uuid.hex()} was not identified: {found.message}"
+                reporter.notice(Notice("unfinished", text, uuid=node.uuid))
     if first is not None and not identified:
         raise first
+
+
+def _side_by_side(
+    nodes: list[Conversation], work: Callable[[Conversation], Found]
+) -> Iterator[tuple[Conversation, Found | TedsProvisionError]]:
+    """What became of each node, in their order: as many at a time as the link bears, as a mute one takes 40 s."""
+
+    def one(node: Conversation) -> Found | TedsProvisionError:
+        try:
+            return work(node)
+        except TedsProvisionError as error:
+            return error
+
+    at_once = min(len(nodes), *(node.contact.link.capabilities.at_once for node in nodes))
+    if at_once < 2:
+        yield from ((node, one(node)) for node in nodes)
+        return
+    pool = ThreadPoolExecutor(at_once, thread_name_prefix="node")
+    try:
+        yield from zip(nodes, pool.map(one, nodes), strict=True)
+    finally:  # after a Ctrl-C nobody is waited for: the bus is closed next
+        pool.shutdown(wait=False, cancel_futures=True)
 
 
 def _one(station: Station, node: Conversation, add: bool) -> Found:
