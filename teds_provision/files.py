@@ -77,7 +77,11 @@ def write_whole(
     mode: int = PRIVATE,
     failure: type[TedsProvisionError] = StoreFailure,
 ) -> None:
-    """Put a file in the place of ``path``, whole and durable; raises ``failure``, and then the old one is as it was."""
+    """Put a file in the place of ``path``, whole and durable.
+
+    Raises UsageFailure where a folder lies there, NotFound where its own is missing (and ``failure`` is no other one),
+    else ``failure``; the old file is then as it was.
+    """
     try:
         with whole_file(path, replace=True, mode=mode) as file:
             file.writelines((octets,) if isinstance(octets, bytes) else octets)
@@ -116,7 +120,7 @@ def require_new(path: Path) -> None:
     if path.exists() or path.is_symlink():
         raise _taken(path)
     if not path.parent.is_dir():
-        raise NotFound(f"There is no folder {path.parent}.")
+        raise NotFound(f"There is no folder {path.parent}.", hint="Make it, or name another place.")
 
 
 def read_limited(
@@ -266,4 +270,8 @@ def _taken(path: Path) -> UsageFailure:
 
 
 def _cannot_write(path: Path, error: OSError, failure: type[TedsProvisionError]) -> TedsProvisionError:
+    if failure is StoreFailure and isinstance(error, FileNotFoundError | NotADirectoryError):  # of a name from a user
+        return NotFound(f"There is no folder {path.parent}.", hint="Make it, or name another place.")
+    if isinstance(error, IsADirectoryError):
+        return UsageFailure(f"{path} is a folder, not a file.", hint="Name a file in it.")
     return failure(f"{path} cannot be written: {error.strerror}.", hint="Mend that and run the same command again.")

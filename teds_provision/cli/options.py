@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import os
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -12,6 +13,7 @@ import click
 
 from teds_provision.cli.context import App
 from teds_provision.cli.tracing import tracing
+from teds_provision.errors import NotFound
 from teds_provision.lazy import late
 from teds_provision.links import LINKS, LinkSettings
 from teds_provision.protocol.fingerprints import read_fingerprint
@@ -69,6 +71,28 @@ class WholeNumber(click.IntRange):
         if isinstance(value, str) and not value.strip().lstrip("+-").isdecimal():
             self.fail(f"{value!r} is no {self.means}.", param, ctx)
         return super().convert(value, param, ctx)
+
+
+class FileToRead(click.Path):
+    """A file that is read: where a folder lies there is no such file (3); what is to be written has a usage error (2).
+
+    ``exists``: it must be there; else whoever reads it says so.
+    """
+
+    def __init__(self, *, exists: bool = False) -> None:
+        super().__init__(path_type=Path)
+        self._must_exist = exists
+
+    def convert(
+        self, value: Any, param: click.Parameter | None, ctx: click.Context | None
+    ) -> str | bytes | os.PathLike[str]:
+        """Read a path; raises NotFound."""
+        path = super().convert(value, param, ctx)
+        if os.path.isdir(path):
+            raise NotFound(f"{os.fsdecode(path)} is a folder, not a file.")
+        if self._must_exist and not os.path.exists(path):
+            raise NotFound(f"There is no file {os.fsdecode(path)}.")
+        return path
 
 
 class Channel(WholeNumber):

@@ -137,7 +137,7 @@ def test_a_name_that_no_file_can_have_is_called_that_and_is_no_bug(home: Path, t
         (["build", UUID, "-p", "load-cell", "-c", long], 3),
         (["sign", long], 3),
         (["trust", "ca", "export", str(loop / "x")], 3),
-        (["profile", "new", "thing", "-o", str(file / "x")], 2),
+        (["profile", "new", "thing", "-o", str(file / "x")], 3),
         (["whitelist", "export", ""], 2),
         (["import-keys", ""], 3),
         (["group", "delete", "\udcff"], 8),

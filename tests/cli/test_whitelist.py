@@ -70,7 +70,7 @@ def test_nothing_is_imported_by_half(home: Path, tmp_path: Path) -> None:
 
 
 def test_an_export_that_cannot_be_written_leaves_nothing(home: Path, tmp_path: Path) -> None:
-    assert call(home, "whitelist", "export", tmp_path / "none" / "list.xml").code == 2
+    assert call(home, "whitelist", "export", tmp_path / "none" / "list.xml").code == 3
     assert call(home, "whitelist", "export", tmp_path / "list.dat").code == 2
     assert not (tmp_path / "list.dat").exists()
 

@@ -33,7 +33,7 @@ def test_what_is_wrong_is_said_and_what_to_do(hall: Hall, tmp_path: Path) -> Non
         (("measure", g, "--channel", "y"), 2, "no number of a channel"),
         (("measure", g, "--channel", "1", "--duration", "1"), 8, "no sensor"),
         (("measure", g, "--to", "run.xyz"), 2, ".csv"),
-        (("measure", g, "--to", tmp_path / "no" / "run.csv", "--duration", "1"), 7, "its folder is not there"),
+        (("measure", g, "--to", tmp_path / "no" / "run.csv", "--duration", "1"), 3, "its folder is not there"),
         (("measure", g, "--require", nothing), 8, "asks for nothing"),
         (("set", g, "x", "1"), 2, "no number of a channel"),
         (("set", g, "1", "-0.5"), 6, "beyond the limits"),  # a value, and no option
@@ -55,9 +55,11 @@ def test_what_is_wrong_is_said_and_what_to_do(hall: Hall, tmp_path: Path) -> Non
     "words", [("measure", "recover"), ("measure", "recover", "."), ("measure", "recover", "none.mcap")]
 )
 def test_recover_names_what_it_is(hall: Hall, words: tuple[str, ...]) -> None:
-    codes = {2: "Name one recording", 8: "is a folder", 3: "There is no file"}
+    code, told = {2: (2, "Name one recording"), 3: (3, "none.mcap")}[2 if len(words) == 2 else 3]
+    told = "is a folder" if words[-1] == "." else told
     outcome = hall.station.start("--json", *words).end()
-    assert codes[outcome.code] in outcome.out
+    assert outcome.code == code
+    assert told in outcome.out
 
 
 def test_a_broker_that_is_not_there_is_told_and_what_it_cost(hall: Hall) -> None:

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from teds_provision.errors import BadData, UsageFailure
+from teds_provision.errors import BadData, NotFound, UsageFailure
 from teds_provision.teds.calibration import Calibration, CalibrationInput, read_calibrations
 from teds_provision.teds.profile import load_profile, shipped_profiles
 from teds_provision.teds.show.plot import plot_blocks
@@ -85,7 +85,7 @@ def test_what_cannot_be_drawn_is_said(finger, tmp_path: Path) -> None:  # type: 
         plot_blocks(blocks, tmp_path / "x.png", channel=2)
     with pytest.raises(BadData, match="any channel"):
         plot_blocks({(0, 1): b"", (1, 5): b"\xff" * 40}, tmp_path / "x.png")
-    with pytest.raises(UsageFailure, match="cannot be written"):
+    with pytest.raises(NotFound, match="There is no folder"):
         plot_blocks(blocks, tmp_path / "no" / "x.png")
     erased = replace(calibrations[1], zero_offset=float("nan"))
     with pytest.raises(BadData):

@@ -12,7 +12,7 @@ import click
 from teds_provision.cli.context import App, pass_app
 from teds_provision.cli.options import COMMAND_SETTINGS, command, dry_run_option, examples
 from teds_provision.cli.rendering import print_table
-from teds_provision.errors import BadData, UsageFailure
+from teds_provision.errors import BadData, StoreFailure, UsageFailure
 from teds_provision.files import SHARED, holds, write_new
 from teds_provision.teds.profile import check as check_profile
 from teds_provision.teds.profile import (
@@ -208,7 +208,9 @@ def new(app: App, name: str, extends: str | None, output: Path | None, dry_run: 
         app.emit({"profiles": [{"name": name, "file": str(path)}], "text": text}, _plain(text.rstrip("\n")))
         return
     if not done:
-        _write(path, text)
+        if output is None:
+            _make(path.parent)
+        write_new(path, text.encode("utf-8"), mode=SHARED)
     said = _plain(f"{path} {'is there already' if done else 'written'}.")
     app.emit({"profiles": [{"name": name, "file": str(path)}]}, said)
 
@@ -226,9 +228,9 @@ def _place(home: Path, name: str) -> Path:
     return folder / f"{name}.toml"
 
 
-def _write(path: Path, text: str) -> None:
+def _make(folder: Path) -> None:
+    """Make our own folder of profiles."""
     try:
-        path.parent.mkdir(parents=True, exist_ok=True, mode=0o700)
+        folder.mkdir(parents=True, exist_ok=True, mode=0o700)
     except OSError as error:
-        raise UsageFailure(f"{path} cannot be written: {error.strerror}.") from error
-    write_new(path, text.encode("utf-8"), mode=SHARED, failure=UsageFailure)
+        raise StoreFailure(f"{folder} cannot be made: {error.strerror}.") from error

@@ -10,7 +10,14 @@ import click
 from teds_provision import handover, protocol
 from teds_provision.cli.context import App, pass_app
 from teds_provision.cli.handover.bundles import count_of
-from teds_provision.cli.options import COMMAND_SETTINGS, dry_run_option, examples, fingerprint_option, yes_option
+from teds_provision.cli.options import (
+    COMMAND_SETTINGS,
+    FileToRead,
+    dry_run_option,
+    examples,
+    fingerprint_option,
+    yes_option,
+)
 from teds_provision.errors import OtherKey
 from teds_provision.files import holds, read_limited, write_new
 from teds_provision.protocol.fingerprints import same_key
@@ -40,7 +47,7 @@ def trust() -> None:
     epilog=examples("teds-provision trust add lab keys/lab.pem", "teds-provision trust add --from keys/ --yes"),
 )
 @click.argument("name", required=False)
-@click.argument("file", type=_FILE, required=False)
+@click.argument("file", type=FileToRead(), required=False)
 @click.option("--from", "folder", type=click.Path(path_type=Path), metavar="DIR", help="Every key of a folder.")
 @click.option("--role", type=click.Choice(["station", "ca"]), default="station", show_default=True, help="Whose key.")
 @fingerprint_option(
@@ -234,7 +241,7 @@ def create(app: App) -> None:
     short_help="Certify the station that made REQUEST with init --request.",
     epilog=examples("teds-provision trust ca sign lab.request --output lab.cert --yes"),
 )
-@click.argument("request", type=_FILE)
+@click.argument("request", type=FileToRead())
 @click.option("--output", type=_FILE, required=True, metavar="CERT", help="Where the certificate goes.")
 @yes_option
 @dry_run_option
@@ -301,7 +308,7 @@ def drop(app: App, yes: bool) -> None:
 
 
 @ca.command("import", context_settings=COMMAND_SETTINGS, epilog=examples("teds-provision trust ca import owner-ca.pem"))
-@click.argument("file", type=_FILE)
+@click.argument("file", type=FileToRead())
 @pass_app
 def import_(app: App, file: Path) -> None:
     """Bring the CA key back from the file that "trust ca export" wrote."""

@@ -17,7 +17,7 @@ from teds_provision import teds
 from teds_provision.cli import measure as measure_cli
 from teds_provision.cli.context import App, pass_app
 from teds_provision.cli.measure.values import ending, over_the_bus
-from teds_provision.cli.options import Channel, Number, WholeNumber, command, link_options
+from teds_provision.cli.options import Channel, FileToRead, Number, WholeNumber, command, link_options
 from teds_provision.cli.steps.build import read_file
 from teds_provision.errors import UsageFailure
 from teds_provision.links import LINKS, LinkSettings, ble, can
@@ -53,7 +53,7 @@ KINDS = ("periodic", "event", "free")
 @click.option("--actuators/--no-actuators", default=True, show_default=True, help="Take set points from ROS topics.")
 @click.option("--dead-man", type=WholeNumber(20, 10_000), default=1000, show_default=True, metavar="MS",
               help="An actuator without set points for so long is safe.")  # fmt: skip
-@click.option("--require", type=click.Path(path_type=Path, dir_okay=False), metavar="FILE", help="What the task needs.")
+@click.option("--require", type=FileToRead(), metavar="FILE", help="What the task needs.")
 @click.option("--scalar-rate", type=Number(0, 1000), default=10.0, show_default=True, metavar="HZ",
               help="Rate of topics of one value.")  # fmt: skip
 @link_options

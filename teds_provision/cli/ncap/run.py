@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any, Final
 import click
 
 from teds_provision.cli.context import App, pass_app, to_json
-from teds_provision.cli.options import command
+from teds_provision.cli.options import FileToRead, command
 from teds_provision.cli.tracing import tracing
 from teds_provision.errors import UsageFailure
 from teds_provision.lazy import how_to_install, late
@@ -29,7 +29,7 @@ else:
 MOST: Final = 1000  # lines that may wait for somebody to read them
 LEAVING: Final = 2.0  # seconds for them to leave at the end
 _NEEDED = ("starlette", "uvicorn", "websockets")
-_FILE = click.Path(path_type=Path, dir_okay=False, exists=True)
+_FILE = FileToRead(exists=True)
 
 
 @command(

@@ -9,7 +9,7 @@ import click
 from teds_provision import node, protocol
 from teds_provision import teds as teds_room
 from teds_provision.cli.context import App, pass_app
-from teds_provision.cli.options import WholeNumber, command
+from teds_provision.cli.options import FileToRead, WholeNumber, command
 from teds_provision.errors import UsageFailure
 
 _NAME_OCTETS = 120
@@ -47,7 +47,7 @@ def _name(_ctx: click.Context, _parameter: click.Parameter, text: str) -> str:
 @click.option("--name", default="", callback=_name, help="What its maker calls it, at most 120 octets.")
 @click.option(
     "--teds",
-    type=click.Path(path_type=Path, dir_okay=False),
+    type=FileToRead(),
     metavar="FILE",
     help="Its datasheet and hardware: an image, XML, JSON, hex or binary file.",
 )

@@ -13,7 +13,7 @@ from teds_provision import handover, protocol
 from teds_provision import store as store_room
 from teds_provision import vault as vault_room
 from teds_provision.cli.context import App, pass_app, read_line
-from teds_provision.cli.options import command, dry_run_option, yes_option
+from teds_provision.cli.options import FileToRead, command, dry_run_option, yes_option
 from teds_provision.cli.steps.build import read_file
 from teds_provision.errors import NotFound, UsageFailure, VaultFailure, WrongPassphrase
 
@@ -40,7 +40,7 @@ _fd_option = click.option(
 @click.option(
     "--to",
     "recovery",
-    type=click.Path(path_type=Path, dir_okay=False),
+    type=FileToRead(),
     metavar="PEM",
     help="Seal to this public recovery key (P-256) instead of a passphrase.",
 )
@@ -86,10 +86,10 @@ def backup(
     "teds-provision restore station.backup",
     "teds-provision --home new restore station.backup --recovery-key recovery.pem",
 )
-@click.argument("file", type=click.Path(path_type=Path, dir_okay=False))
+@click.argument("file", type=FileToRead())
 @click.option(
     "--recovery-key",
-    type=click.Path(path_type=Path, dir_okay=False),
+    type=FileToRead(),
     metavar="PEM",
     help="The recovery key it was sealed to, as an encrypted PEM.",
 )

@@ -10,7 +10,7 @@ import click
 from teds_provision import handover, protocol
 from teds_provision import station as station_room
 from teds_provision.cli.context import App, pass_app
-from teds_provision.cli.options import command, yes_option
+from teds_provision.cli.options import FileToRead, command, yes_option
 from teds_provision.errors import TedsProvisionError, UsageFailure
 from teds_provision.files import read_limited, require_new, write_new
 from teds_provision.vault.agent import asking
@@ -32,7 +32,9 @@ _FILE = click.Path(path_type=Path, dir_okay=False)
     "--keystore", metavar="keyring|file|pkcs11:URI", help="Where the keys lie (default: the keyring if one works)."
 )
 @click.option("--request", type=_FILE, metavar="FILE", help="Make no CA key; ask for another's signature in FILE.")
-@click.option("--certificate", type=_FILE, metavar="CERT", help='Take in what "trust ca sign" gave for that request.')
+@click.option(
+    "--certificate", type=FileToRead(), metavar="CERT", help='Take in what "trust ca sign" gave for that request.'
+)
 @yes_option
 @pass_app
 def init(

@@ -12,8 +12,7 @@ import click
 from teds_provision import steps
 from teds_provision import teds as teds_room
 from teds_provision.cli.context import App, pass_app
-from teds_provision.cli.options import Function, command, dry_run_option, yes_option
-from teds_provision.errors import UsageFailure
+from teds_provision.cli.options import FileToRead, Function, command, dry_run_option, yes_option
 from teds_provision.files import SHARED, read_limited, write_whole
 
 MAX_INPUT_OCTETS = 32 << 20
@@ -37,7 +36,7 @@ def order_options(function: Function) -> Function:
         click.option(
             "--calibration",
             "-c",
-            type=click.Path(path_type=Path, dir_okay=False),
+            type=FileToRead(),
             metavar="FILE",
             help="CSV of raw, value pairs, or coefficients.",
         ),
@@ -98,7 +97,7 @@ def build(app: App, uuid: str, order: Any, output: Path | None, edition: str, ye
 def write_file(path: Path, text: str | Iterable[str]) -> None:
     """Write a result file whole or not at all; its parts as they come."""
     parts = (text,) if isinstance(text, str) else text
-    write_whole(path, (part.encode("utf-8") for part in parts), mode=SHARED, failure=UsageFailure)
+    write_whole(path, (part.encode("utf-8") for part in parts), mode=SHARED)
 
 
 def read_file(path: Path) -> bytes:

@@ -11,7 +11,7 @@ import click
 from teds_provision import station
 from teds_provision import steps as steps_room
 from teds_provision.cli.context import App, pass_app
-from teds_provision.cli.options import command, dry_run_option, link_options, yes_option
+from teds_provision.cli.options import FileToRead, command, dry_run_option, link_options, yes_option
 from teds_provision.cli.rendering import print_table, reporter_for
 from teds_provision.cli.steps.build import order_options
 from teds_provision.cli.steps.screen import Watched, screen_for
@@ -45,7 +45,7 @@ _CHANGES_SHOWN = 20
 @click.option("--watch", is_flag=True, help="Tap after tap, until Ctrl-C.")
 @click.option(
     "--batch",
-    type=click.Path(path_type=Path, dir_okay=False),
+    type=FileToRead(),
     metavar="FILE",
     help="A sheet says which board gets what: uuid, name, profile, calibration, fingerprint.",
 )

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from teds_provision.cli.context import App, pass_app
-from teds_provision.cli.options import WholeNumber, command, dry_run_option, link_options, yes_option
+from teds_provision.cli.options import FileToRead, WholeNumber, command, dry_run_option, link_options, yes_option
 from teds_provision.cli.rendering import reporter_for
 from teds_provision.errors import UsageFailure
 from teds_provision.links import LinkSettings
@@ -25,9 +25,7 @@ if TYPE_CHECKING:
     "teds-provision write 8d4d --from 3 --nfc udp:localhost:54321",
 )
 @click.argument("uuid")
-@click.option(
-    "--image", type=click.Path(path_type=Path, dir_okay=False), metavar="IMAGE", help="Write this file's image."
-)
+@click.option("--image", type=FileToRead(), metavar="IMAGE", help="Write this file's image.")
 @click.option(
     "--from",
     "sequence",

@@ -14,7 +14,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Literal, Protocol
 
-from teds_provision.errors import StoreFailure, TedsProvisionError
+from teds_provision.errors import NotFound, StoreFailure, TedsProvisionError
 from teds_provision.measure.blocks import Block, ChannelFacts, Command, GroupRows, NodeReport, SinkStats, StationFacts
 
 Item = Block | GroupRows | NodeReport | tuple[ChannelFacts, ...]
@@ -284,7 +284,8 @@ def as_sink_failure(error: OSError, name: str) -> TedsProvisionError:
         errno.EFBIG: ("the file may not grow any more", "Record to another disk, or in shorter runs."),
         errno.EACCES: ("it may not be written", "Check the owner and mode of the folder."),
         errno.EROFS: ("the disk is read-only", "Record to another disk."),
-        errno.ENOENT: ("its folder is not there", "Make the folder first."),
     }
+    if error.errno == errno.ENOENT:
+        return NotFound(f"{name} cannot be written: its folder is not there.", hint="Make the folder first.")
     cause, cure = cures.get(error.errno or 0, (error.strerror or type(error).__name__, "Check the path."))
     return StoreFailure(f"{name} cannot be written: {cause}.", hint=cure)

@@ -10,7 +10,7 @@ from datetime import datetime
 from pathlib import Path
 from typing import Final
 
-from teds_provision.errors import UsageFailure
+from teds_provision.errors import NotFound, UsageFailure
 from teds_provision.files import SHARED, write_whole
 from teds_provision.steps.many.board import Totals
 from teds_provision.steps.many.progress import Progress
@@ -24,20 +24,20 @@ _STYLE: Final = (
 
 
 def check_report(path: Path | None) -> None:
-    """Raise UsageFailure for a report of an unknown form, or without a folder to lie in, before the first tap."""
+    """Raise UsageFailure for a report of an unknown form, NotFound without a folder to lie in, before the first tap."""
     if path is None:
         return
     if path.suffix.lower() not in (".csv", ".html", ".htm"):
         raise UsageFailure(f"{path.name} is neither CSV nor HTML.", hint="Name it FILE.csv or FILE.html.")
     if not path.parent.is_dir():
-        raise UsageFailure(f"There is no folder {path.parent} for the report.")
+        raise NotFound(f"There is no folder {path.parent} for the report.", hint="Make it, or name another place.")
 
 
 def write_report(path: Path, progress: Progress) -> None:
-    """Write the report whole; raises UsageFailure where it cannot be written."""
+    """Write the report whole; raises what ``write_whole`` raises."""
     rows, totals = _rows(progress), progress.totals()
     text = _csv(rows, totals) if path.suffix.lower() == ".csv" else _html(progress.sheet.path.name, rows, totals)
-    write_whole(path, text.encode(), mode=SHARED, failure=UsageFailure)
+    write_whole(path, text.encode(), mode=SHARED)
 
 
 def _rows(progress: Progress) -> list[tuple[str, ...]]:

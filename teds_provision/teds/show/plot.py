@@ -51,7 +51,8 @@ def plot_blocks(
     """Draw the calibrations among framed TEDS into a PNG or SVG file (by its ending); returns the channels drawn.
 
     ``calibrations`` are those that the blocks were made from: their points and residuals are drawn too. Raises BadData
-    (no calibration that can be drawn), UsageFailure (another ending, no matplotlib, file cannot be written).
+    (no calibration that can be drawn), UsageFailure (another ending, no matplotlib), and what
+    ``write_whole`` raises.
     """
     kind = path.suffix.lower().lstrip(".")
     if kind not in FORMATS:
@@ -62,7 +63,7 @@ def plot_blocks(
         raise BadData(f"There is no calibration of {which} that can be drawn.")
     if len(panels) > MAXIMUM_PANELS:
         raise UsageFailure(f"{len(panels)} channels do not fit one picture.", hint="Choose one channel.")
-    write_whole(path, _picture(panels, kind, _node(blocks)), mode=SHARED, failure=UsageFailure)
+    write_whole(path, _picture(panels, kind, _node(blocks)), mode=SHARED)
     return tuple(panel.curve.channel.number for panel in panels)
 
 

@@ -59,7 +59,7 @@ def recover(path: Path) -> Recovered:
     except FileNotFoundError:
         raise NotFound(f"There is no file {path}.", hint="Name the recording that was cut.") from None
     except IsADirectoryError:
-        raise BadData(f"{path} is a folder.", hint="Name one recording in it.") from None
+        raise NotFound(f"{path} is a folder, not a file.", hint="Name one recording in it.") from None
     except OSError as error:
         raise as_sink_failure(error, str(path)) from error
 
