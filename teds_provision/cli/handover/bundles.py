@@ -13,16 +13,9 @@ from typing import TYPE_CHECKING, Any, BinaryIO, Literal
 import click
 
 from teds_provision import handover, protocol
+from teds_provision.cli import options
 from teds_provision.cli.context import App, pass_app
-from teds_provision.cli.options import (
-    FileToRead,
-    WholeNumber,
-    command,
-    dry_run_option,
-    link_options,
-    links_given,
-    yes_option,
-)
+from teds_provision.cli.options import WholeNumber, command, dry_run_option, link_options, links_given, yes_option
 from teds_provision.cli.rendering import local_time, reporter_for
 from teds_provision.errors import BadData, LinkFailure, PolicyRefused
 from teds_provision.files import holds, open_to_read, require_new, write_new
@@ -187,7 +180,7 @@ def _first(lines: list[str], most: int, count: int) -> list[str]:
     "teds-provision import-keys lab.jwe --no-prove",
     "teds-provision import-keys lab.jwe --via can --can udp_multicast:239.74.163.2 --yes",
 )
-@click.argument("file", type=FileToRead())
+@click.argument("file", type=options.FileToRead())
 @click.option(
     "--prove/--no-prove", default=None, help="Meet each node and open a session (default: with link options)."
 )
