@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import functools
 import logging
+import math
 import threading
 import time
 from collections.abc import Sequence
@@ -49,6 +50,7 @@ LOOK_FOR_DATA = 0.4  # seconds after an announcement in which data shows that it
 ANNOUNCED = 1.0  # seconds until a node without such data is asked after it
 AT_ONCE = 1.0  # seconds between two tries, however often something announces itself as this node
 SLOWER = 10  # halvings of the rate while the firmware says that its shortest period is longer
+BUSY = 2.0  # seconds in which a busy node is asked again at once; then it is tried again as after any other error
 _CURED_BY_TIME = frozenset({Reason.WRONG_STATE, Reason.BUSY, Reason.BAD_TAG, 21, 22, 23})
 _FINAL = (NotAuthentic, PolicyRefused, BadData, StoreFailure, Bug)
 
@@ -82,6 +84,7 @@ class NodeKeeper:
         self._anew = threading.Event()
         self._announced = 0.0  # when it announced itself (time.monotonic), 0: it did not
         self._lost_at = 0.0
+        self._until = math.inf  # when it is given up, unless it ran by then (time.monotonic)
         self._sighting: Sighting | None = None  # where it was last
         self._halved = 0
         self._driven: TopicActuators | None = None
@@ -110,7 +113,8 @@ class NodeKeeper:
     # -- the thread --------------------------------------------------------------------------------------------------
 
     def _run(self) -> None:
-        pause, first = FIRST_PAUSE, time.monotonic()
+        pause = FIRST_PAUSE
+        self._until = time.monotonic() + self._wish.timeout
         try:
             while not self._stop.is_set():
                 self._anew.clear()
@@ -119,13 +123,13 @@ class NodeKeeper:
                 if error is None or self._stop.is_set():
                     break
                 self.error = error
-                if self._gives_up(error, first):
+                if self._gives_up(error):
                     self._say("refused", error)
                     return
                 if time.monotonic() - began > LAST_PAUSE:
                     pause = FIRST_PAUSE
-                self._say("lost" if self.ever_ran else "waiting", error, f"; again in {pause:.0f} s")
-                self._wait(pause, began)
+                self._say("lost" if self.ever_ran else "waiting", error, f"; again in {self._again(pause)}")
+                self._wait(min(pause, self._left), began)
                 pause = min(2 * pause, LAST_PAUSE)
             self._say("ended")
         finally:
@@ -136,6 +140,16 @@ class NodeKeeper:
                 bus.share.gone(self.uuid)
             self.done.set()
             self.ready.set()
+
+    @property
+    def _left(self) -> float:
+        """Seconds in which a first value has to come; no end where it came, or the node is waited for for ever."""
+        return math.inf if self.ever_ran or self._wish.patient else max(0.0, self._until - time.monotonic())
+
+    def _again(self, pause: float) -> str:
+        """When it is tried again, and for how long that goes on."""
+        left = self._left
+        return f"{pause:.0f} s" if left == math.inf else f"{min(pause, left):.0f} s, given up in {left:.0f} s"
 
     def _wait(self, pause: float, began: float) -> None:
         """Wait until it is time to try again: after ``pause`` seconds, or at once when the node announces itself."""
@@ -158,19 +172,18 @@ class NodeKeeper:
             return Bug(f"Unexpected {type(bug).__name__}.", hint="This is a bug: please report it with -vv.")
         return None
 
-    def _gives_up(self, error: TedsProvisionError, first: float) -> bool:
+    def _gives_up(self, error: TedsProvisionError) -> bool:
         """Before the first value a refusal ends it; later anyone could have sent it, so it is tried again."""
-        if self.ever_ran or self._wish.patient:
+        if self._left == math.inf:
             return False
-        final = isinstance(error, _FINAL) and not self._passing(error)
-        return final or time.monotonic() - first > self._wish.timeout
+        return not self._left or (isinstance(error, _FINAL) and not self._passing(error))
 
     def _passing(self, error: TedsProvisionError) -> bool:
         """A refusal that time cures: another claim, no room, a node that is busy or starts anew."""
         return isinstance(error, NodeRefused) and error.reason in _CURED_BY_TIME
 
     def _once(self) -> None:
-        seconds = self._wish.timeout if not self.ever_ran else LOOKING
+        seconds = LOOKING if self.ever_ran else max(LOOKING, min(self._wish.timeout, self._left))
         sighting = self._buses.sightings.find(self.uuid, seconds=seconds, stop=self._stop, fresh=self._lost_at)
         self._sighting = sighting
         self.bus = self._buses.of(sighting)
@@ -186,7 +199,7 @@ class NodeKeeper:
 
     def _in_session(self, bus: Bus, sighting: Sighting) -> None:
         standing = Standing(self._station, self.uuid)
-        with Conversation(sighting.contact(), notice=lambda _notice: None) as node:
+        with Conversation(sighting.contact(), notice=lambda _notice: None, busy_seconds=BUSY) as node:
             trusted = open_trusted(self._station, node, unsigned=self._wish.unsigned)
             if self._wish.require is not None:
                 self._wish.require.offer(self.uuid, trusted.sheet, self._stop)

@@ -26,7 +26,7 @@ from teds_provision.protocol.session import StationSession
 
 _log = logging.getLogger(__name__)
 BUSY_PAUSE, BUSY_SECONDS = 0.25, 10.0
-"""A node that is busy is asked again, after a pause, and not for ever."""
+"""A node that is busy is asked again, after a pause, and not for ever; a conversation may have less patience."""
 _REOPENINGS = 2
 _REPEATS = 5
 """How often a command that does no harm is sent again on a link that loses frames."""
@@ -70,6 +70,7 @@ _CURE = {
     Reason.TOO_LARGE: "Use a smaller calibration table, or a node with more flash.",
     Reason.DOES_NOT_FIT: "Ask for a lower rate, more samples in a message, or CAN FD; NFC and BLE do not offer all.",
     Reason.NO_ROOM: "Let another measurement of this node end first.",
+    Reason.BUSY: "Try again in a moment; mode UUID says which station claims what.",
     Reason.FAULT: "Look at its power and self-test: sample UUID, mode UUID.",
     Reason.FLASH_FAILURE: "Try again; if it stays, the board is broken.",
 }
@@ -91,6 +92,11 @@ def refused(reason: int | None, doing: str, *, sealed: bool = False) -> NodeRefu
     )
 
 
+def is_busy(error: TedsProvisionError) -> bool:
+    """Whether a node refused because it is busy (17): time cures that, nothing else does."""
+    return isinstance(error, NodeRefused) and error.reason == Reason.BUSY
+
+
 # What a node says to an Open of which an octet was changed on the way; said twice it is what the node means.
 _DISTURBED = (Reason.UNKNOWN_KEY, Reason.BAD_FORM, Reason.BAD_POINT)
 
@@ -106,7 +112,7 @@ class SessionLost(Exception):
 class Conversation:
     """One node on one link. Commands go plain until :meth:`open` succeeded, sealed from then on."""
 
-    def __init__(self, contact: Contact, *, notice: NoticeSink) -> None:
+    def __init__(self, contact: Contact, *, notice: NoticeSink, busy_seconds: float | None = None) -> None:
         self.contact = contact
         self.identity = contact.identity
         self.uuid = contact.identity.uuid
@@ -114,7 +120,7 @@ class Conversation:
         """What Identify said in the session that is open, None where it was not asked yet."""
         self.charging = contact.charging
         """What its initial NFC message said of its charge, also where the conversation went on over another link."""
-        self._notice = notice
+        self._notice, self._busy_seconds = notice, busy_seconds
         self._key: bytes | None = None
         self._session: StationSession | None = None
         self._release: Callable[[], object] = _nothing
@@ -246,7 +252,10 @@ class Conversation:
         return self.send(command, doing)
 
     def ask(self, command: Command, doing: str) -> bytes:
-        """Send a command that may be repeated without harm, over a new session where the old one was lost."""
+        """Send a command that may be repeated without harm, over a new session where the old one was lost.
+
+        One that the node was too busy for is given up: a new session would meet the same node.
+        """
         reopenings = repeats = torn = 0
         until = time.monotonic() + _REPEATING_SECONDS
         while True:
@@ -254,7 +263,7 @@ class Conversation:
                 return self.sure(command, doing)
             except SessionLost as lost:
                 reopenings += 1
-                if reopenings > _REOPENINGS:
+                if reopenings > _REOPENINGS or is_busy(lost.cause):
                     raise lost.cause from lost
                 self.reopen()
             except (NodeSilent, Garbled) as failure:
@@ -262,6 +271,10 @@ class Conversation:
                 repeats += isinstance(failure, NodeSilent)
                 if repeats > _REPEATS or torn > _TORN_REPEATS or time.monotonic() > until or not self.lives():
                     raise
+
+    @property
+    def _patience_with_busy(self) -> float:
+        return BUSY_SECONDS if self._busy_seconds is None else self._busy_seconds
 
     @property
     def _is_noisy(self) -> bool:
@@ -283,7 +296,7 @@ class Conversation:
 
     def _exchange(self, command: Command, inside: Command | None = None, within: float | None = None) -> Reply:
         """Send a command, again while the node is busy; ``inside`` is what is sealed in it."""
-        until = time.monotonic() + (BUSY_SECONDS if within is None else 0.0)
+        until = time.monotonic() + (self._patience_with_busy if within is None else 0.0)
         while True:
             frame = command.encode()
             self._trace_sent(frame, command, inside)

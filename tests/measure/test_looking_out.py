@@ -2,27 +2,30 @@
 
 from __future__ import annotations
 
+import math
 import threading
 import time
 from collections import Counter
 from collections.abc import Iterator
-from contextlib import suppress
+from contextlib import contextmanager, suppress
 from typing import Any
 
 import pytest
 
 from teds_provision.errors import AddressConflict, LinkFailure
+from teds_provision.links.can.frame import Frame
 from teds_provision.links.can.port import CanPort
-from teds_provision.measure.finding.lookout import Lookout
+from teds_provision.measure.finding.asking import LEAST, Pace
+from teds_provision.measure.finding.lookout import BELIEVED, SOON, Lookout
 from teds_provision.measure.finding.sightings import Sighting, Sightings
 from teds_provision.ncap.nodes.leaving import AT_ONCE, CHECK, StillThere
-from teds_provision.protocol.announce import uuid_crc
-from teds_provision.protocol.messages.identity import Identity
+from teds_provision.protocol.announce import Announce, uuid_crc
+from teds_provision.protocol.messages.identity import Identity, NodeState
 from tests.links.can.conftest import hub, nodes  # noqa: F401  fixtures
 from tests.links.can.hub import Hub
 from tests.links.can.test_can_loss import Start
 from tests.measure.test_lookout import ONE, seen
-from tests.pace import best_of, until
+from tests.pace import PATIENCE, best_of, crowded, until
 
 pytestmark = pytest.mark.link
 ADDRESSES = list(range(0x21, 0x21 + 20))
@@ -73,30 +76,62 @@ def test_who_announces_itself_is_asked_once_in_ten_seconds_and_five_a_second_ove
 
 
 def test_a_node_that_somebody_waits_for_is_looked_for_at_once(lookout: Lookout, hub: Hub) -> None:  # noqa: F811
+    with looked_for(lookout):
+        until(lambda: asked(hub)[0] >= 4, "somebody is missing: at the start, at once, after 1 s, after 2 s")
+        hub.frames.clear()
+        began = time.monotonic()
+        announce(hub, 0x21, uuid_crc(ONE).to_bytes(4, "big"))
+        until(lambda: asked(hub)[0])
+        assert crowded() or time.monotonic() - began < 3, "the next question without an Announce comes after 4 s"
+
+
+def test_a_question_that_the_missing_node_did_not_hear_is_asked_again_at_once(
+    lookout: Lookout,
+    hub: Hub,  # noqa: F811
+) -> None:
+    """The second one came a second later, and in a measurement of many nodes all others waited for it."""
+
+    def pause() -> float:
+        hub.frames.clear()
+        announce(hub, 0x21, uuid_crc(ONE).to_bytes(4, "big"))
+        until(lambda: asked(hub)[0] >= 1, "because it announced itself")
+        began = time.monotonic()
+        until(lambda: asked(hub)[0] >= 2, "because it is still missing")
+        return time.monotonic() - began
+
+    with looked_for(lookout):
+        until(lambda: asked(hub)[0] >= 3)
+        best_of(3, LEAST, pause)
+    pace = Pace(time.monotonic(), first=SOON)
+    until(lambda: pace.is_due(wanted=False, missing=True, poll=None))
+    pace.asked = time.monotonic()
+    assert not pace.is_due(wanted=False, missing=True, poll=None), "from there on after 1 s, doubling"
+
+
+def test_who_goes_on_announcing_a_missing_node_does_not_have_everybody_asked_on_and_on(lookout: Lookout) -> None:
+    words = Announce(0x21, NodeState.PROVISIONED, uuid_crc(ONE))
+    frame = Frame(words.identifier, words.encode())
+    with looked_for(lookout):
+        assert [lookout._heard(frame) for _ in range(3 * BELIEVED)] == [SOON] * BELIEVED + [math.inf] * 2 * BELIEVED
+
+
+@contextmanager
+def looked_for(lookout: Lookout) -> Iterator[None]:
+    """Somebody waits for a node that is not there."""
     stop = threading.Event()
 
     def wait() -> None:
         with suppress(LinkFailure):
-            lookout._sightings.find(ONE, seconds=20, stop=stop)
+            lookout._sightings.find(ONE, seconds=PATIENCE, stop=stop)
 
-    def took() -> float:
-        """Seconds from an Announce to the question to everybody, after the last question began a pause of seconds."""
-        waiting = threading.Thread(target=wait)
-        waiting.start()
-        try:
-            until(lookout._sightings.missing)
-            time.sleep(1.5)  # the question to everybody a second after the last one, because somebody is missing
-            hub.frames.clear()
-            announced = time.monotonic()
-            announce(hub, 0x21, uuid_crc(ONE).to_bytes(4, "big"))
-            until(lambda: asked(hub)[0])
-            return time.monotonic() - announced
-        finally:
-            stop.set()
-            waiting.join()
-            stop.clear()
-
-    best_of(5, 1.0, took)
+    waiting = threading.Thread(target=wait)
+    waiting.start()
+    until(lookout._sightings.missing)
+    try:
+        yield
+    finally:
+        stop.set()
+        waiting.join()
 
 
 class Bus:

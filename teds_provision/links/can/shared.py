@@ -139,10 +139,14 @@ class Line:
 
 @dataclass
 class Asked:
-    """A functional Identify under way: ``gathering`` is filled by the loop, :meth:`next` waits for news of it."""
+    """A functional Identify under way: ``gathering`` is filled by the loop, :meth:`next` waits for news of it.
+
+    ``began`` and ``heard_at``: when it was asked, and when the last frame of an answer came (time.monotonic).
+    """
 
     gathering: Gathering
     heard_at: float
+    began: float
     until: float = math.inf
     news: SimpleQueue[int] = field(default_factory=SimpleQueue)
 
@@ -253,7 +257,7 @@ class SharedBus:
         second node answered under the same address (:meth:`clash`).
         """
         now = time.monotonic()
-        asked = Asked(Gathering(self.own, transaction), now)
+        asked = Asked(Gathering(self.own, transaction), now, now)
         with self._lock:
             self._asked = (*(other for other in self._asked if other.until > now), asked)
         try:
@@ -262,7 +266,7 @@ class SharedBus:
             asked.until = time.monotonic() + _STRAGGLERS_SECONDS
 
     def clash(self, node: int) -> bool:
-        """Whether two nodes were heard under this address a short while ago."""
+        """Whether two nodes were heard under this address a short while ago, and not one alone since then."""
         return time.monotonic() - self._clashes.get(node, -math.inf) < _CLASH_SECONDS
 
     # -- the loop, and what runs in it -----------------------------------------------------------------------------
@@ -369,6 +373,10 @@ class SharedBus:
             self._reply(answer)
         if node in gathering.clashes:
             self._clashes[node] = time.monotonic()
+        elif node in gathering.answers and self._clashes.get(node, math.inf) < asked.began:
+            del self._clashes[
+                node
+            ]  # one of the two has left, by its Claim: here one answers; if both do, it stands again
         if before != (len(gathering.answers), len(gathering.conflicts)):
             asked.news.put(node)
 

@@ -13,21 +13,25 @@ LEAST, MOST = 1.0, 30.0  # seconds between questions while somebody is missing
 
 
 class Pace:
-    """When everybody is asked again: ``asked`` is when they were last, ``_pause`` how long it is till the next time."""
+    """When everybody is asked again: ``asked`` is when they were last.
 
-    def __init__(self, asked: float) -> None:
+    While somebody is missing that is after ``first`` seconds, then after LEAST, doubling to MOST. ``first`` is short on
+    a bus, where a question, or its answer, may have been lost.
+    """
+
+    def __init__(self, asked: float, *, first: float = LEAST) -> None:
         self.asked = asked
-        self._pause = LEAST
+        self._first = self._pause = first
 
     def is_due(self, *, wanted: bool, missing: bool, poll: float | None) -> bool:
         """Whether to ask now: somebody wants it, is missing, or polls."""
         since = time.monotonic() - self.asked
         if wanted or not missing:
-            self._pause = LEAST
+            self._pause = self._first
         if wanted:
             return True
         if (missing and since >= self._pause) or (poll and since >= poll):
-            self._pause = min(2 * self._pause, MOST)
+            self._pause = min(max(LEAST, 2 * self._pause), MOST)
             return True
         return False
 

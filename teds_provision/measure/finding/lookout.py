@@ -1,9 +1,10 @@
 """Who is on a bus, asked once for everybody who waits: announcements, and a functional Identify now and then.
 
 Fifty nodes that are looked for by fifty threads would each ask the whole bus; so one look-out asks for all. It asks at
-its start, when somebody is missing (after 1 s, doubling to 30 s; sooner where that one announces itself), and every
-``poll`` seconds where it was asked to. Then it also asks each address that announces itself, once in 10 s at most and
-five a second over all (operation.md section 7). What it hears is a hint: a session says who it is.
+its start, when somebody is missing (once more at once, then after 1 s, doubling to 30 s; sooner where that one
+announces itself), and every ``poll`` seconds where it was asked to. Then it also asks each address that announces
+itself, once in 10 s at most and five a second over all (operation.md section 7). What it hears is a hint: a session
+says who it is.
 """
 
 from __future__ import annotations
@@ -24,7 +25,8 @@ from teds_provision.protocol.messages.identity import Identity
 POLL = 30.0  # seconds between questions to everybody, where that was asked for (operation.md section 7)
 EACH, ALL = 10.0, 0.2  # seconds between questions to one address that announces itself, and to any of them
 PATIENCE = 0.5  # seconds for the answer of one that has just announced itself
-AWAITED = 0.25  # seconds between questions to everybody, where something announces itself as a node that is missing
+SOON = 0.05  # seconds from a question to everybody, its silence included, to the next: one that missed it costs no more
+BELIEVED = 4  # Announces of a missing node in EACH seconds for which everybody is asked soon: anyone can send them
 LOOK = 0.05  # seconds between looks at who waits
 
 
@@ -37,6 +39,7 @@ class Lookout(Asking):
         self.port = port
         self._announcers: deque[int] = deque(maxlen=LAST_ADDRESS)
         self._asked_at: dict[int, float] = {}
+        self._awaited: dict[int, deque[float]] = {}  # when a missing node (its CRC) was looked for because of Announces
         super().__init__(port.place, sightings, poll)
 
     def _run(self) -> None:
@@ -53,7 +56,7 @@ class Lookout(Asking):
         """Ask, and hear announcements, until the bus fails."""
         with self.port.bus().listen(lambda frame: is_announce(frame.identifier), most=256) as ear:
             self._ask()
-            pace, soon = Pace(time.monotonic()), math.inf
+            pace, soon = Pace(time.monotonic(), first=SOON), math.inf
             while not self._stop.is_set():
                 soon = min(soon, self._heard(ear.get(LOOK)))
                 wanted = self._asked.is_set() or time.monotonic() - pace.asked >= soon
@@ -70,10 +73,17 @@ class Lookout(Asking):
             return math.inf
         self._sightings.announced(self.port.place, announce)
         if self._sightings.awaits(announce):
-            return AWAITED
+            return SOON if self._believes(announce) else math.inf
         if self._poll and announce.address not in self._announcers:
             self._announcers.append(announce.address)
         return math.inf
+
+    def _believes(self, announce: Announce) -> bool:
+        now, before = time.monotonic(), self._awaited.setdefault(announce.crc, deque(maxlen=BELIEVED))
+        if len(before) == BELIEVED and now - before[0] < EACH:
+            return False
+        before.append(now)
+        return True
 
     def _ask_announcer(self) -> None:
         """Ask one address that announced itself, where its turn has come; who is asked too soon is left out."""

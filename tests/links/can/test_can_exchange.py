@@ -221,6 +221,19 @@ def test_two_nodes_under_one_address_are_a_conflict(hub: Hub) -> None:
         assert "conflict" in kinds
 
 
+def test_an_address_is_good_again_as_soon_as_one_node_alone_answers_there(hub: Hub) -> None:
+    """It was refused for ten seconds, though a Claim sorts the two out within a tenth of one."""
+    first, second = EchoNode(0x21, uuid=b"A" * 10), EchoNode(0x21, uuid=b"B" * 10)
+    first.pinned = second.pinned = True
+    with serving(hub.spec, first), opened(hub.spec) as port:
+        with serving(hub.spec, second), pytest.raises(AddressConflict, match="0x21"):
+            port.everyone(seconds=3, notice=quiet)
+        assert port.bus().clash(0x21)
+        [contact] = port.everyone(seconds=3, notice=quiet)
+        assert contact.identity.uuid == first.uuid
+        assert contact.link.exchange(COUNT)
+
+
 def test_a_node_is_asked_first_where_it_is_thought_to_be(hub: Hub) -> None:
     """Everyone answers after a random wait of up to 50 ms, one that is asked alone at once (profile: wire, "CAN")."""
     with serving(hub.spec, EchoNode(0x21)), opened(hub.spec) as port:
