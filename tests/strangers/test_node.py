@@ -19,6 +19,7 @@ from teds_provision.teds.image import Image
 from teds_provision.teds.sheet import Kind, Sheet
 from tests.e2e.desk import ANGLE, Running
 from tests.measure.hall import Hall, events, of, ran
+from tests.pace import crowded
 from tests.strangers.wire import of_spec
 
 pytestmark = pytest.mark.link
@@ -276,3 +277,20 @@ def test_a_node_that_contradicts_itself_is_reported(fd_angle: Stranger, fault: s
         assert any("clock" in why for why in whys)
     else:
         assert of(lines) == []
+
+
+def test_a_node_that_is_busy_for_ever_is_told_until_when_and_holds_up_nobody(
+    fd_angle: Stranger, gripper: Stranger
+) -> None:
+    fd_angle.start("busy for ever", program="tests.strangers.liar")
+    gripper.start()
+    hall = fd_angle.hall
+    lines = events(hall.begin(fd_angle.uuid, gripper.uuid, "--rate", 20, "--duration", 1).end().out)
+    assert ran([line for line in lines if line.get("uuid") == gripper.uuid]) == ["running", "ended"]
+    whys = [line["why"] for line in lines if line["event"] == "status" and line["uuid"] == fd_angle.uuid]
+    assert any("it is busy" in why and "again in 1 s, given up in" in why for why in whys), whys
+    # Where it is alone, it is given up at the end of --timeout, and no later than a last try takes.
+    lines = measured(fd_angle, "--timeout", 3, code=6)
+    waited = [line["time"] for line in lines if line["event"] == "status"]
+    assert crowded() or waited[-1] - waited[0] < 15, "65 s before"
+    assert [line["state"] for line in lines if line["event"] == "status"][-1] == "refused"

@@ -9,8 +9,9 @@ from teds_provision.protocol.agreement import Credentials, StationAgreement
 from teds_provision.protocol.keys import SoftwareKey, station_key_message
 from teds_provision.protocol.messages.frames import Function, Reason, decode_reply, read_teds, security_command
 from teds_provision.protocol.session import StationSession
+from teds_provision.talk.conversation import Conversation
 from teds_provision.teds.image import SECURITY
-from tests.bench import Board, MemoryLink, talk
+from tests.bench import Board, MemoryLink, contact, talk
 
 STATION, CA = SoftwareKey(5), SoftwareKey(3)
 
@@ -115,3 +116,27 @@ def test_a_request_that_was_disturbed_on_a_bus_is_sent_once_more(board: Board) -
         reply = node.sure(agreement.request(), "the key agreement")
     assert agreement.accept(reply, pinned=None, epoch=0).epoch == 1
     assert link.count == 2
+
+
+def test_a_node_that_stays_busy_is_asked_for_one_patience_and_no_new_session_is_opened(
+    board: Board, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Each of three sessions had a patience of its own: `verify` waited for half a minute."""
+    monkeypatch.setattr("teds_provision.talk.conversation._BUSY_PAUSE", 0.001)
+    key = keyed(board)
+    sealed = bytes([0, 0, 128, Function.SEALED])
+
+    def busy(number: int, reply: bytes) -> bytes:
+        return bytes([0, 0, 1, Reason.BUSY]) if link.frames[number - 1].startswith(sealed) else reply
+
+    link = MemoryLink(board, via="can", tapped=False, tamper=busy)
+    with Conversation(contact(board, link), notice=lambda _notice: None, busy_seconds=0.05) as node:
+        node.open(key)
+        with pytest.raises(NodeRefused) as caught:
+            node.ask(security_command(Function.LIST), "to list its TEDS")
+        assert caught.value.reason == Reason.BUSY
+        node.forget()
+    asked = [frame.startswith(sealed) for frame in link.frames]
+    assert asked.index(True) == 2, "asked for c, then Open"
+    assert sum(asked) >= 2, "it may have been for a moment"
+    assert all(asked[2:])
