@@ -21,6 +21,7 @@ from teds_provision.measure.blocks import Block
 from teds_provision.measure.clock import ClockMap
 from teds_provision.measure.interpreter import StreamInterpreter
 from teds_provision.protocol.operation.can_frames import DATA, Assembly
+from teds_provision.protocol.operation.stream_commands import Kind
 from teds_provision.protocol.operation.subscription import Message, Receiver
 
 SLICE = 0.004  # seconds between looks at what waits
@@ -56,7 +57,8 @@ class HeardStream:
     def __post_init__(self) -> None:
         plan = self.receiver.plan
         self._at_once = plan.span >= GATHER * 1e9
-        self._last_instant = plan.span - plan.subscribe.period
+        # Of a stream that runs free only the first instant of each message is known for certain.
+        self._last_instant = 0 if plan.subscribe.kind == Kind.FREE else plan.span - plan.subscribe.period
         self._test_pattern = plan.subscribe.test_pattern
 
     def take(self, segment: int, frame: Frame) -> None:

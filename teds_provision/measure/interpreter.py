@@ -42,6 +42,8 @@ class StreamInterpreter:
         self._row = at
         self._period, self._n = plan.subscribe.period, plan.subscribe.n
         self._even = plan.subscribe.kind == Kind.PERIODIC
+        self._free, self._real = plan.subscribe.kind == Kind.FREE, float(self._period)  # ns between its instants
+        self._before: Message | None = None
         self._stream, self._numbers = plan.subscribe.stream, plan.layout.channels
         self._test_pattern = plan.subscribe.test_pattern
         self._steps, self._seconds = np.zeros(0, dtype=np.uint64), np.zeros(0)  # of instants: ns, s after the first
@@ -79,13 +81,11 @@ class StreamInterpreter:
             told = [message.valid and not message.test_pattern for message in messages]
             valid = valid & np.repeat(told, self._n)[:, None]
             value = np.where(valid, value, np.nan)
-        if len(self._steps) < count:
-            self._steps = np.arange(count, dtype=np.uint64) * np.uint64(self._period)
-            self._seconds = self._steps / 1e9
-        span = (count - 1) * self._period
+        steps, seconds = self._spaced(first, count)
+        span = int(steps[-1])
         # Whole nanoseconds first: a tick of months and an offset of years would lose microseconds as floats.
         host, rate, bound = self._clock.line(first.tick, first.tick + span)
-        times = self._seconds[:count] * rate
+        times = seconds * rate
         times += host / 1e9 + self._wall.offset
         return Block(
             uuid=self._uuid,
@@ -93,7 +93,7 @@ class StreamInterpreter:
             channels=self._numbers,
             index=first.index,
             time=self._monotone.straight(times),
-            tick=self._steps[:count] + first.tick,
+            tick=steps + first.tick,
             raw=raws,
             value=value,
             valid=valid,
@@ -102,6 +102,23 @@ class StreamInterpreter:
             test_pattern=self._test_pattern,
             run=self._run,
         )
+
+    def _spaced(self, first: Message, count: int) -> tuple[np.ndarray, np.ndarray]:
+        """When so many instants are after that of the first one, in ns and in seconds.
+
+        The period of a stream that runs free is what its own ticks say; the asked one is nominal (operation.md 3).
+        """
+        if self._free:
+            before, self._before = self._before, first
+            if before is not None:
+                real = (first.tick - before.tick) / (first.index - before.index)
+                self._real = real if self._period / 2 <= real <= self._period * 2 else self._real
+            steps = np.rint(np.arange(count) * self._real).astype(np.uint64)
+            return steps, steps / 1e9
+        if len(self._steps) < count:
+            self._steps = np.arange(count, dtype=np.uint64) * np.uint64(self._period)
+            self._seconds = self._steps / 1e9
+        return self._steps[:count], self._seconds[:count]
 
     def _values(self, octets: bytes) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Raw values, values (NaN where not valid), and which are valid, of instants as they stand in messages."""

@@ -76,6 +76,7 @@ class TopicActuators:
         self._newest: dict[int, Command] = {}
         self._news = threading.Condition()
         self._stop = False
+        self._last_drive = 0  # its run
         self._unsure = False  # whether a value may still be on its way
         self.refused = 0
         self._thread = threading.Thread(target=self._run, name=f"actuators {trusted.uuid[:8]}", daemon=True)
@@ -187,7 +188,9 @@ class TopicActuators:
         if actuator.driver is None:
             layout = Layout((number,), (len(octets),))
             reply = Driven.decode(self._trusted.node.send(drive([number]), "to be driven"))
-            actuator.driver = Driver(layout, reply, self._trusted.node.message_key, dead_man=self._dead_man)
+            key = self._trusted.node.message_key
+            actuator.driver = Driver(layout, reply, key, dead_man=self._dead_man, after=self._last_drive)
+            self._last_drive = reply.run
         left = round(self._left(command) * 1e9)
         with self._mapping:
             now = self._clock.ticks_at(time.monotonic_ns())

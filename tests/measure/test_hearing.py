@@ -34,7 +34,8 @@ WALL = Wall(1.8e9)
 class Scene:
     """A stream of two channels, n = 3 at 1 kHz, whose node's clock stood at 1 s when the host's stood at ``base``."""
 
-    def __init__(self, kind: Kind = Kind.PERIODIC, period: int = MS) -> None:
+    def __init__(self, kind: Kind = Kind.PERIODIC, period: int = MS, *, real: int = MS) -> None:
+        self.real = real  # period of a sensor that runs free
         self.plan = Plan.of(0, ((1, 2), (2, 2)), n=3, period=period, kind=kind)
         self.base = time.monotonic_ns() - 3600 * SECOND
         clock = ClockMap()
@@ -48,7 +49,9 @@ class Scene:
 
     def message(self, counter: int, flags: int = 0) -> bytes:
         raws = np.random.default_rng(counter).integers(0, 65536, 6).astype(">u2").tobytes()
-        free = (SECOND + counter * 3 * MS + 17).to_bytes(8, "big") if self.plan.subscribe.kind == Kind.FREE else b""
+        free = (
+            (SECOND + counter * 3 * self.real + 17).to_bytes(8, "big") if self.plan.subscribe.kind == Kind.FREE else b""
+        )
         return self._sealer.seal(counter, bytes([flags]) + free + raws)
 
     def arrival(self, counter: int) -> int:
@@ -87,6 +90,24 @@ def test_together_or_one_by_one_the_same_samples(kind: Kind, steps: list[tuple[i
     np.testing.assert_array_equal(all_at_once["value"], alone["value"])
     true = [tick / 1e9 - 1 + (scene.base / 1e9 + 1.8e9) for scene, tick in ((together, t) for t in all_at_once["tick"])]  # type: ignore[operator]
     assert all_at_once["time"] == pytest.approx(true, abs=2e-5)
+
+
+@pytest.mark.parametrize("real", [MS - MS // 10, MS + MS // 10])
+def test_a_stream_that_runs_free_has_the_period_that_its_ticks_say(real: int) -> None:
+    """The asked one stood for it: the last sample of each message had a time that was wrong, up to a period's tenth
+    for each sample before it, and the clock was said to lie where samples were dated after they had come.
+    """
+    scene = Scene(Kind.FREE, real=real)
+    for counter in range(50):
+        scene.heard.whole(scene.message(counter), scene.base + (counter * 3 + 2) * real + 1000)
+        scene.heard.finish()
+    samples = scene.samples()
+    true = [SECOND + 17 + k * real for k in range(150)]
+    assert np.abs(np.array(samples["tick"][3:], dtype=np.int64) - true[3:]).max() <= 1  # type: ignore[index]
+    assert scene.heard.receiver.counts.good == 50
+    now = scene.base + 150 * real
+    scene.clock.exchange(Exchange(now, now + 2000, SECOND + 150 * real + 500, SECOND + 150 * real + 1500, 1, 20))
+    assert not scene.clock.lie
 
 
 def test_what_waited_for_12_ms_is_handed_on_and_not_before() -> None:

@@ -44,7 +44,7 @@ class StreamTotals:
         self.samples += heard.samples
         self.lost += counts.lost
         self.late += counts.late + counts.stale + counts.overflow
-        self.bad += counts.bad + counts.junk + counts.future + counts.unasked + heard.wrong_pattern
+        self.bad += counts.bad + counts.junk + counts.future + counts.back + counts.unasked + heard.wrong_pattern
         self.invalid += heard.invalid
         self.clock_error = heard.bound if heard.bound is not None else self.clock_error
 
@@ -68,10 +68,12 @@ class NodeStreams:
         self.running: dict[int, HeardStream] = {}
         self.totals: dict[int, StreamTotals] = {}
         self._wall, self._deliver = wall, deliver
+        self._run = 0  # the session's last
         self._monotone: dict[int, Monotone] = {}
 
     def new_session(self) -> None:
-        """Nothing is known of the node's clock: it may have started anew."""
+        """Nothing is known of the node's clock: it may have started anew. Runs begin at 1 again."""
+        self._run = 0
         with self.mapping:
             self.clock = ClockMap()
 
@@ -87,7 +89,8 @@ class NodeStreams:
         number = plan.subscribe.stream
         payload = trusted.node.send(plan.command(), "to stream")
         with self.mapping:
-            reply = plan.accept(payload, self.clock.ticks_at(time.monotonic_ns()))
+            reply = plan.accept(payload, self.clock.ticks_at(time.monotonic_ns()), after=self._run)
+        self._run = reply.run
         before = self.running.get(number)
         receiver = Receiver(
             plan, reply, trusted.node.message_key, previous=before.receiver if before is not None else None

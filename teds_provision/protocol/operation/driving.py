@@ -14,7 +14,7 @@ from teds_provision.protocol.operation.datagram import (
     drive_length,
 )
 from teds_provision.protocol.operation.stream_commands import Driven
-from teds_provision.protocol.operation.subscription import TickBounds
+from teds_provision.protocol.operation.subscription import TickBounds, require_new_run
 
 MICRO: Final = 1000
 _WRAP: Final = 1 << 32
@@ -23,14 +23,16 @@ _WRAP: Final = 1 << 32
 class Driver:
     """Seals the values of one run of Drive; ``layout`` says channels and widths, ``dead_man`` the smallest of them, ms.
 
-    Raises NotAuthentic where the reply's length is not the one computed.
+    ``after`` is the session's last run of Drive. Raises NotAuthentic where the reply's length is not the one computed,
+    or its run is not a new one.
     """
 
-    def __init__(self, layout: Layout, reply: Driven, message_key: bytes, *, dead_man: int) -> None:
+    def __init__(self, layout: Layout, reply: Driven, message_key: bytes, *, dead_man: int, after: int = 0) -> None:
         if reply.length != drive_length(layout.octets):
             raise NotAuthentic(
                 f"The node takes Drive messages of {reply.length} octets; {drive_length(layout.octets)} were computed."
             )
+        require_new_run(reply.run, after)
         self.layout, self.run = layout, reply.run
         self.next = 0
         self._dead_man = dead_man * 10**6

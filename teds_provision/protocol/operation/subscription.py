@@ -76,10 +76,11 @@ class Plan:
         """Subscribe."""
         return self.subscribe.command()
 
-    def accept(self, payload: bytes, now: TickBounds) -> Subscribed:
+    def accept(self, payload: bytes, now: TickBounds, *, after: int = 0) -> Subscribed:
         """Read the reply; ``now`` bounds the node's tick when it came (it may have been made up to 1 s before).
 
-        Raises Garbled, or NotAuthentic where length or start are not those that were asked: end and report the stream.
+        ``after`` is the session's last run. Raises Garbled, or NotAuthentic where length or start are not those that
+        were asked, or the run is not a new one: end and report the stream.
         """
         reply, asked = Subscribed.decode(payload), self.subscribe.start
         if reply.length != self.length:
@@ -87,9 +88,15 @@ class Plan:
         good = now.low <= reply.start + START_WITHIN and reply.start <= now.high + START_WITHIN
         if reply.start != asked and not (asked == SOON and good):
             raise NotAuthentic("The node's stream begins at another time than was asked.")
-        if reply.run == 0:
-            raise NotAuthentic("The node names run 0; runs begin at 1.")
+        require_new_run(reply.run, after)
         return reply
+
+
+def require_new_run(run: int, after: int) -> None:
+    """Raise NotAuthentic where a session's run is not above the last one: two runs would have one key."""
+    if run <= after:
+        said = f"run {run} after run {after}" if after else f"run {run}; runs begin at 1"
+        raise NotAuthentic(f"The node names {said}.", hint="Its firmware does not keep to the profile.")
 
 
 def most_instants(kind: Kind, octets: int, most: int = MOST_OCTETS) -> int:
@@ -128,7 +135,8 @@ class Counts:
 
     ``lost``: gaps of the counter, to the count that Stop gave. ``late``: counter not above the last good one (late,
     doubled, replayed). ``bad``: wrong tag. ``junk``: wrong length, or frames that make no message. ``future``: its
-    first tick is later than now. ``stale``: too old. ``unasked``: a test pattern that was not asked for, or the other
+    first tick is later than now. ``stale``: too old. ``back``: its tick is not later than that of the good one before,
+    though ticks never go back. ``unasked``: a test pattern that was not asked for, or the other
     way round. ``overflow``: held for a mark for too long. ``cut``: begun after the end that the station wanted, and
     taken back by Stop before it had left.
     """
@@ -140,6 +148,7 @@ class Counts:
     junk: int = 0
     future: int = 0
     stale: int = 0
+    back: int = 0
     unasked: int = 0
     overflow: int = 0
     cut: int = 0
@@ -172,6 +181,7 @@ class Receiver:
         # Of its last instant; a message is dated by its first one.
         self._oldest = (2 * plan.span + LATE_AFTER if oldest is None else oldest) + plan.span - self._period
         self._timed = plan.subscribe.kind != Kind.PERIODIC
+        self._tick = -1  # of the last good message
         self._pattern = TEST_PATTERN if plan.subscribe.test_pattern else 0
         self._held: deque[tuple[Message, TickBounds]] = deque()
 
@@ -271,11 +281,18 @@ class Receiver:
         return b"".join(rows)
 
     def _fresh(self, tick: int, low: int, high: int) -> bool:
-        """Whether it is neither from the future nor too old, the node's tick between these; else it is counted."""
+        """Whether it is after the one before, neither from the future nor too old; else it is counted.
+
+        The node's tick lies between ``low`` and ``high``.
+        """
         if tick > high:
             self.counts.future += 1
             return False
         if tick < low - self._oldest:
             self.counts.stale += 1
             return False
+        if tick <= self._tick:
+            self.counts.back += 1
+            return False
+        self._tick = tick
         return True

@@ -133,6 +133,26 @@ def test_events_and_free_streams_carry_their_tick() -> None:
     assert waiting.take(sealed(0, body=START.to_bytes(8, "big") + b"abcd"), LATER) is not None
 
 
+@pytest.mark.parametrize("kind", [Kind.EVENT, Kind.FREE])
+def test_ticks_of_messages_that_do_not_go_forward_are_counted_and_not_believed(kind: Kind) -> None:
+    """Stamps never go back, so such samples were handed on with the time of the ones before."""
+    taker = receiver(kind=kind, n=1)
+    ticks = (0, 10, 10, 3, 20)
+    messages = [sealed(k, body=(START + at * MS).to_bytes(8, "big") + b"ab") for k, at in enumerate(ticks)]
+    found = [one.tick - START if (one := taker.take(octets, LATER)) else None for octets in messages]
+    assert found == [0, 10 * MS, None, None, 20 * MS]
+    counted(taker, good=3, back=2)
+
+
+@pytest.mark.parametrize("jump", [2**31, -(2**31), 2**63, -START])
+def test_a_tick_that_jumps_is_no_time_of_a_sample(jump: int) -> None:
+    taker = receiver(kind=Kind.FREE, n=1)
+    lie = ((START + jump) % 2**64).to_bytes(8, "big")
+    for counter, tick in enumerate((START.to_bytes(8, "big"), lie, (START + 10 * MS).to_bytes(8, "big"))):
+        taker.take(sealed(counter, body=tick + b"ab"), LATER)
+    counted(taker, good=2, **{"future" if jump > 0 else "stale": 1})
+
+
 # -- the plan ----------------------------------------------------------------------------------------------------------
 
 
@@ -168,6 +188,19 @@ def test_a_length_that_was_not_computed_is_reported() -> None:
         made.accept(Subscribed(0, 17, START).encode(), TickBounds(START, START))
     with pytest.raises(Garbled):
         made.accept(bytes(11), LATER)
+
+
+def test_a_run_that_was_there_before_is_reported() -> None:
+    """Its key is that of the run before, so messages of that one would count again."""
+    made, now = plan(), TickBounds(START, START)
+    assert made.accept(Subscribed(4, made.length, START).encode(), now, after=3).run == 4
+    for run in (3, 2):
+        with pytest.raises(NotAuthentic, match=f"run {run} after run 3"):
+            made.accept(Subscribed(run, made.length, START).encode(), now, after=3)
+    layout = Layout((1,), (2,))
+    with pytest.raises(NotAuthentic, match="run 3 after run 3"):
+        Driver(layout, Driven(3, 18), K_M, dead_man=100, after=3)
+    assert Driver(layout, Driven(4, 18), K_M, dead_man=100, after=3).run == 4
 
 
 def test_how_many_instants_fit() -> None:
