@@ -205,12 +205,17 @@ class NodeKeeper:
                 self._wish.require.offer(self.uuid, trusted.sheet, self._stop)
             self.trusted, self._announced = trusted, 0.0
             self._buses.sightings.on_announce(sighting, self._heard_announce)
+            answers = False
             try:
                 self._measure(bus, trusted, sighting.address)
                 standing.drives = self._driven is not None
                 self._keep(trusted, standing)
+                answers = True
+            except (NotAuthentic, PolicyRefused, BadData):
+                answers = True  # what it was asked for would go on until its lease ends
+                raise
             finally:
-                self._end(bus, trusted, sighting.address)
+                self._end(bus, trusted, sighting.address, answers=answers or self._stop.is_set())
 
     def _measure(self, bus: Bus, trusted: Trusted, address: int) -> None:
         """Clock, Operate, Subscribe; every stream is heard from then on."""
@@ -355,17 +360,16 @@ class NodeKeeper:
             self._announced = 0.0
         return doubted
 
-    def _end(self, bus: Bus, trusted: Trusted, address: int) -> None:
-        """Let go in order, as far as the node still answers."""
-        alive = self._stop.is_set()
+    def _end(self, bus: Bus, trusted: Trusted, address: int, *, answers: bool) -> None:
+        """Let go in order, as far as the node still ``answers``."""
         if self._driven is not None:
             self._driven.close()
             self._driven = None
         self._buses.sightings.let_announce(self.uuid)
-        self.streams.stop(bus, trusted if alive else None, address)
+        self.streams.stop(bus, trusted if answers else None, address)
         with bus.share.lock:
             bus.share.taken.pop(self.uuid, None)
-        if alive:
+        if answers:
             with suppress(TedsProvisionError, SessionLost):
                 trusted.node.send(idle(0), "to let go")
         else:

@@ -277,6 +277,9 @@ def test_a_node_that_contradicts_itself_is_reported(fd_angle: Stranger, fault: s
         assert any("clock" in why for why in whys)
     else:
         assert of(lines) == []
+    # What it was asked for is ended, and not left to go on until the lease does.
+    asked = fd_angle.hall.station.ask("mode", fd_angle.uuid, "--can", f"{fd_angle.can}&source=0xF5")
+    assert asked["mode"] == "configuration"
 
 
 def test_a_node_that_is_busy_for_ever_is_told_until_when_and_holds_up_nobody(
