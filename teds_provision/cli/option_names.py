@@ -40,7 +40,7 @@ OPTIONS: Final[dict[str, frozenset[str]]] = {
     "set": frozenset({"unit", "hold", "dead-man", "via", "nfc", "can", "ble", "timeout", "trace"}),
     "mode": frozenset({"via", "nfc", "can", "ble", "timeout", "trace"}),
     "ncap open": frozenset({"read-only"}),
-    "ncap run": frozenset({"detection", "adopt", "http", "http-allow", "tls-cert", "tls-key", "record", "ros1", "ros2", "mqtt", "actuators", "metrics", "http-1451", "nfc", "can", "ble", "trace"}),
+    "ncap run": frozenset({"detection", "adopt", "http", "http-allow", "tls-cert", "tls-key", "record", "ros1", "ros2", "mqtt", "actuators", "dead-man", "metrics", "http-1451", "nfc", "can", "ble", "trace"}),
     "ncap token add": frozenset({"read-only"}),
     "group add": frozenset({"dry-run"}),
     "group create": frozenset({"dry-run"}),

@@ -49,12 +49,21 @@ class Daemon:
         self.buses = Buses(news=self._saw)
         self.desk = Desk(self.roster, self.turns, self._port_of)
         sinks = DaemonSinks(station.home, settings.sinks, settings.record, actuators=settings.actuators)
-        self.measuring = Measuring(station, self.roster, self.live, self.turns, self.buses, sinks, self._admits)
+        self.measuring = Measuring(
+            station, self.roster, self.live, self.turns, self.buses, sinks, self._admits, dead_man=settings.dead_man
+        )
+        self._takes_set_points = sinks.take_set_points
         self.names = Names(station, self.roster, self.live, self.measuring.is_measured)
         self.sheets = Sheets(station, self.roster, self.desk, self.measuring.sheet)
         self.provisioning = Provisioning(station, self.roster, self.live, self.desk)
         self.holding = Holding(
-            station, self.live, self.desk, self.turns, self.measuring.session, self.measuring.is_measured
+            station,
+            self.live,
+            self.desk,
+            self.turns,
+            self.measuring.session,
+            self.measuring.is_measured,
+            dead_man=settings.dead_man,
         )
         self.virtuals = Virtuals(station, self.live)
         self.adopting = Adopting(station, self.roster, self.live, self.virtuals, lambda: self._adopts)
@@ -170,6 +179,8 @@ class Daemon:
             "url": self.url,
             "detection": self.detection,
             "adopt": self.settings.adopt,
+            "actuators": self._takes_set_points,
+            "dead_man": self.settings.dead_man,
             "links": links,
             "nodes": sum(link["nodes"] for link in links),
             "strangers": sum(link["strangers"] for link in links),

@@ -53,7 +53,10 @@ class Running:
 
 
 class Measuring:
-    """All of them. ``admits`` says of a set point that came by a topic whether it may pass."""
+    """All of them. ``admits`` says of a set point that came by a topic whether it may pass.
+
+    ``dead_man`` in ms holds for a measurement that is begun without one.
+    """
 
     def __init__(
         self,
@@ -64,9 +67,12 @@ class Measuring:
         buses: Buses,
         sinks: DaemonSinks,
         admits: Callable[[Command], bool],
+        *,
+        dead_man: int = DEAD_MAN,
     ) -> None:
         self._station, self._roster, self._live, self._turns = station, roster, live, turns
         self._buses, self._sinks, self._admits = buses, sinks, admits
+        self._dead_man = dead_man
         self._running: dict[str, Running] = {}
         self._guard = threading.Lock()
         self._messages: tuple[float, int] = (time.monotonic(), 0)
@@ -101,7 +107,7 @@ class Measuring:
         trigger: bool = False,
         sinks: Sequence[str] = (),
         actuators: bool = True,
-        dead_man: int = DEAD_MAN,
+        dead_man: int | None = None,
         scalar_rate: float = SCALAR_RATE,
     ) -> dict[str, Any]:
         """Measure from now on, after every restart too, until it is deleted.
@@ -121,7 +127,7 @@ class Measuring:
             trigger=trigger,
             sinks=tuple(self._sinks.whole(spec) for spec in sinks),
             actuators=actuators,
-            dead_man=dead_man,
+            dead_man=self._dead_man if dead_man is None else dead_man,
             scalar_rate=scalar_rate,
         )
         nodes = self._station.measurements.nodes_of(kept)
@@ -242,6 +248,7 @@ class Measuring:
             "trigger": kept.trigger,
             "sinks": list(kept.sinks),
             "actuators": self._sinks.moves(kept),
+            "dead_man": kept.dead_man,
             "created": kept.created,
             "state": one.state,
             "why": one.why,

@@ -10,6 +10,7 @@ from typing import Final, Literal
 
 from teds_provision.errors import UsageFailure
 from teds_provision.links import Trace
+from teds_provision.measure.trusting import DEAD_MAN
 
 Detection = Literal["transparent", "whitelist"]
 _FIRST, _SOURCES = 0xF2, 6
@@ -23,7 +24,8 @@ class Settings:
 
     ``http`` is (host, port) or None: then only the Unix socket of the home is served. ``sinks`` take what is measured,
     beside those of each measurement; ``record`` is a folder for a recording of each measurement. ``actuators``: whether
-    set points may come by topics of ROS. ``trace`` is an open one: every frame of every link is written to it.
+    set points may come by topics of ROS. ``dead_man`` in ms holds for whatever is moved, where a measurement says no
+    other. ``trace`` is an open one: every frame of every link is written to it.
     """
 
     places: tuple[str, ...] = ()
@@ -36,6 +38,7 @@ class Settings:
     record: Path | None = None
     sinks: tuple[str, ...] = ()
     actuators: bool = True
+    dead_man: int = DEAD_MAN
     metrics: bool = False
     clause_12: bool = False
     trace: Trace | None = None

@@ -56,6 +56,11 @@ class DaemonSinks:
         """Whether set points may come for this measurement: it allows it, so does the daemon, and a ROS carries it."""
         return self.actuators and kept.actuators and bool(_ROS & {*self._specs, *kept.sinks})
 
+    @property
+    def take_set_points(self) -> bool:
+        """Whether set points come by topics for a measurement that allows it and names no sink of its own."""
+        return self.actuators and bool(_ROS & set(self._specs))
+
     def _folder(self) -> Path:
         folder = self._record or self._home / RECORDINGS
         folder.mkdir(parents=True, exist_ok=True)

@@ -369,10 +369,10 @@ HELD = 1.0  # the daemon's dead-man, seconds
 
 
 @contextmanager
-def held(hall: Hall) -> Iterator[Service]:
+def held(hall: Hall, *words: object) -> Iterator[Service]:
     """A daemon that holds the gripper's opening for half a minute."""
     hall.desk.links = type(hall.desk.links)(hall.desk.links.nfc, hall.can)
-    service = Service(hall.desk, hall.station).start()
+    service = Service(hall.desk, hall.station).start(*words)
     uuid = hall.nodes["g"].uuid
     assert verified(service, uuid)["verdict"] == "authentic"
     with service.client() as asked:
@@ -386,6 +386,18 @@ def test_a_daemon_that_is_killed_leaves_it_safe(hall: Hall) -> None:
         killed = time.time()
         service.kill()
         Journal.of(hall, HELD).is_safe(killed)
+
+
+def test_the_dead_man_of_a_daemon_is_the_one_that_it_was_started_with(hall: Hall) -> None:
+    with held(hall, "--dead-man", 8000) as service:
+        with service.client() as asked:
+            assert asked.request("GET", "/status")["dead_man"] == 8000
+        killed = time.time()
+        service.kill()
+        journal = Journal.of(hall, 8.0)
+        journal.is_safe(killed)
+        safe = [time_of(line) - killed for line in journal.states() if line["safe"] and time_of(line) > killed]
+        assert safe[0] > HELD + BUSY, "its last value was fed at most a quarter of the dead-man before"
 
 
 def test_a_daemon_whose_bus_is_cut_leaves_it_safe_and_holds_again_when_asked(cut_hall: Hall, wire: Hub) -> None:

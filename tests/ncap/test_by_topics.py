@@ -56,6 +56,7 @@ def listening(hall: Hall, ros: Ros1 | Ros2, *words: object, measured: bool = Tru
     if measured:
         with service.client() as asked:
             body = {"uuids": [uuid], "rate": 20, "dead_man": int(DEAD_MAN * 1000), **more}
+            body = {key: value for key, value in body.items() if value is not None}
             asked.request("POST", "/measurements", body)
             until(lambda: (asked.node(uuid)["measuring"] or {}).get("state") == "running", "it is not measured")
     yield service
@@ -160,6 +161,16 @@ def test_without_leave_nobody_listens(hall: Hall, master: Master, publishers: Pu
         publishers.append(ros.publish())
         time.sleep(2 * DEAD_MAN)
         assert all(line["safe"] for line in Journal.of(hall).states())
+        service.end()
+
+
+def test_a_measurement_without_a_dead_man_has_the_daemons(hall: Hall, master: Master) -> None:  # noqa: F811
+    master.start()
+    with listening(hall, Ros1(master), "--dead-man", 700, dead_man=None) as service, service.client() as asked:
+        [one] = asked.request("GET", "/measurements")["measurements"]
+        assert (one["actuators"], one["dead_man"]) == (True, 700)
+        status = asked.request("GET", "/status")
+        assert (status["actuators"], status["dead_man"]) == (True, 700)
         service.end()
 
 

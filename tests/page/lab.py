@@ -71,11 +71,11 @@ class Lab:
     def url(self) -> str:
         return f"http://127.0.0.1:{self.port}"
 
-    def run(self, *options: object) -> None:
+    def run(self, *options: object, **more: Any) -> None:
         """Start the daemon and wait until it serves."""
         links = ["--can", self.can, "--nfc", self.desk.links.nfc]
         words = ["--home", self.station.home, "--json", "ncap", "run", "--http", f"127.0.0.1:{self.port}", *links]
-        self.daemon = self.desk.start(*words, *options, passphrase=PASSPHRASE)
+        self.daemon = self.desk.start(*words, *options, passphrase=PASSPHRASE, **more)
         self.daemon.wait_for('"ready": true')
 
     def end(self, number: int = signal.SIGTERM) -> None:
@@ -126,6 +126,12 @@ class Lab:
     def ask(self, *words: object) -> Any:
         """A command of the same home."""
         return self.station.ask(*words)
+
+    def measurements(self) -> list[dict[str, Any]]:
+        """What the daemon measures."""
+        with client.connect(home=self.station.home) as station:
+            found: list[dict[str, Any]] = station.request("GET", "/measurements")["measurements"]
+        return found
 
     def login(self, *, read_only: bool = False) -> str:
         """An address of the page with a token that works once."""

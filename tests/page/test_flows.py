@@ -12,7 +12,9 @@ import pytest
 
 from teds_provision.station.station import Station
 from tests.bench import PASSPHRASE
+from tests.cli.shell import clean_environment
 from tests.pace import until
+from tests.places import ros_domain
 
 from .lab import Lab, opened
 
@@ -75,6 +77,60 @@ def test_a_rate_that_does_not_fit_is_refused_with_the_fastest(browser: Browser, 
         page.get_by_role("button", name="Measure").click()
         page.get_by_role("alert").filter(has_text="gives at most 100 Hz").wait_for()
         assert page.get_by_role("button", name="Idle", pressed=True).is_visible()
+
+
+def test_who_measures_says_whether_topics_may_move_actuators_and_when_these_are_safe(
+    browser: Browser, fresh: Lab
+) -> None:
+    with ros_domain() as domain:
+        fresh.run("--ros2", "--dead-man", 300, environment={**clean_environment(), "ROS_DOMAIN_ID": str(domain)})
+        with opened(browser, fresh, route="virtual") as page:
+            page.get_by_label("Transducer type").select_option("gripper")
+            page.get_by_label("Name").fill("hand")
+            page.get_by_role("button", name="Make it").click()
+            page.get_by_role("link", name="Nodes").click()
+            page.locator(".card", has_text="hand").get_by_text("Authentic", exact=True).wait_for()
+            page.get_by_role("link", name="Measure").click()
+            make_group(page, "arm", "hand")
+            card = in_group(page, "arm")
+            card.get_by_text("More", exact=True).click()
+            may = card.get_by_label("Topics may move its actuators")
+            assert may.is_checked()
+            assert card.get_by_label("Dead-man, ms").get_attribute("placeholder") == "300"
+            card.get_by_label("Dead-man, ms").fill("5")
+            page.get_by_role("button", name="Start arm").click()
+            page.get_by_role("alert").filter(has_text="from 20 to 10000 ms").wait_for()
+            card.get_by_label("Dead-man, ms").fill("")
+            page.get_by_role("button", name="Start arm").click()
+            card.get_by_text("without one for 300 ms an actuator is safe").wait_for()
+            assert [(one["actuators"], one["dead_man"]) for one in fresh.measurements()] == [(True, 300)]
+            page.get_by_role("button", name="Stop arm").click()
+            page.get_by_role("button", name="Start arm").wait_for()
+            may.uncheck()
+            card.get_by_label("Dead-man, ms").fill("250")
+            page.get_by_role("button", name="Start arm").click()
+            card.get_by_text("They are not taken").wait_for()
+            assert [(one["actuators"], one["dead_man"]) for one in fresh.measurements()] == [(False, 250)]
+            page.get_by_role("button", name="Stop arm").click()
+            page.get_by_role("button", name="Start arm").wait_for()
+            # The same of one node by itself.
+            page.get_by_role("link", name="Nodes").click()
+            page.locator(".card", has_text="hand").click()
+            page.get_by_role("group", name="Set points by topics").get_by_label(
+                "Topics may move its actuators"
+            ).uncheck()
+            page.get_by_role("button", name="Measure", exact=True).click()
+            page.get_by_text("They are not taken").wait_for()
+            assert [one["actuators"] for one in fresh.measurements()] == [False]
+
+
+def test_a_station_without_topics_says_that_it_takes_no_set_points(browser: Browser, lab: Lab) -> None:
+    with opened(browser, lab, route=f"nodes/{lab.nodes['hand'].uuid}/live") as page:
+        page.get_by_text("This station takes no set points from topics").wait_for()
+        assert page.get_by_label("Topics may move its actuators").is_disabled()
+    with opened(browser, lab, route=f"nodes/{lab.nodes['slew'].uuid}/live") as page:
+        page.get_by_role("button", name="Measure", exact=True).wait_for()
+        assert not page.get_by_label("Topics may move its actuators").is_visible(), "it has none"
 
 
 def test_an_actuator_moves_while_it_is_held_and_the_node_says_that_it_is_safe(browser: Browser, lab: Lab) -> None:

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any, Final
 import click
 
 from teds_provision.cli.context import App, pass_app, to_json
-from teds_provision.cli.options import FileToRead, command
+from teds_provision.cli.options import FileToRead, WholeNumber, command
 from teds_provision.cli.tracing import tracing
 from teds_provision.errors import UsageFailure
 from teds_provision.lazy import how_to_install, late
@@ -48,6 +48,8 @@ _FILE = FileToRead(exists=True)
 @click.option("--ros2", is_flag=True, help="Publish to ROS 2 (ROS_DOMAIN_ID), on this machine.")
 @click.option("--mqtt", metavar="URL", help="Publish to a broker: mqtt://HOST.")
 @click.option("--actuators/--no-actuators", default=True, show_default=True, help="Take set points from ROS topics.")
+@click.option("--dead-man", type=WholeNumber(20, 10_000), default=1000, show_default=True, metavar="MS",
+              help="An actuator without set points for so long is safe.")  # fmt: skip
 @click.option("--metrics", is_flag=True, help="Serve /metrics for Prometheus.")
 @click.option("--http-1451", "clause_12", is_flag=True, help="Serve the paths of IEEE 1451.0 clause 12, read only.")
 @click.option("--nfc", multiple=True, metavar="PATH", help="A reader: auto, usb, udp:localhost:54321; several times.")

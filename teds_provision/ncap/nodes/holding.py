@@ -18,7 +18,7 @@ from teds_provision.errors import LinkFailure, NodeBusy, NodeRefused, NoNode, St
 from teds_provision.links.ports import Notice
 from teds_provision.measure.blocks import Command
 from teds_provision.measure.held_actuator import HeldActuator
-from teds_provision.measure.trusting import Trusted, open_trusted, require_whitelisted
+from teds_provision.measure.trusting import DEAD_MAN, Trusted, open_trusted, require_whitelisted
 from teds_provision.ncap.live import Live
 from teds_provision.ncap.nodes.desk import Desk
 from teds_provision.ncap.nodes.turns import Turns
@@ -73,7 +73,10 @@ class _Shared:
 
 
 class Holding:
-    """The actuators that are held now. ``measured`` gives the session of a node that is being measured."""
+    """The actuators that are held now, with a ``dead_man`` in ms.
+
+    ``measured`` gives the session of a node that is being measured.
+    """
 
     def __init__(
         self,
@@ -83,9 +86,11 @@ class Holding:
         turns: Turns,
         measured: Measured,
         is_measured: Callable[[str], bool],
+        *,
+        dead_man: int = DEAD_MAN,
     ) -> None:
         self._station, self._live, self._desk, self._turns = station, live, desk, turns
-        self._measured, self._is_measured = measured, is_measured
+        self._measured, self._is_measured, self._dead_man = measured, is_measured, dead_man
         self._held: dict[tuple[str, int], _Held] = {}
         self._shared: dict[str, _Shared] = {}
         self._last: dict[tuple[str, int], dict[str, Any]] = {}
@@ -236,7 +241,7 @@ class Holding:
                     if trusted is None:
                         raise LinkFailure("The node is not there now.", hint="See /nodes.")
                     if actuator is None or order.unit != unit:
-                        actuator, unit = _claimed(trusted, held.channel, order, again=actuator is not None), order.unit
+                        actuator, unit = self._claimed(trusted, held, order, again=actuator is not None), order.unit
                     applied = actuator.apply(order.value)
                 answered = order.number
                 with held.news:
@@ -261,6 +266,23 @@ class Holding:
             with held.news:
                 held.news.wait_for(lambda: held.let_go, _LOOK)
 
+    def _claimed(self, trusted: Trusted, held: _Held, order: _Order, *, again: bool) -> HeldActuator:
+        """The actuator, claimed; the limits are looked at before anything is claimed."""
+        actuator = HeldActuator(trusted, held.channel, unit=order.unit, dead_man=self._dead_man)
+        actuator.octets_of(order.value)
+        if not again:
+            try:
+                actuator.__enter__()
+            except NodeRefused as refusal:
+                if refusal.reason != Reason.WRONG_STATE:
+                    raise
+                # It is claimed in this very session: by the set points of a topic, which only a measurement takes.
+                raise NodeBusy(
+                    f"Channel {held.channel} is driven by set points of a topic.",
+                    hint="End what publishes them, then ask again.",
+                ) from refusal
+        return actuator
+
     @staticmethod
     def _until_news(held: _Held, answered: int, pause: float) -> None:
         """Wait until the value has to be sent again, there is another one, or it is to be let go."""
@@ -274,24 +296,6 @@ class Holding:
         self._last[held.uuid, held.channel] = facts
         self._live.event("actuator", uuid=held.uuid, state="held" if safe is False else "released",
                          channel=held.channel, **facts)  # fmt: skip
-
-
-def _claimed(trusted: Trusted, channel: int, order: _Order, *, again: bool) -> HeldActuator:
-    """The actuator, claimed; the limits are looked at before anything is claimed."""
-    actuator = HeldActuator(trusted, channel, unit=order.unit)
-    actuator.octets_of(order.value)
-    if not again:
-        try:
-            actuator.__enter__()
-        except NodeRefused as refusal:
-            if refusal.reason != Reason.WRONG_STATE:
-                raise
-            # It is claimed in this very session: by the set points of a topic, which only a measurement takes.
-            raise NodeBusy(
-                f"Channel {channel} is driven by set points of a topic.",
-                hint="End what publishes them, then ask again.",
-            ) from refusal
-    return actuator
 
 
 def _quiet(_notice: Notice) -> None:

@@ -91,7 +91,7 @@ OPERATIONS: Final = (
             kind=maybe("string", enum=["periodic", "event", "free", None]), trigger=FLAG,
             sinks=listed(text(description="ros1, ros2, mqtt://HOST, or the name of a file")),
             actuators={"type": "boolean", "description": "may set points come by topics of ROS; true unless said"},
-            dead_man={"type": "integer", "minimum": 20, "maximum": 10000, "description": "ms, 1000 unless said"},
+            dead_man={"type": "integer", "minimum": 20, "maximum": 10000, "description": "ms, else the station's"},
             scalar_rate={"type": "number", "minimum": 0, "maximum": 1000, "description": "Hz, 10 unless said"},
         ),
         status=201,

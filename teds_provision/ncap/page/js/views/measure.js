@@ -5,6 +5,7 @@ import { button, chip, empty, field, fill, h, icon, keyed, say, text, toast, tro
 import { channelName, count, nameOf, verdict } from "../format.js";
 import { LivePlot } from "../plot.js";
 import { measuring, membersOf, on, refresh, state } from "../state.js";
+import { SetPoints } from "./setpoints.js";
 import { plotHead, requireRate, told } from "./values.js";
 
 const MOST = 20; // channels in the plot
@@ -84,6 +85,7 @@ class GroupCard {
     this.rate = h("input", { type: "number", min: "0.01", step: "any", inputmode: "decimal", placeholder: "datasheet's", class: "narrow" });
     this.kind = h("select", {}, h("option", { value: "periodic" }, "periodic"), h("option", { value: "event" }, "event"), h("option", { value: "free" }, "free"));
     this.trigger = h("input", { type: "checkbox" });
+    this.setPoints = new SetPoints();
     this.record = h("input", { type: "text", placeholder: "run.csv", autocomplete: "off" });
     this.start = button("Start", { class: "main", onclick: () => this.start.busy(() => this.go()) }, "play");
     this.stop = button("Stop", { onclick: () => this.stop.busy(() => this.halt()) }, "stop");
@@ -91,7 +93,7 @@ class GroupCard {
     this.keep = button("Keep these members", { onclick: () => this.keep.busy(() => this.remember()) });
     this.drop = button("Delete group", { class: "quiet" });
     this.drop.addEventListener("click", () => this.drop.busy(() => this.away()));
-    this.more = h("details", { class: "more" }, h("summary", {}, "More"), h("div", { class: "row" }, field("Kind", this.kind), h("label", { class: "tick" }, this.trigger, h("span", {}, "Begin together, by trigger")), field("Record to", this.record, "A file in the station's record folder: .csv, .txt, .mcap, .jsonl.")), this.others, h("div", { class: "row" }, this.keep, this.drop));
+    this.more = h("details", { class: "more" }, h("summary", {}, "More"), h("div", { class: "row" }, field("Kind", this.kind), h("label", { class: "tick" }, this.trigger, h("span", {}, "Begin together, by trigger")), field("Record to", this.record, "A file in the station's record folder: .csv, .txt, .mcap, .jsonl.")), this.setPoints.element, this.others, h("div", { class: "row" }, this.keep, this.drop));
     this.error = h("div", {});
     this.element = h("li", { class: "panel group" }, h("div", { class: "panel-head" }, h("h4", {}, name), this.state), this.members, h("div", { class: "row" }, field("Rate, Hz", this.rate), this.start, this.stop), this.more, this.error);
     this.element.card = this;
@@ -121,6 +123,7 @@ class GroupCard {
     this.paintMembers(group, !may || Boolean(one));
     this.drop.disabled = !may || Boolean(one);
     this.rate.disabled = this.kind.disabled = this.trigger.disabled = this.record.disabled = Boolean(one);
+    this.setPoints.paint(group.uuids ?? [], one);
     if (one?.error && this.errorShown !== one.error.message) fill(this.error, trouble(one.error));
     this.errorShown = one?.error?.message;
   }
@@ -150,7 +153,7 @@ class GroupCard {
     const record = this.record.value.trim();
     await this.does(() => {
       requireRate(membersOf({ group: this.name }), rate);
-      return post("measurements", { group: this.name, rate, kind: this.kind.value, trigger: this.trigger.checked, sinks: record ? [record] : [] });
+      return post("measurements", { group: this.name, rate, kind: this.kind.value, trigger: this.trigger.checked, sinks: record ? [record] : [], ...this.setPoints.asked });
     }, `Group ${this.name} is being measured.`);
   }
 

@@ -6,6 +6,7 @@ import { age, channelName, count, hertz, nameOf, number, range, short } from "..
 import { LivePlot, WINDOWS } from "../plot.js";
 import { isStale, lastOf, measuring, now, on, refresh, state } from "../state.js";
 import { ActuatorPanel } from "./actuator.js";
+import { SetPoints } from "./setpoints.js";
 
 const MOVING = 12; // channels that a node's plot shows
 
@@ -181,9 +182,10 @@ class ModePanel {
     this.idle = button("Idle", { onclick: () => this.idle.busy(() => this.stop()) }, "stop");
     this.run = button("Measure", { class: "main", onclick: () => this.run.busy(() => this.start()) }, "play");
     this.state = h("p", { class: "state" });
+    this.setPoints = new SetPoints();
     this.error = h("div", {});
     const both = h("div", { class: "switch", role: "group", "aria-label": "What this node does" }, this.idle, this.run);
-    this.element = h("section", { class: "panel mode", "aria-label": "Configure" }, h("div", { class: "row" }, h("h3", {}, "Configure"), both, field("Rate, Hz", this.rate), this.state), this.error);
+    this.element = h("section", { class: "panel mode", "aria-label": "Configure" }, h("div", { class: "row" }, h("h3", {}, "Configure"), both, field("Rate, Hz", this.rate), this.state), this.setPoints.element, this.error);
     this.off = on("status connection measurements", () => this.paint());
   }
 
@@ -204,6 +206,7 @@ class ModePanel {
     this.run.disabled = !may || Boolean(one) || !sensors || node?.whitelisted === false;
     this.rate.disabled = Boolean(one);
     const stranger = node?.whitelisted === false;
+    this.setPoints.paint([this.uuid], one);
     if (!one && stranger) fill(this.state, "Not on the whitelist: ", h("a", { href: `#/nodes/${this.uuid}/provision` }, "provision it first"), ".");
     else if (!one) fill(this.state, sensors ? "Idle." : "No sensor to measure.");
     else if (one.group) fill(this.state, "Measured with group ", h("a", { href: "#/measure" }, one.group), ": stop it there.");
@@ -215,7 +218,7 @@ class ModePanel {
     const rate = this.rate.value.trim() === "" ? null : Number(this.rate.value);
     try {
       requireRate([this.uuid], rate);
-      await post("measurements", { uuids: [this.uuid], rate, kind: "periodic", trigger: false, sinks: [] });
+      await post("measurements", { uuids: [this.uuid], rate, kind: "periodic", trigger: false, sinks: [], ...this.setPoints.asked });
       say("Measuring.");
       await refresh("measurements", "nodes");
     } catch (error) {
