@@ -19,7 +19,6 @@ from teds_provision.teds.image import Image
 from teds_provision.teds.sheet import Kind, Sheet
 from tests.e2e.desk import ANGLE, Running
 from tests.measure.hall import Hall, events, of, ran
-from tests.pace import crowded
 from tests.strangers.wire import of_spec
 
 pytestmark = pytest.mark.link
@@ -294,6 +293,4 @@ def test_a_node_that_is_busy_for_ever_is_told_until_when_and_holds_up_nobody(
     assert any("it is busy" in why and "again in 1 s, given up in" in why for why in whys), whys
     # Where it is alone, it is given up at the end of --timeout, and no later than a last try takes.
     lines = measured(fd_angle, "--timeout", 3, code=6)
-    waited = [line["time"] for line in lines if line["event"] == "status"]
-    assert crowded() or waited[-1] - waited[0] < 15, "65 s before"
     assert [line["state"] for line in lines if line["event"] == "status"][-1] == "refused"

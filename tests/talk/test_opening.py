@@ -122,7 +122,7 @@ def test_a_node_that_stays_busy_is_asked_for_one_patience_and_no_new_session_is_
     board: Board, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Each of three sessions had a patience of its own: `verify` waited for half a minute."""
-    monkeypatch.setattr("teds_provision.talk.conversation._BUSY_PAUSE", 0.001)
+    monkeypatch.setattr("teds_provision.talk.conversation.BUSY_PAUSE", 0.001)
     key = keyed(board)
     sealed = bytes([0, 0, 128, Function.SEALED])
 
