@@ -173,14 +173,11 @@ class NodeKeeper:
         return None
 
     def _gives_up(self, error: TedsProvisionError) -> bool:
-        """Before the first value a refusal ends it; later anyone could have sent it, so it is tried again."""
+        """Before the first value a refusal ends it that time does not cure; later anyone could have sent it."""
         if self._left == math.inf:
             return False
-        return not self._left or (isinstance(error, _FINAL) and not self._passing(error))
-
-    def _passing(self, error: TedsProvisionError) -> bool:
-        """A refusal that time cures: another claim, no room, a node that is busy or starts anew."""
-        return isinstance(error, NodeRefused) and error.reason in _CURED_BY_TIME
+        passing = isinstance(error, NodeRefused) and error.reason in _CURED_BY_TIME
+        return not self._left or (isinstance(error, _FINAL) and not passing)
 
     def _once(self) -> None:
         seconds = LOOKING if self.ever_ran else max(LOOKING, min(self._wish.timeout, self._left))
