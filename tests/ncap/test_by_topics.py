@@ -72,6 +72,7 @@ def set_points(ros: Ros1 | Ros2, value: float) -> subprocess.Popen[bytes]:
     return subprocess.Popen(command, env=ros.master.environment, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
 
 
+@pytest.mark.realtime
 def test_set_points_move_it_and_whatever_dies_it_is_safe(hall: Hall, ros: Ros1 | Ros2, publishers: Publishers) -> None:
     with listening(hall, ros) as service:
         journal = Journal.of(hall)
