@@ -18,9 +18,15 @@ import time
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import BinaryIO, Final
+from typing import TYPE_CHECKING, BinaryIO, Final
 
 from teds_provision.errors import BadData, NotFound, StoreFailure, TedsProvisionError, UsageFailure
+from teds_provision.lazy import late
+
+if TYPE_CHECKING:
+    import socket
+else:  # most commands listen on nothing
+    socket = late("socket")
 
 PRIVATE: Final = 0o600
 """Mode of what holds secrets, sealed or not."""
@@ -29,8 +35,8 @@ SHARED: Final = 0o666
 _SUFFIX: Final = ".teds-part"
 _STALE_SECONDS: Final = 60.0  # between making the file and locking it a living writer looks like a dead one
 _LONGEST_SOCKET: Final = 100
-_PIECE: Final = 1 << 16
 """Octets: Linux takes 107 for the name of a Unix socket."""
+_PIECE: Final = 1 << 16
 _NO_FOLDER_SYNC: Final = frozenset({errno.EINVAL, errno.ENOTSUP, errno.ENOSYS, errno.EROFS, errno.EACCES})
 _NO_HARD_LINKS: Final = frozenset({errno.EPERM, errno.ENOTSUP, errno.ENOSYS, errno.EMLINK, errno.EXDEV, errno.EACCES})
 
@@ -230,6 +236,21 @@ def short_path(path: Path) -> Iterator[str]:
         yield f"/proc/self/fd/{folder}/{path.name}"
     finally:
         os.close(folder)
+
+
+def listen_alone(path: Path, waiting: int) -> socket.socket:
+    """A Unix socket that only this user can reach; what a killed process left is replaced. Raises OSError."""
+    with suppress(FileNotFoundError):
+        path.unlink()
+    listener = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
+    before = os.umask(0o177)  # its mode is set when it is bound: there is no moment in which others may connect
+    try:
+        with short_path(path) as name:
+            listener.bind(name)
+    finally:
+        os.umask(before)
+    listener.listen(waiting)
+    return listener
 
 
 def _publish(draft: Path, path: Path, *, replace: bool) -> None:

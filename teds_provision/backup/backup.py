@@ -7,7 +7,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
-from teds_provision.backup.content import Content, Head
+from teds_provision.backup.content import Head
 from teds_provision.backup.sealed_file import MAX_OCTETS, SealedFile, Sealer, write
 from teds_provision.errors import StoreFailure, StoreLocked, TedsProvisionError, VaultFailure
 from teds_provision.files import whole_draft
@@ -15,7 +15,7 @@ from teds_provision.protocol.keys import fingerprint
 from teds_provision.station.station import Station
 from teds_provision.store import utc_now
 from teds_provision.store.snapshot import totals
-from teds_provision.vault import Ask, node_key_context
+from teds_provision.vault import Ask
 from teds_provision.vault.passphrase import PRODUCT, Costs
 
 
@@ -81,29 +81,17 @@ def _kind(keystore: str) -> str:
 
 
 def _read_back(station: Station, draft: Path, key: bytes) -> tuple[int, int, int]:
-    """Open what was written as restore would; count nodes, keys, and the keys that the vault does not open."""
+    """Open what was written as restore would; count nodes, keys, and keys that are lost already."""
     try:
         sealed = SealedFile(draft)
         with sealed.open_with_content_key(key) as content:
             found = totals(content.copy)
-            return found["nodes"], found["keys"], _useless(station, content)
+            return found["nodes"], found["keys"], sum(1 for _ in content.unopened(station.vault))
     except TedsProvisionError as error:
         raise StoreFailure(
             f"The backup was written and does not open again: {error.message}",
             hint=f"Nothing was kept. Check the disk (at most {MAX_OCTETS >> 30} GiB are read), then run it again.",
         ) from error
-
-
-def _useless(station: Station, content: Content) -> int:
-    """Count the keys that the vault does not open: those are lost already."""
-    useless = 0
-    for record in content.copy.all_keys():
-        try:
-            context = node_key_context(content.copy.id, record.uuid, record.epoch, record.slot)
-            station.vault.unwrap(record.wrapped, context=context)
-        except VaultFailure:
-            useless += 1
-    return useless
 
 
 def _note(station: Station, notice: Callable[[str], object] | None, **detail: object) -> list[str]:

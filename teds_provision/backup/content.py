@@ -3,16 +3,18 @@
 from __future__ import annotations
 
 import hashlib
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from types import TracebackType
 from typing import Any, Final
 
 from teds_provision import __version__
-from teds_provision.errors import BadData, NotAuthentic
+from teds_provision.errors import BadData, NotAuthentic, VaultFailure
 from teds_provision.protocol.handover.strict_json import dump, load_object
 from teds_provision.protocol.keys import fingerprint, is_point
-from teds_provision.store import Store
+from teds_provision.store import KeyRecord, Store
+from teds_provision.vault import Vault, node_key_context
 
 MAX_HEAD_OCTETS: Final = 64 * 1024
 _TEXTS: Final = ("store", "station", "point", "name", "created", "keystore", "material")
@@ -94,6 +96,15 @@ class Content(Head):
     """An opened backup: its head, and its store as a private copy that lives until :meth:`close`."""
 
     copy: Store = field(repr=False, kw_only=True)
+
+    def unopened(self, vault: Vault) -> Iterator[KeyRecord]:
+        """The keys that a vault does not open."""
+        for record in self.copy.all_keys():
+            context = node_key_context(self.copy.id, record.uuid, record.epoch, record.slot)
+            try:
+                vault.unwrap(record.wrapped, context=context)
+            except VaultFailure:
+                yield record
 
     def close(self) -> None:
         """Let the copy go."""

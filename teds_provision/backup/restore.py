@@ -19,7 +19,7 @@ from teds_provision.station.station import Station
 from teds_provision.store import Store, StoreLock
 from teds_provision.store.home import has_store
 from teds_provision.store.snapshot import Relation, is_damage, place, relation, set_aside, totals
-from teds_provision.vault import Ask, Vault, create_vault, node_key_context, open_vault
+from teds_provision.vault import Ask, Vault, create_vault, open_vault
 from teds_provision.vault.passphrase import PRODUCT, Costs
 
 
@@ -167,23 +167,13 @@ def complete_vault(store: Store, content: Content, ask: Ask, *, keystore: str | 
         raise
     except VaultFailure:  # lost, or locked: then making it fails as well and says so
         return bring_vault(store.home, content, ask, wanted)[0]
-    if _opens_all(vault, content):
+    if not any(True for _ in content.unopened(vault)):
         return vault
     had_ca = vault.ca() is not None
     vault, _ = bring_vault(store.home, content, ask, wanted)
     if not had_ca:
         vault.drop_ca()
     return vault
-
-
-def _opens_all(vault: Vault, content: Content) -> bool:
-    try:
-        for record in content.copy.all_keys():
-            context = node_key_context(content.copy.id, record.uuid, record.epoch, record.slot)
-            vault.unwrap(record.wrapped, context=context)
-    except VaultFailure:
-        return False
-    return True
 
 
 def merge_sealed(store: Store, content: Content, vault: Vault, ask: Ask) -> Restored:

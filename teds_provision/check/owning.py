@@ -11,6 +11,8 @@ from teds_provision.check.rule import Stage, rule
 from teds_provision.check.teds_rules import security_state
 from teds_provision.protocol.agreement import AgreedKey, Credentials, RequestPayload, StationAgreement
 from teds_provision.protocol.keys import (
+    CHALLENGE_OCTETS,
+    SIGNATURE_OCTETS,
     SoftwareKey,
     fingerprint,
     normalise_signature,
@@ -69,15 +71,18 @@ def factory_open(probe: Probe) -> str:
     return probe.refused(security_command(Function.SEALED, bytes(36)), Reason.WRONG_STATE)
 
 
+def require_reset_proof(probe: Probe, epoch: int, challenge: bytes, proof: bytes) -> None:
+    """Raise RuleBroken unless the reply to Reset is signed by the node's key, over this challenge."""
+    message = reset_message(probe.uuid, epoch, challenge)
+    right = len(proof) == SIGNATURE_OCTETS and verify(probe.security().node_key, message, normalise_signature(proof))
+    holds(right, "Reset (128.9): the proof does not verify under field 101 at this epoch.")
+
+
 @rule("factory-reset", "Reset", Stage.FACTORY)
 def factory_reset(probe: Probe) -> str:
     """Reset in factory state changes nothing and gives the proof."""
-    before, challenge = probe.identity(), os.urandom(32)
-    proof = probe.good(security_command(Function.RESET, challenge))
-    right = len(proof) == 64 and verify(
-        probe.security().node_key, reset_message(probe.uuid, before.epoch, challenge), normalise_signature(proof)
-    )
-    holds(right, "Reset (128.9): the proof does not verify under field 101 at this epoch.")
+    before, challenge = probe.identity(), os.urandom(CHALLENGE_OCTETS)
+    require_reset_proof(probe, before.epoch, challenge, probe.good(security_command(Function.RESET, challenge)))
     after = probe.identity()
     holds(after == before, f"Reset (128.9) in factory state changed Identify from {before} to {after}.")
     return f"a proof for epoch {before.epoch}, nothing changed"

@@ -7,12 +7,16 @@ from collections.abc import Callable
 from dataclasses import replace
 
 from teds_provision.check.outcome import NotApplicable
-from teds_provision.check.owning import Strangers, request, tapped_or_bus
+from teds_provision.check.owning import Strangers, request, require_reset_proof, tapped_or_bus
 from teds_provision.check.probe import Probe, holds
 from teds_provision.check.rule import Stage, rule
 from teds_provision.check.teds_rules import absent, security_state
 from teds_provision.protocol.datasheet import NodeKeys, digests, sign_datasheet, unsigned_datasheet
-from teds_provision.protocol.keys import SoftwareKey, fingerprint, normalise_signature, reset_message, verify
+from teds_provision.protocol.keys import (
+    CHALLENGE_OCTETS,
+    SoftwareKey,
+    fingerprint,
+)
 from teds_provision.protocol.messages.frames import (
     COMMON,
     Attribute,
@@ -286,15 +290,11 @@ def commit(probe: Probe) -> str:
 @rule("reset", "Reset", Stage.RESET)
 def reset(probe: Probe) -> str:
     """In a session Reset erases key and trust and proves it; epoch and sequence stay, sessions end."""
-    before, stored, challenge = probe.identity(), _stored(probe), os.urandom(32)
+    before, stored, challenge = probe.identity(), _stored(probe), os.urandom(CHALLENGE_OCTETS)
     probe.sealed_refused(security_command(Function.RESET, challenge[1:]), Reason.BAD_FORM, "a challenge of 31 octets")
     proof = probe.sealed_good(security_command(Function.RESET, challenge))
     probe.session = None
-    point = probe.security().node_key
-    right = len(proof) == 64 and verify(
-        point, reset_message(probe.uuid, before.epoch, challenge), normalise_signature(proof)
-    )
-    holds(right, "Reset (128.9): the proof does not verify under field 101 at this epoch.")
+    require_reset_proof(probe, before.epoch, challenge, proof)
     after = probe.identity()
     holds(after.state == NodeState.FACTORY, f"After Reset the node is {after.state.name.lower()}.")
     kept = (after.epoch, after.sequence) == (before.epoch, before.sequence)

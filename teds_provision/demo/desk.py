@@ -12,8 +12,11 @@ from teds_provision.links import LinkSettings
 from teds_provision.links.loopback import free_port
 from teds_provision.station.station import Station
 from teds_provision.steps.agree import require_session
+from teds_provision.steps.build_order import BuildOrder
 from teds_provision.steps.identify import identify
+from teds_provision.steps.provision import Provisioned, provision
 from teds_provision.steps.read import read_image
+from teds_provision.steps.verify import require_authentic
 from teds_provision.steps.verify_node import verify_node
 from teds_provision.talk.meeting import meet
 from teds_provision.talk.progress import Reporter, Steps
@@ -39,6 +42,15 @@ class Demo:
     def over(self, via: str) -> LinkSettings:
         """Link options of a station in this demo."""
         return LinkSettings(via, self.nfc, self.can, timeout=15.0)
+
+
+def provision_over(demo: Demo, station: Station, via: str, uuid: bytes, order: BuildOrder) -> Provisioned:
+    """Every step of provisioning, from one station over one link; raises unless the node is authentic at the end."""
+    with meet(station, demo.over(via), uuid, demo.reporter) as node:
+        done = provision(station, node, order, accept=lambda who: None, reporter=demo.reporter)
+    require_authentic(done.verified)
+    demo.steps.done += done.steps
+    return done
 
 
 def verify_from(demo: Demo, station: Station, what: str) -> None:

@@ -9,16 +9,12 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from teds_provision.demo.desk import Demo
+from teds_provision.demo.desk import Demo, provision_over
 from teds_provision.errors import LinkFailure
 from teds_provision.lazy import late
 from teds_provision.links import can
 from teds_provision.station.station import Station
-from teds_provision.steps.agree import agree
 from teds_provision.steps.build_order import BuildOrder
-from teds_provision.steps.identify import identify
-from teds_provision.steps.provision import provision
-from teds_provision.steps.verify import require_authentic
 from teds_provision.talk.meeting import meet
 
 if TYPE_CHECKING:
@@ -55,21 +51,13 @@ def calibrations(folder: Path) -> dict[str, Path]:
 
 def provision_gripper(demo: Demo, station: Station, uuid: bytes, calibration: Path) -> None:
     """The same steps for a node without NFC, over the bus that it hangs on."""
-    with meet(station, demo.over("can"), uuid, demo.reporter) as node:
-        order = BuildOrder(GRIPPER, calibration=calibration, name="hand")
-        done = provision(station, node, order, accept=lambda who: None, reporter=demo.reporter)
-    require_authentic(done.verified)
-    demo.steps.done += done.steps
+    provision_over(demo, station, "can", uuid, BuildOrder(GRIPPER, calibration=calibration, name="hand"))
 
 
 def calibrate_sensor(demo: Demo, station: Station, calibration: Path) -> None:
     """A new datasheet for the sensor, with its calibration; signed and written by its new owner."""
-    with meet(station, demo.over("can"), demo.uuid, demo.reporter) as node:
-        agree(station, node, identify(station, node))
-        order = BuildOrder("magnetic-angular-position-sensor", calibration=calibration, name="crane slew angle")
-        done = provision(station, node, order, accept=lambda who: None, reporter=demo.reporter)
-    require_authentic(done.verified)
-    demo.steps.done += done.steps
+    order = BuildOrder("magnetic-angular-position-sensor", calibration=calibration, name="crane slew angle")
+    provision_over(demo, station, "can", demo.uuid, order)
 
 
 def measure_group(demo: Demo, station: Station, uuids: tuple[bytes, ...]) -> None:

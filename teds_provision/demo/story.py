@@ -19,7 +19,7 @@ from pathlib import Path
 
 from teds_provision import steps as steps_room
 from teds_provision import vault
-from teds_provision.demo.desk import Demo
+from teds_provision.demo.desk import Demo, provision_over
 from teds_provision.demo.handover import hand_over
 from teds_provision.demo.measuring import (
     GRIPPER,
@@ -32,8 +32,6 @@ from teds_provision.demo.measuring import (
 from teds_provision.errors import LinkFailure
 from teds_provision.station.station import Station, initialise
 from teds_provision.steps.build import BuildOrder
-from teds_provision.steps.provision import Provisioned, provision
-from teds_provision.steps.verify import require_authentic
 from teds_provision.talk.meeting import meet
 from teds_provision.talk.progress import Reporter, StepResult
 
@@ -69,7 +67,7 @@ def _run(demo: Demo) -> DemoDone:
         demo.uuid = demo.stack.enter_context(_node(demo, "node", PROFILE, "--nfc", demo.nfc))
         step.detail = f"{demo.uuid.hex()} on {demo.nfc} and {demo.can}"
     demo.say("Tap: station bench provisions the sensor over NFC.")
-    done = _provision(demo, first)
+    done = provision_over(demo, first, "nfc", demo.uuid, BuildOrder(PROFILE))
     demo.say("The same sensor over CAN: written anew under another name, verified, its key rotated.")
     _over_can(demo, first)
     demo.say("Hand over: crane gets a copy of the key, then bench gives the sensor away for good.")
@@ -107,20 +105,8 @@ def _station(demo: Demo, name: str) -> Station:
     return station
 
 
-def _provision(demo: Demo, station: Station) -> Provisioned:
-    with meet(station, demo.over("nfc"), demo.uuid, demo.reporter) as node:
-        done = provision(station, node, BuildOrder(PROFILE), accept=lambda who: None, reporter=demo.reporter)
-    require_authentic(done.verified)
-    demo.steps.done += done.steps
-    return done
-
-
 def _over_can(demo: Demo, station: Station) -> None:
-    with meet(station, demo.over("can"), demo.uuid, demo.reporter) as node:
-        order = BuildOrder(PROFILE, name="crane slew angle")
-        done = provision(station, node, order, accept=lambda who: None, reporter=demo.reporter)
-        require_authentic(done.verified)
-        demo.steps.done += done.steps
+    provision_over(demo, station, "can", demo.uuid, BuildOrder(PROFILE, name="crane slew angle"))
     with meet(station, demo.over("can"), demo.uuid, demo.reporter) as node, demo.steps.step("rotate") as step:
         agreed = steps_room.agree.agree(station, node, steps_room.identify.identify(station, node), rotate=True)
         step.detail = f"key epoch {agreed.epoch}, key {agreed.key_id}"

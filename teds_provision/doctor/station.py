@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import fcntl
 import os
 import shutil
 import stat
@@ -17,9 +16,9 @@ from teds_provision.doctor.registry import Finding, Place, check
 from teds_provision.errors import NoKeyring, StoreFailure, VaultFailure
 from teds_provision.store import Choice, Store
 from teds_provision.store.home import has_store
+from teds_provision.store.lock import holder_of
 from teds_provision.vault.agent import asking
 
-_LOCK: Final = "store.lock"
 _MIN_FREE: Final = 64 * 1024 * 1024
 _BACKUP_DAYS: Final = 90
 _MAX_KEY_FILE: Final = 64 * 1024
@@ -111,21 +110,11 @@ def _backups(opened: Store, nodes: int) -> Iterator[Finding]:
 
 
 def _lock(place: Place) -> Iterator[Finding]:
-    try:
-        descriptor = os.open(place.home / _LOCK, os.O_RDWR | os.O_NOFOLLOW)
-    except OSError:
+    holder = holder_of(place.home)
+    if holder is None:
         yield Finding("lock", "ok", "Nobody holds the store.")
-        return
-    try:
-        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        yield Finding("lock", "ok", "Nobody holds the store.")
-    except OSError:
-        said = os.pread(descriptor, 500, 0).decode("utf-8", "replace")
-        yield Finding(
-            "lock", "warning", f"The store is held by {said or 'another process'}.", "Wait until it has ended."
-        )
-    finally:
-        os.close(descriptor)
+    else:
+        yield Finding("lock", "warning", f"The store is held by {holder}.", "Wait until it has ended.")
 
 
 @check("keyring", "store")

@@ -7,11 +7,11 @@ from collections.abc import Callable
 from typing import Any
 
 from teds_provision.errors import Frozen, UsageFailure
-from teds_provision.measure.blocks import ChannelFacts, StationFacts
+from teds_provision.measure.blocks import ChannelFacts
+from teds_provision.measure.running.job import station_facts
 from teds_provision.measure.sinks.names import Topics, is_topic
 from teds_provision.ncap.live import Live
 from teds_provision.ncap.nodes.roster import Roster
-from teds_provision.station.measurements import STATION
 from teds_provision.station.station import Station
 
 
@@ -68,9 +68,7 @@ class Names:
             topics = self._topics if self._made_of == changes else None
         if topics is not None:
             return topics
-        names = {(uuid.hex(), channel): name for (uuid, channel), name in self._station.measurements.names.items()}
-        station = names.pop((STATION.hex(), 0), self._station.name)
-        topics = Topics(StationFacts(station, names=names))
+        topics = Topics(station_facts(self._station))
         facts = [
             ChannelFacts(uuid, self._roster.name(uuid), number, name)
             for uuid in self._roster.uuids()

@@ -12,7 +12,7 @@ from typing import Final
 
 from teds_provision.client import SOCKET
 from teds_provision.errors import StoreLocked
-from teds_provision.files import short_path
+from teds_provision.files import listen_alone
 
 LOCK: Final = "ncap.lock"
 
@@ -51,14 +51,4 @@ class Presence:
 
     def listen(self) -> socket.socket:
         """The listening Unix socket, for this user alone; what a killed daemon left is replaced."""
-        with suppress(FileNotFoundError):
-            (self._home / SOCKET).unlink()
-        listener = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
-        before = os.umask(0o177)  # its mode is set when it is bound: there is no moment in which others may connect
-        try:
-            with short_path(self._home / SOCKET) as path:
-                listener.bind(path)
-        finally:
-            os.umask(before)
-        listener.listen(128)
-        return listener
+        return listen_alone(self._home / SOCKET, 128)

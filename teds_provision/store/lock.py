@@ -166,17 +166,7 @@ class Mark(_HeldFile):
     @property
     def is_taken(self) -> bool:
         """Whether somebody holds it now, alone or shared."""
-        try:
-            descriptor = os.open(self._path, os.O_RDWR | os.O_NOFOLLOW | os.O_CLOEXEC)
-        except OSError:
-            return False
-        try:
-            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            return True
-        finally:
-            os.close(descriptor)
-        return False
+        return _held_by(self._path) is not None
 
 
 class Taken(StoreLocked):
@@ -189,6 +179,25 @@ class Taken(StoreLocked):
 
 def _signature(command: str) -> bytes:
     return f'{{"pid": {os.getpid()}, "command": {_quoted(command)}, "since": "{utc_now()}"}}'.encode()
+
+
+def holder_of(home: Path) -> str | None:
+    """Who holds the store of ``home`` now, in words; None where nobody does."""
+    return _held_by(home / FILE_NAME)
+
+
+def _held_by(path: Path) -> str | None:
+    try:
+        descriptor = os.open(path, os.O_RDWR | os.O_NOFOLLOW | os.O_CLOEXEC)
+    except OSError:
+        return None
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return _holder(descriptor)
+    finally:
+        os.close(descriptor)
+    return None
 
 
 def _holder(descriptor: int) -> str:

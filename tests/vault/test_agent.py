@@ -12,6 +12,7 @@ from pathlib import Path
 
 import pytest
 
+from teds_provision import files
 from teds_provision.cli.main import run as in_process
 from teds_provision.vault import forget_vaults
 from teds_provision.vault.agent import asking, holding
@@ -87,7 +88,7 @@ def test_a_machine_that_slept_finds_it_closed(home: Path, monkeypatch: pytest.Mo
     clock = [100.0]
     monkeypatch.setattr(holding, "_now", lambda: clock[0])
     page = page_with(b"Fsecret")
-    listener = holding._listening(home / asking.SOCKET)
+    listener = files.listen_alone(home / asking.SOCKET, 16)
     thread = threading.Thread(target=holding.serve, args=(listener, page, 200.0))
     thread.start()
     assert asking.held(home, "file") == b"secret"
@@ -102,7 +103,7 @@ def test_a_machine_that_slept_finds_it_closed(home: Path, monkeypatch: pytest.Mo
 
 def test_another_user_at_either_end_gets_nothing(home: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     page = page_with(b"Fsecret")
-    listener = holding._listening(home / asking.SOCKET)
+    listener = files.listen_alone(home / asking.SOCKET, 16)
     thread = threading.Thread(target=holding.serve, args=(listener, page, holding._now() + 60))
     thread.start()
     for module in (asking, holding):

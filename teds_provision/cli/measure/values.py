@@ -117,7 +117,7 @@ def mode(app: App, node: str, links: LinkSettings) -> None:
             {"channel": number, "name": names.get(number, ""), "state": words(state), "claimant": claimant}
             for number, (state, claimant) in sorted(found.channels.items())
         ],
-        "power": _power(power),
+        "power": power.as_json() if power is not None else None,
         "charging": _charging(station, trusted.node),
     }
     app.emit(result, lambda console: _mode(console, found, names, power))
@@ -125,7 +125,7 @@ def mode(app: App, node: str, links: LinkSettings) -> None:
 
 def words(state: int) -> list[str]:
     """State bits of a channel as words."""
-    return [bit.name.lower().replace("_", " ") for bit in operation.commands.ChannelState if state & bit and bit.name]
+    return operation.commands.bit_words(operation.commands.ChannelState, state)
 
 
 def _charging(station: Station, node: Conversation) -> dict[str, Any] | None:
@@ -134,23 +134,6 @@ def _charging(station: Station, node: Conversation) -> dict[str, Any] | None:
         return dict(node.contact.charging.to_json())
     known = station.nodes.get(node.uuid)
     return dict(json.loads(known.charging)) if known is not None and known.charging else None
-
-
-def _power(power: Power | None) -> dict[str, Any] | None:
-    if power is None:
-        return None
-
-    return {
-        "flags": [
-            flag.name.lower().replace("_", " ")
-            for flag in operation.commands.PowerFlag
-            if power.flags & flag and flag.name
-        ],
-        "level": power.level,
-        "voltage": power.voltage,
-        "current": power.current,
-        "temperature": power.temperature,
-    }
 
 
 def _mode(console: Console, found: Operation, names: dict[int, str], power: Power | None) -> None:

@@ -12,7 +12,7 @@ from typing import Any, Final
 
 from teds_provision.errors import BadData, NodeRefused, TedsProvisionError
 from teds_provision.protocol.messages.identity import NodeState
-from teds_provision.protocol.operation.commands import POWER, Power, PowerFlag
+from teds_provision.protocol.operation.commands import POWER, Power
 from teds_provision.station.station import Station
 from teds_provision.steps.agree import session_if_keyed
 from teds_provision.steps.identify import Identified, identify
@@ -85,16 +85,9 @@ def _stranger(station: Station, node: Conversation, who: Identified) -> Look:
 def power_of(node: Conversation) -> dict[str, Any] | None:
     """128.18 in an open session, None where the node does not tell."""
     try:
-        power = Power.decode(node.send(POWER, "to tell its power"))
+        return Power.decode(node.send(POWER, "to tell its power")).as_json()
     except (NodeRefused, BadData):
         return None
-    return {
-        "flags": [flag.name.lower().replace("_", " ") for flag in PowerFlag if power.flags & flag and flag.name],
-        "level": power.level,
-        "voltage": power.voltage,
-        "current": power.current,
-        "temperature": power.temperature,
-    }
 
 
 def as_problem(error: TedsProvisionError) -> dict[str, str]:

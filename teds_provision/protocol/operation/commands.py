@@ -10,7 +10,7 @@ import struct
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from enum import IntFlag
-from typing import Final
+from typing import Any, Final
 
 from teds_provision.errors import Garbled
 from teds_provision.protocol.messages.frames import (
@@ -184,6 +184,11 @@ def run_self_test(channel: int = 0) -> Command:
 POWER: Final = security_command(Function.POWER)
 
 
+def bit_words(kind: type[IntFlag], value: int) -> list[str]:
+    """The bits that are set, as words: ``in field``, ``too low``."""
+    return [bit.name.lower().replace("_", " ") for bit in kind if value & bit and bit.name]
+
+
 class PowerFlag(IntFlag):
     """Flags of the reply to Power."""
 
@@ -206,6 +211,16 @@ class Power:
     voltage: float | None = None
     current: float | None = None
     temperature: int | None = None
+
+    def as_json(self) -> dict[str, Any]:
+        """As the API and `mode --json` have it."""
+        return {
+            "flags": bit_words(PowerFlag, self.flags),
+            "level": self.level,
+            "voltage": self.voltage,
+            "current": self.current,
+            "temperature": self.temperature,
+        }
 
     def encode(self) -> bytes:
         """Return the 7 octets: flags ‖ level ‖ mV u16 ‖ mA i16 ‖ °C i8."""

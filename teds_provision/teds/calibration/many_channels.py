@@ -15,6 +15,7 @@ import numpy as np
 
 from teds_provision.teds.calibration.interpreter import ChannelInterpreter
 from teds_provision.teds.calibration.model import Calibration
+from teds_provision.teds.calibration.reading import WORD, big_endian
 from teds_provision.teds.calibration.samples import DataModel
 
 if TYPE_CHECKING:
@@ -22,7 +23,6 @@ if TYPE_CHECKING:
 
     Floats = NDArray[np.float64]
 
-_WORD: Final = 8
 _FAR_FROM_OVERFLOW: Final = 1e100
 _MOST_SEGMENTS: Final = 64
 """Longer tables are searched channel by channel: here each boundary is compared."""
@@ -50,7 +50,7 @@ class ManyChannels:
     def _prepare(self) -> None:
         """What can be left out, since it changes nothing: a call of numpy costs as much for few samples as for many."""
         self._form = np.dtype(f">u{self._width}") if self._width in (1, 2, 4, 8) else None
-        self._native = np.dtype(np.int64 if self._width < _WORD else np.uint64)
+        self._native = np.dtype(np.int64 if self._width < WORD else np.uint64)
         self._may_be_more = bool((self._most < 2.0 ** (8 * self._width) - 1).any())
         self._curves = np.concatenate([self._offsets[None], self._terms])
         self._lowest, self._highest = self._curves[:, None, :, 0], self._curves[:, None, :, -1]
@@ -107,7 +107,7 @@ class ManyChannels:
     def of(cls, channels: Sequence[ChannelInterpreter], usable: Sequence[bool]) -> ManyChannels | None:
         """Side by side, or None where they are not of one form; those that are not ``usable`` give no values."""
         widths = {one.octets for one in channels}
-        if len(widths) != 1 or max(widths) > _WORD:
+        if len(widths) != 1 or max(widths) > WORD:
             return None
         return cls(channels, usable) if all(map(_can_stand_beside, channels)) else None
 
@@ -116,9 +116,7 @@ class ManyChannels:
         if self._form is not None:
             return np.frombuffer(octets, self._form).astype(self._native).reshape(-1, len(self._columns))
         rows = np.frombuffer(octets, dtype=np.uint8).reshape(-1, len(self._columns), self._width)
-        padded = np.zeros((len(rows), len(self._columns), _WORD), dtype=np.uint8)
-        padded[:, :, _WORD - self._width :] = rows
-        return padded.view(">u8")[:, :, 0].astype(self._native)
+        return big_endian(rows).astype(self._native)
 
     def values(self, raw: NDArray[Any]) -> tuple[Floats, NDArray[np.bool_]]:
         """Values in SI units, and which are valid."""

@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Any, Final
 
 from teds_provision.errors import BadData
 from teds_provision.lazy import late
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 else:
     np = late("numpy")
 
-_WORD: Final = 8
+WORD: Final = 8
 _NEGATIVE: Final = 1 << 31
 _FLOATS: Final = {DataModel.FLOAT32: ">f4", DataModel.FLOAT64: ">f8"}
 _INTEGERS: Final = (DataModel.UNSIGNED, DataModel.BITS, DataModel.LONG_INTEGER)
@@ -47,7 +47,7 @@ class SampleReader:
 
     @cached_property
     def _long(self) -> bool:
-        return self.form.octets > _WORD
+        return self.form.octets > WORD
 
     def raw(self, octets: Octets) -> NDArray[np.generic]:
         """Raw values as the data model says: unsigned 64-bit integers, Float64 for floats, fractions and times.
@@ -120,11 +120,16 @@ class SampleReader:
         return np.array([number / (1 << whole) for number in _whole(rows).tolist()], dtype=np.float64)
 
 
+def big_endian(rows: NDArray[np.uint8]) -> NDArray[Any]:
+    """Octets of the last axis (at most 8) as integers of 64 bits, high octet first."""
+    padded = np.zeros((*rows.shape[:-1], WORD), dtype=np.uint8)
+    padded[..., WORD - rows.shape[-1] :] = rows
+    return padded.view(">u8")[..., 0]
+
+
 def _words(rows: NDArray[np.uint8]) -> NDArray[np.uint64]:
     """Up to 8 octets a row, as integers."""
-    padded = np.zeros((len(rows), _WORD), dtype=np.uint8)
-    padded[:, _WORD - rows.shape[1] :] = rows
-    return padded.view(">u8")[:, 0].astype(np.uint64)
+    return big_endian(rows).astype(np.uint64)
 
 
 def _whole(rows: NDArray[np.uint8]) -> NDArray[np.object_]:

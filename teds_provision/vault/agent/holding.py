@@ -20,7 +20,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Final, NoReturn
 
-from teds_provision.files import short_path
+from teds_provision.files import listen_alone
 from teds_provision.vault.agent.asking import END, MOST_OCTETS, SECRET, SOCKET, TIME, user_at
 from teds_provision.vault.hardening import harden
 
@@ -39,7 +39,7 @@ def main() -> None:
     path = home / SOCKET
     try:
         page.read(0)
-        listener = _listening(path)
+        listener = listen_alone(path, 16)
         ours = path.stat().st_ino
         os.write(1, b"ready\n")
         _give_up_streams()
@@ -112,21 +112,6 @@ def _answer(line: socket.socket, page: Page, until: float) -> bool:
     elif request == TIME:
         line.sendall(struct.pack(">I", int(left)))
     return True
-
-
-def _listening(path: Path) -> socket.socket:
-    """The socket, for this user alone; what a killed process left is replaced."""
-    with suppress(FileNotFoundError):
-        path.unlink()
-    listener = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
-    before = os.umask(0o177)  # its mode is set when it is bound: there is no moment in which others may connect
-    try:
-        with short_path(path) as name:
-            listener.bind(name)
-    finally:
-        os.umask(before)
-    listener.listen(16)
-    return listener
 
 
 def _give_up_streams() -> None:
