@@ -34,7 +34,7 @@ NODES: Final = (
     ("gripper", "hand", "sine:5"),
 )
 _TAPPED: Final = "temperature-sensor"
-_READY: Final = 30.0  # seconds, on a loaded machine
+_READY: Final = 60.0  # seconds, on a loaded machine
 _ENDING: Final = 15.0
 
 
