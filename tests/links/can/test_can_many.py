@@ -19,7 +19,7 @@ from teds_provision.links.can.port import CanPort
 from teds_provision.links.can.spec import parse_spec
 from tests.links.can.hub import Hub
 from tests.links.can.test_can_loss import assert_all_found
-from tests.pace import PATIENCE, until
+from tests.pace import PATIENCE, best_of, until
 
 pytestmark = pytest.mark.link
 Start = Callable[..., None]
@@ -56,10 +56,14 @@ def test_eight_nodes_are_talked_to_at_once_and_none_waits_for_a_slow_one(hub: Hu
     nodes(hub.spec, *addresses, delay=1.0)
     port = CanPort(hub.spec)
     bodies = [os.urandom(300 + 10 * number) for number in range(8)]
-    began = time.monotonic()
-    replies = in_threads(lambda number: port.link(addresses[number]).exchange(write(bodies[number])), 8)
-    assert replies == [body[::-1] for body in bodies]
-    assert time.monotonic() - began < 8, "one after the other they take eight seconds"
+
+    def took() -> float:
+        began = time.monotonic()
+        replies = in_threads(lambda number: port.link(addresses[number]).exchange(write(bodies[number])), 8)
+        assert replies == [body[::-1] for body in bodies]
+        return time.monotonic() - began
+
+    best_of(5, 8, took)  # seconds that they take one after the other
     port.close()
 
 
@@ -124,7 +128,7 @@ def test_a_bus_that_goes_away_wakes_whoever_waits() -> None:
     port = CanPort(hub.spec)
     ear = port.listen(lambda frame: True)
     threading.Timer(0.2, hub.close).start()
-    results = in_threads(lambda number: ear.get(20) if number else port.link(0x21).exchange(write(b"x")), 2)
+    results = in_threads(lambda number: ear.get(PATIENCE) if number else port.link(0x21).exchange(write(b"x")), 2)
     assert [isinstance(result, LinkFailure) for result in results] == [True, True], results
     port.close()
 

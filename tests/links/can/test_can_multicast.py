@@ -17,6 +17,7 @@ from teds_provision.errors import LinkFailure
 from teds_provision.links.can.bus import Bus, Frame
 from teds_provision.links.can.spec import parse_spec
 from teds_provision.links.can.wire import multicast
+from tests.pace import PATIENCE
 
 pytestmark = pytest.mark.link
 IDENTIFIERS = st.integers(0, (1 << 29) - 1)
@@ -76,7 +77,7 @@ def test_python_can_hears_us_and_we_hear_it(group: str) -> None:
     with can.Bus(interface="udp_multicast", channel=spec.channel, port=port, hop_limit=0, fd=True) as theirs:
         for frame in (Frame(0x18DA21F1, b"classic"), Frame(0x18DA21F1, bytes(range(64)), fd=True)):
             ours.send(frame)
-            heard = theirs.recv(2)
+            heard = theirs.recv(PATIENCE)
             assert heard is not None
             assert (heard.arbitration_id, bytes(heard.data), heard.is_fd, heard.bitrate_switch) == (
                 frame.identifier,
@@ -85,8 +86,8 @@ def test_python_can_hears_us_and_we_hear_it(group: str) -> None:
                 frame.fd,
             )
             theirs.send(heard)
-            assert theirs.recv(2) is not None, "python-can hears itself"
-            assert ours.receive(2) == frame, "octet for octet what we sent, and yet another's"
+            assert theirs.recv(PATIENCE) is not None, "python-can hears itself"
+            assert ours.receive(PATIENCE) == frame, "octet for octet what we sent, and yet another's"
     ours.close()
 
 
@@ -99,11 +100,14 @@ def test_our_own_frames_do_not_come_back(monkeypatch: pytest.MonkeyPatch, group:
     frame = Frame(0x18DA21F1, b"mine")
     for _ in range(3):
         bus.send(frame)
-    assert [other.receive(2) for _ in range(3)] == [frame] * 3
+    assert [other.receive(PATIENCE) for _ in range(3)] == [frame] * 3
     woken = select.select([bus._descriptor], [], [], 0)[0]
     assert bool(woken) == (not filtered), "the kernel drops them before anybody is woken"
     other.send(frame)  # the very same, but from another program
-    assert [heard for heard in (bus.receive(0.5) for _ in range(4)) if heard] == [frame]
+    heard = [bus.receive(1.0) for _ in range(4)]  # each of its own that came wakes it, and is nothing
+    if not any(heard):
+        heard.append(bus.receive(PATIENCE))
+    assert [one for one in heard if one] == [frame]
     bus.close()
     other.close()
 
@@ -134,7 +138,7 @@ def test_a_frame_never_comes_before_it_was_sent(monkeypatch: pytest.MonkeyPatch,
     sent = time.monotonic()
     other.send(Frame(0x18DA21F1, b"when"))
     monkeypatch.setattr(multicast, "time", Hurdled())
-    heard = bus.receive(2)
+    heard = bus.receive(PATIENCE)
     assert heard is not None
     assert heard.at >= sent
     bus.close()
@@ -151,7 +155,7 @@ def test_another_machine_with_our_port_is_no_echo_of_ours(group: str) -> None:
     frame = Frame(0x18DAF121, b"afar")
     multicast._drop_own(bus._multicast._in, ("203.0.113.1", port))
     other.send(frame)
-    assert bus.receive(2) == frame
+    assert bus.receive(PATIENCE) == frame
     multicast._drop_own(bus._multicast._in, (address, port))
     other.send(frame)
     assert bus.receive(0.2) is None
@@ -166,5 +170,5 @@ def test_an_error_frame_that_says_bus_off_is_a_link_failure(group: str) -> None:
     with can.Bus(interface="udp_multicast", channel=spec.channel, port=port, hop_limit=0) as one:
         one.send(can.Message(arbitration_id=0x40, is_error_frame=True, data=bytes(8)))
         with pytest.raises(LinkFailure, match="bus-off"):
-            bus.receive(2)
+            bus.receive(PATIENCE)
     bus.close()

@@ -12,6 +12,7 @@ from typing import Any
 
 import pytest
 
+from tests.pace import PATIENCE
 from tests.places import free_reader
 
 ROOT = Path(__file__).resolve().parents[3]
@@ -31,7 +32,7 @@ class Process:
         self._lines: list[str] = []
         self._rest = b""
 
-    def wait_for(self, start: str, seconds: float = 20.0) -> str:
+    def wait_for(self, start: str, seconds: float = PATIENCE) -> str:
         """Return the next line that begins with ``start``."""
         until = time.monotonic() + seconds
         with selectors.DefaultSelector() as selector:
@@ -50,7 +51,7 @@ class Process:
     def signal(self, number: int) -> None:
         self._process.send_signal(number)
 
-    def wait(self, seconds: float = 10.0) -> int:
+    def wait(self, seconds: float = PATIENCE) -> int:
         return self._process.wait(seconds)
 
     def kill(self) -> None:

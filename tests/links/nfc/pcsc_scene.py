@@ -62,7 +62,7 @@ class Card:
 
     def put(self) -> None:
         """Put it on the reader."""
-        until = time.monotonic() + 10
+        until = time.monotonic() + 60
         while True:
             try:
                 self._slot = socket.create_connection(("127.0.0.1", PORT))
@@ -145,7 +145,7 @@ def start_pcscd(folder: Path) -> subprocess.Popen[bytes]:
     process = subprocess.Popen(
         ["/usr/sbin/pcscd", "--foreground", "--config", config], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
     )
-    until = time.monotonic() + 10
+    until = time.monotonic() + 60
     while not Path("/run/pcscd/pcscd.comm").exists():
         assert time.monotonic() < until
         time.sleep(0.05)

@@ -10,7 +10,7 @@ from teds_provision.links import LinkSettings, Notice, open_port
 
 def hold(path: str) -> None:
     port = open_port(LinkSettings(nfc=path))
-    contact = port.find(lambda identity: True, seconds=10, notice=lambda notice: None)
+    contact = port.find(lambda identity: True, seconds=60, notice=lambda notice: None)
     contact.link.exchange(bytes(10))
     print("holding", flush=True)
     time.sleep(60)

@@ -94,7 +94,7 @@ def test_a_contact_carries_what_its_initial_message_says(start_node: StartNode, 
     ]
     start_node(initial=message.encode(initial).hex())
     port = open_port(LinkSettings(nfc=path))
-    contact = port.find(lambda identity: True, seconds=5, notice=lambda notice: None)
+    contact = port.find(lambda identity: True, seconds=60, notice=lambda notice: None)
     assert contact.charging is not None
     assert contact.charging.battery_percent == 100
     assert contact.ble is not None

@@ -96,9 +96,9 @@ def test_a_node_is_identified_over_a_pc_sc_reader(scene: Scene) -> None:
     none = scene.run("identify", "--nfc", READER, "--timeout", "1")
     assert (none["code"], none["error"]["code"]) == (5, "no-node")
     scene.do("put")
-    found = scene.run("identify", "--nfc", READER, "--timeout", "10")
+    found = scene.run("identify", "--nfc", READER, "--timeout", "40")
     assert (found.get("uuid"), found["tag_uid"], found["state"]) == (scene.uuid, "04112233445566", "factory"), found
-    several = scene.run("identify", "--timeout", "10")  # auto, and vpcd has two slots
+    several = scene.run("identify", "--timeout", "40")  # auto, and vpcd has two slots
     assert several["code"] == 2
     assert READER in several["error"]["message"]
     scene.do("lift")
@@ -114,7 +114,7 @@ def test_a_node_is_identified_over_a_pc_sc_reader(scene: Scene) -> None:
 @pytest.mark.parametrize("scene", ["4", "2"], indirect=True)
 def test_a_node_is_provisioned_over_a_pc_sc_reader(scene: Scene) -> None:
     scene.do("put")
-    words = ["provision", "--yes", "--profile", "temperature-sensor", "--nfc", READER, "--timeout", "10"]
+    words = ["provision", "--yes", "--profile", "temperature-sensor", "--nfc", READER, "--timeout", "40"]
     done = scene.run(*words)
     assert (done.get("uuid"), done.get("verdict")) == (scene.uuid, "authentic"), done
 

@@ -80,7 +80,7 @@ def make_node(chip: Chip) -> Iterator[Callable[[str], Node]]:
 def test_frames_go_over_a_usb_reader(make_node: Callable[[str], Node], chip: Chip, tag: str, path: str) -> None:
     make_node(tag).put_down()
     port = open_port(LinkSettings(nfc=path))
-    contact = port.find(lambda identity: True, seconds=3, notice=lambda notice: None)
+    contact = port.find(lambda identity: True, seconds=60, notice=lambda notice: None)
     assert contact.identity.uuid.hex().upper() == UUID
     for size in (10, 480, 1500):
         assert contact.link.exchange(bytes(range(10)) + bytes(size)) == b"\x01" + bytes(size) + bytes(range(9, -1, -1))
@@ -138,7 +138,7 @@ def test_unplugging_in_the_middle_of_a_transfer_is_a_reader_error(make_node: Cal
     node = make_node("2")
     node.put_down()
     port = open_port(LinkSettings(nfc="usb"))
-    contact = port.find(lambda identity: True, seconds=3, notice=lambda notice: None)
+    contact = port.find(lambda identity: True, seconds=60, notice=lambda notice: None)
     answer, left = chip.answer, [20]
 
     def unplug_after_a_while(command: bytes) -> bytes | None:
@@ -155,7 +155,7 @@ def test_unplugging_in_the_middle_of_a_transfer_is_a_reader_error(make_node: Cal
         port.find(lambda identity: True, seconds=0.5, notice=lambda notice: None)
     chip.plugged = True
     node.put_down()
-    again = port.find(lambda identity: True, seconds=3, notice=lambda notice: None)
+    again = port.find(lambda identity: True, seconds=60, notice=lambda notice: None)
     assert again.link.exchange(b"xy") == b"\x01yx"
     port.close()
 
