@@ -18,6 +18,8 @@ from teds_provision.protocol.announce import Announce
 from teds_provision.protocol.messages.identity import NodeState
 from tests.links.can.echo_node import EchoNode
 from tests.links.can.hub import Hub
+from tests.pace import PATIENCE
+from tests.places import free_tcp_port
 
 IDENTIFY = b"\x00\x00\x80\x07\x00\x00"
 COUNT = b"\x00\x00\x01\x7f\x00\x00"
@@ -33,12 +35,19 @@ class Stranger:
     def everyone(self, octets: str) -> None:
         self.bus.send(Frame(0x18DBFF00 | self.source, bytes.fromhex(octets)))
 
-    def ask(self, node: int, body: bytes, seconds: float = 0.4) -> list[bytes]:
-        """Send ``body`` (none if empty) and return every message that comes back within ``seconds``."""
+    def ask(self, node: int, body: bytes) -> list[bytes]:
+        """Send ``body`` (none if empty), wait for the answer, and return it with whatever comes soon after it."""
+        return self._hear(node, body, PATIENCE)
+
+    def silence(self, node: int, body: bytes = b"", seconds: float = 0.2) -> list[bytes]:
+        """Send ``body``, and return what comes back within ``seconds``, which is to be nothing."""
+        return self._hear(node, body, seconds)
+
+    def _hear(self, node: int, body: bytes, seconds: float) -> list[bytes]:
         pair = Pair(self.source, node, self.bus.send)
         if body:
             pair.send(body)
-        messages = []
+        messages: list[bytes] = []
         until = time.monotonic() + seconds
         while time.monotonic() < until:
             frame = self.bus.receive(0.01)
@@ -47,6 +56,7 @@ class Stranger:
             pair.run()
             while (message := pair.received()) is not None:
                 messages.append(message)
+                until = min(until, time.monotonic() + 0.2)
         return messages
 
 
@@ -86,7 +96,7 @@ def test_answers_a_functional_identify_from_its_own_address(station: Stranger, n
 @pytest.mark.parametrize("octets", ["0742000101010000", "06420000800700", "0842000080070000", "1042000080070000", "07"])
 def test_answers_nothing_else_that_is_asked_of_everyone(station: Stranger, node: EchoNode, octets: str) -> None:
     station.everyone(octets)
-    assert station.ask(0x21, b"", 0.2) == []
+    assert station.silence(0x21) == []
     assert node.seen == []
 
 
@@ -95,7 +105,7 @@ def test_an_equal_repetition_is_not_run_again_even_after_a_functional_identify(
 ) -> None:
     assert station.ask(0x21, b"\x09" + COUNT) == [b"\x09\x01\x00\x01"]
     station.everyone("0742000080070000")
-    assert len(station.ask(0x21, b"", 0.2)) == 1
+    assert len(station.ask(0x21, b"")) == 1
     assert station.ask(0x21, b"\x09" + COUNT) == [b"\x09\x01\x00\x01"]
     assert station.ask(0x21, b"\x0a" + COUNT) == [b"\x0a\x01\x00\x02"]
     assert node.runs == 2
@@ -114,7 +124,7 @@ def test_lines_do_not_share_a_stored_reply(hub: Hub, station: Stranger, node: Ec
 
 @pytest.mark.parametrize("body", [b"\x01", b"\x01\x00\x00\x80\x07\x00"])
 def test_what_is_too_short_for_a_command_gets_a_reply_all_the_same(station: Stranger, body: bytes) -> None:
-    (reply,) = station.ask(0x21, body, 0.3)
+    (reply,) = station.ask(0x21, body)
     assert reply[:1] == b"\x01"
 
 
@@ -123,23 +133,23 @@ def test_a_command_of_bad_form_gets_what_the_node_says_of_it(station: Stranger) 
 
 
 def test_other_addresses_are_not_its_own(station: Stranger, node: EchoNode) -> None:
-    assert station.ask(0x22, b"\x01" + IDENTIFY, 0.2) == []
-    assert station.ask(0x21, b"\x02\x00\x00\x80\x0a\x00\x01\x22", 0.2) == [b"\x02\x01\x00\x00"]
-    assert len(station.ask(0x22, b"\x01" + IDENTIFY, 0.3)) == 1
-    assert station.ask(0x21, b"\x01" + IDENTIFY, 0.2) == []
+    assert station.silence(0x22, b"\x01" + IDENTIFY) == []
+    assert station.ask(0x21, b"\x02\x00\x00\x80\x0a\x00\x01\x22") == [b"\x02\x01\x00\x00"]
+    assert len(station.ask(0x22, b"\x01" + IDENTIFY)) == 1
+    assert station.silence(0x21, b"\x01" + IDENTIFY) == []
 
 
 def test_a_station_outside_f1_to_f7_is_not_heard(hub: Hub, server: CanServer, node: EchoNode) -> None:
     outsider = Stranger(hub.spec, 0xF8)
     try:
-        assert outsider.ask(0x21, b"\x01" + IDENTIFY, 0.2) == []
+        assert outsider.silence(0x21, b"\x01" + IDENTIFY) == []
     finally:
         outsider.bus.close()
 
 
 def test_an_overlong_message_is_told_off_and_the_line_goes_on(station: Stranger) -> None:
     station.bus.send(Frame(physical_id(0x21, 0xF1), bytes.fromhex("1000000010000000")))
-    assert station.ask(0x21, b"", 0.1) == []
+    assert wait_for(lambda: bool(station.silence(0x21, seconds=0.1) or station.frames))
     assert [frame.data[0] for frame in station.frames] == [0x32]
     assert station.ask(0x21, b"\x09" + COUNT) == [b"\x09\x01\x00\x01"]
 
@@ -167,7 +177,7 @@ def announces(hub: Hub) -> list[Announce]:
     return [announce for announce in found if announce is not None]
 
 
-def wait_for(what: Callable[[], bool], seconds: float = 8.0) -> bool:
+def wait_for(what: Callable[[], bool], seconds: float = PATIENCE) -> bool:
     until = time.monotonic() + seconds
     while not what():
         if time.monotonic() > until:
@@ -178,7 +188,7 @@ def wait_for(what: Callable[[], bool], seconds: float = 8.0) -> bool:
 
 def test_announces_itself_once_after_its_start(hub: Hub, server: CanServer, node: EchoNode) -> None:
     node.state = NodeState.PROVISIONED
-    assert wait_for(lambda: bool(announces(hub)), 1.5)
+    assert wait_for(lambda: bool(announces(hub)))
     assert hub.frames[0][0] == 0x1CFF0021
     assert not wait_for(lambda: len(announces(hub)) > 1, 0.3)
     assert announces(hub)[0].crc == zlib.crc32(node.uuid)
@@ -194,7 +204,7 @@ def test_moves_away_from_a_smaller_crc_and_ends_the_sessions_there(
     assert wait_for(lambda: any(announce.address == 0x23 for announce in announces(hub)))
     assert node.links_lost == ["can:f1"]
     assert len(station.ask(0x23, b"\x0a" + COUNT)) == 1
-    assert station.ask(0x21, b"\x0b" + COUNT, 0.2) == []
+    assert station.silence(0x21, b"\x0b" + COUNT) == []
 
 
 def test_stays_before_a_greater_crc_and_says_so(station: Stranger, hub: Hub, node: EchoNode) -> None:
@@ -251,10 +261,13 @@ def test_200_nodes_in_one_process_answer_everyone_and_keep_to_few_threads(hub: H
     stranger = Stranger(hub.spec)
     try:
         pairs = {node.address: Pair(0xF1, node.address, stranger.bus.send) for node in nodes}
-        stranger.everyone("0742000080070000")
         answers: dict[int, bytes] = {}
-        until = time.monotonic() + 20
+        asked = time.monotonic() - 20
+        until = time.monotonic() + 3 * 20
         while len(answers) < 200 and time.monotonic() < until:
+            if time.monotonic() - asked >= 20:  # again, where a busy machine lets their answers be too late
+                asked = time.monotonic()
+                stranger.everyone("0742000080070000")
             frame = stranger.bus.receive(0.05)
             if frame is not None and (pair := pairs.get(frame.identifier & 0xFF)) and pair.take(frame):
                 while (message := pair.received()) is not None:
@@ -299,7 +312,7 @@ def test_a_trigger_is_timed_while_a_data_frame_of_the_node_is_still_on_the_wire(
     server.start()
     stranger = Stranger(hub.spec)
     try:
-        assert stranger.ask(0x21, b"\x09" + COUNT, 20.0)
+        assert stranger.ask(0x21, b"\x09" + COUNT)
         ends: list[int] = []
 
         def send() -> None:
@@ -323,7 +336,7 @@ def test_a_lost_flow_control_costs_the_next_request_nothing(station: Stranger, s
     request = b"\x05\x00\x00\x01\x03\x00\x1e" + bytes(30)
     pair = Pair(0xF1, 0x21, station.bus.send)
     pair.send(request)
-    until = time.monotonic() + 5
+    until = time.monotonic() + PATIENCE
     while time.monotonic() < until:  # our flow control for its reply is never sent
         frame = station.bus.receive(0.05)
         if frame is None or frame.identifier != 0x18DAF121:
@@ -332,11 +345,11 @@ def test_a_lost_flow_control_costs_the_next_request_nothing(station: Stranger, s
             pair.take(frame)
         elif frame.data[0] >> 4 == 1:
             break
-    assert station.ask(0x21, request, 0.5) == [b"\x05" + bytes(30)]
+    assert station.ask(0x21, request) == [b"\x05" + bytes(30)]
 
 
 def test_comes_back_from_a_lost_bus_silent_and_announces_again(node: EchoNode) -> None:
-    hub = Hub()
+    hub = Hub(port=free_tcp_port())  # not one that the system may deal out to others while it is closed
     server = CanServer(hub.spec, node)
     server.start()
     stranger = Stranger(hub.spec)
@@ -359,7 +372,7 @@ def test_a_repetition_that_meets_the_reply_costs_neither(station: Stranger, serv
     pair = Pair(0xF1, 0x21, station.bus.send)
     pair.send(request)
     messages: list[bytes] = []
-    until = time.monotonic() + 5
+    until = time.monotonic() + PATIENCE
     while time.monotonic() < until and not messages:
         frame = station.bus.receive(0.05)
         if frame is None or frame.identifier != 0x18DAF121:

@@ -88,7 +88,7 @@ def test_every_message_has_the_fields_and_types_of_ros_2(ros: Sourced) -> None:
     k = 0
     while not (all(ros.last(f"/bench/arm/{one}") for one in topics) and ros.last("/bench/crane")):
         k += 1
-        assert k < 600, sink.stats
+        assert k < 1200, sink.stats
         sink.write(block([[10]], index=k, start=time.time()))
         sink.write(replace(block([[1, 2, 3, 4]], channels=(4, 5, 6, 7), index=k, start=time.time()), stream=1))
         sink.write(block([[7, 5]], [[293.15, 0.5]], uuid=HAND, channels=(3, 2), index=k, start=time.time()))

@@ -47,6 +47,7 @@ class Master:
             "HOME": str(folder),
         }
         self.process: subprocess.Popen[bytes] | None = None
+        self.echoes: list[subprocess.Popen[str]] = []
 
     def start(self) -> None:
         command = ["/usr/bin/python3", "/usr/bin/rosmaster", "--core", "-p", str(self.port)]
@@ -60,6 +61,12 @@ class Master:
             self.process.wait()
             self.process = None
 
+    def echo(self, topic: str) -> subprocess.Popen[str]:
+        """The first message of a topic, as Debian's tool prints it; ended with the master."""
+        command = ["/usr/bin/python3", "/usr/bin/rostopic", "echo", "-n", "1", topic]
+        self.echoes.append(subprocess.Popen(command, env=self.environment, stdout=subprocess.PIPE, text=True))
+        return self.echoes[-1]
+
     def tool(self, *words: str) -> str:
         command = ["/usr/bin/python3", f"/usr/bin/{words[0]}", *words[1:]]
         done = subprocess.run(command, env=self.environment, capture_output=True, text=True, timeout=60, check=False)
@@ -72,6 +79,9 @@ def master(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Master]:
     for name in ("ROS_IP", "ROS_HOME", "ROS_LOG_DIR"):
         monkeypatch.setenv(name, one.environment[name])
     yield one
+    for echo in one.echoes:
+        echo.kill()
+        echo.wait()
     one.stop()
 
 
@@ -95,18 +105,7 @@ def test_debians_tools_see_topics_values_metadata_and_parameters(master: Master)
     sink.report(NodeReport(ARM, "running", lost=2))
     until(lambda: sink.stats.state == "running")
     feed(sink, 0)
-    reader = subprocess.Popen(
-        ["/usr/bin/python3", "/usr/bin/rostopic", "echo", "-n", "1", "/bench/hand/oil"],
-        env=master.environment,
-        stdout=subprocess.PIPE,
-        text=True,
-    )
-    array = subprocess.Popen(
-        ["/usr/bin/python3", "/usr/bin/rostopic", "echo", "-n", "1", "/bench/crane"],
-        env=master.environment,
-        stdout=subprocess.PIPE,
-        text=True,
-    )
+    reader, array = master.echo("/bench/hand/oil"), master.echo("/bench/crane")
     k = 0
     while reader.poll() is None or array.poll() is None:
         k += 1
@@ -145,8 +144,7 @@ def test_a_vector_and_a_wrench_are_messages_of_their_own(master: Master) -> None
     sink = ros1(master)
     sink.open(forces, STATION)
     until(lambda: sink.stats.state == "running")
-    topic, words = "/bench/arm/wrench", ["/usr/bin/python3", "/usr/bin/rostopic", "echo", "-n", "1"]
-    echo = subprocess.Popen([*words, topic], env=master.environment, stdout=subprocess.PIPE, text=True)
+    echo = master.echo("/bench/arm/wrench")
     k = 0
     while echo.poll() is None:
         k += 1
@@ -230,16 +228,11 @@ def test_a_child_that_waits_for_a_master_ends_when_its_parent_was_killed() -> No
         " stdout=subprocess.PIPE, env={'ROS_MASTER_URI': 'http://127.0.0.1:9', 'PATH': '/usr/bin', 'HOME': '/tmp'});"
         "p.stdout.readline(); print(p.pid, flush=True); time.sleep(60)"
     )
-    parent = subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, text=True)
-    assert parent.stdout is not None
-    orphan = int(parent.stdout.readline())
-    parent.kill()
-    parent.wait()
-    parent.stdout.close()
-    until = time.monotonic() + 15
-    while Path(f"/proc/{orphan}").exists():
-        assert time.monotonic() < until, "the child outlives its parent"
-        time.sleep(0.05)
+    with subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, text=True) as parent:
+        assert parent.stdout is not None
+        orphan = int(parent.stdout.readline())
+        parent.kill()
+    until(lambda: not Path(f"/proc/{orphan}").exists(), "the child outlives its parent")
 
 
 def test_two_stations_of_one_name_do_not_end_each_other(master: Master) -> None:
