@@ -81,9 +81,7 @@ def test_a_question_takes_the_digits_of_the_key(desk: Desk, answer: str, code: i
     station, (node, digits) = desk.station(), made(desk, "node")
     node.start()
     said = {"whole": digits, "first": digits[:32].upper(), "other": "0" * 32}.get(answer, answer)
-    ended, shown = on_a_terminal(
-        station, "provision", "--profile", ANGLE, *desk.links.over("nfc"), answers=[said.encode() + b"\n"]
-    )
+    ended, shown = on_a_terminal(station, "provision", "--profile", ANGLE, *desk.links.over("nfc"), answer=said)
     assert ended == code, shown
     assert digits[:32] in shown
     assert (node.flash["key"] is not None) == (code == 0)

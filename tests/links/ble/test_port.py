@@ -20,6 +20,7 @@ from teds_provision.protocol.messages.ble import piece_octets
 from teds_provision.protocol.messages.frames import Command, Function, security_command, write_teds
 from teds_provision.protocol.messages.identity import Identity
 from tests.node.measuring_station import SealedLine
+from tests.pace import PATIENCE, until
 
 from .conftest import ANGLE
 from .radio import Radio, needs_dbus
@@ -38,15 +39,8 @@ def quiet(_notice: Notice) -> None:
     pass
 
 
-def find(port: BlePort, wanted: Callable[[Identity], bool] = anyone, *, seconds: float = 30) -> Contact:
+def find(port: BlePort, wanted: Callable[[Identity], bool] = anyone, *, seconds: float = PATIENCE) -> Contact:
     return port.find(wanted, seconds=seconds, notice=quiet)
-
-
-def until(true: Callable[[], bool], seconds: float = 15) -> None:
-    end = time.monotonic() + seconds
-    while not true():
-        assert time.monotonic() < end
-        time.sleep(0.05)
 
 
 @pytest.mark.parametrize("mtu", [23, 247, 517])
@@ -268,7 +262,7 @@ def test_a_stranger_neither_hides_the_node_nor_stays(air: Air, port: Ports) -> N
 
 
 def test_who_has_a_session_stays(air: Air, port: Ports) -> None:
-    stranger_seconds = 3.0  # it has so long to open a session; half a second was too little on a busy machine
+    stranger_seconds = 5.0  # it has so long to open a session; half a second was too little on a busy machine
     radio = air(stranger_seconds=stranger_seconds)
     contact = find(port())
     line = SealedLine(contact.link, contact.identity.uuid)
