@@ -279,7 +279,7 @@ def _bundled(station: Station, nodes: Iterable[Leaving]) -> Iterator[BundledNode
     """Read the nodes and unwrap their keys, a page at a time."""
     for page in pages(nodes):
         uuids_of_page = [node.uuid for node in page]
-        records = station.nodes.of_page(uuids_of_page)
+        records = station.nodes.handed_of_page(uuids_of_page)
         keys = {(key.uuid, key.key_id): key for key in station.keys.of_page(uuids_of_page)}
         for leaving in page:
             record, key = records.get(leaving.uuid), keys.get((leaving.uuid, leaving.key_id))

@@ -19,7 +19,7 @@ from teds_provision.protocol.handover.bundle import Bundle
 from teds_provision.protocol.handover.receipt import Receipt, open_receipt
 from teds_provision.protocol.handover.strict_json import decode_base64url, load_object
 from teds_provision.station.station import Station
-from teds_provision.store import Handover, Holder
+from teds_provision.store import Handover, Holder, pages
 
 OPEN, CLOSED, UNDONE, IMPORTED = "open", "closed", "undone", "imported"
 
@@ -72,9 +72,12 @@ def content_digest(
     ascend by UUID. The digest is over JSON, which is never there as a whole.
     """
     digest = hashlib.sha256(_compact([sender, sorted(to), mode, ca.hex()])[:-1] + b",[")
-    for number, (uuid, identifier, epoch) in enumerate(nodes):
+    comma = ""
+    for page in pages(nodes):
         # as JSON, by hand: hex digits and a number need no quoting, and there may be ten thousand
-        digest.update(f'{"," if number else ""}["{uuid.hex()}","{identifier}",{epoch}]'.encode())
+        listed = [f'["{uuid.hex()}","{identifier}",{epoch}]' for uuid, identifier, epoch in page]
+        digest.update(f"{comma}{','.join(listed)}".encode())
+        comma = ","
     digest.update(b"]]")
     return digest.hexdigest()
 

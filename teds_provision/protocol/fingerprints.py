@@ -18,8 +18,9 @@ def read_fingerprint(text: str) -> str | None:
 
 def same_key(one: str, other: str) -> bool:
     """Whether two fingerprints, each whole or its first digits, are of the same key."""
-    short, long = (one, other) if len(one) <= len(other) else (other, one)
-    return len(short) >= LEAST_DIGITS and long.startswith(short)
+    if len(one) > len(other):
+        one, other = other, one
+    return len(one) >= LEAST_DIGITS and other.startswith(one)
 
 
 def is_whole(fingerprint: str | None) -> bool:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 from teds_provision.lazy import late
 from teds_provision.station.seals import Seals
-from teds_provision.store import DatasheetRecord, Draft, Known, NodeRecord, Search, Shown, Store
+from teds_provision.store import DatasheetRecord, Draft, Handed, Known, NodeRecord, Search, Shown, Store
 from teds_provision.teds.codec.codes import AccessCode
 from teds_provision.teds.image import Image
 
@@ -36,6 +36,10 @@ class Nodes:
     def of_page(self, uuids: Sequence[bytes]) -> dict[bytes, NodeRecord]:
         """What is known of a page of nodes, by UUID."""
         return self._store.nodes_of(uuids)
+
+    def handed_of_page(self, uuids: Sequence[bytes]) -> dict[bytes, Handed]:
+        """What a bundle says of a page of nodes, by UUID."""
+        return self._store.handed_of(uuids)
 
     def bearers_of(self, names: Sequence[str]) -> dict[str, bytes]:
         """Who has each of a page of names."""

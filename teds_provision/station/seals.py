@@ -37,14 +37,14 @@ class Seals:
         self._store = store
         self._vault = vault
         self._tell = tell
-        self._key: bytes | None = None
+        self._keyed: hmac.HMAC | None = None
         self.broken_trust: tuple[str, ...] = ()
         """Names of trusted keys whose seal does not hold; they do not count."""
 
     @property
     def active(self) -> bool:
         """Whether the vault was opened, so that seals can be made and checked without asking anybody."""
-        return self._key is not None
+        return self._keyed is not None
 
     def require(self) -> None:
         """Open the vault if it is not open yet: what decides whom the station believes is changed by its owner only."""
@@ -55,9 +55,10 @@ class Seals:
     def facts(self, facts: Facts) -> Facts:
         """The station's facts with their seal, and a seal key if there is none yet."""
         if facts.seal_key is None:
-            self._key = os.urandom(_KEY_OCTETS)
-            facts = replace(facts, seal_key=self._vault().wrap(self._key, context=self._context()))
-        return replace(facts, mac=self._mac("station", *_facts(facts)))
+            key = os.urandom(_KEY_OCTETS)
+            facts = replace(facts, seal_key=self._vault().wrap(key, context=self._context()))
+            self._keyed = _keyed(key)
+        return replace(facts, mac=self._mac("station", _facts(facts)))
 
     def entry(self, entry: WhitelistEntry) -> WhitelistEntry:
         """A whitelist entry with its seal."""
@@ -65,42 +66,42 @@ class Seals:
 
     def of_entry(self, entry: WhitelistEntry) -> bytes:
         """The seal of a whitelist entry."""
-        return self._mac("whitelist", *_entry(entry))
+        return self._mac("whitelist", _entry(entry))
 
     def trust(self, record: TrustRecord) -> TrustRecord:
         """A trusted key with its seal."""
-        return replace(record, mac=self._mac("trust", *_trust(record)))
+        return replace(record, mac=self._mac("trust", _trust(record)))
 
     def point(self, uuid: bytes, point: bytes) -> bytes | None:
         """The seal of a node's identity key; None, and so only a hint, as long as the vault is closed."""
-        return self._mac("node", uuid, point) if self.active else None
+        return self._mac("node", (uuid, point)) if self.active else None
 
     def ca(self, uuid: bytes, ca: bytes) -> bytes:
         """The seal of the CA that a node keeps."""
-        return self._mac("ca", uuid, ca)
+        return self._mac("ca", (uuid, ca))
 
     def note(self, kind: str, name: str) -> bytes:
         """The seal of a person's decision: ``lifted`` (a ban), ``ended ca`` (trust in a CA out of a bundle)."""
-        return self._mac(kind, name)
+        return self._mac(kind, (name,))
 
     # -- checking --------------------------------------------------------------------------------------------------
 
     def check_entry(self, entry: WhitelistEntry | None) -> WhitelistEntry | None:
         """Return a whitelist entry; raises StoreChanged where its seal does not hold. Unchecked with a closed vault."""
-        if entry is not None and self.active and not self._holds(entry.mac, "whitelist", *_entry(entry)):
+        if entry is not None and self.active and not self._holds(entry.mac, "whitelist", _entry(entry)):
             raise changed([f"the whitelist entry of {entry.uuid.hex()}"], "Take it off the whitelist, and add it anew.")
         return entry
 
     def check_point(self, node: NodeRecord | Shown) -> None:
         """Raise StoreChanged where a node's sealed identity key was changed."""
         bad = node.point is not None and node.point_mac is not None
-        if bad and self.active and not self._holds(node.point_mac, "node", node.uuid, node.point):
+        if bad and self.active and not self._holds(node.point_mac, "node", (node.uuid, node.point)):
             remove = f"teds-provision whitelist remove {node.uuid.hex()}, then tap the node."
             raise changed([f"the key of node {node.uuid.hex()}"], remove)
 
     def check_ca(self, uuid: bytes, ca: bytes, mac: bytes | None) -> None:
         """Raise StoreChanged where the CA that a node keeps is not the one that this station noted."""
-        if self.active and not self._holds(mac, "ca", uuid, ca):
+        if self.active and not self._holds(mac, "ca", (uuid, ca)):
             raise changed([f"the CA of node {uuid.hex()}"], "Restore a backup, or reset the node and agree anew.")
 
     def trusted(self, record: TrustRecord) -> bool:
@@ -109,12 +110,12 @@ class Seals:
 
     def noted(self, kind: str, name: str, mac: bytes | None) -> bool:
         """Whether a person's decision counts: its seal holds, or the vault is closed and nobody can say."""
-        return not self.active or self._holds(mac, kind, name)
+        return not self.active or self._holds(mac, kind, (name,))
 
     def all_broken(self) -> Iterator[str]:
         """Name every row whose seal does not hold (the vault is open), for doctor."""
         for name, mac, kind, values in self._sealed_rows():
-            if not self._holds(mac, kind, *values):
+            if not self._holds(mac, kind, values):
                 yield name
 
     def _sealed_rows(self) -> Iterator[tuple[str, bytes | None, str, _Values]]:
@@ -154,8 +155,8 @@ class Seals:
             if self._store.frozen is None:
                 self._take_over(facts, vault)
             return  # a store of version 0.1 on a disk that takes nothing: it is read as that version read it
-        self._key = vault.unwrap(facts.seal_key, context=self._context())
-        if not self._holds(facts.mac, "station", *_facts(facts)):
+        self._keyed = _keyed(vault.unwrap(facts.seal_key, context=self._context()))
+        if not self._holds(facts.mac, "station", _facts(facts)):
             raise changed(
                 ["the station's own key or CA"],
                 "Move store.sqlite3 away, then restore a backup: teds-provision restore FILE",
@@ -165,19 +166,19 @@ class Seals:
     def _look_at_trust(self) -> None:
         """Find, and tell, what another program wrote of whom this station believes: none of it counts."""
         self.broken_trust = tuple(
-            record.name for record in self._store.trusted() if not self._holds(record.mac, "trust", *_trust(record))
+            record.name for record in self._store.trusted() if not self._holds(record.mac, "trust", _trust(record))
         )
         if self.broken_trust:
             names = ", ".join(self.broken_trust[:_SHOWN])
             self._tell(f"Trust in {names} was changed by another program than this one and does not count.")
-        strange = [name for name, mac, kind, values in self._decisions() if not self._holds(mac, kind, *values)]
+        strange = [name for name, mac, kind, values in self._decisions() if not self._holds(mac, kind, values)]
         if strange:
             self._tell(f"Another program than this one noted {', '.join(strange[:_SHOWN])}: it does not count.")
 
     def _take_over(self, facts: Facts, vault: Vault) -> None:
         key = os.urandom(_KEY_OCTETS)
         wrapped = vault.wrap(key, context=self._context())
-        self._key = key
+        self._keyed = _keyed(key)
         with self._store.transaction():
             self._store.put_facts(self.facts(replace(facts, seal_key=wrapped, taken_over=utc_now())))
             counts = self.seal_what_has_none()
@@ -196,7 +197,7 @@ class Seals:
         nodes = [node for node in self._store.nodes() if node.point is not None and node.point_mac is None]
         self._store.put_seals(
             {entry.uuid: entry.mac for entry in entries},
-            {node.uuid: self._mac("node", node.uuid, node.point) for node in nodes},
+            {node.uuid: self._mac("node", (node.uuid, node.point)) for node in nodes},
         )
         return {"trust": trust, "whitelist": len(entries), "nodes": len(nodes), "cas": self._seal_cas()}
 
@@ -227,10 +228,10 @@ class Seals:
     def _context(self) -> bytes:
         return b"TEDS1 seal key\0" + self._store.id.encode()
 
-    def _mac(self, kind: str, *values: str | bytes | None) -> bytes:
-        if self._key is None:
+    def _mac(self, kind: str, values: _Values) -> bytes:
+        if self._keyed is None:
             self.require()
-        assert self._key is not None
+        assert self._keyed is not None
         whole = kind.encode() + b"\0"  # in one piece: there may be 100,000
         for value in values:
             if value is None:  # not the empty text: a length that no value has
@@ -238,10 +239,17 @@ class Seals:
             else:
                 octets = value if isinstance(value, bytes) else value.encode()
                 whole += len(octets).to_bytes(4, "big") + octets
-        return hmac.digest(self._key, whole, "sha256")[:SEAL_OCTETS]
+        mac = self._keyed.copy()
+        mac.update(whole)
+        return mac.digest()[:SEAL_OCTETS]
 
-    def _holds(self, mac: bytes | None, kind: str, *values: str | bytes | None) -> bool:
-        return mac is not None and hmac.compare_digest(mac, self._mac(kind, *values))
+    def _holds(self, mac: bytes | None, kind: str, values: _Values) -> bool:
+        return mac is not None and hmac.compare_digest(mac, self._mac(kind, values))
+
+
+def _keyed(key: bytes) -> hmac.HMAC:
+    """HMAC that has taken its key in: half of what a short one costs, and a handover makes two for each node."""
+    return hmac.new(key, digestmod="sha256")
 
 
 def _facts(facts: Facts) -> _Values:

@@ -91,6 +91,18 @@ class Shown(NamedTuple):
     verdict: str | None
 
 
+class Handed(NamedTuple):
+    """Of one node, what a bundle says beside its link key; as in :class:`NodeRecord`."""
+
+    uuid: bytes
+    point: bytes | None
+    sequence: int
+    profile: str | None
+    name: str | None
+    teds_sha256: str | None
+    groups: tuple[str, ...]
+
+
 @dataclass(frozen=True, slots=True)
 class KeyRecord:
     """One link key of one node, wrapped by the vault; ``key_id`` is 16 hex digits (profile.md, "Key agreement").

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Protocol
 
@@ -83,12 +84,11 @@ class Vault(Protocol):
 
 def node_key_context(store_id: str, uuid: bytes, epoch: int, slot: int) -> bytes:
     """Return what a wrapped node key is bound to: store, node, epoch (u32) and slot (u32)."""
+    return _of_store(store_id) + uuid + epoch.to_bytes(4, "big") + slot.to_bytes(4, "big")
+
+
+@lru_cache(maxsize=4)
+def _of_store(store_id: str) -> bytes:
+    """What is the same for all keys of a store, of which there may be ten thousand."""
     identifier = store_id.encode()
-    return (
-        b"TEDS1 wrapped key\0"
-        + len(identifier).to_bytes(2, "big")
-        + identifier
-        + uuid
-        + epoch.to_bytes(4, "big")
-        + slot.to_bytes(4, "big")
-    )
+    return b"TEDS1 wrapped key\0" + len(identifier).to_bytes(2, "big") + identifier

@@ -12,13 +12,13 @@ import binascii
 import json
 import os
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
+
+from cryptography.exceptions import InvalidTag
+from cryptography.hazmat.primitives.ciphers.aead import AESGCM
 
 from teds_provision.errors import VaultFailure
 from teds_provision.protocol.keys import SoftwareKey
-
-if TYPE_CHECKING:
-    from cryptography.hazmat.primitives.ciphers.aead import AESGCM
 
 MASTER_OCTETS = 32
 _SECRET_OCTETS = 32
@@ -63,8 +63,6 @@ class MasterKeys:
 
     def unwrap(self, wrapped: bytes, *, context: bytes) -> bytes:
         """Open a wrapped key; raises VaultFailure if it is damaged, moved, or of another master key."""
-        from cryptography.exceptions import InvalidTag
-
         head, nonce, sealed = wrapped[:_HEAD_OCTETS], wrapped[_HEAD_OCTETS:][:_NONCE_OCTETS], wrapped[17:]
         if len(sealed) < 16 or head[0] != _VERSION:
             raise VaultFailure("A wrapped key in the store is damaged.", hint=_DAMAGED)
@@ -80,8 +78,6 @@ class MasterKeys:
 
     def _cipher(self, number: int) -> AESGCM:
         """The cipher of one master key, made once: a handover opens ten thousand keys."""
-        from cryptography.hazmat.primitives.ciphers.aead import AESGCM
-
         if number not in self._ciphers:
             self._ciphers[number] = AESGCM(self.keys[number])
         return self._ciphers[number]

@@ -122,8 +122,9 @@ def test_a_copy_for_several_is_closed_by_the_last_receipt(pair: Pair, tmp_path: 
 # -- move -------------------------------------------------------------------------------------------------------------
 
 
-def test_a_handover_is_known_by_the_digest_that_earlier_versions_noted() -> None:
-    nodes = [(bytes([number]) * 10, f"{number:016x}", number) for number in (1, 2, 255)]
+@pytest.mark.parametrize("count", [0, 1, 3, 1001])
+def test_a_handover_is_known_by_the_digest_that_earlier_versions_noted(count: int) -> None:
+    nodes = [(number.to_bytes(10, "big"), f"{number:016x}", number) for number in range(count)]
     said = [
         "ab" * 32,
         ["cd" * 32, "ef" * 32],

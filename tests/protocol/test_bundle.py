@@ -372,12 +372,19 @@ def test_a_bundle_sealed_by_hand_with_a_key_of_no_station_opens_only_in_its_name
 @given(
     st.lists(st.text(st.characters(blacklist_categories=("Cs", "Cc", "Cf", "Zl", "Zp")), max_size=20), min_size=3),
     st.integers(1, LAST_U32),
+    st.binary(min_size=64, max_size=64),
+    st.binary(min_size=16, max_size=16),
 )
-def test_a_node_written_by_hand_is_the_json_that_an_encoder_gives(texts: list[str], epoch: int) -> None:
+def test_a_node_written_by_hand_is_the_json_that_an_encoder_gives(
+    texts: list[str], epoch: int, point: bytes, key: bytes
+) -> None:
     profile, name, *groups = texts
-    node = BundledNode(bytes(10), SoftwareKey(1).point, bytes(16), epoch, 7, profile, name, tuple(groups), None)
+    node = BundledNode(bytes(10), b"\x04" + point, key, epoch, 7, profile, name, tuple(groups), None)
     written = _node_to_json(node)
     members = json.loads(written)
     assert json.dumps(members, separators=(",", ":")) == written
     assert (members["profile"], members["name"], members["groups"]) == (profile, name, groups)
     assert (members["epoch"], members["sequence"], members["teds_sha256"]) == (epoch, 7, None)
+    coordinates = {"x": encode_base64url(point[:32]), "y": encode_base64url(point[32:])}
+    assert members["node_public_key"] == {"kty": "EC", "crv": "P-256", **coordinates}
+    assert members["key"] == {"kty": "oct", "k": encode_base64url(key), "kid": node.kid}

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import hmac
 import shutil
 import sqlite3
 from collections.abc import Callable, Iterator
@@ -83,6 +84,18 @@ def test_an_untouched_store_says_nothing(opened: Open) -> None:
     assert list(station.seals.all_broken()) == []
     assert station.pins.pinned(NODE) == fingerprint(POINT)
     assert {record.name for record in station.policy.trusted()} == {"peer", "owner"}
+
+
+def test_a_seal_is_the_one_that_earlier_versions_made(home: Path, opened: Open) -> None:
+    station = opened()
+    station.unlock()
+    with closing(sqlite3.connect(home / "store.sqlite3")) as database:
+        ((wrapped,),) = database.execute("SELECT seal_key FROM station").fetchall()
+        ((seal,),) = database.execute("SELECT mac FROM whitelist").fetchall()
+    key = station.vault.unwrap(wrapped, context=b"TEDS1 seal key\0" + station.id.encode())
+    values = (NODE, fingerprint(POINT).encode(), b"tap")
+    whole = b"whitelist\0" + b"".join(len(value).to_bytes(4, "big") + value for value in values)
+    assert seal == hmac.digest(key, whole + b"\xff" * 4, "sha256")[:16]  # it has no name
 
 
 @pytest.mark.parametrize("column", ["ca", "point"])

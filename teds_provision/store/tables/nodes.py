@@ -11,7 +11,7 @@ from typing import Any
 
 from teds_provision.errors import NotFound, OtherKey, UsageFailure
 from teds_provision.store.database import PAGE, Database
-from teds_provision.store.records import UUID_OCTETS, NodeRecord, Shown, WhitelistEntry
+from teds_provision.store.records import UUID_OCTETS, Handed, NodeRecord, Shown, WhitelistEntry
 
 _UUID_DIGITS = 2 * UUID_OCTETS
 _MIN_PREFIX = 4
@@ -19,6 +19,7 @@ _SHOWN_CANDIDATES = 5
 NODE_FIELDS = tuple(column.name for column in fields(NodeRecord))
 GROUPS = NODE_FIELDS.index("groups")
 _NODE_COLUMNS = ", ".join(NODE_FIELDS)
+_HANDED_COLUMNS = ", ".join(Handed._fields)
 REPLACE_NODE = f"INSERT OR REPLACE INTO nodes({_NODE_COLUMNS}) VALUES({', '.join('?' * len(NODE_FIELDS))})"
 REPLACE_ENTRY = "INSERT OR REPLACE INTO whitelist VALUES(?, ?, ?, ?, ?, ?)"
 
@@ -86,6 +87,12 @@ class NodeTables:
         places = ", ".join("?" * len(uuids))
         statement = f"SELECT {_NODE_COLUMNS} FROM nodes WHERE uuid IN ({places})"
         return {record.uuid: record for record in self._database.read(_node, statement, uuids)}
+
+    def handed_of(self, uuids: Sequence[bytes]) -> dict[bytes, Handed]:
+        """Return what a bundle says of these nodes (a page of them), by UUID."""
+        places = ", ".join("?" * len(uuids))
+        statement = f"SELECT {_HANDED_COLUMNS} FROM nodes WHERE uuid IN ({places})"
+        return {handed.uuid: handed for handed in self._database.read(_handed, statement, uuids)}
 
     def whitelist_of(self, uuids: Sequence[bytes]) -> dict[bytes, WhitelistEntry]:
         """Return the entries of these nodes (a page of them), by UUID."""
@@ -178,6 +185,11 @@ class NodeTables:
     def all_named(self, name: str) -> list[bytes]:
         """Return the UUIDs of the nodes and whitelist entries that have exactly this name."""
         return sorted(bytes(uuid) for (uuid,) in self._database.execute(*_by_name(name)))
+
+
+def _handed(*row: Any) -> Handed:
+    values: tuple[Any, ...] = (*row[:-1], _groups(row[-1]))
+    return Handed(*values)
 
 
 def _node(*row: Any) -> NodeRecord:
