@@ -110,44 +110,6 @@ def file_of(name: str) -> Path | None:
     return None
 
 
-def circles() -> list[list[str]]:
-    """Files that import each other, imports inside functions and for type checkers counted (Tarjan's algorithm)."""
-    graph = {
-        path: {file_of(name) for name, _ in imports(parsed(path)) if name.startswith("teds_provision")}
-        for path in MODULES
-    }
-    order: dict[Path, int] = {}
-    low: dict[Path, int] = {}
-    stack: list[Path] = []
-    found: list[list[str]] = []
-
-    def visit(path: Path) -> None:
-        order[path] = low[path] = len(order)
-        stack.append(path)
-        for other in graph[path] - {None, path}:
-            assert other is not None
-            if other not in order:
-                visit(other)
-                low[path] = min(low[path], low[other])
-            elif other in stack:
-                low[path] = min(low[path], order[other])
-        if low[path] == order[path]:
-            at = stack.index(path)
-            circle = stack[at:]
-            del stack[at:]
-            if len(circle) > 1:
-                found.append(sorted(map(name_of, circle)))
-
-    for path in MODULES:
-        if path not in order:
-            visit(path)
-    return found
-
-
-def test_no_files_import_each_other() -> None:
-    assert not circles()
-
-
 def test_the_rooms_are_those_of_the_page() -> None:
     assert {room_of(path) for path in MODULES} - {"__init__"} == set(ARROWS)
 

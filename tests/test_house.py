@@ -11,6 +11,7 @@ import sys
 from collections import Counter
 from pathlib import Path
 from types import ModuleType
+from typing import Any
 
 import pytest
 
@@ -41,6 +42,11 @@ def modules(house: ModuleType) -> dict[str, object]:
     return dict(house.modules())
 
 
+def test_no_files_import_each_other(house: ModuleType, modules: dict[str, Any]) -> None:
+    """Imports inside functions and for type checkers count too."""
+    assert not house.circles({name: module.imports for name, module in modules.items()})
+
+
 def test_imports_of_our_own_stand_on_top(house: ModuleType, modules: dict[str, object]) -> None:
     found = Counter(place.rpartition(":")[0] for place in house.late_imports(modules))
     more = [f"{file}: {count}" for file, count in found.items() if count > LATE_IMPORTS.get(file, 0)]
@@ -48,7 +54,6 @@ def test_imports_of_our_own_stand_on_top(house: ModuleType, modules: dict[str, o
 
 
 def test_scripts_of_the_page_import_each_other_one_way(house: ModuleType) -> None:
-    """The circles of Python's files are tests/test_architecture.py's."""
     found = house.scripts()
     assert found["views/node.js"], "the scripts' imports are not read"
     assert house.circles(found) == []

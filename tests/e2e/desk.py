@@ -171,9 +171,10 @@ class Desk:
         """A random UUID of a node that keeps its default address beside the others of this desk."""
         return new_uuid(self.addresses)
 
-    def node(self, name: str = "node", *, uuid: str | None = None, called: str = "") -> Node:
+    def node(self, name: str = "node", *, uuid: str | None = None, called: str = "", type_: str | None = None) -> Node:
         """A new node in factory state, made in this process: what the command does is in tests/node."""
-        made = create(self.folder / name, uuid=bytes.fromhex(uuid) if uuid else self.new_uuid(), name=called)
+        own = bytes.fromhex(uuid) if uuid else self.new_uuid()
+        made = create(self.folder / name, uuid=own, name=called, profile=type_)
         made.release()
         return Node(self, self.folder / name, made.load().uuid.hex())
 

@@ -138,26 +138,24 @@ def another_datasheet(node: Faulty, frame: DataFrame, send: Send) -> None:
 
 def too_fast(node: Faulty) -> None:
     """It samples a quarter faster than it was asked to."""
-
-    class Fast(Stream):
-        @property
-        def next_instant(self) -> int | None:
-            due = super().next_instant
-            return None if due is None or self.start is None else self.start + (due - self.start) * 3 // 4
-
-    _after_subscribe(node, lambda stream: setattr(stream, "__class__", Fast))
+    _at_another_pace(node, 3, 4)
 
 
 def too_slow(node: Faulty) -> None:
     """It samples at half of the rate that it was asked for."""
+    _at_another_pace(node, 2, 1)
 
-    class Slow(Stream):
+
+def _at_another_pace(node: Faulty, times: int, over: int) -> None:
+    """Each period becomes ``times / over`` of what was asked for."""
+
+    class Paced(Stream):
         @property
         def next_instant(self) -> int | None:
             due = super().next_instant
-            return None if due is None or self.start is None else self.start + (due - self.start) * 2
+            return None if due is None or self.start is None else self.start + (due - self.start) * times // over
 
-    _after_subscribe(node, lambda stream: setattr(stream, "__class__", Slow))
+    _after_subscribe(node, lambda stream: setattr(stream, "__class__", Paced))
 
 
 def _after_subscribe(node: Faulty, change: Callable[[Stream], None]) -> None:

@@ -37,11 +37,7 @@ class Bench:
         self.angle = self.gripper if only else self.node("a", ANGLE)
 
     def node(self, name: str, type_: str) -> Node:
-        folder = self.desk.folder / name
-        words = ["--name", name, "--profile", type_, "--uuid", self.desk.new_uuid().hex()]
-        made = self.desk.start("--json", "node", "create", folder, *words).end()
-        assert made.code == 0, made
-        node = Node(self.desk, folder, made.json["uuid"])
+        node = self.desk.node(name, called=name, type_=type_)
         self.power(node)
         calibration = self.desk.folder / f"{name}.csv"
         calibration.write_text(CALIBRATIONS[type_])

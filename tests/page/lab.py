@@ -87,11 +87,7 @@ class Lab:
 
     def create(self, name: str, type_: str) -> Node:
         """A virtual node in factory state, from a transducer type; not powered."""
-        folder = self.desk.folder / name
-        words = ["--name", name, "--profile", type_, "--uuid", self.desk.new_uuid().hex()]
-        made = self.desk.start("--json", "node", "create", folder, *words).end()
-        assert made.code == 0, made
-        node = self.nodes[name] = Node(self.desk, folder, made.json["uuid"])
+        node = self.nodes[name] = self.desk.node(name, called=name, type_=type_)
         return node
 
     def power(self, *names: str, nfc: bool = False, source: str = "ramp:2", more: tuple[str, ...] = ()) -> Running:

@@ -125,6 +125,16 @@ def body_of(data: bytes) -> bytes | None:
     return data[1 : 1 + data[0]]
 
 
+def posing(air: Air, nodes: range, uuid_of: Callable[[int], bytes]) -> Iterator[tuple[int, int, bytes, bool]]:
+    """Answer Identify at these addresses as the node of that UUID; give station, node, data, FD of all else."""
+    for node, station, data, fd in requests(air, nodes):
+        body = body_of(data)
+        if body is not None and body[1:7] == IDENTIFY:
+            whole(air, station, node, body[:1] + identity(uuid_of(node), can_at=node), fd=fd)
+        else:
+            yield station, node, data, fd
+
+
 def always_new(nodes: range, said: list[bytes]) -> Attack:
     """At each of these addresses: a new UUID every time, put into ``said``, and an Announce of it."""
 
@@ -134,12 +144,13 @@ def always_new(nodes: range, said: list[bytes]) -> Attack:
                 for node in nodes[:40]:
                     air.put(0x1CFF0000 | node, bytes([1, 0]) + os.urandom(4) + bytes(2))
 
+        def new(_node: int) -> bytes:
+            said.append(os.urandom(10))
+            return said[-1]
+
         threading.Thread(target=announce, daemon=True).start()
-        for node, station, data, fd in requests(air, nodes):
-            body = body_of(data)
-            if body is not None and body[1:7] == IDENTIFY:
-                said.append(os.urandom(10))
-                whole(air, station, node, body[:1] + identity(said[-1], can_at=node), fd=fd)
+        for _ in posing(air, nodes, new):
+            pass
 
     return attack
 
@@ -149,10 +160,8 @@ def silent_strangers(nodes: range) -> Attack:
     uuids = {node: os.urandom(10) for node in nodes}
 
     def attack(air: Air) -> None:
-        for node, station, data, fd in requests(air, nodes):
-            body = body_of(data)
-            if body is not None and body[1:7] == IDENTIFY:
-                whole(air, station, node, body[:1] + identity(uuids[node], can_at=node), fd=fd)
+        for _ in posing(air, nodes, uuids.__getitem__):
+            pass
 
     return attack
 
@@ -161,11 +170,9 @@ def copy_cat(node: int, uuid: bytes, *, mute: bool = True) -> Attack:
     """Says that it is another one's node, and knows nothing else."""
 
     def attack(air: Air) -> None:
-        for _, station, data, fd in requests(air, range(node, node + 1)):
+        for station, _, data, fd in posing(air, range(node, node + 1), lambda _: uuid):
             body = body_of(data)
-            if body is not None and body[1:7] == IDENTIFY:
-                whole(air, station, node, body[:1] + identity(uuid, can_at=node), fd=fd)
-            elif body is not None and not mute:
+            if body is not None and not mute:
                 whole(air, station, node, body[:1] + bytes([0, 0, 1, 16]), fd=fd)
 
     return attack
@@ -183,11 +190,9 @@ def waits_for_ever(node: int, uuid: bytes) -> Attack:
                     air.to(station, node, padded(bytes([0x31, 16, 0]), False))
 
         threading.Thread(target=wait, daemon=True).start()
-        for _, station, data, fd in requests(air, range(node, node + 1)):
+        for station, _, data, fd in posing(air, range(node, node + 1), lambda _: uuid):
             body = body_of(data)
-            if body is not None and body[1:7] == IDENTIFY:
-                whole(air, station, node, body[:1] + identity(uuid, can_at=node), fd=fd)
-            elif data[0] >> 4 == 1:
+            if data[0] >> 4 == 1:
                 asked.add(station)
             elif body is not None:
                 whole(air, station, node, body[:1] + b"\1\0\x08" + bytes(8), fd=fd)

@@ -171,7 +171,7 @@ class Line:
         if self.swallow and body[1] == 0x42:
             self.swallow = False
             return
-        self._write(_framed(b"\x7f" if answer is None else bytes((0xD5, body[1] + 1)) + answer))
+        self._write(framed(b"\x7f" if answer is None else bytes((0xD5, body[1] + 1)) + answer))
         if body[1] == 0x10 and body[2] < len(_BAUD):  # SetSerialBaudRate counts from the next command on
             self.chip.baud = _BAUD[body[2]]
 
@@ -191,7 +191,7 @@ def _words(data: bytes, size: int) -> list[int]:
     return [int.from_bytes(data[at : at + size], "big") for at in range(0, len(data), size)]
 
 
-def _framed(body: bytes) -> bytes:
+def framed(body: bytes) -> bytes:
     size = len(body)
     short = bytes((size, -size & 255)) if size < 256 else b""
     head = short or b"\xff\xff" + size.to_bytes(2, "big") + bytes((-(size >> 8) - (size & 255) & 255,))

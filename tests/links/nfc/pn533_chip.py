@@ -15,6 +15,8 @@ from typing import Any
 import nfc.clf.device
 import pytest
 
+from tests.links.nfc.pn532_chip import framed
+
 ACK = bytes.fromhex("0000ff00ff00")
 IDS = (0x04E6, 0x5591)
 
@@ -110,13 +112,4 @@ class Transport:
         answer = self.chip.run(data[1], data[2:])
         self._answers.append(bytearray(ACK))
         if answer is not None:
-            self._answers.append(_framed(bytes((0xD5, data[1] + 1)) + answer))
-
-
-def _framed(body: bytes) -> bytearray:
-    size = len(body)
-    if size < 256:
-        head = bytes((size, 256 - size & 255))
-    else:
-        head = b"\xff\xff" + size.to_bytes(2, "big") + bytes((-(size >> 8) - (size & 255) & 255,))
-    return bytearray(b"\0\0\xff" + head + body + bytes((-sum(body) & 255, 0)))
+            self._answers.append(bytearray(framed(bytes((0xD5, data[1] + 1)) + answer)))

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import os
 import signal
+import time
 from collections.abc import Iterable
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -13,6 +15,7 @@ from hypothesis import strategies as st
 from teds_provision.measure.blocks import Block, ChannelFacts, GroupRows, NodeReport, StationFacts
 from teds_provision.measure.sinks import Sink
 from teds_provision.measure.sinks.ros.child import ChildSink
+from teds_provision.teds.units.units import parse_units
 from tests.pace import until
 
 ARM = "8d4d9da65281f7000001"
@@ -34,6 +37,13 @@ ANGLE = ChannelFacts(
     period=0.01,
 )
 FORCE = ChannelFacts(HAND, "hand", 2, "force", unit="N", uncertainty=0.1, fingerprint="cd" * 32, period=0.01)
+OIL = replace(FORCE, number=3, name="oil", unit="K", units=parse_units("K"), uncertainty=0.3)
+GRIP = replace(FORCE, kind="actuator")
+DISTANCE = replace(ANGLE, number=7, name="range finder", unit="m", units=parse_units("m"), low=0.25, high=8.0)
+AXES = [
+    replace(ANGLE, number=n, name=f"axis {n}", units=parse_units("m/s^2"), uncertainty=0.3, vector=(4, 5, 6))
+    for n in (4, 5, 6)
+]
 STATION = StationFacts("bench", group="crane", started=1_795_000_000.0)
 
 
@@ -105,6 +115,15 @@ def fill(sink: Sink, items: Iterable[Block | GroupRows | NodeReport | list[Chann
             sink.describe(item)
     sink.close()
     assert sink.stats.error == ""
+
+
+def feed_robot(sink: Sink, k: int) -> None:
+    """Row ``k`` of everything: an angle, a distance and an acceleration of the arm, oil and force of the hand."""
+    sink.write(block([[10]], index=k, start=time.time()))
+    sink.write(replace(block([[1, 2, 3, 4]], channels=(4, 5, 6, 7), index=k, start=time.time()), stream=1))
+    sink.write(block([[7, 5]], [[293.15, 0.5]], uuid=HAND, channels=(3, 2), index=k, start=time.time()))
+    row = np.array([[1.0, np.nan]])
+    sink.write_group(GroupRows("crane", ((ARM, 1), (HAND, 3)), np.array([12.25 + k]), row, row * 0))
 
 
 def kill_child(sink: ChildSink) -> None:

@@ -15,21 +15,27 @@ import numpy as np
 import pytest
 from rosbags.typesys import Stores, get_typestore
 
-from teds_provision.measure.blocks import ChannelFacts, Command, GroupRows, NodeReport
+from teds_provision.measure.blocks import ChannelFacts, Command, NodeReport
 from teds_provision.measure.sinks import open_sink
 from teds_provision.measure.sinks.ros import sourced
 from teds_provision.measure.sinks.ros.ros2 import Ros2Sink
 from teds_provision.measure.sinks.ros.sourced import RclpySink
-from teds_provision.teds.units.units import parse_units
-from tests.measure.sinks.parts import ANGLE, ARM, FORCE, HAND, STATION, block, kill_child
+from tests.measure.sinks.parts import (
+    ANGLE,
+    ARM,
+    AXES,
+    DISTANCE,
+    GRIP,
+    HAND,
+    OIL,
+    STATION,
+    feed_robot,
+    kill_child,
+)
 from tests.pace import until
 
 STANDIN = Path(__file__).with_name("rclpy_standin")
 STORE = get_typestore(Stores.ROS2_JAZZY)
-GRIP = replace(FORCE, kind="actuator")
-OIL = replace(FORCE, number=3, name="oil", unit="K", units=parse_units("K"), uncertainty=0.3)
-DISTANCE = replace(ANGLE, number=7, name="range finder", unit="m", units=parse_units("m"), low=0.25, high=8.0)
-AXES = [replace(ANGLE, number=n, name=f"axis {n}", units=parse_units("m/s^2"), vector=(4, 5, 6)) for n in (4, 5, 6)]
 
 
 @dataclass
@@ -89,11 +95,7 @@ def test_every_message_has_the_fields_and_types_of_ros_2(ros: Sourced) -> None:
     while not (all(ros.last(f"/bench/arm/{one}") for one in topics) and ros.last("/bench/crane")):
         k += 1
         assert k < 1200, sink.stats
-        sink.write(block([[10]], index=k, start=time.time()))
-        sink.write(replace(block([[1, 2, 3, 4]], channels=(4, 5, 6, 7), index=k, start=time.time()), stream=1))
-        sink.write(block([[7, 5]], [[293.15, 0.5]], uuid=HAND, channels=(3, 2), index=k, start=time.time()))
-        row = np.array([[1.0, np.nan]])
-        sink.write_group(GroupRows("crane", ((ARM, 1), (HAND, 3)), np.array([12.25 + k]), row, row * 0))
+        feed_robot(sink, k)
         time.sleep(0.05)
     (ros.folder / "commands").write_text("/bench/hand/force/cmd 1.25\n")
     command = came.get(timeout=60)

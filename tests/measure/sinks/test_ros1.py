@@ -19,7 +19,7 @@ from teds_provision.measure.sinks import open_sink
 from teds_provision.measure.sinks.ros import ros1_child
 from teds_provision.measure.sinks.ros.ros1 import Ros1Sink
 from teds_provision.teds.units.units import parse_units
-from tests.measure.sinks.parts import ANGLE, ARM, FORCE, HAND, STATION, block, kill_child
+from tests.measure.sinks.parts import ANGLE, ARM, FORCE, GRIP, HAND, OIL, STATION, block, kill_child
 from tests.pace import until
 from tests.places import free_tcp_port
 
@@ -28,8 +28,6 @@ pytestmark = [
     pytest.mark.skipif(not Path("/usr/bin/rosmaster").exists(), reason="python3-rosmaster is not installed"),
     pytest.mark.skipif(not Path("/usr/bin/rostopic").exists(), reason="python3-rostopic is not installed"),
 ]
-OIL = replace(FORCE, number=3, name="oil", unit="K", units=parse_units("K"), uncertainty=0.3)
-GRIP = replace(FORCE, kind="actuator")
 
 
 class Master:

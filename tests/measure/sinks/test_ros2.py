@@ -10,7 +10,6 @@ import subprocess
 import threading
 import time
 from collections.abc import Iterator
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -19,23 +18,15 @@ import pytest
 from rosbags.typesys import Stores, get_typestore
 
 from teds_provision.errors import UsageFailure
-from teds_provision.measure.blocks import Command, GroupRows
+from teds_provision.measure.blocks import Command
 from teds_provision.measure.sinks import open_sink
 from teds_provision.measure.sinks.ros.ros2_types import HUMBLE_HASHES, TYPE_HASHES
-from teds_provision.teds.units.units import parse_units
-from tests.measure.sinks.parts import ANGLE, ARM, FORCE, HAND, STATION, block
+from tests.measure.sinks.parts import ANGLE, AXES, DISTANCE, GRIP, HAND, OIL, STATION, feed_robot
 from tests.pace import succeeds, until
 from tests.places import ros_domain
 
 HEADER = Path("/usr/include/fastdds/dds/domain/DomainParticipant.hpp")
 SOURCE = Path(__file__).with_name("fastdds_reader.cpp")
-OIL = replace(FORCE, number=3, name="oil", unit="K", units=parse_units("K"), uncertainty=0.3)
-GRIP = replace(FORCE, kind="actuator")
-AXES = [
-    replace(ANGLE, number=n, name=f"axis {n}", units=parse_units("m/s^2"), uncertainty=0.3, vector=(4, 5, 6))
-    for n in (4, 5, 6)
-]
-DISTANCE = replace(ANGLE, number=7, name="range finder", unit="m", units=parse_units("m"), low=0.25, high=8.0)
 LATER = [Stores.ROS2_IRON, Stores.ROS2_JAZZY, Stores.ROS2_KILTED, Stores.ROS2_LYRICAL]
 
 needs_fastdds = [
@@ -130,13 +121,7 @@ class TestSeenByFastDds:
             k = 0
             while not (all(seen.samples(name) for name in names) and not came.empty()):
                 assert time.monotonic() < end, [name for name in names if not seen.samples(name)]
-                sink.write(block([[10]], index=k, start=time.time()))
-                axes = block([[1, 2, 3, 4]], channels=(4, 5, 6, 7), index=k, start=time.time())
-                sink.write(replace(axes, stream=1))
-                values = [[293.15, 0.5]]
-                sink.write(block([[7, 5]], values, uuid=HAND, channels=(3, 2), index=k, start=time.time()))
-                row = np.array([[1.0, np.nan]])
-                sink.write_group(GroupRows("crane", ((ARM, 1), (HAND, 3)), np.array([12.25 + k]), row, row * 0))
+                feed_robot(sink, k)
                 time.sleep(0.05)
                 k += 1
         finally:
