@@ -23,7 +23,7 @@ def test_an_ended_demo_takes_its_node_and_its_folder_away(tmp_path: Path, number
         env=clean_environment(TMPDIR=str(tmp_path)),
     )
     try:
-        until = time.monotonic() + 30
+        until = time.monotonic() + 60
         while not list(tmp_path.glob("*/node-flash/lock")):  # the node runs
             assert time.monotonic() < until
             assert process.poll() is None

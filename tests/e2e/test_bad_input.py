@@ -115,7 +115,7 @@ def test_a_tag_that_is_no_node_is_named_and_left_alone(station: Station) -> None
     tag = station.desk.start(json.dumps(options), program=ANOTHER_TAG)
     tag.wait_for("ready")
     with unchanged(station):
-        outcome = station.run("provision", "--profile", ANGLE, "--yes", *links.over("nfc"), "--timeout", "3")
+        outcome = station.run("provision", "--profile", ANGLE, "--yes", *links.over("nfc"), "--timeout", "6")
         assert outcome.code == 5
         assert "02112233445566" in outcome.err
         assert "not" in outcome.err

@@ -133,6 +133,7 @@ def test_a_station_without_topics_says_that_it_takes_no_set_points(browser: Brow
         assert not page.get_by_label("Topics may move its actuators").is_visible(), "it has none"
 
 
+@pytest.mark.realtime
 def test_an_actuator_moves_while_it_is_held_and_the_node_says_that_it_is_safe(browser: Browser, lab: Lab) -> None:
     with opened(browser, lab, route=f"nodes/{lab.nodes['hand'].uuid}/live") as page:
         hold = page.get_by_role("button", name="Hold to move")
@@ -165,6 +166,7 @@ def test_an_actuator_moves_while_it_is_held_and_the_node_says_that_it_is_safe(br
         page.get_by_role("alert").filter(has_text="beyond the limits").wait_for()
 
 
+@pytest.mark.realtime
 def test_whoever_closes_the_page_lets_go_of_the_actuator(browser: Browser, lab: Lab) -> None:
     with opened(browser, lab, route=f"nodes/{lab.nodes['hand'].uuid}/live") as page:
         page.get_by_role("spinbutton", name="Value, mm").fill("30")

@@ -12,7 +12,7 @@ from .load import run
 if TYPE_CHECKING:
     from playwright.sync_api import Browser
 
-pytestmark = pytest.mark.system
+pytestmark = [pytest.mark.system, pytest.mark.realtime]
 
 
 def test_twenty_channels_at_100_hz_lose_nothing_that_is_not_told_and_need_no_more_memory(

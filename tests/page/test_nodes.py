@@ -94,6 +94,7 @@ def test_a_browser_whose_token_was_removed_is_told_how_to_sign_in(browser: Brows
         page.locator("#connection", has_text="Live").wait_for()
 
 
+@pytest.mark.realtime
 @pytest.mark.parametrize("how", [signal.SIGKILL, signal.SIGSTOP], ids=["killed", "frozen"])
 def test_a_lost_connection_is_seen_within_two_seconds_and_healed(
     browser: Browser, fresh: Lab, how: signal.Signals

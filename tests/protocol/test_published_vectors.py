@@ -261,7 +261,7 @@ def test_nfc_messages_as_published(document: Entry, entry: Entry) -> None:
 
     tag = TnepTag(mailbox, TagHandler(node(entry["name"], entry["state"])), wt_int=20, n_wait=15)
     tag.start()
-    shown = [mailbox.shown.get(timeout=10)]
+    shown = [mailbox.shown.get(timeout=60)]
     for step in entry["steps"]:
         assert len(step["message"]) // 2 <= entry["max_ndef"]
         if step["by"] == "station":
@@ -404,9 +404,9 @@ def test_a_node_on_a_bus_answers_the_published_functional_identify() -> None:
                     data = bytes.fromhex(step["data"])
                     bus.send(can.Message(arbitration_id=int(step["id"], 16), data=data, is_extended_id=True))
                 else:
-                    got = bus.recv(timeout=5)
+                    got = bus.recv(timeout=60)
                     while got is not None and got.arbitration_id >> 8 == 0x1CFF00:  # its Announce, whenever it comes
-                        got = bus.recv(timeout=5)
+                        got = bus.recv(timeout=60)
                     assert got is not None
                     assert (f"{got.arbitration_id:08x}", bytes(got.data).hex()) == (step["id"], step["data"])
     finally:

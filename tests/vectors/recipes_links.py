@@ -59,7 +59,7 @@ class Mailbox:
     def write(self, octets: bytes) -> bytes:
         """The reader writes a message; returns the next one that is not empty."""
         self.written(octets)
-        return self.shown.get(timeout=10)
+        return self.shown.get(timeout=60)
 
 
 class TagHandler:
@@ -93,9 +93,9 @@ class Tap:
         self.mailbox = Mailbox(max_ndef)
         self.tag = TnepTag(self.mailbox, TagHandler(node(name, state)), wt_int=20, n_wait=15)
         self.tag.start()
-        initial = self.mailbox.shown.get(timeout=10)
+        initial = self.mailbox.shown.get(timeout=60)
         self.tag.activated()
-        initial = self.mailbox.shown.get(timeout=10)
+        initial = self.mailbox.shown.get(timeout=60)
         self._node(initial, "Initial message: the Tp record, then the id record with the payload of Identify.")
 
     def _node(self, octets: bytes, note: str) -> None:
