@@ -42,13 +42,6 @@ HIGHEST = 0xFFFFFFFF
 
 
 @pytest.fixture
-def pair(tmp_path: Path) -> Iterator[Pair]:
-    made = Pair.make(tmp_path)
-    yield made
-    made.close()
-
-
-@pytest.fixture
 def west(pair: Pair, tmp_path: Path) -> Iterator[Station]:
     """A third station; north and west trust each other."""
     made = make_station(tmp_path / "west", "west")

@@ -9,6 +9,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+import pytest
 from cryptography.exceptions import InvalidTag
 from cryptography.hazmat.primitives import hashes
 from cryptography.hazmat.primitives.asymmetric import ec
@@ -40,6 +41,12 @@ def entries(*names: str) -> Iterator[tuple[str, Entry, Entry]]:
         document = load(name)
         for entry in document["entries"]:
             yield f"{name}-{entry['name']}", document, entry
+
+
+def cases(*names: str) -> pytest.MarkDecorator:
+    """A test with every entry of these files, and its file."""
+    found = list(entries(*names))
+    return pytest.mark.parametrize(("document", "entry"), [pytest.param(d, e, id=i) for i, d, e in found])
 
 
 def flash_of(document: Entry, state: Entry) -> Flash:

@@ -8,49 +8,20 @@ import stat
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from teds_provision.errors import NotFound, StoreFailure, UsageFailure, VaultFailure, WrongPassphrase
+from teds_provision.errors import StoreFailure, UsageFailure, VaultFailure, WrongPassphrase
 from teds_provision.protocol.keys import SoftwareKey, verify
-from teds_provision.store import KeyRecord, Store
-from teds_provision.vault import create_vault, forget_vaults, node_key_context, open_vault
+from teds_provision.vault import create_vault, open_vault
 from teds_provision.vault.file_vault import FileVault
-from teds_provision.vault.master import MasterKeys, Material
+from teds_provision.vault.master import Material
 from teds_provision.vault.passphrase import PRODUCT, THROWAWAY
 from tests.pace import costs_at_most
-
-GOOD = "four random words here"
-STORE = "5e" * 16
-NODE = bytes(range(10))
-
-
-class Person:
-    """Someone at the terminal: answers with one passphrase and remembers what was asked."""
-
-    def __init__(self, passphrase: str = GOOD) -> None:
-        self.passphrase = passphrase
-        self.asked: list[tuple[str, bool]] = []
-
-    def __call__(self, prompt: str, confirm: bool) -> str:
-        self.asked.append((prompt, confirm))
-        return self.passphrase
-
-
-@pytest.fixture(autouse=True)
-def _locked_again() -> Iterator[None]:
-    forget_vaults()
-    yield
-    forget_vaults()
-
-
-@pytest.fixture
-def vault(tmp_path: Path) -> FileVault:
-    return FileVault.create(tmp_path, STORE, Person(), costs=THROWAWAY)
+from tests.vault.passphrase import GOOD, STORE, Person
 
 
 def test_the_keys_come_back_with_the_passphrase(tmp_path: Path, vault: FileVault) -> None:
@@ -168,78 +139,6 @@ def test_a_new_passphrase_replaces_the_old(tmp_path: Path, vault: FileVault) -> 
     assert again.identity().point == vault.identity().point
 
 
-def test_the_ca_key_can_be_kept_away_and_brought_back(tmp_path: Path, vault: FileVault) -> None:
-    ca = vault.ca()
-    assert ca is not None
-    away = tmp_path / "ca.pem"
-    vault.export_ca(away, "a passphrase for the safe")
-    assert stat.S_IMODE(away.stat().st_mode) == 0o600
-    assert vault.drop_ca()
-    assert not vault.drop_ca()
-    assert FileVault.open(tmp_path, STORE, Person()).ca() is None
-    with pytest.raises(VaultFailure, match="no CA key"):
-        vault.export_ca(tmp_path / "other.pem", "a passphrase for the safe")
-    with pytest.raises(WrongPassphrase):
-        vault.import_ca(away, "not that passphrase")
-    assert vault.ca() is None
-    assert vault.import_ca(away, "a passphrase for the safe").point == ca.point
-    reopened = FileVault.open(tmp_path, STORE, Person()).ca()
-    assert reopened is not None
-    assert reopened.point == ca.point
-
-
-def test_openssl_opens_the_exported_ca_key(tmp_path: Path, vault: FileVault) -> None:
-    away = tmp_path / "ca.pem"
-    vault.export_ca(away, "a passphrase for the safe")
-    command = ["openssl", "pkey", "-in", str(away), "-passin", "stdin", "-pubout", "-outform", "DER"]
-    try:
-        run = subprocess.run(command, input=b"a passphrase for the safe\n", capture_output=True, check=False)
-    except FileNotFoundError:
-        pytest.skip("no openssl on this machine")
-    ca = vault.ca()
-    assert ca is not None
-    assert run.stdout[-65:] == ca.point
-    wrong = subprocess.run(command, input=b"wrong\n", capture_output=True, check=False)
-    assert wrong.returncode != 0
-
-
-def test_an_export_never_overwrites_and_never_takes_a_weak_passphrase(tmp_path: Path, vault: FileVault) -> None:
-    taken = tmp_path / "ca.pem"
-    taken.write_text("precious")
-    with pytest.raises(VaultFailure, match="exists already"):
-        vault.export_ca(taken, "a passphrase for the safe")
-    assert taken.read_text() == "precious"
-    with pytest.raises(VaultFailure, match="too short"):
-        vault.export_ca(tmp_path / "new.pem", "short")
-    assert not (tmp_path / "new.pem").exists()
-
-
-def test_what_is_no_ca_file_is_refused(tmp_path: Path, vault: FileVault) -> None:
-    with pytest.raises(NotFound):
-        vault.import_ca(tmp_path / "nowhere.pem", GOOD)
-    (tmp_path / "letter.pem").write_text("dear aunt")
-    with pytest.raises(VaultFailure, match="no encrypted private key"):
-        vault.import_ca(tmp_path / "letter.pem", GOOD)
-    (tmp_path / "torn.pem").write_text(
-        "-----BEGIN ENCRYPTED PRIVATE KEY-----\nMIIB\n-----END ENCRYPTED PRIVATE KEY-----\n"
-    )
-    with pytest.raises(VaultFailure):
-        vault.import_ca(tmp_path / "torn.pem", GOOD)
-
-
-def test_another_ca_key_does_not_replace_the_one_that_is_there(tmp_path: Path, vault: FileVault) -> None:
-    other = tmp_path / "other"
-    other.mkdir()
-    FileVault.create(other, STORE, Person(), costs=THROWAWAY).export_ca(tmp_path / "ca.pem", GOOD)
-    before = vault.ca()
-    with pytest.raises(VaultFailure, match="another CA key"):
-        vault.import_ca(tmp_path / "ca.pem", GOOD)
-    after = vault.ca()
-    assert before is not None
-    assert after is not None
-    assert after.point == before.point
-
-
 def test_every_flipped_octet_of_the_file_is_noticed(tmp_path: Path, vault: FileVault) -> None:
     path = tmp_path / "vault.json"
     good = path.read_bytes()
@@ -349,102 +248,6 @@ def test_a_full_disk_leaves_the_vault_as_it_was(tmp_path: Path, vault: FileVault
     assert "cannot be written" in run.stdout
     assert [path.name for path in tmp_path.iterdir()] == ["vault.json"]
     assert (tmp_path / "vault.json").read_bytes() == before
-
-
-def test_a_wrapped_key_opens_only_in_its_own_place(vault: FileVault) -> None:
-    key = bytes(range(16))
-    place = node_key_context(STORE, NODE, 3, 1)
-    wrapped = vault.wrap(key, context=place)
-    assert key not in wrapped
-    assert vault.unwrap(wrapped, context=place) == key
-    for moved in (
-        node_key_context("77" * 16, NODE, 3, 1),
-        node_key_context(STORE, bytes(10), 3, 1),
-        node_key_context(STORE, NODE, 4, 1),
-        node_key_context(STORE, NODE, 3, 2),
-        b"",
-    ):
-        with pytest.raises(VaultFailure):
-            vault.unwrap(wrapped, context=moved)
-
-
-def test_every_flipped_bit_of_a_wrapped_key_is_noticed(vault: FileVault) -> None:
-    wrapped = vault.wrap(bytes(16), context=b"c")
-    for bit in range(8 * len(wrapped)):
-        torn = bytearray(wrapped)
-        torn[bit // 8] ^= 1 << bit % 8
-        with pytest.raises(VaultFailure):
-            vault.unwrap(bytes(torn), context=b"c")
-    for length in range(len(wrapped)):
-        with pytest.raises(VaultFailure):
-            vault.unwrap(wrapped[:length], context=b"c")
-
-
-def test_the_same_key_is_never_wrapped_alike(vault: FileVault) -> None:
-    assert len({vault.wrap(bytes(16), context=b"c") for _ in range(100)}) == 100
-
-
-@given(key=st.binary(max_size=64), context=st.binary(max_size=64))
-def test_wrapping_goes_both_ways(key: bytes, context: bytes) -> None:
-    masters = MasterKeys.generate()
-    assert masters.unwrap(masters.wrap(key, context=context), context=context) == key
-    assert masters.with_new().unwrap(masters.wrap(key, context=context), context=context) == key
-
-
-@given(st.integers(0, 2**32 - 1), st.integers(0, 2**32 - 1), st.binary(min_size=10, max_size=10))
-def test_no_two_places_share_a_context(epoch: int, slot: int, uuid: bytes) -> None:
-    context = node_key_context(STORE, uuid, epoch, slot)
-    assert context.endswith(uuid + epoch.to_bytes(4, "big") + slot.to_bytes(4, "big"))
-    assert context != node_key_context(STORE + "0", uuid, epoch, slot)
-
-
-def test_a_master_change_cut_at_any_point_keeps_every_key(tmp_path: Path, vault: FileVault) -> None:
-    key = bytes(range(16))
-
-    def place(record: KeyRecord) -> bytes:
-        return node_key_context(STORE, record.uuid, record.epoch, record.slot)
-
-    with Store.open(tmp_path / "home", create=True) as store:
-        for number in range(3):
-            blank = KeyRecord(NODE, number, f"{number:016x}", "pending", number, b"")
-            store.add_key(
-                KeyRecord(NODE, number, f"{number:016x}", "pending", number, vault.wrap(key, context=place(blank)))
-            )
-
-        def all_open(with_vault: FileVault) -> bool:
-            return all(with_vault.unwrap(record.wrapped, context=place(record)) == key for record in store.all_keys())
-
-        def rewrap(record: KeyRecord) -> bytes:
-            opened = vault.unwrap(record.wrapped, context=place(record))
-            return vault.wrap(opened, context=place(record))
-
-        vault.add_master()
-        assert all_open(FileVault.open(tmp_path, STORE, Person()))
-        store.replace_keys(rewrap)
-        assert all_open(FileVault.open(tmp_path, STORE, Person()))
-        vault.retire_masters()
-        vault.retire_masters()
-        assert all_open(FileVault.open(tmp_path, STORE, Person()))
-        assert list(vault._material.masters.keys) == [2]
-
-
-def test_the_secret_line_fits_every_keyring_and_goes_both_ways() -> None:
-    material = Material.generate()
-    material = Material(material.identity, material.ca, material.masters.with_new().with_new())
-    line = material.encode()
-    assert line.isascii()
-    assert line.isprintable()
-    assert len(line) < 1280
-    assert Material.decode(line) == material
-    assert Material.decode(material.with_ca(None).encode()).ca is None
-
-
-@given(
-    st.text(max_size=200) | st.binary(max_size=100).map(lambda b: "teds1:" + __import__("base64").b64encode(b).decode())
-)
-def test_no_secret_line_raises_anything_foreign(line: str) -> None:
-    with pytest.raises(VaultFailure):
-        Material.decode(line)
 
 
 def test_a_backup_brings_the_station_to_another_home(tmp_path: Path, vault: FileVault) -> None:

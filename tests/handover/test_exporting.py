@@ -1,0 +1,137 @@
+"""What leaves in a bundle, how often, and what is not handed over."""
+
+from __future__ import annotations
+
+import json
+import stat
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+
+import pytest
+
+from teds_provision.errors import NotFound, PolicyRefused, UsageFailure
+from teds_provision.handover.export_keys import plan_export
+from teds_provision.handover.import_keys import ImportPlan, plan_import
+from teds_provision.handover.pending import close, find_handover, undo
+from teds_provision.handover.selection import ExportOrder
+from teds_provision.protocol.handover.bundle import open_bundle
+from tests.bench import Board, make_station
+from tests.handover.desk import Pair, everything, key_up, provisioned, session, trust
+
+
+@pytest.mark.parametrize("mode", ["copy", "move"])
+@pytest.mark.parametrize("named", [True, False])
+def test_the_same_export_again_is_the_same_handover(pair: Pair, mode: str, named: bool) -> None:
+    nodes = (pair.board.uuid,) if named else None
+    path, first = pair.export(mode, nodes=nodes)  # type: ignore[arg-type]
+    _, finished = pair.export(mode, nodes=nodes, output=path)  # type: ignore[arg-type]
+    assert (finished.fresh, finished.plan.id, finished.sha256) == (False, first.plan.id, first.sha256)
+    other, again = pair.export(mode, nodes=nodes)  # type: ignore[arg-type]
+    assert (again.fresh, again.plan.id) == (True, first.plan.id)
+    taken = pair.take(path)
+    assert pair.take(other).receipt == taken.receipt
+    assert close(pair.north, taken.receipt).fresh
+
+
+def test_a_bundle_file_is_private_and_never_overwritten(pair: Pair) -> None:
+    path, _ = pair.export("copy")
+    assert stat.S_IMODE(path.stat().st_mode) == 0o600
+    occupied = pair.folder / "occupied"
+    occupied.write_text("a letter")
+    with pytest.raises(UsageFailure, match="exists already"):
+        pair.export("move", output=occupied)
+    assert occupied.read_text() == "a letter"
+    assert pair.north.policy.tombstones() == []
+
+
+def test_no_key_in_the_clear_anywhere(pair: Pair) -> None:
+    path, exported = pair.export("copy")
+    taken = pair.take(path)
+    key = pair.board.state.key
+    assert key is not None
+    import base64
+
+    spellings = {key, key.hex().encode(), base64.b64encode(key)[:21], base64.urlsafe_b64encode(key)[:21]}
+    files = [file for file in pair.folder.rglob("*") if file.is_file()]
+    assert len(files) >= 5
+    for file in files:
+        assert not any(spelling in file.read_bytes() for spelling in spellings), file
+    shown = repr((exported, taken, plan_import(pair.south, path.read_bytes()))).encode()
+    assert not any(spelling in shown for spelling in spellings)
+
+
+def test_only_a_proven_key_is_handed_over(pair: Pair) -> None:
+    other = Board(uuid=bytes.fromhex("8d4d9da65281f700ffff"))
+    pair.take(pair.export("copy")[0])
+    trust(pair.south, pair.north)
+    with pytest.raises(PolicyRefused, match="never proven"):
+        plan_export(pair.south, ExportOrder(("north",), (pair.board.uuid,)))
+    with pytest.raises(PolicyRefused, match="no key of it is held"):
+        plan_export(pair.north, ExportOrder(("south",), (other.uuid,)))
+    with pytest.raises(NotFound):
+        plan_export(pair.south, ExportOrder(("north",), None))
+
+
+def test_a_key_that_is_due_for_rotation_is_not_handed_over(pair: Pair) -> None:
+    _, exported = pair.export("move")
+    undo(pair.north, find_handover(pair.north, exported.plan.id))
+    with pytest.raises(PolicyRefused, match="must be rotated first"):
+        plan_export(pair.north, ExportOrder(("south",), (pair.board.uuid,)))
+
+
+def test_a_moved_node_is_not_handed_to_someone_else(pair: Pair, tmp_path: Path) -> None:
+    pair.export("move")
+    west = make_station(tmp_path / "west", "west")
+    trust(pair.north, west)
+    for mode in ("copy", "move"):
+        with pytest.raises(PolicyRefused, match="was moved to station"):
+            plan_export(pair.north, ExportOrder(("west",), (pair.board.uuid,), mode))  # type: ignore[arg-type]
+    west.close()
+
+
+def test_without_the_ca_key_the_receiver_must_be_certified_already(pair: Pair) -> None:
+    signature = pair.north.identity.certify(pair.south.point)
+    pair.north.vault.drop_ca()  # type: ignore[attr-defined]
+    with pytest.raises(PolicyRefused, match="not certified by the CA"):
+        pair.export("copy")
+    pair.north.identity.keep_certificate(pair.north.ca, pair.south.point, signature)
+    pair.take(pair.export("copy")[0])
+    assert provisioned(pair.south, pair.board).verified.verdict == "authentic"
+
+
+def test_nodes_of_two_cas_go_in_two_bundles(pair: Pair) -> None:
+    pair.take(pair.export("copy")[0])
+    session(pair.south, pair.board)
+    own = Board(uuid=bytes.fromhex("8d4d9da65281f700ffff"))
+    key_up(pair.south, own)
+    with pytest.raises(PolicyRefused, match="2 different CA keys"):
+        plan_export(pair.south, ExportOrder(("north",), None))
+    from teds_provision.protocol.keys import fingerprint
+
+    plan = plan_export(pair.south, ExportOrder(("north",), None, ca=fingerprint(pair.north.ca)[:16]))
+    assert [node.uuid for node in plan.nodes] == [pair.board.uuid]
+
+
+def test_a_plan_changes_nothing(pair: Pair) -> None:
+    before = everything(pair.north)
+    plan_export(pair.north, ExportOrder(("south",), None, "move"))
+    assert everything(pair.north) == before
+    path, _ = pair.export("copy")
+    before = everything(pair.south)
+    assert isinstance(plan_import(pair.south, path.read_bytes()), ImportPlan)
+    assert everything(pair.south) == before
+
+
+def test_the_bundle_says_what_the_profile_lists(pair: Pair) -> None:
+    provisioned(pair.north, pair.board)
+    path, _exported = pair.export("copy")
+    keys = {pair.north.fingerprint: pair.north.point}
+    opened = open_bundle(path.read_bytes(), pair.south.vault.identity(), keys.get, datetime.now(UTC))
+    (node,) = opened.bundle.nodes
+    record = pair.north.nodes.get(pair.board.uuid)
+    assert record is not None
+    assert (node.uuid, node.node_key, node.key) == (pair.board.uuid, pair.board.key.point, pair.board.state.key)
+    assert (node.epoch, node.sequence, node.teds_sha256) == (1, 1, record.teds_sha256)
+    assert opened.bundle.expires - opened.bundle.created == timedelta(days=7)
+    assert opened.station_signature is not None
+    assert json.loads(path.read_bytes())["recipients"][0]["header"]["kid"] == pair.south.fingerprint

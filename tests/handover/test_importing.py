@@ -1,0 +1,162 @@
+"""What comes in by a bundle, and what is refused: strangers, old epochs, other keys."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+
+import pytest
+
+from teds_provision.errors import NodeRefused, NotAuthentic, PolicyRefused
+from teds_provision.handover.export_keys import export_keys, plan_export
+from teds_provision.handover.import_keys import Imported, ImportPlan, import_keys, plan_import
+from teds_provision.handover.pending import close
+from teds_provision.handover.selection import ExportOrder
+from teds_provision.protocol.agreement import key_id
+from teds_provision.steps.agree import agree
+from teds_provision.steps.identify import identify
+from teds_provision.steps.reset import reset_node
+from tests.bench import Board, make_station, talk
+from tests.handover.desk import Pair, everything, held, key_up, provisioned, session
+
+
+def key_again(station, board):  # type: ignore[no-untyped-def]
+    with talk(board) as node:
+        agree(station, node, identify(station, node))
+
+
+def test_an_expired_bundle_is_refused_but_its_receipt_can_be_had(pair: Pair) -> None:
+    path, _ = pair.export("copy")
+    later = datetime.now(UTC) + timedelta(days=8)
+    with pytest.raises(PolicyRefused, match="expired"):
+        plan_import(pair.south, path.read_bytes(), later)
+    taken = pair.take(path)
+    again = plan_import(pair.south, path.read_bytes(), later)
+    assert isinstance(again, Imported)
+    assert again.receipt == taken.receipt
+
+
+def test_a_bundle_for_another_station_or_from_a_stranger(pair: Pair, tmp_path: Path) -> None:
+    west = make_station(tmp_path / "west", "west")
+    path, _ = pair.export("copy")
+    with pytest.raises(PolicyRefused, match="not sealed for this station"):
+        plan_import(west, path.read_bytes())
+    pair.south.policy.distrust("north")
+    with pytest.raises(NotAuthentic, match="Nobody trusted here"):
+        plan_import(pair.south, path.read_bytes())
+    west.close()
+
+
+def test_an_id_that_came_before_with_other_content(pair: Pair) -> None:
+    path, exported = pair.export("copy")
+    pair.take(path)
+    other = Board(uuid=bytes.fromhex("8d4d9da65281f700ffff"))
+    key_up(pair.north, other)
+    plan = replace(plan_export(pair.north, ExportOrder(("south",), None)), id=exported.plan.id)
+    forged = pair.folder / "forged.jwe"
+    export_keys(pair.north, plan, forged)
+    before = everything(pair.south)
+    with pytest.raises(PolicyRefused, match="replayed or forged"):
+        plan_import(pair.south, forged.read_bytes())
+    assert everything(pair.south) == before
+
+
+def test_an_older_epoch_than_the_stores_is_refused(pair: Pair) -> None:
+    old, _ = pair.export("copy")
+    with talk(pair.board) as node:
+        agree(pair.north, node, identify(pair.north, node), rotate=True)
+    new, _ = pair.export("copy")
+    pair.take(new)
+    session(pair.south, pair.board)
+    with pytest.raises(PolicyRefused, match="epoch 1 is older than 2"):
+        plan_import(pair.south, old.read_bytes())
+
+
+def test_a_newer_epoch_comes_in_beside_the_old_key_until_it_is_proven(pair: Pair) -> None:
+    pair.take(pair.export("copy")[0])
+    session(pair.south, pair.board)
+    with talk(pair.board) as node:
+        agree(pair.north, node, identify(pair.north, node), rotate=True)
+    plan = plan_import(pair.south, pair.export("copy")[0].read_bytes())
+    assert isinstance(plan, ImportPlan)
+    assert [node.decision for node in plan.nodes] == ["newer"]
+    import_keys(pair.south, plan)
+    assert held(pair.south, pair.board) == [("pending", 2, "import"), ("active", 1, "import")]
+    assert session(pair.south, pair.board) == 2
+    assert held(pair.south, pair.board) == [("active", 2, "import")]
+
+
+def test_a_newer_key_under_another_ca_counts_once_it_is_proven(pair: Pair) -> None:
+    """North shares a node; south resets it and keys it under its own CA, then shares it back."""
+    pair.take(pair.export("copy")[0])
+    with talk(pair.board) as node:
+        reset_node(pair.south, node, identify(pair.south, node))
+    key_again(pair.south, pair.board)
+    assert pair.board.state.ca == pair.south.ca
+    bundle = pair.folder / "back.jwe"
+    export_keys(pair.south, plan_export(pair.south, ExportOrder(("north",), None)), bundle)
+    pair.take(bundle, pair.north)
+    assert pair.north.keys.ca_of(pair.board.uuid) == pair.north.ca
+    assert session(pair.north, pair.board) == 2
+    assert pair.north.keys.ca_of(pair.board.uuid) == pair.south.ca
+    assert provisioned(pair.north, pair.board).verified.verdict == "authentic"
+
+
+def test_a_claimed_key_under_another_ca_does_not_spoil_the_one_in_use(pair: Pair) -> None:
+    """A trusted station that errs, or lies: its key is never proven, and the node stays reachable and writable."""
+    path, _ = pair.export("copy")
+    pair.take(path)
+    key = bytes(range(16))
+    pair.south.keys.add_pending(pair.board.uuid, key=key, key_id=key_id(key), epoch=9)
+    pair.south.keys.promote(pair.board.uuid, key_id(key).hex())
+    pair.south.keys.set_ca_of(pair.board.uuid, pair.south.ca)
+    bundle = pair.folder / "lie.jwe"
+    export_keys(pair.south, plan_export(pair.south, ExportOrder(("north",), None)), bundle)
+    pair.take(bundle, pair.north)
+    assert session(pair.north, pair.board) == 1
+    assert provisioned(pair.north, pair.board).verified.verdict == "authentic"
+
+
+def test_a_uuid_known_with_another_node_key_is_refused_and_the_rest_comes_in(tmp_path: Path) -> None:
+    pair = Pair.make(tmp_path, 2)
+    clone = Board(uuid=pair.boards[1].uuid)
+    key_up(pair.south, clone)
+    plan = plan_import(pair.south, pair.export("copy")[0].read_bytes())
+    assert isinstance(plan, ImportPlan)
+    assert [node.decision for node in plan.nodes] == ["new", "refused"]
+    assert "another node key" in plan.nodes[1].why
+    import_keys(pair.south, plan)
+    assert session(pair.south, clone) == 1
+    assert session(pair.south, pair.boards[0]) == 1
+    pair.close()
+
+
+def test_where_every_node_is_refused_nothing_is_imported(pair: Pair) -> None:
+    key_up(pair.south, Board(uuid=pair.board.uuid))
+    before = everything(pair.south)
+    with pytest.raises(PolicyRefused, match="another node key"):
+        plan_import(pair.south, pair.export("copy")[0].read_bytes())
+    assert everything(pair.south) == before
+
+
+def test_the_same_keys_again_in_a_new_bundle(pair: Pair) -> None:
+    first, exported = pair.export("copy")
+    close(pair.north, pair.take(first).receipt)
+    second, again = pair.export("copy")
+    assert again.plan.id != exported.plan.id
+    plan = plan_import(pair.south, second.read_bytes())
+    assert isinstance(plan, ImportPlan)
+    assert [node.decision for node in plan.nodes] == ["same"]
+    import_keys(pair.south, plan)
+    assert len(held(pair.south, pair.board)) == 1
+
+
+def test_a_station_that_lost_the_node_to_a_rotation_does_not_agree_anew(pair: Pair) -> None:
+    pair.take(pair.export("move")[0])
+    pair.north.policy.take_back([pair.board.uuid])
+    with talk(pair.board) as node:
+        agree(pair.north, node, identify(pair.north, node), rotate=True)
+    with talk(pair.board) as node, pytest.raises((PolicyRefused, NodeRefused), match="knows none"):
+        agree(pair.south, node, identify(pair.south, node))
+    assert pair.board.state.epoch == 2

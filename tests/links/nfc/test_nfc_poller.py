@@ -1,0 +1,93 @@
+"""The station's half of TNEP against other people's nodes: slow, torn, wrong, mute."""
+
+from __future__ import annotations
+
+import pytest
+
+from teds_provision.errors import Garbled, NodeSilent
+from teds_provision.links.nfc import message, tnep
+from teds_provision.links.nfc.pieces import Piece
+from teds_provision.links.nfc.poller import Poller
+from tests.node.tag_talk import answer, request, select
+
+
+class Script:
+    """Someone else's node: what stands in its mailbox at each read, the last of it for ever."""
+
+    def __init__(self, *reads: bytes) -> None:
+        self.reads = list(reads)
+        self.written: list[bytes] = []
+        self.now = 0.0
+
+    def read(self) -> bytes:
+        return self.reads.pop(0) if len(self.reads) > 1 else self.reads[0]
+
+    def write(self, octets: bytes) -> None:
+        self.written.append(octets)
+
+    def sleep(self, seconds: float) -> None:
+        self.now += seconds
+
+    def transact(self, *, wt_int: int = 20, n_wait: int = 15, max_ndef: int = 300) -> bytes:
+        service = tnep.ServiceParameters(tnep.SERVICE, wt_int, n_wait, max_ndef)
+        return Poller(self, service, clock=lambda: self.now, sleep=self.sleep).transact(3, b"abcd")
+
+
+OK = message.encode([tnep.status(0)])
+
+
+GOOD = answer(Piece(3, 2, 0, b"ok", answer=True))
+
+
+@pytest.mark.parametrize(
+    "reads",
+    [
+        [b"", b"", OK, b"", GOOD],
+        [select(), OK, request(Piece(3, 4, 0, b"abcd")), GOOD],  # our own message still there
+        [OK, b"\xd1torn", GOOD],
+        [OK, GOOD[:-3], GOOD],
+        [OK, answer(Piece(2, 2, 0, b"no", answer=True)), GOOD],  # another transaction
+        [OK, answer(Piece(3, 2, 0, b"o", answer=True, more=True)), answer(Piece(3, 2, 1, b"k", answer=True))],
+        [OK, *[b""] * 100, GOOD],  # far past N_wait, within 5 s at an interval of 32 ms
+    ],
+)
+def test_a_station_bears_with_other_peoples_nodes(reads: list[bytes]) -> None:
+    script = Script(*reads)
+    assert script.transact(n_wait=0) == b"ok"
+
+
+@pytest.mark.parametrize("wt_int", [0, 4, 20, 36, 44])
+def test_a_station_gives_up_after_its_own_5_s(wt_int: int) -> None:
+    script = Script(b"")
+    with pytest.raises(NodeSilent):
+        script.transact(wt_int=wt_int, n_wait=0)
+    assert 5.0 <= script.now < 5.1
+
+
+def test_a_node_that_announces_more_time_than_5_s_gets_it_up_to_15_s() -> None:
+    for wt_int, n_wait, seconds in ((40, 15, 8.2), (60, 15, 15.0)):
+        script = Script(b"")
+        with pytest.raises(NodeSilent):
+            script.transact(wt_int=wt_int, n_wait=n_wait)
+        assert script.now == pytest.approx(seconds, abs=0.1)
+
+
+@pytest.mark.parametrize(
+    "reads",
+    [
+        [message.encode([tnep.status(1)])],
+        [OK, message.encode([tnep.status(0x81)])],
+        [OK, OK],
+        [OK, message.encode([tnep.payload_record(Piece(3, 2, 0, b"ok", answer=True).encode())])],
+        [OK, answer(Piece(3, 9, 0, b"", answer=True))],  # never holds anything
+        [OK, b"\xd1torn"],
+    ],
+)
+def test_what_breaks_the_wire_format_is_garbled(reads: list[bytes]) -> None:
+    with pytest.raises(Garbled):
+        Script(*reads).transact()
+
+
+def test_a_node_that_takes_too_little_is_named() -> None:
+    with pytest.raises(Garbled, match="at most 30 octets"):
+        Script(OK).transact(max_ndef=30)

@@ -1,0 +1,190 @@
+"""The emulated tags, Type 4 and Type 2, octet by octet, and the time that frames take on air."""
+
+from __future__ import annotations
+
+import time
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from teds_provision.errors import UsageFailure
+from teds_provision.node.nfc.air import ETU, Air, answer_seconds, command_seconds
+from teds_provision.node.nfc.type2 import Type2Memory
+from teds_provision.node.nfc.type4 import IsoDepTag, NdefApplication, Type4Memory
+from tests.node.tag_talk import Handler
+from tests.pace import best_of
+
+SELECT_APPLICATION = bytes.fromhex("00A4040007D276000085010100")
+SELECT_CC, SELECT_NDEF = bytes.fromhex("00A4000C02E103"), bytes.fromhex("00A4000C02E104")
+UID = bytes.fromhex("02112233445566")
+
+
+# --- the tags ---------------------------------------------------------------------------------------------------------
+
+
+def card(memory: Type4Memory, ready: bool = True) -> IsoDepTag:
+    return IsoDepTag(b"\xe0\x80", NdefApplication(memory, lambda seconds: ready), patience=0.0)
+
+
+def blocks(tag: IsoDepTag, *apdus: bytes) -> list[bytes]:
+    answers = []
+    for number, apdu in enumerate(apdus):
+        block = tag.answer(bytes((0x02 | number & 1,)) + apdu)
+        assert block is not None
+        assert block[0] == 0x02 | number & 1
+        answers.append(block[1:])
+    return answers
+
+
+def test_a_type_4_tag_is_read_as_the_nfc_forum_says() -> None:
+    memory = Type4Memory(1000)
+    memory.put(b"hello")
+    answers = blocks(
+        card(memory),
+        SELECT_APPLICATION,
+        SELECT_CC,
+        bytes.fromhex("00B000000F"),
+        SELECT_NDEF,
+        bytes.fromhex("00B0000007"),
+    )
+    assert answers[:2] == [b"\x90\x00"] * 2
+    assert answers[2].hex() == "000f2000fb00f80406e10403ea0000" + "9000"
+    assert answers[3:] == [b"\x90\x00", b"\x00\x05hello\x90\x00"]
+
+
+def test_a_message_counts_as_written_when_its_length_is() -> None:
+    memory, written = Type4Memory(1000), []
+    memory.written = written.append
+    tag = card(memory)
+    body = bytes(range(200))
+    parts = [b"\x00\x00" + body[:100], body[100:]]
+    updates = [bytes.fromhex("00D60000") + bytes((102,)) + parts[0], bytes.fromhex("00D6006664") + parts[1]]
+    blocks(tag, SELECT_APPLICATION, SELECT_NDEF, *updates)
+    assert written == []
+    assert tag.answer(bytes.fromhex("0200D600000200C8")) == b"\x02\x90\x00"
+    assert written == [body]
+
+
+@pytest.mark.parametrize(
+    ("apdu", "status"),
+    [
+        ("00A4040007D2760000850199", "6A82"),
+        ("00B0000002", "6986"),  # application not selected
+        ("00", "6700"),
+        ("00CA000000", "6986"),
+    ],
+)
+def test_a_type_4_tag_refuses_what_it_does_not_have(apdu: str, status: str) -> None:
+    assert blocks(card(Type4Memory(100)), bytes.fromhex(apdu))[0].hex().upper() == status
+
+
+def test_a_type_4_tag_does_not_go_past_its_file() -> None:
+    update = bytes.fromhex("00D6006020") + bytes(32)
+    answers = blocks(card(Type4Memory(100)), SELECT_APPLICATION, SELECT_NDEF, update, bytes.fromhex("00B0FFFF02"))
+    assert [answer.hex() for answer in answers[2:]] == ["6a84", "6b00"]
+
+
+def test_a_slow_command_asks_for_more_time() -> None:
+    ready = [False, False, True]
+    tag = IsoDepTag(b"\xe0\x80", NdefApplication(Type4Memory(100), lambda seconds: ready.pop(0)))
+    assert tag.answer(b"\x02" + SELECT_APPLICATION) == b"\xf2\x01"
+    assert tag.answer(b"\xf2\x01") == b"\xf2\x01"
+    assert tag.answer(b"\xf2\x01") == b"\x02\x90\x00"
+
+
+def test_a_lost_block_is_sent_again_and_chains_work_both_ways() -> None:
+    memory = Type4Memory(100)
+    memory.put(bytes(60))
+    tag = IsoDepTag(b"\xe0\x00", NdefApplication(memory, lambda seconds: True))  # FSD 16: 13 octets a block
+    first, second = SELECT_APPLICATION[:7], SELECT_APPLICATION[7:]
+    assert tag.answer(b"\x12" + first) == b"\xa2"
+    assert tag.answer(b"\xb2") == b"\xa2"  # R(NAK): the acknowledge again
+    assert tag.answer(b"\x03" + second) == b"\x03\x90\x00"
+    assert tag.answer(b"\x02" + SELECT_NDEF) == b"\x02\x90\x00"
+    got, block = b"", tag.answer(bytes.fromhex("0300B000003E"))
+    number = 1
+    while block is not None:
+        assert tag.answer(bytes((0xB2 | number,))) == block
+        got += block[1:]
+        if not block[0] & 0x10:
+            break
+        number ^= 1
+        block = tag.answer(bytes((0xA2 | number,)))
+    assert got == b"\x00\x3c" + bytes(60) + b"\x90\x00"
+    assert tag.answer(b"\xc2") == b"\xc2"
+    assert tag.deselected
+
+
+@given(st.lists(st.binary(min_size=1, max_size=300), max_size=20), st.binary(min_size=1, max_size=2))
+def test_no_block_upsets_a_type_4_tag(blocks_sent: list[bytes], rats: bytes) -> None:
+    tag = IsoDepTag(rats, NdefApplication(Type4Memory(200), lambda seconds: True))
+    for block in blocks_sent:
+        got = tag.answer(block)
+        assert got is None or 0 < len(got) <= 254
+
+
+def test_a_type_2_tag_has_the_layout_of_the_nhs31xx() -> None:
+    memory = Type2Memory(UID)
+    memory.put(b"hello")
+    assert memory.answer(b"\x30\x00") == bytes.fromhex("021122B9 33445566 44000000 E1106F00")
+    assert memory.answer(b"\x30\x04") == bytes.fromhex("0103E80E46FD0100") + b"\x03\x05hello\xfe"
+    memory.put(bytes(range(250)) + bytes(249))
+    assert (memory.answer(b"\x30\x06") or b"")[:6] == bytes.fromhex("03FF01F30001")
+    assert memory.answer(bytes((0x30, 131)))[3:4] == b"\xfe"  # type: ignore[index]
+    assert memory.answer(bytes((0x30, 132))) == b"\x00"
+
+
+def test_page_6_with_a_length_completes_a_message() -> None:
+    memory, written = Type2Memory(UID), []
+    memory.written = written.append
+    for page, octets in ((6, "03006162"), (7, "6364FE00"), (6, "03046162")):
+        assert memory.answer(bytes((0xA2, page)) + bytes.fromhex(octets)) == b"\x0a"
+    assert written == [b"abcd"]
+
+
+def test_header_and_registers_of_a_type_2_tag_are_not_written() -> None:
+    memory = Type2Memory(UID)
+    for page in (0, 3, 132, 255):
+        assert memory.answer(bytes((0xA2, page)) + bytes(4)) == b"\x00"
+
+
+@given(st.lists(st.binary(max_size=8), max_size=30))
+def test_no_command_upsets_a_type_2_tag(commands: list[bytes]) -> None:
+    memory = Type2Memory(UID)
+    for command in commands:
+        assert len(memory.answer(command) or b"") in (1, 16)
+
+
+# --- time on air ------------------------------------------------------------------------------------------------------
+
+
+def test_frames_take_what_a_data_sheet_says() -> None:
+    assert command_seconds(b"\x30\x04") == pytest.approx(368e-6, abs=1e-6)  # NTAG21x, READ and WRITE
+    assert answer_seconds(b"\x30\x04", bytes(16)) == pytest.approx(1548e-6, abs=1.5e-6 + ETU)
+    assert command_seconds(b"\xa2\x04abcd") == pytest.approx(708e-6, abs=1e-6)
+    assert answer_seconds(b"\xa2\x04abcd", b"\x0a") == pytest.approx(6 * ETU)
+
+
+def test_a_paced_exchange_lasts_as_long_as_on_air() -> None:
+    air = Air()
+
+    def ten() -> float:
+        began = time.perf_counter()
+        for _ in range(10):
+            air(b"\x30\x04", False)
+            air(bytes(16), True)
+        took = time.perf_counter() - began
+        assert took > 0.0205  # 10 x 2.09 ms
+        return took
+
+    best_of(10, 0.05, ten)
+
+
+def test_a_tag_that_cannot_be_is_refused() -> None:
+    from teds_provision.node.nfc.server import NfcServer
+
+    with pytest.raises(UsageFailure):
+        NfcServer("udp:localhost:5000", Handler(), tag="2", uid=bytes(4))
+    with pytest.raises(UsageFailure):
+        NfcServer("udp:0.0.0.0:5000", Handler())

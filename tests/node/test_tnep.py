@@ -1,0 +1,187 @@
+"""The node's half of TNEP on an emulated tag, against the station's half in memory."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from teds_provision.links.nfc import message, tnep
+from teds_provision.links.nfc.pieces import Piece
+from teds_provision.links.nfc.poller import Poller
+from teds_provision.node.nfc import charging
+from teds_provision.node.nfc.tnep import TnepTag
+from teds_provision.node.nfc.type4 import Type4Memory
+from teds_provision.protocol.operation.commands import Power, PowerFlag
+from tests.node.tag_talk import Handler, request, select
+
+
+class Mailbox:
+    """The reader's view of a Type 4 file, without frames."""
+
+    def __init__(self, memory: Type4Memory) -> None:
+        self.memory = memory
+
+    def read(self) -> bytes:
+        size = int.from_bytes(self.memory.read(b"\xe1\x04", 0, 2) or b"", "big")
+        return self.memory.read(b"\xe1\x04", 2, size) or b""
+
+    def write(self, octets: bytes) -> None:
+        assert self.memory.write(0, len(octets).to_bytes(2, "big") + octets)
+
+
+class Desk:
+    """A node's tag on a reader, in memory."""
+
+    def __init__(self, max_ndef: int = 500) -> None:
+        self.handler = Handler()
+        self.mailbox = Mailbox(Type4Memory(max_ndef))
+        self.tag = TnepTag(self.mailbox.memory, self.handler, wt_int=4, n_wait=15)
+        self.tag.start()
+        self.tag.activated()
+        assert self.tag.ready(5)
+
+    def poller(self) -> Poller:
+        service = tnep.our_service(message.decode(self.mailbox.read()))
+        assert service is not None
+        return Poller(self.mailbox, service)
+
+    def say(self, octets: bytes) -> tuple[message.Record, ...]:
+        """Write one message and return the answer to it."""
+        self.mailbox.write(octets)
+        until = time.monotonic() + 5
+        while not (answer := self.mailbox.read()):
+            assert time.monotonic() < until
+            time.sleep(0.001)
+        return message.decode(answer)
+
+
+@pytest.fixture
+def desk() -> Iterator[Desk]:
+    desk = Desk()
+    yield desk
+    desk.tag.stop()
+
+
+def test_the_initial_message_offers_the_service_and_says_who_it_is(desk: Desk) -> None:
+    records = message.decode(desk.mailbox.read())
+    assert tnep.our_service(records) == tnep.ServiceParameters(tnep.SERVICE, 4, 15, 500)
+    assert tnep.external(records, tnep.ID_TYPE) == desk.handler.identify()
+
+
+def test_a_frame_before_the_selection_is_a_protocol_error(desk: Desk) -> None:
+    assert tnep.status_of(desk.say(request(Piece(1, 4, 0, b"abcd")))) == tnep.PROTOCOL_ERROR
+    assert desk.handler.frames == []
+
+
+def test_a_message_that_is_nonsense_is_refused(desk: Desk) -> None:
+    assert tnep.status_of(desk.say(select())) == tnep.SUCCESS
+    torn = bytearray(request(Piece(1, 4, 0, b"abcd")))
+    torn[-1] ^= 1
+    for nonsense in (bytes(torn), b"\xff\xff\xff", request(Piece(1, 4, 0, b"abcd", answer=True))):
+        assert tnep.status_of(desk.say(nonsense)) == tnep.GARBLED_REQUEST
+    assert desk.handler.frames == []
+
+
+def test_selecting_another_service_gives_the_initial_message(desk: Desk) -> None:
+    for uri in (b"urn:nfc:sn:handover", b""):
+        desk.say(select())
+        assert tnep.our_service(desk.say(message.encode([tnep.select(uri)]))) is not None
+
+
+def test_a_repeated_frame_is_not_run_again_until_the_field_was_gone(desk: Desk) -> None:
+    frame = bytes.fromhex("000080010000")
+    first = desk.poller().transact(7, frame)
+    again = Poller(desk.mailbox, tnep.ServiceParameters(tnep.SERVICE, 4, 15, 500)).transact(7, frame)
+    assert first == again
+    assert len(desk.handler.frames) == 1
+    desk.tag.lost()
+    desk.tag.activated()
+    assert desk.tag.ready(5)
+    assert desk.handler.lost_lines == ["nfc"]
+    assert desk.poller().transact(7, frame) != first
+    assert len(desk.handler.frames) == 2
+
+
+def test_an_answer_that_is_ready_after_the_field_was_gone_is_not_put(desk: Desk) -> None:
+    desk.say(select())
+    desk.handler.go.clear()
+    desk.mailbox.write(request(Piece(1, 4, 0, b"abcd")))
+    assert desk.mailbox.read() == b""  # more time, please
+    assert desk.handler.entered.wait(60)
+    desk.tag.lost()
+    desk.tag.activated()
+    assert not desk.tag.ready(0.05)
+    desk.handler.go.set()
+    assert desk.tag.ready(5)
+    records = message.decode(desk.mailbox.read())
+    assert tnep.external(records, tnep.ID_TYPE) == desk.handler.identify()
+
+
+@given(st.lists(st.binary(min_size=1, max_size=80), max_size=8))
+def test_no_message_upsets_the_node(messages: list[bytes]) -> None:
+    desk = Desk(120)
+    try:
+        for octets in messages:
+            desk.say(octets)
+        desk.tag.activated()
+        assert desk.tag.ready(5)
+        assert desk.poller().transact(1, b"abcd")[4:] == b"abcd"
+    finally:
+        desk.tag.stop()
+
+
+@given(st.binary(min_size=1, max_size=1500), st.integers(56, 700))
+def test_no_message_is_longer_than_announced(frame: bytes, max_ndef: int) -> None:
+    desk = Desk(max_ndef)
+    try:
+        written = desk.mailbox.write
+
+        def checked(octets: bytes) -> None:
+            assert len(octets) <= max_ndef
+            written(octets)
+
+        desk.mailbox.write = checked  # type: ignore[method-assign]
+        assert desk.poller().transact(1, frame)[4:] == frame
+    finally:
+        desk.tag.stop()
+
+
+@pytest.mark.parametrize("max_ndef", [300, 499])
+def test_a_battery_stands_first_in_the_initial_message_and_the_service_is_found(max_ndef: int) -> None:
+    power = [Power(PowerFlag.BATTERY, 80)]
+    tag = Type4Memory(max_ndef)
+    node = TnepTag(
+        tag,
+        Handler(),
+        wt_int=4,
+        n_wait=15,
+        extras=charging.Extras(
+            before=lambda: charging.charge_records(power[0]),
+            after=lambda: (charging.out_of_band_record(bytes.fromhex("C1D857000101"), random=True),),
+        ),
+    )
+    node.start()
+    try:
+        records = message.decode(Mailbox(tag).read())
+        assert [record.type for record in records[:2]] == [b"WLCCAP", b"WLCSTAI"]
+        assert records[1].payload == b"\x01\x50"
+        assert records[-1].payload.hex() == "081b0101005" + "7d8c101021c00"  # the octets of a real record
+        assert tnep.our_service(records) is not None
+        power[0] = Power(PowerFlag.BATTERY | PowerFlag.FULL, 100)
+        node.activated()
+        assert node.ready(5)
+        renewed = message.decode(Mailbox(tag).read())
+        assert renewed[0].payload[1] >> 6 == 2
+        assert renewed[1].payload == b"\x01\x64"
+    finally:
+        node.stop()
+
+
+def test_a_charging_reader_that_writes_its_power_disturbs_nobody(desk: Desk) -> None:
+    before = desk.mailbox.read()
+    assert desk.say(message.encode([message.Record(message.WELL_KNOWN, b"WLCINF", bytes(6))])) == message.decode(before)
+    assert tnep.status_of(desk.say(select())) == tnep.SUCCESS

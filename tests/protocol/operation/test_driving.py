@@ -1,0 +1,152 @@
+"""Drive messages on the node: sets that feed the dead-man, and all that moves nothing (operation.md section 2)."""
+
+from __future__ import annotations
+
+import pytest
+
+from teds_provision.protocol.messages.frames import Function, Reason, security_command
+from teds_provision.protocol.operation.commands import ChannelState
+from teds_provision.protocol.operation.datagram import Layout
+from teds_provision.protocol.operation.driving import Driver
+from teds_provision.protocol.operation.stream_commands import (
+    CLOCK,
+    NONE,
+    Driven,
+    drive,
+)
+from teds_provision.protocol.operation.subscription import TickBounds
+
+from .bench import MS, Bench
+from .consumer import clock
+
+
+class Wheel:
+    """Actuators 4 and 6 driven by message."""
+
+    def __init__(self, bench: Bench, dead_man: int = 500) -> None:
+        self.bench = bench
+        reply = Driven.decode(bench.send(drive([4, 6])).payload)
+        self.layout = Layout((4, 6), (2, 2))
+        self.driver = Driver(self.layout, reply, bench.sessions["can:f1"].message_key, dead_man=dead_man)
+        self.assembly_segments: list[bytes] = []
+
+    def message(self, *values: int, hold: int | None = None, now: int | None = None) -> bytes:
+        tick = self.bench.hardware.tick if now is None else now
+        octets = tuple(value.to_bytes(2, "big") for value in values)
+        return self.driver.seal(octets, TickBounds(tick, tick), hold=hold)
+
+    def hear(self, message: bytes) -> None:
+        from teds_provision.protocol.operation.can_frames import cut
+
+        for piece in cut(message, fd=False, drive=True):
+            self.bench.tim.drive("can:f1", piece.data)
+
+    @property
+    def points(self) -> tuple[int, int]:
+        points = self.bench.hardware.points
+        return int.from_bytes(points[4], "big"), int.from_bytes(points[6], "big")
+
+
+@pytest.fixture
+def wheel() -> Wheel:
+    return Wheel(Bench().open().operate(4, 6, dead_man=500))
+
+
+def test_drive_messages_are_sets_and_feed_the_dead_men(wheel: Wheel) -> None:
+    for value in range(1000, 1010):
+        wheel.hear(wheel.message(value, value + 1))
+        assert wheel.points == (value, value + 1)
+        wheel.bench.later(400 * MS)
+    assert wheel.bench.tim.actuator_claimed()
+    assert clock(wheel.bench).last == 9
+    wheel.bench.later(200 * MS)
+    assert wheel.points == (100, 100)
+
+
+def test_a_fresh_drive_message_after_the_dead_man_moves_nothing_even_where_nobody_polled(wheel: Wheel) -> None:
+    """A node whose processor hung wakes up with a fresh message in its controller: its timer ran out before that."""
+    wheel.hear(wheel.message(1000, 1000))
+    wheel.bench.hardware.tick += 500 * MS
+    wheel.hear(wheel.message(2000, 2000))
+    assert wheel.points == (100, 100)
+    states = wheel.bench.operation().channels
+    assert states[4] == states[6] == (ChannelState.ACTUATOR | ChannelState.SAFE | ChannelState.STOPPED, 0)
+
+
+def test_a_drive_message_that_is_late_replayed_forged_or_too_much_moves_nothing(wheel: Wheel) -> None:
+    bench = wheel.bench
+    good = wheel.message(1000, 1000)
+    held_back = wheel.message(2000, 2000, hold=20 * MS)
+    wheel.hear(good)
+    assert clock(bench).last == 0
+    assert wheel.points == (1000, 1000)
+    forged = bytearray(wheel.message(3000, 3000))
+    forged[-1] ^= 1
+    wheel.hear(bytes(forged))
+    assert clock(bench).last == 0, "a bad tag uses up nothing"
+    bench.later(21 * MS)
+    wheel.hear(held_back)
+    assert (wheel.points, clock(bench).last) == ((1000, 1000), 1), "its until is past; its counter is used up"
+    ahead = wheel.message(3000, 3000, now=bench.hardware.tick + 501 * MS, hold=1 * MS)
+    wheel.hear(ahead)
+    assert wheel.points == (1000, 1000), "further ahead than the smallest dead-man"
+    wheel.hear(wheel.message(3000, 4001))
+    assert wheel.points == (1000, 1000), "one value that the hardware does not bear: all of it"
+    wheel.hear(good)
+    assert wheel.points == (1000, 1000)
+    wheel.hear(wheel.message(1500, 1600))
+    assert wheel.points == (1500, 1600)
+
+
+def test_until_runs_over_every_71_minutes(wheel: Wheel) -> None:
+    bench = wheel.bench
+    bench.hardware.tick = ((1 << 32) - 5) * 1000
+    bench.tim._role.claims.actuators[4].deadline = 1 << 62  # type: ignore[union-attr]
+    for held in bench.tim._role.claims.actuators.values():  # type: ignore[union-attr]
+        held.deadline = 1 << 62
+    bench.tim._role.claims._leases.clear()  # type: ignore[union-attr]
+    wheel.hear(wheel.message(1234, 1234, hold=50 * MS))
+    assert wheel.points == (1234, 1234)
+
+
+def test_drive_ends_with_the_claim_of_any_of_its_channels(wheel: Wheel) -> None:
+    wheel.hear(wheel.message(1000, 1000))
+    wheel.bench.idle(6)
+    wheel.hear(wheel.message(2000, 2000))
+    assert wheel.points == (1000, 100)
+    assert clock(wheel.bench).last == NONE
+
+
+def test_a_new_drive_replaces_the_one_before(wheel: Wheel) -> None:
+    old = wheel.message(2000, 2000)
+    again = Wheel(wheel.bench)
+    assert again.driver.run == wheel.driver.run + 1
+    wheel.hear(old)
+    assert wheel.points == (100, 100)
+    again.hear(again.message(1000, 1000))
+    assert wheel.points == (1000, 1000)
+    assert wheel.bench.reason(drive([4, 1])) == Reason.WRONG_STATE
+    again.hear(again.message(1001, 1001))
+    assert wheel.points == (1001, 1001), "a refused one changes nothing"
+
+
+def test_frames_of_a_drive_message_out_of_order_move_nothing(wheel: Wheel) -> None:
+    from teds_provision.protocol.operation.can_frames import cut
+
+    pieces = list(cut(wheel.message(1000, 1000), fd=False, drive=True))
+    for at in (0, 2, 1):
+        wheel.bench.tim.drive("can:f1", pieces[at].data)
+    assert wheel.points == (100, 100)
+
+
+def test_messages_without_a_session_or_a_drive_are_nothing() -> None:
+    bench = Bench()
+    bench.tim.drive("can:f1", bytes(8))
+    bench.tim.trigger("can:f1", bytes(8), 5)
+    bench.open()
+    bench.send(CLOCK)
+    bench.tim.drive("can:f1", bytes(8))
+    bench.tim.drive("can:f1", b"")
+    bench.tim.event(5, 1, b"\0")
+    assert bench.send(security_command(Function.CLOSE)).ok
+    assert bench.tim.next_frame("can") is None

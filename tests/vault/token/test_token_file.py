@@ -1,0 +1,124 @@
+"""The file beside a token: what it holds, what is noticed, and how a backup of it comes back."""
+
+from __future__ import annotations
+
+import stat
+
+import pytest
+
+from teds_provision.errors import VaultFailure
+from teds_provision.protocol.keys import SoftwareKey
+from teds_provision.vault.pkcs11 import FILE_NAME, Pkcs11Vault
+from tests.vault.softhsm import PIN
+from tests.vault.token.person import Person, in_new_process
+
+pytestmark = pytest.mark.system
+STORE = "5e" * 16
+CONTEXT = b"a node"
+
+
+def test_a_wrapped_key_opens_under_its_context_alone_and_in_a_new_process(vault, home, store_id, uri, uris):
+    wrapped = vault.wrap(b"sixteen octets!!", context=CONTEXT)
+    assert vault.unwrap(wrapped, context=CONTEXT) == b"sixteen octets!!"
+    with pytest.raises(VaultFailure, match="does not belong"):
+        vault.unwrap(wrapped, context=b"another")
+    code = (
+        "import sys; from pathlib import Path; from teds_provision.vault.pkcs11 import Pkcs11Vault\n"
+        f"v = Pkcs11Vault.open(Path(sys.argv[1]), sys.argv[2], sys.argv[3], lambda p, c: {PIN!r})\n"
+        f"print(v.unwrap(bytes.fromhex(sys.argv[4]), context={CONTEXT!r}).decode(), v.identity().point.hex())"
+    )
+    done = in_new_process(uris, code, str(home), store_id, uri, wrapped.hex())
+    assert done.stdout.split() == ["sixteen", "octets!!", vault.identity().point.hex()], done.stderr
+
+
+def test_the_file_is_private_and_holds_neither_key_nor_pin(vault, home):
+    path = home / FILE_NAME
+    assert stat.S_IMODE(path.stat().st_mode) == 0o600
+    text = path.read_text()
+    assert PIN not in text
+    for master in vault._content.masters.keys.values():
+        assert master.hex() not in text
+    assert PIN not in repr(vault)
+
+
+def test_every_changed_digit_of_the_file_is_noticed(vault, home, store_id, uri):
+    path = home / FILE_NAME
+    text = path.read_text()
+    for at in range(0, len(text), 7):
+        if text[at] not in "0123456789abcdef":
+            continue
+        path.write_text(text[:at] + ("0" if text[at] != "0" else "1") + text[at + 1 :])
+        with pytest.raises(VaultFailure):
+            Pkcs11Vault.open(home, store_id, uri, Person())
+    path.write_text(text)
+    assert Pkcs11Vault.open(home, store_id, uri, Person()).identity().point == vault.identity().point
+
+
+def test_masters_that_someone_else_sealed_to_the_station_key_are_refused(vault, home, store_id, uri):
+    """Whoever may write the file knows the public key; without the signature they could choose the master key."""
+    from teds_provision.vault import pkcs11
+    from teds_provision.vault.master import MasterKeys
+
+    forger = pkcs11._Content(vault._content.station, vault._content.ca, MasterKeys({1: bytes(32)}))
+    outsider = SoftwareKey(5)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(type(forger.station), "sign", lambda _, message: outsider.sign(message))
+        pkcs11._save(home, store_id, forger, replace=True)
+    with pytest.raises(VaultFailure, match="was changed"):
+        Pkcs11Vault.open(home, store_id, uri, Person())
+
+
+@pytest.mark.parametrize("content", ["", "{", "[]", "null", "{}", '{"station": 1, "ca": 2}', "[" * 9999, "x" * 70_000])
+def test_a_file_that_is_something_else_is_named_before_anyone_is_asked(home, store_id, uri, content):
+    (home / FILE_NAME).write_text(content)
+    person = Person()
+    with pytest.raises(VaultFailure, match=FILE_NAME):
+        Pkcs11Vault.open(home, store_id, uri, person)
+    assert not person.prompts
+
+
+def test_a_missing_file_and_one_of_another_store(vault, home, store_id, uri):
+    with pytest.raises(VaultFailure, match="another store"):
+        Pkcs11Vault.open(home, STORE, uri, Person())
+    (home / FILE_NAME).unlink()
+    with pytest.raises(VaultFailure, match="missing"):
+        Pkcs11Vault.open(home, store_id, uri, Person())
+
+
+def test_a_change_of_the_master_key(vault, home, store_id, uri):
+    before = vault.wrap(b"k" * 16, context=CONTEXT)
+    vault.add_master()
+    after = vault.wrap(b"k" * 16, context=CONTEXT)
+    again = Pkcs11Vault.open(home, store_id, uri, Person())
+    assert again.unwrap(before, context=CONTEXT) == again.unwrap(after, context=CONTEXT) == b"k" * 16
+    again.retire_masters()
+    last = Pkcs11Vault.open(home, store_id, uri, Person())
+    assert last.unwrap(after, context=CONTEXT) == b"k" * 16
+    with pytest.raises(VaultFailure, match="lacks"):
+        last.unwrap(before, context=CONTEXT)
+
+
+def test_a_backup_opens_with_the_same_token_alone(vault, tmp_path, store_id, uri, uris):
+    wrapped, backup = vault.wrap(b"k" * 16, context=CONTEXT), vault.secret_material()
+    for name in ("again", "elsewhere"):
+        (tmp_path / name).mkdir()
+    again = Pkcs11Vault.create(tmp_path / "again", store_id, uri, Person(), restored=backup)
+    assert again.unwrap(wrapped, context=CONTEXT) == b"k" * 16
+    with pytest.raises(VaultFailure, match="does not hold the station key"):
+        Pkcs11Vault.create(tmp_path / "elsewhere", store_id, uris["spare"], Person(), restored=backup)
+    for damaged in ("", backup.replace('"nonce": "', '"nonce": "00'), backup.replace(store_id, STORE)):
+        with pytest.raises(VaultFailure):
+            Pkcs11Vault.create(tmp_path / "elsewhere", store_id, uri, Person(), restored=damaged)
+    assert not (tmp_path / "elsewhere" / FILE_NAME).exists()
+
+
+def test_a_backup_joins_what_is_there_and_another_stations_does_not(vault, home, tmp_path, store_id, uri, uris):
+    wrapped, backup = vault.wrap(b"k" * 16, context=CONTEXT), vault.secret_material()
+    vault.add_master()
+    vault.retire_masters()
+    again = Pkcs11Vault.create(home, store_id, uri, Person(), restored=backup)
+    assert again.unwrap(wrapped, context=CONTEXT) == b"k" * 16
+    (tmp_path / "other").mkdir()
+    other = Pkcs11Vault.create(tmp_path / "other", store_id, uri.replace("?", ";id=%09?"), Person())
+    with pytest.raises(VaultFailure, match="another station"):
+        Pkcs11Vault.create(home, store_id, uri, Person(), restored=other.secret_material())
