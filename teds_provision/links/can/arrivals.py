@@ -12,10 +12,11 @@ from teds_provision.errors import AddressConflict
 from teds_provision.links.can.finding import Found, ask_all, conflict_text, settle
 from teds_provision.links.can.spec import CanSpec
 from teds_provision.links.ports import Notice, NoticeSink
-from teds_provision.protocol.announce import is_announce
+from teds_provision.protocol.announce import Announce, is_announce, uuid_crc
 from teds_provision.protocol.messages.identity import Identity, NodeState
 
 if TYPE_CHECKING:
+    from teds_provision.links.can.frame import Frame
     from teds_provision.links.can.shared import Ear, SharedBus
 
 _GONE_SECONDS: Final = 3.0
@@ -27,6 +28,9 @@ _UNCLEAR_SECONDS: Final = 0.1
 for nobody else is found. The next round asks everyone again."""
 _LONGEST_SECONDS: Final = 3.0
 _MOST_PAUSE: Final = 1.0
+_CHANGE_SECONDS: Final = 0.015
+"""For a machine to change the board that was just served: asked at once, nobody new is there yet, and the silence after
+that question takes longer."""
 _PAUSE_PER_NODE: Final = 0.03
 """Seconds from one question to the next for each node that answered: its six frames take 1.6 ms, 5 % of a bus."""
 
@@ -67,7 +71,8 @@ class Arrivals:
         self._seen: dict[bytes, _Seen] = {}
         self._conflicts: set[int] = set()
         self._round = 0
-        self._asked_at = 0.0
+        self._asked_at = self._served_at = 0.0
+        self._served: set[int] = set()
         self._ear: Ear | None = None
         self._bus: SharedBus | None = None
 
@@ -79,12 +84,14 @@ class Arrivals:
         """Ask everyone (or ``node=`` alone) and yield address and identity of each node that is news."""
         self._round += 1
         self._asked_at = time.monotonic()
+        self._served.clear()
         self._listen()
         clashing: set[int] = set()
-        if self._port.spec.node is not None:
-            yield from self._one(self._port.spec.node, clashing)
-        else:
-            yield from self._all(stop, clashing)
+        address = self._port.spec.node
+        for news in self._all(stop, clashing) if address is None else self._one(address, clashing):
+            yield news
+            self._served_at = time.monotonic()
+            self._served.add(uuid_crc(news[1].uuid))
         for node in sorted(clashing - self._conflicts):
             self._notice(Notice("conflict", conflict_text(node)))
         self._conflicts = clashing
@@ -93,14 +100,25 @@ class Arrivals:
             self._port.tell_of_rivals(self._notice)
 
     def pause(self, stop: threading.Event) -> None:
-        """Wait until everyone may be asked again, or a node announces itself; what a round took counts."""
+        """Wait until everyone may be asked again, or a node announces itself; what a round took counts.
+
+        A board that was served may be changed meanwhile; what it announced while it was served is no news.
+        """
+        if self._ear is not None and not all(map(self._was_served, self._ear.get_all(0.0))):
+            return
         answered = sum(last.round == self._round for last in self._seen.values())
         until = self._asked_at + min(_MOST_PAUSE, _PAUSE_PER_NODE * answered)
+        until = max(until, self._served_at + _CHANGE_SECONDS)
         while (left := until - time.monotonic()) > 0 and not stop.is_set():
             if self._ear is None:
                 stop.wait(left)
             elif self._ear.get(min(left, 0.1)) is not None:
                 return
+
+    def _was_served(self, frame: Frame) -> bool:
+        """Whether an Announce is of a node that this round brought."""
+        announce = Announce.decode(frame.identifier, frame.data)
+        return announce is not None and announce.crc in self._served
 
     def _listen(self) -> None:
         bus = self._port.bus()
