@@ -26,6 +26,16 @@ if TYPE_CHECKING:
 _PIPE_COLUMNS = 1000
 
 
+def count_of(number: int) -> str:
+    """``1 node``, ``2 nodes``."""
+    return f"{number} node{'' if number == 1 else 's'}"
+
+
+def first_lines(lines: list[str], most: int, count: int) -> list[str]:
+    """The first lines of a list of so many, and how many more there are."""
+    return [*lines[:most], f"  … and {count - most} more"] if count > most else lines
+
+
 def shown(text: str | None) -> str:
     """A name or remark from outside, fit for a terminal: what cannot be printed becomes ``?``."""
     return "".join(character if character.isprintable() else "?" for character in text or "")

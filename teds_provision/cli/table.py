@@ -60,9 +60,9 @@ SECTIONS: Final[dict[str, dict[str, Entry]]] = {
     },
     "A key's life": {
         "export-keys": Entry(
-            "handover.bundles", "export_keys", "Hand node keys to another base station in a sealed bundle."
+            "handover.export_keys", "export_keys", "Hand node keys to another base station in a sealed bundle."
         ),
-        "import-keys": Entry("handover.bundles", "import_keys", "Take node keys over from another base station."),
+        "import-keys": Entry("handover.import_keys", "import_keys", "Take node keys over from another base station."),
         "handover": Entry("handover.pending", "handover", "Handovers under way: list, receipt, undo."),
         "revoke": Entry("handover.life", "revoke", "Ban a node's key, here and where bundles from here go."),
         "decommission": Entry("handover.life", "decommission", "Reset a node and take it out of service."),

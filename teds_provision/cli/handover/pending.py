@@ -10,9 +10,8 @@ import click
 from teds_provision import handover as handover_room
 from teds_provision import protocol
 from teds_provision.cli.context import App, pass_app
-from teds_provision.cli.handover.bundles import count_of
 from teds_provision.cli.options import COMMAND_SETTINGS, dry_run_option, examples, yes_option
-from teds_provision.cli.rendering import local_time
+from teds_provision.cli.rendering import count_of, local_time
 from teds_provision.errors import BadData, NotFound, TedsProvisionError
 from teds_provision.files import read_limited
 

@@ -9,7 +9,6 @@ import click
 
 from teds_provision import handover, protocol
 from teds_provision.cli.context import App, pass_app
-from teds_provision.cli.handover.bundles import count_of
 from teds_provision.cli.options import (
     COMMAND_SETTINGS,
     FileToRead,
@@ -18,6 +17,7 @@ from teds_provision.cli.options import (
     fingerprint_option,
     yes_option,
 )
+from teds_provision.cli.rendering import count_of
 from teds_provision.errors import OtherKey
 from teds_provision.files import holds, read_limited, write_new
 from teds_provision.protocol.fingerprints import same_key

@@ -1,0 +1,161 @@
+"""``export-keys``: node keys to another base station, in a sealed bundle."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
+
+import click
+
+from teds_provision import handover
+from teds_provision.cli.context import App, pass_app
+from teds_provision.cli.options import WholeNumber, command, dry_run_option, yes_option
+from teds_provision.cli.rendering import count_of, first_lines, local_time
+from teds_provision.errors import PolicyRefused
+
+if TYPE_CHECKING:
+    from teds_provision.handover.export_keys import Exported, ExportPlan
+    from teds_provision.handover.selection import Leaving
+    from teds_provision.station.station import Station
+
+_SHOWN = 20
+_MEANS = {
+    "copy": "A copy: both stations hold the same keys from now on, and either can pose as a node to the other.",
+    "move": "A move: the keys rest here at once. Only when the other station has rotated them at its first contact is"
+    " this one locked out for certain.",
+}
+
+
+@command(
+    "teds-provision export-keys --to lab --all --output lab.jwe",
+    "teds-provision export-keys --to lab 8d4d --mode move --output finger.jwe",
+)
+@click.argument("uuids", metavar="[UUID]…", nargs=-1)
+@click.option("--to", "receivers", multiple=True, required=True, metavar="STATION", help="Name, fingerprint or PEM.")
+@click.option("--all", "everything", is_flag=True, help="Every node whose key is held and proven.")
+@click.option("--mode", type=click.Choice(["copy", "move"]), default="copy", show_default=True, help="Share, or give.")
+@click.option(
+    "--output",
+    type=click.Path(path_type=Path, dir_okay=False),
+    required=True,
+    metavar="FILE",
+    help="Where the sealed bundle goes.",
+)
+@click.option(
+    "--expires",
+    type=WholeNumber(1, 365),
+    default=7,
+    show_default=True,
+    metavar="DAYS",
+    help="How long it can be imported.",
+)
+@click.option("--ca", metavar="FINGERPRINT", help="Only the nodes that keep this CA key.")
+@yes_option
+@dry_run_option
+@pass_app
+def export_keys(
+    app: App,
+    uuids: tuple[str, ...],
+    receivers: tuple[str, ...],
+    everything: bool,
+    mode: Literal["copy", "move"],
+    output: Path,
+    expires: int,
+    ca: str | None,
+    yes: bool,
+    dry_run: bool,
+) -> None:
+    """Hand node keys to other base stations in a bundle, sealed to them and signed by this one.
+
+    Nothing is ever written unsealed. A move marks the nodes as given away before the file exists; its receipt closes
+    it ("handover receipt"); before that "handover undo" takes it back. More nodes than one bundle holds go into FILE,
+    FILE.2 and so on, each with a receipt of its own.
+    """
+    if everything == bool(uuids):
+        raise click.UsageError("Name the nodes, or say --all.")
+    station = app.station()
+    nodes = None if everything else tuple(station.nodes.resolve(uuid) for uuid in uuids)
+    order = handover.selection.ExportOrder(receivers, nodes, mode, expires, ca)
+    if not dry_run:
+        station.unlock()
+    shown = handover.export_keys.plan_exports(station, order)
+    outputs = handover.export_keys.outputs_of(output, len(shown))
+    if dry_run:
+        told = _exported(shown, outputs, station)
+        id_ = None if shown[0].earlier is None else shown[0].id
+        app.emit({**told, "id": id_, "plan": True}, _plan_text(shown, station))
+        return
+    state = station.version()
+    app.note(_plan_text(shown, station))
+    app.confirm(f"{mode.capitalize()} {_count(shown)}?", yes=yes)
+    with station.lock("export-keys", app.note):
+        plans = shown if station.version() == state else handover.export_keys.plan_exports(station, order)
+        require_same([plan.content for plan in plans] == [plan.content for plan in shown])
+        told = _exported(plans, outputs, station)
+        done = handover.export_keys.export_all(station, plans, outputs)
+    _tell_export(app, plans, outputs, told, done)
+
+
+def _tell_export(
+    app: App, plans: Sequence[ExportPlan], outputs: Sequence[Path], told: dict[str, Any], done: Sequence[Exported]
+) -> None:
+    for bundle, one in zip(told["bundles"], done, strict=True):
+        bundle |= {"sha256": one.sha256, "octets": one.octets, "fresh": one.fresh}
+    fresh = any(one.fresh for one in done)
+    told |= {"sha256": done[0].sha256, "octets": sum(one.octets for one in done), "fresh": fresh}
+    again = "" if fresh else " (nothing to do, it is there already)"
+    moved = plans[0].mode == "move"
+    next_step = "\nIts receipt closes the move: teds-provision handover receipt FILE.receipt" if moved else ""
+    files = ", ".join(map(str, outputs))
+    app.emit(told, f"{_count(plans)} in {files}, handover {plans[0].id}{again}.{next_step}")
+
+
+def _count(plans: Sequence[ExportPlan]) -> str:
+    return count_of(sum(len(plan.nodes) for plan in plans))
+
+
+def _exported(plans: Sequence[ExportPlan], outputs: Sequence[Path], station: Station) -> dict[str, Any]:
+    plan = plans[0]
+    return {
+        "bundle": str(outputs[0]),
+        "from": station.fingerprint,
+        "to": [{"name": record.name, "fingerprint": record.fingerprint} for record in plan.receivers],
+        "mode": plan.mode,
+        "count": sum(len(one.nodes) for one in plans),
+        "id": plan.id,
+        "expires": plan.expires.strftime("%Y-%m-%dT%H:%M:%SZ"),
+        "nodes": [node.uuid.hex() for one in plans for node in one.nodes],
+        "skipped": [{"uuid": uuid.hex(), "why": why} for uuid, why in plan.skipped],
+        "also_held_by": sorted({digits for one in plans for digits in one.also_held_by}),
+        "bundles": [
+            {"bundle": str(output), "id": one.id, "count": len(one.nodes)}
+            for one, output in zip(plans, outputs, strict=True)
+        ],
+    }
+
+
+def _plan_text(plans: Sequence[ExportPlan], station: Station) -> str:
+    plan, chosen = plans[0], [one for part in plans for one in part.nodes]
+    lines = [f"{plan.mode.capitalize()} {_count(plans)}, to be imported by {local_time(plan.expires.isoformat())}"]
+    lines += [f"  in {len(plans)} bundles"] if len(plans) > 1 else []
+    lines += first_lines(_node_lines(chosen[:_SHOWN], station), _SHOWN, len(chosen))
+    lines += [f"  not {uuid.hex()}: {why}" for uuid, why in plan.skipped]
+    if plan.also_held_by:
+        names = ", ".join(handover.pending.peer_name(station, digits) for digits in plan.also_held_by)
+        lines.append(f"  also held, by an earlier copy, by {names}: until the keys are rotated")
+    lines.append("For comparison by voice:")
+    lines += [f"  to   {record.name}\n       {handover.trust.spoken(record.fingerprint)}" for record in plan.receivers]
+    lines.append(f"  from {station.name}\n       {handover.trust.spoken(station.fingerprint)}")
+    return "\n".join([*lines, _MEANS[plan.mode]])
+
+
+def _node_lines(chosen: Sequence[Leaving], station: Station) -> list[str]:
+    known = station.nodes.of_page([node.uuid for node in chosen])
+    return [f"  {node.uuid.hex()}  epoch {node.epoch}  {known[node.uuid].name or ''}".rstrip() for node in chosen]
+
+
+def require_same(same: bool) -> None:
+    """What a person was shown must still be so under the lock."""
+    if not same:
+        raise PolicyRefused("Another command changed the plan while this one waited.", hint="Run it again.")
