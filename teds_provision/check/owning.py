@@ -198,9 +198,10 @@ def keyed_reset(probe: Probe) -> str:
 
 @rule("first-owner-wins", "Key agreement", Stage.KEYED)
 def first_owner_wins(probe: Probe) -> str:
-    """A Request that shows another CA gets 14, looked at before SIG104."""
-    if not probe.tapped:
-        raise NotApplicable("Needs a tap: try it over NFC.")
+    """A Request that shows another CA, tapped or in a session, gets 14, looked at before SIG104."""
     probe.require(NodeState.KEYED, NodeState.PROVISIONED)
-    probe.refused(request(Strangers.make().request(certified=False)), Reason.UNTRUSTED_STATION, "SIG104 wrong too")
-    return probe.refused(request(Strangers.make().request()), Reason.UNTRUSTED_STATION, "another owner's CA")
+    refused = probe.refused if probe.tapped else probe.sealed_refused
+    refused(request(Strangers.make().request(certified=False)), Reason.UNTRUSTED_STATION, "SIG104 wrong too")
+    seen = refused(request(Strangers.make().request()), Reason.UNTRUSTED_STATION, "another owner's CA")
+    probe.close()
+    return seen

@@ -42,6 +42,8 @@ class Probe:
         self.credentials: Credentials | None = None
         self.key: bytes | None = None
         self.session: StationSession | None = None
+        self.asked = ""
+        """The last command that was sent, in words."""
 
     # -- frames ----------------------------------------------------------------------------------------------------
 
@@ -51,13 +53,14 @@ class Probe:
         ``inside`` is the command that is sealed in them. Raises NodeSilent where not even Identify is answered.
         """
         opened = None if inside is None else inside.encode()
+        self.asked = what
         until = time.monotonic() + BUSY_SECONDS
         while True:
             self.contact.note("out", frame, what, sealed=inside is not None, opened=opened)
             try:
                 raw = self.contact.link.exchange(frame)
             except NodeSilent:
-                self.contact.link.exchange(IDENTIFY.encode())
+                self.listen()
                 raise RuleBroken(f"{what}: no reply, and every command gets one.") from None
             try:
                 reply = decode_reply(raw)
@@ -70,6 +73,10 @@ class Probe:
             if time.monotonic() >= until:
                 raise NotApplicable(f"{what}: the node is busy (17).")
             time.sleep(BUSY_PAUSE)
+
+    def listen(self) -> None:
+        """Ask Identify, whatever it says; raises LinkFailure where nothing comes."""
+        self.contact.link.exchange(IDENTIFY.encode())
 
     def plain(self, command: Command) -> Reply:
         """Send a plain command."""
@@ -147,6 +154,11 @@ class Probe:
             self.session = None
 
     # -- what the node says ----------------------------------------------------------------------------------------
+
+    @property
+    def noisy(self) -> bool:
+        """Whether single frames may be lost or disturbed here without anybody's fault: a bus."""
+        return self.contact.link.capabilities.many
 
     @property
     def tapped(self) -> bool:

@@ -8,7 +8,7 @@ from teds_provision.check import owning, plain, sessions, teds_rules, writing
 from teds_provision.check.outcome import Checked, NotApplicable, RuleBroken
 from teds_provision.check.probe import Probe
 from teds_provision.check.rule import RULES, Rule, Stage
-from teds_provision.errors import BadData, Garbled, NodeRefused, NotAuthentic, PolicyRefused
+from teds_provision.errors import BadData, Garbled, LinkFailure, NodeRefused, NotAuthentic, PolicyRefused
 from teds_provision.links import LinkSettings
 from teds_provision.protocol.messages.identity import NodeState
 from teds_provision.station.station import Station
@@ -26,12 +26,21 @@ _NEEDS_FACTORY = "Changes the node's key. Ask with --factory."
 _NEEDS_KEY = "The node has no key. Ask with --factory to give it one."
 
 
+_GONE = "The node does not answer any more."
+_TORN_TRIES = 3
+"""So often a rule is tried whose replies come torn, at a reader; nothing but the node makes them so each time there."""
+
+
 @dataclass(frozen=True)
 class Report:
-    """Every rule, in order, and how often each result came."""
+    """Every rule, in order, and how often each result came.
+
+    ``lost`` is why the rest could not be tried: the node fell silent, or the reader went away; None where all was.
+    """
 
     uuid: bytes
     checks: tuple[Checked, ...]
+    lost: LinkFailure | None = None
 
     def count(self, result: str) -> int:
         """How many rules ended so."""
@@ -49,7 +58,8 @@ def check_node(station: Station, node: Conversation, *, factory: bool = False) -
 
     Without ``factory`` no key changes: a factory node is tried in factory state, one of ours in sessions too. With it a
     node of ours is reset, then keyed, written and reset again, so that it ends in factory state.
-    Raises PolicyRefused for a node with another owner, before anything but Identify was asked; LinkFailure.
+    A node that falls silent ends it, with what was found until then. Raises PolicyRefused for a node with another
+    owner, before anything but Identify was asked; LinkFailure before the first rule.
     """
     return _Run(station, node, factory).all()
 
@@ -59,6 +69,7 @@ class _Run:
         self._station, self._node, self._factory = station, node, factory
         self._probe = Probe(node.contact)
         self._checks: dict[str, Checked] = {}
+        self._lost: LinkFailure | None = None
 
     def all(self) -> Report:
         ours = self._probe.identity().state != NodeState.FACTORY
@@ -66,16 +77,21 @@ class _Run:
             self._take_up()
         elif self._factory:
             self._station.policy.require_not_given_away(self._node.uuid)
-        self._stage(Stage.PLAIN)
-        if ours:
-            self._stage(Stage.KEYED)
-            self._stage(Stage.SESSION)
-        self._in_factory_state(ours)
+        try:
+            self._stage(Stage.PLAIN)
+            if ours:
+                self._stage(Stage.KEYED)
+                self._stage(Stage.SESSION)
+            self._in_factory_state(ours)
+        except LinkFailure as lost:
+            self._lost = lost
+            for stage in Stage:
+                self._skip(stage, _GONE)
         for stage in Stage:
             held = stage in (Stage.KEYED, Stage.SESSION) and not self._factory
             self._skip(stage, _NEEDS_KEY if held else _NEEDS_FACTORY)
         checks = tuple(self._checks[each.name] for each in _ordered())
-        return Report(self._node.uuid, checks)
+        return Report(self._node.uuid, checks, self._lost)
 
     def _in_factory_state(self, ours: bool) -> None:
         """Rules of factory state, and of the way from there to a key and back; a node of ours is reset for them."""
@@ -101,14 +117,30 @@ class _Run:
                 self._checks[each.name] = Checked(each.name, each.clause, "skipped", why)
 
     def _try(self, each: Rule) -> Checked:
+        for left in reversed(range(_TORN_TRIES)):
+            try:
+                return self._tried(each)
+            except Garbled as torn:  # of the link, after its own repetitions
+                why, self._probe.session = torn.message, None
+                if self._probe.noisy:  # not the node's fault for certain
+                    return Checked(each.name, each.clause, "skipped", f"The link failed: {why}")
+                if left:
+                    self._probe.listen()  # a node that answers nothing else either is lost, not wrong in this
+        return Checked(each.name, each.clause, "failed", f"{self._probe.asked}: no reply that can be read. {why}")
+
+    def _tried(self, each: Rule) -> Checked:
         try:
             return Checked(each.name, each.clause, "passed", each.run(self._probe))
         except NotApplicable as skip:
             return Checked(each.name, each.clause, "skipped", str(skip))
         except RuleBroken as broken:
             detail = str(broken)
-        except Garbled as torn:  # of the link, after its own repetitions: not the node's fault for certain
-            return Checked(each.name, each.clause, "skipped", f"The link failed: {torn.message}")
+        except Garbled:
+            raise
+        except LinkFailure as lost:
+            detail = f"{self._probe.asked}: {lost.message}"
+            self._checks[each.name] = Checked(each.name, each.clause, "skipped", detail)
+            raise type(lost)(f"The node fell silent in the rule {each.name}: {detail}", hint=lost.hint) from lost
         except (BadData, NotAuthentic, PolicyRefused) as wrong:
             detail = wrong.message
         self._probe.session = None

@@ -151,18 +151,17 @@ def any_mac(board: Board, octets: bytes, reference: Next) -> bytes:
 
 
 def any_counter(board: Board, octets: bytes, reference: Next) -> bytes:
-    session = board.tim._sessions.on("nfc")
-    if session is not None and _is(octets, Function.SEALED):
-        session.counter = -1
+    for line in board.tim._sessions._links.values():
+        if line.session is not None and _is(octets, Function.SEALED):
+            line.session.counter = -1
     return reference(octets)
 
 
 def close_is_ignored(board: Board, octets: bytes, reference: Next) -> bytes:
-    line = board.tim._sessions._links.get("nfc")
-    session = line.session if line is not None else None
+    lines = [(line, line.session) for line in board.tim._sessions._links.values()]
     reply = reference(octets)
-    if session is not None and line is not None and line.session is None:
-        line.session = session
+    for line, session in lines:
+        line.session = line.session or session
     return reply
 
 

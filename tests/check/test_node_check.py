@@ -10,7 +10,7 @@ import pytest
 
 from teds_provision.check.rule import RULES, Stage
 from teds_provision.check.run import Report, check_node
-from teds_provision.errors import NodeSilent, PolicyRefused
+from teds_provision.errors import Garbled, NodeSilent, PolicyRefused
 from teds_provision.protocol.commit import verified_commit
 from teds_provision.protocol.messages.identity import NodeState
 from teds_provision.protocol.tim import teds_access
@@ -37,9 +37,7 @@ def names(report: Report, result: str) -> set[str]:
 # -- a good node -------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(
-    ("via", "skipped"), [("nfc", {"keyed-untapped"}), ("can", {"first-owner-wins", "confirm-elsewhere"})]
-)
+@pytest.mark.parametrize(("via", "skipped"), [("nfc", {"keyed-untapped"}), ("can", {"confirm-elsewhere"})])
 def test_the_reference_node_keeps_every_rule(station: Station, via: str, skipped: set[str]) -> None:
     board = Board()
     board.flash.state = replace(board.state, blocks={(0, 1): META, (1, 12): NAME})
@@ -69,8 +67,9 @@ def agreed(station: Station, board: Board) -> None:
             raise NodeSilent("The power of the station went.")
         return reference(octets)
 
-    with pytest.raises(NodeSilent):
-        checked(station, board, fault=cut)
+    report = checked(station, board, fault=cut)
+    assert isinstance(report.lost, NodeSilent)
+    assert "power of the station" in report.lost.message
     assert board.state.state == NodeState.KEYED
 
 
@@ -176,6 +175,43 @@ def test_a_commit_that_takes_an_old_sequence_is_found(station: Station, monkeypa
 
     monkeypatch.setattr(teds_access, "verified_commit", forgetful)
     assert names(checked(station, Board()), "failed") == {"commit-sequence"}
+
+
+@pytest.mark.parametrize(("via", "result"), [("nfc", "failed"), ("can", "skipped")])
+def test_a_reply_that_is_torn_each_time_is_the_nodes_fault_at_a_reader(station: Station, via: str, result: str) -> None:
+    """It was skipped, and a board that answered 0 octets over NFC passed; on a bus single frames are lost."""
+
+    class Torn(FaultyLink):
+        def exchange(self, frame: bytes) -> bytes:
+            if frame[2:4] == bytes([128, 99]):
+                raise Garbled("The node asks for the same pieces again and again.")
+            return super().exchange(frame)
+
+    report = check_node(station, talk(board := Board(), Torn(board, via=via)))
+    torn = {check.rule: check for check in report.checks if check.rule in ("unknown-command", "refusal-form")}
+    assert {check.result for check in torn.values()} == {result}
+    assert len(torn) == 2
+    assert names(report, "failed") <= set(torn)
+
+
+@pytest.mark.parametrize("via", ["nfc", "can"])
+def test_a_node_that_falls_silent_loses_no_report(station: Station, via: str) -> None:
+    """Nothing was said of the rules before it, nor which command it was."""
+
+    def hangs(board: Board, octets: bytes, reference: faulty.Next) -> bytes:
+        if board.max_message == 0 or octets[2:4] == bytes([1, 1]):
+            board.max_message = 0
+            raise NodeSilent("The node does not answer any more.")
+        return reference(octets)
+
+    report = checked(station, Board(), fault=hangs, via=via)
+    assert report.lost is not None
+    assert "Query (1.1)" in report.lost.message
+    assert {"list-ascending", "teds-checksum"} <= names(report, "passed")
+    assert not names(report, "failed")
+    (last,) = [check for check in report.checks if "Query (1.1)" in check.detail]
+    assert last.rule in report.lost.message
+    assert {"commit", "reset"} <= names(report, "skipped")
 
 
 # -- what a report says ------------------------------------------------------------------------------------------------

@@ -10,7 +10,7 @@ from teds_provision import check as check_room
 from teds_provision.cli.context import App, pass_app
 from teds_provision.cli.options import command, dry_run_option, link_options, yes_option
 from teds_provision.cli.rendering import print_table, reporter_for
-from teds_provision.errors import NotAuthentic
+from teds_provision.errors import NotAuthentic, TedsProvisionError
 from teds_provision.links import LinkSettings
 
 if TYPE_CHECKING:
@@ -39,7 +39,7 @@ def check(app: App, factory: bool, yes: bool, dry_run: bool, links: LinkSettings
 
     A node of another owner is left alone (6). Keys change only with --factory: a factory node, or one of this
     station's, is then keyed, written and reset.
-    Exits 4 where a rule failed, 5 where no node is.
+    Exits 4 where a rule failed, 5 where no node is, or it fell silent.
     """
     station = app.station()
     if dry_run:
@@ -57,10 +57,17 @@ def check(app: App, factory: bool, yes: bool, dry_run: bool, links: LinkSettings
         for each in report.checks
     ]
     broken = [each.rule for each in report.checks if each.result == "failed"]
-    error = NotAuthentic(f"The node breaks {len(broken)} rules: {', '.join(broken)}.") if broken else None
+    error: TedsProvisionError | None = report.lost
+    if broken:
+        count = "a rule" if len(broken) == 1 else f"{len(broken)} rules"
+        error = NotAuthentic(f"The node breaks {count}: {', '.join(broken)}.", hint=_silent(report))
     app.conclude(
         {"uuid": report.uuid.hex(), "checks": checks, **counts}, lambda console: _table(console, report), error
     )
+
+
+def _silent(report: Report) -> str:
+    return "" if report.lost is None else f"{report.lost.message} What comes after it was not tried."
 
 
 def _table(console: Console, report: Report) -> None:

@@ -1,0 +1,157 @@
+"""A board with one fault, behind real links: ``python -m tests.check.board FAULT [--nfc PATH] [--can BUS]``.
+
+Prints a line when its links are up; ends when stdin closes. FAULT "" is the good one.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+import threading
+import time
+from collections.abc import Callable
+from dataclasses import replace
+
+import pytest
+
+from teds_provision.links.can import isotp
+from teds_provision.node.can import seat
+from teds_provision.node.can.server import CanServer
+from teds_provision.node.nfc import tnep as tnep_of_node
+from teds_provision.node.nfc import type4
+from teds_provision.node.nfc.server import NfcServer
+from teds_provision.protocol.messages.identity import NodeState
+from teds_provision.protocol.repetition import Repetition
+from tests.bench import Board
+from tests.check.faulty import Fault
+from tests.check.test_node_check import FAULTS
+from tests.check.test_wrong_inside import INSIDE
+from tests.protocol.desk import META, NAME
+
+Bend = Callable[[pytest.MonkeyPatch], None]
+
+
+def _runs_again(patch: pytest.MonkeyPatch) -> None:
+    patch.setattr(Repetition, "answer", lambda self, transaction, frame, run, now: run(frame))
+
+
+def _padded_with(octet: int) -> Bend:
+    def bend(patch: pytest.MonkeyPatch) -> None:
+        original = seat.Pair.__init__
+
+        def init(self: isotp.Pair, *args: object, **more: object) -> None:
+            original(self, *args, **more)  # type: ignore[arg-type]
+            self._logic.params.tx_padding = octet
+
+        patch.setattr(seat.Pair, "__init__", init)
+        patch.setattr(isotp, "PADDING", octet)
+
+    return bend
+
+
+def _block_of(size: int, gap: int) -> Bend:
+    def bend(patch: pytest.MonkeyPatch) -> None:
+        original = seat.Pair.__init__
+
+        def init(self: isotp.Pair, *args: object, **more: object) -> None:
+            original(self, *args, **more)  # type: ignore[arg-type]
+            self._logic.params.blocksize, self._logic.params.stmin = size, gap
+
+        patch.setattr(seat.Pair, "__init__", init)
+
+    return bend
+
+
+def _always_classic(patch: pytest.MonkeyPatch) -> None:
+    original = isotp.Pair.speak
+    patch.setattr(isotp.Pair, "speak", lambda self, fd: original(self, fd=False))
+
+
+def _wtx(octets: bytes) -> Bend:
+    def bend(patch: pytest.MonkeyPatch) -> None:
+        patch.setattr(type4, "_WTX", octets)
+        original = type4.IsoDepTag.__init__
+        patch.setattr(type4.IsoDepTag, "__init__", lambda self, rats, app: original(self, rats, app, patience=0.0))
+
+    return bend
+
+
+LINK_FAULTS: dict[str, Bend] = {
+    "runs again": _runs_again,
+    "padding 00": _padded_with(0),
+    "block size 8": _block_of(8, 0),
+    "gap of 5 ms": _block_of(16, 5),
+    "always classic": _always_classic,
+    "WTX 0": _wtx(b"\xf2\x00"),
+    "WTX 63": _wtx(b"\xf2\x3f"),
+    "a TNEP status of 81": lambda patch: patch.setattr(tnep_of_node.tnep, "SUCCESS", 0x81),
+}
+
+
+class OnLinks:
+    """The board as its links see it; see ``NodeHandler``."""
+
+    def __init__(self, board: Board, fault: Fault | None) -> None:
+        self.board, self.fault = board, fault
+        self._turn = threading.Lock()
+
+    def request(self, link: str, frame: bytes, *, tapped: bool) -> bytes:
+        with self._turn:
+            board = self.board
+            board.seconds = time.monotonic()
+
+            def reference(octets: bytes) -> bytes:
+                return board.tim.handle(octets, link=link, tapped=tapped)
+
+            return reference(frame) if self.fault is None else self.fault(board, frame, reference)
+
+    def lost(self, link: str) -> None:
+        with self._turn:
+            self.board.tim.link_lost(link)
+
+    def identify(self) -> bytes:
+        return self.board.tim.identity().encode()
+
+    def can_address(self) -> int:
+        return self.board.tim.can_address
+
+    def take_can_address(self, address: int) -> None:
+        self.board.tim.take_can_address(address)
+
+    def actuator_claimed(self) -> bool:
+        return False
+
+
+def main() -> None:
+    words = argparse.ArgumentParser()
+    words.add_argument("fault")
+    words.add_argument("--nfc")
+    words.add_argument("--can")
+    words.add_argument("--wait-time", type=int, default=4)
+    said = words.parse_args()
+    patch = pytest.MonkeyPatch()
+    if said.fault in INSIDE:
+        INSIDE[said.fault][0](patch)
+    if said.fault in LINK_FAULTS:
+        LINK_FAULTS[said.fault](patch)
+    board = Board()
+    board.flash.state = replace(board.state, blocks={(0, 1): META, (1, 12): NAME}, epoch=4)
+    board.power_on()
+    handler = OnLinks(board, FAULTS[said.fault][0] if said.fault in FAULTS else None)
+    servers: list[NfcServer | CanServer] = []
+    if said.nfc:
+        servers.append(NfcServer(said.nfc, handler, wt_int=said.wait_time))
+    if said.can:
+        always = said.fault == "tapped by bus"
+        tapped = lambda: always or (not said.nfc and board.state.state == NodeState.FACTORY)  # noqa: E731
+        servers.append(CanServer(said.can, handler, counts_as_tapped=tapped))
+    for server in servers:
+        server.start()
+    print("ready", flush=True)
+    sys.stdin.read()
+    for server in servers:
+        server.stop()
+
+
+if __name__ == "__main__":
+    main()
