@@ -12,6 +12,7 @@ from teds_provision.check.teds_rules import security_state
 from teds_provision.protocol.agreement import AgreedKey, Credentials, RequestPayload, StationAgreement
 from teds_provision.protocol.keys import (
     CHALLENGE_OCTETS,
+    GROUP_ORDER,
     SIGNATURE_OCTETS,
     SoftwareKey,
     fingerprint,
@@ -102,6 +103,16 @@ def request_checks(probe: Probe) -> str:
     return probe.refused(request(wrong), Reason.BAD_SIGNATURE, "SIG104 of another key")
 
 
+@rule("request-high-s", "Notation", Stage.FACTORY)
+def request_high_s(probe: Probe) -> str:
+    """Whoever verifies refuses an s in the upper half: a Request whose SIG104 has one gets 5."""
+    tapped_or_bus(probe)
+    good = Strangers.make().request()
+    high = GROUP_ORDER - int.from_bytes(good[97:129], "big")
+    twisted = good[:97] + high.to_bytes(32, "big") + good[129:]
+    return probe.refused(request(twisted), Reason.BAD_SIGNATURE, "SIG104 with a high s")
+
+
 @rule("confirm-without-request", "Key agreement", Stage.FACTORY)
 def confirm_without_request(probe: Probe) -> str:
     """A Confirm with nothing pending gets 2."""
@@ -132,6 +143,15 @@ def confirm_checks(probe: Probe) -> str:
     after = probe.identity()
     holds(after == before, f"Identify went from {before} to {after} although no Confirm was good.")
     return "4, 12, then 2; nothing changed"
+
+
+@rule("confirm-newest", "Key agreement", Stage.AGREEMENT)
+def confirm_newest(probe: Probe) -> str:
+    """What pends goes at a new good Request: the tagS of the one before gets 12."""
+    tapped_or_bus(probe)
+    first = agree(probe, probe.station, epoch=0)
+    agree(probe, probe.station, epoch=0)
+    return demand(probe.plain(first.confirm), Reason.BAD_TAG, "Confirm (128.2) of the Request before the last")
 
 
 @rule("agreement-epoch", "Key agreement", Stage.AGREEMENT)

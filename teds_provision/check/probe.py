@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from typing import Final
 
+from teds_provision.check.heard import Heard
 from teds_provision.check.outcome import NotApplicable, RuleBroken
 from teds_provision.errors import BadData, Garbled, NodeSilent, NotAuthentic
 from teds_provision.links import Contact
@@ -33,10 +34,13 @@ _LARGEST_TEDS: Final = 1 << 20
 
 
 class Probe:
-    """One node under test. ``credentials`` is this station's, ``key`` the link key where one is held."""
+    """One node under test. ``credentials`` is this station's, ``key`` the link key where one is held.
 
-    def __init__(self, contact: Contact) -> None:
-        self.contact = contact
+    ``heard`` are the frames of its link, None where nobody listened.
+    """
+
+    def __init__(self, contact: Contact, heard: Heard | None = None) -> None:
+        self.contact, self.heard = contact, heard
         self.uuid = contact.identity.uuid
         self.max_message = contact.identity.max_message
         self.credentials: Credentials | None = None
@@ -66,6 +70,8 @@ class Probe:
                 reply = decode_reply(raw)
             except Garbled as error:
                 raise RuleBroken(f"{what}: {error.message}") from None
+            if len(raw) > self.max_message:
+                raise RuleBroken(f"{what}: {len(raw)} octets came; maxMessage is {self.max_message}.")
             if inside is None or not reply.ok:  # what is sealed is told when it is opened
                 self.contact.note("in", raw, f"reply to {what}: {told(reply)}")
             if reply.reason != Reason.BUSY:

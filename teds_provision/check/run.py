@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
-from teds_provision.check import owning, plain, sessions, teds_rules, writing
+from teds_provision.check import link_rules, owning, plain, sessions, teds_rules, writing
+from teds_provision.check.heard import Heard
 from teds_provision.check.outcome import Checked, NotApplicable, RuleBroken
 from teds_provision.check.probe import Probe
 from teds_provision.check.rule import RULES, Rule, Stage
@@ -19,7 +20,7 @@ from teds_provision.talk.conversation import Conversation
 from teds_provision.talk.meeting import meet
 from teds_provision.talk.progress import Reporter
 
-_REGISTERS = (plain, teds_rules, owning, sessions, writing)
+_REGISTERS = (plain, teds_rules, link_rules, owning, sessions, writing)
 """The modules whose rules are registered by being imported."""
 _ONLY_FACTORY = "The node has a key. Ask with --factory to have it reset and keyed anew."
 _NEEDS_FACTORY = "Changes the node's key. Ask with --factory."
@@ -49,25 +50,26 @@ class Report:
 
 def check_at(station: Station, links: LinkSettings, reporter: Reporter, *, factory: bool) -> Report:
     """Run the rules against the node that is met first; see :func:`check_node`. Raises NoNode, NoReader as well."""
-    with meet(station, links, None, reporter, before=station.unlock) as node:
-        return check_node(station, node, factory=factory)
+    heard = Heard(links.trace)
+    with meet(station, replace(links, trace=heard), None, reporter, before=station.unlock) as node:
+        return check_node(station, node, factory=factory, heard=heard)
 
 
-def check_node(station: Station, node: Conversation, *, factory: bool = False) -> Report:
-    """Run the rules against a node, most of which change nothing.
+def check_node(station: Station, node: Conversation, *, factory: bool = False, heard: Heard | None = None) -> Report:
+    """Run the rules against a node, most of which change nothing; ``heard`` has the frames of its link.
 
     Without ``factory`` no key changes: a factory node is tried in factory state, one of ours in sessions too. With it a
     node of ours is reset, then keyed, written and reset again, so that it ends in factory state.
     A node that falls silent ends it, with what was found until then. Raises PolicyRefused for a node with another
     owner, before anything but Identify was asked; LinkFailure before the first rule.
     """
-    return _Run(station, node, factory).all()
+    return _Run(station, node, factory, heard).all()
 
 
 class _Run:
-    def __init__(self, station: Station, node: Conversation, factory: bool) -> None:
+    def __init__(self, station: Station, node: Conversation, factory: bool, heard: Heard | None) -> None:
         self._station, self._node, self._factory = station, node, factory
-        self._probe = Probe(node.contact)
+        self._probe = Probe(node.contact, heard)
         self._checks: dict[str, Checked] = {}
         self._lost: LinkFailure | None = None
 

@@ -21,7 +21,7 @@ from teds_provision.protocol.messages.frames import (
     security_command,
 )
 from teds_provision.protocol.messages.words import named, told
-from teds_provision.protocol.session import OPEN_OCTETS, StationSession, open_mac
+from teds_provision.protocol.session import LAST_COUNTER, OPEN_OCTETS, StationSession, open_mac
 
 
 def _ask(probe: Probe) -> bytes:
@@ -99,6 +99,25 @@ def open_beside(probe: Probe) -> str:
     probe.session = new
     probe.sealed_good(IDENTIFY)
     return demand(probe.plain(old.seal(IDENTIFY)), Reason.BAD_TAG, "Sealed (128.4) in the session that was replaced")
+
+
+@rule("open-replaced", "Sessions", Stage.SESSION)
+def open_replaced(probe: Probe) -> str:
+    """A new Open replaces the half-open one: what is sealed under that gets 12."""
+    old, new = probe.open(), probe.open()
+    seen = demand(probe.plain(old.seal(IDENTIFY)), Reason.BAD_TAG, "Sealed (128.4) under an Open that was replaced")
+    probe.session = new
+    probe.sealed_good(IDENTIFY)
+    return seen
+
+
+@rule("sealed-last-counter", "Sessions", Stage.SESSION)
+def sealed_last_counter(probe: Probe) -> str:
+    """Counter 2^32 - 1 is served, and ends the session."""
+    session = probe.open()
+    session.unseal(probe.good(session.seal(IDENTIFY, counter=LAST_COUNTER)).ljust(36, b"\0"))
+    probe.session = None
+    return demand(probe.plain(session.seal(IDENTIFY, counter=LAST_COUNTER)), Reason.WRONG_STATE, "Sealed after it")
 
 
 @rule("sealed-counter", "Sessions", Stage.SESSION)

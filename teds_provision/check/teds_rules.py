@@ -24,6 +24,8 @@ from teds_provision.protocol.messages.identity import NodeState
 from teds_provision.teds.codec.frame import unframe
 from teds_provision.teds.image import SECURITY, BlockId
 
+_TEXTS = frozenset({2, 4, 6, 10, 11, 14, 15})
+"""Access codes of text-based TEDS (profile.md, "Command frames")."""
 _NEVER: tuple[BlockId, ...] = ((0, 0), (0, 18), (0, 127), (0, 136), (256, 1))
 
 
@@ -65,7 +67,7 @@ def teds_checksum(probe: Probe) -> str:
 
 @rule("query-present", "Command frames", Stage.PLAIN)
 def query_present(probe: Probe) -> str:
-    """Size is what Read hands out, the checksum that of the TEDS, NotAvail is not set, MfgrDefine from 128 on."""
+    """Size is what Read hands out, the checksum that of the TEDS; NotAvail not set, TextTEDS and MfgrDefine right."""
     listed = probe.listed()
     for block in listed:
         status, octets = _status(probe, block), probe.teds(block)
@@ -77,6 +79,8 @@ def query_present(probe: Probe) -> str:
         holds(not status.attributes & Attribute.NOT_AVAILABLE, f"Query (1.1) of {block}: NotAvail, but List has it.")
         manufacturer = bool(status.attributes & Attribute.MANUFACTURER)
         holds(manufacturer == (block[1] >= 128), f"Query (1.1) of {block}: MfgrDefine is {int(manufacturer)}.")
+        text = bool(status.attributes & Attribute.TEXT)
+        holds(text == (block[1] in _TEXTS), f"Query (1.1) of {block}: TextTEDS is {int(text)}.")
         holds(status.status == 0, f"Query (1.1) of {block}: status {status.status}, 0 is due.")
     return f"size, checksum and attributes of {len(listed)} TEDS"
 

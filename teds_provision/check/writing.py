@@ -14,6 +14,7 @@ from teds_provision.check.teds_rules import absent, security_state
 from teds_provision.protocol.datasheet import NodeKeys, digests, sign_datasheet, unsigned_datasheet
 from teds_provision.protocol.keys import (
     CHALLENGE_OCTETS,
+    GROUP_ORDER,
     SoftwareKey,
     fingerprint,
 )
@@ -54,6 +55,21 @@ def write_checks(probe: Probe) -> str:
     probe.sealed_refused(Command(block[0], COMMON, TedsFunction.WRITE, bytes([block[1], 0, 0, 0])), Reason.BAD_FORM)
     probe.sealed_refused(write_teds(*block, 1, b"\0"), Reason.BAD_FORM, "offset 1, nothing staged")
     seen = probe.sealed_refused(write_teds(0, 99, 0, b"\0"), Reason.NO_SUCH_TEDS, "access code 99")
+    probe.close()
+    return seen
+
+
+@rule("write-keeps", "Writing to flash", Stage.SESSION)
+def write_keeps(probe: Probe) -> str:
+    """A refused Write changes no staging; an empty one at 0 stages an empty image, which fails its own check."""
+    block = absent(probe)
+    good = _example(block)
+    probe.sealed_good(write_teds(*block, 0, good))
+    probe.sealed_refused(write_teds(*block, len(good) + 1, b"\0"), Reason.BAD_FORM, "an offset beyond what is staged")
+    staged = TedsStatus.decode(probe.sealed_good(update_teds(*block)))
+    holds(staged.size == len(good), f"Update (1.4): size {staged.size} after a refused Write; {len(good)} is due.")
+    probe.sealed_good(write_teds(*block, 0, b""))
+    seen = probe.sealed_refused(update_teds(*block), Reason.BAD_FORM, "an empty image is staged")
     probe.close()
     return seen
 
@@ -163,11 +179,23 @@ def commit_signatures(probe: Probe) -> str:
     _refused_commit(probe, Reason.BAD_SIGNATURE, "101 of another node", lambda s: replace(s, node_key=other.point))
     forged = other.sign(b"no station key")
     _refused_commit(probe, Reason.BAD_SIGNATURE, "104 wrong", lambda s: replace(s, station_key_signature=forged))
+    _refused_commit(probe, Reason.BAD_SIGNATURE, "102 wrong", lambda s: replace(s, node_key_signature=forged))
     octets = _sheet(probe, _stored(probe)).with_signature(other.sign(b"another datasheet")).encode()
     _write(probe, SECURITY, octets)
     seen = probe.sealed_refused(update_teds(*SECURITY), Reason.BAD_SIGNATURE, "100 wrong")
     probe.close()
     return seen
+
+
+@rule("commit-high-s", "Notation", Stage.COMMIT)
+def commit_high_s(probe: Probe) -> str:
+    """A field 100 whose s is in the upper half gets 5."""
+    sheet = _sheet(probe, _stored(probe))
+    good = security.decode(_signed(probe, sheet)).signature
+    assert good is not None
+    twisted = good[:32] + (GROUP_ORDER - int.from_bytes(good[32:], "big")).to_bytes(32, "big")
+    octets = sheet.with_signature(twisted).encode()
+    return _refused_over(probe, Reason.BAD_SIGNATURE, "100 with a high s", octets)
 
 
 @rule("commit-form", "Writing to flash", Stage.COMMIT)

@@ -121,6 +121,15 @@ class Repeats(Protocol):
 
 
 @runtime_checkable
+class Announces(Protocol):
+    """A link on which the node says beforehand how it wants to be talked to (NFC: the record ``Tp``)."""
+
+    @property
+    def announced(self) -> dict[str, int]:
+        """``WT_INT``, ``N_wait`` and ``maxNdef``, as profile.md, "NFC" has them."""
+
+
+@runtime_checkable
 class Prompt(Protocol):
     """A link on which a request can be given up soon: what it orders would be too late afterwards."""
 

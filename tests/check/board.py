@@ -68,12 +68,28 @@ def _always_classic(patch: pytest.MonkeyPatch) -> None:
 
 
 def _wtx(octets: bytes) -> Bend:
+    """Each APDU is answered after an S(WTX) with this multiplier."""
+
     def bend(patch: pytest.MonkeyPatch) -> None:
-        patch.setattr(type4, "_WTX", octets)
-        original = type4.IsoDepTag.__init__
-        patch.setattr(type4.IsoDepTag, "__init__", lambda self, rats, app: original(self, rats, app, patience=0.0))
+        run = type4.IsoDepTag._run
+
+        def asks_first(self: type4.IsoDepTag, apdu: bytes) -> bytes:
+            if self._pending is None:
+                self._pending = apdu
+                return self._kept(octets)
+            return run(self, apdu)
+
+        patch.setattr(type4.IsoDepTag, "_run", asks_first)
 
     return bend
+
+
+def _stale(patch: pytest.MonkeyPatch) -> None:
+    def identify(self: OnLinks) -> bytes:
+        now = self.board.tim.identity()
+        return replace(now, epoch=now.epoch - 1).encode()
+
+    patch.setattr(OnLinks, "identify", identify)
 
 
 LINK_FAULTS: dict[str, Bend] = {
@@ -81,7 +97,9 @@ LINK_FAULTS: dict[str, Bend] = {
     "padding 00": _padded_with(0),
     "block size 8": _block_of(8, 0),
     "gap of 5 ms": _block_of(16, 5),
+    "found as of an older epoch": _stale,
     "always classic": _always_classic,
+    "WTX 1": _wtx(b"\xf2\x01"),
     "WTX 0": _wtx(b"\xf2\x00"),
     "WTX 63": _wtx(b"\xf2\x3f"),
     "a TNEP status of 81": lambda patch: patch.setattr(tnep_of_node.tnep, "SUCCESS", 0x81),

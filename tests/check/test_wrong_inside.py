@@ -12,7 +12,7 @@ from cryptography.hazmat.primitives.ciphers.aead import AESCCM
 from teds_provision.check.run import check_node
 from teds_provision.protocol import commit, datasheet
 from teds_provision.protocol.flash import Flash
-from teds_provision.protocol.keys import SoftwareKey
+from teds_provision.protocol.keys import SoftwareKey, normalise_signature, verify
 from teds_provision.protocol.messages.frames import Command, Function, Reason, Refused, Reply
 from teds_provision.protocol.session import NodeSession
 from teds_provision.protocol.tim import node, teds_access
@@ -145,6 +145,76 @@ def _reset_to(change: Callable[[Flash, Flash], Flash]) -> Callable[[Patch], None
     return lambda patch: patch.setattr(node, "_factory", lambda flash: change(flash, original(flash)))
 
 
+def _lenient(verified: Any) -> Any:
+    return lambda point, message, signature: verified(point, message, normalise_signature(signature))
+
+
+def any_s_in_a_request(patch: Patch) -> None:
+    original = Agreeing.request
+
+    def request(self: Agreeing, *args: Any) -> bytes:
+        self._verify = _lenient(verify)
+        return original(self, *args)
+
+    patch.setattr(Agreeing, "request", request)
+
+
+def any_s_in_a_datasheet(patch: Patch) -> None:
+    def lenient(flash: Flash, staged: Any, verified: Any) -> Flash:
+        return commit.verified_commit(flash, staged, _lenient(verified))
+
+    patch.setattr(teds_access, "verified_commit", lenient)
+
+
+def the_first_request_stays(patch: Patch) -> None:
+    original = Agreeing.request
+
+    def request(self: Agreeing, *args: Any) -> bytes:
+        before, reply = self._pending, original(self, *args)
+        self._pending = before or self._pending
+        return reply
+
+    patch.setattr(Agreeing, "request", request)
+
+
+def the_first_open_stays(patch: Patch) -> None:
+    original = Sessions.open
+
+    def opened(self: Sessions, payload: bytes, link: str, flash: Flash) -> bytes:
+        before = self._links[link].half_open if link in self._links else None
+        reply = original(self, payload, link, flash)
+        if payload and before is not None:
+            self._links[link].half_open = before
+        return reply
+
+    patch.setattr(Sessions, "open", opened)
+
+
+def a_refused_write_drops(patch: Patch) -> None:
+    original = teds_access.TedsAccess.write
+
+    def write(self: Any, flash: Flash, command: Command, staging: dict[Any, bytes]) -> Reply:
+        try:
+            return original(self, flash, command, staging)
+        except Refused:
+            staging.pop((command.channel, command.payload[0]), None)
+            raise
+
+    patch.setattr(teds_access.TedsAccess, "write", write)
+
+
+def an_empty_write_stages_nothing(patch: Patch) -> None:
+    original = teds_access.TedsAccess.write
+
+    def write(self: Any, flash: Flash, command: Command, staging: dict[Any, bytes]) -> Reply:
+        reply = original(self, flash, command, staging)
+        if len(command.payload) == 5:
+            del staging[command.channel, command.payload[0]]
+        return reply
+
+    patch.setattr(teds_access.TedsAccess, "write", write)
+
+
 def any_challenge_of_reset(patch: Patch) -> None:
     original = node._length
     patch.setattr(node, "_length", lambda payload, octets: None if octets == 32 else original(payload, octets))
@@ -174,6 +244,16 @@ INSIDE: dict[str, tuple[Callable[[Patch], None], str]] = {
         "commit-uuid",
     ),
     "a refused commit uses a sequence up": (a_refused_commit_counts, "commit-signatures"),
+    "a high s in a Request": (any_s_in_a_request, "request-high-s"),
+    "a high s in a datasheet": (any_s_in_a_datasheet, "commit-high-s"),
+    "an older Request that still counts": (the_first_request_stays, "confirm-newest"),
+    "an older Open that still counts": (the_first_open_stays, "open-replaced"),
+    "a session beyond the last counter": (
+        lambda patch: patch.setattr(node, "LAST_COUNTER", -1),
+        "sealed-last-counter",
+    ),
+    "a refused Write drops what is staged": (a_refused_write_drops, "write-keeps"),
+    "an empty Write stages nothing": (an_empty_write_stages_nothing, "write-keeps"),
     "Reset takes the other TEDS": (_reset_to(lambda _, reset: replace(reset, blocks={})), "reset"),
     "Reset keeps the CA": (_reset_to(lambda flash, reset: replace(reset, ca=flash.ca)), "reset-forgets"),
     "Reset with any challenge": (any_challenge_of_reset, "prove-length"),
@@ -211,6 +291,25 @@ def test_identify_with_a_payload_is_found(station: Station) -> None:
         return answer
 
     assert failed(station, fault=any_payload) == {"no-payload"}
+
+
+def test_a_reply_longer_than_max_message_is_found(station: Station) -> None:
+    def long(_board: Board, octets: bytes, reference: Any) -> bytes:
+        answer: bytes = reference(octets)
+        return Reply(True, bytes(2046)).encode() if _is(octets, Function.LIST) else answer
+
+    board = Board()
+    report = check_node(station, talk(board, FaultyLink(board, fault=long)))
+    assert any("maxMessage is 2048" in check.detail for check in report.checks if check.rule == "list-ascending")
+
+
+def test_an_attribute_that_is_wrong_is_found(station: Station) -> None:
+    def texts(_board: Board, octets: bytes, reference: Any) -> bytes:
+        answer: bytes = reference(octets)
+        query = _is(octets, 1, 1) and answer[:1] == b"\1"
+        return answer[:3] + bytes([answer[3] | 0x10]) + answer[4:] if query else answer
+
+    assert "query-present" in failed(station, fault=texts)
 
 
 def test_an_initial_teds_of_an_older_epoch_is_found(station: Station) -> None:

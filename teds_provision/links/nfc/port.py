@@ -254,6 +254,12 @@ class NfcLink:
         """What a tap can do."""
         return NFC
 
+    @property
+    def announced(self) -> dict[str, int]:
+        """What the node's service record says; see ``Announces``."""
+        service = self.visit.service
+        return {"WT_INT": service.wt_int, "N_wait": service.n_wait, "maxNdef": service.max_ndef}
+
     def exchange(self, frame: bytes) -> bytes:
         """Send one whole command frame and return its whole reply frame.
 

@@ -1,0 +1,121 @@
+"""Rules of the link itself, where its frames were heard: ISO-TP on CAN, ISO-DEP and TNEP over NFC; changes nothing."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Final
+
+from teds_provision.check.heard import HeardFrame
+from teds_provision.check.outcome import NotApplicable
+from teds_provision.check.probe import Probe, holds
+from teds_provision.check.rule import Stage, rule
+from teds_provision.links.can.isotp import BLOCK_SIZE, PADDING, addresses, padded
+from teds_provision.links.ports import Announces
+from teds_provision.protocol.messages.frames import write_teds
+from teds_provision.teds.image import SECURITY
+
+_SINGLE, _FIRST, _CONSECUTIVE, _FLOW = range(4)
+_WTX: Final = 0xF2
+_MOST_WTX: Final = 59
+
+
+_LONG: Final = write_teds(0, 12, 0, bytes(96))
+"""Takes several frames, in FD too; refused outside a session."""
+
+
+def _of_the_node(probe: Probe) -> tuple[HeardFrame, list[HeardFrame]]:
+    """The first CAN frame that asks, and those by which the node takes a long question and gives a long answer."""
+    if probe.heard is None or probe.contact.address is None:
+        raise NotApplicable("A rule of CAN; try it there.")
+    began = len(probe.heard.frames)
+    probe.plain(_LONG)
+    probe.teds(SECURITY)
+    frames = [one for one in probe.heard.frames[began:] if one.identifier is not None]
+    asked = next(one for one in frames if one.direction == "out")
+    told = [one for one in frames if one.direction == "in" and one.octets]
+    return asked, [one for one in told if (addresses(one.identifier or 0) or (0, 0))[1] == probe.contact.address]
+
+
+def _used(frames: list[HeardFrame]) -> Iterator[tuple[HeardFrame, int]]:
+    """Each frame, and how many of its octets say something (ISO 15765-2, N_PDU table).
+
+    What stands behind a frame that was lost, or heard twice, is left out until the next message.
+    """
+    left = number = 0
+    for one in frames:
+        data = one.octets
+        kind, low = data[0] >> 4, data[0] & 0xF
+        if kind == _SINGLE:
+            yield one, 1 + low if low else 2 + data[1]
+        elif kind == _FIRST:
+            left, number = (low << 8 | data[1]) - (len(data) - 2), 0
+            yield one, len(data)
+        elif kind == _FLOW:
+            yield one, 3
+        elif left > 0 and low == (number + 1) % 16:
+            yield one, 1 + min(left, len(data) - 1)
+            left, number = left - (len(data) - 1), low
+        else:
+            left = 0
+
+
+@rule("can-padding", "CAN", Stage.PLAIN)
+def can_padding(probe: Probe) -> str:
+    """Padding CC, to 8 octets, in FD to the next length that FD knows."""
+    _, frames = _of_the_node(probe)
+    for one, used in _used(frames):
+        due = padded(one.octets[:used], fd=one.fd)
+        holds(one.octets == due, f"A frame of {used} octets came as {one.octets.hex()}; {due.hex()} is due.")
+    return f"{len(frames)} frames, padded with {PADDING:02X}"
+
+
+@rule("can-flow-control", "CAN", Stage.PLAIN)
+def can_flow_control(probe: Probe) -> str:
+    """Flow control asks for blocks of 16 frames without a gap."""
+    _, frames = _of_the_node(probe)
+    controls = {one.octets[:3] for one in frames if one.octets[0] >> 4 == _FLOW}
+    due = bytes([_FLOW << 4, BLOCK_SIZE, 0])
+    wrong = " ".join(sorted(control.hex() for control in controls - {due}))
+    holds(not wrong, f"Flow control {wrong}: {due.hex()} is due (block size {BLOCK_SIZE}, STmin 0).")
+    return f"block size {BLOCK_SIZE}, STmin 0"
+
+
+@rule("can-form", "CAN", Stage.PLAIN)
+def can_form(probe: Probe) -> str:
+    """The node answers in the form, classic or FD, in which it was asked."""
+    asked, frames = _of_the_node(probe)
+    form = {True: "CAN FD", False: "classic CAN"}
+    same = all(one.fd == asked.fd for one in frames)
+    holds(same, f"Asked in {form[asked.fd]} it answered in {form[not asked.fd]}.")
+    return f"asked and answered in {form[asked.fd]}"
+
+
+@rule("nfc-wait-time", "NFC", Stage.PLAIN)
+def nfc_wait_time(probe: Probe) -> str:
+    """The service record announces a WT_INT that is a multiple of 4."""
+    link = probe.contact.link
+    if not isinstance(link, Announces):
+        raise NotApplicable("A rule of NFC; try it there.")
+    wt_int = link.announced["WT_INT"]
+    holds(wt_int % 4 == 0, f"WT_INT is {wt_int}: implementations round what is no multiple of 4 differently.")
+    return ", ".join(f"{name} {value}" for name, value in link.announced.items())
+
+
+@rule("nfc-wtx", "NFC", Stage.PLAIN)
+def nfc_wtx(probe: Probe) -> str:
+    """An S(WTX) asks for 1 to 59 times the frame waiting time (ISO/IEC 14443-4, clause 7.3)."""
+    blocks = [one.octets for one in probe.heard.frames if one.direction == "in"] if probe.heard is not None else []
+    asked = {block[1] & 0x3F for block in blocks if len(block) == 2 and block[0] == _WTX}
+    if probe.contact.address is not None or not asked:
+        raise NotApplicable("No S(WTX) was heard.")
+    wrong = sorted(asked - set(range(1, _MOST_WTX + 1)))
+    holds(not wrong, f"S(WTX) with multiplier {', '.join(map(str, wrong))}: 1 to {_MOST_WTX} are allowed.")
+    return f"multiplier {', '.join(map(str, sorted(asked)))}"
+
+
+@rule("identify-found", "Identify, Prove, List", Stage.PLAIN)
+def identify_found(probe: Probe) -> str:
+    """What the node was found by (the id record over NFC, functional Identify on CAN) says what Identify says."""
+    found, now = probe.contact.identity, probe.identity()
+    holds(found == now, f"The node was found as {found}; Identify says {now}.")
+    return "the same when it was found and when it is asked"
