@@ -30,10 +30,14 @@ def _of_the_node(probe: Probe) -> tuple[HeardFrame, list[HeardFrame]]:
     began = len(probe.heard.frames)
     probe.plain(_LONG)
     probe.teds(SECURITY)
-    frames = [one for one in probe.heard.frames[began:] if one.identifier is not None]
+    frames = probe.heard.frames[began:]
     asked = next(one for one in frames if one.direction == "out")
-    told = [one for one in frames if one.direction == "in" and one.octets]
-    return asked, [one for one in told if (addresses(one.identifier or 0) or (0, 0))[1] == probe.contact.address]
+    return asked, [one for one in frames if _is_from(one, probe.contact.address)]
+
+
+def _is_from(one: HeardFrame, node: int) -> bool:
+    ends = addresses(one.identifier) if one.identifier is not None else None
+    return one.direction == "in" and bool(one.octets) and ends is not None and ends[1] == node
 
 
 def _used(frames: list[HeardFrame]) -> Iterator[tuple[HeardFrame, int]]:
