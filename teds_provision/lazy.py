@@ -25,12 +25,14 @@ from typing import TYPE_CHECKING, Final
 _NOTHING: Final[Mapping[str, str]] = MappingProxyType({})
 
 
-def lazy(package: str, where: Mapping[str, str] = _NOTHING) -> Callable[[str], object]:
-    """Return the ``__getattr__`` of a package: it gives the package's modules, and the names of ``where``.
+def lazy(package: str, names: Mapping[str, str] = _NOTHING) -> Callable[[str], object]:
+    """Return the ``__getattr__`` of a package: it gives the package's modules, and names out of them.
 
-    ``where`` says in which of its modules a name stands: ``{"fit": "fitting"}`` is ``package.fit`` of
-    ``package.fitting``. No such name may be a module's too: Python would put the module in its place.
+    ``names`` says which of its modules has which: ``{"fitting": "fit residuals"}`` is ``package.fit`` and
+    ``package.residuals`` of ``package.fitting``. No such name may be a module's too: Python would put the module in
+    its place.
     """
+    where = {name: module for module, listed in names.items() for name in listed.split()}
 
     def load(name: str) -> object:
         if name in where:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import importlib
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -112,6 +113,15 @@ def file_of(name: str) -> Path | None:
 
 def test_the_rooms_are_those_of_the_page() -> None:
     assert {room_of(path) for path in MODULES} - {"__init__"} == set(ARROWS)
+
+
+def test_what_a_room_names_it_gives() -> None:
+    """A name stands in `__all__` and in the table of `lazy()`: whoever forgets one of them is told here."""
+    rooms = [path.parent.relative_to(PACKAGE.parent) for path in MODULES if path.name == "__init__.py"]
+    loaded = [importlib.import_module(".".join(room.parts)) for room in rooms]
+    named = {room: getattr(room, "__all__", ()) for room in loaded}
+    assert not [f"{room.__name__}.{name}" for room, names in named.items() for name in names if not hasattr(room, name)]
+    assert sum(map(bool, named.values())) >= 5
 
 
 def test_no_arrow_of_the_table_makes_a_circle() -> None:

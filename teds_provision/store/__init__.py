@@ -33,33 +33,13 @@ else:
     __getattr__ = lazy(
         __name__,
         {
-            **dict.fromkeys(("AuditEntry", "AuditLog", "AuditVerdict", "Choice", "is_failure"), "audit"),
-            **dict.fromkeys(("NodeTurn", "StoreLock"), "lock"),
-            **dict.fromkeys(
-                (
-                    "DatasheetRecord",
-                    "Draft",
-                    "Facts",
-                    "Group",
-                    "Handed",
-                    "Handover",
-                    "Holder",
-                    "KeyRecord",
-                    "Marks",
-                    "Measurement",
-                    "NodeRecord",
-                    "Revocation",
-                    "Shown",
-                    "Tombstone",
-                    "TrustRecord",
-                    "WhitelistEntry",
-                    "utc_now",
-                ),
-                "records",
-            ),
-            "Store": "store",
-            **dict.fromkeys(("Batch", "pages"), "tables.batches"),
-            **dict.fromkeys(("Known", "Search"), "tables.overview"),
+            "audit": "AuditEntry AuditLog AuditVerdict Choice is_failure",
+            "lock": "NodeTurn StoreLock",
+            "records": "DatasheetRecord Draft Facts Group Handed Handover Holder KeyRecord Marks Measurement NodeRecord"
+            " Revocation Shown Tombstone TrustRecord WhitelistEntry utc_now",
+            "store": "Store",
+            "tables.batches": "Batch pages",
+            "tables.overview": "Known Search",
         },
     )
 

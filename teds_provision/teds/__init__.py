@@ -60,25 +60,18 @@ __all__ = [
     "unpack_uuid",
 ]
 
-_LAZY: Final = {
-    "AccessCode": "codec.codes",
-    "decode": "codec.decode",
-    **dict.fromkeys(
-        ("Decoded", "Edition", "Field", "Finding", "Severity", "TimeInstance", "Units", "Value", "Verdict"),
-        "codec.model",
-    ),
-    **dict.fromkeys(("FieldSpec", "Table", "name_of", "table"), "codec.tables"),
-    "compose": "codec.composer",
-    "encode": "codec.composer",
-    "recompose": "codec.composer",
-    "convert": "codec.editions",
-    "ReadKey": "codec.keyforms",
-    "read_key": "codec.keyforms",
-    "Sheet": "sheet",
-    "UuidParts": "codec.uuid",
-    "pack_uuid": "codec.uuid",
-    "unpack_uuid": "codec.uuid",
-}
-
 if not TYPE_CHECKING:
-    __getattr__ = lazy(__name__, _LAZY)
+    __getattr__ = lazy(
+        __name__,
+        {
+            "codec.codes": "AccessCode",
+            "codec.composer": "compose encode recompose",
+            "codec.decode": "decode",
+            "codec.editions": "convert",
+            "codec.keyforms": "ReadKey read_key",
+            "codec.model": "Decoded Edition Field Finding Severity TimeInstance Units Value Verdict",
+            "codec.tables": "FieldSpec Table name_of table",
+            "codec.uuid": "UuidParts pack_uuid unpack_uuid",
+            "sheet": "Sheet",
+        },
+    )

@@ -19,11 +19,7 @@ if TYPE_CHECKING:
     from teds_provision.vault.choose import create_vault, forget_vaults, open_vault
 else:
     __getattr__ = lazy(
-        __name__,
-        {
-            **dict.fromkeys(("Ask", "Vault", "node_key_context"), "base"),
-            **dict.fromkeys(("create_vault", "forget_vaults", "open_vault"), "choose"),
-        },
+        __name__, {"base": "Ask Vault node_key_context", "choose": "create_vault forget_vaults open_vault"}
     )
 
 __all__ = ["Ask", "Vault", "create_vault", "forget_vaults", "node_key_context", "open_vault"]
