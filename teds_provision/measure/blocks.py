@@ -82,7 +82,7 @@ class Block:
     value: NDArray[Any]  # (n, c) float64
     valid: NDArray[Any]  # (n, c) bool
     age: float = 0.0  # seconds from the last instant to the moment when the block was handed on
-    clock_error: float | None = None  # bound of the error of `time` in seconds; None where none is known
+    clock_error: float | None = None  # bound of the error of `time` in seconds; None: none is known, or the clock lies
     test_pattern: bool = False
     run: int = 0  # number of the run of the stream in its session
 

@@ -98,7 +98,7 @@ class StreamInterpreter:
             value=value,
             valid=valid,
             age=time.monotonic() - (host + span * rate) / 1e9,
-            clock_error=bound if bound < math.inf else None,
+            clock_error=bound if bound < math.inf and not self._clock.lie else None,
             test_pattern=self._test_pattern,
             run=self._run,
         )

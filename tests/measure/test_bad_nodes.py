@@ -181,8 +181,11 @@ def test_a_node_whose_samples_fall_behind_is_not_believed(seen: dict[str, Seen])
 
 
 @pytest.mark.parametrize("fault", ["jumping_clock", "backward_clock"])
-def test_a_clock_that_contradicts_itself_is_told(seen: dict[str, Seen], fault: str) -> None:
-    assert "its clock lies" in seen[fault].told
+def test_a_clock_that_contradicts_itself_is_told_and_its_data_claim_no_bound(seen: dict[str, Seen], fault: str) -> None:
+    one = seen[fault]
+    assert "its clock lies" in one.told
+    assert one.data[-1]["clock_error"] is None, "data of a clock that lies are marked (operation.md section 5)"
+    assert seen["good"].data[-1]["clock_error"] is not None
 
 
 @pytest.mark.parametrize(

@@ -277,7 +277,8 @@ class TopicSink(ThreadedSink):
     def _status(self, report: NodeReport) -> Status:
         counters = {"lost": report.lost, "late": report.late, "bad": report.bad, "invalid": report.invalid}
         level = {"running": OK, "waiting": WARN, "ended": OK}.get(report.state, ERROR)
-        if level == OK and any(counters.values()):
+        told = report.state == "running" and report.why
+        if level == OK and (told or any(counters.values())):
             level = WARN
         values = [("samples", str(report.samples)), *((name, str(count)) for name, count in counters.items())]
         if report.clock_error is not None:
