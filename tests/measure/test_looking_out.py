@@ -117,6 +117,17 @@ def test_who_goes_on_announcing_a_missing_node_does_not_have_everybody_asked_on_
         assert [lookout._heard(frame) for _ in range(3 * BELIEVED)] == [SOON] * BELIEVED + [math.inf] * 2 * BELIEVED
 
 
+def test_everybody_is_asked_now_and_then_so_that_a_node_is_found_whose_announce_nobody_heard(
+    lookout: Lookout,
+    hub: Hub,  # noqa: F811
+) -> None:
+    hub.frames.clear()
+    time.sleep(1.0)
+    assert not asked(hub)[0], "nobody is missing, and 30 s have not passed"
+    lookout.poll(0.2)
+    until(lambda: asked(hub)[0] >= 2)
+
+
 @contextmanager
 def looked_for(lookout: Lookout) -> Iterator[None]:
     """Somebody waits for a node that is not there."""
