@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import sys
 import time
 from collections.abc import Iterable
@@ -39,6 +40,13 @@ def first_lines(lines: list[str], most: int, count: int) -> list[str]:
 def shown(text: str | None) -> str:
     """A name or remark from outside, fit for a terminal: what cannot be printed becomes ``?``."""
     return "".join(character if character.isprintable() else "?" for character in text or "")
+
+
+def tidy(value: float, uncertainty: float | None) -> float:
+    """A measured value for people: no digits below a thousandth of its uncertainty, and a zero is 0."""
+    if uncertainty is None or not 0 < uncertainty < math.inf or not math.isfinite(value):
+        return value
+    return round(value, 3 - math.floor(math.log10(uncertainty))) + 0.0
 
 
 def local_time(text: str) -> str:

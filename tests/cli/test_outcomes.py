@@ -10,7 +10,7 @@ import pytest
 from rich.spinner import Spinner
 
 from teds_provision.cli.context import App
-from teds_provision.cli.rendering import LiveReporter
+from teds_provision.cli.rendering import LiveReporter, tidy
 from teds_provision.cli.steps.provision import _questions
 from teds_provision.errors import NotAuthentic
 from teds_provision.links.nfc.message import Record
@@ -151,3 +151,22 @@ def test_files_are_written_in_utf_8_whatever_the_locale(tmp_path: Path) -> None:
     exported = spawn("--home", tmp_path, "whitelist", "export", tmp_path / "list.xml", environment=environment)
     assert exported.code == 0, exported
     assert "fräse \N{GEAR}" in (tmp_path / "list.xml").read_text(encoding="utf-8")
+
+
+@pytest.mark.parametrize(
+    ("value", "uncertainty", "seen"),
+    [
+        (-2.13163e-17, 1e-4, "0"),
+        (0.0799951, 1e-4, "0.0799951"),
+        (-1.23456789, 0.5, "-1.2346"),
+        (1.23456789, None, "1.23457"),
+        (3e-12, 1e-15, "3e-12"),
+        (-2e-17, 0.0, "-2e-17"),
+        (12345.678, 5000.0, "12346"),
+    ],
+)
+def test_a_value_has_no_digits_that_its_uncertainty_makes_noise_of(
+    value: float, uncertainty: float | None, seen: str
+) -> None:
+    """The lower end of a gripper's range was shown as -2.13163e-17 m."""
+    assert f"{tidy(value, uncertainty):.6g}" == seen

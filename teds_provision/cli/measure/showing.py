@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 from teds_provision import measure
 from teds_provision.cli.context import App
-from teds_provision.cli.rendering import shown
+from teds_provision.cli.rendering import shown, tidy
 from teds_provision.measure.blocks import Block, ChannelFacts, NodeReport
 from teds_provision.measure.runner import Watcher
 from teds_provision.measure.sinks import Sink, ThreadedSink
@@ -197,7 +197,7 @@ class LiveTable:
         for key, (value, when, count, since) in sorted(newest.items())[:ROWS]:
             known = facts.get(key, ChannelFacts(key[0], "", key[1], ""))
             rate = count / max(monotonic - since, 1e-3)
-            number, unit = in_peoples_units(value, known)
+            number, unit = in_peoples_units(None if value is None else tidy(value, known.uncertainty), known)
             table.add_row(
                 escape(shown(known.node or key[0][:8])),
                 escape(shown(known.label)),

@@ -17,7 +17,7 @@ import click
 from teds_provision import measure, talk
 from teds_provision.cli.context import App, pass_app
 from teds_provision.cli.options import Channel, Number, WholeNumber, command, link_options, said_here
-from teds_provision.cli.rendering import print_table, reporter_for, shown
+from teds_provision.cli.rendering import print_table, reporter_for, shown, tidy
 from teds_provision.errors import LinkFailure, NodeRefused, UsageFailure
 from teds_provision.links import LinkSettings
 from teds_provision.protocol import operation
@@ -88,7 +88,7 @@ def _samples(console: Console, samples: Sequence[Sample]) -> None:
 
     table = Table("channel", "name", "value", "±", "unit", "raw", box=None, pad_edge=False)
     for one in samples:
-        value = f"{one.value:.6g}" if one.value is not None else f"not valid: {one.why}"
+        value = f"{tidy(one.value, one.uncertainty):.6g}" if one.value is not None else f"not valid: {one.why}"
         uncertainty = f"{one.uncertainty:.3g}" if one.uncertainty is not None else ""
         table.add_row(str(one.channel), escape(shown(one.name)), escape(value), uncertainty, one.unit, str(one.raw))
     print_table(console, table)
