@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import functools
 import logging
-import math
 import threading
 import time
 from collections.abc import Sequence
@@ -22,7 +21,6 @@ from teds_provision.errors import (
     NodeRefused,
     NotAuthentic,
     PolicyRefused,
-    StoreFailure,
     TedsProvisionError,
 )
 from teds_provision.measure.blocks import Command, NodeReport, State
@@ -31,6 +29,7 @@ from teds_provision.measure.finding.buses import Bus, Buses
 from teds_provision.measure.finding.sightings import Sighting
 from teds_provision.measure.planning import BusTime, Plans, plan_node, sensors_of
 from teds_provision.measure.running.common_start import CommonStart
+from teds_provision.measure.running.patience import Patience
 from teds_provision.measure.running.streams import NodeStreams
 from teds_provision.measure.topic_actuators import TopicActuators
 from teds_provision.measure.trusting import Standing, Trusted, claim, open_trusted
@@ -51,8 +50,6 @@ ANNOUNCED = 1.0  # seconds until a node without such data is asked after it
 AT_ONCE = 1.0  # seconds between two tries, however often something announces itself as this node
 SLOWER = 10  # halvings of the rate while the firmware says that its shortest period is longer
 BUSY = 2.0  # seconds in which a busy node is asked again at once; then it is tried again as after any other error
-_CURED_BY_TIME = frozenset({Reason.WRONG_STATE, Reason.BUSY, Reason.BAD_TAG, 21, 22, 23})
-_FINAL = (NotAuthentic, PolicyRefused, BadData, StoreFailure, Bug)
 
 
 class NodeKeeper:
@@ -84,7 +81,8 @@ class NodeKeeper:
         self._anew = threading.Event()
         self._announced = 0.0  # when it announced itself (time.monotonic), 0: it did not
         self._lost_at = 0.0
-        self._until = math.inf  # when it is given up, unless it ran by then (time.monotonic)
+        self._proven = True  # whether what failed last did so in a session
+        self._patience = Patience(None)
         self._sighting: Sighting | None = None  # where it was last
         self._halved = 0
         self._driven: TopicActuators | None = None
@@ -114,7 +112,7 @@ class NodeKeeper:
 
     def _run(self) -> None:
         pause = FIRST_PAUSE
-        self._until = time.monotonic() + self._wish.timeout
+        patience = self._patience = Patience(None if self._wish.patient else self._wish.timeout)
         try:
             while not self._stop.is_set():
                 self._anew.clear()
@@ -123,13 +121,14 @@ class NodeKeeper:
                 if error is None or self._stop.is_set():
                     break
                 self.error = error
-                if self._gives_up(error):
+                elsewhere = functools.partial(self._buses.sightings.elsewhere, self.uuid)
+                if patience.gives_up(error, proven=self._proven, elsewhere=elsewhere):
                     self._say("refused", error)
                     return
                 if time.monotonic() - began > LAST_PAUSE:
                     pause = FIRST_PAUSE
-                self._say("lost" if self.ever_ran else "waiting", error, f"; again in {self._again(pause)}")
-                self._wait(min(pause, self._left), began)
+                self._say("lost" if self.ever_ran else "waiting", error, f"; again in {patience.again(pause)}")
+                self._wait(min(pause, patience.left), began)
                 pause = min(2 * pause, LAST_PAUSE)
             self._say("ended")
         finally:
@@ -140,16 +139,6 @@ class NodeKeeper:
                 bus.share.gone(self.uuid)
             self.done.set()
             self.ready.set()
-
-    @property
-    def _left(self) -> float:
-        """Seconds in which a first value has to come; no end where it came, or the node is waited for for ever."""
-        return math.inf if self.ever_ran or self._wish.patient else max(0.0, self._until - time.monotonic())
-
-    def _again(self, pause: float) -> str:
-        """When it is tried again, and for how long that goes on."""
-        left = self._left
-        return f"{pause:.0f} s" if left == math.inf else f"{min(pause, left):.0f} s, given up in {left:.0f} s"
 
     def _wait(self, pause: float, began: float) -> None:
         """Wait until it is time to try again: after ``pause`` seconds, or at once when the node announces itself."""
@@ -172,15 +161,8 @@ class NodeKeeper:
             return Bug(f"Unexpected {type(bug).__name__}.", hint="This is a bug: please report it with -vv.")
         return None
 
-    def _gives_up(self, error: TedsProvisionError) -> bool:
-        """Before the first value a refusal ends it that time does not cure; later anyone could have sent it."""
-        if self._left == math.inf:
-            return False
-        passing = isinstance(error, NodeRefused) and error.reason in _CURED_BY_TIME
-        return not self._left or (isinstance(error, _FINAL) and not passing)
-
     def _once(self) -> None:
-        seconds = LOOKING if self.ever_ran else max(LOOKING, min(self._wish.timeout, self._left))
+        seconds = LOOKING if self.ever_ran else max(LOOKING, min(self._wish.timeout, self._patience.left))
         sighting = self._buses.sightings.find(self.uuid, seconds=seconds, stop=self._stop, fresh=self._lost_at)
         self._sighting = sighting
         self.bus = self._buses.of(sighting)
@@ -197,7 +179,10 @@ class NodeKeeper:
     def _in_session(self, bus: Bus, sighting: Sighting) -> None:
         standing = Standing(self._station, self.uuid)
         with Conversation(sighting.contact(), notice=lambda _notice: None, busy_seconds=BUSY) as node:
-            trusted = open_trusted(self._station, node, unsigned=self._wish.unsigned)
+            try:
+                trusted = open_trusted(self._station, node, unsigned=self._wish.unsigned)
+            finally:
+                self._proven = node.sealed
             if self._wish.require is not None:
                 self._wish.require.offer(self.uuid, trusted.sheet, self._stop)
             self.trusted, self._announced = trusted, 0.0
@@ -230,6 +215,7 @@ class NodeKeeper:
         notes = [plans.slowed] if plans.slowed else []
         notes += [problem for heard in self.streams.running.values() for problem in heard.interpreter.problems.values()]
         self.ever_ran, self.error = True, None
+        self._patience.has_run()
         self._say("running", why="; ".join(notes))
         self.ready.set()
 

@@ -8,6 +8,7 @@ import time
 from collections import Counter
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
+from dataclasses import replace
 from typing import Any
 
 import pytest
@@ -115,6 +116,30 @@ def test_who_goes_on_announcing_a_missing_node_does_not_have_everybody_asked_on_
     frame = Frame(words.identifier, words.encode())
     with looked_for(lookout):
         assert [lookout._heard(frame) for _ in range(3 * BELIEVED)] == [SOON] * BELIEVED + [math.inf] * 2 * BELIEVED
+
+
+@pytest.mark.realtime
+def test_a_node_that_is_lost_is_looked_for_at_once_while_another_one_is_missing_for_long(
+    lookout: Lookout,
+    hub: Hub,  # noqa: F811
+) -> None:
+    """The pause had grown with the absence of the other one, to 30 s."""
+    sightings, stop = lookout._sightings, threading.Event()
+    [*_, one] = sightings.all()
+
+    def lost() -> float:
+        sightings.saw(replace(one, at=time.monotonic()))
+        asked_before, began = asked(hub)[0], time.monotonic()
+        sightings.wrong(one)
+        with suppress(LinkFailure):
+            sightings.find(one.uuid, seconds=PATIENCE, stop=stop, fresh=time.monotonic())
+        assert asked(hub)[0] > asked_before
+        return time.monotonic() - began
+
+    with looked_for(lookout):
+        until(lambda: asked(hub)[0] >= 5, "at the start, at once, after 1, 2 and 4 s; the next one comes after 8 s")
+        best_of(3, 4.0, lost)
+    stop.set()
 
 
 def test_everybody_is_asked_now_and_then_so_that_a_node_is_found_whose_announce_nobody_heard(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import threading
 import time
 from collections.abc import Iterator
@@ -10,12 +11,13 @@ from typing import Any
 
 import pytest
 
-from teds_provision.errors import AddressConflict, NoNode, PolicyRefused
+from teds_provision.errors import AddressConflict, NodeRefused, NoNode, PolicyRefused
 from teds_provision.links.ports import Contact
 from teds_provision.measure.clock import ClockMap, Exchange
 from teds_provision.measure.finding.air import AirLookout
 from teds_provision.measure.finding.sightings import MOST, TWIN, Sighting, Sightings
 from teds_provision.measure.running.common_start import CommonStart
+from teds_provision.measure.running.patience import Patience
 from teds_provision.measure.running.requirements import Requirements
 from teds_provision.protocol.announce import Announce, uuid_crc
 from teds_provision.protocol.messages.identity import Identity, NodeState
@@ -120,6 +122,22 @@ def test_the_node_itself_is_waited_for_where_a_copy_of_its_identity_answers_soon
     sightings.saw(seen(ONE, 7))
     monkeypatch.setattr("teds_provision.measure.finding.sightings.TWIN", TWIN)
     assert find(sightings, ONE, seconds=PATIENCE, fresh=alone).address == 7, "nobody else answers: it is tried again"
+
+
+def test_a_copy_that_refuses_is_no_reason_to_give_a_node_up_that_answers_elsewhere() -> None:
+    """Who gave himself a node's UUID, and said that he knows no key, ended its measurement before it began."""
+    sightings, unknown = Sightings(), PolicyRefused("It knows none of the keys.")
+    copy = seen(ONE, 7)
+    sightings.saw(copy)
+    sightings.wrong(copy)
+    look = functools.partial(sightings.elsewhere, ONE)
+    assert Patience(60.0).gives_up(unknown, proven=False, elsewhere=look), "nobody else answers"
+    threading.Timer(TWIN / 5, sightings.saw, [seen(ONE, 8)]).start()
+    assert not Patience(60.0).gives_up(unknown, proven=False, elsewhere=look)
+    assert Patience(60.0).gives_up(unknown, proven=True, elsewhere=look), "said in a session it is the node's word"
+    assert not Patience(None).gives_up(unknown, proven=True, elsewhere=look)
+    assert not Patience(60.0).gives_up(NodeRefused("busy", reason=17), proven=True, elsewhere=look)
+    assert Patience(0.0).gives_up(NodeRefused("busy", reason=17), proven=True, elsewhere=look)
 
 
 def test_made_up_uuids_fill_no_memory_and_put_no_node_out() -> None:

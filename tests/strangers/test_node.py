@@ -10,6 +10,7 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -44,7 +45,8 @@ class Stranger:
     def uuid(self) -> str:
         return self.hall.nodes[self.name].uuid
 
-    def start(self, fault: str = "", *, program: str = "tests.strangers.node") -> Stranger:
+    def plan(self, fault: str = "", **more: Any) -> Path:
+        """The file that says who it is and what is wrong with it."""
         file = FlashFile(self.hall.folder / self.name)
         flash, document = file.load(), json.loads(file.path.read_text())
         file.release()
@@ -64,11 +66,14 @@ class Stranger:
             "bus": {"group": group, "port": port, "fd": self.fd, "address": self.address},
             "uuid": flash.uuid.hex(), "key": flash.key.hex() if flash.key else "", "epoch": flash.epoch,
             "sequence": flash.sequence, "identity": document["key"], "channels": channels, "fault": fault,
-            "teds": {f"{channel},{code}": octets.hex() for (channel, code), octets in flash.blocks.items()},
+            "teds": {f"{channel},{code}": octets.hex() for (channel, code), octets in flash.blocks.items()}, **more,
         }  # fmt: skip
         plan = self.hall.folder / f"{self.name}.json"
         plan.write_text(json.dumps(given))
-        self.process = self.hall.desk.start(plan, program=(sys.executable, "-m", program))
+        return plan
+
+    def start(self, fault: str = "", *, program: str = "tests.strangers.node") -> Stranger:
+        self.process = self.hall.desk.start(self.plan(fault), program=(sys.executable, "-m", program))
         self.process.wait_for('"ready": true')
         return self
 

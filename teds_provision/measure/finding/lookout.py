@@ -1,7 +1,7 @@
 """Who is on a bus, asked once for everybody who waits: announcements, and a functional Identify now and then.
 
 Fifty nodes that are looked for by fifty threads would each ask the whole bus; so one look-out asks for all. It asks at
-its start, when somebody is missing (once more at once, then after 1 s, doubling to 30 s; sooner where that one
+its start, when somebody is missing (at once, once more, then after 1 s, doubling to 30 s; sooner where that one
 announces itself), and every ``poll`` seconds where it was asked to. Then it also asks each address that announces
 itself, once in 10 s at most and five a second over all (operation.md section 7). What it hears is a hint: a session
 says who it is.
@@ -55,13 +55,17 @@ class Lookout(Asking):
     def _watch(self) -> None:
         """Ask, and hear announcements, until the bus fails."""
         with self.port.bus().listen(lambda frame: is_announce(frame.identifier), most=256) as ear:
+            gone = self._sightings.gone
             self._ask()
             pace, soon = Pace(time.monotonic(), first=SOON), math.inf
             while not self._stop.is_set():
                 soon = min(soon, self._heard(ear.get(LOOK)))
+                missing = self._sightings.missing()
+                if missing and self._sightings.gone != gone:
+                    soon = SOON  # one that goes does not wait for the pause that another one's absence has come to
                 wanted = self._asked.is_set() or time.monotonic() - pace.asked >= soon
-                if pace.is_due(wanted=wanted, missing=self._sightings.missing(), poll=self._poll):
-                    soon = math.inf
+                if pace.is_due(wanted=wanted, missing=missing, poll=self._poll):
+                    soon, gone = math.inf, self._sightings.gone
                     self._ask()
                     pace.asked = time.monotonic()
                 self._ask_announcer()

@@ -65,11 +65,14 @@ class Sightings:
     _conflicts: dict[Place, float] = field(default_factory=dict)
     _announced: dict[bytes, tuple[Place, Callable[[], None]]] = field(default_factory=dict)
     _missing: dict[bytes, int] = field(default_factory=dict)
+    _unseen: set[bytes] = field(default_factory=set)  # those that somebody waited for, and that were not seen since
+    gone: int = 0  # how often a node that had been seen, or was never looked for, became missing
     _turn: threading.Condition = field(default_factory=threading.Condition)
 
     def saw(self, sighting: Sighting) -> None:
         """Take what a look-out saw."""
         with self._turn:
+            self._unseen.discard(sighting.uuid)
             places = self._seen.pop(sighting.uuid, {})  # who was seen last stands last
             places[sighting.port.place, sighting.address] = sighting
             self._seen[sighting.uuid] = places
@@ -132,6 +135,9 @@ class Sightings:
                     found = self._best(uuid, fresh)
                     if found is not None:
                         return found
+                    if uuid not in self._unseen:
+                        self._unseen.add(uuid)
+                        self.gone += 1
                     left = until - time.monotonic()
                     if left <= 0 or stop.is_set():
                         raise self._nobody(uuid, seconds)
@@ -147,6 +153,15 @@ class Sightings:
         with self._turn:
             self._seen.get(sighting.uuid, {}).pop(place, None)
             self._wrong.setdefault(sighting.uuid, {})[place] = time.monotonic()
+
+    def elsewhere(self, uuid: bytes) -> bool:
+        """Whether it answers somewhere else than where it turned out not to be; waits for the answer of a twin."""
+
+        def other() -> bool:
+            return bool(self._seen.get(uuid, {}).keys() - self._wrong.get(uuid, {}).keys())
+
+        with self._turn:
+            return self._turn.wait_for(other, TWIN)
 
     def _forget_the_oldest(self) -> None:
         while len(self._seen) > MOST:

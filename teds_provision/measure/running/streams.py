@@ -45,6 +45,7 @@ class StreamTotals:
         self.lost += counts.lost
         self.late += counts.late + counts.stale + counts.overflow
         self.bad += counts.bad + counts.junk + counts.future + counts.back + counts.unasked + heard.wrong_pattern
+        self.bad += heard.assembly.wrong
         self.invalid += heard.invalid
         self.clock_error = heard.bound if heard.bound is not None else self.clock_error
 

@@ -113,12 +113,13 @@ def frames_of(length: int, *, fd: bool, drive: bool = False) -> int:
 class Assembly:
     """Puts the messages of one stream (or of Drive) together; ``length`` octets each.
 
-    ``broken`` counts messages that were begun and not finished, and frames that belong to none (junk on this address).
+    ``broken`` counts messages that were begun and not finished, because a frame is missing; ``wrong`` frames of another
+    length than their place in a message has, each of which ends its message.
     """
 
     def __init__(self, length: int, *, fd: bool, drive: bool = False) -> None:
         self.length, self.fd, self.drive = length, fd, drive
-        self.broken = 0
+        self.broken = self.wrong = 0
         self._room = (FD_OCTETS if fd else CLASSIC_OCTETS) - drive
         self._held: bytearray | None = None
         self._next = 0
@@ -137,7 +138,7 @@ class Assembly:
             return None
         due = min(self._room, self.length - len(self._held))
         if len(data) != (fd_length(due + self.drive) - self.drive if self.fd else due):
-            self.broken += 1
+            self.wrong += 1
             self._held = None
             return None
         self._held += data[:due]

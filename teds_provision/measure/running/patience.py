@@ -1,0 +1,55 @@
+"""How long a node is tried again after an error, and which errors no second try cures."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable
+
+from teds_provision.errors import (
+    BadData,
+    Bug,
+    NodeRefused,
+    NotAuthentic,
+    PolicyRefused,
+    StoreFailure,
+    TedsProvisionError,
+)
+from teds_provision.protocol.messages.frames import Reason
+
+CURED_BY_TIME = frozenset({Reason.WRONG_STATE, Reason.BUSY, Reason.BAD_TAG, 21, 22, 23})
+_FINAL = (NotAuthentic, PolicyRefused, BadData, StoreFailure, Bug)
+
+
+class Patience:
+    """Until its first value a node has ``timeout`` seconds (None: no end), from then on there is no end."""
+
+    def __init__(self, timeout: float | None) -> None:
+        self._until = math.inf if timeout is None else time.monotonic() + timeout
+
+    def has_run(self) -> None:
+        """Its first value is there: from now on anyone could have sent a refusal, so it is tried again for ever."""
+        self._until = math.inf
+
+    @property
+    def left(self) -> float:
+        """Seconds in which a first value has to come."""
+        return max(0.0, self._until - time.monotonic())
+
+    def again(self, pause: float) -> str:
+        """When it is tried again, and for how long that goes on."""
+        left = self.left
+        return f"{pause:.0f} s" if left == math.inf else f"{min(pause, left):.0f} s, given up in {left:.0f} s"
+
+    def gives_up(self, error: TedsProvisionError, *, proven: bool, elsewhere: Callable[[], bool]) -> bool:
+        """Whether no other try is worth it.
+
+        ``proven``: the error came in a session. Outside one anybody on the bus can have given himself the node's UUID
+        and refuse to open one: then it is looked for ``elsewhere``.
+        """
+        if self.left == math.inf:
+            return False
+        passing = isinstance(error, NodeRefused) and error.reason in CURED_BY_TIME
+        if not isinstance(error, _FINAL) or passing:
+            return not self.left
+        return proven or not elsewhere()

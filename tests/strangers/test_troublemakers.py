@@ -1,0 +1,132 @@
+"""Strangers' nodes that break the rules of what they send, all of them under one measurement beside good ones.
+
+What is published is held against what a stranger's sensor shows: the millisecond of its tick.
+"""
+
+from __future__ import annotations
+
+import itertools
+import signal
+import sys
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Any
+
+import pytest
+
+from tests.e2e.desk import ANGLE
+from tests.measure.hall import Hall, events, of, states
+from tests.pace import until
+from tests.strangers.test_node import Stranger
+from tests.strangers.troublemaker import TROUBLES
+
+pytestmark = pytest.mark.link
+RATE = 10  # Hz
+VICTIM, FREE = "victim", [name for name in TROUBLES if "tick" in name]
+ORDER = ["", VICTIM, "from another node", *(name for name in TROUBLES if name not in ("", "from another node"))]
+NEVER = "says it is another node"
+COUNTED = {
+    "longer": "bad", "shorter": "bad", "twice the instants": "bad", "no instants": "bad",
+    "empty frames": "bad", VICTIM: "bad",
+    "begins again": "late", "stands still": "late", "counts down": "late", "leaps": "bad",
+    "ticks jump ahead": "bad", "ticks jump back": "late", "ticks of 32 bits": "late",
+    "every second tick is the one before": "bad", "ticks at the end": "bad",
+}  # fmt: skip
+NOTHING = {
+    "longer", "shorter", "twice the instants", "no instants", "of another stream", "to another station",
+    "from another node", "ticks of 32 bits", "ticks at the end", NEVER,
+}  # fmt: skip
+UNDISTURBED = ["", "goes on after Stop", "announces itself as others", "empty frames", "data before the reply"]
+
+
+@dataclass
+class Seen:
+    """What the measurement said of one node."""
+
+    lines: list[dict[str, Any]]
+    end: dict[str, Any]
+
+    @property
+    def samples(self) -> list[tuple[float, int]]:
+        """Time and raw value, in the order in which they were published."""
+        return [pair for line in of(self.lines) for pair in zip(line["time"], line["raw"], strict=True)]
+
+    def count(self, what: str) -> int:
+        return sum(stream[what] for stream in self.end["streams"])
+
+
+@pytest.fixture(scope="module")
+def seen(tmp_path_factory: pytest.TempPathFactory) -> Iterator[dict[str, Seen]]:
+    names = {f"t{number}": name for number, name in enumerate(ORDER)}
+    hall = Hall(tmp_path_factory.mktemp("troubles"), dict.fromkeys(names, ANGLE))
+    try:
+        nodes = {name: Stranger(hall, place, True, 0x41 + int(place[1:])) for place, name in names.items()}
+        others = [nodes[name].uuid for name in ("", VICTIM)]
+        plans = [node.plan("" if name == VICTIM else name, others=others) for name, node in nodes.items()]
+        crowd = hall.desk.start(*plans, program=(sys.executable, "-m", "tests.strangers.troublemaker"))
+        crowd.wait_for('"ready": true')
+        found: dict[str, Seen] = {}
+        for names_of, words in (([name for name in ORDER if name not in FREE], ()), (["", *FREE], ("--kind", "free"))):
+            found |= measured(hall, {name: nodes[name].uuid for name in names_of}, *words)
+        yield found
+    finally:
+        hall.close()
+
+
+def measured(hall: Hall, uuids: dict[str, str], *words: object) -> dict[str, Seen]:
+    running = hall.begin(*uuids.values(), "--rate", RATE, *words)
+
+    def enough() -> bool:
+        running.read(0.1)
+        lines = events(running.out)
+        told = {name: states([line for line in lines if line.get("uuid") == uuid]) for name, uuid in uuids.items()}
+        whys = " ".join(line["why"] for line in lines if line["event"] == "status")
+        rest = "claims go" not in uuids or (told["claims go"].count("running") > 1 and "not authentic" in whys)
+        return rest and len(of(lines, uuids[""])) > 6 * RATE
+
+    until(enough, lambda: running.out[-3000:])
+    running.signal(signal.SIGTERM)
+    lines = events(running.end().out)
+    ends = {node["uuid"]: node for node in lines[-1]["nodes"]}
+    return {
+        name: Seen([line for line in lines if line.get("uuid") == uuid], ends[uuid]) for name, uuid in uuids.items()
+    }
+
+
+def test_every_trouble_is_here(seen: dict[str, Seen]) -> None:
+    assert set(seen) == {*TROUBLES, VICTIM}
+    assert len(TROUBLES) > 20
+
+
+@pytest.mark.parametrize("name", ORDER)
+def test_every_value_that_was_published_is_what_the_sensor_showed_then(seen: dict[str, Seen], name: str) -> None:
+    samples = seen[name].samples
+    assert bool(samples) != (name in NOTHING)
+    for (before, low), (after, high) in itertools.pairwise(samples):
+        assert after > before
+        apart = round((after - before) * 1000)
+        if apart < 60_000:
+            assert abs(apart - (high - low) % 65536) <= 20, "milliseconds by stamp and by sensor"
+
+
+@pytest.mark.parametrize("name", COUNTED)
+def test_what_is_not_believed_is_counted(seen: dict[str, Seen], name: str) -> None:
+    assert seen[name].count(COUNTED[name]) > 0, seen[name].end
+
+
+@pytest.mark.parametrize("name", [*UNDISTURBED, VICTIM])
+def test_who_keeps_to_the_rules_is_measured_on(seen: dict[str, Seen], name: str) -> None:
+    one = seen[name]
+    assert "lost" not in states(one.lines)
+    assert one.count("samples") + one.count("lost") + one.count("late") >= 3 * RATE
+    assert name in COUNTED or one.count("bad") == 0
+
+
+def test_a_datasheet_that_changed_under_its_session_gives_no_value_in_the_next_one(seen: dict[str, Seen]) -> None:
+    one = seen["datasheet goes"]
+    assert states(one.lines).count("running") == 1
+    assert one.end["error"]["code"] == "not-authentic"
+
+
+def test_claims_that_a_node_lost_are_claimed_again(seen: dict[str, Seen]) -> None:
+    assert states(seen["claims go"].lines).count("running") > 1
