@@ -138,6 +138,7 @@ def test_a_node_that_is_lost_is_looked_for_at_once_while_another_one_is_missing_
 
     with looked_for(lookout):
         until(lambda: asked(hub)[0] >= 5, "at the start, at once, after 1, 2 and 4 s; the next one comes after 8 s")
+        until(lambda: lookout._finished == lookout._begun, "that question is answered")
         best_of(3, 4.0, lost)
     stop.set()
 
