@@ -121,8 +121,7 @@ class NodeKeeper:
                 if error is None or self._stop.is_set():
                     break
                 self.error = error
-                elsewhere = functools.partial(self._buses.sightings.elsewhere, self.uuid)
-                if patience.gives_up(error, proven=self._proven, elsewhere=elsewhere):
+                if patience.gives_up(error, proven=self._proven, elsewhere=self._is_elsewhere):
                     self._say("refused", error)
                     return
                 if time.monotonic() - began > LAST_PAUSE:
@@ -139,6 +138,9 @@ class NodeKeeper:
                 bus.share.gone(self.uuid)
             self.done.set()
             self.ready.set()
+
+    def _is_elsewhere(self) -> bool:
+        return self._buses.sightings.elsewhere(self.uuid)
 
     def _wait(self, pause: float, began: float) -> None:
         """Wait until it is time to try again: after ``pause`` seconds, or at once when the node announces itself."""
