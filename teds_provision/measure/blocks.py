@@ -151,9 +151,12 @@ class Command:
     received: float  # time.monotonic() when it was taken
 
 
-@dataclass(frozen=True)
+@dataclass
 class SinkStats:
-    """What became of what a sink was given. ``error`` is for people: the sink has ended and takes nothing more."""
+    """What became of what a sink was given. ``error`` is for people: the sink has ended and takes nothing more.
+
+    Not frozen: a sink counts in one of its own, and a new one for each item took longer than to write the item.
+    """
 
     written: int = 0  # samples (values) that went out
     dropped: int = 0  # samples that a slow consumer cost; 0 for a recorder, always
@@ -164,3 +167,8 @@ class SinkStats:
     detail: str = ""  # e.g. "waits for a ROS master at http://localhost:11311"
     error: str = ""
     hint: str = ""
+
+    def fail(self, error: str, hint: str) -> None:
+        """The first failure stays."""
+        if self.state != "failed":
+            self.state, self.error, self.hint = "failed", error, hint

@@ -7,7 +7,7 @@ come later, and a process killed at any instant leaves the last commit. ``secure
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence, Sized
 from contextlib import nullcontext, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
@@ -31,6 +31,11 @@ PAGE = 500
 """Rows that are looked up, read or written at once."""
 _REMEMBERED = 100
 _Record = TypeVar("_Record")
+
+
+def places(values: Sized) -> str:
+    """A ``?`` for each value, as a statement has them."""
+    return ", ".join("?" * len(values))
 
 
 class Database(Connection):

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any, Final, Protocol
 
 from teds_provision.errors import BadData, StoreFailure
 from teds_provision.lazy import late
-from teds_provision.store.database import PAGE
+from teds_provision.store.database import PAGE, places
 from teds_provision.store.schema import APPLICATION_ID, SCHEMA_VERSION, STEPS_TO
 from teds_provision.store.store import Store
 
@@ -115,7 +115,7 @@ def _fill(connection: sqlite3.Connection, source: RowSource) -> None:
             raise BadData(f"The store in the backup has an unknown table {table}.")
     for table in known:
         connection.execute(f"DELETE FROM {table}")  # what a schema begins with; the dump brings it as it became
-    inserts = [f"INSERT INTO {table} VALUES({', '.join('?' * len(columns))})" for table, columns in tables.items()]
+    inserts = [f"INSERT INTO {table} VALUES({places(columns)})" for table, columns in tables.items()]
     widths = [len(columns) for columns in tables.values()]
     for number, page in _pages(source, widths):
         connection.executemany(inserts[number], page)

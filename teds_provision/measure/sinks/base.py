@@ -11,7 +11,7 @@ import time
 from abc import ABC, abstractmethod
 from collections import deque
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import replace
 from typing import Literal, Protocol
 
 from teds_provision.errors import NotFound, StoreFailure, TedsProvisionError
@@ -70,26 +70,6 @@ class Sink(Protocol):
         """Write out what is owed, end, give back what was opened. A second call does nothing."""
 
 
-@dataclass
-class _Tally:
-    """SinkStats while they grow: a frozen one for each item took longer than to write it."""
-
-    written: int = 0
-    dropped: int = 0
-    octets: int = 0
-    messages: int = 0
-    lag: float = 0.0
-    state: Literal["starting", "running", "waiting", "ended", "failed"] = "starting"
-    detail: str = ""
-    error: str = ""
-    hint: str = ""
-
-    def fail(self, error: str, hint: str) -> None:
-        """The first failure stays."""
-        if self.state != "failed":
-            self.state, self.error, self.hint = "failed", error, hint
-
-
 class ThreadedSink(ABC):
     """A sink whose work is done by one thread of its own; subclasses fill in four steps and the name.
 
@@ -106,7 +86,7 @@ class ThreadedSink(ABC):
         self._items: deque[tuple[float, int, Item]] = deque()
         self._owed = 0
         self._closing = False
-        self._tally = _Tally()
+        self._tally = SinkStats()
         self._thread: threading.Thread | None = None
 
     @property
@@ -118,7 +98,7 @@ class ThreadedSink(ABC):
     def stats(self) -> SinkStats:
         """A snapshot of the counters."""
         with self._lock:
-            return SinkStats(**vars(self._tally))
+            return replace(self._tally)
 
     def open(self, facts: Sequence[ChannelFacts], station: StationFacts) -> None:
         """Do what can fail at once, then start the thread. Raises TedsProvisionError."""

@@ -8,7 +8,7 @@ from itertools import islice
 from operator import attrgetter
 from typing import Any, TypeVar
 
-from teds_provision.store.database import PAGE, Database
+from teds_provision.store.database import PAGE, Database, places
 from teds_provision.store.records import Holder, KeyRecord, NodeRecord, Tombstone, WhitelistEntry
 from teds_provision.store.tables.nodes import GROUPS, NODE_FIELDS, REPLACE_ENTRY, REPLACE_NODE, listed
 
@@ -53,8 +53,7 @@ class BulkTables:
 
     def slots_of(self, uuids: Sequence[bytes]) -> dict[bytes, int]:
         """Return the last slot given to the keys of each of these nodes (a page of them)."""
-        places = ", ".join("?" * len(uuids))
-        rows = self._database.execute(f"SELECT uuid, last FROM key_slots WHERE uuid IN ({places})", uuids)
+        rows = self._database.execute(f"SELECT uuid, last FROM key_slots WHERE uuid IN ({places(uuids)})", uuids)
         return {bytes(uuid): int(last) for uuid, last in rows}
 
     def put_batch(

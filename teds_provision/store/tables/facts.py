@@ -7,7 +7,7 @@ from dataclasses import fields
 from operator import attrgetter
 from typing import Any
 
-from teds_provision.store.database import Database
+from teds_provision.store.database import Database, places
 from teds_provision.store.records import Facts, Marks
 
 _FACTS = ", ".join(column.name for column in fields(Facts))
@@ -35,8 +35,7 @@ class FactTables:
         """Keep the station's facts, all of them."""
         self._seen = None
         values = tuple(getattr(facts, column.name) for column in fields(Facts))
-        marks = ", ".join("?" * len(values))
-        self._database.execute(f"INSERT OR REPLACE INTO station(one, {_FACTS}) VALUES(1, {marks})", values)
+        self._database.execute(f"INSERT OR REPLACE INTO station(one, {_FACTS}) VALUES(1, {places(values)})", values)
 
     # -- certificates ----------------------------------------------------------------------------------------------
 
@@ -62,8 +61,8 @@ class FactTables:
 
     def marks_of(self, uuids: Sequence[bytes]) -> dict[bytes, Marks]:
         """Return the marks on those of these nodes (a page of them) that have one."""
-        places = ", ".join("?" * len(uuids))
-        return dict(self._database.read(_marked, f"SELECT uuid, {_MARKS} FROM marks WHERE uuid IN ({places})", uuids))
+        statement = f"SELECT uuid, {_MARKS} FROM marks WHERE uuid IN ({places(uuids)})"
+        return dict(self._database.read(_marked, statement, uuids))
 
     def all_marks(self) -> dict[bytes, Marks]:
         """Return the marks on every node that has one."""
@@ -71,12 +70,13 @@ class FactTables:
 
     def put_marks(self, marks: Mapping[bytes, Marks]) -> None:
         """Keep the marks on nodes, in place of those that are there; a node without any has no row."""
-        places = ", ".join("?" * (len(fields(Marks)) + 1))
+        columns = ("uuid", *fields(Marks))
         rows = ((uuid, *_values(mark)) for uuid, mark in marks.items() if mark != _NONE)
         without = [(uuid,) for uuid, mark in marks.items() if mark == _NONE]
         with self._database.together():
             self._database.execute_many("DELETE FROM marks WHERE uuid = ?", without)
-            self._database.execute_many(f"INSERT OR REPLACE INTO marks(uuid, {_MARKS}) VALUES({places})", rows)
+            statement = f"INSERT OR REPLACE INTO marks(uuid, {_MARKS}) VALUES({places(columns)})"
+            self._database.execute_many(statement, rows)
 
 
 def _marked(uuid: bytes, *row: Any) -> tuple[bytes, Marks]:

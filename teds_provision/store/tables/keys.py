@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
 from teds_provision.errors import NotFound
-from teds_provision.store.database import Database
+from teds_provision.store.database import Database, places
 from teds_provision.store.records import KeyRecord
 
 _COLUMNS = "seq, uuid, epoch, key_id, state, slot, wrapped, source, created"
@@ -24,8 +24,9 @@ class KeyTables:
 
     def keys_of(self, uuids: Sequence[bytes]) -> list[KeyRecord]:
         """Return the keys of these nodes (a page of them), in the order they came."""
-        places = ", ".join("?" * len(uuids))
-        return self._database.read(_key, f"SELECT {_COLUMNS} FROM keys WHERE uuid IN ({places}) ORDER BY seq", uuids)
+        return self._database.read(
+            _key, f"SELECT {_COLUMNS} FROM keys WHERE uuid IN ({places(uuids)}) ORDER BY seq", uuids
+        )
 
     def next_slot(self, uuid: bytes) -> int:
         """Return a slot number that this node never had; to be asked before wrapping a new key."""

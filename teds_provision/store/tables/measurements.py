@@ -8,7 +8,7 @@ from dataclasses import replace
 from typing import Any, cast
 
 from teds_provision.errors import BadData
-from teds_provision.store.database import Database
+from teds_provision.store.database import Database, places
 from teds_provision.store.records import DetectionMode, Group, Measurement
 
 
@@ -92,8 +92,7 @@ class MeasurementTables:
             int(one.unsigned),
             one.require,
         )
-        marks = ", ".join("?" * len(values))
-        self._database.execute(f"INSERT OR REPLACE INTO measurements VALUES({marks})", values)
+        self._database.execute(f"INSERT OR REPLACE INTO measurements VALUES({places(values)})", values)
 
     def remove_measurement(self, measurement_id: str) -> bool:
         """Measure this no more; False if there is none."""

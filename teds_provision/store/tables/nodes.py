@@ -10,7 +10,7 @@ from functools import lru_cache
 from typing import Any
 
 from teds_provision.errors import NotFound, OtherKey, UsageFailure
-from teds_provision.store.database import PAGE, Database
+from teds_provision.store.database import PAGE, Database, places
 from teds_provision.store.records import UUID_OCTETS, Handed, NodeRecord, Shown, WhitelistEntry
 
 _UUID_DIGITS = 2 * UUID_OCTETS
@@ -20,7 +20,7 @@ NODE_FIELDS = tuple(column.name for column in fields(NodeRecord))
 GROUPS = NODE_FIELDS.index("groups")
 _NODE_COLUMNS = ", ".join(NODE_FIELDS)
 _HANDED_COLUMNS = ", ".join(Handed._fields)
-REPLACE_NODE = f"INSERT OR REPLACE INTO nodes({_NODE_COLUMNS}) VALUES({', '.join('?' * len(NODE_FIELDS))})"
+REPLACE_NODE = f"INSERT OR REPLACE INTO nodes({_NODE_COLUMNS}) VALUES({places(NODE_FIELDS)})"
 REPLACE_ENTRY = "INSERT OR REPLACE INTO whitelist VALUES(?, ?, ?, ?, ?, ?)"
 
 
@@ -84,26 +84,22 @@ class NodeTables:
 
     def nodes_of(self, uuids: Sequence[bytes]) -> dict[bytes, NodeRecord]:
         """Return what is known of these nodes (a page of them), by UUID."""
-        places = ", ".join("?" * len(uuids))
-        statement = f"SELECT {_NODE_COLUMNS} FROM nodes WHERE uuid IN ({places})"
+        statement = f"SELECT {_NODE_COLUMNS} FROM nodes WHERE uuid IN ({places(uuids)})"
         return {record.uuid: record for record in self._database.read(_node, statement, uuids)}
 
     def handed_of(self, uuids: Sequence[bytes]) -> dict[bytes, Handed]:
         """Return what a bundle says of these nodes (a page of them), by UUID."""
-        places = ", ".join("?" * len(uuids))
-        statement = f"SELECT {_HANDED_COLUMNS} FROM nodes WHERE uuid IN ({places})"
+        statement = f"SELECT {_HANDED_COLUMNS} FROM nodes WHERE uuid IN ({places(uuids)})"
         return {handed.uuid: handed for handed in self._database.read(_handed, statement, uuids)}
 
     def whitelist_of(self, uuids: Sequence[bytes]) -> dict[bytes, WhitelistEntry]:
         """Return the entries of these nodes (a page of them), by UUID."""
-        places = ", ".join("?" * len(uuids))
-        statement = f"SELECT * FROM whitelist WHERE uuid IN ({places})"
+        statement = f"SELECT * FROM whitelist WHERE uuid IN ({places(uuids)})"
         return {entry.uuid: entry for entry in self._database.read(WhitelistEntry, statement, uuids)}
 
     def bearers_of(self, names: Sequence[str]) -> dict[str, bytes]:
         """Return who has each of these names (a page of them), in the nodes or in the whitelist."""
-        places = ", ".join("?" * len(names))
-        found = (f"SELECT name, uuid FROM {table} WHERE name IN ({places})" for table in ("whitelist", "nodes"))
+        found = (f"SELECT name, uuid FROM {table} WHERE name IN ({places(names)})" for table in ("whitelist", "nodes"))
         return {name: bytes(uuid) for statement in found for name, uuid in self._database.execute(statement, names)}
 
     def node(self, uuid: bytes) -> NodeRecord | None:

@@ -10,7 +10,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
-from teds_provision.store.database import PAGE, Database
+from teds_provision.store.database import PAGE, Database, places
 from teds_provision.store.records import UUID_OCTETS
 
 _TABLES = ("nodes", "whitelist", "keys", "tombstones", "revocations")
@@ -141,9 +141,8 @@ class OverviewTables:
     def _lists(
         self, table: str, columns: Sequence[str], uuids: Sequence[bytes], order: str
     ) -> dict[bytes, list[dict[str, Any]]]:
-        places = ", ".join("?" * len(uuids))
         rows = self._database.execute(
-            f"SELECT uuid, {', '.join(columns)} FROM {table} WHERE uuid IN ({places}) ORDER BY {order}", uuids
+            f"SELECT uuid, {', '.join(columns)} FROM {table} WHERE uuid IN ({places(uuids)}) ORDER BY {order}", uuids
         )
         found: dict[bytes, list[dict[str, Any]]] = {}
         for uuid, *values in rows:
