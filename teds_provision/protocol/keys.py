@@ -118,7 +118,7 @@ def is_point(point: bytes) -> bool:
     return True
 
 
-_SHA256 = ec.ECDSA(hashes.SHA256())
+_OF_DIGEST = ec.ECDSA(Prehashed(hashes.SHA256()))
 
 Verify = Callable[[bytes, bytes, bytes], bool]
 """Whether a signature (64 octets) is SIG(point, message); :func:`verify`, or a chip that does it."""
@@ -132,7 +132,7 @@ def verify(point: bytes, message: bytes, signature: bytes) -> bool:
     if not 0 < r < GROUP_ORDER or not 0 < s <= _HALF_ORDER:
         return False
     try:
-        public_key(point).verify(encode_dss_signature(r, s), message, _SHA256)
+        public_key(point).verify(encode_dss_signature(r, s), hashlib.sha256(message).digest(), _OF_DIGEST)
     except (InvalidSignature, BadData):
         return False
     return True

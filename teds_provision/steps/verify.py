@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from typing import Literal, NamedTuple
 
@@ -89,17 +89,50 @@ def verify_image(station: Judging, image: Image, *, known: Known | None = None) 
 
     Never raises on any octets.
     """
-    checks = [_form(image)]
+    return _checks(station, image, _proofs(image), known)
+
+
+def verify_images(station: Judging, images: Iterable[Image]) -> list[list[Check]]:
+    """The checks of many files, as :func:`verify_image` makes them of each.
+
+    All signatures are checked in a row. Between the other checks of its image, each one took half as long again: the
+    tables of OpenSSL and the Python around them pushed each other out of the processor's cache.
+    """
+    proven = [(image, _proofs(image)) for image in images]
+    return [_checks(station, image, proofs, None) for image, proofs in proven]
+
+
+class _Proofs(NamedTuple):
+    """What the Security TEDS of an image says, or why it cannot be read (None: there is none), and its signatures."""
+
+    shown: SecurityTeds | NotCanonical | None
+    node_key: bool = False
+    datasheet: bool = False
+
+
+def _proofs(image: Image) -> _Proofs:
+    """Read the Security TEDS of an image, and check what needs nobody's trust: fields 102 and 100."""
     octets = image.security
     if octets is None:
-        return [*checks, Check("signed", "failed", "the image holds no Security TEDS")]
+        return _Proofs(None)
     try:
         shown = security.decode(octets)
     except NotCanonical as error:
-        ours = security.has_profile_version(octets)
-        why = error.message if ours else "the Security TEDS is not of this profile: shown, never trusted"
+        return _Proofs(error)
+    node_key = node_key_good(image.uuid, shown.node_key, shown.node_key_signature)
+    return _Proofs(shown, node_key, shown.signed and datasheet.signature_good(shown, octets, image.uuid))
+
+
+def _checks(station: Judging, image: Image, proofs: _Proofs, known: Known | None) -> list[Check]:
+    checks, shown = [_form(image)], proofs.shown
+    if shown is None:
+        return [*checks, Check("signed", "failed", "the image holds no Security TEDS")]
+    if isinstance(shown, NotCanonical):
+        ours = security.has_profile_version(image.blocks[SECURITY])
+        why = shown.message if ours else "the Security TEDS is not of this profile: shown, never trusted"
         return [*checks, Check("canonical form", "failed", why)]
-    checks += [Check("canonical form", "passed"), _algorithms(shown), _node_key(station, image.uuid, shown)]
+    checks += [Check("canonical form", "passed"), _algorithms(shown)]
+    checks += [_node_key(station, image.uuid, shown, signed=proofs.node_key)]
     checks += [_epoch(shown, known), _sequence(shown, known)]
     checks.append(_not_revoked(station, image.uuid))
     if not shown.signed:
@@ -108,7 +141,7 @@ def verify_image(station: Judging, image: Image, *, known: Known | None = None) 
         Check("signed", "passed"),
         _station(station, image.uuid, shown),
         _certificate(station, image.uuid, shown),
-        _signature(image, octets, shown),
+        _check("signature", proofs.datasheet, _CHANGED),
         _blocks(image, shown),
         _unlisted(image, shown),
         _meta(image),
@@ -174,9 +207,9 @@ def _algorithms(shown: SecurityTeds) -> Check:
     return _check("algorithms", not wrong, why, "ECDSA P-256, SHA-256, AES-128")
 
 
-def _node_key(station: Judging, uuid: bytes, shown: SecurityTeds) -> Check:
+def _node_key(station: Judging, uuid: bytes, shown: SecurityTeds, *, signed: bool) -> Check:
     name = "node key"
-    if not node_key_good(uuid, shown.node_key, shown.node_key_signature):
+    if not signed:
         return Check(name, "failed", "field 102 does not sign this key for this UUID")
     try:
         station.pins.check(uuid, shown.node_key)
@@ -220,12 +253,13 @@ def _not_revoked(station: Judging, uuid: bytes) -> Check:
 
 def _station(station: Judging, uuid: bytes, shown: SecurityTeds) -> Check:
     key = shown.station_key or b""
+    digits = fingerprint(key)[:16]
     certified = any(datasheet.station_signature_good(shown, ca) for ca in station.policy.trusted_cas(uuid))
     return _check(
         "signing station",
         key in station.policy.trusted_stations() or certified,
-        f"station {fingerprint(key)[:16]} is not trusted here, nor certified by a trusted CA",
-        fingerprint(key)[:16],
+        f"station {digits} is not trusted here, nor certified by a trusted CA",
+        digits,
     )
 
 
@@ -239,9 +273,7 @@ def _certificate(station: Judging, uuid: bytes, shown: SecurityTeds) -> Check:
     return Check(name, "skipped", "the station is trusted itself; its CA is not known here")
 
 
-def _signature(image: Image, octets: bytes, shown: SecurityTeds) -> Check:
-    why = "field 100 does not verify: the datasheet was changed, or is another node's"
-    return _check("signature", datasheet.signature_good(shown, octets, image.uuid), why)
+_CHANGED = "field 100 does not verify: the datasheet was changed, or is another node's"
 
 
 def _blocks(image: Image, shown: SecurityTeds) -> Check:

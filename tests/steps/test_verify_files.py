@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -64,6 +66,10 @@ def lines(out: str) -> list[dict[str, object]]:
     return [json.loads(line) for line in out.splitlines()]
 
 
+def _of_no_file(line: dict[str, object]) -> dict[str, object]:
+    return {name: value for name, value in line.items() if name != "file"}
+
+
 def test_a_folder_gives_a_line_for_each_image_and_totals(home: Path, tmp_path: Path) -> None:
     folder = tmp_path / "images"
     for number in range(3):
@@ -123,6 +129,50 @@ def test_the_same_verdicts_come_from_one_process_and_from_several(
     together = call(home, "--json", "verify", folder).out
     assert together == alone
     assert call(home, "--json", "verify", folder / "1.json").json["checks"] == lines(alone)[1]["checks"]
+
+
+def test_every_check_of_an_image_is_its_own_whoever_it_is_checked_with(
+    home: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    good, unsigned, strange = signed(1), Image(bytes(10), signed(2).unsigned_blocks()), signed(3)
+    other_key = strange.with_block((0, 128), signed(4).blocks[0, 128])
+    octets = bytearray(signed(5).blocks[0, 128])
+    octets[-3] ^= 1  # the checksum no longer fits: not canonical
+    kinds = (unsigned, good, other_key, "{", signed(5).with_block((0, 128), bytes(octets)))
+    names = [write(tmp_path / "images", f"{number:02}.json", kinds[number % 5]) for number in range(40)]
+    alone = [lines(call(home, "--json", "verify", name, tmp_path / "gone").out)[0] for name in names[:5]]
+    monkeypatch.setattr(many, "_FEW", 1)
+    monkeypatch.setattr(many, "_CHUNK", 8)  # four images after one another, by each of two processes
+    together = lines(call(home, "--json", "verify", tmp_path / "images").out)
+    for number in range(40):
+        assert _of_no_file(together[number]) == _of_no_file(alone[number % 5])
+
+
+def test_so_many_images_are_held_at_a_time_as_there_is_room_for(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    image = signed(1)
+    paths = [write(tmp_path, f"{number}.json", image if number != 2 else "{") for number in range(5)]
+    size = len(image.to_json())
+    for room, held in ((0, [1, 1, 1, 1, 1]), (2 * size, [3, 2]), (9 * size, [5])):
+        monkeypatch.setattr(many, "_TOGETHER", room)
+        assert [len(some) for some in many._some(paths)] == held
+
+
+def test_images_without_a_calibration_load_no_guard(home: Path, tmp_path: Path) -> None:
+    write(tmp_path / "images", "1.json", signed(1))
+    code = (
+        "import sys\nfrom teds_provision.__main__ import main\n"
+        f"sys.argv = ['teds-provision', '--home', {str(home)!r}, 'verify', {str(tmp_path / 'images')!r}]\n"
+        "try:\n    main()\nexcept SystemExit:\n    pass\n"
+        "print(*sys.modules, file=sys.stderr)"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert "1 image: 1 authentic." in done.stdout
+    assert "teds_provision.steps.verify" in done.stderr.split()
+    assert not {"teds_provision.teds.guard.findings", "teds_provision.teds.codec.decode"}.intersection(
+        done.stderr.split()
+    )
 
 
 def test_a_folder_without_images_is_said_and_doubles_count_once(tmp_path: Path) -> None:

@@ -15,14 +15,17 @@ from teds_provision.files import read_limited
 from teds_provision.limits import LIMITS
 from teds_provision.station.station import Station
 from teds_provision.steps.judging import Judging, remember
-from teds_provision.steps.verify import Check, Verified, require_authentic, verify_image
-from teds_provision.teds.guard.findings import check_calibration
+from teds_provision.steps.verify import Check, Verified, require_authentic, verify_images
+from teds_provision.teds import guard
+from teds_provision.teds.codec.codes import AccessCode
 from teds_provision.teds.image import Image
 
 ENDING: Final = ".json"
 _FEW: Final = 50
 """So many are judged sooner than another process is ready."""
 _CHUNK: Final = 64
+_TOGETHER: Final = 1 << 20
+"""Octets of image files that are held at a time."""
 
 
 @dataclass(frozen=True)
@@ -138,10 +141,10 @@ class _Work:
     def done(self, places: range) -> tuple[list[str], Totals]:
         """Judge the files at these places of the list, which every process has."""
         lines, totals = [], Totals()
-        for place in places:
-            found = _judged(self.judging, self.files[place])
-            totals.add(found)
-            lines.append(self.tell(found))
+        for some in _some([self.files[place] for place in places]):
+            for found in _judged(self.judging, some):
+                totals.add(found)
+                lines.append(self.tell(found))
         return lines, totals
 
 
@@ -159,12 +162,39 @@ def _done(places: range) -> tuple[list[str], Totals]:
     return _work.done(places)
 
 
-def _judged(judging: Judging, path: Path) -> FileVerdict:
-    try:
-        image = Image.from_json(read_limited(path, LIMITS.teds_file, "image", failure=BadData))
-    except TedsProvisionError as error:
-        return FileVerdict(path, exit_code=error.exit_code, code=error.code, error=error.message)
-    verified = Verified(image.uuid, tuple(verify_image(judging, image)), scope="image")
+_Read = tuple[Path, Image | TedsProvisionError]
+
+
+def _some(paths: Sequence[Path]) -> Iterator[list[_Read]]:
+    """Read images, some at a time: as many as are no burden to hold together."""
+    some: list[_Read] = []
+    octets = 0
+    for path in paths:
+        try:
+            text = read_limited(path, LIMITS.teds_file, "image", failure=BadData)
+            octets += len(text)
+            some.append((path, Image.from_json(text)))
+        except TedsProvisionError as error:
+            some.append((path, error))
+        if octets > _TOGETHER:
+            yield some
+            some, octets = [], 0
+    if some:
+        yield some
+
+
+def _judged(judging: Judging, some: Sequence[_Read]) -> Iterator[FileVerdict]:
+    """The verdicts of files that were read, in their order."""
+    checks = iter(verify_images(judging, (image for _, image in some if isinstance(image, Image))))
+    for path, image in some:
+        if isinstance(image, Image):
+            yield _verdict(path, image, next(checks))
+        else:
+            yield FileVerdict(path, exit_code=image.exit_code, code=image.code, error=image.message)
+
+
+def _verdict(path: Path, image: Image, checks: Sequence[Check]) -> FileVerdict:
+    verified = Verified(image.uuid, tuple(checks), scope="image")
     result = FileVerdict(path, image.uuid.hex(), verified.verdict, verified.checks)
     try:
         require_authentic(verified)
@@ -175,7 +205,9 @@ def _judged(judging: Judging, path: Path) -> FileVerdict:
 
 def _with_warnings(result: FileVerdict, image: Image) -> FileVerdict:
     """Look at the calibrations, as every command does before it trusts a datasheet."""
-    findings = check_calibration(image.unsigned_blocks())
+    if not any(code == AccessCode.CALIBRATION for _, code in image.blocks):
+        return result  # and the guard is not loaded
+    findings = guard.findings.check_calibration(image.unsigned_blocks())
     texts = tuple(f"channel {finding.channel}: {finding.message}" for finding in findings)
     harmful = [text for text, finding in zip(texts, findings, strict=True) if finding.severity == "error"]
     whole = FileVerdict(result.path, result.uuid, result.verdict, result.checks, texts)
