@@ -20,7 +20,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from teds_provision.errors import LinkFailure, NodeRefused, TedsProvisionError
+from teds_provision.errors import Garbled, LinkFailure, NodeRefused, NotAuthentic, TedsProvisionError
 from teds_provision.measure.blocks import Block, Command
 from teds_provision.measure.clock import ClockMap
 from teds_provision.measure.trusting import LEASE, Trusted, claim
@@ -45,6 +45,7 @@ class _Actuator:
     count: int = 0
     came: deque[float] = field(default_factory=lambda: deque(maxlen=WATCHED))
     driver: Driver | None = None
+    drivable: bool = True  # whether the node takes Drive messages for it, as far as is known
 
     @property
     def fast(self) -> bool:
@@ -150,9 +151,8 @@ class TopicActuators:
         if not (actuator.fast and alone):
             actuator.driver = None
         # Nobody answers a Drive message, so now and then a value goes by command: a node that was cut off says so.
-        if actuator.fast and alone and now - actuator.answered < self._dead_man / 2000:
-            self._drive(command, actuator, octets)
-        else:
+        due = actuator.fast and alone and now - actuator.answered < self._dead_man / 2000
+        if not (due and actuator.drivable and self._is_driven(command, actuator, octets)):
             self._set(command, actuator, octets)
             actuator.answered = time.monotonic()
         actuator.claimed_until = time.monotonic() + self._dead_man / 1000
@@ -182,6 +182,17 @@ class TopicActuators:
         except NodeRefused as refusal:
             if refusal.reason != Reason.WRONG_STATE:  # it is claimed by this session still
                 raise
+
+    def _is_driven(self, command: Command, actuator: _Actuator, octets: bytes) -> bool:
+        """Send it as a Drive message; False where the node takes none: then values go by command, as fast as it can."""
+        try:
+            self._drive(command, actuator, octets)
+        except (NodeRefused, NotAuthentic, Garbled) as error:
+            if not (isinstance(error, NodeRefused) and error.reason == Reason.WRONG_STATE):  # its claim is gone: _set
+                actuator.drivable = False
+                self._tell(f"channel {command.channel} takes no Drive messages: {error.message}")
+            return False
+        return True
 
     def _drive(self, command: Command, actuator: _Actuator, octets: bytes) -> None:
         number = command.channel

@@ -1,0 +1,110 @@
+"""Set points of topics that come fast: as Drive messages where the node takes them, else by command; without a bus."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable
+from typing import Any
+
+import pytest
+
+from teds_provision.errors import NodeRefused
+from teds_provision.measure.blocks import Block
+from teds_provision.measure.blocks import Command as SetPoint
+from teds_provision.measure.topic_actuators import WATCHED, TopicActuators
+from teds_provision.measure.trusting import Trusted
+from teds_provision.protocol.messages.frames import Command, Function, Reason
+from teds_provision.teds.calibration import fit
+from tests.measure.test_lookout import clock
+from tests.pace import until
+from tests.teds.test_interpreter import sheet_of
+
+SHEET = sheet_of("gripper", {1: fit([(0, 0.0), (4095, 0.11)], "linear", channel=1, actuator=True)})
+LENGTH = 4 + 4 + 2 + 8
+Answer = Callable[[], bytes]
+
+
+class Node:
+    """A session with a node that takes every command; ``driven`` answers Drive."""
+
+    message_key = bytes(32)
+
+    def __init__(self, driven: Answer) -> None:
+        self.driven, self.asked, self.values = driven, 0, 0
+
+    def send(self, command: Command, _doing: str, *, within: float | None = None) -> bytes:
+        if (command.command_class, command.function) == (128, Function.DRIVE):
+            self.asked += 1
+            return self.driven()
+        self.values += within is not None
+        return b""
+
+
+class Scene:
+    def __init__(self, driven: Answer) -> None:
+        self.node, self.messages, self.told, self.applied = Node(driven), list[bytes](), list[str](), list[Block]()
+        node: Any = self.node
+        self.actuators = TopicActuators(
+            Trusted(node, SHEET, "00" * 32, "g"), self.messages.append, (1,), dead_man=10_000, clock=clock(10**9),
+            turn=threading.Lock(), mapping=threading.Lock(), echo=self.applied.append, tell=self.told.append,
+        )  # fmt: skip
+
+    def give(self, count: int) -> None:
+        """So many set points as of a publisher of 500 Hz, each when the one before is applied or refused."""
+        began = time.monotonic()
+        for k in range(count):
+            before = len(self.applied) + self.actuators.refused
+            self.actuators.take(SetPoint(SHEET.uuid.hex(), 1, 0.05, began + k * 0.002))
+            until(lambda before=before: len(self.applied) + self.actuators.refused > before)
+
+
+def reply(run: int, length: int = LENGTH) -> bytes:
+    return run.to_bytes(2, "big") + length.to_bytes(2, "big")
+
+
+def refusal(reason: int) -> bytes:
+    raise NodeRefused("The node refused to be driven.", reason=reason)
+
+
+def test_fast_set_points_go_as_drive_messages() -> None:
+    scene = Scene(lambda: reply(1))
+    scene.give(3 * WATCHED)
+    scene.actuators.close()
+    assert scene.node.asked == 1
+    assert len(scene.messages) > WATCHED
+    assert {len(one) for one in scene.messages} == {LENGTH}
+    assert not scene.told
+
+
+@pytest.mark.parametrize(
+    "driven",
+    [
+        lambda: reply(1, LENGTH + 1),
+        lambda: reply(0),
+        lambda: b"\0\1",
+        lambda: refusal(Reason.UNKNOWN_COMMAND),
+        lambda: refusal(Reason.NO_ROOM),
+    ],
+    ids=["another length", "run 0", "half a reply", "unknown", "no room"],
+)
+def test_a_node_that_cannot_be_driven_is_moved_by_command_and_that_is_told_once(driven: Answer) -> None:
+    """Each set point was refused: what moved at 40 values a second stood in its safe state at 60."""
+    scene = Scene(driven)
+    scene.give(3 * WATCHED)
+    scene.actuators.close()
+    assert scene.node.asked == 1
+    assert scene.messages == []
+    assert scene.node.values == len(scene.applied) == 3 * WATCHED
+    assert len(scene.told) == 1
+    assert "no Drive messages" in scene.told[0]
+
+
+def test_a_claim_that_is_gone_says_nothing_about_drive() -> None:
+    answers = iter([None, 1])
+    scene = Scene(lambda: reply(1) if next(answers) else refusal(Reason.WRONG_STATE))
+    scene.give(3 * WATCHED)
+    scene.actuators.close()
+    assert scene.node.asked == 2
+    assert scene.messages
+    assert not scene.told
