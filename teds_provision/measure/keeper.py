@@ -164,7 +164,7 @@ class NodeKeeper:
         return None
 
     def _once(self) -> None:
-        seconds = LOOKING if self.ever_ran else max(LOOKING, min(self._wish.timeout, self._patience.left))
+        seconds = LOOKING if self.ever_ran else max(LOOKING, round(min(self._wish.timeout, self._patience.left), 1))
         sighting = self._buses.sightings.find(self.uuid, seconds=seconds, stop=self._stop, fresh=self._lost_at)
         self._sighting = sighting
         self.bus = self._buses.of(sighting)

@@ -22,7 +22,7 @@ from teds_provision.measure.finding.buses import Buses
 from teds_provision.measure.grid import Grid
 from teds_provision.measure.keeper import NodeKeeper
 from teds_provision.measure.running import trigger
-from teds_provision.measure.running.common_start import CommonStart
+from teds_provision.measure.running.common_start import TOGETHER, CommonStart
 from teds_provision.measure.sinks import Sink
 from teds_provision.measure.trusting import Trusted
 from teds_provision.measure.wish import Events, Wish
@@ -105,7 +105,7 @@ class Measurement:
             self._loop(stop, duration)
         finally:
             self._end()
-        return self._ended()
+        return self._ended(stopped=stop.is_set())
 
     def _loop(self, stop: threading.Event, duration: float | None) -> None:
         until = math.inf
@@ -114,8 +114,7 @@ class Measurement:
             now = time.monotonic()
             if self._all_done():
                 return
-            if self._common_start.due(sum(one.ready.is_set() for one in self.keepers), len(self.keepers)):
-                trigger.pull(self._common_start, self.keepers, self.watcher.note)
+            self._trigger()
             if until == math.inf:
                 until = self._until(now, duration)
             if now >= until:
@@ -126,6 +125,15 @@ class Measurement:
                 self._look()
                 if self._gave_up():
                     return
+
+    def _trigger(self) -> None:
+        """Pull the trigger when it is due; say for whom, and for how long, it waits."""
+        late = [one for one in self.keepers if not one.ready.is_set()]
+        if self._common_start.due(len(self.keepers) - len(late), len(self.keepers)):
+            trigger.pull(self._common_start, self.keepers, self.watcher.note)
+        elif late and len(late) < len(self.keepers) and self._common_start.tells():
+            names = ", ".join(one.uuid.hex() for one in late[:3]) + (" …" if len(late) > 3 else "")
+            self.watcher.note(f"The trigger waits for {names}, up to {TOGETHER:.0f} s.")
 
     def _until(self, now: float, duration: float | None) -> float:
         """When ``duration`` seconds of data are over: they count from the first values."""
@@ -241,7 +249,13 @@ class Measurement:
             sink.close()
         self._look()
 
-    def _ended(self) -> Ended:
+    def _ended(self, *, stopped: bool) -> Ended:
+        for keeper in self.keepers:
+            if not (stopped or keeper.ever_ran or keeper.error):
+                keeper.error = NoNode(
+                    f"Node {keeper.uuid.hex()} did not answer until the measurement was over.",
+                    hint="Check its power, the bit rate and the address.",
+                )
         nodes = [_summary(keeper) for keeper in self.keepers]
         errors = [keeper.error for keeper in self.keepers if keeper.error is not None]
         errors += [_as_error(sink) for sink in self.sinks if sink.stats.error]

@@ -300,6 +300,22 @@ def test_a_node_that_is_not_there_is_5_after_the_time_allowed(bench: Bench, tmp_
     assert end["error"]["code"] == "no-node"
 
 
+@pytest.mark.parametrize("words", [[], ["--trigger"]], ids=["start time", "trigger"])
+def test_a_node_that_never_came_is_5_at_the_end_of_the_others(bench: Bench, words: list[str]) -> None:
+    """It was 0: nothing said that one of two was not in the file."""
+    bench.gripper.kill()
+    outcome = bench.station.run(
+        "--json", "measure", bench.angle.uuid, bench.gripper.uuid, "--duration", 1, *words, *bench.can
+    )
+    assert outcome.code == 5, outcome
+    *_, end = [json.loads(line) for line in outcome.out.splitlines()]
+    there, away = end["nodes"]
+    assert there["streams"][0]["samples"] > 0
+    assert "error" not in there
+    assert "did not answer until the measurement was over" in away["error"]["message"]
+    assert ("The trigger waits for" in outcome.err) == bool(words)
+
+
 def test_what_a_task_requires_is_judged_before_anything_is_measured(bench: Bench, tmp_path: Path) -> None:
     file = tmp_path / "task.toml"
     file.write_text('[angle]\nrange = ">= 720 deg"\n')

@@ -15,6 +15,7 @@ from teds_provision.measure.clock import ClockMap
 from teds_provision.protocol.operation.stream_commands import SOON, WAITS
 
 WAITING = 2.0  # seconds that the first node waits for the others
+TELLING = 1.0  # seconds until it is told that a trigger waits
 TOGETHER = 15.0  # seconds that a trigger waits for all nodes, from the first one that is ready
 AHEAD, AHEAD_EACH = 0.25, 0.04  # seconds from the choice of a start time to it, and more for each node
 
@@ -26,7 +27,7 @@ class CommonStart:
         self._coming = set(uuids)
         self._alone = len(self._coming) < 2
         self._trigger, self._waiting = trigger, waiting
-        self._triggered = False
+        self._triggered = self._told = False
         self._at: float | None = None  # monotonic seconds of the start time, once it was chosen
         self._first: float | None = None
         self._turn = threading.Condition()
@@ -97,6 +98,13 @@ class CommonStart:
             self._first = time.monotonic()
         late = self._first is not None and time.monotonic() - self._first > TOGETHER
         return ready == all_of or late
+
+    def tells(self) -> bool:
+        """Whether it is to be told now, once, for whom the trigger waits."""
+        long = self._first is not None and time.monotonic() - self._first > TELLING
+        tells = self._trigger and not self._triggered and long and not self._told
+        self._told |= tells
+        return tells
 
     def triggered(self) -> None:
         """The trigger goes out: who comes later begins by itself."""
