@@ -105,7 +105,9 @@ class Measurement:
             self._loop(stop, duration)
         finally:
             self._end()
-        return self._ended(stopped=stop.is_set())
+        if not stop.is_set():
+            self._note_who_never_came()
+        return self._ended()
 
     def _loop(self, stop: threading.Event, duration: float | None) -> None:
         until = math.inf
@@ -249,13 +251,15 @@ class Measurement:
             sink.close()
         self._look()
 
-    def _ended(self, *, stopped: bool) -> Ended:
+    def _note_who_never_came(self) -> None:
         for keeper in self.keepers:
-            if not (stopped or keeper.ever_ran or keeper.error):
+            if not keeper.ever_ran and keeper.error is None:
                 keeper.error = NoNode(
                     f"Node {keeper.uuid.hex()} did not answer until the measurement was over.",
                     hint="Check its power, the bit rate and the address.",
                 )
+
+    def _ended(self) -> Ended:
         nodes = [_summary(keeper) for keeper in self.keepers]
         errors = [keeper.error for keeper in self.keepers if keeper.error is not None]
         errors += [_as_error(sink) for sink in self.sinks if sink.stats.error]

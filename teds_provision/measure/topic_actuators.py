@@ -147,12 +147,12 @@ class TopicActuators:
         now = time.monotonic()
         if now >= actuator.claimed_until:
             self._claim(command.channel, actuator)
-        alone = sum(1 for one in self._actuators.values() if one.claimed_until > now) <= 1
-        if not (actuator.fast and alone):
+        fast_alone = actuator.fast and sum(one.claimed_until > now for one in self._actuators.values()) <= 1
+        if not fast_alone:
             actuator.driver = None
         # Nobody answers a Drive message, so now and then a value goes by command: a node that was cut off says so.
-        due = actuator.fast and alone and now - actuator.answered < self._dead_man / 2000
-        if not (due and actuator.drivable and self._is_driven(command, actuator, octets)):
+        by_message = fast_alone and now - actuator.answered < self._dead_man / 2000
+        if not (by_message and self._is_driven(command, actuator, octets)):
             self._set(command, actuator, octets)
             actuator.answered = time.monotonic()
         actuator.claimed_until = time.monotonic() + self._dead_man / 1000
@@ -185,6 +185,8 @@ class TopicActuators:
 
     def _is_driven(self, command: Command, actuator: _Actuator, octets: bytes) -> bool:
         """Send it as a Drive message; False where the node takes none: then values go by command, as fast as it can."""
+        if not actuator.drivable:
+            return False
         try:
             self._drive(command, actuator, octets)
         except (NodeRefused, NotAuthentic, Garbled) as error:
