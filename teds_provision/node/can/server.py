@@ -16,11 +16,12 @@ from typing import Final
 from teds_provision.errors import LinkFailure, NoReader, TedsProvisionError
 from teds_provision.links.can.bus import Bus, Frame
 from teds_provision.links.can.isotp import FUNCTIONAL, Pair, addresses, read_single
-from teds_provision.links.can.spec import FIRST_STATION, LAST_NODE, LAST_STATION, parse_spec
+from teds_provision.links.can.spec import FIRST_STATION, LAST_STATION, parse_spec
+from teds_provision.node.can.addresses import Addresses
 from teds_provision.node.can.seat import Line, Request, Seat, link_name
 from teds_provision.node.can.workers import Crew
 from teds_provision.node.handler import Measuring, NodeHandler
-from teds_provision.protocol.announce import Announce, is_announce
+from teds_provision.protocol.announce import is_announce
 from teds_provision.protocol.messages.frames import IDENTIFY, Reply
 from teds_provision.protocol.operation.can_frames import drive_address, trigger_station
 
@@ -62,8 +63,7 @@ class CanServer:
         self._crew: Crew | None = None
         self._seats: list[Seat] = []
         self._seat_of: dict[int, Seat] = {}
-        self._at: dict[int, list[Seat]] = {}
-        self._known: set[int] = set()
+        self._addresses = self._seated()
         self._active: set[tuple[Seat, Pair]] = set()
         self._pushing: set[tuple[Seat, Pair]] = set()
         self._looked = 0.0
@@ -93,11 +93,11 @@ class CanServer:
         self._bus = Bus(self._spec)
         self._stop.clear()
         self._crew = Crew()
-        self._known, self._active, self._pushing, self._later, self._everyone_due = set(), set(), set(), [], {}
+        self._active, self._pushing, self._later, self._everyone_due = set(), set(), [], {}
         self._seats = [Seat(node, tapped, self._crew, self._out, more) for node, tapped, more in self._nodes]
         self._seat_of = {id(seat.handler): seat for seat in self._seats}
-        self._find_seats()
-        self._announce_all()
+        self._addresses = self._seated()
+        self._addresses.announce_all()
         self._wake, woken = socket.socketpair()
         self._thread = threading.Thread(target=self._serve, args=(woken,), name="can", daemon=True)
         self._thread.start()
@@ -115,10 +115,20 @@ class CanServer:
         for seat in self._seats:
             for line in seat.lines.values():
                 line.begin_anew()
-        self._seats, self._at = [], {}
+        self._seats = []
+        self._addresses = self._seated()
         if self._bus is not None:
             self._bus.close()
             self._bus = None
+
+    def _seated(self) -> Addresses:
+        echoes = bool(dict(self._spec.options).get("receive_own_messages"))
+        return Addresses(self._seats, self._at_time, self._moves, self._tell, echoes=echoes)
+
+    def _moves(self, seat: Seat) -> None:
+        """What is under way from its old address ends."""
+        for pairs in (self._active, self._pushing):
+            pairs.difference_update([entry for entry in pairs if entry[0] is seat])
 
     def send_data(self, handler: NodeHandler, identifier: int, data: bytes, *, fd: bool) -> None:
         """Put a data frame of a node on the bus; raises LinkFailure where that is lost.
@@ -129,7 +139,7 @@ class CanServer:
             seat, bus = self._seat_of.get(id(handler)), self._bus
             if seat is None or bus is None or self._stop.is_set():
                 return
-            self._speaks(seat, identifier)
+            self._addresses.speaks(seat, identifier)
         with self._sending:
             bus.send(Frame(identifier, data, fd))
 
@@ -201,32 +211,21 @@ class CanServer:
         heapq.heappush(self._later, (due, next(self._number), job))
 
     def _out(self, seat: Seat, frame: Frame) -> None:
-        """Put a node's frame on the bus; the other nodes of this process hear it as they hear those of the bus."""
+        """Put a node's frame on the bus."""
         assert self._bus is not None
         with self._sending:
             self._bus.send(frame)
-        self._speaks(seat, frame.identifier)
+        self._addresses.speaks(seat, frame.identifier)
         if is_announce(frame.identifier):
-            self._announced(frame, seat)
-
-    def _speaks(self, seat: Seat, identifier: int) -> None:
-        source = identifier & 0xFF
-        if source not in seat.spoken_from:
-            seat.spoken_from.add(source)
-            for other in self._seats:
-                if other is not seat:
-                    other.claim.hear(source)
+            self._addresses.announced(frame, seat)
 
     # -- frames ----------------------------------------------------------------------------------------------------
 
     def _dispatch(self, frame: Frame) -> None:
         source = frame.identifier & 0xFF
-        if 1 <= source <= LAST_NODE and source not in self._known:
-            self._known.add(source)
-            for seat in self._seats:
-                seat.claim.hear(source)
+        self._addresses.heard(source)
         if is_announce(frame.identifier):
-            self._announced(frame, None)
+            self._addresses.announced(frame, None)
         elif FIRST_STATION <= source <= LAST_STATION:
             self._from_station(source, frame)
 
@@ -242,7 +241,7 @@ class CanServer:
             self._measuring_frame(station, frame)
             return
         own = ends[0]
-        for seat in self._at.get(own, ()):
+        for seat in self._addresses.at(own):
             line, pair = seat.pair(station, own)
             self._request(seat, line, pair, frame)
         if frame.data and frame.data[0] >> 4 == _FLOW_CONTROL:
@@ -264,7 +263,7 @@ class CanServer:
             for node, tick in [(node, node.tick(frame.at)) for node in nodes]:
                 node.trigger(link_name(station), frame.data, tick)
         elif (address := drive_address(frame.identifier)) is not None:
-            for seat in self._at.get(address.node, ()):
+            for seat in self._addresses.at(address.node):
                 if seat.measuring is not None:
                     seat.measuring.drive(link_name(station), frame.data)
 
@@ -287,7 +286,7 @@ class CanServer:
         with self._lock:
             if line.seat.address != line.seat.handler.can_address():  # 128.10
                 line.seat.address = line.seat.handler.can_address()
-                self._find_seats()
+                self._addresses.find()
             if self._stop.is_set() or line.gone or line.pairs.get(pair.own) is not pair:
                 return  # lost meanwhile
             try:
@@ -325,57 +324,6 @@ class CanServer:
         pair.send(transaction + Reply(True, seat.handler.identify()).encode())
         self._note(seat, pair)
 
-    # -- addresses -------------------------------------------------------------------------------------------------
-
-    def _find_seats(self) -> None:
-        self._at = {}
-        for seat in self._seats:
-            self._at.setdefault(seat.address, []).append(seat)
-
-    def _announce_all(self) -> None:
-        for seat in self._seats:
-            seat.claim.start(time.monotonic())
-            self._announce_when_due(seat)
-
-    def _announce_when_due(self, seat: Seat) -> None:
-        due = seat.claim.due(time.monotonic())
-        if due is None:
-            return
-
-        def announce() -> None:
-            if seat.claim.due(due) == due:
-                seat.announce()
-
-        self._at_time(due, announce)
-
-    def _announced(self, frame: Frame, speaker: Seat | None) -> None:
-        """An Announce was heard, from the bus or from a node of this process (``speaker``)."""
-        announce = Announce.decode(frame.identifier, frame.data)
-        if announce is None:
-            return
-        for seat in list(self._at.get(announce.address, ())):
-            if seat is not speaker and not (speaker is None and self._echo(seat, announce)):
-                self._contested(seat, announce)
-
-    def _echo(self, seat: Seat, announce: Announce) -> bool:
-        """Whether it is the node's own Announce, given back by a controller that does so."""
-        return announce.crc == seat.claim.crc and bool(dict(self._spec.options).get("receive_own_messages"))
-
-    def _contested(self, seat: Seat, announce: Announce) -> None:
-        now, before, told = time.monotonic(), seat.address, seat.claim.conflict
-        address = seat.claim.take(announce, before, now, pinned=seat.handler.actuator_claimed())
-        if seat.claim.conflict and not told:
-            self._tell(
-                f"Another node announces the UUID {seat.uuid.hex()} (or one of equal CRC-32) "
-                f"from the CAN address 0x{before:02x}: take one of the two from the bus."
-            )
-        if address != before:
-            for pairs in (self._active, self._pushing):
-                pairs.difference_update([entry for entry in pairs if entry[0] is seat])
-            seat.move(address)
-            self._find_seats()
-        self._announce_when_due(seat)
-
     # -- losses ----------------------------------------------------------------------------------------------------
 
     def _lose_lines(self) -> None:
@@ -395,5 +343,5 @@ class CanServer:
             except (LinkFailure, NoReader):
                 continue
             with self._lock:
-                self._announce_all()
+                self._addresses.announce_all()
             return
