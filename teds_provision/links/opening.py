@@ -66,8 +66,10 @@ def open_port(settings: LinkSettings) -> Port:
     """Open the one reader or bus that ``settings`` name; raises NoReader with the cure, or UsageFailure."""
     places = settings.places
     if len(places) > 1:
+        named = ", ".join(place.partition(":")[2] for place in places)
         raise UsageFailure(
-            f"{len(places)} readers or buses are named, and this command works with one.",
+            f"{len(places)} {'readers' if settings.via == 'nfc' else 'buses'} are named ({named}), "
+            "and this command works with one.",
             hint=f"Name one with --{settings.via}; several are for --watch and measure.",
         )
     return open_place(places[0], settings.trace)

@@ -56,6 +56,7 @@ say(made=made, again=again, doctor=doctor, backup=backup)
     assert again == made
     results = {check["name"]: check["result"] for check in said["doctor"][1]["checks"]}
     assert (said["doctor"][0], results["keyring"], results["vault"]) == (0, "ok", "ok")
+    assert results["seals"] == "ok", "a keyring asks nobody for a passphrase"
     assert said["backup"][0] == 0
     assert [path.name for path in (session.home / "station").iterdir() if "vault" in path.name] == []
 

@@ -156,6 +156,13 @@ def test_nodes_are_found_by_every_part(fleet: Path, words: list[str], names: lis
     assert [node["name"] for node in call(fleet, "--json", "nodes", *words).json["nodes"]] == names
 
 
+def test_a_filter_that_nothing_fits_is_not_taken_for_an_empty_store(fleet: Path) -> None:
+    """It said "No node is known yet. Tap one"."""
+    for words in (["--state", "moved"], ["--profile", "no-such-type"], ["--since", "2099-01-01"]):
+        said = call(fleet, "nodes", *words)
+        assert (said.code, said.out.startswith("No node that is known fits that.")) == (0, True), said
+
+
 def test_due_counts_days_from_today_and_what_is_overdue(fleet: Path) -> None:
     ahead = (date(2026, 3, 15) - date.today()).days
     found = call(fleet, "--json", "nodes", "--due", str(max(ahead, 0))).json["nodes"]

@@ -60,6 +60,12 @@ def test_measure_takes_the_bus_that_is_kept_beside_a_reader(home: Path, monkeypa
     assert told.code == 5
 
 
+def test_several_readers_for_a_command_of_one_are_listed(home: Path) -> None:
+    words = ("--nfc", "udp:127.0.0.1:9", "--nfc", "usb:072f")
+    said = call(home, "--json", "identify", *words)
+    assert (said.code, "(udp:127.0.0.1:9, usb:072f)" in said.json["error"]["message"]) == (2, True), said.out
+
+
 def test_a_clock_that_no_datasheet_can_hold_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
     """TimeInstance has 32 bits of seconds: until 2106."""
     monkeypatch.setattr(sign.time, "time_ns", lambda: (1 << 32) * 1_000_000_000)

@@ -22,6 +22,8 @@ from teds_provision.station.inventory import STATES, inventory, search
 _FIRST = 200  # the rows that decide how wide each column is
 _NAME_COLUMNS = 24
 _GAP = "  "
+_NONE_KNOWN = "No node is known yet. Tap one: teds-provision identify --add"
+_NONE_FITS = "No node that is known fits that. All of them: teds-provision nodes"
 
 
 @command("teds-provision nodes", "teds-provision nodes finger --state provisioned", "teds-provision --json nodes 8d4d")
@@ -70,7 +72,7 @@ def nodes(
     elif form == "csv":
         _csv(described)
     elif not found:
-        print("No node is known yet. Tap one: teds-provision identify --add")
+        print(_NONE_FITS if search(station) else _NONE_KNOWN)
     elif text is not None and len(found) == 1:
         _one(next(described))
     else:
