@@ -165,6 +165,8 @@ class LiveReporter:
             self._show()
         else:
             self._stop()
+            if notice.kind == "node-left":  # whatever step ran ended with it
+                self._step = ""
             self._console.print(harmless(f"… {notice.text}"), style="yellow", markup=False)
 
     def written(self, octets: int, total: int) -> None:
@@ -191,7 +193,9 @@ class LiveReporter:
 
         left = "" if self._until is None else f" ({max(0.0, self._until - time.monotonic()):.0f} s left)"
         what = f"  {self._what}{left}" if self._what else ""
-        return Spinner("dots", text=Text(harmless(f"{self._step}{what}")))  # a bare text would be read as markup
+        return Spinner(
+            "dots", text=Text(harmless(f"{self._step}{what}".lstrip()))
+        )  # a bare text would be read as markup
 
     def close(self) -> None:
         """Take the live line away."""

@@ -13,6 +13,7 @@ from teds_provision.cli.context import App
 from teds_provision.cli.rendering import LiveReporter, tidy
 from teds_provision.cli.steps.provision import _questions
 from teds_provision.errors import NotAuthentic
+from teds_provision.links import Notice
 from teds_provision.links.nfc.message import Record
 from teds_provision.steps.agree import agree
 from teds_provision.steps.build import BuildOrder, build
@@ -95,6 +96,17 @@ def test_what_is_waited_for_is_no_markup() -> None:
     shown = reporter._render()
     assert isinstance(shown, Spinner)
     assert str(shown.text).strip() == "Looking on udp_multicast:[ff02::1] ?[2J"
+
+
+def test_a_step_that_ended_with_its_board_is_not_shown_while_the_next_one_is_waited_for() -> None:
+    reporter = LiveReporter(App())
+    reporter.started("whitelist")
+    reporter.notice(Notice("node-left", "Node 8d4d was taken off the reader."))
+    reporter.notice(Notice("waiting", "Hold a node to the reader."))
+    shown = reporter._render()
+    reporter.close()
+    assert isinstance(shown, Spinner)
+    assert str(shown.text) == "Hold a node to the reader."
 
 
 @pytest.mark.parametrize("ended", [KeyboardInterrupt, click.Abort])

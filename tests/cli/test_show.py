@@ -205,12 +205,13 @@ def test_a_bundle_longer_than_any_file_of_teds_shows_its_header(show, tmp_path):
     [
         (b'{"format":"teds-backup/2","store":"x"}\n', "a backup", "restore"),
         (b"\x89MCAP0\r\n" + bytes(100), "a recording", "mcap info"),
+        (b"# teds-provision measurement, text 1; times are unix seconds\ntime,uuid\n", "a recording (text)", "less"),
         (b"\n\r\r\n" + bytes(100), "a trace", "trace show"),
         (b'{"format": "teds-trace/1"}\n', "a trace", "trace show"),
         (b'{"format":"teds-backup/2"}' + bytes(33 << 20), "a backup", "restore"),
         (bytes(33 << 20), "it has more than 32 MiB", ""),
     ],
-    ids=["backup", "mcap", "pcapng", "trace", "long backup", "long"],
+    ids=["backup", "mcap", "text", "pcapng", "trace", "long backup", "long"],
 )
 def test_another_file_of_this_program_is_called_what_it_is(show, tmp_path, octets, what, command):
     path = tmp_path / "file"

@@ -9,7 +9,7 @@ import pytest
 from teds_provision.errors import BadData, NodeSilent, NoNode
 from teds_provision.station.station import Station
 from teds_provision.steps.build_order import BuildOrder
-from teds_provision.steps.many.board import Board
+from teds_provision.steps.many.board import Board, Declined
 from teds_provision.steps.many.progress import Progress
 from teds_provision.steps.many.report import write_report
 from teds_provision.steps.many.sheet import Sheet, read_sheet
@@ -116,6 +116,18 @@ def test_a_board_that_is_turned_away_takes_no_row(station: Station, tmp_path: Pa
     assert progress.next_row is second
     later = Progress(station.home, progress.sheet)
     assert later.row_for(board_of(5), "") is later.sheet.rows[0], "nobody has it"
+
+
+def test_a_no_is_no_try_of_a_board(station: Station, tmp_path: Path) -> None:
+    """A board that passed when it was held there again counted as one that needed two tries."""
+    progress = Progress(station.home, read(station, tmp_path, "name\na\n"))
+    (row,) = progress.sheet.rows
+    progress.note(row, Board(board_of(1), 1.0, error=Declined("You said no."), row=1))
+    assert (progress.rows[1].result, progress.rows[1].tries) == ("skipped", 0)
+    progress.rows[1].result = ""
+    progress.note(row, Board(board_of(1), 1.0, row=1))
+    assert (progress.rows[1].result, progress.rows[1].tries, progress.rows[1].first) == ("passed", 1, True)
+    assert progress.totals().first_pass == 1.0
 
 
 def test_a_batch_to_which_no_board_came_says_so(station: Station, tmp_path: Path) -> None:

@@ -30,6 +30,10 @@ _HEAD_OCTETS: Final = 64
 _OTHERS: Final = {
     b'{"format":"teds-backup/': ("a backup of a station", "teds-provision restore {}"),
     b"\x89MCAP0\r\n": ("a recording (MCAP)", "mcap info {}"),
+    b"# teds-provision measurement, text": (
+        "a recording (text)",
+        "less {}",
+    ),
     b"\n\r\r\n": ("a trace (pcapng)", "teds-provision trace show {}"),
     b'{"format": "teds-trace/': ("a trace", "teds-provision trace show {}"),
 }
