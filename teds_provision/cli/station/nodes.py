@@ -8,7 +8,7 @@ import sys
 from collections.abc import Callable, Iterable, Iterator
 from datetime import UTC, datetime, timedelta
 from itertools import chain, islice
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import click
 
@@ -19,11 +19,12 @@ from teds_provision.cli.rendering import local_time, print_json_list, shown
 from teds_provision.cli.station.fits import show_fits
 from teds_provision.station.inventory import STATES, inventory, search
 
+if TYPE_CHECKING:
+    from teds_provision.station.station import Station
+
 _FIRST = 200  # the rows that decide how wide each column is
 _NAME_COLUMNS = 24
 _GAP = "  "
-_NONE_KNOWN = "No node is known yet. Tap one: teds-provision identify --add"
-_NONE_FITS = "No node that is known fits that. All of them: teds-provision nodes"
 
 
 @command("teds-provision nodes", "teds-provision nodes finger --state provisioned", "teds-provision --json nodes 8d4d")
@@ -72,11 +73,18 @@ def nodes(
     elif form == "csv":
         _csv(described)
     elif not found:
-        print(_NONE_FITS if search(station) else _NONE_KNOWN)
+        _none(station)
     elif text is not None and len(found) == 1:
         _one(next(described))
     else:
         _table(described)
+
+
+def _none(station: Station) -> None:
+    """Say why the list is empty."""
+    known = bool(search(station))
+    print("No node that is known fits that." if known else "No node is known yet.", end=" ")
+    print("All of them: teds-provision nodes" if known else "Tap one: teds-provision identify --add")
 
 
 _FIELDS = (
