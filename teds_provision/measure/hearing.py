@@ -79,8 +79,9 @@ class HeardStream:
         return self._at_once and bool(self._came)
 
     def begin(self, start: int) -> None:
-        """The first instant of a stream that waited for a trigger is known."""
+        """The first instant of a stream that waited for a trigger is known: from now on its silence counts."""
         self.finish()
+        self.heard = time.monotonic()
         with self.mapping:
             messages = self.receiver.begin(start)
             blocks = self.interpreter.blocks(messages)

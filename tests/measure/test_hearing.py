@@ -110,6 +110,16 @@ def test_a_stream_that_runs_free_has_the_period_that_its_ticks_say(real: int) ->
     assert not scene.clock.lie
 
 
+def test_a_stream_that_waited_for_its_trigger_was_not_silent_meanwhile() -> None:
+    """A trigger that waited for a missing node had all others lost as soon as it went out."""
+    scene = Scene()
+    scene.heard.receiver.start = None
+    scene.heard.heard -= 15.0
+    began = time.monotonic()
+    scene.heard.begin(SECOND)
+    assert scene.heard.heard >= began
+
+
 def test_what_waited_for_12_ms_is_handed_on_and_not_before() -> None:
     scene = Scene()
     before = time.monotonic()
