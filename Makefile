@@ -36,7 +36,7 @@ types: $(VENV)/.dev
 WORKERS ?= 3
 USUAL := not soak and not machine
 unit: $(VENV)/.dev
-	$(BIN)/python -m pytest -n $(WORKERS) --dist worksteal -rs -m '$(USUAL) and not realtime'
+	$(BIN)/python -m pytest -n $(WORKERS) --dist worksteal -rs --hypothesis-profile gate -m '$(USUAL) and not realtime'
 	$(BIN)/python -m pytest -rsR -m '$(USUAL) and realtime'
 
 # The inner loop: the rooms without a link or a process, the rules of the house, one case of each link, one provisioning

@@ -16,7 +16,7 @@ from contextlib import ExitStack, nullcontext
 from pathlib import Path
 
 import pytest
-from hypothesis import settings
+from hypothesis import HealthCheck, settings
 
 from teds_provision.station.station import Station
 from tests.bench import Board, make_station
@@ -25,9 +25,10 @@ AT_THE_GATE = os.environ.get("CI", "").lower() not in ("", "0", "false")
 
 SHARED = ("hall", "bench", "lab")  # fixtures of a module whose value says ``visited``
 
-settings.register_profile("desk", deadline=None, print_blob=True)
-settings.register_profile("quick", deadline=None, print_blob=True, max_examples=20)
-settings.register_profile("gate", deadline=None, print_blob=True, derandomize=True)
+# Of the checks of health that one alone is about time: examples that a busy machine was slow to make are good examples.
+settings.register_profile("desk", deadline=None, print_blob=True, suppress_health_check=[HealthCheck.too_slow])
+settings.register_profile("quick", settings.get_profile("desk"), max_examples=20)
+settings.register_profile("gate", settings.get_profile("desk"), derandomize=True)
 settings.load_profile("gate" if AT_THE_GATE else "desk")
 
 
