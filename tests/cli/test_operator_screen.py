@@ -47,7 +47,13 @@ class Terminal:
     def __init__(self, batch: Batch) -> None:
         self.out = io.StringIO()
         console = Console(
-            file=self.out, force_terminal=True, force_interactive=False, width=80, height=24, color_system=None
+            file=self.out,
+            force_terminal=True,
+            force_interactive=False,
+            width=80,
+            height=24,
+            color_system=None,
+            _environ={"TERM": "xterm"},
         )
         self.screen = OperatorScreen(console, batch)
 

@@ -162,6 +162,7 @@ def test_fifty_clients_of_which_ten_never_read(service: Service) -> None:
                     additional_headers={"Authorization": f"Bearer {token}"},
                     compression=None,
                     open_timeout=PATIENCE,
+                    proxy=None,
                 )
             )
             for _ in range(40)
