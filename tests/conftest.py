@@ -23,6 +23,19 @@ from tests.bench import Board, make_station
 
 AT_THE_GATE = os.environ.get("CI", "").lower() not in ("", "0", "false")
 
+OF_TERMINALS = {
+    "COLUMNS",
+    "LINES",
+    "NO_COLOR",
+    "FORCE_COLOR",
+    "CLICOLOR",
+    "CLICOLOR_FORCE",
+    "PAGER",
+    "EDITOR",
+    "VISUAL",
+}
+OF_PROXIES = {"http_proxy", "https_proxy", "all_proxy", "no_proxy"}
+OF_THE_CALLER = OF_TERMINALS | {"AMENT_PREFIX_PATH", "CYCLONEDDS_URI", "NOTIFY_SOCKET", "WATCHDOG_USEC"}
 SHARED = ("hall", "bench", "lab")  # fixtures of a module whose value says ``visited``
 
 # Of the checks of health that one alone is about time: examples that a busy machine was slow to make are good examples.
@@ -33,9 +46,16 @@ settings.load_profile("gate" if AT_THE_GATE else "desk")
 
 
 def pytest_configure() -> None:
-    """Take Ctrl-C as usual: what a shell starts in the background ignores it, and so would the programs under test."""
+    """Take Ctrl-C as usual: what a shell starts in the background ignores it, and so would the programs under test.
+
+    And what the caller's environment says of terminals, proxies, ROS and this program is nothing that a test asked for.
+    """
     if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
         signal.signal(signal.SIGINT, signal.default_int_handler)
+    for name in list(os.environ):
+        theirs = name in OF_THE_CALLER or name.lower() in OF_PROXIES or name.startswith(("TEDS_PROVISION_", "ROS_"))
+        if theirs:
+            del os.environ[name]
 
 
 @pytest.hookimpl(tryfirst=True)
