@@ -179,7 +179,21 @@ def test_a_folder_without_images_is_said_and_doubles_count_once(tmp_path: Path) 
     with pytest.raises(NotFound, match="no image"):
         image_files([tmp_path])
     one = write(tmp_path, "1.json", signed(1))
-    assert image_files([one, tmp_path, one]) == [one]
+    assert image_files([one, tmp_path, one]) == [str(one)]
+
+
+def test_images_of_a_folder_come_by_name_folders_in_their_place_links_to_files_too(tmp_path: Path) -> None:
+    names = ("a/z.json", "a-b/y.json", "a.json", "b.json", "b/a/x.json", "b/b.json", "c.json/d.json")
+    for name in names:
+        path = tmp_path / "images" / name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.touch()
+    (tmp_path / "images" / "link.json").symlink_to(tmp_path / "images" / "a.json")
+    (tmp_path / "images" / "nowhere.json").symlink_to(tmp_path / "gone")
+    (tmp_path / "images" / "round").symlink_to(tmp_path / "images")
+    (tmp_path / "images" / "notes.txt").touch()
+    found = [Path(file).relative_to(tmp_path / "images") for file in image_files([tmp_path / "images"])]
+    assert found == sorted(map(Path, (*names, "link.json")))
 
 
 def test_the_worst_exit_code_wins_whatever_the_order() -> None:

@@ -6,7 +6,9 @@ import gc
 import multiprocessing
 import os
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field
+from operator import attrgetter
 from pathlib import Path
 from typing import Final
 
@@ -86,32 +88,54 @@ Tell = Callable[[FileVerdict], str]
 _WORST: Final = (0, 6, 7, 3, 8, 1, 4)
 
 
-def image_files(paths: Sequence[Path]) -> list[Path]:
-    """Files that are named, and every ``*.json`` below folders that are named, by name.
+def image_files(paths: Sequence[Path]) -> list[str]:
+    """Files that are named, and every ``*.json`` below folders that are named, by name; each once.
 
-    Raises NotFound for a folder without one; a file that is not there is told with the others' verdicts.
+    As text: paths are made of them where they are read, by several processes. Raises NotFound for a folder without one;
+    a file that is not there is told with the others' verdicts.
     """
-    found: list[Path] = []
+    found: list[str] = []
     for path in paths:
         if path.is_dir():
-            inside = sorted(_below(path), key=lambda file: file.split(os.sep))
+            inside = list(_below(str(path)))
             if not inside:
                 raise NotFound(f"There is no image (*{ENDING}) in the folder {path}.")
-            found += map(Path, inside)
+            found += inside
         else:
-            found.append(path)
+            found.append(str(path))
     return list(dict.fromkeys(found))
 
 
-def _below(folder: Path) -> Iterator[str]:
-    """The images in a folder and its folders; as text, which costs half of what paths do where there are thousands."""
-    for place, _, names in os.walk(folder):
-        files = (os.path.join(place, name) for name in names if name.endswith(ENDING))
-        yield from filter(os.path.isfile, files)
+def _below(folder: str) -> Iterator[str]:
+    """The images in a folder and its folders, by name; neither links to folders nor what cannot be looked into."""
+    here: list[os.DirEntry[str]] = []
+    with suppress(OSError), os.scandir(folder) as entries:
+        here = sorted(entries, key=attrgetter("name"))
+    for entry in here:
+        if _is_folder(entry):
+            yield from _below(entry.path)
+        elif entry.name.endswith(ENDING) and _is_file(entry):
+            yield entry.path
+
+
+def _is_folder(entry: os.DirEntry[str]) -> bool:
+    """Whether it is a folder itself; its own folder knew that already, so that most need no look at the disk."""
+    try:
+        return entry.is_dir(follow_symlinks=False)
+    except OSError:
+        return False
+
+
+def _is_file(entry: os.DirEntry[str]) -> bool:
+    """Whether it is a file, or a link to one."""
+    try:
+        return entry.is_file()
+    except OSError:
+        return False
 
 
 def verify_files(
-    station: Station, files: Sequence[Path], tell: Tell, *, processes: int | None = None
+    station: Station, files: Sequence[str], tell: Tell, *, processes: int | None = None
 ) -> Iterator[tuple[list[str], Totals]]:
     """Judge every file, in order, some at a time: what ``tell`` says of each, and their totals.
 
@@ -136,12 +160,12 @@ class _Work:
 
     judging: Judging
     tell: Tell
-    files: Sequence[Path]
+    files: Sequence[str]
 
     def done(self, places: range) -> tuple[list[str], Totals]:
         """Judge the files at these places of the list, which every process has."""
         lines, totals = [], Totals()
-        for some in _some([self.files[place] for place in places]):
+        for some in _some([Path(self.files[place]) for place in places]):
             for found in _judged(self.judging, some):
                 totals.add(found)
                 lines.append(self.tell(found))
