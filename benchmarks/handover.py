@@ -28,7 +28,8 @@ from teds_provision.handover.import_keys import Imported, import_keys, plan_impo
 from teds_provision.handover.selection import ExportOrder
 from teds_provision.protocol.agreement import key_id
 from teds_provision.protocol.handover import jose
-from teds_provision.protocol.handover.bundle import TYPE, _payload, open_bundle
+from teds_provision.protocol.handover.bundle import TYPE, open_bundle
+from teds_provision.protocol.handover.contents import payload_of
 from teds_provision.protocol.handover.strict_json import dump, load_object
 from teds_provision.protocol.keys import SoftwareKey, fingerprint
 from teds_provision.station.station import Station, initialise
@@ -171,7 +172,7 @@ def main(count: int = 10_000) -> None:
             imports.append(seconds)
         octets = bundle.read_bytes()
         opened = open_bundle(octets, south.vault.identity(), {north.fingerprint: north.point}.get, datetime.now(UTC))
-        payload = _payload(opened.bundle)
+        payload = payload_of(opened.bundle)
         keys = [jwk.JWK.generate(kty="EC", crv="P-256") for _ in range(2)]
         theirs = bare(payload, *keys)
         layer = jose_layer(payload)

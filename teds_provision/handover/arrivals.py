@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 from typing import Any, Literal
 
 from teds_provision.protocol.fingerprints import is_whole
-from teds_provision.protocol.handover.bundle import Bundle, BundledNode
+from teds_provision.protocol.handover.contents import Bundle, BundledNode
 from teds_provision.protocol.keys import fingerprint
 from teds_provision.protocol.messages.identity import NodeState
 from teds_provision.station.station import Station

@@ -20,7 +20,8 @@ from teds_provision.handover import collector
 from teds_provision.handover.pending import OPEN, Notes, content_digest
 from teds_provision.handover.selection import Chosen, ExportOrder, Leaving, Selection
 from teds_provision.handover.trust import find_trusted
-from teds_provision.protocol.handover.bundle import Bundle, BundledNode, Mode, sealing
+from teds_provision.protocol.handover.bundle import sealing
+from teds_provision.protocol.handover.contents import Bundle, BundledNode, Mode
 from teds_provision.protocol.handover.payload import time_text
 from teds_provision.protocol.handover.sealing import Sealing
 from teds_provision.protocol.keys import fingerprint

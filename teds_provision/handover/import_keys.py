@@ -17,7 +17,8 @@ from teds_provision.handover.arrivals import Arrivals, Decision, PlannedNode
 from teds_provision.handover.deny import deny_all, why_not
 from teds_provision.handover.pending import IMPORTED, Notes, digest_of
 from teds_provision.protocol.fingerprints import same_key
-from teds_provision.protocol.handover.bundle import Bundle, BundledNode, OpenedBundle, check_times, open_bundle
+from teds_provision.protocol.handover.bundle import OpenedBundle, check_times, open_bundle
+from teds_provision.protocol.handover.contents import Bundle, BundledNode
 from teds_provision.protocol.handover.payload import time_text
 from teds_provision.protocol.handover.receipt import Receipt, RefusedNode, seal_receipt
 from teds_provision.protocol.handover.revocation import Revocation as Statement

@@ -9,7 +9,7 @@ from typing import NamedTuple
 from teds_provision.errors import NotFound, PolicyRefused
 from teds_provision.handover.pending import OPEN, Notes
 from teds_provision.protocol.fingerprints import same_key
-from teds_provision.protocol.handover.bundle import Mode
+from teds_provision.protocol.handover.contents import Mode
 from teds_provision.protocol.keys import fingerprint
 from teds_provision.station.station import Station
 from teds_provision.store import NodeRecord, Shown, pages

@@ -16,7 +16,8 @@ from cryptography.hazmat.primitives.asymmetric import ec, rsa
 from cryptography.hazmat.primitives.serialization import Encoding, NoEncryption, PrivateFormat, PublicFormat
 
 from teds_provision.protocol.handover import jose
-from teds_provision.protocol.handover.bundle import TYPE, Bundle, BundledNode, _payload, seal_bundle
+from teds_provision.protocol.handover.bundle import TYPE, seal_bundle
+from teds_provision.protocol.handover.contents import Bundle, BundledNode, payload_of
 from teds_provision.protocol.handover.strict_json import base64url, decode_base64url, dump
 from teds_provision.protocol.keys import SoftwareKey, fingerprint, station_key_message, to_pem
 from teds_provision.vault import forget_vaults
@@ -282,7 +283,7 @@ class Forger:
 
     def members(self, **changes: Any) -> bytes:
         """A payload with members that the sender's own code would not write."""
-        payload = json.loads(_payload(self.good)) | changes
+        payload = json.loads(payload_of(self.good)) | changes
         return self.signed(dump(payload))
 
     def signed(self, payload: bytes, **header: Any) -> bytes:
@@ -314,7 +315,7 @@ def _expired(forger: Forger) -> bytes:
 
 
 def _with_duplicate(forger: Forger) -> bytes:
-    nodes = json.loads(_payload(forger.good))["nodes"]
+    nodes = json.loads(payload_of(forger.good))["nodes"]
     return forger.members(nodes=[nodes[0], nodes[0]])
 
 

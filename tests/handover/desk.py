@@ -10,7 +10,7 @@ from teds_provision.handover.export_keys import Exported, export_keys, plan_expo
 from teds_provision.handover.import_keys import Imported, ImportPlan, import_keys, plan_import
 from teds_provision.handover.selection import ExportOrder
 from teds_provision.protocol.agreement import key_id
-from teds_provision.protocol.handover.bundle import Mode
+from teds_provision.protocol.handover.contents import Mode
 from teds_provision.protocol.keys import SoftwareKey, fingerprint
 from teds_provision.station.station import Station
 from teds_provision.steps.agree import agree, require_session

@@ -23,7 +23,8 @@ from teds_provision.handover.pending import close, find_handover, undo
 from teds_provision.handover.selection import ExportOrder
 from teds_provision.handover.trust import plan_removal, remove
 from teds_provision.protocol.datasheet import SEQUENCE_WINDOW
-from teds_provision.protocol.handover.bundle import Bundle, BundledNode, Mode, seal_bundle
+from teds_provision.protocol.handover.bundle import seal_bundle
+from teds_provision.protocol.handover.contents import Bundle, BundledNode, Mode
 from teds_provision.protocol.handover.jose import verify_compact
 from teds_provision.protocol.handover.receipt import TYPE, open_receipt, seal_receipt
 from teds_provision.protocol.handover.revocation import seal_revocation

@@ -9,7 +9,8 @@ from datetime import UTC, datetime, timedelta
 from typing import Any
 
 from teds_provision.protocol.handover import jose
-from teds_provision.protocol.handover.bundle import TYPE, Bundle, BundledNode, _payload
+from teds_provision.protocol.handover.bundle import TYPE
+from teds_provision.protocol.handover.contents import Bundle, BundledNode, payload_of
 from teds_provision.protocol.handover.strict_json import base64url, dump
 from teds_provision.protocol.keys import SoftwareKey, fingerprint, station_key_message
 
@@ -51,7 +52,7 @@ def bundle(count: int = 1, to: tuple[SoftwareKey, ...] = (RECEIVER,), **changes:
 
 def members_of(made: Bundle) -> dict[str, Any]:
     """The payload as JSON members, to be bent."""
-    return json.loads(_payload(made))
+    return json.loads(payload_of(made))
 
 
 def sealed(members: object, *, sender: SoftwareKey = SENDER, to: SoftwareKey = RECEIVER, typ: str = TYPE) -> bytes:

@@ -10,7 +10,8 @@ import pytest
 
 from teds_provision.errors import NotAuthentic
 from teds_provision.protocol.handover import jose
-from teds_provision.protocol.handover.bundle import TYPE, _payload, open_bundle, seal_bundle
+from teds_provision.protocol.handover.bundle import TYPE, open_bundle, seal_bundle
+from teds_provision.protocol.handover.contents import payload_of
 from teds_provision.protocol.handover.jwk import public_jwk
 from teds_provision.protocol.handover.receipt import open_receipt, seal_receipt
 from teds_provision.protocol.handover.strict_json import encode_base64url
@@ -117,14 +118,14 @@ def test_the_other_opens_our_bundle(other, count):
     octets = seal_bundle(made, SENDER, [key.point for key in RECEIVERS])
     for key in RECEIVERS if count == 1 else RECEIVERS[1:]:
         payload = other.verified(other.decrypt(octets, key), SENDER)
-        assert json.loads(payload) == json.loads(_payload(made))
+        assert json.loads(payload) == json.loads(payload_of(made))
 
 
 @pytest.mark.parametrize("count", [1, 1_000, pytest.param(10_000, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("receivers", [RECEIVERS[:1], RECEIVERS], ids=["one receiver", "two receivers"])
 def test_we_open_the_others_bundle(other, count, receivers):
     made = bundle(count, to=receivers)
-    octets = other.encrypt(other.sign(_payload(made), SENDER, HEADER), receivers, PROTECTED)
+    octets = other.encrypt(other.sign(payload_of(made), SENDER, HEADER), receivers, PROTECTED)
     for key in receivers:
         assert open_bundle(octets, key, trusts(SENDER), NOW).bundle == made
 
@@ -144,6 +145,6 @@ def test_the_other_verifies_our_receipt_and_we_theirs(other):
 
 
 def test_a_name_of_a_sender_on_the_others_signature_does_not_help(other):
-    octets = other.encrypt(other.sign(_payload(bundle()), THIRD, HEADER), RECEIVERS[:1], PROTECTED)
+    octets = other.encrypt(other.sign(payload_of(bundle()), THIRD, HEADER), RECEIVERS[:1], PROTECTED)
     with pytest.raises(NotAuthentic):
         open_bundle(octets, RECEIVER, trusts(SENDER), NOW)

@@ -8,7 +8,8 @@ from dataclasses import replace
 import pytest
 
 from teds_provision.errors import PolicyRefused, VaultFailure
-from teds_provision.protocol.handover.bundle import _payload, open_bundle, seal_bundle
+from teds_provision.protocol.handover.bundle import open_bundle, seal_bundle
+from teds_provision.protocol.handover.contents import payload_of
 from teds_provision.protocol.handover.receipt import open_receipt, seal_receipt
 from teds_provision.protocol.handover.revocation import open_revocation, seal_revocation
 from teds_provision.protocol.keys import fingerprint, station_key_message
@@ -82,14 +83,14 @@ def test_signed_in_the_token_and_opened_by_the_jose_tool(stations, tmp_path, cou
     north, tool = stations[0].identity(), CTool(tmp_path)
     made = between(north, RECEIVER, stations[0].ca(), count)
     octets = seal_bundle(made, north, [RECEIVER.point])
-    assert json.loads(tool.verified(tool.decrypt(octets, RECEIVER), north)) == json.loads(_payload(made))
+    assert json.loads(tool.verified(tool.decrypt(octets, RECEIVER), north)) == json.loads(payload_of(made))
 
 
 @pytest.mark.parametrize("count", [1, 1_000])
 def test_sealed_by_the_jose_tool_and_opened_in_the_token(stations, tmp_path, count):
     south, tool = stations[1].identity(), CTool(tmp_path)
     made = between(SENDER, south, stations[0].ca(), count)
-    octets = tool.encrypt(tool.sign(_payload(made), SENDER, HEADER), [south], PROTECTED)
+    octets = tool.encrypt(tool.sign(payload_of(made), SENDER, HEADER), [south], PROTECTED)
     assert open_bundle(octets, south, trusts(SENDER), NOW).bundle == made
 
 
