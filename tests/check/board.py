@@ -1,6 +1,6 @@
 """A board with one fault, behind real links: ``python -m tests.check.board FAULT [--nfc PATH] [--can BUS]``.
 
-Prints a line when its links are up; ends when stdin closes. FAULT "" is the good one.
+Prints a line when its links are up; ends when stdin closes. FAULT "" is the good one, "mute" answers Identify alone.
 """
 
 from __future__ import annotations
@@ -14,12 +14,14 @@ from dataclasses import replace
 
 import pytest
 
+from teds_provision.errors import LinkFailure
 from teds_provision.links.can import isotp
 from teds_provision.node.can import seat
 from teds_provision.node.can.server import CanServer
 from teds_provision.node.nfc import tnep as tnep_of_node
 from teds_provision.node.nfc import type4
 from teds_provision.node.nfc.server import NfcServer
+from teds_provision.protocol.messages.frames import IDENTIFY
 from teds_provision.protocol.messages.identity import NodeState
 from teds_provision.protocol.repetition import Repetition
 from tests.bench import Board
@@ -111,9 +113,12 @@ class OnLinks:
 
     def __init__(self, board: Board, fault: Fault | None) -> None:
         self.board, self.fault = board, fault
+        self.mute = False
         self._turn = threading.Lock()
 
     def request(self, link: str, frame: bytes, *, tapped: bool) -> bytes:
+        if self.mute and frame[2:4] != IDENTIFY.encode()[2:4]:
+            raise LinkFailure("It is mute.")
         with self._turn:
             board = self.board
             board.seconds = time.monotonic()
@@ -156,6 +161,7 @@ def main() -> None:
     board.flash.state = replace(board.state, blocks={(0, 1): META, (1, 12): NAME}, epoch=4)
     board.power_on()
     handler = OnLinks(board, FAULTS[said.fault][0] if said.fault in FAULTS else None)
+    handler.mute = said.fault == "mute"
     servers: list[NfcServer | CanServer] = []
     if said.nfc:
         servers.append(NfcServer(said.nfc, handler, wt_int=said.wait_time))

@@ -218,16 +218,18 @@ class Boards:
         """Each of these nodes in a thread, as many at a time as the bus and the token bear, until ``stop`` is set."""
         token = self._station.identity.keystore.startswith("pkcs11:")
         workers = max(1, min(_TOKEN_WORKERS if token else port.capabilities.at_once, len(contacts)))
-        with ThreadPoolExecutor(workers, thread_name_prefix="node") as pool:
-            running = [pool.submit(self._board, contact, port.place, questions) for contact in contacts]
-            try:
-                for done in as_completed(running):
-                    yield done.result()
-                    if self.stop.is_set():
-                        break
-            finally:
-                for future in running:
-                    future.cancel()
+        pool = ThreadPoolExecutor(workers, thread_name_prefix="node")
+        running = [pool.submit(self._board, contact, port.place, questions) for contact in contacts]
+        try:
+            for done in as_completed(running):
+                yield done.result()
+                if self.stop.is_set():
+                    break
+        except BaseException:  # Ctrl-C: a mute node would be waited for, a minute long
+            port.close()
+            raise
+        finally:
+            pool.shutdown(cancel_futures=True)
 
     def _require_known(self, found: list[Contact]) -> None:
         """Raise NotWhitelisted where none of the nodes that answered is one of ours: nothing done is not all done."""
