@@ -6,8 +6,6 @@ import fcntl
 import os
 import pty
 import struct
-import subprocess
-import sys
 import termios
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -18,8 +16,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from teds_provision.cli.terminal.folding import folded
-
-from .shell import clean_environment
+from tests.terminal import on_terminal
 
 COLUMNS = 80
 
@@ -33,28 +30,10 @@ def terminal(columns: int) -> Iterator[TextIO]:
     os.close(ours)
 
 
-def shown(home: Path, *words: object) -> list[str]:
-    """What a command says on a terminal, line by line as it was sent."""
-    ours, theirs = pty.openpty()
-    fcntl.ioctl(theirs, termios.TIOCSWINSZ, struct.pack("HHHH", 24, COLUMNS, 0, 0))
-    with subprocess.Popen(
-        [sys.executable, "-m", "teds_provision", "--home", str(home), *map(str, words)],
-        stdin=subprocess.DEVNULL, stdout=theirs, stderr=theirs, env=clean_environment(TERM="xterm"),
-    ):  # fmt: skip
-        os.close(theirs)
-        said = b""
-        while True:
-            try:
-                said += os.read(ours, 4096)
-            except OSError:
-                break
-    os.close(ours)
-    return said.decode().splitlines()
-
-
 def test_an_error_and_its_hint_are_broken_between_words(home: Path) -> None:
     """A word in the middle of a line went on in the next one."""
-    lines = shown(home, "provision", "--watch", "--name", "the same name for every board", "--profile", "load-cell")
+    words = ("provision", "--watch", "--name", "the same name for every board", "--profile", "load-cell")
+    lines = on_terminal(home, *words, columns=COLUMNS).screen.splitlines()
     assert lines[0].startswith("Error: Every node would get the name")
     assert len(lines) > 2, lines
     assert max(map(len, lines)) <= COLUMNS, lines
