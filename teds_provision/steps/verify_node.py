@@ -29,9 +29,18 @@ class Looked:
 
 
 def look_at_node(station: Station, node: Conversation, who: Identified) -> Looked:
-    """Open a session where a key is held, read every TEDS and judge them; raises LinkFailure and what a read raises."""
+    """Open a session where a key is held, read every TEDS and judge them; raises LinkFailure and what a read raises.
+
+    One in which the node answers nothing but that it is busy is as good as none: then all is read without it.
+    """
     why = open_or_say_why(station, node)
-    image = read_image(node)
+    try:
+        image = read_image(node)
+    except NodeRefused as refusal:
+        if not (node.sealed and refusal.message.startswith(HEARD)):
+            raise
+        node.forget()
+        why, image = _said(refusal), read_image(node)
     return Looked(image, verify_node(station, node, image, who.point, why=why))
 
 
@@ -61,10 +70,14 @@ def open_or_say_why(station: Station, node: Conversation) -> str:
     except NodeRefused as refusal:
         if node.sealed:
             raise
-        return refusal.message.removeprefix(HEARD).rstrip(".")
+        return _said(refusal)
     if held is None and station.keys.held(node.uuid) and station.policy.tombstone(node.uuid) is None:
         return "the node opens no session under any key that is held here"
     return ""
+
+
+def _said(refusal: NodeRefused) -> str:
+    return refusal.message.removeprefix(HEARD).rstrip(".")
 
 
 def verify_node(station: Station, node: Conversation, image: Image, point: bytes, *, why: str = "") -> Verified:

@@ -301,6 +301,11 @@ def test_a_node_that_is_busy_for_ever_is_told_until_when_and_holds_up_nobody(
     assert ran([line for line in lines if line.get("uuid") == gripper.uuid]) == ["running", "ended"]
     whys = [line["why"] for line in lines if line["event"] == "status" and line["uuid"] == fd_angle.uuid]
     assert any("it is busy" in why and "again in 1 s, given up in" in why for why in whys), whys
+    # Its datasheet is read all the same, and nobody vouches for it.
+    words = ["verify", fd_angle.uuid, "--via", "can", "--can", fd_angle.can]
+    verified = hall.station.ask(*words, code=5)
+    assert verified["verdict"] == "unproven"
+    assert "it is busy" in next(check["why"] for check in verified["checks"] if check["name"] == "session")
     # Where it is alone, it is given up at the end of --timeout, and no later than a last try takes.
     lines = measured(fd_angle, "--timeout", 3, code=6)
     assert [line["state"] for line in lines if line["event"] == "status"][-1] == "refused"
