@@ -103,7 +103,10 @@ def test_a_link_in_the_place_of_the_store_is_not_followed(home: Path, tmp_path: 
 def test_a_home_of_another_user_is_refused_before_anything_is_written(tmp_path: Path) -> None:
     home = tmp_path / "home"
     home.mkdir(mode=0o700)
-    os.chown(home, 12345, 12345)
+    try:
+        os.chown(home, 12345, 12345)
+    except PermissionError:
+        pytest.skip("this root may not give a folder to another user")
     with pytest.raises(StoreFailure, match="another user"):
         Store.open(home, create=True)
     assert list(home.iterdir()) == []
