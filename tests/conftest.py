@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import os
 import signal
+import tempfile
 from collections.abc import Generator, Iterator
 from contextlib import ExitStack, nullcontext
 from pathlib import Path
@@ -36,6 +37,7 @@ OF_TERMINALS = {
 }
 OF_PROXIES = {"http_proxy", "https_proxy", "all_proxy", "no_proxy"}
 OF_THE_CALLER = OF_TERMINALS | {"AMENT_PREFIX_PATH", "CYCLONEDDS_URI", "NOTIFY_SOCKET", "WATCHDOG_USEC"}
+LONGEST_TEMPORARY = 20  # characters: tests bind Unix sockets below it, whose whole path has 107 at most
 SHARED = ("hall", "bench", "lab")  # fixtures of a module whose value says ``visited``
 
 # Of the checks of health that one alone is about time: examples that a busy machine was slow to make are good examples.
@@ -52,6 +54,8 @@ def pytest_configure() -> None:
     """
     if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
         signal.signal(signal.SIGINT, signal.default_int_handler)
+    if len(tempfile.gettempdir()) > LONGEST_TEMPORARY and os.access("/tmp", os.W_OK | os.X_OK):
+        os.environ["TMPDIR"] = tempfile.tempdir = "/tmp"
     for name in list(os.environ):
         theirs = name in OF_THE_CALLER or name.lower() in OF_PROXIES or name.startswith(("TEDS_PROVISION_", "ROS_"))
         if theirs:
