@@ -120,7 +120,7 @@ def test_the_end_of_a_duration_is_not_moved_by_a_restart(hall: Hall) -> None:
     hall.station.ask("group", "create", "short", hall.nodes["g"].uuid)
     for seconds in (6, 20, 60):  # of which something must be left when the second command is up
         first = hall.begin("short", "--rate", 20, "--duration", seconds, "--channel", 2)
-        first.wait_for('"event":"data"')
+        until(lambda first=first: (first.read(0.1), first.out.count('"event":"data"') >= 10)[1])  # its end is kept
         began = min(of(events(first.out), channel=2)[0]["time"])
         killed(first)
         lines = hall.measure("short")
