@@ -219,15 +219,20 @@ class Daemon:
         return self.station.measurements.detection
 
     def set_detection(self, mode: str) -> None:
-        """Change the mode, and look at all links anew; raises UsageFailure."""
+        """Change the mode, and look at all links anew; raises UsageFailure.
+
+        What was found in another mode is forgotten until it is found again; in the same one it stays.
+        """
         if mode not in get_args(Detection):
             raise UsageFailure(f"{mode!r} is no mode of detection.", hint="Use transparent or whitelist.")
+        changes = mode != self.station.measurements.detection
         with self.station.durable("detection"):
             self.station.measurements.detection = mode  # type: ignore[assignment]
             self.station.audit("detection", None, "set", mode=mode)
         self.live.event("detection", state=mode)
         for watch in self.watches:
-            self.roster.forget_place(watch.place)
+            if changes:
+                self.roster.forget_place(watch.place)
             watch.look_at_all()
 
     def discover(self) -> list[dict[str, Any]]:
