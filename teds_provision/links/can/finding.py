@@ -38,6 +38,13 @@ class Found:
         unfinished = (self.unfinished | other.unfinished) - identities.keys()
         return Found(identities, self.conflicts | other.conflicts, unfinished)
 
+    def cleared_by(self, later: Found) -> Found:
+        """What a later question made of it: where two seemed to answer, they do if they did again."""
+        identities = {node: who for node, who in self.identities.items() if node not in later.conflicts}
+        identities |= later.identities
+        unclear = self.unfinished | self.conflicts | later.unfinished
+        return Found(identities, later.conflicts, unclear - identities.keys() - later.conflicts)
+
     @property
     def twice(self) -> dict[bytes, list[int]]:
         """UUIDs that answer under more than one address, with these: one of them is not who it says."""

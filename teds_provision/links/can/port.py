@@ -29,7 +29,6 @@ from teds_provision.links.can.spec import LAST_NODE, parse_spec
 from teds_provision.links.ports import CAN, Capabilities, Contact, Notice, NoticeSink, Trace
 from teds_provision.protocol.messages.identity import Identity
 
-"""Identifier of an Announce, its node in the last octet (profile.md, "CAN")."""
 _HELLO_SECONDS: Final = 1.0
 _GUESS_SECONDS: Final = 0.1
 """The wait for who may be at the address where a node is thought to be; everyone is asked after it."""
@@ -173,7 +172,7 @@ class CanPort:
             found = found.together(more)
             if len(found.identities) == known:
                 break
-        found = settle(found, self.identify, until=began + LONGEST_SECONDS + _HELLO_SECONDS)
+        found = self._settled(found, began + LONGEST_SECONDS + _HELLO_SECONDS)
         if found.unfinished:
             notice(Notice("unfinished", unfinished_text(found.unfinished)))
         for uuid, addresses in found.twice.items():
@@ -187,6 +186,17 @@ class CanPort:
             if isinstance(news, Found):
                 found = news
         return found
+
+    def _settled(self, found: Found, until: float) -> Found:
+        """Look again at what remained unclear: where two seem to be, by asking everyone once more.
+
+        A reply to a station that died a moment ago, by chance under our transaction number, looks like a second node;
+        it comes once, a second node each time.
+        """
+        left = until - time.monotonic()
+        if found.conflicts and left > 0:
+            found = found.cleared_by(self._asked_once(min(LONGEST_SECONDS, left)))
+        return settle(found, self.identify, until=until)
 
     def watch(self, *, stop: threading.Event, notice: NoticeSink) -> Iterator[Contact]:
         """Yield each node once: when it first answers, when it comes back, and when it is in factory state again.
@@ -250,7 +260,7 @@ class CanPort:
                 found = news
             elif wanted(news[1]):
                 return self._contact(*news)
-        found = settle(found, self.identify, until=time.monotonic() + min(LONGEST_SECONDS, seconds))
+        found = self._settled(found, time.monotonic() + min(LONGEST_SECONDS, seconds))
         for node in sorted(found.conflicts):
             notice(Notice("conflict", conflict_text(node)))
         for node, identity in sorted(found.identities.items()):

@@ -16,6 +16,7 @@ from teds_provision.errors import AddressConflict, LinkFailure, NodeSilent, NoNo
 from teds_provision.links.can import link as link_module
 from teds_provision.links.can.arrivals import Arrivals
 from teds_provision.links.can.frame import Frame
+from teds_provision.links.can.isotp import FUNCTIONAL
 from teds_provision.links.can.port import CanPort
 from teds_provision.links.can.spec import parse_spec
 from teds_provision.links.ports import Contact, Notice
@@ -328,6 +329,26 @@ def test_an_address_is_good_again_as_soon_as_one_node_alone_answers_there(hub: H
         assert port.bus().clash(0x21)
         [contact] = port.everyone(seconds=3, notice=quiet)
         assert contact.identity.uuid == first.uuid
+        assert contact.link.exchange(COUNT)
+
+
+def test_a_late_reply_to_a_station_that_died_makes_no_second_node(hub: Hub) -> None:
+    """One time in 256 it has our transaction number: the next command said that two nodes answer, for ten seconds."""
+    with serving(hub.spec, EchoNode(0x21)), opened(hub.spec) as port, opened(hub.spec + "&source=0xF2") as other:
+
+        def reply_late() -> None:
+            with other.listen(lambda frame: frame.identifier == FUNCTIONAL | 0xF1) as ear:
+                listening.set()
+                asked = ear.get(PATIENCE)
+            assert asked is not None
+            other.bus().send(Frame(0x18DAF121, bytes([0x10, 40, asked.data[1], 1, 0, 36, 7, 7])))
+
+        listening = threading.Event()
+        node = threading.Thread(target=reply_late)
+        node.start()
+        assert listening.wait(PATIENCE)
+        [contact] = port.everyone(seconds=10, notice=quiet)
+        node.join(PATIENCE)
         assert contact.link.exchange(COUNT)
 
 
