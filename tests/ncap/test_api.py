@@ -276,7 +276,7 @@ def test_a_virtual_transducer_is_made_from_a_document_under_a_uuid_of_its_own(
 
 
 def test_the_mode_that_holds_already_forgets_nobody(service: Service, asked: Client) -> None:
-    uuid = virtual(service)
+    uuid = virtual(service, name="steadfast")
     for _ in range(5):
         asked.request("PUT", "/detection", {"mode": "whitelist"})
         assert asked.node(uuid)["present"]
