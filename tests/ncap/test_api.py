@@ -275,11 +275,11 @@ def test_a_virtual_transducer_is_made_from_a_document_under_a_uuid_of_its_own(
     refused(asked, 404, "not-found", "POST", "/virtual", {"profile": "no-such-type", "source": "noise"})
 
 
-def test_the_mode_that_holds_already_forgets_nobody(service: Service, asked: Client) -> None:
-    uuid = virtual(service, name="steadfast")
+def test_the_mode_that_holds_already_forgets_nobody(asked: Client, hand: str) -> None:
+    until(lambda: asked.node(hand)["present"])
     for _ in range(5):
         asked.request("PUT", "/detection", {"mode": "whitelist"})
-        assert asked.node(uuid)["present"]
+        assert asked.node(hand)["present"]
 
 
 def test_detection_decides_who_is_shown(service: Service, asked: Client) -> None:
