@@ -374,9 +374,8 @@ class SharedBus:
         if node in gathering.clashes:
             self._clashes[node] = time.monotonic()
         elif node in gathering.answers and self._clashes.get(node, math.inf) < asked.began:
-            del self._clashes[
-                node
-            ]  # one of the two has left, by its Claim: here one answers; if both do, it stands again
+            # One of the two has left, by its Claim: one alone answers here. If both do, it stands again.
+            del self._clashes[node]
         if before != (len(gathering.answers), len(gathering.conflicts)):
             asked.news.put(node)
 
