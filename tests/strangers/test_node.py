@@ -138,6 +138,7 @@ def measured(node: Stranger, *words: object, code: int = 0) -> list[dict[str, An
     return node.hall.measure(node.uuid, *words, can=node.can, code=code)
 
 
+@pytest.mark.realtime  # the bound of the clock is what the best exchange took
 def test_it_is_verified_sampled_and_measured(angle: Stranger) -> None:
     angle.start()
     station = angle.hall.station
@@ -156,6 +157,7 @@ def test_it_is_verified_sampled_and_measured(angle: Stranger) -> None:
     for line in data:
         for raw, value in zip(line["raw"], line["value"], strict=True):
             assert value == pytest.approx(raw / 65535 * 6.2814, abs=2e-3)
+    assert stream["clock_error"] < 0.1
     assert station.ask("mode", angle.uuid, "--can", angle.can)["mode"] == "configuration"
 
 
