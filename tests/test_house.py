@@ -1,7 +1,7 @@
-"""The figures of the house (scripts/house.py) stay at what was reached.
+"""What holds of the house: no circle between files, imports on top.
 
-A figure may sink: then the number here sinks with it. It may not rise: split the function, divide the folder, put the
-import on top. An exception has a name and a reason.
+How long, deep or full anything is, `make house` prints; no limit stands here. A limit divides functions and files where
+their parts have no name worth knowing.
 """
 
 from __future__ import annotations
@@ -17,9 +17,6 @@ import pytest
 
 ROOT = Path(__file__).parent.parent
 
-FILES_IN_A_FOLDER = 15
-FULLER: dict[str, int] = {}
-"""Folders that have more files, and how many."""
 LATE_IMPORTS = {
     "__main__.py": 2,  # Ctrl-C while Python imports the command line ends with 130 as later
 }
@@ -57,13 +54,3 @@ def test_scripts_of_the_page_import_each_other_one_way(house: ModuleType) -> Non
     found = house.scripts()
     assert found["views/node.js"], "the scripts' imports are not read"
     assert house.circles(found) == []
-
-
-def test_no_more_functions_have_too_many_branches(house: ModuleType, modules: dict[str, object]) -> None:
-    found = house.complex_functions(modules)
-    assert not found, "\n".join(["functions of complexity C or worse:", *found])
-
-
-def test_a_folder_holds_what_can_be_looked_over(house: ModuleType) -> None:
-    over = [f"{folder}: {n} files" for n, folder in house.drawers() if n > FULLER.get(folder, FILES_IN_A_FOLDER)]
-    assert not over
