@@ -16,6 +16,7 @@ from teds_provision.cli.tracing import tracing
 from teds_provision.errors import NotFound
 from teds_provision.lazy import late
 from teds_provision.links import LINKS, LinkSettings
+from teds_provision.links.ports import LISTEN_SECONDS
 from teds_provision.protocol.fingerprints import read_fingerprint
 
 if TYPE_CHECKING:
@@ -147,7 +148,10 @@ def link_options(function: Function) -> Function:
     ) -> Any:
         named = can[0] if len(can) == 1 else can or None
         with tracing(trace) as opened, readers_for(via):
-            return function(*args, links=LinkSettings(via, nfc or None, named, ble, timeout, opened), **rest)
+            # a setting of config.toml is patience for a tap; whoever names it here means this very search
+            listen = timeout if said_here("timeout") else LISTEN_SECONDS
+            links = LinkSettings(via, nfc or None, named, ble, timeout, opened, listen)
+            return function(*args, links=links, **rest)
 
     options = [
         click.option(
@@ -180,7 +184,7 @@ def link_options(function: Function) -> Function:
             default=60.0,
             show_default=True,
             metavar="SECONDS",
-            help="How long to wait for the node.",
+            help="How long to wait for the node; identify and provision --all over CAN or BLE listen as long as that.",
         ),
         click.option(
             "--trace",

@@ -5,7 +5,7 @@ from __future__ import annotations
 import threading
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
-from typing import Literal, Protocol, runtime_checkable
+from typing import Final, Literal, Protocol, runtime_checkable
 
 from teds_provision.links.hints import BleAddress, Charging
 from teds_provision.protocol.messages.identity import Identity
@@ -221,8 +221,12 @@ class Port(Protocol):
         Foreign tags and unwanted nodes are reported through ``notice`` and waited past.
         """
 
-    def everyone(self, *, seconds: float, notice: NoticeSink) -> list[Contact]:
-        """Wait until any node is tapped, or answers on the bus: there, all that answer. Raises NoNode."""
+    def everyone(self, *, seconds: float, notice: NoticeSink, listen: float = 0.0) -> list[Contact]:
+        """Wait until any node is tapped, or answers on the bus: there, all that answer. Raises NoNode.
+
+        Where a link carries many, it listens for ``listen`` seconds at least, however soon the first ones answered;
+        a node that is named by its address is not waited past.
+        """
 
     def watch(self, *, stop: threading.Event, notice: NoticeSink) -> Iterator[Contact]:
         """Yield every node as it comes, once per visit (debounced), until ``stop`` is set; survives unplugging.
@@ -234,11 +238,15 @@ class Port(Protocol):
         """Release the reader or the bus; never raises."""
 
 
+LISTEN_SECONDS: Final = 3.0
+
+
 @dataclass(frozen=True)
 class LinkSettings:
     """The user's link options, unparsed: ``--via``, ``--nfc``, ``--can`` (one or several), ``--ble``, ``--timeout``.
 
-    ``timeout`` in seconds. ``nfc`` None or ``auto``: the one reader that is there. ``trace`` is an open one (--trace).
+    ``timeout`` in seconds; ``listen`` is how long a command that collects nodes listens at least: 3 s, or ``--timeout``
+    where that was given. ``nfc`` None or ``auto``: the one reader that is there. ``trace`` is an open one (--trace).
     """
 
     via: str = "nfc"
@@ -247,6 +255,7 @@ class LinkSettings:
     ble: str | None = None
     timeout: float = 60.0
     trace: Trace | None = None
+    listen: float = LISTEN_SECONDS
 
     @property
     def places(self) -> tuple[str, ...]:

@@ -79,7 +79,8 @@ def meet_everyone(links: LinkSettings, reporter: Reporter) -> Iterator[list[Conv
     """Wait for any node and give a conversation with each that is there: the tapped one, or all on the bus."""
     port = open_port(links)
     try:
-        contacts = without_twins(port.everyone(seconds=links.timeout, notice=reporter.notice), reporter.notice)
+        everyone = port.everyone(seconds=links.timeout, notice=reporter.notice, listen=links.listen)
+        contacts = without_twins(everyone, reporter.notice)
         with ExitStack() as stack:
             yield [stack.enter_context(Conversation(contact, notice=reporter.notice)) for contact in contacts]
     finally:

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import click
 import pytest
@@ -12,6 +14,7 @@ from teds_provision.cli.measure.values import over_the_bus
 from teds_provision.cli.options import link_options
 from teds_provision.errors import TedsProvisionError
 from teds_provision.links import LinkSettings
+from teds_provision.links.ports import LISTEN_SECONDS
 from teds_provision.steps import sign
 
 from .shell import call
@@ -19,17 +22,22 @@ from .shell import call
 READER, BUS, AIR = "usb", "socketcan:can0", "hci0"
 
 
-def taken(kept: dict[str, str], *typed: str, streams: bool) -> str:
-    """The link of a command with these options in config.toml, and those on its line."""
+def given(kept: dict[str, Any], *typed: str, read: Callable[[LinkSettings], LinkSettings] = lambda links: links) -> Any:
+    """The links of a command with these options in config.toml, and those on its line, as ``read`` there gives them."""
     found: list[LinkSettings] = []
 
     @click.command()
     @link_options
     def probe(links: LinkSettings) -> None:
-        found.append(over_the_bus(links, streams=streams))
+        found.append(read(links))
 
     probe.main(list(typed), default_map=Defaults(kept), standalone_mode=False)
-    return found[0].via
+    return found[0]
+
+
+def taken(kept: dict[str, str], *typed: str, streams: bool) -> str:
+    """The link of a measuring command."""
+    return str(given(kept, *typed, read=lambda links: over_the_bus(links, streams=streams)).via)
 
 
 def test_a_bus_that_is_named_is_meant() -> None:
@@ -50,6 +58,17 @@ def test_a_bus_that_is_named_is_meant() -> None:
         ({}, ["--nfc", READER, "--ble", AIR], False, "ble"),  # the reader for the tap, the air for the rest
     ):
         assert taken(kept, *typed, streams=streams) == via, (kept, typed, streams)
+
+
+def test_who_names_a_time_has_the_nodes_collected_for_so_long() -> None:
+    """`--timeout` in config.toml is patience for a tap: it makes no identify of a bus wait for two minutes."""
+    for kept, typed, seconds in (
+        ({}, [], (60, LISTEN_SECONDS)),
+        ({"timeout": 120}, [], (120, LISTEN_SECONDS)),
+        ({"timeout": 120}, ["--timeout", "9"], (9, 9)),
+    ):
+        links = given(kept, *typed)
+        assert (links.timeout, links.listen) == seconds, (kept, typed)
 
 
 def test_measure_takes_the_bus_that_is_kept_beside_a_reader(home: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import threading
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -75,6 +76,24 @@ def test_the_nodes_of_a_bus_are_asked_side_by_side(station: Station, tmp_path: P
         came = list(identify_at(station, LinkSettings("can", can=spec, timeout=PATIENCE), Told()))
     assert [one.uuid.hex() for one in came] == uuids
     assert all(one.result is not None for one in came)
+
+
+def test_a_node_that_starts_meanwhile_is_found_while_somebody_listens(station: Station, tmp_path: Path) -> None:
+    with bus(tmp_path / "first", 1, threading.Barrier(1)) as (spec, (early,)):
+        FlashFile.create(tmp_path / "late", uuid=bytes(range(10)))
+        late = CanServer(spec)
+        late.add(VirtualNode(tmp_path / "late"))
+        starts = threading.Timer(2, late.start)
+        starts.start()
+        began = time.monotonic()
+        try:
+            links = LinkSettings("can", can=spec, timeout=PATIENCE, listen=6)
+            came = list(identify_at(station, links, Told()))
+        finally:
+            starts.join()
+            late.stop()
+    assert {one.uuid.hex() for one in came} == {early, bytes(range(10)).hex()}
+    assert time.monotonic() - began >= 6
 
 
 def test_a_node_without_a_proof_is_told_of_beside_the_others(station: Station, tmp_path: Path) -> None:

@@ -9,7 +9,7 @@ import queue
 import secrets
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from typing import Final
@@ -21,7 +21,7 @@ from teds_provision.links.ble.link import BleLink
 from teds_provision.links.ble.loop import Loop
 from teds_provision.links.ble.remembered import Remembered, cache_file
 from teds_provision.links.ble.spec import parse_spec
-from teds_provision.links.ports import BLE, Capabilities, Contact, Notice, NoticeSink, Trace
+from teds_provision.links.ports import BLE, LISTEN_SECONDS, Capabilities, Contact, Notice, NoticeSink, Trace
 from teds_provision.protocol.messages.frames import IDENTIFY, decode_reply
 from teds_provision.protocol.messages.identity import Identity, NodeState
 
@@ -140,23 +140,31 @@ class BlePort:
             hint="A node advertises for 60 s after a tap, and while it has a key. Bring it closer, or tap it.",
         )
 
-    def everyone(self, *, seconds: float, notice: NoticeSink) -> list[Contact]:
-        """Every node that advertises, asked one after the other; raises NoNode after ``seconds``."""
+    def everyone(self, *, seconds: float, notice: NoticeSink, listen: float = 0.0) -> list[Contact]:
+        """Every node that advertises, asked one after the other; raises NoNode after ``seconds``.
+
+        Listens until nobody new came for 1.5 s, and for ``listen`` seconds at least. Who is heard is asked soon: a new
+        node advertises for a minute after its tap, and no longer.
+        """
         notice(Notice("waiting", f"Looking for nodes over BLE ({self.spec.text}).", seconds))
-        until = time.monotonic() + seconds
+        began = time.monotonic()
+        until, enough = began + seconds, began + min(listen, seconds)
+        told: set[bytes] = set()
+        found: dict[str, Contact] = {}
+        asked: dict[str, float] = {}
         while (left := until - time.monotonic()) > 0:
-            addresses = [self.spec.address] if self.spec.address else self._all_seen(left)
-            told: set[bytes] = set()
-            found = []
-            for each in addresses:
+            for each in [self.spec.address] if self.spec.address else self._all_new(left, asked, found, enough):
                 in_use = self._is_up(each)
                 contact = self._ask(each, _anyone, notice, told)
+                asked[each] = time.monotonic()
                 if contact is not None:
                     if not in_use:  # there may be twenty: each is connected again when its turn comes
                         contact.link.close()
-                    found.append(contact)
-            if found:
-                return found
+                    found[each] = contact
+            if found and (self.spec.address or time.monotonic() >= enough):
+                break
+        if found:
+            return [found[each] for each in sorted(found)]
         raise NoNode(
             f"No node advertises within {seconds:g} s.",
             hint="A node advertises for 60 s after a tap, and while it has a key.",
@@ -230,18 +238,28 @@ class BlePort:
 
         return fresh(self._loop.run(self._adapter.scan(seconds, lambda seen: bool(fresh(seen)))))
 
-    def _all_seen(self, seconds: float) -> list[str]:
-        """All that advertise: until nobody new came for a while."""
+    def _all_new(
+        self, seconds: float, asked: Mapping[str, float], found: Mapping[str, Contact], enough: float
+    ) -> list[str]:
+        """Who advertises and was not found yet: until nobody new came for a while, and it was ``enough``.
+
+        Who did not say who it is is new again after some seconds, while it goes on to advertise.
+        """
         began = time.monotonic()
         first_at: dict[str, float] = {}
+        least = min(enough, began + LISTEN_SECONDS)
 
-        def enough(seen: dict[str, float]) -> bool:
+        def over(seen: dict[str, float]) -> bool:
             now = time.monotonic()
-            for address in seen:
-                first_at.setdefault(address, now)
-            return bool(first_at) and now - max(*first_at.values(), began) >= _SILENCE_SECONDS
+            for address, at in seen.items():
+                if address not in found and at - asked.get(address, -_GONE_SECONDS) >= _GONE_SECONDS / 2:
+                    first_at.setdefault(address, now)
+            if not first_at:
+                return bool(found) and now >= enough
+            return now >= least and now - max(first_at.values()) >= _SILENCE_SECONDS
 
-        return sorted(self._loop.run(self._adapter.scan(min(seconds, _LONGEST_SECONDS), enough)))
+        self._loop.run(self._adapter.scan(min(seconds, max(_LONGEST_SECONDS, enough - began)), over))
+        return sorted(first_at)
 
     def _ask(
         self, address: str, wanted: Callable[[Identity], bool], notice: NoticeSink, told: set[bytes]

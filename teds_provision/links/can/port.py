@@ -37,6 +37,8 @@ _ROUNDS_OF_MANY: Final = 3
 """Where so many answer, everyone is asked again until nobody new answers: the first frame of an answer that is lost
 leaves no trace of its node, and with each node more it is likelier that one was."""
 _ROUND_SECONDS: Final = 1.0
+_BUSY_SECONDS: Final = 1.5
+"""So long a node may take for its answer where somebody collects: a key agreement keeps a small one from everything."""
 _REOPEN_SECONDS: Final = 1.0
 
 
@@ -145,25 +147,38 @@ class CanPort:
             hint="Check its power, the bit rate and the address; teds-provision identify --via can lists who answers.",
         )
 
-    def everyone(self, *, seconds: float, notice: NoticeSink) -> list[Contact]:
-        """Every node that answers, as soon as one does: what identify shows, and provision chooses from.
+    def everyone(self, *, seconds: float, notice: NoticeSink, listen: float = 0.0) -> list[Contact]:
+        """Every node that answers: what identify shows, and provision chooses from.
 
         Listens until 300 ms of silence, 3 s at most, and asks by itself each address whose answer was torn; what
-        remains unclear is told through ``notice``. Raises NoNode after ``seconds``, AddressConflict, LinkFailure.
+        remains unclear is told through ``notice``. With ``listen`` everyone is asked again and again so long, and has
+        1.5 s for each answer: a node may be busy with another station, or about to start. Raises NoNode after
+        ``seconds``, AddressConflict, LinkFailure.
         """
-        until = time.monotonic() + seconds
+        began = time.monotonic()
+        until, enough = began + seconds, began + min(listen, seconds)
         notice(Notice("waiting", f"Asking every node on {self.spec.text}.", seconds))
+        found, told = Found(), set[str]()
+
+        def once(each: Notice) -> None:
+            if each.text not in told:
+                told.add(each.text)
+                notice(each)
+
         while self.spec.node is None and (left := until - time.monotonic()) > 0:
-            found = self._everyone(min(LONGEST_SECONDS, left), notice)
+            silence = max(SILENCE_SECONDS, min(_BUSY_SECONDS, enough - time.monotonic()))
+            found = found.together(self._everyone(min(LONGEST_SECONDS, left), once, silence))
             if found.conflicts:
                 raise conflict(min(found.conflicts))
-            if found.identities:
-                return [self._contact(node, identity) for node, identity in sorted(found.identities.items())]
+            if found.identities and time.monotonic() >= enough:
+                break
+        if found.identities:
+            return [self._contact(node, identity) for node, identity in sorted(found.identities.items())]
         return [self.find(lambda _: True, seconds=max(0.1, until - time.monotonic()), notice=notice)]
 
-    def _everyone(self, longest: float, notice: NoticeSink) -> Found:
+    def _everyone(self, longest: float, notice: NoticeSink, silence: float = SILENCE_SECONDS) -> Found:
         began = time.monotonic()
-        found = self._asked_once(longest)
+        found = self._asked_once(longest, silence)
         for _ in range(_ROUNDS_OF_MANY - 1):
             if len(found.identities) < _MANY or time.monotonic() - began >= longest:
                 break
@@ -180,9 +195,9 @@ class CanPort:
         self.tell_of_rivals(notice)
         return found
 
-    def _asked_once(self, longest: float) -> Found:
+    def _asked_once(self, longest: float, silence: float = SILENCE_SECONDS) -> Found:
         found = Found()
-        for news in ask_all(self.bus(), self.next_transaction(), silence=SILENCE_SECONDS, longest=longest):
+        for news in ask_all(self.bus(), self.next_transaction(), silence=silence, longest=longest):
             if isinstance(news, Found):
                 found = news
         return found

@@ -101,7 +101,7 @@ class NfcPort:
             hint="Hold the node's NFC antenna flat on the reader, or give it more time with --timeout.",
         )
 
-    def everyone(self, *, seconds: float, notice: NoticeSink) -> list[Contact]:
+    def everyone(self, *, seconds: float, notice: NoticeSink, listen: float = 0.0) -> list[Contact]:
         """The node that is tapped: a reader sees one at a time; see ``Port.everyone``."""
         return [self.find(lambda _: True, seconds=seconds, notice=notice)]
 

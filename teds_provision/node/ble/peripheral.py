@@ -78,15 +78,20 @@ class Peripheral:
         from bumble.gatt import Characteristic, CharacteristicValue, Service
 
         properties, permissions = Characteristic.Properties, Characteristic.Permissions
-        self._notify = Characteristic(_uuid(ble.NOTIFY), properties.NOTIFY, permissions(0), b"")
+        self._notify = Characteristic(
+            _uuid(ble.NOTIFY), properties.NOTIFY, permissions(0), CharacteristicValue(read=_unread, write=_unwritten)
+        )
         self._data = Characteristic(
             _uuid(ble.DATA),
             properties.NOTIFY | properties.WRITE_WITHOUT_RESPONSE,
             permissions.WRITEABLE,
-            CharacteristicValue(write=self._driven),
+            CharacteristicValue(read=_unread, write=self._driven),
         )
         write = Characteristic(
-            _uuid(ble.WRITE), properties.WRITE, permissions.WRITEABLE, CharacteristicValue(write=self._written)
+            _uuid(ble.WRITE),
+            properties.WRITE,
+            permissions.WRITEABLE,
+            CharacteristicValue(read=_unread, write=self._written),
         )
         self._device = Device(name="", address=self._bumble_address(), host=host)
         self._device.add_service(Service(_uuid(ble.SERVICE), [write, self._notify, self._data]))
@@ -264,6 +269,19 @@ class Peripheral:
         line = self._line_of(connection)
         if line is not None and value[:1] == b"\0":
             line.turns.put(lambda: self._node.drive(line.name, bytes(value[1:])))
+
+
+def _unread(_connection: Any) -> bytes:
+    """Refuse an ATT read; bumble answers only this exception, after any other the client waits for its 30 s."""
+    from bumble.att import ATT_READ_NOT_PERMITTED_ERROR, ATT_Error
+
+    raise ATT_Error(ATT_READ_NOT_PERMITTED_ERROR)
+
+
+def _unwritten(_connection: Any, _value: bytes) -> None:
+    from bumble.att import ATT_WRITE_NOT_PERMITTED_ERROR, ATT_Error
+
+    raise ATT_Error(ATT_WRITE_NOT_PERMITTED_ERROR)
 
 
 def _uuid(text: str) -> Any:

@@ -203,7 +203,9 @@ class Boards:
         try:
             if not port.capabilities.many:
                 raise UsageFailure("--all is for a bus: a reader sees one node.", hint="Use --watch, tap after tap.")
-            everyone = port.everyone(seconds=self._links.timeout, notice=self._reporter.notice)
+            everyone = port.everyone(
+                seconds=self._links.timeout, notice=self._reporter.notice, listen=self._links.listen
+            )
             found = without_twins(everyone, self._reporter.notice)
             contacts = [contact for contact in found if self._is_meant(contact)]
             if not contacts:

@@ -17,9 +17,10 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
+from bumble.att import ATT_Error
 from bumble.controller import Controller
-from bumble.core import PhysicalTransport
-from bumble.device import Device
+from bumble.core import UUID, PhysicalTransport
+from bumble.device import Device, Peer
 from bumble.hci import Address
 from bumble.host import Host
 from bumble.link import LocalLink
@@ -155,6 +156,7 @@ class Everything:
             "lines": lambda number: len(self.nodes[number]._lines),
             "reset": lambda number: self.virtual[number].reset_by_hand(),
             "stranger": self.stranger,
+            "access": self.access,
             "strangers_held": lambda: sum(not each.is_gone for each in self.strangers),
             "address": lambda number: self.nodes[number]._address.address.text,
             "manners": self.manners,
@@ -168,6 +170,22 @@ class Everything:
         await device.power_on()
         address = Address(self.nodes[number]._address.address.text, Address.RANDOM_DEVICE_ADDRESS)
         self.strangers.append(Stranger(await device.connect(address, timeout=10)))
+
+    async def access(self, number: int, kind: str, uuid: str) -> int | None:
+        """Somebody reads or writes a characteristic of a node: the error that comes back, None for none in 5 s."""
+        await self.stranger(number)
+        peer = Peer(self.strangers[-1].connection)
+        await peer.discover_services()
+        await peer.discover_characteristics()
+        (found,) = peer.get_characteristics_by_uuid(UUID(uuid))
+        work = found.read_value() if kind == "read" else found.write_value(b"\0", with_response=True)
+        try:
+            await asyncio.wait_for(work, 5)
+        except ATT_Error as error:
+            return int(error.error_code)
+        except TimeoutError:
+            return None
+        return 0
 
     def cut(self, number: int, pieces: int) -> None:
         node = self.nodes[number]

@@ -14,12 +14,14 @@ from teds_provision.errors import LinkFailure, NoNode, NoReader, UsageFailure
 from teds_provision.links.ble.port import BlePort
 from teds_provision.links.ble.remembered import cache_file
 from teds_provision.links.ble.spec import parse_spec
-from teds_provision.links.ports import Contact, Notice, Prompt
+from teds_provision.links.ports import LISTEN_SECONDS, Contact, Notice, Prompt
 from teds_provision.node import described
+from teds_provision.node.flash_file import FlashFile
+from teds_provision.protocol.messages import ble
 from teds_provision.protocol.messages.ble import piece_octets
 from teds_provision.protocol.messages.frames import Command, Function, security_command, write_teds
 from teds_provision.protocol.messages.identity import Identity
-from tests.node.measuring_station import SealedLine
+from tests.node.measuring_station import SealedLine, keyed_node
 from tests.pace import PATIENCE, until
 
 from .conftest import ANGLE
@@ -112,6 +114,36 @@ def test_twenty_nodes_are_asked_one_after_the_other(air: Air, port: Ports) -> No
     assert counts["most_held"] == 1
     assert counts["pending_at_once"] == 1
     assert contacts[7].link.exchange(IDENTIFY), "and each is connected again when its turn comes"
+
+
+def test_who_collects_listens_for_as_long_as_it_was_told(air: Air, port: Ports, tmp_path: Path) -> None:
+    """`identify --timeout 120` ended after 1.5 s of silence, with one node of two."""
+    keyed_node(tmp_path / "keyed", profile=ANGLE)
+    FlashFile.create(tmp_path / "new", uuid=bytes(range(10)))
+    radio = air([tmp_path / "keyed", tmp_path / "new"])
+    late = threading.Timer(5, lambda: radio.do("tap", 1))
+    late.start()
+    began = time.monotonic()
+    contacts = port().everyone(seconds=60, notice=quiet, listen=12)
+    assert len(contacts) == 2
+    assert time.monotonic() - began >= 12
+    late.join()
+
+
+def test_who_says_no_time_listens_for_three_seconds_at_least(air: Air, port: Ports) -> None:
+    air()
+    began = time.monotonic()
+    assert len(port().everyone(seconds=60, notice=quiet, listen=LISTEN_SECONDS)) == 1
+    assert time.monotonic() - began >= LISTEN_SECONDS
+
+
+@pytest.mark.parametrize(
+    ("kind", "uuid", "error"),
+    [("read", ble.WRITE, 0x02), ("read", ble.NOTIFY, 0x02), ("read", ble.DATA, 0x02), ("write", ble.NOTIFY, 0x03)],
+)
+def test_what_a_characteristic_does_not_offer_is_refused_at_once(air: Air, kind: str, uuid: str, error: int) -> None:
+    """A read of the write characteristic was never answered: a phone's explorer hangs for 30 s, and disconnects."""
+    assert air().do("access", 0, kind, uuid) == error
 
 
 def test_one_connect_at_a_time(air: Air, port: Ports) -> None:
