@@ -92,6 +92,10 @@ class Garbled(LinkFailure):
     code = "garbled"
 
 
+class TooLongForNode(Garbled):
+    """The node refuses a message on the level of the link because of its length."""
+
+
 class AddressConflict(LinkFailure):
     """Two nodes answer under one CAN address, or one UUID at two."""
 

@@ -121,6 +121,31 @@ class Repeats(Protocol):
 
 
 @runtime_checkable
+class OnABus(Protocol):
+    """A node's line on a bus, where others can ask it as well (CAN): under the addresses of other base stations.
+
+    ``address`` is the node's; a node that has moved is asked at its new one once this is set.
+    """
+
+    address: int
+
+    def beside(self, source: int) -> Link:
+        """A line to the same node from another station's address (0xF1 to 0xF7), over the same adapter."""
+
+    def everyone(self) -> bytes:
+        """Ask everyone, from this line's own station, who is there; this node's reply frame, empty where none came."""
+
+    def there(self, address: int) -> Identity | None:
+        """Who answers Identify at this address within a second; None for nobody."""
+
+    def begin(self, octets: int) -> bytes:
+        """Announce a request of so many octets and send nothing of it but its first frame.
+
+        Returns the data of the frame that the node answers with (ISO-TP, its first octet says which), empty for none.
+        """
+
+
+@runtime_checkable
 class Announces(Protocol):
     """A link on which the node says beforehand how it wants to be talked to (NFC: the record ``Tp``)."""
 

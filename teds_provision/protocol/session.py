@@ -82,12 +82,12 @@ def _seal_padded(key: bytes, counter: int, padded: bytes) -> bytes:
     return counter.to_bytes(4, "big") + AESCCM(key, tag_length=TAG_OCTETS).encrypt(nonce, padded, None)
 
 
-def _unseal(key: bytes, payload: bytes) -> bytes | None:
+def _decrypt(key: bytes, payload: bytes) -> bytes | None:
+    """The padded octets where the tag is right, else None."""
     try:
-        padded = AESCCM(key, tag_length=TAG_OCTETS).decrypt(bytes(9) + payload[:4], payload[4:], None)
+        return AESCCM(key, tag_length=TAG_OCTETS).decrypt(bytes(9) + payload[:4], payload[4:], None)
     except (InvalidTag, ValueError):
         return None
-    return unpad(padded)
 
 
 class StationSession:
@@ -153,9 +153,16 @@ class StationSession:
         assert self._keys is not None, "unseal() before a good accept()"
         if len(payload) < SEALED_HEAD_OCTETS + BLOCK_OCTETS or int.from_bytes(payload[:4], "big") != self._counter:
             raise NotAuthentic("A sealed reply does not belong to the command that was sent.")
-        inner = _unseal(self._keys.to_station, payload)
-        if inner is None:
+        padded = _decrypt(self._keys.to_station, payload)
+        if padded is None:
             raise NotAuthentic("The tag of a sealed reply is wrong.")
+        inner = unpad(padded)
+        if inner is None:
+            raise NotAuthentic(
+                "The padding of a sealed reply is wrong; its tag is right.",
+                hint="The node's firmware is at fault, not its key: PKCS #7 adds 1 to 16 octets, a whole block where"
+                " the reply is a multiple of 16. Run: teds-provision node check",
+            )
         return decode_reply(inner)
 
 
@@ -180,7 +187,8 @@ class NodeSession:
 
     def unseal(self, payload: bytes) -> bytes | None:
         """Return the inner frame where tag and padding are right, else None. Changes nothing."""
-        return _unseal(self._keys.to_node, payload)
+        padded = _decrypt(self._keys.to_node, payload)
+        return None if padded is None else unpad(padded)
 
     def seal(self, counter: int, frame: bytes) -> bytes:
         """Seal the one reply of ``counter``."""

@@ -7,8 +7,8 @@ import pytest
 from teds_provision.errors import Garbled, NotAuthentic
 from teds_provision.protocol.agreement import key_id
 from teds_provision.protocol.keys import SoftwareKey
-from teds_provision.protocol.messages.frames import Command, Function, Reason, refusal, security_command
-from teds_provision.protocol.session import SessionKeys, StationSession, _unseal, open_mac
+from teds_provision.protocol.messages.frames import Command, Function, Reason, Reply, refusal, security_command
+from teds_provision.protocol.session import NodeSession, SessionKeys, StationSession, _decrypt, _seal_padded, open_mac
 
 from .desk import UUID, Desk
 
@@ -128,7 +128,7 @@ def test_the_link_key_alone_opens_no_recorded_session() -> None:
     guesses = (b"", bytes(32), desk.key, station[1:33], node[1:33], open_mac(desk.key, UUID, bytes(8), station))
     for shared in guesses:
         derived = SessionKeys.derive(desk.key, UUID, shared, station, node)
-        assert _unseal(derived.to_node, recorded) is None
+        assert _decrypt(derived.to_node, recorded) is None
     assert desk.plain(security_command(Function.SEALED, recorded)).ok, "the frame was a good one"
 
 
@@ -157,3 +157,15 @@ def test_the_station_ends_a_session_whose_counters_are_used_up() -> None:
     assert desk.sealed(IDENTIFY).ok, "the last one"
     with pytest.raises(Garbled, match="used up its counters"):
         desk.session.seal(IDENTIFY)
+
+
+def test_a_sealed_reply_whose_padding_is_wrong_is_not_told_as_a_wrong_tag() -> None:
+    """A node that adds no block of padding to a multiple of 16 octets: its key is right, and was accused."""
+    station, key = StationSession(bytes(16), UUID), bytes(16)
+    node = NodeSession(key, UUID, station.open(bytes(8)).payload[8:73], SoftwareKey(31))
+    station.accept(node.reply)
+    station.seal(IDENTIFY)
+    inner = Reply(True, bytes(13)).encode()
+    assert len(inner) % 16 == 0
+    with pytest.raises(NotAuthentic, match="padding of a sealed reply is wrong; its tag is right"):
+        station.unseal(_seal_padded(node._keys.to_station, 1, inner))

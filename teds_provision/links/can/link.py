@@ -4,15 +4,18 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
+from contextlib import suppress
 from queue import Empty
 from typing import Final
 
-from teds_provision.errors import AddressConflict, Garbled, LinkFailure, NodeSilent
+from teds_provision.errors import AddressConflict, BadData, Garbled, LinkFailure, NodeSilent, TooLongForNode
 from teds_provision.links.can.frame import Frame
-from teds_provision.links.can.isotp import physical_id, single
+from teds_provision.links.can.isotp import FUNCTIONAL, physical_id, single
 from teds_provision.links.can.shared import Line, SharedBus
 from teds_provision.links.can.transfer import OVERFLOW, WAIT, consecutive_frames, first_frame, gap_seconds
 from teds_provision.links.ports import CAN, Capabilities
+from teds_provision.protocol.messages.frames import IDENTIFY, decode_reply
+from teds_provision.protocol.messages.identity import Identity
 from teds_provision.protocol.repetition import REPEAT_SECONDS, REPLY_SECONDS, TRIES
 
 _SHARES: Final = (0.3, 0.7, 1.0)
@@ -25,6 +28,7 @@ _FLOW_SECONDS: Final = (0.25, 0.5, 1.0)
 """The wait for a flow control, try after try, at most N_Bs of ISO 15765-2: a lost one ends it early."""
 _GAP_SECONDS: Final = 0.5
 """The wait for the next consecutive frame (N_Cr, at most 1 s)."""
+_HELLO_SECONDS: Final = 1.0
 _LONGEST_TRY: Final = 120.0
 """Seconds: 4095 octets at the longest gap (127 ms) that a node may ask for take 75 s."""
 
@@ -57,8 +61,9 @@ class CanLink:
         address: int,
         *,
         reply_seconds: float | None = None,
+        source: int | None = None,
     ) -> None:
-        self._bus, self._number = bus, number
+        self._bus, self._number, self._source = bus, number, source
         self.address = address
         self._last = 0
         self.left = self.came = 0.0  # see links.ports.Timed
@@ -85,6 +90,47 @@ class CanLink:
     def close(self) -> None:
         """Nothing to leave behind on CAN."""
 
+    # -- to try a node out, see links.ports.OnABus ------------------------------------------------------------------
+
+    def beside(self, source: int) -> CanLink:
+        """A line to the same node from another station's address."""
+        return CanLink(self._bus, self._number, self.address, reply_seconds=self._reply_seconds, source=source)
+
+    def everyone(self) -> bytes:
+        """Ask everyone who is there; the reply frame of this node, empty where none came."""
+        bus, transaction = self._bus(), self._number()
+        with bus.gather(transaction) as asked:
+            until, fd = time.monotonic() + _HELLO_SECONDS, bus.spec.fd
+            bus.send(Frame(FUNCTIONAL | bus.own, single(bytes([transaction]) + IDENTIFY.encode(), fd=fd), fd))
+            while (left := until - time.monotonic()) > 0 and self.address not in asked.gathering.answers:
+                asked.next(left)
+                bus.check()
+            return asked.gathering.answers.get(self.address, b"")
+
+    def there(self, address: int) -> Identity | None:
+        """Who answers Identify at this address."""
+        link = CanLink(self._bus, self._number, address, source=self._source)
+        try:
+            reply = decode_reply(link.ask(IDENTIFY.encode(), tries=1, seconds=_HELLO_SECONDS))
+            return Identity.decode(reply.payload)
+        except (NodeSilent, Garbled, BadData):
+            return None
+
+    def begin(self, octets: int) -> bytes:
+        """The frame by which the node answers the first frame of a request of so many octets."""
+        bus, transaction = self._bus(), self._number()
+        with bus.line(self.address, self._source).exchange(transaction) as line:
+            head, _ = first_frame(bytes([transaction]).ljust(octets, b"\0"), fd=bus.spec.fd)
+            bus.send(Frame(physical_id(line.node, line.own), head, bus.spec.fd))
+            until = time.monotonic() + _HELLO_SECONDS
+            while time.monotonic() < until:
+                with suppress(Empty):
+                    return bus.next_of(line.flows, 0.01)
+                with suppress(Empty):
+                    event = bus.next_of(line.events, 0.01)
+                    return single(event.body, fd=bus.spec.fd) if event.kind == "whole" else b"\x10"
+        return b""
+
     def ask(self, frame: bytes, *, tries: int, seconds: float) -> bytes:
         """As ``exchange``, at most ``tries`` times, each with ``seconds`` of silence allowed."""
         self._last = self._number()
@@ -93,7 +139,7 @@ class CanLink:
     def _ask(self, frame: bytes, transaction: int, *, tries: int, seconds: float, prompt: bool = False) -> bytes:
         bus = self._bus()
         try:
-            with bus.line(self.address).exchange(transaction) as line:
+            with bus.line(self.address, self._source).exchange(transaction) as line:
                 exchange = _Exchange(bus, line, bytes([transaction]) + frame, tries, seconds, prompt=prompt)
                 self.left = self.left or time.monotonic()
                 reply, self.came = exchange.run()
@@ -201,7 +247,7 @@ class _Exchange:
                 self._bus.check()
                 continue
             if data[0] == OVERFLOW:
-                raise Garbled(
+                raise TooLongForNode(
                     f"The node at 0x{self._line.node:02X} refuses {len(self._body)} octets (flow control: overflow).",
                     hint="Its Identify announces a longer maxMessage than it keeps; write in smaller pieces.",
                 )
@@ -212,7 +258,7 @@ class _Exchange:
         raise _NoFlow(begun=begun)
 
     def _put(self, data: bytes) -> None:
-        self._bus.send(Frame(physical_id(self._line.node, self._bus.own), data, self._fd))
+        self._bus.send(Frame(physical_id(self._line.node, self._line.own), data, self._fd))
 
     def _reply(self, seconds: float) -> tuple[bytes, float] | None:
         """Wait for the reply; None after ``seconds`` without a beginning, or where it is torn."""

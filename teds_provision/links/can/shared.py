@@ -106,12 +106,13 @@ class Event:
 
 @dataclass
 class Line:
-    """What the loop knows of one node: its message that comes in, and the thread that has an exchange with it.
+    """What the loop knows of one pair of addresses: the message that comes in, and the thread that has an exchange.
 
-    ``transaction`` is that of the exchange that runs, -1 for none.
+    ``own`` is the station's address; ``transaction`` that of the exchange that runs, -1 for none.
     """
 
     node: int
+    own: int
     turn: threading.Lock = field(default_factory=threading.Lock)
     flows: SimpleQueue[bytes] = field(default_factory=SimpleQueue)
     events: SimpleQueue[Event] = field(default_factory=SimpleQueue)
@@ -169,7 +170,7 @@ class SharedBus:
         self._failure: LinkFailure | None = None
         self._ears: tuple[Ear, ...] = ()
         self._asked: tuple[Asked, ...] = ()
-        self._lines: dict[int, Line] = {}
+        self._lines: dict[tuple[int, int], Line] = {}
         self._clashes: dict[int, float] = {}
         self._lost_at = -math.inf
         self._lock = threading.Lock()
@@ -244,10 +245,11 @@ class SharedBus:
         with self._lock:
             self._ears = tuple(other for other in self._ears if other is not ear)
 
-    def line(self, node: int) -> Line:
-        """The line to the node at this address."""
+    def line(self, node: int, own: int | None = None) -> Line:
+        """The line to the node at this address; ``own`` is another address than this station's, to try a node out."""
+        pair = node, self.own if own is None else own
         with self._lock:
-            return self._lines.setdefault(node, Line(node))
+            return self._lines.setdefault(pair, Line(*pair))
 
     @contextmanager
     def gather(self, transaction: int) -> Iterator[Asked]:
@@ -286,8 +288,10 @@ class SharedBus:
     def _take(self, frame: Frame) -> None:
         self.rivals.heard(frame)
         ends = addresses(frame.identifier)
-        if ends is not None and ends[0] == self.own and len(frame.data) >= 2:
-            self._from_node(self.line(ends[1]), frame)
+        if ends is not None and len(frame.data) >= 2:
+            own, node = ends
+            if own == self.own or (node, own) in self._lines:
+                self._from_node(self.line(node, own), frame)
         for ear in self._ears:
             ear.offer(frame)
 
@@ -319,7 +323,7 @@ class SharedBus:
         transaction = partial.octets[0]
         if transaction == line.transaction:
             if partial.too_long:
-                self._reply(flow(line.node, self.own, OVERFLOW, fd=frame.fd))
+                self._reply(flow(line.node, line.own, OVERFLOW, fd=frame.fd))
                 return
             other = line.partial
             if other is not None and other.first != partial.first:
@@ -327,12 +331,12 @@ class SharedBus:
             elif other is not None and not other.number:
                 return  # the same frame twice
             line.partial, line.gathering = partial, None
-            self._reply(flow(line.node, self.own, CONTINUE, fd=frame.fd))
+            self._reply(flow(line.node, line.own, CONTINUE, fd=frame.fd))
             line.events.put(Event("begun"))
         elif self._gathered(line, frame, transaction):
             return
         elif transaction in line.asked:  # a late reply: end it, so that the node is free for the next
-            self._reply(flow(line.node, self.own, OVERFLOW, fd=frame.fd))
+            self._reply(flow(line.node, line.own, OVERFLOW, fd=frame.fd))
         else:
             self.rivals.unasked(line.node)
 
@@ -358,10 +362,10 @@ class SharedBus:
                 line.partial = None
                 line.events.put(Event("whole", bytes(partial.octets), frame.at))
             case "block":
-                self._reply(flow(line.node, self.own, CONTINUE, fd=partial.fd))
+                self._reply(flow(line.node, line.own, CONTINUE, fd=partial.fd))
             case "torn":
                 line.partial = None
-                self._reply(flow(line.node, self.own, OVERFLOW, fd=partial.fd))  # it need not send the rest
+                self._reply(flow(line.node, line.own, OVERFLOW, fd=partial.fd))  # it need not send the rest
                 line.events.put(Event("torn"))
 
     def _gather(self, asked: Asked, node: int, frame: Frame) -> None:
