@@ -21,7 +21,7 @@ from teds_provision.protocol.operation.commands import ChannelState, idle, write
 from teds_provision.talk.conversation import SessionLost
 from teds_provision.teds.calibration.interpreter import ChannelInterpreter
 from teds_provision.teds.sheet import Channel
-from teds_provision.teds.units.units import WrittenUnit, parse_unit
+from teds_provision.teds.units import WrittenUnit, parse_unit
 
 
 @dataclass(frozen=True)

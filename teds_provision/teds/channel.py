@@ -16,8 +16,7 @@ from teds_provision.teds.codec.codes import AccessCode
 from teds_provision.teds.codec.decode import decode
 from teds_provision.teds.codec.model import Decoded, Units
 from teds_provision.teds.image import BlockId
-from teds_provision.teds.units.names import ARBITRARY, DIGITAL, RATIO
-from teds_provision.teds.units.units import WrittenUnit, display_unit, format_value, name_of_units
+from teds_provision.teds.units import ARBITRARY, DIGITAL, RATIO, WrittenUnit, display_unit, format_value, name_of_units
 
 NOT_STATED: Final = math.nan
 """Stands for a number that the TEDS do not give, or call not available: IEEE 1451.0 writes NaN for that itself."""

@@ -22,8 +22,7 @@ from teds_provision.limits import LIMITS, check_size, check_toml
 from teds_provision.teds.channel import ROUNDING
 from teds_provision.teds.codec.model import Units
 from teds_provision.teds.sheet import Channel, Sheet
-from teds_provision.teds.units.names import NAMED, RATIO
-from teds_provision.teds.units.units import WrittenUnit, format_units, parse_unit
+from teds_provision.teds.units import NAMED, RATIO, WrittenUnit, format_units, parse_unit
 
 Result = Literal["passed", "failed", "skipped"]
 

@@ -14,7 +14,7 @@ from teds_provision.teds.calibration import fit
 from teds_provision.teds.fits import Fit, parse_fits, parse_require
 from teds_provision.teds.image import Image
 from teds_provision.teds.profile import load_profile
-from teds_provision.teds.units.units import parse_unit
+from teds_provision.teds.units import parse_unit
 
 from .shell import call
 

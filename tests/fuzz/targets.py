@@ -506,7 +506,7 @@ def image_seeds() -> Iterable[bytes]:
 def check_units(data: bytes) -> None:
     """Units, times and ``--fits`` expressions."""
     from teds_provision.teds.fits import parse_fits
-    from teds_provision.teds.units.units import parse_seconds, parse_unit
+    from teds_provision.teds.units import parse_seconds, parse_unit
 
     text = as_text(data)
     reads(lambda: parse_unit(text), lambda: parse_seconds(text), lambda: parse_fits(text))

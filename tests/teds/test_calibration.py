@@ -32,7 +32,7 @@ from teds_provision.teds.calibration import (
 )
 from teds_provision.teds.profile import Profile, load_profile
 from teds_provision.teds.sheet import Sheet
-from teds_provision.teds.units.units import parse_unit
+from teds_provision.teds.units import parse_unit
 
 
 @pytest.fixture(scope="module")

@@ -18,7 +18,7 @@ from teds_provision.teds.codec.frame import frame, unframe
 from teds_provision.teds.guard.findings import GuardFinding, check_calibration
 from teds_provision.teds.image import BlockId
 from teds_provision.teds.profile import Profile, load_profile, shipped_profiles
-from teds_provision.teds.units.units import parse_unit
+from teds_provision.teds.units import parse_unit
 from tests.pace import costs_at_most
 
 UUID = bytes(10)

@@ -29,7 +29,7 @@ from teds_provision.teds.calibration import (
 from teds_provision.teds.calibration.samples import DataModel, SampleForm
 from teds_provision.teds.image import BlockId, Image
 from teds_provision.teds.profile import load_profile
-from teds_provision.teds.units.units import WrittenUnit, parse_unit
+from teds_provision.teds.units import WrittenUnit, parse_unit
 
 UUID = bytes(10)
 Blocks = dict[BlockId, bytes]

@@ -18,7 +18,7 @@ from teds_provision.limits import LIMITS, check_toml, load_json, whole_number
 from teds_provision.teds import AccessCode, compose
 from teds_provision.teds.formats import read_blocks
 from teds_provision.teds.image import Image
-from teds_provision.teds.units.units import parse_unit
+from teds_provision.teds.units import parse_unit
 
 pytestmark = pytest.mark.slow
 MIB = 1 << 20

@@ -13,7 +13,7 @@ from teds_provision.errors import BadData, NotFound, UsageFailure
 from teds_provision.teds.calibration import Calibration, CalibrationInput, read_calibrations
 from teds_provision.teds.profile import load_profile, shipped_profiles
 from teds_provision.teds.show.plot import plot_blocks
-from teds_provision.teds.units.units import parse_unit
+from teds_provision.teds.units import parse_unit
 
 pytest.importorskip("matplotlib")
 UUID = bytes(10)

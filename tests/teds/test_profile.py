@@ -29,7 +29,7 @@ from teds_provision.teds.profile import (
     template,
 )
 from teds_provision.teds.profile.source import key_lines
-from teds_provision.teds.units.units import parse_unit
+from teds_provision.teds.units import parse_unit
 
 UUID = bytes.fromhex("81c0f9744881f5622e78")
 CHANNEL = """\

@@ -19,7 +19,7 @@ from teds_provision.teds.codec.frame import frame, unframe
 from teds_provision.teds.image import BlockId, Image
 from teds_provision.teds.profile import load_profile, shipped_profiles
 from teds_provision.teds.sheet import Kind, channel_of
-from teds_provision.teds.units.units import parse_unit
+from teds_provision.teds.units import parse_unit
 
 UUID = bytes.fromhex("00112233445566778899")
 WHEN = datetime(2026, 3, 1, tzinfo=UTC)

@@ -12,8 +12,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from teds_provision.errors import BadData
+from teds_provision.teds import units as u
 from teds_provision.teds.codec.model import UNIT_PARTS, Units
-from teds_provision.teds.units import units as u
 
 
 def exponents(text: str) -> dict[str, Fraction]:
@@ -197,6 +197,6 @@ def test_what_is_no_time_is_refused(written: object) -> None:
 
 
 def test_everyday_units_do_not_load_pint() -> None:
-    code = "import sys; from teds_provision.teds.units.units import parse_unit as p\n"
+    code = "import sys; from teds_provision.teds.units import parse_unit as p\n"
     code += "p('degree'), p('N'); print('pint' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout == "False\n"

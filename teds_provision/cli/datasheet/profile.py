@@ -25,7 +25,7 @@ from teds_provision.teds.profile import (
     template,
 )
 from teds_provision.teds.show.values import seconds
-from teds_provision.teds.units.units import short_unit
+from teds_provision.teds.units import short_unit
 
 if TYPE_CHECKING:
     from rich.console import Console

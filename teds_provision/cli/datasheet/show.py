@@ -132,7 +132,7 @@ def _has_errors(file: ShownFile) -> bool:
 
 def _diff(app: App, before: str, after: str, *, as_json: bool) -> None:
     old, new = (datasheet.show_files.placed(datasheet.show_files.load(name).blocks) for name in (before, after))
-    changes = teds.diff.datasheets.diff_blocks(old, new)
+    changes = teds.diff.diff_blocks(old, new)
     judged = teds.guard.findings.check_calibration(new, old)
     result = {
         "changes": [asdict(change) for change in changes],

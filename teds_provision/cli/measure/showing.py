@@ -217,8 +217,8 @@ def in_peoples_units(value: float | None, known: ChannelFacts) -> tuple[float | 
     """A value in SI units as people see it."""
     if value is None or known.units is None:
         return value, known.unit
-    number, unit = units.units.in_display_units(value, known.units, known.shown_unit)
-    return number, units.units.short_unit(unit)
+    number, unit = units.in_display_units(value, known.units, known.shown_unit)
+    return number, units.short_unit(unit)
 
 
 def _line(report: NodeReport) -> str:

@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from teds_provision.steps.many.board import Board
     from teds_provision.steps.many.boards import Boards, Plan, Questions
     from teds_provision.steps.provision import Provisioned
-    from teds_provision.teds.diff.datasheets import Change
+    from teds_provision.teds.diff import Change
 
 _CHANGES_SHOWN = 20
 

@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 
 from teds_provision.measure.blocks import ChannelFacts
 from teds_provision.teds.codec.model import Units
-from teds_provision.teds.units.names import units_of
+from teds_provision.teds.units import units_of
 
 KELVIN = 273.15  # 0 °C
 VARIANCE_NOTE = "variance = (uncertainty / sqrt 3)^2: every error within the worst case equally likely"

@@ -27,10 +27,10 @@ from teds_provision.measure.blocks import Block, ChannelFacts, NodeReport, Stati
 from teds_provision.measure.sinks.base import CommandTaker, Item, ThreadedSink
 from teds_provision.measure.sinks.lines import status_line
 from teds_provision.measure.sinks.names import Topics, slug
-from teds_provision.teds.units.units import display_unit, short_unit
+from teds_provision.teds.units import display_unit, short_unit
 
 if TYPE_CHECKING:
-    from teds_provision.teds.units.units import WrittenUnit
+    from teds_provision.teds.units import WrittenUnit
 
 DISCOVERY = "homeassistant"
 PORTS = {"mqtt": 1883, "mqtts": 8883}

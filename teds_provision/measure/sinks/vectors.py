@@ -20,7 +20,7 @@ from typing import Final
 
 from teds_provision.measure.blocks import ChannelFacts
 from teds_provision.measure.sinks.meaning import variance_of
-from teds_provision.teds.units.names import units_of
+from teds_provision.teds.units import units_of
 
 FieldValue = float | int | list[float]
 AXES: Final = ("x", "y", "z")

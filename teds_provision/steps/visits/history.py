@@ -15,7 +15,7 @@ from teds_provision.steps.visits.visit import at_node
 from teds_provision.steps.write import Written, write
 from teds_provision.store import DatasheetRecord, Draft
 from teds_provision.talk.progress import Reporter
-from teds_provision.teds.diff.datasheets import Change, diff_blocks
+from teds_provision.teds.diff import Change, diff_blocks
 from teds_provision.teds.image import Image
 
 

@@ -19,7 +19,7 @@ from teds_provision.talk.conversation import Conversation
 from teds_provision.talk.meeting import meet
 from teds_provision.talk.progress import Reporter
 from teds_provision.teds.codec import security
-from teds_provision.teds.diff.datasheets import diff_blocks
+from teds_provision.teds.diff import diff_blocks
 from teds_provision.teds.image import SECURITY, BlockId, Image
 
 

@@ -8,7 +8,7 @@ from datetime import UTC, datetime, timedelta
 from teds_provision.errors import BadData
 from teds_provision.teds.calibration.model import METHODS, MONOTONE, Calibration, CalibrationInput, Method, Monotone
 from teds_provision.teds.codec.model import Decoded, Field, TimeInstance, Units
-from teds_provision.teds.units.units import WrittenUnit, recognize
+from teds_provision.teds.units import WrittenUnit, recognize
 
 
 def from_decoded(

@@ -19,7 +19,7 @@ from teds_provision.teds.calibration.reading import SampleReader
 from teds_provision.teds.calibration.samples import Range, SampleForm
 from teds_provision.teds.channel import ROUNDING
 from teds_provision.teds.sheet import Channel, Sheet
-from teds_provision.teds.units.units import WrittenUnit
+from teds_provision.teds.units import WrittenUnit
 
 if TYPE_CHECKING:
     import numpy as np

@@ -17,7 +17,7 @@ from typing import Final, Literal
 
 from teds_provision.errors import BadData
 from teds_provision.teds.codec.model import Edition, TimeInstance
-from teds_provision.teds.units.units import WrittenUnit, parse_unit
+from teds_provision.teds.units import WrittenUnit, parse_unit
 
 Method = Literal["linear", "polynomial", "table", "steps"]
 Monotone = Literal["increasing", "decreasing", "either"]

@@ -14,7 +14,7 @@ from teds_provision.teds.calibration.model import METHODS, Calibration, Calibrat
 from teds_provision.teds.profile.model import ChannelProfile
 from teds_provision.teds.profile.reader import FLOAT32_MAXIMUM
 from teds_provision.teds.profile.source import Table
-from teds_provision.teds.units.units import WrittenUnit, parse_seconds, parse_unit
+from teds_provision.teds.units import WrittenUnit, parse_seconds, parse_unit
 
 
 def is_number(value: object) -> bool:

@@ -36,7 +36,7 @@ from teds_provision.teds.profile.load import load_profile, parse_profile
 from teds_provision.teds.profile.model import Profile
 from teds_provision.teds.profile.reader import Problems
 from teds_provision.teds.profile.source import parse
-from teds_provision.teds.units.units import display_unit, format_units, parse_unit
+from teds_provision.teds.units import display_unit, format_units, parse_unit
 
 NO_UUID: Final = bytes(10)
 _PLACES: Final[Mapping[int, int]] = {AccessCode.META: 0, AccessCode.NAME: 0, AccessCode.PHY: 0}

@@ -15,7 +15,7 @@ from teds_provision.teds.calibration.samples import Range
 from teds_provision.teds.codec.model import Units
 from teds_provision.teds.image import BlockId
 from teds_provision.teds.sheet import described
-from teds_provision.teds.units.units import WrittenUnit, display_unit, format_value, parse_unit
+from teds_provision.teds.units import WrittenUnit, display_unit, format_value, parse_unit
 
 if TYPE_CHECKING:
     import numpy as np

@@ -21,7 +21,7 @@ from teds_provision.teds.profile.keys import (
 from teds_provision.teds.profile.model import CalibrationDemand, ChannelProfile, Pairs
 from teds_provision.teds.profile.reader import FLOAT32_MAXIMUM, Section
 from teds_provision.teds.profile.source import Table
-from teds_provision.teds.units.units import WrittenUnit, parse_seconds, parse_unit
+from teds_provision.teds.units import WrittenUnit, parse_seconds, parse_unit
 
 MAXIMUM_CHANNEL: Final = 255
 _RANGE: Final = re.compile(r"(\d+)(?:-(\d+))?\Z")

@@ -15,7 +15,7 @@ from teds_provision.teds.codec.codes import AccessCode
 from teds_provision.teds.codec.composer import compose
 from teds_provision.teds.codec.model import Edition, Units
 from teds_provision.teds.image import BlockId
-from teds_provision.teds.units.units import WrittenUnit
+from teds_provision.teds.units import WrittenUnit
 
 USER_DEFINED_NAME: Final = 0
 _CAL_NONE, _CAL_SUPPLIED = 0, 1

@@ -10,7 +10,7 @@ from difflib import get_close_matches
 from teds_provision.errors import BadData
 from teds_provision.teds.profile.keys import Key, Kind, Need
 from teds_provision.teds.profile.source import Item, Table, Where
-from teds_provision.teds.units.units import WrittenUnit, parse_seconds, parse_unit
+from teds_provision.teds.units import WrittenUnit, parse_seconds, parse_unit
 
 _LIMITS = {Kind.U8: 0xFF, Kind.U16: 0xFFFF, Kind.U32: 0xFFFF_FFFF}
 _SHOWN = 60  # characters of a wrong value that a message shows

@@ -18,7 +18,7 @@ from teds_provision.teds.formats.jsonform import teds_to_json
 from teds_provision.teds.sheet import channel_from, described
 from teds_provision.teds.show.summary import Line, summary_of
 from teds_provision.teds.show.values import Context, meaning_of, text_of
-from teds_provision.teds.units.units import WrittenUnit, display_unit
+from teds_provision.teds.units import WrittenUnit, display_unit
 
 __all__ = ["Shown", "ShownField", "describe", "finding_to_json", "shown_to_json"]
 

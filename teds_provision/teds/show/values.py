@@ -13,7 +13,7 @@ from teds_provision.teds.codec.keyforms import read_key
 from teds_provision.teds.codec.model import Field, TimeInstance, Units
 from teds_provision.teds.codec.tables import FieldSpec, name_of
 from teds_provision.teds.formats.tree import shortest
-from teds_provision.teds.units.units import WrittenUnit, format_value, name_of_units
+from teds_provision.teds.units import WrittenUnit, format_value, name_of_units
 
 _DAY: Final = 86_400
 SHOWN_NUMBERS: Final = 8

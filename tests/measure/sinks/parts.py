@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 from teds_provision.measure.blocks import Block, ChannelFacts, GroupRows, NodeReport, StationFacts
 from teds_provision.measure.sinks import Sink
 from teds_provision.measure.sinks.ros.child import ChildSink
-from teds_provision.teds.units.units import parse_units
+from teds_provision.teds.units import parse_units
 from tests.pace import until
 
 ARM = "8d4d9da65281f7000001"

@@ -20,7 +20,7 @@ from teds_provision.measure.sinks.live import ERROR, JOINT_STATE, OK, WARN, Stat
 from teds_provision.measure.sinks.meaning import Meaning, meaning_of, variance_of
 from teds_provision.measure.sinks.names import Topics, slug
 from teds_provision.measure.sinks.vectors import FieldValue, compounds_of, is_range
-from teds_provision.teds.units.units import parse_units
+from teds_provision.teds.units import parse_units
 from tests.measure.sinks.parts import ANGLE, ARM, FORCE, HAND, STATION, block, fill
 
 ROS_TOPIC = re.compile(r"/[A-Za-z][A-Za-z0-9_]*(/[A-Za-z][A-Za-z0-9_]*)*")

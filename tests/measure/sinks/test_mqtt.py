@@ -15,7 +15,7 @@ import pytest
 from teds_provision.errors import TedsProvisionError, UsageFailure
 from teds_provision.measure.blocks import ChannelFacts, NodeReport
 from teds_provision.measure.sinks import open_sink
-from teds_provision.teds.units.units import parse_units
+from teds_provision.teds.units import parse_units
 from tests.measure.sinks.parts import ANGLE, ARM, FORCE, HAND, STATION, block
 from tests.pace import until
 from tests.places import free_tcp_port

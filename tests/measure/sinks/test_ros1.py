@@ -18,7 +18,7 @@ from teds_provision.measure.blocks import Command, GroupRows, NodeReport
 from teds_provision.measure.sinks import open_sink
 from teds_provision.measure.sinks.ros import ros1_child
 from teds_provision.measure.sinks.ros.ros1 import Ros1Sink
-from teds_provision.teds.units.units import parse_units
+from teds_provision.teds.units import parse_units
 from tests.measure.sinks.parts import ANGLE, ARM, FORCE, GRIP, HAND, OIL, STATION, block, kill_child
 from tests.pace import until
 from tests.places import free_tcp_port
