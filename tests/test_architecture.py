@@ -157,9 +157,7 @@ def test_what_must_be_quick_loads_nothing_heavy(statement: str) -> None:
     assert not HEAVY.intersection(loaded), statement
 
 
-@pytest.mark.parametrize(
-    "module", ["steps.provision", "teds.sheet", "teds.formats", "teds.diff", "teds.fits"]
-)
+@pytest.mark.parametrize("module", ["steps.provision", "teds.sheet", "teds.formats", "teds.diff", "teds.fits"])
 def test_numbers_without_a_calibration_need_no_numpy(module: str) -> None:
     ask = f"import sys, teds_provision.{module}; print(*sys.modules)"
     done = subprocess.run([sys.executable, "-c", ask], capture_output=True, text=True, timeout=60, check=True)

@@ -20,13 +20,13 @@ from teds_provision.teds.sheet import Sheet
 
 if TYPE_CHECKING:
     from teds_provision.teds import calibration
+    from teds_provision.teds import guard as guarding
     from teds_provision.teds.calibration import Calibration
-    from teds_provision.teds.guard import findings as guarding
-    from teds_provision.teds.guard.findings import GuardFinding
+    from teds_provision.teds.guard import GuardFinding
     from teds_provision.teds.image import BlockId
     from teds_provision.teds.profile import BuiltDatasheet, Profile
 else:  # numpy: not for a datasheet without calibration
-    calibration, guarding = late("teds_provision.teds.calibration"), late("teds_provision.teds.guard.findings")
+    calibration, guarding = late("teds_provision.teds.calibration"), late("teds_provision.teds.guard")
 
 _UUID, _COUNT = "{uuid}", "{n}"
 _NOBODY: Final = bytes(10)

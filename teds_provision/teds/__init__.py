@@ -11,7 +11,21 @@ from typing import TYPE_CHECKING, Final
 from teds_provision.lazy import lazy
 
 if TYPE_CHECKING:
-    from teds_provision.teds import calibration, codec, diff, fits, formats, guard, image, profile, sheet, show, units
+    from teds_provision.teds import (
+        calibration,
+        codec,
+        curve,
+        diff,
+        fits,
+        formats,
+        guard,
+        image,
+        plot,
+        profile,
+        sheet,
+        show,
+        units,
+    )
     from teds_provision.teds.codec.codes import AccessCode
     from teds_provision.teds.codec.composer import compose, encode, recompose
     from teds_provision.teds.codec.decode import decode

@@ -15,15 +15,15 @@ from teds_provision.teds.codec.codes import AccessCode
 from teds_provision.teds.codec.decode import decode
 from teds_provision.teds.codec.model import Decoded, Field, Units
 from teds_provision.teds.codec.tables import FieldSpec, name_of, table
-from teds_provision.teds.guard.curve import channel_of, curve_of
+from teds_provision.teds.curve import channel_of, curve_of
 from teds_provision.teds.image import BlockId
 from teds_provision.teds.sheet import described, name_among
-from teds_provision.teds.show.values import Context, meaning_of, text_of
+from teds_provision.teds.show import Context, meaning_of, text_of
 
 if TYPE_CHECKING:
     import numpy as np
 
-    from teds_provision.teds.guard.curve import Channel, Curve
+    from teds_provision.teds.curve import Channel, Curve
 else:
     np = late("numpy")
 

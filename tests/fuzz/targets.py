@@ -98,7 +98,7 @@ def check_sheet(data: bytes) -> None:
     from teds_provision.teds.calibration import ChannelInterpreter
     from teds_provision.teds.codec.frame import frame
     from teds_provision.teds.formats import Block
-    from teds_provision.teds.guard.findings import check_calibration
+    from teds_provision.teds.guard import check_calibration
     from teds_provision.teds.image import Image
     from teds_provision.teds.sheet import Sheet
     from teds_provision.teds.show import describe

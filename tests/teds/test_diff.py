@@ -14,7 +14,7 @@ from teds_provision import teds
 from teds_provision.teds.calibration import Calibration, CalibrationInput, fit
 from teds_provision.teds.diff import Change, diff_blocks
 from teds_provision.teds.profile import Profile, load_profile, shipped_profiles
-from teds_provision.teds.show.values import seconds
+from teds_provision.teds.show import seconds
 from teds_provision.teds.units import parse_unit
 
 UUID = bytes(10)

@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 from teds_provision import teds
 from teds_provision.teds.calibration import Calibration, CalibrationInput, fit, read_calibrations
 from teds_provision.teds.codec.frame import frame, unframe
-from teds_provision.teds.guard.findings import GuardFinding, check_calibration
+from teds_provision.teds.guard import GuardFinding, check_calibration
 from teds_provision.teds.image import BlockId
 from teds_provision.teds.profile import Profile, load_profile, shipped_profiles
 from teds_provision.teds.units import parse_unit

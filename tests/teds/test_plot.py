@@ -11,8 +11,8 @@ import pytest
 
 from teds_provision.errors import BadData, NotFound, UsageFailure
 from teds_provision.teds.calibration import Calibration, CalibrationInput, read_calibrations
+from teds_provision.teds.plot import plot_blocks
 from teds_provision.teds.profile import load_profile, shipped_profiles
-from teds_provision.teds.show.plot import plot_blocks
 from teds_provision.teds.units import parse_unit
 
 pytest.importorskip("matplotlib")
@@ -100,7 +100,7 @@ sys.modules["matplotlib"] = None
 from pathlib import Path
 from teds_provision.errors import TedsProvisionError
 from teds_provision.teds.calibration import read_calibrations
-from teds_provision.teds.show.plot import plot_blocks
+from teds_provision.teds.plot import plot_blocks
 from teds_provision.teds.profile import load_profile, shipped_profiles
 angle = load_profile("magnetic-angular-position-sensor", [shipped_profiles()])
 blocks = angle.build(bytes(10), calibration=read_calibrations("0,0\\n65535,360\\n", "x.csv", angle)).blocks

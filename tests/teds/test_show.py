@@ -11,8 +11,7 @@ from hypothesis import strategies as st
 from teds_provision import teds
 from teds_provision.teds.codec.model import TimeInstance, Units
 from teds_provision.teds.formats import Block, read_blocks
-from teds_provision.teds.show import describe, shown_to_json
-from teds_provision.teds.show.values import hexadecimal, instant, seconds, span
+from teds_provision.teds.show import describe, hexadecimal, instant, seconds, shown_to_json, span
 
 VECTORS = sorted((Path(__file__).parent.parent / "vectors" / "ieee1451").glob("*.hex"))
 NOW = datetime(2026, 1, 1, tzinfo=UTC)

@@ -24,7 +24,7 @@ from teds_provision.teds.profile import (
     load_profile,
     template,
 )
-from teds_provision.teds.show.values import seconds
+from teds_provision.teds.show import seconds
 from teds_provision.teds.units import short_unit
 
 if TYPE_CHECKING:

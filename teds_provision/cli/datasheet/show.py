@@ -133,7 +133,7 @@ def _has_errors(file: ShownFile) -> bool:
 def _diff(app: App, before: str, after: str, *, as_json: bool) -> None:
     old, new = (datasheet.show_files.placed(datasheet.show_files.load(name).blocks) for name in (before, after))
     changes = teds.diff.diff_blocks(old, new)
-    judged = teds.guard.findings.check_calibration(new, old)
+    judged = teds.guard.check_calibration(new, old)
     result = {
         "changes": [asdict(change) for change in changes],
         "guard": [datasheet.show_files.guard_to_json(finding) for finding in judged],
@@ -149,5 +149,5 @@ def _diff(app: App, before: str, after: str, *, as_json: bool) -> None:
 def _plot(app: App, files: Sequence[ShownFile], path: Path) -> None:
     if len(files) != 1:
         raise UsageFailure("A plot shows the calibrations of one file.", hint="Call show once for each.")
-    channels = teds.show.plot.plot_blocks(datasheet.show_files.placed(files[0].blocks), path)
+    channels = teds.plot.plot_blocks(datasheet.show_files.placed(files[0].blocks), path)
     app.note(f"Drawn in {path}: channel {', '.join(map(str, channels))}.")

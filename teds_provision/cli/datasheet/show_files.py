@@ -18,12 +18,12 @@ from teds_provision.teds import convert, decode
 from teds_provision.teds.codec.codes import AccessCode
 from teds_provision.teds.codec.model import Decoded, Edition, Finding, Verdict
 from teds_provision.teds.formats import Block, Kind, class_of, detect, read_blocks
-from teds_provision.teds.guard.findings import check_calibration
+from teds_provision.teds.guard import check_calibration
 from teds_provision.teds.show import Shown, describe
 
 if TYPE_CHECKING:
     from teds_provision.protocol.handover.bundle import BundleHeader
-    from teds_provision.teds.guard.findings import GuardFinding
+    from teds_provision.teds.guard import GuardFinding
 
 STDIN = "-"
 _HEAD_OCTETS: Final = 64

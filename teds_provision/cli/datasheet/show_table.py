@@ -12,8 +12,7 @@ from teds_provision.protocol.messages.message import Argument, Message
 from teds_provision.teds.codec.model import Finding, TimeInstance, Verdict
 from teds_provision.teds.formats import with_class
 from teds_provision.teds.formats.jsonform import value_to_json
-from teds_provision.teds.show import Shown, ShownField, describe
-from teds_provision.teds.show.values import hexadecimal, instant
+from teds_provision.teds.show import Shown, ShownField, describe, hexadecimal, instant
 
 if TYPE_CHECKING:
     from rich import markup

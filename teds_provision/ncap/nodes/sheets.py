@@ -28,9 +28,9 @@ from teds_provision.teds.sheet import Sheet
 from teds_provision.teds.show import describe, shown_to_json
 
 if TYPE_CHECKING:
-    from teds_provision.teds.guard import curve as curves_of_guard
+    from teds_provision.teds import curve as curves_of_guard
 else:  # numpy
-    curves_of_guard = late("teds_provision.teds.guard.curve")
+    curves_of_guard = late("teds_provision.teds.curve")
 
 FORMATS: Final = {"json": "application/json", "xml": "application/xml", "hex": "text/plain; charset=utf-8"}
 _POINTS: Final = 200

@@ -231,7 +231,7 @@ def _with_warnings(result: FileVerdict, image: Image) -> FileVerdict:
     """Look at the calibrations, as every command does before it trusts a datasheet."""
     if not any(code == AccessCode.CALIBRATION for _, code in image.blocks):
         return result  # and the guard is not loaded
-    findings = guard.findings.check_calibration(image.unsigned_blocks())
+    findings = guard.check_calibration(image.unsigned_blocks())
     texts = tuple(f"channel {finding.channel}: {finding.message}" for finding in findings)
     harmful = [text for text, finding in zip(texts, findings, strict=True) if finding.severity == "error"]
     whole = FileVerdict(result.path, result.uuid, result.verdict, result.checks, texts)

@@ -19,7 +19,7 @@ from teds_provision.teds.calibration.decoded import is_sound
 from teds_provision.teds.calibration.describe import kind_of
 from teds_provision.teds.calibration.fitting import residuals
 from teds_provision.teds.calibration.model import Calibration
-from teds_provision.teds.guard.curve import channel_of, curve_of
+from teds_provision.teds.curve import channel_of, curve_of
 from teds_provision.teds.image import BlockId
 from teds_provision.teds.sheet import Sheet, name_among
 
@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     import numpy as np
     from matplotlib.figure import Figure
 
-    from teds_provision.teds.guard.curve import Channel, Curve
+    from teds_provision.teds.curve import Channel, Curve
     from teds_provision.teds.profile.model import Profile
 else:
     np = late("numpy")
