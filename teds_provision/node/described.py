@@ -13,7 +13,7 @@ from teds_provision.limits import LIMITS
 from teds_provision.node.flash_file import FILE, FlashFile
 from teds_provision.node.hardware.board import Board
 from teds_provision.protocol.datasheet import can_be_stored, passes_own_check
-from teds_provision.teds.formats.placing import UUID_OCTETS, placed, stated_uuid, under
+from teds_provision.teds.formats import UUID_OCTETS, placed, stated_uuid, under
 from teds_provision.teds.image import SECURITY, BlockId, Image
 from teds_provision.teds.profile import load_profile
 from teds_provision.teds.sheet import Sheet

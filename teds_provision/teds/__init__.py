@@ -27,9 +27,8 @@ if TYPE_CHECKING:
         units,
     )
     from teds_provision.teds.codec.codes import AccessCode
-    from teds_provision.teds.codec.composer import compose, encode, recompose
+    from teds_provision.teds.codec.composer import compose, convert, encode, recompose
     from teds_provision.teds.codec.decode import decode
-    from teds_provision.teds.codec.editions import convert
     from teds_provision.teds.codec.keyforms import ReadKey, read_key
     from teds_provision.teds.codec.model import (
         Decoded,
@@ -79,9 +78,8 @@ if not TYPE_CHECKING:
         __name__,
         {
             "codec.codes": "AccessCode",
-            "codec.composer": "compose encode recompose",
+            "codec.composer": "compose convert encode recompose",
             "codec.decode": "decode",
-            "codec.editions": "convert",
             "codec.keyforms": "ReadKey read_key",
             "codec.model": "Decoded Edition Field Finding Severity TimeInstance Units Value Verdict",
             "codec.tables": "FieldSpec Table name_of table",

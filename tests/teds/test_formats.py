@@ -12,9 +12,9 @@ from teds_provision import teds
 from teds_provision.errors import BadData, NotFound
 from teds_provision.teds.codec.frame import frame
 from teds_provision.teds.formats import FORMATS, Block, class_of, detect, lost, read_blocks, write_blocks
-from teds_provision.teds.formats.block import split_run
 from teds_provision.teds.formats.intelhex import stretches, write_intel_hex
 from teds_provision.teds.formats.tree import from_tree, shortest, to_tree
+from teds_provision.teds.image import split_run
 
 ROOT = Path(__file__).parent.parent.parent
 VECTORS = sorted((ROOT / "tests" / "vectors" / "ieee1451").glob("*.hex"))

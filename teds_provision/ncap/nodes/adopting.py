@@ -23,7 +23,7 @@ from teds_provision.steps.verify import Verified
 from teds_provision.steps.visits.sheet_file import write_sheet
 from teds_provision.talk.conversation import Conversation
 from teds_provision.talk.progress import Silent
-from teds_provision.teds.formats.placing import placed
+from teds_provision.teds.formats import placed
 
 
 class Adopting:

@@ -35,7 +35,7 @@ from teds_provision.protocol.keys import fingerprint
 from teds_provision.station.station import Station
 from teds_provision.steps.build_order import check_name
 from teds_provision.store.records import WhitelistEntry
-from teds_provision.teds.formats.placing import UUID_OCTETS, placed, stated_uuid
+from teds_provision.teds.formats import UUID_OCTETS, placed, stated_uuid
 from teds_provision.teds.profile import default_folders
 from teds_provision.teds.sheet import Sheet
 

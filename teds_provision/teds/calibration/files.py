@@ -17,7 +17,7 @@ from teds_provision.teds.calibration.csv_text import CsvTable, read_csv
 from teds_provision.teds.calibration.model import Calibration
 from teds_provision.teds.calibration.order import Order, calibration_of
 from teds_provision.teds.profile.model import ChannelProfile, Profile
-from teds_provision.teds.profile.source import Item, Table, Where, parse, read_text
+from teds_provision.teds.profile.reader import Item, Table, Where, parse, read_text
 
 KEYS: Final = (
     "channel",

@@ -12,8 +12,7 @@ from teds_provision.errors import BadData
 from teds_provision.teds.calibration.fitting import fit, residuals
 from teds_provision.teds.calibration.model import METHODS, Calibration, CalibrationInput, Method
 from teds_provision.teds.profile.model import ChannelProfile
-from teds_provision.teds.profile.reader import FLOAT32_MAXIMUM
-from teds_provision.teds.profile.source import Table
+from teds_provision.teds.profile.reader import FLOAT32_MAXIMUM, Table
 from teds_provision.teds.units import WrittenUnit, parse_seconds, parse_unit
 
 

@@ -10,8 +10,7 @@ from typing import Final
 from teds_provision.teds.codec import security
 from teds_provision.teds.codec.codes import AccessCode
 from teds_provision.teds.codec.model import Field, TimeInstance, Units
-from teds_provision.teds.codec.tables import FieldSpec, Table
-from teds_provision.teds.codec.tables.phy_text_security import LEVELS
+from teds_provision.teds.codec.tables import LEVELS, FieldSpec, Table
 
 Find = Callable[..., None]
 

@@ -10,7 +10,6 @@ from typing import Any, Final
 from teds_provision.errors import BadData
 from teds_provision.limits import LIMITS, check_count, load_json
 from teds_provision.teds.codec.model import TimeInstance, Units
-from teds_provision.teds.formats.block import Block
 from teds_provision.teds.formats.tree import (
     MAX_DEPTH,
     Entry,
@@ -22,6 +21,7 @@ from teds_provision.teds.formats.tree import (
     units_from_parts,
     units_to_parts,
 )
+from teds_provision.teds.image import Block
 
 FORMAT: Final = "teds/1"
 _HEAD: Final = {

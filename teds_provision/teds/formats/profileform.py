@@ -17,8 +17,8 @@ from teds_provision.teds.codec.codes import AccessCode
 from teds_provision.teds.codec.decode import decode
 from teds_provision.teds.codec.model import UNIT_PARTS, Decoded, Edition, Field, Units
 from teds_provision.teds.codec.tables import name_of
-from teds_provision.teds.formats.block import Block
 from teds_provision.teds.formats.tree import shortest
+from teds_provision.teds.image import Block
 from teds_provision.teds.profile.interpret import TEXT_CLASSES, interpret
 from teds_provision.teds.profile.keys import (
     CALIBRATION_KEYS,
@@ -34,8 +34,7 @@ from teds_provision.teds.profile.keys import (
 )
 from teds_provision.teds.profile.load import load_profile, parse_profile
 from teds_provision.teds.profile.model import Profile
-from teds_provision.teds.profile.reader import Problems
-from teds_provision.teds.profile.source import parse
+from teds_provision.teds.profile.reader import Problems, parse
 from teds_provision.teds.units import display_unit, format_units, parse_unit
 
 NO_UUID: Final = bytes(10)

@@ -19,7 +19,7 @@ from teds_provision.teds.codec.composer import compose
 from teds_provision.teds.codec.decode import decode
 from teds_provision.teds.codec.model import UNIT_PARTS, Decoded, Edition, Field, TimeInstance, Units
 from teds_provision.teds.codec.tables import TEXT_BASED, FieldSpec, name_of, table
-from teds_provision.teds.formats.block import Block
+from teds_provision.teds.image import Block
 
 Kind = Literal["integer", "number", "text", "octets", "units", "time", "integers", "numbers", "fields"]
 EntryValue = int | float | str | bytes | Units | TimeInstance | tuple[int, ...] | tuple[float, ...] | None

@@ -15,7 +15,6 @@ from typing import Final
 from teds_provision.errors import BadData
 from teds_provision.limits import LIMITS, check_count, check_size, check_xml, whole_number
 from teds_provision.teds.codec.model import Edition, TimeInstance, Units
-from teds_provision.teds.formats.block import Block
 from teds_provision.teds.formats.tree import (
     MAX_DEPTH,
     Entry,
@@ -27,6 +26,7 @@ from teds_provision.teds.formats.tree import (
     units_from_parts,
     units_to_parts,
 )
+from teds_provision.teds.image import Block
 
 NAMESPACE: Final = "urn:teds-provision:teds:1"
 SCHEMA: Final = Path(__file__).resolve().parent.parent / "schema" / "teds-1.xsd"

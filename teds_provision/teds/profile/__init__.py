@@ -3,21 +3,24 @@
 Pure but for reading the files themselves. ``load_profile`` finds and checks, :meth:`Profile.build` makes the TEDS.
 """
 
-from teds_provision.teds.profile.describe import describe, describe_channel, listed, summary
 from teds_provision.teds.profile.load import (
     Listed,
     check,
     default_folders,
+    describe,
+    describe_channel,
     find_profile,
     is_profile_name,
     list_profiles,
+    listed,
     load_profile,
     passed_over,
     shipped_profiles,
+    summary,
+    template,
 )
 from teds_provision.teds.profile.model import BuiltDatasheet, CalibrationDemand, ChannelProfile, Profile, TextProfile
 from teds_provision.teds.profile.reader import Problem
-from teds_provision.teds.profile.template import template
 
 __all__ = [
     "BuiltDatasheet",

@@ -3,18 +3,31 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from difflib import get_close_matches
 from functools import cache
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 from teds_provision.errors import BadData, NotFound
-from teds_provision.teds.profile.interpret import interpret
-from teds_provision.teds.profile.model import Profile
-from teds_provision.teds.profile.reader import Problem, Problems
-from teds_provision.teds.profile.source import Table, Where, parse, read_text
+from teds_provision.teds.calibration.model import METHODS
+from teds_provision.teds.profile.interpret import TEXT_CLASSES, interpret
+from teds_provision.teds.profile.keys import (
+    CALIBRATION_KEYS,
+    CHANNEL_KEYS,
+    CHANNEL_TYPES,
+    DATA_SET_KEYS,
+    META_GROUPS,
+    META_KEYS,
+    MODELS,
+    MODES,
+    PHY_KEYS,
+    Key,
+    Need,
+)
+from teds_provision.teds.profile.model import ChannelProfile, Profile
+from teds_provision.teds.profile.reader import Problem, Problems, Table, Where, parse, read_text
 
 _NAME: Final = re.compile(r"[a-z0-9][a-z0-9._-]{0,63}\Z")
 MAXIMUM_DEPTH: Final = 16
@@ -185,3 +198,143 @@ def _base(name: str, where: Where, path: Path, folders: Sequence[Path], chain: S
             circle = " -> ".join([*(one.stem for one in chain), name])
             raise BadData(f"{where}: extends: the profiles extend each other in a circle: {circle}.") from error
         raise BadData(f"{where}: extends: {error.message}", hint=error.hint) from error
+
+
+# A profile as plain data, in the units that its author wrote: for ``profile show`` and JSON.
+
+_TYPES: Final = {code: name for name, code in CHANNEL_TYPES.items()}
+
+
+def describe(profile: Profile) -> dict[str, Any]:
+    """Plain data of a profile; limits and uncertainty in the channel's own unit, times in seconds."""
+    return {
+        **summary(profile),
+        "description": profile.description,
+        "node_name": profile.tim_name,
+        "extends": list(profile.lineage[1:]),
+        "meta": {name: value for name, value in profile.meta if isinstance(value, (int, float))},
+        "channels": [describe_channel(channel) for channel in profile.channels],
+        "warnings": list(profile.warnings),
+    }
+
+
+def summary(profile: Profile) -> dict[str, Any]:
+    """The line of a profile in a list."""
+    return {
+        "name": profile.name,
+        "title": profile.title,
+        "file": profile.file,
+        "abstract": profile.abstract,
+        "links": list(profile.links),
+        "channels": len(profile.channels),
+    }
+
+
+def listed(entry: Listed) -> dict[str, Any]:
+    """The line of a file found in a folder, with its error where it cannot be read."""
+    if entry.profile is None:
+        return {"name": entry.name, "file": str(entry.path), "error": entry.error}
+    return summary(entry.profile)
+
+
+def describe_channel(channel: ChannelProfile) -> dict[str, Any]:
+    """Plain data of one channel."""
+    unit, demand = channel.unit, channel.calibration
+    period = channel.fields.get("SPeriod")
+    return {
+        "number": channel.number,
+        "name": channel.name,
+        "type": _TYPES.get(channel.type, str(channel.type)),
+        "unit": unit.text,
+        "low_limit": unit.from_si(channel.low_limit),
+        "high_limit": unit.from_si(channel.high_limit),
+        "uncertainty": unit.difference_from_si(channel.uncertainty),
+        "raw_range": list(channel.raw_range) if channel.raw_range else None,
+        "sampling_period": period if isinstance(period, (int, float)) else None,
+        "calibration": {
+            "required": demand.required,
+            "method": demand.method,
+            "degree": demand.degree,
+            "monotone": demand.monotone,
+            "interval": demand.interval,
+            "zero_offset": demand.zero_offset,
+            "standard_deviation": demand.standard_deviation,
+        },
+    }
+
+
+# The commented text that ``profile new`` writes: every key there is, made from the same tables that read it.
+
+
+def template(name: str) -> str:
+    """Text of a new profile: what is needed is filled with examples, what is optional stands as a comment."""
+    return "\n".join(
+        [
+            f"# Transducer type {name}.",
+            "# Adapt the figures; keys behind # are optional. Every key is explained in docs/profiles.md.",
+            "",
+            '# extends = "smart-sensor"          # take everything from another profile and change what is said here',
+            f'title = "{name}"',
+            'description = """',
+            "What it measures, with which parts, and where the figures come from.",
+            '"""',
+            f'name = "{name}"                    # TIM name (XdcrName TEDS); up to 120 octets',
+            'links = ["nfc", "can"]              # of nfc, can, ble; for people only',
+            "",
+            "[meta]                              # Meta-TEDS, access code 1; UUID and MaxChan are filled in",
+            *_lines(META_KEYS),
+            *_groups(),
+            "# Each channel is a TransducerChannel TEDS, access code 3; [channel.1-12], [channel.all] say it for many.",
+            "[channel.1]",
+            'name = "channel 1"                  # {channel} stands for its number',
+            'unit = "degree"                     # as people write it: N, mm, degC, m/s², mV/V, %, count, digital',
+            '# display-unit = "degree"           # unit to show values in, where it is another',
+            *_lines(CHANNEL_KEYS),
+            f'# calibration-key = "auto"          # auto, {", ".join(CALIBRATION_KEYS)}',
+            f"# models: {', '.join(MODELS)}",
+            'sample = { model = "unsigned", octets = 2, bits = 16 }',
+            f"# modes: {', '.join(MODES)}",
+            'sampling = { modes = ["trigger", "continuous"], default = "continuous" }',
+            "",
+            "# [channel.1.data-set]",
+            *_lines(DATA_SET_KEYS, comment=True),
+            '# unit = "s"                        # unit of origin and step',
+            "",
+            "[channel.1.calibration]             # what is asked of the file given with --calibration",
+            "required = false",
+            f'# method = "table"                  # {", ".join(METHODS)}',
+            "# degree = 3                        # of a polynomial",
+            '# monotone = "increasing"           # increasing, decreasing, true (either)',
+            '# interval = "1 year"               # due again after this time',
+            "# raw-range = [0, 65535]            # raw values that the electronics can give",
+            "# zero-offset = false               # the offset may be adjusted in use",
+            "# standard-deviation = 0.5          # in the channel's unit, for people",
+            "",
+            "# [phy]                             # PHY TEDS of IEEE 1451.5, access code 13; many nodes bring their own",
+            *_lines(PHY_KEYS, comment=True),
+            "",
+            "# [[text]]                          # a text-based TEDS",
+            f'# kind = "title"                    # {", ".join(TEXT_CLASSES)}',
+            "# channel = 0",
+            '# language = "en"',
+            '# xml = "<Title>Bench 3</Title>"',
+            "",
+        ]
+    )
+
+
+def _lines(keys: Iterable[Key], *, comment: bool = False) -> list[str]:
+    return [_line(key, comment or key.need is Need.OPTIONAL) for key in keys]
+
+
+def _line(key: Key, comment: bool) -> str:
+    choices = f" ({', '.join(key.choices)})" if key.choices else ""
+    text = f"{'# ' if comment else ''}{key.key} = {key.example}"
+    return f"{text:<35} # {key.field}: {key.help}{choices}"
+
+
+def _groups() -> list[str]:
+    lines = [""]
+    for key, (field, keys) in META_GROUPS.items():
+        lines += [f"# [[meta.{key}]]  # {field}", *_lines(keys, comment=True), ""]
+    return lines
