@@ -158,16 +158,20 @@ class App:
         """Whether a person can be asked: a terminal, and neither --no-input nor --json."""
         return not self.no_input and sys.stdin.isatty()
 
-    def confirm(self, question: str, *, yes: bool) -> None:
+    def confirm(self, question: str, *, yes: bool, named: str = "") -> None:
         """Ask before something that cannot be undone; ``yes`` is the command's --yes.
 
-        Raises PolicyRefused where the answer is no, or nobody can be asked.
+        ``named`` is the option that must stand beside it. Raises PolicyRefused where the answer is no, or nobody can be
+        asked.
         """
         if yes:
             return
         if not self.interactive:
             raise PolicyRefused(
-                "This needs a person's word and nobody can be asked.", hint="Add --yes, or --dry-run to see the plan."
+                f"This needs a person's word and nobody can be asked. {question}"
+                if named
+                else "This needs a person's word and nobody can be asked.",
+                hint=f"Add {named} --yes." if named else "Add --yes, or --dry-run to see the plan.",
             )
         if not self.ask(question):
             raise PolicyRefused("You said no: nothing was changed.")

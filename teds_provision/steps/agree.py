@@ -5,19 +5,27 @@ What a lost message left half done is found and finished here.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
-from teds_provision.errors import Garbled, NodeRefused, NodeSilent, NotAuthentic, PolicyRefused
+from teds_provision.errors import BadData, Garbled, LinkFailure, NodeRefused, NodeSilent, NotAuthentic, PolicyRefused
 from teds_provision.protocol.agreement import StationAgreement
+from teds_provision.protocol.datasheet import signature_good, station_signature_good
+from teds_provision.protocol.keys import fingerprint
 from teds_provision.protocol.messages.frames import Reason
 from teds_provision.protocol.messages.identity import NodeState
 from teds_provision.station.station import NodeKey, Station
 from teds_provision.steps.identify import Identified
-from teds_provision.steps.read import read_identity
+from teds_provision.steps.read import read_block, read_identity
 from teds_provision.store import KeyRecord, WhitelistEntry, utc_now
 from teds_provision.talk.conversation import Conversation, SessionLost
+from teds_provision.teds.codec import security
+from teds_provision.teds.image import SECURITY
 
 _BEGINNINGS = 5
+
+TakeOver = Callable[[str], object]
+"""Asked before another station of the owner is locked out of a node; raises where the answer is no."""
 
 
 @dataclass(frozen=True)
@@ -121,19 +129,52 @@ def require_session(station: Station, node: Conversation) -> NodeKey:
             f"This station holds no key of node {node.uuid.hex()}.",
             hint=f"Tap it and agree on one: teds-provision agree {node.uuid.hex()}",
         )
-    raise unknown_key(node.uuid)
+    raise unknown_key(station, node)
 
 
-def unknown_key(uuid: bytes) -> PolicyRefused:
+def unknown_key(station: Station, node: Conversation) -> PolicyRefused:
     """The error where every key held here was answered with "unknown key" (16), which anyone on the link can say.
 
     The operator decides what that means, never the tool (profile, section 2).
     """
+    uuid = node.uuid.hex()
+    elsewhere = agreed_elsewhere(station, node)
+    said = "the answer heard is that it knows none of the keys that are held here"
+    if elsewhere:
+        return PolicyRefused(
+            f"No session with node {uuid}: {said}; {elsewhere}.",
+            hint=f"Use it at that station, or have the key handed over. To take it over, tap it: agree {uuid} --rotate",
+        )
     return PolicyRefused(
-        f"No session with node {uuid.hex()}: the answer heard is that it knows none of the keys that are held here. "
-        "Nobody signed that answer, so it proves nothing.",
-        hint=f"Try at the reader. Was it reset, or rotated elsewhere? Then tap it: agree {uuid.hex()} --rotate.",
+        f"No session with node {uuid}: {said}. Nobody signed that answer, so it proves nothing.",
+        hint=f"Try at the reader. Was it reset, or rotated elsewhere? Then tap it: agree {uuid} --rotate",
     )
+
+
+def agreed_elsewhere(station: Station, node: Conversation) -> str:
+    """What a node outside a session hints of a key that another station agreed on, in words; empty for no such hint.
+
+    The epoch is that of a plain Identify. Who agreed is seen only from a datasheet that this station's trust vouches
+    for, and the new owner may not have signed one yet.
+    """
+    held = max((record.epoch for record in station.keys.of(node.uuid)), default=0)
+    said = node.identity.epoch
+    if said <= held:
+        return ""
+    hint = f"it gives its key epoch as {said}, after {held} here: agreed elsewhere, at a tap (a hint, not proven)"
+    try:
+        octets = read_block(node, SECURITY)
+        shown = security.decode(octets)
+    except (BadData, NodeRefused, LinkFailure):
+        return hint
+    if shown.station_key not in (None, station.point) and signature_good(shown, octets, node.uuid):
+        names = {record.point: record.name for record in station.policy.trusted("station")}
+        digits = fingerprint(shown.station_key)[:16]
+        if shown.station_key in names:
+            return f"{hint}; its datasheet is signed by {names[shown.station_key]} ({digits})"
+        if any(station_signature_good(shown, ca) for ca in station.policy.trusted_cas(node.uuid)):
+            return f"{hint}; its datasheet is signed by station {digits}, which a CA of yours certified"
+    return f"{hint}; who did shows when that station signs its datasheet"
 
 
 def agree(
@@ -143,19 +184,22 @@ def agree(
     *,
     rotate: bool = False,
     newcomer: WhitelistEntry | None = None,
+    take_over: TakeOver | None = None,
 ) -> Agreed:
     """End with a session open under an agreed key: the present one, or a new one.
 
     ``rotate`` demands a new one, by a person's word: inside a session where a key is known, else by tap.
+    ``take_over`` is asked, with a question, before a node that has a key gets one without a session under a key of
+    ours: whoever holds the present one is locked out (Figure 5 of the paper). None: ``rotate`` itself is that word.
     ``newcomer`` is the whitelist entry that is made together with the first key: a board of another owner refuses, and
     never comes onto the list. On a link that loses messages an agreement begins anew, five times at most.
     Raises NotWhitelisted, OtherKey, PolicyRefused, NodeRefused, NotAuthentic, LinkFailure; whatever is cut, the same
     call carries on.
     """
-    again = 0
+    again, word = 0, _Word(rotate, take_over)
     while True:
         try:
-            return _agree(station, node, who, rotate=rotate, newcomer=newcomer, again=again > 0)
+            return _agree(station, node, who, rotate=rotate, newcomer=newcomer, word=word, again=again > 0)
         except (NodeSilent, Garbled):
             again += 1
             if again == _BEGINNINGS or not node.lives():
@@ -170,6 +214,7 @@ def _agree(
     *,
     rotate: bool,
     newcomer: WhitelistEntry | None,
+    word: _Word,
     again: bool,
 ) -> Agreed:
     new = who.state == NodeState.FACTORY
@@ -184,9 +229,39 @@ def _agree(
         if demanded or station.keys.rotation_due(node.uuid) is not None:
             return _new_key(station, node, who, entry, returning=returning, demanded=True)
         return Agreed(held.record.epoch, held.record.key_id, fresh=again)
-    if not (new or rotate or again):
-        _require_no_key_held(station, node.uuid)
+    if not new:
+        word.require(station, node)
     return _new_key(station, node, who, entry, returning=returning, demanded=demanded)
+
+
+@dataclass
+class _Word:
+    """A person's word that a node with another station's key is to get one of ours; asked for once in a run."""
+
+    rotate: bool
+    take_over: TakeOver | None
+    given: bool = False
+
+    def require(self, station: Station, node: Conversation) -> None:
+        """Raise PolicyRefused, or what the question raises, where nobody gives it."""
+        if self.given:
+            return
+        if station.keys.held(node.uuid) and not self.rotate:
+            raise unknown_key(station, node)
+        if self.take_over is not None:
+            uuid = node.uuid.hex()
+            self.take_over(f"Node {uuid} has a key that is not held here. Take it over and lock out whoever holds it?")
+        elif not self.rotate:
+            raise must_take_over(node.uuid)
+        self.given = True
+
+
+def must_take_over(uuid: bytes) -> PolicyRefused:
+    """The error where a node has another station's key, and nobody said that it is to be taken over."""
+    return PolicyRefused(
+        f"Node {uuid.hex()} has a key that this station does not hold; a new one would lock out whoever holds it.",
+        hint=f"Have the key handed over (export-keys there), or take it over: agree {uuid.hex()} --rotate --yes",
+    )
 
 
 def _new_key(
@@ -197,7 +272,7 @@ def _new_key(
     pinned = _pin_for(entry, node, who)
     ca = station.ca if new else station.keys.ca_of(node.uuid)
     try:
-        return _agree_anew(station, node, pinned, ca, returning=returning)
+        return _agree_anew(station, node, pinned, ca, returning=returning, only_new=new and not demanded)
     except NodeRefused as refusal:
         # Identify may have been answered while the node was still storing the key of a run that was cut off
         late = refusal.reason == Reason.NOT_PERMITTED and new and not demanded
@@ -221,11 +296,6 @@ def _enlist_keyed(station: Station, newcomer: WhitelistEntry | None) -> None:
     if newcomer is not None:
         with station.durable("agree"):
             _enlist(station, newcomer)
-
-
-def _require_no_key_held(station: Station, uuid: bytes) -> None:
-    if station.keys.held(uuid):
-        raise unknown_key(uuid)
 
 
 def _enlist(station: Station, entry: WhitelistEntry) -> None:
@@ -264,11 +334,18 @@ def _pin_for(entry: WhitelistEntry, node: Conversation, who: Identified) -> Whit
 
 
 def _agree_anew(
-    station: Station, node: Conversation, entry: WhitelistEntry, ca: bytes, *, returning: bool = False
+    station: Station,
+    node: Conversation,
+    entry: WhitelistEntry,
+    ca: bytes,
+    *,
+    returning: bool = False,
+    only_new: bool = False,
 ) -> Agreed:
     """Request, Confirm, Open; ``ca`` is the one that the node keeps, or shall keep from now on.
 
     ``returning`` nodes were given away: only a signed-for initial Security TEDS shows that they were reset since.
+    ``only_new``: nobody said that a node may be taken over. Identify, which called it new, is a hint.
     """
     uuid = node.uuid
     agreement = StationAgreement(station.identity.credentials(ca), uuid)
@@ -279,6 +356,8 @@ def _agree_anew(
     key_id = agreed.key_id.hex()
     if returning and not agreed.unsigned:
         station.policy.require_not_given_away(uuid)
+    if only_new and not agreed.unsigned:
+        raise must_take_over(uuid)
     with station.durable("agree"):
         if returning:
             station.policy.take_back([uuid])

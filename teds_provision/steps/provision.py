@@ -14,7 +14,7 @@ from teds_provision.errors import PolicyRefused, StoreFailure, TedsProvisionErro
 from teds_provision.protocol.datasheet import NodeKeys
 from teds_provision.protocol.messages.identity import NodeState
 from teds_provision.station.station import Station
-from teds_provision.steps.agree import Agreed, agree
+from teds_provision.steps.agree import Agreed, TakeOver, agree
 from teds_provision.steps.build import BuildOrder, Confirm, Proposal, nobody, propose
 from teds_provision.steps.build_order import Prepared, named_for, no_profile, prepare
 from teds_provision.steps.identify import Identified, identify
@@ -59,14 +59,16 @@ def provision(
     confirm: Confirm = nobody,
     onward: Onward | None = None,
     low: Low = wait_for_charge,
+    take_over: TakeOver | None = None,
 ) -> Provisioned:
     """Bring one node from wherever it stands to a verified datasheet; raises at the first step that fails.
 
     ``accept`` is asked before an unknown node is whitelisted, ``confirm`` before a datasheet changes in what the order
-    does not name, ``low`` before a node with a low battery is written. ``onward`` takes the conversation to another
+    does not name, ``low`` before a node with a low battery is written, ``take_over`` before a node with another
+    station's key gets one of ours (None: that is refused). ``onward`` takes the conversation to another
     link once the key is agreed on. A failure stands in the audit log with the step that it happened in.
     """
-    run = _Run(station, node, order, accept, confirm, reporter, onward, low)
+    run = _Run(station, node, order, accept, confirm, reporter, onward, low, take_over)
     try:
         with station.turn(node.uuid), station.run():
             return run.run()
@@ -87,10 +89,11 @@ class _Run:
         reporter: Reporter,
         onward: Onward | None,
         low: Low,
+        take_over: TakeOver | None,
     ) -> None:
         self.station, self.node, self.order = station, node, order
         self.accept, self.confirm, self.reporter = accept, confirm, reporter
-        self.steps, self.onward, self.low = Steps(reporter), onward, low
+        self.steps, self.onward, self.low, self.take_over = Steps(reporter), onward, low, take_over
 
     def run(self) -> Provisioned:
         who = self._identify()
@@ -141,7 +144,7 @@ class _Run:
 
     def _agree(self, who: Identified, entry: WhitelistEntry | None) -> Agreed:
         with self.steps.step("agree") as step:
-            agreed = agree(self.station, self.node, who, newcomer=entry)
+            agreed = agree(self.station, self.node, who, newcomer=entry, take_over=self.take_over)
             step.result = DONE if agreed.fresh else NOTHING
             step.detail = f"key epoch {agreed.epoch}, key {agreed.key_id}"
         return agreed

@@ -174,7 +174,7 @@ def unproven(uuid: bytes, why: str) -> Unproven:
     """The error (exit 5) where a key of the node is held and neither a session nor its signature vouches for it."""
     return Unproven(
         f"Nothing is proven of node {uuid.hex()}: {why}.",
-        hint="Whoever answered may have recorded this. Try at the reader; to take a node over: agree --rotate.",
+        hint="What came without a session may be a recording. Try at the reader; to take a node over: agree --rotate",
     )
 
 

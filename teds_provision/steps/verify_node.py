@@ -8,7 +8,7 @@ from hashlib import sha256
 from teds_provision.errors import LinkFailure, NodeRefused, NotAuthentic
 from teds_provision.protocol.messages.identity import Identity, NodeState
 from teds_provision.station.station import Station
-from teds_provision.steps.agree import session_if_keyed
+from teds_provision.steps.agree import agreed_elsewhere, session_if_keyed
 from teds_provision.steps.identify import Identified, prove
 from teds_provision.steps.read import read_block, read_identity, read_image
 from teds_provision.steps.reset import proof_of_reset
@@ -72,7 +72,8 @@ def open_or_say_why(station: Station, node: Conversation) -> str:
             raise
         return _said(refusal)
     if held is None and station.keys.held(node.uuid) and station.policy.tombstone(node.uuid) is None:
-        return "the node opens no session under any key that is held here"
+        elsewhere = agreed_elsewhere(station, node)
+        return "the node opens no session under any key that is held here" + (elsewhere and f"; {elsewhere}")
     return ""
 
 

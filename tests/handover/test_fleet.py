@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
-from teds_provision.errors import BadData, NotAuthentic, NotFound, PolicyRefused
+from teds_provision.errors import BadData, NodeSilent, NotAuthentic, NotFound, PolicyRefused
 from teds_provision.handover import certify as fleet
 from teds_provision.handover.certify import (
     adopt_certificate,
@@ -21,14 +22,20 @@ from teds_provision.handover.export_keys import export_keys, plan_export
 from teds_provision.handover.import_keys import ImportPlan, import_keys, plan_import
 from teds_provision.handover.selection import ExportOrder
 from teds_provision.handover.trust import add, candidate
+from teds_provision.protocol.messages.identity import NodeState
 from teds_provision.station.station import Station, initialise
-from teds_provision.steps.agree import agree
+from teds_provision.steps.agree import agree, require_session
+from teds_provision.steps.build import BuildOrder, build
 from teds_provision.steps.identify import identify
 from teds_provision.steps.verify import Verified, verify_image
+from teds_provision.steps.verify_node import look_at_node
+from teds_provision.steps.visits.sign_command import SignOrder, sign_image
+from teds_provision.steps.write import write
 from teds_provision.store import WhitelistEntry
-from teds_provision.teds.image import Image
+from teds_provision.teds.codec import security
+from teds_provision.teds.image import SECURITY, Image
 from teds_provision.vault import forget_vaults, passphrase
-from tests.bench import PASSPHRASE, Board, make_station, talk
+from tests.bench import PASSPHRASE, Board, MemoryLink, make_station, talk
 from tests.handover.desk import provisioned, session, trust
 
 
@@ -97,15 +104,141 @@ def test_they_verify_each_others_datasheets(pair: tuple[Station, Station], direc
 
 
 @pytest.mark.parametrize("direction", [1, -1])
-def test_they_rekey_each_others_nodes_by_tap(pair: tuple[Station, Station], direction: int) -> None:
+def test_they_rekey_each_others_nodes_by_tap_where_a_person_says_so(
+    pair: tuple[Station, Station], direction: int
+) -> None:
+    """Figure 5 of the paper: whoever holds the present key is locked out, so that somebody is asked before."""
     one, other = pair[::direction]
     board = Board()
     provisioned(one, board)
     other.pins.put(WhitelistEntry(board.uuid))
+    before, asked = board.state, list[str]()
+    with talk(board) as node, pytest.raises(PolicyRefused, match="lock out whoever holds it"):
+        agree(other, node, identify(other, node))
+
+    def no(question: str) -> None:
+        raise PolicyRefused("You said no.")
+
+    for rotate in (False, True):
+        with talk(board) as node, pytest.raises(PolicyRefused, match="You said no"):
+            agree(other, node, identify(other, node), rotate=rotate, take_over=no)
+    with pytest.raises(PolicyRefused, match="lock out whoever holds it"):
+        provisioned(other, board)
+    assert (board.state, other.keys.held(board.uuid)) == (before, False)
     with talk(board) as node:
-        assert agree(other, node, identify(other, node)).epoch == 2
+        assert agree(other, node, identify(other, node), take_over=asked.append).epoch == 2
+    assert len(asked) == 1
     assert board.state.ca == one.ca
     assert provisioned(other, board).verified.verdict == "authentic"
+
+
+def test_a_node_that_calls_itself_new_and_shows_a_signed_datasheet_is_not_taken_over(
+    pair: tuple[Station, Station],
+) -> None:
+    one, other = pair
+    board = Board()
+    provisioned(one, board)
+    other.pins.put(WhitelistEntry(board.uuid))
+    before = board.state
+    with talk(board) as node:
+        who = replace(identify(other, node), state=NodeState.FACTORY)  # Identify is a hint: anyone may have sent it
+        with pytest.raises(PolicyRefused, match="lock out whoever holds it"):
+            agree(other, node, who)
+    assert (board.state, other.keys.held(board.uuid)) == (before, False)
+
+
+def test_who_is_asked_once_is_not_asked_again_when_the_link_fails(pair: tuple[Station, Station]) -> None:
+    one, other = pair
+    board, asked = Board(), list[str]()
+    provisioned(one, board)
+    other.pins.put(WhitelistEntry(board.uuid))
+    with talk(board, Forgetful(board)) as node:
+        who = identify(other, node)
+        monkey = node.lives
+        node.lives = lambda: True  # type: ignore[method-assign]
+        assert agree(other, node, who, take_over=asked.append).epoch == 2
+        node.lives = monkey  # type: ignore[method-assign]
+    assert len(asked) == 1
+
+
+def test_the_station_that_was_locked_out_is_told_of_a_tap_elsewhere_and_then_who_signs(
+    pair: tuple[Station, Station],
+) -> None:
+    one, other = pair
+    board = Board()
+    provisioned(one, board)
+    other.pins.put(WhitelistEntry(board.uuid))
+    with talk(board) as node:
+        agree(other, node, identify(other, node), rotate=True)
+    for words in ("epoch as 2, after 1 here: agreed elsewhere, at a tap", "who did shows when that station signs"):
+        with pytest.raises(PolicyRefused, match=words):
+            session(one, board)
+        assert words in why_unproven(one, board)
+    assert provisioned(other, board).verified.verdict == "authentic"
+    signed = f"signed by station {other.fingerprint[:16]}, which a CA of yours certified"
+    with pytest.raises(PolicyRefused, match=signed):
+        session(one, board)
+    trust(one, other)
+    with pytest.raises(PolicyRefused, match=f"signed by west \\({other.fingerprint[:16]}\\)") as told:
+        session(one, board)
+    assert "attack" not in told.value.message + (told.value.hint or "")
+    assert "proves nothing" not in told.value.message
+    assert [record.epoch for record in one.keys.of(board.uuid)] == [1], "a hint changes no key"
+
+
+def why_unproven(station: Station, board: Board) -> str:
+    with talk(board) as node:
+        verified = look_at_node(station, node, identify(station, node)).verified
+    assert verified.verdict == "unproven"
+    return next(check.why for check in verified.checks if check.name == "session")
+
+
+class Forgetful(MemoryLink):
+    """A link that loses the first reply to Request."""
+
+    lost = False
+
+    def exchange(self, frame: bytes) -> bytes:
+        reply = super().exchange(frame)
+        if frame[2:4] == bytes([128, 1]) and not self.lost:
+            self.lost = True
+            raise NodeSilent("The reply was lost.")
+        return reply
+
+
+def test_an_image_that_was_built_elsewhere_is_signed_for_the_epoch_and_sequence_that_it_brings(
+    pair: tuple[Station, Station],
+) -> None:
+    """East meets the node and builds, west alone signs: what west never heard of stands in the image."""
+    east, west = pair
+    board, renamed = Board(), BuildOrder("temperature-sensor", name="renamed")
+    provisioned(east, board)
+    with talk(board) as node:
+        agree(east, node, identify(east, node), rotate=True)
+    assert provisioned(east, board).verified.verdict == "authentic"
+    built = build(east, board.uuid, renamed).image
+    west.pins.put(WhitelistEntry(board.uuid))
+    signed = sign_image(west, SignOrder(board.uuid, built), None).signed
+    brought = security.decode(signed.image.blocks[SECURITY])
+    assert (brought.key_epoch, brought.sequence) == (2, board.state.sequence + 1)
+    again = sign_image(west, SignOrder(board.uuid, signed.image), None).signed
+    assert (again.signature, again.reused) == (signed.signature, True)
+    with talk(board) as node:
+        require_session(east, node)
+        write(east, node, signed.image)
+    assert board.state.sequence == brought.sequence
+
+
+def test_an_image_does_not_use_up_the_sequence_of_a_node_that_the_signer_knows(owner: Station) -> None:
+    board = Board()
+    image = provisioned(owner, board).image
+    lie = replace(security.decode(image.blocks[SECURITY]), signature=None, sequence=2**32 - 2, station_key=None)
+    forged = image.with_block(SECURITY, lie.encode())
+    with pytest.raises(PolicyRefused, match="the last one known here is 1"):
+        sign_image(owner, SignOrder(board.uuid, forged), None)
+    record = owner.nodes.get(board.uuid)
+    assert record is not None
+    assert record.sequence == 1
 
 
 @pytest.mark.parametrize("direction", [1, -1])

@@ -206,9 +206,11 @@ def test_a_revoked_node_is_refused(station: Station, board: Board) -> None:
 
 def test_another_owners_station_is_refused(station: Station, board: Board, tmp_path: Path) -> None:
     run(station, board)
-    before = board.state
-    with pytest.raises(NodeRefused) as refused:
-        run(make_station(tmp_path / "stranger"), board)
+    before, stranger = board.state, make_station(tmp_path / "stranger")
+    with pytest.raises(PolicyRefused, match="has a key that this station does not hold"):
+        run(stranger, board)
+    with talk(board) as node, pytest.raises(NodeRefused) as refused:  # a person's word does not help either
+        provision(stranger, node, ANGLE, accept=accept, reporter=Silent(), take_over=lambda question: None)
     assert refused.value.reason == Reason.UNTRUSTED_STATION
     assert board.state == before
 

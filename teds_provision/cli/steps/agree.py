@@ -24,11 +24,12 @@ from teds_provision.steps import visits
 def agree(app: App, uuid: str, links: LinkSettings, rotate: bool, yes: bool, dry_run: bool) -> None:
     """Agree on a key with a whitelisted node; on a node that has one, do nothing, or --rotate it.
 
-    The first agreement needs a tap (or the bus of a node built without NFC); a rotation goes over any link.
+    The first agreement needs a tap (or the bus of a node built without NFC); a rotation goes over any link. A node that
+    has a key of another station is taken over by tap, after a question, or with --rotate --yes: that one is locked out.
     """
 
     def confirm(question: str) -> None:
-        app.confirm(question, yes=yes)
+        app.confirm(question, yes=yes and rotate, named="--rotate")
 
     done = visits.at_node.agree_at(
         app.station(), links, uuid, reporter_for(app), rotate=rotate, dry_run=dry_run, confirm=confirm

@@ -163,7 +163,13 @@ def _questions(app: App, yes: bool, *, strangers: bool = True) -> Questions:
         with turn:
             app.confirm(question, yes=yes)
 
-    return many.boards.Questions(accept, confirm if app.interactive else None, low)
+    def take_over(question: str) -> None:
+        with turn:
+            if not app.ask(question):
+                raise many.board.Declined("You said no: the node keeps its key, nothing was changed.")
+
+    asked = app.interactive
+    return many.boards.Questions(accept, confirm if asked else None, low, take_over if asked else None)
 
 
 # -- telling -----------------------------------------------------------------------------------------------------------

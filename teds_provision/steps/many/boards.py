@@ -14,6 +14,7 @@ from teds_provision.errors import NotWhitelisted, OtherKey, PolicyRefused, TedsP
 from teds_provision.links import Contact, LinkSettings, Port, open_port
 from teds_provision.protocol.messages.identity import NodeState
 from teds_provision.station.station import Station
+from teds_provision.steps.agree import TakeOver
 from teds_provision.steps.build import Confirm, nobody, propose
 from teds_provision.steps.build_order import BuildOrder, Prepared, for_several, named_for, prepare
 from teds_provision.steps.identify import Identified, examine
@@ -59,12 +60,14 @@ class Request:
 class Questions:
     """Who is asked: before an unknown node is whitelisted, and before what nobody named is written (None: nobody).
 
-    ``low``: before a node with a low battery is written.
+    ``low``: before a node with a low battery is written. ``take_over``: before a node with another station's key gets
+    one of ours (None: nobody).
     """
 
     accept: Accept
     confirm: Confirm | None
     low: Low = wait_for_charge
+    take_over: TakeOver | None = None
 
 
 @dataclass(frozen=True)
@@ -288,6 +291,7 @@ class Boards:
             confirm=questions.confirm or nobody,
             onward=onward(self._links, self._reporter.notice),
             low=questions.low,
+            take_over=questions.take_over,
         )
 
     def _for(self, who: Identified) -> Prepared:

@@ -42,21 +42,22 @@ def agree_at(
     *,
     rotate: bool = False,
     dry_run: bool = False,
-    confirm: Callable[[str], object] = lambda question: None,
+    confirm: Callable[[str], object] | None = None,
 ) -> AgreeDone:
     """Agree on a key with the node that ``node`` names (UUID, prefix, name), or rotate it; see :func:`agree`.
 
-    ``confirm`` is asked where the key came back from a backup and nobody taps the node; it raises for a no.
+    ``confirm`` is asked where the key came back from a backup and nobody taps the node, and before a node is taken
+    over from another station; it raises for a no.
     """
     uuid = station.nodes.resolve(node)
     station.policy.require_whitelisted(uuid)
     if dry_run:
         held = tuple(f"{record.state} key of epoch {record.epoch}" for record in station.keys.of(uuid))
         return AgreeDone(uuid, None, ("rotate" if rotate else "keep") if held else "agree on a first key", held)
-    if station.keys.restored(uuid) and rotate and not LINKS[links.via].capabilities.tapped:
+    if confirm and station.keys.restored(uuid) and rotate and not LINKS[links.via].capabilities.tapped:
         confirm(f"Node {uuid.hex()} is {station.keys.rotation_due(uuid)}. Is it still this station's?")
     with at_node(station, links, uuid, reporter, unlock="always") as visit:
-        return AgreeDone(uuid, agree(station, visit.node, visit.who, rotate=rotate))
+        return AgreeDone(uuid, agree(station, visit.node, visit.who, rotate=rotate, take_over=confirm))
 
 
 @dataclass(frozen=True)

@@ -6,8 +6,9 @@ from collections.abc import Collection
 from dataclasses import dataclass
 from pathlib import Path
 
-from teds_provision.errors import NotFound, UsageFailure
+from teds_provision.errors import NotFound, PolicyRefused, UsageFailure
 from teds_provision.links import LinkSettings
+from teds_provision.protocol.datasheet import SEQUENCE_WINDOW
 from teds_provision.station.station import Station
 from teds_provision.steps.agree import require_session
 from teds_provision.steps.build_order import guard
@@ -75,6 +76,9 @@ def sign_at(
 def sign_image(station: Station, order: SignOrder, node: Conversation | None) -> SignDone:
     """Sign the draft or image of one node; with ``node`` against what it has, in a session, else as last known.
 
+    An image file that was built at another station brings the node's epoch and sequence in its Security TEDS, as that
+    station knew them; what this one knows counts where it is newer.
+
     Where nothing lies ready, what the node was last read to have is signed: nothing to do, if it still holds. Raises
     NotFound (nothing built, key unknown), BadData, PolicyRefused (guard), NotWhitelisted.
     """
@@ -85,7 +89,7 @@ def sign_image(station: Station, order: SignOrder, node: Conversation | None) ->
     image = order.image or (draft.image if draft is not None else known)
     if image is None or not image.unsigned_blocks():
         raise NotFound(f"Nothing is built for node {uuid.hex()}.", hint=f"Build it: teds-provision build {uuid.hex()}")
-    present = _last_known(station, uuid, known) if node is None else _read_now(station, node, order)
+    present = _last_known(station, uuid, known, order.image) if node is None else _read_now(station, node, order)
     image, has = present.completing(image), present.image
     keys = known_node_keys(station, uuid, has or image)
     guard(station, image, has, order.accept_calibration, record=not order.dry_run)
@@ -134,10 +138,27 @@ class _Present:
         return self.image.security
 
 
-def _last_known(station: Station, uuid: bytes, known: Image | None) -> _Present:
+def _last_known(station: Station, uuid: bytes, known: Image | None, file: Image | None) -> _Present:
+    """What the store knows of the node, or the image file that came, where it says more.
+
+    A file is hearsay, so it does not use up the sequence of a node that this station knows: more than a node would take
+    at once, it has to be read (``--read-node``).
+    """
     record = station.nodes.get(uuid)
-    epoch = station.keys.active_epoch(uuid) or (record.epoch if record else 0)
-    return _Present(known, epoch, _sequence_of(known))
+    epoch, sequence = station.keys.active_epoch(uuid) or (record.epoch if record else 0), _sequence_of(known)
+    if file is None or SECURITY not in file.blocks:
+        return _Present(known, epoch, sequence)
+    brought = security.decode(file.blocks[SECURITY])
+    epoch = max(epoch, brought.key_epoch)
+    if brought.signed and brought.station_key == station.point:
+        return _Present(known, epoch, sequence)  # this very sequence was given here: the signature may still hold
+    highest = max(sequence, record.sequence if record else 0)
+    if highest and brought.sequence > highest + SEQUENCE_WINDOW:
+        raise PolicyRefused(
+            f"The image says sequence {brought.sequence}; the last one known here is {highest}.",
+            hint="Nobody vouches for that. Meet the node: sign IMAGE --read-node",
+        )
+    return _Present(known, epoch, max(sequence, brought.sequence))
 
 
 def _read_now(station: Station, node: Conversation, order: SignOrder) -> _Present:
