@@ -11,7 +11,7 @@ demo: $(VENV)/.run
 	@$(BIN)/teds-provision demo
 
 # A base station that runs, with its page, two virtual sensors and a virtual gripper; ends with Ctrl-C.
-demo-page: $(VENV)/.page
+demo-page: $(VENV)/.run
 	@$(BIN)/teds-provision demo --page
 
 # The picture of the page in README: made from demo --page, by the chromium of this system.
@@ -145,14 +145,9 @@ $(VENV)/.made:
 	@touch $@
 
 $(VENV)/.run: $(VENV)/.made pyproject.toml
-	@echo "Installing teds-provision …"
-	@$(BIN)/python -m pip install --quiet --editable .
-	@touch $@
-
-$(VENV)/.page: $(VENV)/.made pyproject.toml
-	@echo "Installing teds-provision with its page …"
+	@echo "Installing teds-provision with its service and page …"
 	@$(BIN)/python -m pip install --quiet --editable '.[ncap]'
-	@touch $@ $(VENV)/.run
+	@touch $@
 
 $(VENV)/.dev: $(VENV)/.made pyproject.toml
 	@echo "Installing teds-provision and what its tests need …"

@@ -74,14 +74,64 @@ def late(module: str) -> object:
 if TYPE_CHECKING:
     import pathlib
     import shlex
+    import tomllib
+    from importlib import util
 else:
-    pathlib, shlex = late("pathlib"), late("shlex")
+    pathlib, shlex, tomllib, util = late("pathlib"), late("shlex"), late("tomllib"), late("importlib.util")
+
+_TOOL: Final = "teds-provision"
 
 
-def how_to_install(*packages: str) -> str:
-    """The command that puts packages beside this tool, where it is: pipx keeps it apart, else this Python's own pip."""
-    names = " ".join(packages)
-    parts = pathlib.Path(sys.prefix).parts
-    if "pipx" in parts and "venvs" in parts:
-        return f"Install it: pipx inject {parts[-1]} {names}"
-    return f"Install it: {shlex.quote(sys.executable)} -m pip install {names}"
+def how_to_install(extra: str) -> str:
+    """The command that adds one of our extras to this installation, as a hint."""
+    return f"Install it: {install_command(f'{_TOOL}[{extra}]')}"
+
+
+def install_command(*requirements: str) -> str:
+    """The command that adds requirements to this installation, wherever it is.
+
+    ``uv tool`` undoes at its next upgrade what it was not told, so it is told all again; ``pipx inject`` takes no extra
+    of the tool itself from version 1.5 on; an environment of uv's has no pip.
+    """
+    prefix = pathlib.Path(sys.prefix)
+    quoted = " ".join(map(shlex.quote, requirements))
+    if (prefix / "uv-receipt.toml").is_file():
+        return _uv_tool(prefix / "uv-receipt.toml", requirements)
+    if "pipx" in prefix.parts and "venvs" in prefix.parts:
+        return f"pipx runpip {prefix.name} install {quoted}"
+    if util.find_spec("pip") is None:
+        return f"uv pip install --python {shlex.quote(sys.executable)} {quoted}"
+    return f"{shlex.quote(sys.executable)} -m pip install {quoted}"
+
+
+def _uv_tool(receipt: pathlib.Path, requirements: tuple[str, ...]) -> str:
+    """``uv tool install`` with what its receipt has, and these."""
+    try:
+        said = tomllib.loads(receipt.read_text(encoding="utf-8"))["tool"]
+        listed = {one["name"]: one for one in said["requirements"]}
+    except (OSError, ValueError, KeyError, TypeError):
+        said, listed = {}, {}
+    ours = listed.pop(_TOOL, {})
+    extras = {*ours.get("extras", []), *(each[len(_TOOL) + 1 : -1] for each in requirements if each.startswith(_TOOL))}
+    named = f"{_TOOL}[{','.join(sorted(extras))}]" if extras else _TOOL
+    words = ["uv", "tool", "install"]
+    if "python" in said:
+        words += ["--python", said["python"]]
+    if "editable" in ours:
+        words += ["--editable", named.replace(_TOOL, ours["editable"], 1)]
+    elif "directory" in ours or "path" in ours or "url" in ours:
+        words.append(f"{named} @ {ours.get('directory') or ours.get('path') or ours['url']}")
+    elif "git" in ours:
+        words.append(
+            f"{named} @ git+{ours['git'].replace('?rev=', '@').replace('?tag=', '@').replace('?branch=', '@')}"
+        )
+    else:
+        words.append(named + ours.get("specifier", ""))
+    for name, one in listed.items():
+        words += [
+            "--with",
+            name + (f"[{','.join(one['extras'])}]" if one.get("extras") else "") + one.get("specifier", ""),
+        ]
+    for each in requirements:
+        words += ["--with", each] if not each.startswith(_TOOL) else []
+    return shlex.join(words)

@@ -15,6 +15,7 @@ from teds_provision import store as store_room
 from teds_provision import vault
 from teds_provision.doctor.registry import Finding, Place, check
 from teds_provision.errors import StoreFailure
+from teds_provision.lazy import install_command
 from teds_provision.store.home import has_store
 
 _MIN_PYTHON: Final = (3, 11)
@@ -61,8 +62,8 @@ def libraries(place: Place) -> Iterator[Finding]:
             old.append(f"{name} {version} (needs {least})")
     if missing or old:
         wrong = ", ".join([*(f"{name} is missing" for name in missing), *old])
-        names = " ".join(f"'{name}>={_LIBRARIES[name]}'" for name in _LIBRARIES if name in missing or name in str(old))
-        yield Finding("libraries", "failed", f"{wrong}.", f"pip install {names}")
+        wanted = [f"{name}>={_LIBRARIES[name]}" for name in _LIBRARIES if name in missing or name in str(old)]
+        yield Finding("libraries", "failed", f"{wrong}.", install_command(*wanted))
     else:
         yield Finding("libraries", "ok", f"{', '.join(present)}.")
     yield from _shadowed()

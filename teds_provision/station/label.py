@@ -119,7 +119,7 @@ def _modules(text: str) -> list[list[bool]]:
     try:
         import segno
     except ImportError as error:
-        raise TedsProvisionError("Labels need segno, which is not installed.", hint=how_to_install("segno")) from error
+        raise TedsProvisionError("Labels need segno, which is not installed.", hint=how_to_install("label")) from error
     code = segno.make(text, micro=False, error="m", boost_error=True)
     return [[bool(module) for module in row] for row in code.matrix]
 
@@ -145,9 +145,7 @@ def _png(label: Label, rows: list[list[bool]]) -> bytes:
     try:
         from PIL import Image, ImageDraw, ImageFont
     except ImportError as error:
-        raise TedsProvisionError(
-            "A PNG needs Pillow, which is not installed.", hint=how_to_install("pillow")
-        ) from error
+        raise TedsProvisionError("A PNG needs Pillow, which is not installed.", hint=how_to_install("label")) from error
     side = (len(rows) + 2 * _QUIET) * _MODULE
     font = ImageFont.load_default(4 * _MODULE)
     width = side + _QUIET * _MODULE + int(max(font.getlength(line) for line in label.lines))

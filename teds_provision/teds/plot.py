@@ -111,7 +111,7 @@ def _picture(panels: list[_Panel], kind: str, title: str) -> bytes:
     except ImportError as error:
         raise TedsProvisionError(
             "Pictures need matplotlib, which is not installed.",
-            hint=how_to_install("matplotlib"),
+            hint=how_to_install("plot"),
         ) from error
     columns = min(COLUMNS, len(panels))
     rows = math.ceil(len(panels) / columns)

@@ -222,9 +222,7 @@ def find_token(uri: Pkcs11Uri) -> Token:
     try:
         import pkcs11
     except ImportError as error:
-        raise VaultFailure(
-            "Keys in a token need the package python-pkcs11.", hint=how_to_install("python-pkcs11")
-        ) from error
+        raise VaultFailure("Keys in a token need the package python-pkcs11.", hint=how_to_install("pkcs11")) from error
     try:
         library = guarded(lambda: pkcs11.lib(uri.module_path))
         tokens = guarded(lambda: [token for token in library.get_tokens() if _fits(uri, token)])

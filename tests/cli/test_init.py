@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
+import re
 import subprocess
 import sys
+import tomllib
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
+from teds_provision import lazy
 from teds_provision.lazy import how_to_install
 from teds_provision.protocol.keys import fingerprint, from_pem
 
-from .shell import call, clean_environment, spawn
+from .shell import ROOT, call, clean_environment, spawn
 
 WORDS = "four random words here"
 
@@ -106,7 +110,61 @@ def test_why_where_and_how_long_is_said_before_anybody_is_asked(tmp_path: Path) 
     assert "about to be made" not in call(tmp_path / "new", "init").err
 
 
-def test_the_cure_for_a_missing_package_fits_where_the_program_is(monkeypatch: pytest.MonkeyPatch) -> None:
-    assert how_to_install("matplotlib") == f"Install it: {sys.executable} -m pip install matplotlib"
+def test_the_cure_for_a_missing_package_fits_where_the_program_is(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    assert how_to_install("plot") == f"Install it: {sys.executable} -m pip install 'teds-provision[plot]'"
     monkeypatch.setattr(sys, "prefix", "/home/anna/.local/share/pipx/venvs/teds-provision")
-    assert how_to_install("segno", "pillow") == "Install it: pipx inject teds-provision segno pillow"
+    assert how_to_install("label") == "Install it: pipx runpip teds-provision install 'teds-provision[label]'"
+    monkeypatch.setattr(sys, "prefix", str(tmp_path))
+    monkeypatch.setattr(lazy, "util", SimpleNamespace(find_spec=lambda _name: None))
+    assert how_to_install("ble") == f"Install it: uv pip install --python {sys.executable} 'teds-provision[ble]'"
+
+
+@pytest.mark.parametrize(
+    ("receipt", "command"),
+    [
+        ('requirements = [{ name = "teds-provision" }]', "'teds-provision[ncap]'"),
+        ('requirements = [{ name = "teds-provision", specifier = ">=0.2" }]', "'teds-provision[ncap]>=0.2'"),
+        (
+            'requirements = [{ name = "teds-provision", extras = ["mqtt"], directory = "/src/it" }]\n'
+            'python = "/usr/bin/python3"',
+            "--python /usr/bin/python3 'teds-provision[mqtt,ncap] @ /src/it'",
+        ),
+        (
+            'requirements = [{ name = "teds-provision", editable = "/src/it" }, { name = "paho-mqtt" }]',
+            "--editable '/src/it[ncap]' --with paho-mqtt",
+        ),
+        (
+            'requirements = [{ name = "teds-provision", git = "https://example.org/it?rev=main" }]',
+            "'teds-provision[ncap] @ git+https://example.org/it@main'",
+        ),
+        ("requirements = 3", "'teds-provision[ncap]'"),
+    ],
+)
+def test_a_tool_of_uv_is_installed_again_with_the_extra_and_all_that_it_has(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, receipt: str, command: str
+) -> None:
+    """Receipts of uv 0.13: such an environment has no pip, and what uv was not told of is gone at its next upgrade."""
+    (tmp_path / "uv-receipt.toml").write_text(f"[tool]\n{receipt}\nentrypoints = []\n")
+    monkeypatch.setattr(sys, "prefix", str(tmp_path))
+    assert how_to_install("ncap") == f"Install it: uv tool install {command}"
+
+
+def test_what_the_demo_installs_is_enough_for_the_steps_that_readme_shows_after_it(tmp_path: Path) -> None:
+    """`ncap run` ended in a missing extra."""
+    plan = ["make", "-n", "demo", f"VENV={tmp_path / 'venv'}", "PYTHON=python3"]
+    said = subprocess.run(plan, cwd=ROOT, capture_output=True, text=True, check=True).stdout
+    assert "teds-provision ncap run" in (ROOT / "README.md").read_text()
+    assert "--editable '.[ncap]'" in said
+
+
+def test_every_extra_that_a_hint_names_is_one() -> None:
+    declared = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["optional-dependencies"]
+    named = {
+        extra
+        for path in (ROOT / "teds_provision").rglob("*.py")
+        for extra in re.findall(r"how_to_install\(['\"]([^'\"]+)['\"]\)", path.read_text())
+    }
+    assert named == {"ble", "ble-node", "label", "mqtt", "ncap", "pcsc", "pkcs11", "plot", "ros2"}
+    assert named <= declared.keys()

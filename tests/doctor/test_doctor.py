@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import re
 import sqlite3
+import sys
 import time
 import tomllib
 from collections.abc import Iterator
@@ -253,7 +254,7 @@ def test_a_missing_an_old_and_a_shadowing_library_are_told(place: Place, monkeyp
     libraries, ndeflib = look(place, "libraries")
     assert libraries.result == "failed"
     assert "msgpack is missing, nfcpy 0.13.5 (needs 1.0.4)" in libraries.why
-    assert libraries.fix == "pip install 'nfcpy>=1.0.4' 'msgpack>=1.0'"
+    assert libraries.fix == f"{sys.executable} -m pip install 'nfcpy>=1.0.4' 'msgpack>=1.0'"
     assert (ndeflib.result, "pip uninstall --yes ndef" in ndeflib.fix) == ("failed", True)
 
 

@@ -101,7 +101,7 @@ def run(
 def _require_extra() -> None:
     missing = [name for name in _NEEDED if importlib.util.find_spec(name) is None]
     if missing:
-        raise UsageFailure(f"ncap run needs {', '.join(missing)}.", hint=how_to_install(*missing))
+        raise UsageFailure(f"ncap run needs {', '.join(missing)}.", hint=how_to_install("ncap"))
 
 
 class Lines:

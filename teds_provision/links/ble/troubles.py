@@ -22,7 +22,7 @@ _NO_SERVICE: Final = ("org.freedesktop.DBus.Error.ServiceUnknown", "org.freedesk
 
 def missing_bleak() -> NoReader:
     """The error where bleak is not installed."""
-    return NoReader("BLE needs bleak, which is not installed.", hint=how_to_install("bleak"))
+    return NoReader("BLE needs bleak, which is not installed.", hint=how_to_install("ble"))
 
 
 def is_full(error: BaseException, held: Collection[object]) -> bool:

@@ -30,7 +30,7 @@ def _scard() -> Any:
     except ImportError as error:
         raise NoReader(
             "PC/SC readers need the package pyscard, which is not installed.",
-            hint=f"{how_to_install('pyscard')} (it is built: sudo apt install swig libpcsclite-dev first).",
+            hint=f"{how_to_install('pcsc')} (it is built: sudo apt install swig libpcsclite-dev first).",
         ) from error
     return smartcard.scard
 

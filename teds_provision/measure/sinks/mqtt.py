@@ -70,7 +70,7 @@ class MqttSink(ThreadedSink):
             import paho.mqtt.client as paho
             from paho.mqtt.enums import CallbackAPIVersion
         except ImportError:
-            raise TedsProvisionError("MQTT needs the package paho-mqtt.", hint=how_to_install("paho-mqtt")) from None
+            raise TedsProvisionError("MQTT needs the package paho-mqtt.", hint=how_to_install("mqtt")) from None
         self._station, self._topics = station, Topics(station)
         self._learn(facts)
         client = paho.Client(CallbackAPIVersion.VERSION2)

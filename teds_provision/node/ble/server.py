@@ -34,7 +34,7 @@ class BleServer:
         except ImportError:
             raise UsageFailure(
                 "A node's BLE needs bumble, which is not installed.",
-                hint=how_to_install("bumble"),
+                hint=how_to_install("ble-node"),
             ) from None
         self._transport, self._node, self._address = transport, node, address
         self._loop = asyncio.new_event_loop()

@@ -78,7 +78,7 @@ class Ros2Sink(TopicSink):
             from cyclonedds.domain import Domain, DomainParticipant
             from cyclonedds.qos import Policy, Qos
         except ImportError:
-            raise TedsProvisionError("ROS 2 needs the package cyclonedds.", hint=how_to_install("cyclonedds")) from None
+            raise TedsProvisionError("ROS 2 needs the package cyclonedds.", hint=how_to_install("ros2")) from None
         self._types = ros2_types
         try:
             if "CYCLONEDDS_URI" not in os.environ and self._domain not in _domains:
