@@ -9,9 +9,9 @@ import pytest
 from teds_provision.backup.backup import backup
 from teds_provision.backup.restore import rebuild
 from teds_provision.backup.sealed_file import SealedFile
-from teds_provision.errors import PolicyRefused
+from teds_provision.errors import NodeSilent, PolicyRefused
 from teds_provision.station.station import Station
-from teds_provision.steps.agree import agree, require_session
+from teds_provision.steps.agree import agree, open_session, require_session
 from teds_provision.steps.identify import identify
 from teds_provision.vault import forget_vaults
 from teds_provision.vault.passphrase import THROWAWAY
@@ -26,12 +26,7 @@ def ask(prompt: str, confirm: bool) -> str:
 def restored(tmp_path: Path, board: Board) -> Station:
     station = make_station(tmp_path / "home")
     key_up(station, board)
-    backup(station, tmp_path / "b", ask, costs=THROWAWAY)
-    station.close()
-    forget_vaults()
-    with SealedFile(tmp_path / "b").open_with_passphrase(PASSPHRASE) as content:
-        rebuild(tmp_path / "new", content, ask, costs=THROWAWAY)
-    return Station.open(tmp_path / "new", ask=ask)
+    return back(station, tmp_path)
 
 
 def test_over_a_bus_it_takes_a_persons_word_and_a_new_key(tmp_path: Path) -> None:
@@ -72,3 +67,35 @@ def test_a_pending_key_out_of_a_backup_counts_for_no_rotation(tmp_path: Path) ->
     station.keys.demand_rotation(board.uuid, "others may have it")
     assert {record.source for record in station.keys.of(board.uuid) if record.state == "pending"} == {"import"}
     station.close()
+
+
+def test_a_pending_key_that_came_back_and_opens_is_no_rotation(tmp_path: Path) -> None:
+    """Model, OLD_PENDING: the node took the key of the cut agreement, and so may others have since the backup."""
+    board = Board()
+    station = make_station(tmp_path / "home")
+    key_up(station, board)
+    board.flash.die_after = True
+    with talk(board) as node, pytest.raises(NodeSilent):
+        agree(station, node, identify(station, node), rotate=True)
+    assert [(state, epoch) for state, epoch, *_ in held(station, board)] == [("pending", 2), ("active", 1)]
+    again = back(station, tmp_path)
+    assert {record.source for record in again.keys.of(board.uuid) if record.state == "pending"} == {"agreement"}
+    with talk(board) as node:
+        opened = open_session(again, node)
+        assert opened is not None
+        assert opened.record.epoch == 2
+    assert again.keys.restored(board.uuid), "that key is as old as the backup"
+    with talk(board) as node:
+        assert require_session(again, node).record.epoch == 3
+    assert again.keys.rotation_due(board.uuid) is None
+    again.close()
+
+
+def back(station: Station, tmp_path: Path) -> Station:
+    """The station as it comes back from a backup of now."""
+    backup(station, tmp_path / "b", ask, costs=THROWAWAY)
+    station.close()
+    forget_vaults()
+    with SealedFile(tmp_path / "b").open_with_passphrase(PASSPHRASE) as content:
+        rebuild(tmp_path / "new", content, ask, costs=THROWAWAY)
+    return Station.open(tmp_path / "new", ask=ask)

@@ -42,12 +42,13 @@ class Node:
 
 
 class Scene:
-    def __init__(self, driven: Answer) -> None:
+    def __init__(self, driven: Answer, dead_man: int = 10_000) -> None:
         self.node, self.messages, self.told, self.applied = Node(driven), list[bytes](), list[str](), list[Block]()
         node: Any = self.node
+        self.turn = threading.Lock()
         self.actuators = TopicActuators(
-            Trusted(node, SHEET, "00" * 32, "g"), self.messages.append, (1,), dead_man=10_000, clock=clock(10**9),
-            turn=threading.Lock(), mapping=threading.Lock(), echo=self.applied.append, tell=self.told.append,
+            Trusted(node, SHEET, "00" * 32, "g"), self.messages.append, (1,), dead_man=dead_man, clock=clock(10**9),
+            turn=self.turn, mapping=threading.Lock(), echo=self.applied.append, tell=self.told.append,
         )  # fmt: skip
 
     def give(self, count: int) -> None:
@@ -108,3 +109,39 @@ def test_a_claim_that_is_gone_says_nothing_about_drive() -> None:
     assert scene.node.asked == 2
     assert scene.messages
     assert not scene.told
+
+
+def test_a_set_point_older_than_the_dead_man_moves_nothing_and_is_told() -> None:
+    scene = Scene(lambda: reply(1))
+    for age in (10.5, 9.0):
+        scene.actuators.take(SetPoint(SHEET.uuid.hex(), 1, 0.05, time.monotonic() - age))
+        until(lambda: len(scene.applied) + scene.actuators.refused > 0)
+        if age > 10:
+            assert (scene.node.values, scene.applied, scene.messages, scene.actuators.refused) == (0, [], [], 1)
+            assert "10.5" in scene.told[0]
+            assert "dead-man is 10000 ms" in scene.told[0]
+            scene.actuators.refused = 0
+    scene.actuators.close()
+    assert scene.actuators.refused == 0, "a younger one is applied"
+    assert scene.node.values == len(scene.applied) == 1
+
+
+def test_a_set_point_that_grew_old_while_the_node_was_busy_moves_nothing() -> None:
+    """It was young when it came; the node's turn was somebody else's until its dead-man had run out."""
+    scene = Scene(lambda: reply(1), dead_man=300)
+    with scene.turn:
+        scene.actuators.take(SetPoint(SHEET.uuid.hex(), 1, 0.05, time.monotonic()))
+        time.sleep(0.5)  # that much time, and nothing else, is what makes it old
+    until(lambda: scene.actuators.refused > 0)
+    scene.actuators.close()
+    assert (scene.node.values, scene.applied, scene.messages) == (0, [], [])
+    assert "s old" in scene.told[0]
+
+
+def test_a_set_point_beyond_the_limits_moves_nothing_and_is_told() -> None:
+    scene = Scene(lambda: reply(1))
+    scene.actuators.take(SetPoint(SHEET.uuid.hex(), 1, 5.0, time.monotonic()))
+    until(lambda: scene.actuators.refused > 0)
+    scene.actuators.close()
+    assert (scene.node.values, scene.applied, scene.messages) == (0, [], [])
+    assert scene.told

@@ -12,6 +12,7 @@ import threading
 import time
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -191,6 +192,38 @@ def test_tokens_that_are_made_at_once_are_all_kept(tmp_path: Path) -> None:
     after = Tokens(tmp_path)
     assert all(after.find(token) is not None for token in made)
     assert after.find("nonsense") is None
+
+
+def test_a_browser_is_let_in_for_thirty_days_and_its_login_link_for_five_minutes(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    now = SimpleNamespace(wall=1_800_000_000.0, up=1000.0)
+    clock = SimpleNamespace(time=lambda: now.wall, monotonic=lambda: now.up)
+    monkeypatch.setattr("teds_provision.ncap.web.tokens.time", clock)
+    tokens = Tokens(tmp_path)
+    script, late = tokens.add("script"), tokens.login_link()
+    cookie = tokens.login(tokens.login_link(read_only=True))
+    assert cookie is not None
+    now.up += 301
+    assert tokens.login(late) is None
+    now.wall += 30 * 86_400 - 1
+    found = tokens.find(cookie)
+    assert found is not None
+    assert found.read_only
+    now.wall += 2
+    for each in (tokens, Tokens(tmp_path)):
+        assert each.find(cookie) is None, "the daemon has it in memory, and the file still names it"
+        assert [one.name for one in each.all()] == ["script"]
+        assert each.find(script) is not None
+    tokens.add("another")
+    assert "browser" not in (tmp_path / "ncap-tokens.json").read_text()
+
+
+def test_of_a_hundred_browsers_the_oldest_is_forgotten(tmp_path: Path) -> None:
+    tokens = Tokens(tmp_path)
+    cookies = [tokens.login(tokens.login_link()) or "" for _ in range(101)]
+    good = [tokens.find(cookie) is not None for cookie in cookies]
+    assert good == [False] + [True] * 100
 
 
 def test_the_login_works_once_and_leaves_a_cookie_that_scripts_cannot_read(service: Service) -> None:

@@ -8,13 +8,14 @@ from pathlib import Path
 import pytest
 
 from teds_provision.errors import NotWhitelisted
+from teds_provision.protocol.datasheet import sign_datasheet
 from teds_provision.protocol.keys import SoftwareKey, fingerprint, station_key_message
 from teds_provision.protocol.messages.identity import Identity
 from teds_provision.station.station import Station
-from teds_provision.steps.agree import require_session
+from teds_provision.steps.agree import agree, require_session
 from teds_provision.steps.identify import identify
 from teds_provision.steps.read import read_image
-from teds_provision.steps.verify import Known, Verified, verify_image
+from teds_provision.steps.verify import Known, Verified, known_of, verify_image
 from teds_provision.steps.verify_node import verify_node
 from teds_provision.store import TrustRecord
 from teds_provision.teds.codec import security
@@ -190,6 +191,43 @@ def test_a_datasheet_of_a_later_epoch_is_caught(station: Station, board: Board, 
     assert failed(station, image, identity) == ["key epoch"]
 
 
+def test_an_epoch_older_than_one_that_was_seen_is_caught_without_a_session_too(station: Station, board: Board) -> None:
+    """The node is at hand through somebody's recording: its sequence alone could be the newest."""
+    old = run(station, board).image
+    with talk(board) as node:
+        agree(station, node, identify(station, node), rotate=True)
+    new = run(station, board).image
+    known = known_of(station, board.uuid, None)
+    assert (known.identity, known.sequence, known.key_epoch) == (None, 2, 2)
+    for image, expected in ((old, "failed"), (new, "passed")):
+        checks = {check.name: check for check in verify_image(station, image, known=replace(known, sequence=1))}
+        assert (checks["key epoch"].result, checks["sequence"].result) == (expected, "passed")
+    (check,) = [one for one in verify_image(station, old, known=known) if one.name == "key epoch"]
+    assert check.why == "signed for epoch 1, older than the 2 that this station saw"
+
+
+def test_what_a_stranger_signed_is_no_floor_for_sequence_and_epoch(
+    station: Station, board: Board, tmp_path: Path
+) -> None:
+    image = run(station, board).image
+    stranger = make_station(tmp_path / "stranger")
+    ours = security.decode(image.blocks[SECURITY])
+    theirs = replace(
+        ours,
+        signature=None,
+        sequence=900,
+        key_epoch=900,
+        station_key=stranger.point,
+        station_key_signature=stranger.credentials().station_signature,
+    )
+    signed = sign_datasheet(theirs, board.uuid, stranger.credentials())
+    station.nodes.keep_datasheet(image.with_block(SECURITY, signed))
+    assert known_of(station, board.uuid, None) == Known()
+    broken = replace(ours, sequence=900, key_epoch=900).encode()
+    station.nodes.keep_datasheet(image.with_block(SECURITY, broken))
+    assert known_of(station, board.uuid, None) == Known(), "field 100 is not over these numbers"
+
+
 def test_what_is_not_whitelisted_cannot_be_signed(station: Station, board: Board, image: Image) -> None:
     from teds_provision.steps.visits.sign_command import SignOrder, sign_image
 
@@ -199,7 +237,6 @@ def test_what_is_not_whitelisted_cannot_be_signed(station: Station, board: Board
 
 
 def test_the_same_build_signed_as_draft_and_as_file_has_one_signature(station: Station, board: Board) -> None:
-    from teds_provision.steps.agree import agree
     from teds_provision.steps.build import build
     from teds_provision.steps.visits.sign_command import SignOrder, sign_image
 
