@@ -26,6 +26,7 @@ from teds_provision.teds.profile import (
     load_profile,
     passed_over,
     shipped_profiles,
+    template,
 )
 from teds_provision.teds.profile.reader import key_lines
 from teds_provision.teds.units import parse_unit
@@ -402,12 +403,12 @@ y = 3
 
 
 def test_the_template_is_a_profile_without_errors_and_names_every_key(tmp_path: Path) -> None:
-    profile, problems = check(write(tmp_path, "fresh", keys("fresh")))
+    profile, problems = check(write(tmp_path, "fresh", template("fresh")))
     assert isinstance(profile, Profile)
     assert [problem for problem in problems if problem.severity == "error"] == []
     uncommented = "\n".join(
         line[2:] if line.startswith("# ") and ("=" in line.split("#")[1] or line[2:].startswith("[")) else line
-        for line in keys("fresh").splitlines()
+        for line in template("fresh").splitlines()
         if "extends" not in line and "models:" not in line and "modes:" not in line
     )
     full, problems = check(write(tmp_path, "full", uncommented.replace("members = [1, 2]", "members = [1]")))
