@@ -12,13 +12,13 @@ from operator import attrgetter
 from pathlib import Path
 from typing import Final
 
+from teds_provision import teds
 from teds_provision.errors import BadData, NotFound, PolicyRefused, TedsProvisionError
 from teds_provision.files import read_limited
 from teds_provision.limits import LIMITS
 from teds_provision.station.station import Station
 from teds_provision.steps.judging import Judging, remember
 from teds_provision.steps.verify import Check, Verified, require_authentic, verify_images
-from teds_provision.teds import guard
 from teds_provision.teds.codec.codes import AccessCode
 from teds_provision.teds.image import Image
 
@@ -231,7 +231,7 @@ def _with_warnings(result: FileVerdict, image: Image) -> FileVerdict:
     """Look at the calibrations, as every command does before it trusts a datasheet."""
     if not any(code == AccessCode.CALIBRATION for _, code in image.blocks):
         return result  # and the guard is not loaded
-    findings = guard.check_calibration(image.unsigned_blocks())
+    findings = teds.guard.check_calibration(image.unsigned_blocks())
     texts = tuple(f"channel {finding.channel}: {finding.message}" for finding in findings)
     harmful = [text for text, finding in zip(texts, findings, strict=True) if finding.severity == "error"]
     whole = FileVerdict(result.path, result.uuid, result.verdict, result.checks, texts)
