@@ -24,6 +24,7 @@ from teds_provision.protocol.keys import (
 from teds_provision.protocol.messages.frames import Command, Function, Reason, security_command
 from teds_provision.protocol.messages.identity import NodeState
 from teds_provision.protocol.session import OPEN_OCTETS
+from teds_provision.teds.image import SECURITY
 
 _OFF_CURVE = b"\x04" + bytes(64)
 
@@ -127,7 +128,8 @@ def agree(probe: Probe, credentials: Credentials, *, epoch: int) -> AgreedKey:
     """Send a good Request and check its reply; nothing is kept on either side yet. Raises as ``accept`` does."""
     agreement = StationAgreement(credentials, probe.uuid)
     reply = probe.good(agreement.request())
-    return agreement.accept(reply, pinned=fingerprint(probe.security().node_key), epoch=epoch)
+    teds = probe.teds(SECURITY)
+    return agreement.accept(reply, teds, pinned=fingerprint(probe.security().node_key), epoch=epoch)
 
 
 @rule("confirm-checks", "Key agreement", Stage.AGREEMENT)

@@ -8,19 +8,18 @@ import os
 import secrets
 import time
 from collections.abc import Mapping
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 from teds_provision.errors import BadData, NotFound, StoreFailure, StoreLocked, UsageFailure
 from teds_provision.files import whole_file
 from teds_provision.protocol.announce import default_can_address
-from teds_provision.protocol.flash import Flash, FlashFailure
+from teds_provision.protocol.flash import Flash, FlashFailure, in_factory_state
 from teds_provision.protocol.keys import SoftwareKey, node_key_message
-from teds_provision.teds.image import SECURITY, BlockId
+from teds_provision.teds.image import BlockId
 
-FORMAT = "teds-virtual-node/2"
-_OLDER = "teds-virtual-node/1"
+FORMAT = "teds-virtual-node/3"
+_OLDER = ("teds-virtual-node/1", "teds-virtual-node/2")
 FILE = "flash.json"
 
 
@@ -158,16 +157,15 @@ class FlashFile:
 
 
 def _migrated(document: dict[str, Any]) -> dict[str, Any]:
-    """A flash of the first round, whose node spoke SessionSuite 1: as a board is after the firmware that speaks 2.
+    """A flash whose node spoke KeyAgreement 1, as the board is after firmware that speaks 2: in factory state.
 
-    Keys, epoch, sequence and the other TEDS stay. The signed Security TEDS names the older suite and counts no more, so
-    the node is keyed and shows its initial one until the next commit. Written with the next commit.
+    Identity key, UUID, epoch, sequence and address stay, and the other TEDS, which count as unsigned. What was agreed
+    under KeyAgreement 1 goes: link key, CA, station, and the Security TEDS that names it. Written with the next commit.
     """
-    if document["format"] != _OLDER:
+    if document["format"] not in _OLDER:
         return document
-    flash = _flash_from_json(document["flash"])
-    blocks = {block: teds for block, teds in flash.blocks.items() if block != SECURITY}
-    return {**document, "format": FORMAT, "flash": _flash_to_json(replace(flash, blocks=blocks, provisioned=False))}
+    flash = in_factory_state(_flash_from_json(document["flash"]))
+    return {**document, "format": FORMAT, "flash": _flash_to_json(flash)}
 
 
 def _unusable(folder: Path, error: OSError) -> StoreFailure:

@@ -1,7 +1,9 @@
-"""Key agreement: Request, Confirm, and the link key they give (profile.md, "Key agreement").
+"""Key agreement 2: Request, Confirm, and the link key they give (profile.md, "Key agreement").
 
-NIST SP 800-56A rev. 3 scheme C(1e, 2s, ECC CDH) with bilateral key confirmation; HKDF of RFC 5869. Pure: no I/O, both
-roles. Python cannot wipe memory reliably; Z and OKM live in local names only and are dropped on return.
+ECC CDH of NIST SP 800-56A rev. 3 over two one-time keys and the station's static one, with bilateral key confirmation;
+the node's identity key signs the transcript, as in SIGMA, and agrees on nothing. HKDF of RFC 5869. Pure: no I/O, both
+roles. Python cannot wipe memory reliably; Z, OKM and the one-time keys live in local names only, or go with the object
+that made them.
 """
 
 from __future__ import annotations
@@ -14,15 +16,27 @@ from dataclasses import dataclass, field
 from cryptography.hazmat.primitives import hashes
 from cryptography.hazmat.primitives.kdf.hkdf import HKDF
 
-from teds_provision.errors import Garbled, NotAuthentic, OtherKey, PolicyRefused
+from teds_provision.errors import BadData, Garbled, NotAuthentic, OtherKey, PolicyRefused
 from teds_provision.protocol.fingerprints import same_key
-from teds_provision.protocol.keys import PrivateKey, SoftwareKey, fingerprint, is_point, node_key_good
+from teds_provision.protocol.keys import (
+    POINT_OCTETS,
+    SIGNATURE_OCTETS,
+    PrivateKey,
+    SoftwareKey,
+    agreement_message,
+    fingerprint,
+    is_point,
+    node_key_good,
+    verify,
+)
 from teds_provision.protocol.messages.frames import Command, Function, security_command
 from teds_provision.teds.codec import security
+from teds_provision.teds.codec.security import SecurityTeds
 
-REQUEST_OCTETS = 65 + 64 + 65 + 65
-REPLY_HEAD_OCTETS = 16 + 4 + 16
+NONCE_OCTETS = 16
 TAG_OCTETS = 16
+REQUEST_OCTETS = POINT_OCTETS + SIGNATURE_OCTETS + POINT_OCTETS + POINT_OCTETS
+REPLY_OCTETS = NONCE_OCTETS + 4 + POINT_OCTETS + TAG_OCTETS + SIGNATURE_OCTETS
 LAST_EPOCH = 0xFFFFFFFF
 
 
@@ -68,16 +82,21 @@ def key_id(key: bytes) -> bytes:
     return hashlib.sha256(b"TEDS1 key id\0" + key).digest()[:8]
 
 
-def transcript(request: bytes, nonce: bytes, epoch: int, uuid: bytes, node: bytes, teds: bytes) -> bytes:
-    """T: SHA-256 over the label, the request payload, nonceN, epoch, UUID, P(node) and the hash of the TEDS."""
+def transcript(
+    request: bytes, nonce: bytes, epoch: int, one_time: bytes, uuid: bytes, node: bytes, teds: bytes
+) -> bytes:
+    """T: SHA-256 over the label, the request payload, nonceN, epoch, En, UUID, P(node) and the hash of the TEDS.
+
+    ``one_time`` is En, 65 octets; ``teds`` the node's Security TEDS as it is when Request is run, Length to Checksum.
+    """
     digest = hashlib.sha256(teds).digest()
     return hashlib.sha256(
-        b"TEDS1 transcript\0" + request + nonce + epoch.to_bytes(4, "big") + uuid + node + digest
+        b"TEDS1 transcript\0" + request + nonce + epoch.to_bytes(4, "big") + one_time + uuid + node + digest
     ).digest()
 
 
 def derive(shared: bytes, nonce: bytes, script: bytes) -> LinkKey:
-    """Link key and tags from Z (64 octets), nonceN and T."""
+    """Link key and tags from Z = ECDH(E, En) ‖ ECDH(station, En) (64 octets), nonceN and T."""
     okm = HKDF(hashes.SHA256(), 48, nonce, b"TEDS1 link key\0" + script).derive(shared)
     key, confirmation = okm[:16], okm[16:]
     return LinkKey(
@@ -91,7 +110,7 @@ def derive(shared: bytes, nonce: bytes, script: bytes) -> LinkKey:
 class AgreedKey:
     """What the station has after a good Request: the key to store as pending, and the Confirm to send then.
 
-    ``unsigned`` says that the node shows its initial Security TEDS: authentic, since the transcript covers it.
+    ``unsigned`` says that the node shows its initial Security TEDS: authentic, since sigN covers the transcript.
     """
 
     key: bytes = field(repr=False)
@@ -104,6 +123,27 @@ class AgreedKey:
     def key_id(self) -> bytes:
         """KeyId of the new key, 8 octets."""
         return key_id(self.key)
+
+
+class OtherTranscript(NotAuthentic):
+    """A wrong tagN: the node's Security TEDS changed meanwhile, or the reply was disturbed. It accuses nobody."""
+
+
+def fit_to_agree(teds: bytes, uuid: bytes, pinned: str | None) -> SecurityTeds:
+    """What a node's Security TEDS must be before a Request is made: canonical, this profile's values, its own key.
+
+    ``pinned`` is the fingerprint that the whitelist holds, None where this contact pins. Raises NotCanonical, BadData
+    (another ProfileVersion, SessionSuite or KeyAgreement, by name), OtherKey, NotAuthentic (field 102).
+    """
+    shown = security.decode(teds)
+    if other := security.other_wire(shown):
+        raise BadData(f"This node speaks {other}.", hint="It needs firmware of this version of the profile.")
+    node = shown.node_key
+    if pinned is not None and not same_key(pinned, fingerprint(node)):
+        raise other_key(pinned, node)
+    if not node_key_good(uuid, node, shown.node_key_signature):
+        raise NotAuthentic("The node's key is not signed for this UUID (field 102): it belongs to another node.")
+    return shown
 
 
 class StationAgreement:
@@ -121,33 +161,43 @@ class StationAgreement:
         """Return the Request to send."""
         return security_command(Function.REQUEST, self._payload)
 
-    def accept(self, reply: bytes, *, pinned: str | None, epoch: int) -> AgreedKey:
-        """Check the reply's payload and derive the key.
+    def accept(self, reply: bytes, teds: bytes, *, pinned: str | None, epoch: int) -> AgreedKey:
+        """Check the reply's payload and derive the key; checked in this order: length, En, tagN, sigN, epoch.
 
-        ``pinned`` is the fingerprint that the whitelist holds, None where none is pinned yet; ``epoch`` that of the
-        current key, 0 for none. Raises Garbled, OtherKey, PolicyRefused (epoch) or NotAuthentic (102, tagN).
+        ``teds`` is the node's Security TEDS, read before on this link (in a session: in it); ``pinned`` as in
+        :func:`fit_to_agree`; ``epoch`` that of the current key, 0 for none. Raises what :func:`fit_to_agree` raises,
+        Garbled (length), NotAuthentic (En, sigN), OtherTranscript (tagN), PolicyRefused (epoch).
         """
-        if len(reply) < REPLY_HEAD_OCTETS:
-            raise Garbled(f"The reply to Request has {len(reply)} octets; {REPLY_HEAD_OCTETS} and a TEDS are due.")
-        nonce, offered, tag, teds = reply[:16], int.from_bytes(reply[16:20], "big"), reply[20:36], reply[36:]
-        shown = security.decode(teds)
-        node = shown.node_key
-        if pinned is not None and not same_key(pinned, fingerprint(node)):
-            raise other_key(pinned, node)
-        if node in (self._credentials.key.point, self._one_time.point) or not is_point(node):
-            raise NotAuthentic("The node's public key is not a valid point, or is this station's own.")
-        if not node_key_good(self._uuid, node, shown.node_key_signature):
-            raise NotAuthentic("The node's key is not signed for this UUID (field 102): it belongs to another node.")
+        shown = fit_to_agree(teds, self._uuid, pinned)
+        node, station = shown.node_key, self._credentials.key
+        if node in (station.point, self._one_time.point):
+            raise NotAuthentic("The key that the node shows is this station's own.")
+        if len(reply) != REPLY_OCTETS:
+            raise Garbled(f"The reply to Request has {len(reply)} octets, not {REPLY_OCTETS}.")
+        nonce, reply = reply[:NONCE_OCTETS], reply[NONCE_OCTETS:]
+        offered, one_time = int.from_bytes(reply[:4], "big"), reply[4 : 4 + POINT_OCTETS]
+        tag, signature = reply[4 + POINT_OCTETS : -SIGNATURE_OCTETS], reply[-SIGNATURE_OCTETS:]
+        if not good_one_time(one_time, self._one_time.point, station.point, node):
+            raise NotAuthentic(
+                "The node's one-time key in its reply to Request is not a valid point, or is no one-time key."
+            )
+        script = transcript(self._payload, nonce, offered, one_time, self._uuid, node, teds)
+        derived = derive(self._one_time.ecdh(one_time) + station.ecdh(one_time), nonce, script)
+        if not hmac.compare_digest(derived.node_tag, tag):
+            raise OtherTranscript(
+                "The node's confirmation tag (tagN) is wrong: it made it over another Request or Security TEDS.",
+                hint="A disturbed link does this, or a node with another owner's hand on it: try again at the reader.",
+            )
+        if not verify(node, agreement_message(script), signature):
+            raise NotAuthentic(
+                "The node's signature on the agreement (sigN) is wrong: it does not hold the key that it shows.",
+                hint="This may be a copied tag, or somebody answers in its place. Do not use it.",
+            )
         if offered <= epoch:
             raise PolicyRefused(
                 f"The node offers key epoch {offered}; this station already holds epoch {epoch}.",
                 hint="The node may be a copy or was restored; take it to the bench and reset it by hand.",
             )
-        script = transcript(self._payload, nonce, offered, self._uuid, node, teds)
-        shared = self._one_time.ecdh(node) + self._credentials.key.ecdh(node)
-        derived = derive(shared, nonce, script)
-        if not hmac.compare_digest(derived.node_tag, tag):
-            raise NotAuthentic("The node's confirmation tag is wrong: it does not hold the key that it shows.")
         confirm = security_command(Function.CONFIRM, derived.station_tag)
         return AgreedKey(derived.key, offered, node, confirm, unsigned=not shown.signed)
 
@@ -173,17 +223,35 @@ class NodeAgreement:
 
     @classmethod
     def answer(
-        cls, node: PrivateKey, uuid: bytes, payload: bytes, *, epoch: int, teds: bytes, nonce: bytes | None = None
+        cls,
+        node: PrivateKey,
+        uuid: bytes,
+        payload: bytes,
+        *,
+        epoch: int,
+        teds: bytes,
+        nonce: bytes | None = None,
+        one_time: PrivateKey | None = None,
     ) -> NodeAgreement:
-        """Answer a Request whose points and signature were checked; ``epoch`` is the stored epoch + 1."""
+        """Answer a Request whose points and signature were checked; ``epoch`` is the stored epoch + 1.
+
+        ``node``, the identity key, signs and does nothing else; ``one_time`` is the key of En, for this Request alone.
+        """
         request = RequestPayload.decode(payload)
-        nonce = os.urandom(16) if nonce is None else nonce
-        script = transcript(payload, nonce, epoch, uuid, node.point, teds)
-        derived = derive(node.ecdh(request.one_time) + node.ecdh(request.station), nonce, script)
-        reply = nonce + epoch.to_bytes(4, "big") + derived.node_tag + teds
+        nonce = os.urandom(NONCE_OCTETS) if nonce is None else nonce
+        one_time = SoftwareKey.generate() if one_time is None else one_time
+        script = transcript(payload, nonce, epoch, one_time.point, uuid, node.point, teds)
+        derived = derive(one_time.ecdh(request.one_time) + one_time.ecdh(request.station), nonce, script)
+        proof = node.sign(agreement_message(script))
+        reply = nonce + epoch.to_bytes(4, "big") + one_time.point + derived.node_tag + proof
         return cls(reply, derived.key, derived.station_tag, epoch, request.station, request.ca)
 
 
 def good_point(point: bytes, own: bytes) -> bool:
     """Strict decoding of a point: on the curve, not infinity, not one's own."""
     return point != own and is_point(point)
+
+
+def good_one_time(point: bytes, *others: bytes) -> bool:
+    """Whether ``point`` may be the other side's one-time key: a point, none of one's own, nor a static one at hand."""
+    return point not in others and is_point(point)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Protocol
 
 from teds_provision.protocol.messages.identity import NodeState
@@ -56,6 +56,12 @@ class Flash:
     def present(self) -> list[BlockId]:
         """Every TEDS on the node, ascending."""
         return sorted({*self.blocks, SECURITY})
+
+
+def in_factory_state(flash: Flash) -> Flash:
+    """No key, no CA, no station, initial Security TEDS; identity, epoch, sequence, address and other TEDS stay."""
+    blocks = {block: teds for block, teds in flash.blocks.items() if block != SECURITY}
+    return replace(flash, key=None, ca=None, station=None, provisioned=False, blocks=blocks)
 
 
 class FlashMemory(Protocol):

@@ -185,6 +185,11 @@ def station_key_message(station: bytes) -> bytes:
     return b"TEDS1 station key\0" + station
 
 
+def agreement_message(script: bytes) -> bytes:
+    """What sigN of the reply to Request signs; ``script`` is T, 32 octets."""
+    return b"TEDS1 agree\0" + script
+
+
 def prove_message(uuid: bytes, challenge: bytes) -> bytes:
     """What the reply to Prove signs."""
     return b"TEDS1 prove\0" + uuid + challenge

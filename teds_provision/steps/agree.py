@@ -9,7 +9,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 from teds_provision.errors import BadData, Garbled, LinkFailure, NodeRefused, NodeSilent, NotAuthentic, PolicyRefused
-from teds_provision.protocol.agreement import StationAgreement
+from teds_provision.protocol.agreement import AgreedKey, OtherTranscript, StationAgreement, fit_to_agree
 from teds_provision.protocol.datasheet import signature_good, station_signature_good
 from teds_provision.protocol.keys import fingerprint
 from teds_provision.protocol.messages.frames import Reason
@@ -112,7 +112,7 @@ def session_if_keyed(station: Station, node: Conversation) -> NodeKey | None:
     if held is None or not due or entry is None:
         return held
     try:
-        _agree_anew(station, node, entry, station.keys.ca_of(node.uuid))
+        _agree_anew(station, node, entry, station.keys.ca_of(node.uuid), read_block(node, SECURITY))
     except SessionLost as lost:
         raise lost.cause from lost
     return next(iter(station.keys.unwrapped(node.uuid)))
@@ -272,7 +272,9 @@ def _new_key(
     pinned = _pin_for(entry, node, who)
     ca = station.ca if new else station.keys.ca_of(node.uuid)
     try:
-        return _agree_anew(station, node, pinned, ca, returning=returning, only_new=new and not demanded)
+        # outside a session what the identification read stands: on this link, a moment ago
+        teds = read_block(node, SECURITY) if node.sealed else who.security_teds
+        return _agree_anew(station, node, pinned, ca, teds, returning=returning, only_new=new and not demanded)
     except NodeRefused as refusal:
         # Identify may have been answered while the node was still storing the key of a run that was cut off
         late = refusal.reason == Reason.NOT_PERMITTED and new and not demanded
@@ -338,21 +340,27 @@ def _agree_anew(
     node: Conversation,
     entry: WhitelistEntry,
     ca: bytes,
+    teds: bytes,
     *,
     returning: bool = False,
     only_new: bool = False,
 ) -> Agreed:
     """Request, Confirm, Open; ``ca`` is the one that the node keeps, or shall keep from now on.
 
+    ``teds`` is the node's Security TEDS as it was read on this link, in the session where there is one.
     ``returning`` nodes were given away: only a signed-for initial Security TEDS shows that they were reset since.
     ``only_new``: nobody said that a node may be taken over. Identify, which called it new, is a hint.
     """
     uuid = node.uuid
-    agreement = StationAgreement(station.identity.credentials(ca), uuid)
-    reply = node.sure(agreement.request(), "the key agreement")  # it lies in RAM only, and goes at the next one
-    with station.reading():
-        epoch = station.pins.epoch_to_exceed(uuid, entry.fingerprint)
-    agreed = agreement.accept(reply, pinned=entry.fingerprint, epoch=epoch)
+    try:
+        agreed = _request(station, node, entry, ca, teds)
+    except OtherTranscript:  # the TEDS has changed since it was read, or the reply was disturbed: once more, then no
+        again = read_block(node, SECURITY)
+        if fit_to_agree(again, uuid, entry.fingerprint).node_key != fit_to_agree(teds, uuid, None).node_key:
+            raise NotAuthentic(
+                "The node showed one key and then another one.", hint="Two boards answer, or a copied tag. Look first."
+            ) from None
+        agreed = _request(station, node, entry, ca, again)
     key_id = agreed.key_id.hex()
     if returning and not agreed.unsigned:
         station.policy.require_not_given_away(uuid)
@@ -385,3 +393,13 @@ def _agree_anew(
         station.pins.settled(uuid)
         station.audit("agree", uuid, "done", key_id=key_id, epoch=agreed.epoch)
     return Agreed(agreed.epoch, key_id, fresh=True)
+
+
+def _request(station: Station, node: Conversation, entry: WhitelistEntry, ca: bytes, teds: bytes) -> AgreedKey:
+    """One Request with a one-time key of its own, and its reply checked; nothing is kept on either side yet."""
+    fit_to_agree(teds, node.uuid, entry.fingerprint)
+    agreement = StationAgreement(station.identity.credentials(ca), node.uuid)
+    reply = node.sure(agreement.request(), "the key agreement")  # it lies in RAM only, and goes at the next one
+    with station.reading():
+        epoch = station.pins.epoch_to_exceed(node.uuid, entry.fingerprint)
+    return agreement.accept(reply, teds, pinned=entry.fingerprint, epoch=epoch)

@@ -202,8 +202,8 @@ def _form(image: Image) -> Check:
 def _algorithms(shown: SecurityTeds) -> Check:
     wrong = [number for number, value in security.OUR_VALUES.items() if shown.values[number] != value]
     why = "weak or unknown choice in field " + ", ".join(map(str, wrong))
-    if wrong == [security.SESSION_SUITE] and shown.values[security.SESSION_SUITE] == security.OLDER_SUITE:
-        why = "field 109 names the older session suite 1: write the datasheet anew"
+    if other := security.other_wire(shown):
+        why = f"it names {other}"
     return _check("algorithms", not wrong, why, "ECDSA P-256, SHA-256, AES-128")
 
 

@@ -141,8 +141,8 @@ def a_refused_commit_counts(patch: Patch) -> None:
 
 
 def _reset_to(change: Callable[[Flash, Flash], Flash]) -> Callable[[Patch], None]:
-    original = node._factory
-    return lambda patch: patch.setattr(node, "_factory", lambda flash: change(flash, original(flash)))
+    original = node.in_factory_state
+    return lambda patch: patch.setattr(node, "in_factory_state", lambda flash: change(flash, original(flash)))
 
 
 def _lenient(verified: Any) -> Any:

@@ -68,23 +68,25 @@ def test_a_folder_that_cannot_be_used_is_named(tmp_path: Path) -> None:
         FlashFile(tmp_path / "nothing", exclusive=True)
 
 
-def test_a_flash_of_the_first_round_is_migrated(tmp_path: Path) -> None:
-    """Its node spoke SessionSuite 1: everything stays but the signed Security TEDS, which names that suite."""
+@pytest.mark.parametrize("older", ["teds-virtual-node/1", "teds-virtual-node/2"])
+def test_a_flash_of_key_agreement_1_wakes_in_factory_state_with_its_identity(tmp_path: Path, older: str) -> None:
     desk = Desk().provision()
     path = FlashFile.create(tmp_path / "node", uuid=UUID).path
     made = FlashFile(tmp_path / "node")
-    made.commit(replace(desk.flash, node_key=made.key.point))
+    made.commit(replace(desk.flash, node_key=made.key.point, can_address=77))
     document = json.loads(path.read_text())
-    path.write_text(json.dumps({**document, "format": "teds-virtual-node/1"}))
+    path.write_text(json.dumps({**document, "format": older}))
 
     migrated = FlashFile(tmp_path / "node")
     state = migrated.load()
-    assert (state.state, state.key, state.epoch, state.sequence) == (NodeState.KEYED, desk.key, 1, 1)
-    assert (state.ca, state.station) == (desk.flash.ca, desk.flash.station)
+    assert (state.state, state.key, state.ca, state.station) == (NodeState.FACTORY, None, None, None)
+    assert (state.uuid, state.epoch, state.sequence, state.can_address) == (UUID, 1, 1, 77)
+    assert migrated.key.point == made.key.point
     assert state.blocks == {block: teds for block, teds in desk.flash.blocks.items() if block != SECURITY}
-    assert security.decode(state.security_teds()).values == security.OUR_VALUES
+    shown = security.decode(state.security_teds())
+    assert (shown.values, shown.signed) == (security.OUR_VALUES, False)
     migrated.commit(replace(state, sequence=2))
-    assert json.loads(path.read_text())["format"] == "teds-virtual-node/2"
+    assert json.loads(path.read_text())["format"] == "teds-virtual-node/3"
     assert FlashFile(tmp_path / "node").load() == replace(state, sequence=2)
 
 
@@ -114,7 +116,9 @@ def test_every_point_operation_of_an_agreement_and_a_proof_is_slow(
     node = VirtualNode(tmp_path / "node", delays=Delays(crypto=0.25))
     request = StationAgreement(CREDENTIALS, UUID).request().encode()
     assert decode_reply(node.request("nfc", request, tapped=True)).ok
-    assert slept == [0.25] * 3, "SIG104 is checked, and two ECDH"
+    pair = slept.pop(1)
+    assert 0 < pair <= 0.25, "the chip began with the one-time key pair at its start"
+    assert slept == [0.25] * 4, "SIG104 is checked, two ECDH, and sigN"
     prove = security_command(Function.PROVE, bytes(32)).encode()
     assert decode_reply(node.request("nfc", prove, tapped=True)).ok
-    assert slept == [0.25] * 4
+    assert slept == [0.25] * 5

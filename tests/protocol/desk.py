@@ -79,7 +79,8 @@ class Desk:
         agreement = StationAgreement(credentials, UUID)
         reply = self.plain(agreement.request(), link=link, tapped=tapped)
         assert reply.ok, f"Request refused: {reply.reason}"
-        agreed = agreement.accept(reply.payload, pinned=fingerprint(NODE.point), epoch=self.flash.epoch)
+        teds, epoch = self.flash.security_teds(), self.flash.epoch
+        agreed = agreement.accept(reply.payload, teds, pinned=fingerprint(NODE.point), epoch=epoch)
         assert self.plain(agreed.confirm, link=link, tapped=tapped) == Reply(True)
         self.key = agreed.key
         return self

@@ -7,7 +7,7 @@ import zlib
 import pytest
 
 from teds_provision.protocol import keys
-from teds_provision.protocol.agreement import Credentials, StationAgreement
+from teds_provision.protocol.agreement import Credentials, StationAgreement, derive
 from teds_provision.protocol.datasheet import NodeKeys, sign_datasheet, unsigned_datasheet
 from teds_provision.protocol.flash import Flash
 from teds_provision.protocol.keys import SoftwareKey
@@ -15,6 +15,7 @@ from teds_provision.protocol.messages.frames import Command, decode_reply
 from teds_provision.protocol.session import StationSession, pad
 from teds_provision.protocol.tim import Tim
 from teds_provision.teds.codec import security
+from teds_provision.teds.image import SECURITY
 
 from .kat import KAT, UUID, key, octets
 from .memory import RamFlash
@@ -22,7 +23,7 @@ from .memory import RamFlash
 CREDENTIALS = Credentials(key("station"), octets("sig104", "signature"), key("ca").point)
 
 
-@pytest.mark.parametrize("name", ["node", "station", "ca", "one_time"])
+@pytest.mark.parametrize("name", ["node", "station", "ca", "one_time", "one_time_node"])
 def test_points_and_fingerprints_are_those_of_the_vectors(name: str) -> None:
     assert key(name).point == octets(name, "P")
     if "fingerprint" in KAT[name]:
@@ -59,7 +60,7 @@ def test_the_default_can_address_follows_from_the_uuid() -> None:
 def new_node(**state: object) -> Tim:
     """The vectors' node in factory state, with the vectors' nonces in their order of use."""
     drawn = iter([octets("session", "c"), octets("agreement", "nonceN")])
-    one_time = SoftwareKey(int(KAT["session"]["En"]["d"], 16))
+    one_time = iter([key("one_time_node"), SoftwareKey(int(KAT["session"]["En"]["d"], 16))])
     flash = Flash(UUID, key("node").point, octets("sig102", "signature"), can_address=KAT["default_can_address"])
     return Tim(
         key("node"),
@@ -67,7 +68,7 @@ def new_node(**state: object) -> Tim:
         clock=lambda: 0.0,
         max_message=2048,
         random=lambda n: next(drawn),
-        one_time=lambda: one_time,
+        one_time=lambda: next(one_time),
     )
 
 
@@ -78,7 +79,8 @@ def test_agreement_and_session_from_both_roles_give_the_vectors_frames() -> None
     assert agreement.request().encode() == octets("agreement", "request_frame")
     reply = node.handle(agreement.request().encode(), link="nfc", tapped=True)
     assert reply == octets("agreement", "reply_frame")
-    agreed = agreement.accept(decode_reply(reply).payload, pinned=keys.fingerprint(key("node").point), epoch=0)
+    teds, pinned = octets("initial_security_teds"), keys.fingerprint(key("node").point)
+    agreed = agreement.accept(decode_reply(reply).payload, teds, pinned=pinned, epoch=0)
     assert (agreed.key, agreed.epoch) == (octets("agreement", "K"), 1)
     assert agreed.confirm.encode() == octets("agreement", "confirm_frame")
     assert node.handle(agreed.confirm.encode(), link="nfc", tapped=True) == octets("agreement", "confirm_reply")
@@ -101,6 +103,50 @@ def test_agreement_and_session_from_both_roles_give_the_vectors_frames() -> None
         reply = node.handle(frame, link="nfc", tapped=True)
         assert reply.hex() == sealed["reply_frame"]
         assert session.unseal(decode_reply(reply).payload).encode().hex() == sealed["inner_reply"]
+
+
+def test_the_proof_of_an_agreement_is_over_the_vectors_transcript() -> None:
+    for name in ("agreement", "rotation"):
+        assert keys.agreement_message(octets(name, "T")) == octets(name, "sigN_message")
+        assert key("node").sign(octets(name, "sigN_message")) == octets(name, "sigN")
+        derived = derive(octets(name, "Z"), octets(name, "nonceN"), octets(name, "T"))
+        assert derived.key + derived.node_tag + derived.station_tag == (
+            octets(name, "K") + octets(name, "tagN") + octets(name, "tagS")
+        )
+
+
+def test_rotation_from_both_roles_gives_the_vectors_frames() -> None:
+    told = KAT["rotation"]
+    signed = octets("datasheet", "security_teds")
+    flash = Flash(
+        UUID,
+        key("node").point,
+        octets("sig102", "signature"),
+        blocks={SECURITY: signed},
+        epoch=1,
+        sequence=1,
+        key=octets("agreement", "K"),
+        station=key("station").point,
+        ca=key("ca").point,
+        provisioned=True,
+    )
+    drawn = iter([bytes(8), octets("rotation", "nonceN")])
+    one_time = SoftwareKey(int(told["one_time_node"]["d"], 16))
+    node = Tim(key("node"), RamFlash(flash), lambda: 0.0, random=lambda n: next(drawn), one_time=lambda: one_time)
+    agreement = StationAgreement(CREDENTIALS, UUID, one_time=SoftwareKey(int(told["one_time"]["d"], 16)))
+    assert agreement.request().encode() == octets("rotation", "request_frame")
+    reply = node.handle(agreement.request().encode(), link="nfc", tapped=True)
+    assert reply == octets("rotation", "reply_frame")
+    agreed = agreement.accept(decode_reply(reply).payload, signed, pinned=None, epoch=1)
+    assert (agreed.key, agreed.epoch, agreed.unsigned) == (octets("rotation", "K"), 2, False)
+    assert agreed.confirm.encode() == octets("rotation", "confirm_frame")
+    assert node.handle(agreed.confirm.encode(), link="nfc", tapped=True) == octets("rotation", "confirm_reply")
+
+
+def test_after_a_reset_the_node_shows_the_vectors_initial_security_teds() -> None:
+    epoch, sequence = KAT["reset"]["epoch"], KAT["datasheet"]["sequence"]
+    flash = Flash(UUID, key("node").point, octets("sig102", "signature"), epoch=epoch, sequence=sequence)
+    assert flash.security_teds() == octets("security_teds_after_reset")
 
 
 def test_the_signed_datasheet_is_the_vectors() -> None:

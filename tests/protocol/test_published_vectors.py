@@ -98,9 +98,8 @@ def test_the_station_sends_and_takes_what_is_published(document: Entry, entry: E
             one_time = SoftwareKey(int(document["keys"][told["one_time"]]["d"], 16))
             agreement = StationAgreement(credentials_in(document, command.payload), uuid, one_time=one_time)
             assert agreement.request() == command
-            agreed = agreement.accept(
-                reply.payload, pinned=document["keys"]["node"]["fingerprint"], epoch=told["epoch_held"]
-            )
+            pinned, teds = document["keys"]["node"]["fingerprint"], bytes.fromhex(told["teds"])
+            agreed = agreement.accept(reply.payload, teds, pinned=pinned, epoch=told["epoch_held"])
             assert (agreed.key.hex(), agreed.epoch) == (told["K"], told["epoch"])
             assert agreed.confirm.payload.hex() == told["tagS"]
 
@@ -146,14 +145,16 @@ def check_agreement(document: Entry, uuid: bytes, step: Entry) -> None:
     request, reply = bytes.fromhex(frames["command"])[6:], bytes.fromhex(frames["reply"])[3:]
     station, signature, ca, one_time = request[:65], request[65:129], request[129:194], request[194:]
     vn.check_signature(ca, b"TEDS1 station key\0" + station, signature)
-    nonce, epoch, tag, teds = reply[:16], reply[16:20], reply[20:36], reply[36:]
+    assert len(reply) == 165
+    nonce, epoch, own, tag, proof = reply[:16], reply[16:20], reply[20:85], reply[85:101], reply[101:]
     node = bytes.fromhex(document["keys"]["node"]["P"])
     secret = next(key["d"] for key in document["keys"].values() if key["P"] == station.hex())
     assert document["keys"][told["one_time"]]["P"] == one_time.hex()
-    shared = vn.ecdh(document["keys"][told["one_time"]]["d"], node) + vn.ecdh(secret, node)
-    script = hashlib.sha256(
-        b"TEDS1 transcript\0" + request + nonce + epoch + uuid + node + hashlib.sha256(teds).digest()
-    ).digest()
+    shared = vn.ecdh(document["keys"][told["one_time"]]["d"], own) + vn.ecdh(secret, own)
+    assert shared == vn.ecdh(step["En"], one_time) + vn.ecdh(step["En"], station)
+    teds = hashlib.sha256(bytes.fromhex(told["teds"])).digest()
+    script = hashlib.sha256(b"TEDS1 transcript\0" + request + nonce + epoch + own + uuid + node + teds).digest()
+    vn.check_signature(node, b"TEDS1 agree\0" + script, proof)
     okm = vn.hkdf(shared, nonce, b"TEDS1 link key\0" + script, 48)
     assert okm[:16].hex() == told["K"]
     assert tag == vn.mac(okm[16:], b"node" + script)
@@ -263,7 +264,7 @@ def test_bundles_open_or_are_refused_as_published(document: Entry, entry: Entry)
     told = entry["payload"]
     assert (opened.bundle.id, opened.bundle.mode) == (told["id"], told["mode"])
     assert [each.uuid.hex() for each in opened.bundle.nodes] == [each["uuid"] for each in told["nodes"]]
-    assert opened.bundle.nodes[0].key.hex() == "86938b02ad8bfc4853fddfe9c5e45551"
+    assert opened.bundle.nodes[0].key.hex() == "346dc7ba01b285e9fedeb955a14398b8"
     assert opened.station_signature is not None
     receipt = open_receipt(entry["receipt_jws"].encode(), trust_store(document, [entry["recipient"]]).get)
     assert (receipt.id, receipt.bundle_sha256) == (told["id"], opened.sha256)

@@ -6,11 +6,28 @@ from dataclasses import replace
 
 import pytest
 
-from teds_provision.errors import NotAuthentic, OtherKey, PolicyRefused
-from teds_provision.protocol.agreement import AgreedKey, Credentials, RequestPayload, StationAgreement
-from teds_provision.protocol.keys import GROUP_ORDER, SoftwareKey, fingerprint, node_key_message, station_key_message
+from teds_provision.errors import Garbled, NotAuthentic, OtherKey, PolicyRefused
+from teds_provision.protocol.agreement import (
+    AgreedKey,
+    Credentials,
+    NodeAgreement,
+    OtherTranscript,
+    RequestPayload,
+    StationAgreement,
+    transcript,
+)
+from teds_provision.protocol.keys import (
+    GROUP_ORDER,
+    SoftwareKey,
+    agreement_message,
+    fingerprint,
+    node_key_message,
+    station_key_message,
+)
 from teds_provision.protocol.messages.frames import Function, Reason, Reply, refusal, security_command
 from teds_provision.protocol.messages.identity import NodeState
+from teds_provision.protocol.tim import Tim
+from teds_provision.teds.codec import security
 
 from .desk import CA, CREDENTIALS, NODE, STATION, UUID, Desk
 from .memory import PowerCut
@@ -70,7 +87,7 @@ def test_another_station_of_the_same_owner_may_rekey() -> None:
 def half_way(desk: Desk, *, link: str = "nfc") -> AgreedKey:
     agreement = StationAgreement(CREDENTIALS, UUID)
     reply = desk.plain(agreement.request(), link=link)
-    return agreement.accept(reply.payload, pinned=None, epoch=desk.flash.epoch)
+    return agreement.accept(reply.payload, desk.flash.security_teds(), pinned=None, epoch=desk.flash.epoch)
 
 
 def test_nothing_is_durable_before_confirm() -> None:
@@ -127,7 +144,8 @@ def test_it_goes_with_its_link_but_not_with_another() -> None:
 def test_a_confirm_must_come_in_the_session_of_its_request() -> None:
     desk = Desk().agree().open()
     agreement = StationAgreement(CREDENTIALS, UUID)
-    agreed = agreement.accept(desk.sealed(agreement.request()).payload, pinned=None, epoch=1)
+    teds = desk.flash.security_teds()
+    agreed = agreement.accept(desk.sealed(agreement.request()).payload, teds, pinned=None, epoch=1)
     assert desk.plain(agreed.confirm) == refusal(Reason.WRONG_STATE)
     assert desk.sealed(agreed.confirm) == Reply(True)
     assert desk.flash.epoch == 2
@@ -166,10 +184,10 @@ def test_the_station_refuses_an_epoch_that_is_not_greater_than_that_of_its_key(h
     agreement = StationAgreement(CREDENTIALS, UUID)
     reply = desk.plain(agreement.request()).payload  # offers epoch 1
     if taken:
-        assert agreement.accept(reply, pinned=None, epoch=held).epoch == 1
+        assert agreement.accept(reply, desk.flash.security_teds(), pinned=None, epoch=held).epoch == 1
     else:
         with pytest.raises(PolicyRefused, match=f"offers key epoch 1; this station already holds epoch {held}"):
-            agreement.accept(reply, pinned=None, epoch=held)
+            agreement.accept(reply, desk.flash.security_teds(), pinned=None, epoch=held)
 
 
 def test_the_station_refuses_another_key_than_the_pinned_one_in_the_agreement_itself() -> None:
@@ -178,7 +196,7 @@ def test_the_station_refuses_another_key_than_the_pinned_one_in_the_agreement_it
     agreement = StationAgreement(CREDENTIALS, UUID)
     reply = desk.plain(agreement.request()).payload
     with pytest.raises(OtherKey):
-        agreement.accept(reply, pinned=fingerprint(SoftwareKey(17).point), epoch=0)
+        agreement.accept(reply, desk.flash.security_teds(), pinned=fingerprint(SoftwareKey(17).point), epoch=0)
 
 
 def test_the_station_refuses_a_key_that_is_not_signed_for_this_uuid_in_the_agreement_itself() -> None:
@@ -188,4 +206,130 @@ def test_the_station_refuses_a_key_that_is_not_signed_for_this_uuid_in_the_agree
     desk.restart()
     agreement = StationAgreement(CREDENTIALS, UUID)
     with pytest.raises(NotAuthentic, match="field 102"):
-        agreement.accept(desk.plain(agreement.request()).payload, pinned=None, epoch=0)
+        agreement.accept(desk.plain(agreement.request()).payload, desk.flash.security_teds(), pinned=None, epoch=0)
+
+
+# -- the station's half: the order of its checks -----------------------------------------------------------------------
+
+
+class Answered:
+    """A good reply to a Request, and what the node that made it would say with another En, T or key."""
+
+    def __init__(self) -> None:
+        self.one_time = SoftwareKey(13)
+        self.agreement = StationAgreement(CREDENTIALS, UUID, one_time=self.one_time)
+        self.teds = Desk().flash.security_teds()
+
+    def reply(self, *, epoch: int = 1, one_time: SoftwareKey | None = None, signer: SoftwareKey = NODE) -> bytes:
+        """What a node with this key answers; ``signer`` makes sigN alone."""
+        payload = self.agreement.request().payload
+        pair = one_time or SoftwareKey(23)
+        made = NodeAgreement.answer(NODE, UUID, payload, epoch=epoch, teds=self.teds, nonce=bytes(16), one_time=pair)
+        if signer is NODE:
+            return made.reply
+        script = transcript(payload, bytes(16), epoch, pair.point, UUID, NODE.point, self.teds)
+        return made.reply[:-64] + signer.sign(agreement_message(script))
+
+    def accept(self, reply: bytes, *, epoch: int = 0) -> AgreedKey:
+        return self.agreement.accept(reply, self.teds, pinned=None, epoch=epoch)
+
+
+def with_en(reply: bytes, point: bytes) -> bytes:
+    return reply[:20] + point + reply[85:]
+
+
+def bent(reply: bytes, at: int) -> bytes:
+    return reply[:at] + bytes([reply[at] ^ 1]) + reply[at + 1 :]
+
+
+TAG_AT = 85
+
+
+def test_the_station_checks_length_point_tag_proof_and_epoch_in_this_order() -> None:
+    answered = Answered()
+    everything = with_en(bent(bent(answered.reply(signer=CA), TAG_AT), 19), OFF_CURVE)
+    with pytest.raises(Garbled, match="164 octets, not 165"):
+        answered.accept(everything[:-1], epoch=1)
+    with pytest.raises(NotAuthentic, match="one-time key"):
+        answered.accept(everything, epoch=1)
+    with pytest.raises(OtherTranscript):
+        answered.accept(bent(answered.reply(signer=CA), TAG_AT), epoch=1)
+    with pytest.raises(NotAuthentic, match="sigN"):
+        answered.accept(answered.reply(signer=CA), epoch=1)
+    with pytest.raises(PolicyRefused, match="offers key epoch 1"):
+        answered.accept(answered.reply(), epoch=1)
+    assert answered.accept(answered.reply()).epoch == 1
+
+
+@pytest.mark.parametrize("whose", ["E", "P(station)", "P(node)", "off the curve", "zeros"])
+def test_en_is_a_one_time_key_of_the_node_and_nothing_else(whose: str) -> None:
+    """With En = P(node) a thief of the identity key could read what was agreed on before."""
+    answered = Answered()
+    holders = {"E": answered.one_time, "P(station)": STATION, "P(node)": NODE}
+    if whose in holders:
+        reply = answered.reply(one_time=holders[whose])  # right in everything else
+    else:
+        reply = with_en(answered.reply(), OFF_CURVE if whose == "off the curve" else bytes(65))
+    with pytest.raises(NotAuthentic, match="one-time key"):
+        answered.accept(reply)
+
+
+def test_a_high_s_in_the_proof_of_an_agreement_is_refused() -> None:
+    answered = Answered()
+    reply = answered.reply()
+    high = GROUP_ORDER - int.from_bytes(reply[-32:], "big")
+    with pytest.raises(NotAuthentic, match="sigN"):
+        answered.accept(reply[:-32] + high.to_bytes(32, "big"))
+
+
+def test_a_thief_of_the_station_key_cannot_pose_as_a_node() -> None:
+    """Under KeyAgreement 1 he could: ECDH(station, node) was known to him as well."""
+    answered = Answered()
+    with pytest.raises(NotAuthentic, match="sigN"):
+        answered.accept(answered.reply(signer=STATION))
+
+
+def test_the_datasheet_that_the_station_read_is_part_of_what_is_agreed_on() -> None:
+    answered = Answered()
+    reply = answered.reply()
+    answered.teds = security.initial(NODE.point, Desk().flash.node_key_signature, sequence=1, key_epoch=0)
+    with pytest.raises(OtherTranscript):
+        answered.accept(reply)
+
+
+def test_the_identity_key_of_a_node_only_signs() -> None:
+    class Slot:
+        """A PSA key slot whose policy allows ECDSA alone."""
+
+        point = NODE.point
+
+        def sign(self, message: bytes) -> bytes:
+            return NODE.sign(message)
+
+        sign_digest = NODE.sign_digest
+
+        def ecdh(self, peer: bytes) -> bytes:
+            raise AssertionError("the policy of this key does not permit agreement")
+
+    desk = Desk()
+    desk.tim = Tim(Slot(), desk.memory, lambda: desk.now)
+    desk.provision().agree()
+    assert desk.flash.epoch == 2
+
+
+def test_a_one_time_key_is_for_one_request_and_e_is_no_static_key() -> None:
+    desk = Desk()
+    replies = [desk.plain(security_command(Function.REQUEST, GOOD.encode())).payload for _ in range(2)]
+    assert replies[0][20:85] != replies[1][20:85]
+    assert reason_of(desk, request(one_time=STATION.point)) == Reason.BAD_POINT
+
+
+@pytest.mark.parametrize("by", ["command", "hand"])
+def test_a_reset_ends_a_pending_agreement_in_factory_state_too(by: str) -> None:
+    desk = Desk()
+    confirm = half_way(desk).confirm
+    if by == "command":
+        assert desk.plain(security_command(Function.RESET, bytes(32))).ok
+    else:
+        desk.tim.reset_by_hand()
+    assert desk.plain(confirm) == refusal(Reason.WRONG_STATE)

@@ -2,18 +2,29 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from dataclasses import replace
 from datetime import timedelta
 
 import pytest
 
-from teds_provision.errors import NodeRefused, NodeSilent, NotAuthentic, NotWhitelisted, OtherKey, PolicyRefused
+from teds_provision.errors import (
+    BadData,
+    NodeRefused,
+    NodeSilent,
+    NotAuthentic,
+    NotWhitelisted,
+    OtherKey,
+    PolicyRefused,
+)
 from teds_provision.protocol.agreement import key_id
-from teds_provision.protocol.messages.frames import Command, Reason, refusal
+from teds_provision.protocol.messages.frames import Command, Reason, Reply, refusal
 from teds_provision.protocol.messages.identity import NodeState
 from teds_provision.station.station import Station
 from teds_provision.steps.agree import Agreed, agree, open_session
 from teds_provision.steps.identify import identify
 from teds_provision.store import WhitelistEntry
+from teds_provision.teds.codec import security
 from tests.bench import Board, MemoryLink, make_station, talk
 
 
@@ -92,20 +103,128 @@ def test_over_the_bus_a_node_with_nfc_refuses_its_first_key(station: Station, bo
     assert refused.value.reason == Reason.NOT_PERMITTED
 
 
-def test_a_wrong_node_tag_is_no_key(station: Station, board: Board) -> None:
+# -- the reply to Request ----------------------------------------------------------------------------------------------
+
+REPLY_OCTETS = 3 + 165
+TAG, PROOF = 3 + 16 + 4 + 65, 3 + 16 + 4 + 65 + 16
+
+
+def flipped(octet: int, times: int = 99) -> Callable[[int, bytes], bytes]:
+    """Disturbs one octet of the first so many replies to Request."""
+    left = [times]
+
+    def flip(_count: int, reply: bytes) -> bytes:
+        if len(reply) != REPLY_OCTETS or not left[0]:
+            return reply
+        left[0] -= 1
+        return reply[:octet] + bytes([reply[octet] ^ 1]) + reply[octet + 1 :]
+
+    return flip
+
+
+def requests(link: MemoryLink) -> list[bytes]:
+    return [frame for frame in link.frames if frame[2:4] == b"\x80\x01"]
+
+
+def security_reads(link: MemoryLink) -> int:
+    return sum(frame[:4] == b"\0\0\1\2" and frame[6:7] == b"\x80" for frame in link.frames)
+
+
+def test_after_a_wrong_node_tag_the_teds_is_read_again_and_a_new_request_is_made_once(
+    station: Station, board: Board
+) -> None:
+    whitelist(station, board)
+    link = MemoryLink(board, tamper=flipped(TAG, times=1))
+    assert run(station, board, link).epoch == 1
+    first, second = requests(link)
+    assert first[-65:] != second[-65:], "E is for one Request"
+    assert security_reads(link) == 2
+
+
+def test_a_second_wrong_node_tag_ends_it_and_is_no_key(station: Station, board: Board) -> None:
+    whitelist(station, board)
+    link = MemoryLink(board, tamper=flipped(TAG))
+    with pytest.raises(NotAuthentic, match="tagN"):
+        run(station, board, link)
+    assert (len(requests(link)), held(station, board)) == (2, [])
+
+
+def test_a_wrong_proof_of_the_agreement_is_not_asked_for_again(station: Station, board: Board) -> None:
+    whitelist(station, board)
+    link = MemoryLink(board, tamper=flipped(PROOF))
+    with pytest.raises(NotAuthentic, match="does not hold the key that it shows"):
+        run(station, board, link)
+    assert (len(requests(link)), held(station, board)) == (1, [])
+    entry = station.pins.entry(board.uuid)
+    assert entry is not None
+
+
+def test_a_datasheet_that_changed_between_reading_and_request_is_read_again(station: Station, board: Board) -> None:
     whitelist(station, board)
 
-    def flip(count: int, reply: bytes) -> bytes:
-        return (
-            reply[:24] + bytes([reply[24] ^ 1]) + reply[25:]
-            if len(reply) > 250 and reply[19:23] == b"\0\0\0\1"
-            else reply
-        )
+    def another_station_was_here(count: int, reply: bytes) -> bytes:
+        if count == 2:  # the proof of identify; the TEDS has been read
+            board.flash.state = board.tim._flash = replace(board.state, sequence=7)
+        return reply
 
-    with pytest.raises(NotAuthentic):
-        run(station, board, MemoryLink(board, tamper=flip))
-    assert held(station, board) == []
+    link = MemoryLink(board, tamper=another_station_was_here)
+    assert run(station, board, link).epoch == 1
+    assert (len(requests(link)), security_reads(link)) == (2, 2)
 
+
+def test_a_node_that_shows_another_key_after_a_wrong_tag_gets_no_second_request(station: Station, board: Board) -> None:
+    whitelist(station, board)
+    other = Board()
+
+    def two_boards(_count: int, reply: bytes) -> bytes:
+        if len(reply) == REPLY_OCTETS:
+            board.flash.state = board.tim._flash = other.state
+            return flipped(TAG)(0, reply)
+        return reply
+
+    link = MemoryLink(board, tamper=two_boards)
+    with pytest.raises(OtherKey):  # identify has pinned the first one
+        run(station, board, link)
+    assert (len(requests(link)), held(station, board)) == (1, [])
+
+
+@pytest.mark.parametrize(
+    ("field", "name"), [(105, "ProfileVersion 2"), (109, "SessionSuite 1"), (110, "KeyAgreement 1")]
+)
+def test_a_node_of_another_wire_is_named_and_gets_no_request(
+    station: Station, board: Board, field: int, name: str
+) -> None:
+    whitelist(station, board)
+    shown = security.decode(board.state.security_teds())
+    value = int(name[-1])
+    teds = replace(shown, values={**shown.values, field: value}).encode()
+    whole = Reply(True, bytes(4) + teds).encode()
+
+    def older(_count: int, reply: bytes) -> bytes:
+        return whole if len(reply) == len(whole) else reply
+
+    link = MemoryLink(board, tamper=older)
+    with pytest.raises(BadData, match=name):
+        run(station, board, link)
+    assert (requests(link), held(station, board)) == ([], [])
+
+
+def test_a_rotation_in_a_session_hashes_the_datasheet_that_was_read_in_it(station: Station, board: Board) -> None:
+    """What came plain before says nothing: whoever sits on the bus may have bent it."""
+    whitelist(station, board)
+    run(station, board)
+    shown = security.decode(board.state.security_teds())
+    whole = Reply(True, bytes(4) + shown.encode()).encode()
+    bent = Reply(True, bytes(4) + replace(shown, sequence=9).encode()).encode()
+
+    def on_the_bus(_count: int, reply: bytes) -> bytes:
+        return bent if reply == whole else reply
+
+    link = MemoryLink(board, via="can", tapped=False, tamper=on_the_bus)
+    assert run(station, board, link, rotate=True).epoch == 2
+
+
+# -- lost messages -----------------------------------------------------------------------------------------------------
 
 EXCHANGES = 6  # Read 128, Prove, Request, Confirm, Open, Identify (sealed)
 
@@ -153,7 +272,7 @@ def test_a_confirm_that_is_held_back_finds_its_key_at_the_station(station: Stati
 
         def hold_back(command: Command, why: str) -> bytes:
             sends.append(why)
-            if len(sends) == 2:
+            if why == "the key confirmation":
                 raise KeyboardInterrupt  # the Confirm is on its way, and this station ends here
             return real(command, why)
 

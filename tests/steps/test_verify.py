@@ -88,13 +88,16 @@ def test_weak_algorithms_are_never_authentic(station: Station, image: Image) -> 
     assert failed(station, image.with_block(SECURITY, signed)) == ["algorithms"]
 
 
-def test_a_datasheet_of_the_older_session_suite_is_named_and_never_authentic(station: Station, image: Image) -> None:
+@pytest.mark.parametrize(("field", "name"), [(109, "SessionSuite 1"), (110, "KeyAgreement 1")])
+def test_a_datasheet_of_another_wire_is_named_and_never_authentic(
+    station: Station, image: Image, field: int, name: str
+) -> None:
     shown = security.decode(image.blocks[SECURITY])
-    older = replace(shown, values={**shown.values, 109: 1})
+    older = replace(shown, values={**shown.values, field: 1})
     signed = older.with_signature(station.credentials().key.sign(security.tbs(image.uuid, older.encode()))).encode()
     old = image.with_block(SECURITY, signed)
     assert (verdict(station, old), failed(station, old)) == ("not authentic", ["algorithms"])
-    assert any("older session suite 1" in check.why for check in verify_image(station, old))
+    assert any(f"names {name}; 2 is spoken" in check.why for check in verify_image(station, old))
 
 
 def test_a_foreign_security_teds_is_shown_and_never_trusted(station: Station, image: Image) -> None:

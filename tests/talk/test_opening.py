@@ -22,7 +22,7 @@ def keyed(board: Board) -> bytes:
         Credentials(STATION, CA.sign(station_key_message(STATION.point)), CA.point), board.uuid
     )
     reply = board.tim.handle(agreement.request().encode(), link="nfc", tapped=True)
-    agreed = agreement.accept(decode_reply(reply).payload, pinned=None, epoch=0)
+    agreed = agreement.accept(decode_reply(reply).payload, board.state.security_teds(), pinned=None, epoch=0)
     board.tim.handle(agreed.confirm.encode(), link="nfc", tapped=True)
     return agreed.key
 
@@ -114,7 +114,7 @@ def test_a_request_that_was_disturbed_on_a_bus_is_sent_once_more(board: Board) -
     )
     with talk(board, link) as node:
         reply = node.sure(agreement.request(), "the key agreement")
-    assert agreement.accept(reply, pinned=None, epoch=0).epoch == 1
+    assert agreement.accept(reply, board.state.security_teds(), pinned=None, epoch=0).epoch == 1
     assert link.count == 2
 
 

@@ -142,6 +142,15 @@ def rotation() -> Iterator[Scene]:
     scene.say(agreed.confirm, "Back in the field: 2.")
     yield scene
 
+    scene = Scene(
+        "confirm-after-a-reset",
+        "Reset ends a pending agreement, in factory state too, where it changes nothing stored.",
+    )
+    agreed = scene.request("A good Request.")
+    scene.say(security_command(Function.RESET, CHALLENGE), "Reset: the proof, for epoch 0.")
+    scene.say(agreed.confirm, "Nothing is pending: 2.")
+    yield scene
+
     scene = Scene("confirm-after-a-restart", "The pending agreement lies in RAM only.")
     agreed = scene.request("A good Request.")
     scene.event("restart", "Power off and on.")
@@ -300,6 +309,7 @@ def _open_checks() -> Scene:
     scene.crafted_open("Es is 65 zero octets: 15.", point=bytes(65))
     scene.crafted_open("Es begins with 06 (hybrid form): 15.", point=b"\x06" + good[1:])
     scene.crafted_open("Es is the node's own point: 15.", point=key("node").point)
+    scene.crafted_open("Es is the station's static key: 15, a one-time key is due.", point=key("station").point)
     scene.crafted_open("The mac of the c before: 12.", ahead=-1)
     scene.open("a", "A good Open.")
     again = bytes.fromhex(scene.steps[-1]["command"])

@@ -20,7 +20,7 @@ from teds_provision.protocol.tim import Tim
 from tests.protocol.memory import RamFlash
 
 from .recipes import IDENTIFY
-from .scene import CAN_ADDRESS, UUID, credentials, flash, key, octets
+from .scene import CAN_ADDRESS, UUID, credentials, flash, key, named_key, octets
 
 STATION_ADDRESS = 0xF1
 TRANSACTION = 0x1234
@@ -29,14 +29,15 @@ REQUEST = StationAgreement(credentials(), UUID, one_time=key("one_time")).reques
 
 
 def node(name: str, state: str = "factory", *, max_message: int = 2048) -> Tim:
-    """The vectors' node with fixed nonces: the first is octets(name, 0, ...), and so on."""
-    count = iter(range(1000))
+    """The vectors' node with fixed nonces and one-time keys: octets(name, 0, ...), named_key(name, 0, ...) and so on."""
+    count, pairs = iter(range(1000)), iter(range(1000))
     return Tim(
         key("node"),
         RamFlash(flash(state)),
         lambda: 0.0,
         max_message=max_message,
         random=lambda size: octets(name, "c")[:8] if size == 8 else octets(name, next(count), "nonceN")[:size],
+        one_time=lambda: named_key(name, next(pairs), "En"),
     )
 
 
@@ -160,7 +161,7 @@ def nfc_pieces() -> Iterator[dict[str, Any]]:
     )
     tap = Tap(
         "request-in-two-pieces",
-        "maxNdef 200: Request of 265 octets in two pieces (167 and 98), its reply in two (161 and 115).",
+        "maxNdef 200: Request of 265 octets in two pieces (167 and 98), its reply in two (161 and 7).",
         max_ndef=200,
     )
     yield tap.select().exchange(REQUEST, TRANSACTION).end()

@@ -132,6 +132,7 @@ def _requests() -> Iterator[Scene]:
         (changed_request(one_time=bytes(65)), "E is 65 zero octets: 15.", {}),
         (changed_request(one_time=b"\x06" + key("one_time").point[1:]), "E begins with 06 (hybrid form): 15.", {}),
         (changed_request(one_time=key("node").point), "E is the node's own point: 15.", {}),
+        (changed_request(one_time=key("station").point), "E is P(station): 15, a one-time key is due.", {}),
         (changed_request(station=key("node").point), "P(station) is the node's own point: 15.", {}),
         (changed_request(ca=off_curve), "P(CA) is not on the curve: 15.", {}),
         (changed_request(station=off_curve, ca=foreign.ca), "P(station) bad and a foreign CA: 15 goes before 14.", {}),

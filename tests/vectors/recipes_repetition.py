@@ -12,7 +12,7 @@ from teds_provision.protocol.repetition import Repetition
 from teds_provision.protocol.session import StationSession
 
 from .recipes import CHALLENGE, IDENTIFY, changed_request
-from .scene import UUID, K, Scene, credentials, key, named_key
+from .scene import KAT, UUID, K, Scene, credentials, key, named_key
 
 
 class Line(Scene):
@@ -128,7 +128,8 @@ def repetition() -> Iterator[Scene]:
 def _tag(reply: bytes) -> bytes:
     """TagS that answers this reply to the vectors' Request."""
     agreement = StationAgreement(credentials(), UUID, one_time=key("one_time"))
-    agreed = agreement.accept(decode_reply(reply).payload, pinned=fingerprint(key("node").point), epoch=0)
+    teds = bytes.fromhex(KAT["initial_security_teds"])
+    agreed = agreement.accept(decode_reply(reply).payload, teds, pinned=fingerprint(key("node").point), epoch=0)
     return agreed.confirm.payload
 
 

@@ -32,7 +32,7 @@ BLOCKS: dict[BlockId, bytes] = {
     (entry["channel"], entry["access_code"]): bytes.fromhex(entry["teds"]) for entry in KAT["datasheet"]["blocks"]
 }
 SIGNED: bytes = bytes.fromhex(KAT["datasheet"]["security_teds"])
-NAMES = ("node", "station", "ca", "one_time")
+NAMES = ("node", "station", "ca", "one_time", "one_time_node")
 MORE_NAMES = ("second_station", "foreign_ca", "foreign_station", "one_time_2", "one_time_3", "other_node")
 
 
@@ -195,8 +195,10 @@ class Scene:
             reply = self.say(agreement.request(), note, **station, **more)
         else:
             reply = self.sealed(session, agreement.request(), note, **station, **more)
-        agreed = agreement.accept(reply.payload, pinned=fingerprint(key("node").point), epoch=self.memory.state.epoch)
+        held, pinned = self.memory.state, fingerprint(key("node").point)
+        agreed = agreement.accept(reply.payload, held.security_teds(), pinned=pinned, epoch=held.epoch)
         self.steps[-1]["agreement"] |= {
+            "teds": held.security_teds().hex(),
             "K": agreed.key.hex(),
             "epoch": agreed.epoch,
             "tagS": agreed.confirm.payload.hex(),

@@ -9,16 +9,18 @@ from typing import Final
 
 from teds_provision.protocol.agreement import (
     LAST_EPOCH,
+    NONCE_OCTETS,
     REQUEST_OCTETS,
     TAG_OCTETS,
     NodeAgreement,
     RequestPayload,
+    good_one_time,
     good_point,
 )
 from teds_provision.protocol.flash import Flash
 from teds_provision.protocol.keys import PrivateKey, Verify, station_key_message, verify
 from teds_provision.protocol.messages.frames import Reason, Refused
-from teds_provision.protocol.session import NodeSession
+from teds_provision.protocol.session import NodeSession, OneTime
 from teds_provision.protocol.tim.origin import Origin
 
 PENDING_SECONDS: Final = 60.0
@@ -38,9 +40,15 @@ class Agreeing:
     """One agreement at a time over all links."""
 
     def __init__(
-        self, key: PrivateKey, clock: Callable[[], float], random: Callable[[int], bytes], verify: Verify = verify
+        self,
+        key: PrivateKey,
+        clock: Callable[[], float],
+        random: Callable[[int], bytes],
+        one_time: OneTime,
+        verify: Verify = verify,
     ) -> None:
         self._key, self._clock, self._random, self._verify = key, clock, random, verify
+        self._one_time = one_time
         self._pending: _Pending | None = None
 
     def request(self, payload: bytes, origin: Origin, flash: Flash) -> bytes:
@@ -48,9 +56,10 @@ class Agreeing:
         if len(payload) != REQUEST_OCTETS:
             raise Refused(Reason.BAD_FORM)
         request = RequestPayload.decode(payload)
-        for point in (request.station, request.ca, request.one_time):
-            if not good_point(point, flash.node_key):
-                raise Refused(Reason.BAD_POINT)
+        if not (good_point(request.station, flash.node_key) and good_point(request.ca, flash.node_key)):
+            raise Refused(Reason.BAD_POINT)
+        if not good_one_time(request.one_time, flash.node_key, request.station):
+            raise Refused(Reason.BAD_POINT)
         if flash.ca is not None and request.ca != flash.ca:
             raise Refused(Reason.UNTRUSTED_STATION)
         if not self._verify(request.ca, station_key_message(request.station), request.station_signature):
@@ -58,7 +67,13 @@ class Agreeing:
         if flash.epoch == LAST_EPOCH:
             raise Refused(Reason.WRONG_EPOCH)
         agreement = NodeAgreement.answer(
-            self._key, flash.uuid, payload, epoch=flash.epoch + 1, teds=flash.security_teds(), nonce=self._random(16)
+            self._key,
+            flash.uuid,
+            payload,
+            epoch=flash.epoch + 1,
+            teds=flash.security_teds(),
+            nonce=self._random(NONCE_OCTETS),
+            one_time=self._one_time(),
         )
         self._pending = _Pending(agreement, origin.link, origin.session, self._clock())
         return agreement.reply

@@ -7,7 +7,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 from teds_provision.protocol.announce import LAST_ADDRESS
-from teds_provision.protocol.flash import Flash, FlashFailure, FlashMemory
+from teds_provision.protocol.flash import Flash, FlashFailure, FlashMemory, in_factory_state
 from teds_provision.protocol.keys import (
     CHALLENGE_OCTETS,
     PrivateKey,
@@ -46,8 +46,8 @@ class Tim:
     """One transducer interface module.
 
     ``max_message`` octets (1024 to 4094); ``clock`` gives monotonic seconds; ``random`` gives that many octets, good
-    from the first moment after a start; ``one_time`` makes the key pair of one Open (a board may have one ready),
-    ``verify`` checks a signature.
+    from the first moment after a start; ``one_time`` makes the key pair of one Open or one Request (a board may have
+    one ready), ``verify`` checks a signature.
     ``sessions`` and ``streams`` are its room for them; ``hardware`` is what it measures and acts with, None: nothing.
     ``quick_points``: its point arithmetic holds no Sealed frame up by more than 5 ms.
     """
@@ -70,7 +70,7 @@ class Tim:
         self._taken_address: int | None = None
         self._ending: list[Callable[[], None]] = []
         self._teds = TedsAccess(self.max_message, self.max_teds, self.verify)
-        self._agreeing = Agreeing(self.key, self.clock, self.random, self.verify)
+        self._agreeing = Agreeing(self.key, self.clock, self.random, self.one_time, self.verify)
         self._sessions = Sessions(
             self.clock,
             self.random,
@@ -151,7 +151,7 @@ class Tim:
 
     def reset_by_hand(self) -> None:
         """Button, pad or magnet held 5 s: the effect of Reset."""
-        self._commit(_factory(self._flash), safe=True)
+        self._commit(in_factory_state(self._flash), safe=True)
         self._end_everything()
 
     # -- what links that measure call as well ----------------------------------------------------------------------
@@ -343,8 +343,10 @@ class Tim:
         _length(payload, CHALLENGE_OCTETS)
         flash = self._flash
         proof = self.key.sign(reset_message(flash.uuid, flash.epoch, payload))
-        if flash.state != NodeState.FACTORY:
-            self._commit(_factory(flash), safe=True)
+        if flash.state == NodeState.FACTORY:
+            self._agreeing.forget()
+        else:
+            self._commit(in_factory_state(flash), safe=True)
             self._ending.append(self._end_everything)
         return proof
 
@@ -362,12 +364,6 @@ class Tim:
             self._role.claims.everything_safe()
         self.memory.commit(state)
         self._flash = state
-
-
-def _factory(flash: Flash) -> Flash:
-    """Factory state: no key, no CA, no station, initial Security TEDS; identity, epoch and sequence stay."""
-    blocks = {block: teds for block, teds in flash.blocks.items() if block != (0, SECURITY)}
-    return replace(flash, key=None, ca=None, station=None, provisioned=False, blocks=blocks)
 
 
 def _length(payload: bytes, octets: int) -> None:

@@ -10,7 +10,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Final, NamedTuple
 
-from teds_provision.protocol.agreement import good_point, key_id
+from teds_provision.protocol.agreement import good_one_time, key_id
 from teds_provision.protocol.flash import Flash
 from teds_provision.protocol.messages.frames import Reason, Refused
 from teds_provision.protocol.session import (
@@ -82,7 +82,7 @@ class Sessions:
         if not hmac.compare_digest(payload[-TAG_OCTETS:], open_mac(key, flash.uuid, counter, station)):
             raise Refused(Reason.BAD_TAG)
         self._opens = (self._opens + 1) % (1 << 8 * COUNTER_OCTETS)
-        if not good_point(station, flash.node_key):
+        if not good_one_time(station, flash.node_key, *([flash.station] if flash.station is not None else [])):
             raise Refused(Reason.BAD_POINT)
         made = NodeSession(key, flash.uuid, station, self._one_time())
         held = self._links.setdefault(link, _Link())

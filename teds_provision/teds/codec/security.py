@@ -19,12 +19,10 @@ from teds_provision.teds.image import BlockId
 TEDSID_TUPLE: Final = bytes.fromhex("030400800101")
 
 SIGNATURE, NODE_KEY, NODE_KEY_SIGNATURE, STATION_KEY, STATION_KEY_SIGNATURE = 100, 101, 102, 103, 104
-SIGNED_BLOCK, PROFILE_VERSION, SESSION_SUITE = 108, 105, 109
-OLDER_SUITE = 1
-"""SessionSuite without one-time keys, of this project's first round: shown, never authentic."""
+SIGNED_BLOCK, PROFILE_VERSION, SESSION_SUITE, KEY_AGREEMENT = 108, 105, 109, 110
 
 # Our values of Tables 2 to 5, ProfileVersion, SessionSuite and KeyAgreement: the only ones built, accepted or trusted.
-OUR_VALUES: Final = {1: 4, 2: 2, 3: 0, 4: 1, 105: 1, 109: 2, 110: 1}
+OUR_VALUES: Final = {1: 4, 2: 2, 3: 0, 4: 1, 105: 1, 109: 2, 110: 2}
 _U8 = (1, 2, 3, 4, 105, 109, 110)
 _BASE64 = {100: 64, 101: 65, 102: 64, 103: 65, 104: 64}
 _OCTETS = dict.fromkeys(_U8, 1) | dict.fromkeys(_BASE64, 88) | {6: 8, 106: 4, 107: 4}
@@ -99,6 +97,15 @@ class SecurityTeds:
 def initial(node_key: bytes, node_key_signature: bytes, *, sequence: int, key_epoch: int) -> bytes:
     """Return the initial Security TEDS that a node shows until the first commit after its last reset."""
     return SecurityTeds(node_key, node_key_signature, sequence=sequence, key_epoch=key_epoch).encode()
+
+
+def other_wire(shown: SecurityTeds) -> str:
+    """Which ProfileVersion, SessionSuite or KeyAgreement it names that is not spoken here; empty where all are."""
+    named = {PROFILE_VERSION: "ProfileVersion", SESSION_SUITE: "SessionSuite", KEY_AGREEMENT: "KeyAgreement"}
+    for number, name in named.items():
+        if shown.values[number] != OUR_VALUES[number]:
+            return f"{name} {shown.values[number]}; {OUR_VALUES[number]} is spoken here"
+    return ""
 
 
 def ca_hint(name: str, ca_fingerprint: str) -> str:

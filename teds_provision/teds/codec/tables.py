@@ -416,9 +416,16 @@ SECURITY: Final = (
         "u8",
         "session suite",
         "M",
-        enumeration={1: "AES-128-CCM alone (older)", 2: "one-time ECDH, AES-128-CCM"},
+        enumeration={1: "AES-128-CCM alone (never fielded)", 2: "one-time ECDH, AES-128-CCM"},
     ),
-    _security(110, "KeyAgreement", "u8", "key agreement", "M", enumeration={1: "C(1e, 2s, ECC CDH)"}),
+    _security(
+        110,
+        "KeyAgreement",
+        "u8",
+        "key agreement",
+        "M",
+        enumeration={1: "static keys of both (never fielded)", 2: "one-time keys, node signs"},
+    ),
 )
 
 _PHY_TEXT_SECURITY: Final[dict[int, dict[str, Any]]] = {

@@ -77,6 +77,6 @@ def test_a_key_agreement_of_the_profile_with_the_key_in_the_token(vault):
     signature = vault.ca().sign(station_key_message(station.point))
     agreement = StationAgreement(Credentials(station, signature, vault.ca().point), uuid)
     half = NodeAgreement.answer(node, uuid, agreement.request().payload, epoch=1, teds=shown)
-    agreed = agreement.accept(half.reply, pinned=fingerprint(node.point), epoch=0)
+    agreed = agreement.accept(half.reply, shown, pinned=fingerprint(node.point), epoch=0)
     assert agreed.key == half.key
     assert agreed.confirm.payload == half.station_tag
