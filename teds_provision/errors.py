@@ -180,6 +180,16 @@ class NoKeyring(VaultFailure):
     code = "no-keyring"
 
 
+class UnknownMaster(VaultFailure):
+    """A key is wrapped under a master key that an open vault does not have (any more, or yet)."""
+
+
+class VaultChanged(VaultFailure):
+    """What a person was asked about is not true any more: another command changed the vault meanwhile."""
+
+    code = "vault-changed"
+
+
 class WrongPassphrase(VaultFailure):
     """The passphrase or PIN does not open the vault."""
 

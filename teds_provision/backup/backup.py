@@ -6,6 +6,7 @@ import hashlib
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
+from typing import BinaryIO
 
 from teds_provision.backup.content import Head
 from teds_provision.backup.sealed_file import MAX_OCTETS, SealedFile, Sealer, write
@@ -15,7 +16,7 @@ from teds_provision.protocol.keys import fingerprint
 from teds_provision.station.station import Station
 from teds_provision.store import utc_now
 from teds_provision.store.snapshot import totals
-from teds_provision.vault import Ask
+from teds_provision.vault import Ask, Vault
 from teds_provision.vault.passphrase import PRODUCT, Costs
 
 
@@ -54,13 +55,10 @@ def backup(
         recovery=recovery,
         costs=costs,
     )
-    head = Head(
-        station.id, station.point, station.name, utc_now(), _kind(station.identity.keystore), vault.secret_material()
-    )
     to = fingerprint(recovery) if recovery is not None else "passphrase"
     try:
         with whole_draft(path, replace=True) as (draft, file):
-            key = write(file, head, station.rows(), vault.identity(), sealer)
+            key = _write(station, vault, file, sealer)
             file.flush()
             nodes, keys, useless = _read_back(station, draft, key)
             octets = file.tell()
@@ -73,6 +71,22 @@ def backup(
             f"{path} cannot be written: {error.strerror}.", hint="Mend that and run the same command again."
         ) from error
     return BackedUp(octets, digest, nodes, keys, to, tuple(warnings))
+
+
+def _write(station: Station, vault: Vault, file: BinaryIO, sealer: Sealer) -> bytes:
+    """Write the vault's secrets and the rows of one moment: keys are of no use without the master key that wraps them.
+
+    A command that changes the vault in between (there are few) makes this begin anew. Returns the content key.
+    """
+    while True:
+        vault.refresh()
+        kind = _kind(station.identity.keystore)
+        head = Head(station.id, station.point, station.name, utc_now(), kind, vault.secret_material())
+        key = write(file, head, station.rows(), vault.identity(), sealer)
+        if not vault.refresh():
+            return key
+        file.seek(0)
+        file.truncate()
 
 
 def _kind(keystore: str) -> str:

@@ -12,14 +12,22 @@ from pathlib import Path
 
 from teds_provision.backup.content import Content
 from teds_provision.backup.merge import Merge
-from teds_provision.errors import NotAuthentic, PolicyRefused, StoreFailure, UsageFailure, VaultFailure, WrongPassphrase
+from teds_provision.errors import (
+    NotAuthentic,
+    PolicyRefused,
+    StoreFailure,
+    UsageFailure,
+    VaultChanged,
+    VaultFailure,
+    WrongPassphrase,
+)
 from teds_provision.protocol.keys import fingerprint
 from teds_provision.station.node_keys import RESTORED
 from teds_provision.station.station import Station
 from teds_provision.store import Store, StoreLock
 from teds_provision.store.home import has_store
 from teds_provision.store.snapshot import Relation, is_damage, place, relation, set_aside, totals
-from teds_provision.vault import Ask, Vault, create_vault, open_vault
+from teds_provision.vault import Ask, Vault, asked_first, create_vault, open_vault
 from teds_provision.vault.passphrase import PRODUCT, Costs
 
 
@@ -86,17 +94,27 @@ def rebuild(home: Path, content: Content, ask: Ask, *, keystore: str | None = No
         home.mkdir(mode=0o700, parents=True, exist_ok=True)
     except OSError as error:
         raise StoreFailure(f"{home} cannot be made: {error.strerror}.", hint="Choose another --home.") from error
-    with StoreLock(home, command="restore"):
-        vault, why = bring_vault(home, content, ask, wanted, costs)
-        kind = wanted if wanted is not None and wanted.startswith("pkcs11:") else vault.kind
-        with copy.transaction():
-            _move_to(copy, kind, why)
-            due = _demand_rotations(copy, content, ask)
-            detail = {"created": content.created, "keystore": vault.kind, "rotations_due": due}
-            copy.audit.append("restore", None, "rebuilt", detail)
-        aside = set_aside(home) if has_store(home) else None
-        place(copy, home)
-    return Restored("rebuilt", None, totals(copy), (), kind, aside, due)
+
+    def make(known: Ask) -> Restored:
+        with StoreLock(home, command="restore"):
+            if (present := open_present(home, content)) is not None:  # the person was told of a home without one
+                present.close()
+                raise VaultChanged(
+                    f"Another command has made the station in {home} meanwhile; this one changed nothing.",
+                    hint="Run it again: it brings back what is lacking.",
+                )
+            vault, why = bring_vault(home, content, known, wanted, costs)
+            kind = wanted if wanted is not None and wanted.startswith("pkcs11:") else vault.kind
+            with copy.transaction():
+                _move_to(copy, kind, why)
+                due = _demand_rotations(copy, content, known)
+                detail = {"created": content.created, "keystore": vault.kind, "rotations_due": due}
+                copy.audit.append("restore", None, "rebuilt", detail)
+            aside = set_aside(home) if has_store(home) else None
+            place(copy, home)
+        return Restored("rebuilt", None, totals(copy), (), kind, aside, due)
+
+    return asked_first(ask, make)
 
 
 def _demand_rotations(copy: Store, content: Content, ask: Ask) -> int:
@@ -154,6 +172,20 @@ def bring_vault(
     return vault, why
 
 
+def open_vault_of(store: Store, ask: Ask) -> None:
+    """Open the vault of a living station, before anything is held; one that is lost is no failure yet.
+
+    Raises WrongPassphrase, VaultChanged.
+    """
+    facts = store.facts()
+    try:
+        open_vault(store.home, store.id, facts.keystore if facts is not None else "keyring", ask)
+    except (WrongPassphrase, VaultChanged):
+        raise
+    except VaultFailure:
+        pass
+
+
 def complete_vault(store: Store, content: Content, ask: Ask, *, keystore: str | None = None) -> Vault:
     """Open the vault of a living station; make it again where it is lost, and join master keys that it lacks.
 
@@ -163,7 +195,7 @@ def complete_vault(store: Store, content: Content, ask: Ask, *, keystore: str | 
     wanted = facts.keystore if facts is not None else keystore_for(content, keystore)
     try:
         vault = open_vault(store.home, store.id, wanted or "keyring", ask)
-    except WrongPassphrase:
+    except (WrongPassphrase, VaultChanged):
         raise
     except VaultFailure:  # lost, or locked: then making it fails as well and says so
         return bring_vault(store.home, content, ask, wanted)[0]

@@ -110,12 +110,16 @@ def ask_for_certificate(home: Path, *, name: str | None, keystore: str | None, a
 
     A station that is complete asks with the key that it has. Run again it gives a request for the same key.
     """
-    with Store.open(home, create=True) as store, StoreLock(home, command="init"):
-        station = Station(store, ask)
+    with Store.open(home, create=True) as store:
+        return vaults.asked_first(ask, lambda known: _requested(Station(store, known), name, keystore, known))
+
+
+def _requested(station: Station, name: str | None, keystore: str | None, ask: Ask) -> bytes:
+    with StoreLock(station.home, command="init"):
         if station.identity.is_complete():
             return make_request(station.name, station.vault.identity())
         if station.identity.requested is None:
-            vault, why = vaults.create_vault(home, store.id, keystore, ask, with_ca=False)
+            vault, why = vaults.create_vault(station.home, station.id, keystore, ask, with_ca=False)
             where = keystore if keystore and keystore.startswith("pkcs11:") else vault.kind
             station.adopt(vault)
             with station.transaction():
@@ -134,9 +138,15 @@ def adopt_certificate(home: Path, certificate: Certificate, *, ask: Ask) -> Stat
     if not has_store(home):
         raise NotFound("No station has asked for a certificate here.", hint="First: init --request FILE")
     station = Station(Store.open(home), ask)
-    try:
+
+    def adopt(known: Ask) -> None:
+        station.ask_by(known)
         with StoreLock(home, command="init"):
             _adopt(station, certificate)
+
+    try:
+        vaults.asked_first(ask, adopt)
+        station.ask_by(ask)
     except BaseException:
         station.close()
         raise

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 from datetime import UTC, datetime, timedelta
 from typing import TYPE_CHECKING, Any, Final
 
-from teds_provision.errors import NoKeyring, VaultFailure, WrongPassphrase
+from teds_provision.errors import NoKeyring, UnknownMaster, VaultChanged, VaultFailure, WrongPassphrase
 from teds_provision.station.identity import Identity
 from teds_provision.station.seals import Seals
 from teds_provision.store import Holder, KeyRecord, Marks, Store, pages, utc_now
@@ -121,7 +121,7 @@ class NodeKeys:
             )
 
     def refresh(self) -> None:
-        """Open the vault again where another process has changed the master key (vault rewrap).
+        """Read the vault again where another process has changed the master key (vault rewrap).
 
         To be called inside a transaction, before keys are wrapped in it: then no such change comes in between.
         """
@@ -140,15 +140,27 @@ class NodeKeys:
         return KeyRecord(uuid, epoch, key_id.hex(), "pending", slot, sealed, source, created)
 
     def unwrap(self, record: KeyRecord) -> bytes:
-        """Return a link key in the clear; raises VaultFailure where it is damaged or of another vault."""
-        context = node_key_context(self._store.id, record.uuid, record.epoch, record.slot)
-        vault = self._vault()
+        """Return a link key in the clear.
+
+        A record that was read before another command changed the master key is read again, and so is the vault. Raises
+        VaultFailure where it is damaged or of another vault.
+        """
         try:
-            return vault.unwrap(record.wrapped, context=context)
-        except VaultFailure:
-            if self._identity.master in vault.masters():
+            return self._unwrapped(record, self._vault())
+        except UnknownMaster:  # of the vault as it was a moment ago, or of a record as old as that
+            vault = self._reopened()
+        there = (held for held in self._store.keys(record.uuid) if held.key_id == record.key_id)
+        fresh = next(there, record)
+        try:
+            return self._unwrapped(fresh, vault)
+        except UnknownMaster:
+            if self._identity.master in vault.masters():  # lost for good, and not only to a look at an earlier moment
                 raise
-        return self._reopened().unwrap(record.wrapped, context=context)
+        raise VaultChanged("Another command changed the master key in this moment.", hint="Run this again.")
+
+    def _unwrapped(self, record: KeyRecord, vault: Vault) -> bytes:
+        context = node_key_context(self._store.id, record.uuid, record.epoch, record.slot)
+        return vault.unwrap(record.wrapped, context=context)
 
     def outdated(self, record: KeyRecord) -> list[KeyRecord]:
         """The keys of a node that a good Open under ``record`` shows to be of no use any more.
@@ -205,8 +217,9 @@ class NodeKeys:
 
         The wrapped form is bound to the epoch, so it is made anew, in one transaction.
         """
-        key = self.unwrap(record)
         with self._store.together():
+            self.refresh()
+            key = self.unwrap(record)
             slot = self._store.next_slot(record.uuid)
             context = node_key_context(self._store.id, record.uuid, epoch, slot)
             corrected = replace(record, epoch=epoch, slot=slot, wrapped=self._vault().wrap(key, context=context))

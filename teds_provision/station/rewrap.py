@@ -30,6 +30,7 @@ def rewrap(station: Station) -> Rewrapped:
     Raises VaultFailure and its leaves, StoreFailure; the same command carries on.
     """
     vault, identity = station.vault, station.identity
+    vault.refresh()
     if identity.rewrapping != vault.masters()[-1]:
         if vault.masters()[-1] <= identity.master:  # else a run was cut before it noted the one that it had made
             vault.add_master()

@@ -23,10 +23,10 @@ import threading
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from teds_provision import vault as vaults
-from teds_provision.errors import NotFound
+from teds_provision.errors import NotFound, UnknownMaster
 from teds_provision.lazy import late
 from teds_provision.station.groups import Groups
 from teds_provision.station.handovers import Handovers
@@ -146,19 +146,28 @@ class Station:
         """Use a vault that is open; raises StoreChanged where the store does not go with it any more."""
         self._vault = vault  # the seals below are made and checked with it
         try:
-            self.seals.unlocked(vault)
+            self._look_at_seals(vault)
         except BaseException:
             self._vault = None
             raise
+
+    def _look_at_seals(self, vault: Vault) -> None:
+        try:
+            self.seals.unlocked(vault)
+        except UnknownMaster:  # between the opening of the vault and this look another command changed the master key
+            if not vault.refresh():
+                raise
+            self.seals.unlocked(vault)
 
     def ask_by(self, ask: Ask) -> None:
         """Ask for the passphrase by another function from now on."""
         self._ask = ask
 
     def _reopened(self) -> Vault:
-        """Open the vault again: another process has replaced what this one read."""
-        self._vault = None
-        return self._opened()
+        """Take in what another process has written into the vault; nobody is asked, as the store may be held."""
+        vault = self._opened()
+        vault.refresh()
+        return vault
 
     def unlock(self, uuid: bytes | None = None) -> None:
         """Open the vault now: nobody is asked for a passphrase while the store is locked or a node lies there.
@@ -273,20 +282,30 @@ def initialise(
     station = Station(Store.open(home, create=True), ask)
     if station.identity.is_complete():
         return station, station.identity.keystore_why
-    with StoreLock(home, command="init"):
-        if station.identity.is_complete():  # another init was first
-            return station, station.identity.keystore_why
-        if station.identity.requested is not None:
-            raise not_certified()
-        more = {} if costs is None else {"costs": costs}
-        vault, why = vaults.create_vault(home, station.id, keystore, ask, tell=tell, **more)  # type: ignore[arg-type]
-        key, ca = vault.identity(), vault.ca()
-        if ca is None:
-            raise NotFound("The vault holds no CA key.", hint="Choose another keystore, or bring the CA key back.")
-        station.adopt(vault)
-        with station.transaction():
-            where = keystore if keystore and keystore.startswith("pkcs11:") else vault.kind
-            station.identity.found(name, where, why)
-            station.identity.complete(key.point, ca.point, ca.sign(keys.station_key_message(key.point)))
-            station.audit("init", None, "done", fingerprint=keys.fingerprint(key.point), keystore=vault.kind)
-    return station, why
+    told: set[str] = set()
+
+    def tell_once(text: str) -> None:
+        if text not in told:
+            told.add(text)
+            tell(text)
+
+    def make(known: Ask) -> str:
+        with StoreLock(home, command="init"):
+            if station.identity.is_complete():  # another init was first
+                return station.identity.keystore_why
+            if station.identity.requested is not None:
+                raise not_certified()
+            more: dict[str, Any] = {} if costs is None else {"costs": costs}
+            vault, why = vaults.create_vault(home, station.id, keystore, known, tell=tell_once, **more)
+            key, ca = vault.identity(), vault.ca()
+            if ca is None:
+                raise NotFound("The vault holds no CA key.", hint="Choose another keystore, or bring the CA key back.")
+            station.adopt(vault)
+            with station.transaction():
+                where = keystore if keystore and keystore.startswith("pkcs11:") else vault.kind
+                station.identity.found(name, where, why)
+                station.identity.complete(key.point, ca.point, ca.sign(keys.station_key_message(key.point)))
+                station.audit("init", None, "done", fingerprint=keys.fingerprint(key.point), keystore=vault.kind)
+            return why
+
+    return station, vaults.asked_first(ask, make)

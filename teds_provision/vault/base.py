@@ -17,7 +17,12 @@ SERVICE = "teds-provision"
 
 
 class Vault(Protocol):
-    """Where the secrets of one station lie. All methods raise VaultFailure or a leaf below it."""
+    """Where the secrets of one station lie. All methods raise VaultFailure or a leaf below it.
+
+    What changes the vault reads first what lies there now, and makes what it writes from that: the caller holds the
+    store's lock, and a copy from before the lock decides nothing. It raises VaultChanged where the passphrase (or PIN)
+    that opened this one is not the vault's any more.
+    """
 
     @property
     def kind(self) -> str:
@@ -48,11 +53,15 @@ class Vault(Protocol):
     def retire_masters(self) -> None:
         """Forget all master keys but the newest, durably. Last step of a change, once every key is wrapped anew."""
 
-    def change_passphrase(self, ask: Ask) -> None:
-        """Replace the passphrase (or PIN) durably; the keys stay. Raises VaultFailure where another program does that.
+    def new_passphrase(self, ask: Ask) -> Callable[[], None]:
+        """Ask for another passphrase (or PIN), with no lock held; what is returned sets it durably, under the lock.
 
-        ``ask`` is called for the new one, and before it for the old one where the vault has to give it on.
+        The keys stay. ``ask`` is called for the new one, and before it for the old one where the vault has to give it
+        on. Raises VaultFailure where another program does that.
         """
+
+    def refresh(self) -> bool:
+        """Take in what another process has written since; False where nothing was. Nobody is asked."""
 
     def opener(self) -> bytes:
         """What opens this vault without asking, for an agent (``unlock``): the key of a passphrase file.
@@ -74,9 +83,6 @@ class Vault(Protocol):
 
         Raises WrongPassphrase, NotFound, VaultFailure: not such a file, another CA key is here, none can come in.
         """
-
-    def replaced(self) -> bool:
-        """Say whether another process has replaced what this one opened, so that it has to be opened again."""
 
     def secret_material(self) -> str:
         """Return what a sealed backup has to hold so that this vault can be made again. Whoever calls it seals it."""

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TypeVar
 
-from teds_provision.errors import UsageFailure, VaultFailure, WrongPassphrase
+from teds_provision.errors import UsageFailure, VaultChanged, VaultFailure, WrongPassphrase
 from teds_provision.lazy import late
 from teds_provision.vault.agent import asking
 from teds_provision.vault.base import Ask, Vault
@@ -20,6 +20,36 @@ else:  # a station has one of them, and argon2, keyring and python-pkcs11 are he
     pkcs11 = late("teds_provision.vault.pkcs11")
 
 _opened: dict[tuple[Path, str, str], Vault] = {}
+_Made = TypeVar("_Made")
+
+
+class _Unasked(Exception):
+    """Somebody has to be asked first."""
+
+    def __init__(self, prompt: str, confirm: bool) -> None:
+        super().__init__(prompt)
+        self.question = prompt, confirm
+
+
+def asked_first(ask: Ask, work: Callable[[Ask], _Made]) -> _Made:
+    """Do ``work``, which takes a lock and may need a passphrase in it, without that lock while a person types.
+
+    It is handed an ``ask`` that knows the answers given so far. At a question that is still open it is left, the
+    person is asked, and it begins anew: so it must change nothing before its questions, and read again what it asks
+    for. What another process did meanwhile leads to other questions, not to an old answer.
+    """
+    answers: dict[tuple[str, bool], str] = {}
+
+    def known(prompt: str, confirm: bool) -> str:
+        if (prompt, confirm) not in answers:
+            raise _Unasked(prompt, confirm)
+        return answers[prompt, confirm]
+
+    while True:
+        try:
+            return work(known)
+        except _Unasked as unasked:
+            answers[unasked.question] = ask(*unasked.question)
 
 
 def create_vault(
@@ -35,7 +65,8 @@ def create_vault(
 ) -> tuple[Vault, str]:
     """Make the vault of a station, or open the one that an earlier run made; return it and why it was chosen.
 
-    ``tell`` hears why, where and how long before anybody is asked for a new passphrase.
+    ``tell`` hears why, where and how long before anybody is asked for a new passphrase. The caller holds the store, and
+    lets nobody type meanwhile (:func:`asked_first`).
 
     ``keystore`` is ``keyring``, ``file``, ``pkcs11:…`` (RFC 7512) or None: then the keyring if one works (proven by a
     set, a read back and a delete), else a passphrase file. ``costs`` are those of a new passphrase file, ``restored``
@@ -61,16 +92,26 @@ def create_vault(
 
 
 def open_vault(home: Path, store_id: str, keystore: str, ask: Ask, *, agent: bool = False) -> Vault:
-    """Open the vault of a station; a second call in one process gives the same, without asking again.
+    """Open the vault of a station; a second call in one process gives the same as it is now, without asking again.
 
     With ``agent`` nobody is asked while ``unlock`` holds it open. Raises VaultFailure and its leaves: locked, missing,
     damaged, wrong passphrase.
     """
     harden()
     place = (home.resolve(), store_id, keystore)
-    vault = _opened.get(place)
-    if vault is None or vault.replaced():
+    vault, changed = _opened.get(place), None
+    if vault is not None:
+        try:
+            vault.refresh()
+            return vault
+        except VaultChanged as failure:  # under another passphrase: that one has to be asked for
+            changed = failure
+    try:
         _opened[place] = vault = _open(home, store_id, keystore, ask, agent=agent)
+    except WrongPassphrase:
+        if changed is not None:  # it was the right one before
+            raise changed from None
+        raise
     return vault
 
 

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from teds_provision.errors import BadData, NotFound, VaultFailure
+from teds_provision.errors import BadData, NotFound, VaultChanged, VaultFailure, WrongPassphrase
 from teds_provision.files import read_limited, write_new, write_whole
 from teds_provision.vault.base import Ask
 from teds_provision.vault.master import Material
@@ -16,7 +17,6 @@ from teds_provision.vault.software import SoftwareVault, settle
 FILE_NAME = "vault.json"
 _FORMAT = "teds-provision-vault/1"
 _MAX_OCTETS = 64 * 1024
-Stamp = tuple[int, int, int]
 
 
 class FileVault(SoftwareVault):
@@ -24,13 +24,14 @@ class FileVault(SoftwareVault):
 
     kind = "file"
 
-    def __init__(self, path: Path, store_id: str, material: Material, key: SealingKey) -> None:
+    def __init__(self, path: Path, store_id: str, material: Material, key: SealingKey, content: dict[str, Any]) -> None:
         super().__init__(material)
         self.description = f"passphrase file {path}"
         self._path = path
         self._store_id = store_id
         self._key = key
-        self.stamp = stamp(path)
+        self._content = content
+        """The file as this process read or wrote it, still sealed: tells whether it is another one by now."""
 
     @classmethod
     def create(
@@ -45,14 +46,15 @@ class FileVault(SoftwareVault):
         if path.exists():
             vault = cls.open(home, store_id, ask)
             if restored is not None:
-                vault._replace(settle(vault._material, restored))
+                vault.join(restored)
             return vault
         passphrase = ask("New passphrase for this station's keys", True)
         check_new(passphrase)
         material = settle(None, restored)
         key = SealingKey.derive(passphrase, costs=costs)
-        write_new(path, _sealed(store_id, material, key), failure=VaultFailure)
-        return cls(path, store_id, material, key)
+        content = _sealed(store_id, material, key)
+        write_new(path, _octets_of(content), failure=VaultFailure)
+        return cls(path, store_id, material, key, content)
 
     @classmethod
     def open(cls, home: Path, store_id: str, ask: Ask, *, held: bytes | None = None) -> FileVault:
@@ -62,53 +64,88 @@ class FileVault(SoftwareVault):
         """
         path = home / FILE_NAME
         content = read_sealed(path)
-        if content.get("store") != store_id:
-            raise VaultFailure(f"{path} belongs to another store.", hint="Restore the backup that holds both.")
+        _require_store(content, store_id, path)
         opened = None if held is None else unseal_with(held, content, context=_context(store_id))
         if opened is None:  # nothing is held, or the passphrase is another one by now
-            passphrase = ask("Passphrase of this station's keys", False)
-            opened = unseal(passphrase, content, context=_context(store_id))
+            passphrase, asked = ask("Passphrase of this station's keys", False), content
+            content = read_sealed(path)  # as it is now: a person may have thought for an hour
+            try:
+                opened = unseal(passphrase, content, context=_context(store_id))
+            except WrongPassphrase:
+                if content == asked:
+                    raise
+                raise _another_passphrase() from None
         plaintext, key = opened
-        return cls(path, store_id, Material.decode(plaintext.decode("ascii", "replace")), key)
+        return cls(path, store_id, _material(plaintext), key, content)
 
     def opener(self) -> bytes:
         """What opens this file without its passphrase, as long as that stays: for an agent that the user started."""
         return self._key.salt + self._key.key
 
-    def change_passphrase(self, ask: Ask, *, costs: Costs = PRODUCT) -> None:
-        """Seal the same keys under a new passphrase. Copies and backups made before still open with the old one."""
+    def new_passphrase(self, ask: Ask, *, costs: Costs = PRODUCT) -> Callable[[], None]:
+        """Ask for a new passphrase; what is returned seals the same keys under it, the store being held.
+
+        Copies and backups made before still open with the old one.
+        """
         passphrase = ask("New passphrase for this station's keys", True)
         check_new(passphrase)
         key = SealingKey.derive(passphrase, costs=costs)
-        write_whole(self._path, _sealed(self._store_id, self._material, key), failure=VaultFailure)
-        self._key = key
-        self.stamp = stamp(self._path)
 
-    def replaced(self) -> bool:
-        """Say whether another process has written the file since this one opened it."""
-        return self.stamp != stamp(self._path)
+        def seal_anew() -> None:
+            self.refresh()
+            before, self._key = self._key, key
+            try:
+                self._save(self._material)
+            except BaseException:
+                self._key = before
+                raise
+
+        return seal_anew
+
+    def _load(self) -> Material:
+        content = read_sealed(self._path)
+        if content == self._content:
+            return self._material
+        _require_store(content, self._store_id, self._path)
+        opened = unseal_with(self.opener(), content, context=_context(self._store_id))
+        if opened is None:
+            raise _another_passphrase()
+        self._content = content
+        return _material(opened[0])
 
     def _save(self, material: Material) -> None:
-        write_whole(self._path, _sealed(self._store_id, material, self._key), failure=VaultFailure)
-        self.stamp = stamp(self._path)
+        content = _sealed(self._store_id, material, self._key)
+        write_whole(self._path, _octets_of(content), failure=VaultFailure)
+        self._content = content
 
 
-def stamp(path: Path) -> Stamp | None:
-    """Return what changes when the file is replaced, None if it is not there."""
-    try:
-        status = path.stat()
-    except OSError:
-        return None
-    return status.st_ino, status.st_mtime_ns, status.st_size
+def _another_passphrase() -> VaultChanged:
+    return VaultChanged(
+        "Another command has set a new passphrase since this one asked; this one changed nothing.",
+        hint="Run it again with the new passphrase.",
+    )
+
+
+def _material(plaintext: bytes) -> Material:
+    return Material.decode(plaintext.decode("ascii", "replace"))
+
+
+def _require_store(content: dict[str, Any], store_id: str, path: Path) -> None:
+    if content.get("store") != store_id:
+        raise VaultFailure(f"{path} belongs to another store.", hint="Restore the backup that holds both.")
 
 
 def _context(store_id: str) -> bytes:
     return f"{_FORMAT}\0{store_id}".encode()
 
 
-def _sealed(store_id: str, material: Material, key: SealingKey) -> bytes:
+def _sealed(store_id: str, material: Material, key: SealingKey) -> dict[str, Any]:
     sealed = key.seal(material.encode().encode(), context=_context(store_id))
-    return json.dumps({"format": _FORMAT, "store": store_id, **sealed}, indent=1).encode() + b"\n"
+    return {"format": _FORMAT, "store": store_id, **sealed}
+
+
+def _octets_of(content: dict[str, Any]) -> bytes:
+    return json.dumps(content, indent=1).encode() + b"\n"
 
 
 def read_sealed(path: Path) -> dict[str, Any]:

@@ -33,6 +33,7 @@ _CHAINER: Final = "keyring.backends.chainer.ChainerBackend"
 _UNLOCK = (
     "Unlock it (log in to the desktop, or pipe its password to gnome-keyring-daemon --unlock), then run this again."
 )
+_NO_ENTRY = "Open the keyring of the user who ran init, or restore a backup (teds-provision restore)."
 _INSTEAD = "Start a Secret Service (gnome-keyring, KWallet), or run teds-provision init --keystore file."
 _Result = TypeVar("_Result")
 
@@ -80,24 +81,25 @@ class KeyringVault(SoftwareVault):
                 return cls(backend, name, store_id, Material.decode(line))
         raise failure or VaultFailure(
             "The keyring has no entry for this station.",
-            hint="Open the keyring of the user who ran init, or restore a backup (teds-provision restore).",
+            hint=_NO_ENTRY,
         )
 
     def opener(self) -> bytes:
         """Nothing that could be held beside what is asked for."""
         return b""
 
-    def change_passphrase(self, ask: Ask) -> None:
+    def new_passphrase(self, ask: Ask) -> Callable[[], None]:
         """Refuse: the keyring asks for its own passphrase. Raises VaultFailure always."""
         raise VaultFailure(
             f"The keyring has a passphrase of its own ({self.description}).",
             hint="Change it with the keyring's own program (Seahorse, KWallet manager, Keychain Access, passwd).",
         )
 
-    def replaced(self) -> bool:
-        """Say whether another process has replaced the entry since this one read it."""
+    def _load(self) -> Material:
         line = _get(self._name(), self._backend, self._entry)
-        return line is not None and line != self._material.encode()
+        if line is None:
+            raise VaultFailure("The keyring has no entry for this station any more.", hint=_NO_ENTRY)
+        return Material.decode(line)
 
     def _save(self, material: Material) -> None:
         _set(self._name(), self._backend, self._entry, material.encode())

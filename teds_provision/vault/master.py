@@ -17,7 +17,7 @@ from typing import Any
 from cryptography.exceptions import InvalidTag
 from cryptography.hazmat.primitives.ciphers.aead import AESGCM
 
-from teds_provision.errors import VaultFailure
+from teds_provision.errors import UnknownMaster, VaultFailure
 from teds_provision.protocol.keys import SoftwareKey
 
 MASTER_OCTETS = 32
@@ -62,13 +62,13 @@ class MasterKeys:
         return head + nonce + self._cipher(number).encrypt(nonce, key, head + context)
 
     def unwrap(self, wrapped: bytes, *, context: bytes) -> bytes:
-        """Open a wrapped key; raises VaultFailure if it is damaged, moved, or of another master key."""
+        """Open a wrapped key; raises VaultFailure if it is damaged or moved, UnknownMaster if of another master key."""
         head, nonce, sealed = wrapped[:_HEAD_OCTETS], wrapped[_HEAD_OCTETS:][:_NONCE_OCTETS], wrapped[17:]
         if len(sealed) < 16 or head[0] != _VERSION:
             raise VaultFailure("A wrapped key in the store is damaged.", hint=_DAMAGED)
         number = int.from_bytes(head[1:], "big")
         if number not in self.keys:
-            raise VaultFailure("A key in the store is wrapped under a master key that the vault lacks.", hint=_DAMAGED)
+            raise UnknownMaster("A key in the store is wrapped under a master key that the vault lacks.", hint=_DAMAGED)
         try:
             return self._cipher(number).decrypt(nonce, sealed, head + context)
         except InvalidTag:

@@ -12,14 +12,15 @@ from __future__ import annotations
 import hashlib
 import json
 import os
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from teds_provision.errors import BadData, NotFound, VaultFailure
+from teds_provision.errors import BadData, NotFound, VaultChanged, VaultFailure
 from teds_provision.files import read_limited, write_new, write_whole
 from teds_provision.protocol.keys import PrivateKey, SoftwareKey, fingerprint, verify
 from teds_provision.vault.base import Ask
-from teds_provision.vault.file_vault import stamp
 from teds_provision.vault.master import MasterKeys
 from teds_provision.vault.pkcs11_lock import exclusive
 from teds_provision.vault.pkcs11_token import TokenKey, TokenSession, ask_pin, find_token, log_in
@@ -38,11 +39,12 @@ class Pkcs11Vault:
 
     kind = "pkcs11"
 
-    def __init__(self, home: Path, store_id: str, uri: Pkcs11Uri, session: TokenSession, content: _Content) -> None:
+    def __init__(
+        self, home: Path, store_id: str, uri: Pkcs11Uri, session: TokenSession, opened: tuple[_Content, dict[str, Any]]
+    ) -> None:
         self.description = f"PKCS #11 token {session.label!r} by {uri.module_path}"
         self._home, self._store_id, self._module_path = home, store_id, uri.module_path
-        self._session, self._content = session, content
-        self._stamp = stamp(home / FILE_NAME)
+        self._session, (self._content, self._members) = session, opened
 
     @classmethod
     def create(
@@ -70,8 +72,8 @@ class Pkcs11Vault:
                 station = _find_or_make(session, store_id, where, "station")
                 ca = _find_or_make(session, store_id, where, "CA") if with_ca else None
                 _save(home, store_id, _Content(station, ca, MasterKeys.generate()), replace=False)
-            content = _load(home, store_id, session)  # the token has to open what was just sealed to its key
-        return cls(home, store_id, where, session, content)
+            opened = _load(home, store_id, session)  # the token has to open what was just sealed to its key
+        return cls(home, store_id, where, session, opened)
 
     @classmethod
     def open(cls, home: Path, store_id: str, uri: str, ask: Ask) -> Pkcs11Vault:
@@ -83,8 +85,8 @@ class Pkcs11Vault:
         _read(home, store_id)  # before anyone is asked for a PIN
         session = _open_session(where, ask, write=False)
         with exclusive(where.module_path):
-            content = _load(home, store_id, session)
-        return cls(home, store_id, where, session, content)
+            opened = _load(home, store_id, session)
+        return cls(home, store_id, where, session, opened)
 
     def identity(self) -> PrivateKey:
         """Return the station's identity key."""
@@ -117,10 +119,11 @@ class Pkcs11Vault:
 
     def drop_ca(self) -> bool:
         """Destroy the CA key in the token for good; False if there is none. It cannot be exported before."""
+        self.refresh()
         key = self._content.ca
         if key is None:
             return False
-        self._replace(_Content(self._content.station, None, self._content.masters))
+        self._replace(replace(self._content, ca=None))
         self._session.destroy(key)
         return True
 
@@ -132,24 +135,50 @@ class Pkcs11Vault:
         """Nothing that could be held beside what is asked for."""
         return b""
 
-    def change_passphrase(self, ask: Ask) -> None:
-        """Have the token set a new PIN; it asks for the old one. Raises WrongPassphrase, VaultFailure."""
-        old, new = ask("PIN of the token, as it is now", False), ask("New PIN of the token", True)
-        with exclusive(self._module_path):
-            self._session.set_pin(old, new)
+    def new_passphrase(self, ask: Ask) -> Callable[[], None]:
+        """Ask for the token's PIN and a new one; what is returned has the token set it, the store being held.
 
-    def replaced(self) -> bool:
-        """Say whether another process has replaced the file since this one opened it."""
-        return self._stamp != stamp(self._home / FILE_NAME)
+        That raises WrongPassphrase, VaultFailure, and VaultChanged, before the token counts a try, where another
+        command has set a new PIN since this vault was opened.
+        """
+        old, new = ask("PIN of the token, as it is now", False), ask("New PIN of the token", True)
+
+        def set_pin() -> None:
+            self.refresh()
+            # counted first: a cut in between makes others ask again, the other way round would cost them a try
+            self._replace(replace(self._content, pins=self._content.pins + 1))
+            with exclusive(self._module_path):
+                self._session.set_pin(old, new)
+
+        return set_pin
+
+    def refresh(self) -> bool:
+        """Take in what another process has written since; False where nothing was. Nobody is asked.
+
+        Raises VaultChanged where the token has a new PIN, VaultFailure.
+        """
+        if _read(self._home, self._store_id) == self._members:
+            return False
+        with exclusive(self._module_path):
+            content, members = _load(self._home, self._store_id, self._session)
+        if content.pins != self._content.pins:
+            raise VaultChanged(
+                "Another command has set a new PIN since this one asked; this one changed nothing.",
+                hint="Run it again with the new PIN.",
+            )
+        self._content, self._members = content, members
+        return True
 
     def add_master(self) -> None:
         """Add a master key, which wraps from now on; the old ones still unwrap. First step of a change."""
-        self._replace(_Content(self._content.station, self._content.ca, self._content.masters.with_new()))
+        self.refresh()
+        self._replace(replace(self._content, masters=self._content.masters.with_new()))
 
     def retire_masters(self) -> None:
         """Forget all master keys but the newest: the last step of a change, once every key is wrapped anew."""
+        self.refresh()
         if len(self._content.masters.keys) > 1:
-            self._replace(_Content(self._content.station, self._content.ca, self._content.masters.newest_only()))
+            self._replace(replace(self._content, masters=self._content.masters.newest_only()))
 
     def secret_material(self) -> str:
         """Return what a backup needs: the file, sealed as it is. It is of no use without the token."""
@@ -162,27 +191,32 @@ class Pkcs11Vault:
 
     def _join(self, other: _Content) -> None:
         """Take in the master keys of a backup of this station; raises VaultFailure if it is of another."""
+        self.refresh()
         here, there = self._content.masters.keys, other.masters.keys
         if other.station.point != self._content.station.point or any(
             here[number] != there[number] for number in here.keys() & there
         ):
             raise VaultFailure("The vault holds the keys of another station.", hint="Restore into another --home.")
-        self._replace(_Content(self._content.station, self._content.ca, MasterKeys({**there, **here})))
+        if there.keys() - here.keys():
+            self._replace(replace(self._content, masters=MasterKeys({**there, **here})))
 
     def _replace(self, content: _Content) -> None:
         with exclusive(self._module_path):
-            _save(self._home, self._store_id, content, replace=True)
-        self._content, self._stamp = content, stamp(self._home / FILE_NAME)
+            self._members = _save(self._home, self._store_id, content, replace=True)
+        self._content = content
 
     def __repr__(self) -> str:
         return f"Pkcs11Vault({self.description}, station {fingerprint(self._content.station.point)[:16]})"
 
 
+@dataclass(frozen=True)
 class _Content:
-    """What an open vault holds."""
+    """What an open vault holds; ``pins``: how often a new PIN was set, so that others know theirs for an old one."""
 
-    def __init__(self, station: TokenKey, ca: TokenKey | None, masters: MasterKeys) -> None:
-        self.station, self.ca, self.masters = station, ca, masters
+    station: TokenKey
+    ca: TokenKey | None
+    masters: MasterKeys
+    pins: int = 0
 
 
 def _open_session(uri: Pkcs11Uri, ask: Ask, *, write: bool) -> TokenSession:
@@ -205,8 +239,8 @@ def _find_or_make(session: TokenSession, store_id: str, uri: Pkcs11Uri, role: st
     return found or session.generate(label=label, identifier=identifier)
 
 
-def _save(home: Path, store_id: str, content: _Content, *, replace: bool) -> None:
-    """Seal the master keys to the station key, sign, write whole or not at all."""
+def _save(home: Path, store_id: str, content: _Content, *, replace: bool) -> dict[str, Any]:
+    """Seal the master keys to the station key, sign, write whole or not at all; returns what was written."""
     from cryptography.hazmat.primitives.ciphers.aead import AESGCM
 
     one_time, nonce = SoftwareKey.generate(), os.urandom(_NONCE_OCTETS)
@@ -215,6 +249,7 @@ def _save(home: Path, store_id: str, content: _Content, *, replace: bool) -> Non
         "store": store_id,
         "station": _described(content.station),
         "ca": None if content.ca is None else _described(content.ca),
+        "pins": content.pins,
         "one_time": one_time.point.hex(),
         "nonce": nonce.hex(),
     }
@@ -224,10 +259,12 @@ def _save(home: Path, store_id: str, content: _Content, *, replace: bool) -> Non
     members["signature"] = content.station.sign(_signed(members)).hex()
     write = write_whole if replace else write_new
     write(home / FILE_NAME, json.dumps(members, indent=1).encode() + b"\n", failure=VaultFailure)
+    return members
 
 
-def _load(home: Path, store_id: str, session: TokenSession) -> _Content:
-    return _content_of(_read(home, store_id), session)
+def _load(home: Path, store_id: str, session: TokenSession) -> tuple[_Content, dict[str, Any]]:
+    members = _read(home, store_id)
+    return _content_of(members, session), members
 
 
 def _content_of(members: dict[str, Any], session: TokenSession) -> _Content:
@@ -235,7 +272,14 @@ def _content_of(members: dict[str, Any], session: TokenSession) -> _Content:
     ca = None if members["ca"] is None else _held(session, members["ca"], "CA")
     if not verify(station.point, _signed(members), _octets(members, "signature")):
         raise VaultFailure(f"{FILE_NAME} was changed: its signature does not verify.", hint=_DAMAGED)
-    return _Content(station, ca, _unsealed(station, members))
+    return _Content(station, ca, _unsealed(station, members), _count(members))
+
+
+def _count(members: dict[str, Any]) -> int:
+    pins = members.get("pins", 0)
+    if not isinstance(pins, int):
+        raise VaultFailure(f"{FILE_NAME} is damaged (pins).", hint=_DAMAGED)
+    return pins
 
 
 def _unsealed(station: TokenKey, members: dict[str, Any]) -> MasterKeys:

@@ -60,6 +60,7 @@ class SoftwareVault(ABC):
 
     def drop_ca(self) -> bool:
         """Take the CA key out of the vault for good; False if there is none. Export it first."""
+        self.refresh()
         if self._material.ca is None:
             return False
         self._replace(self._material.with_ca(None))
@@ -71,6 +72,7 @@ class SoftwareVault(ABC):
         Raises WrongPassphrase, VaultFailure (not such a file, or another CA key is here), NotFound.
         """
         secret = ca_file.read_ca(path, passphrase)
+        self.refresh()
         if self._material.ca not in (None, secret):
             raise VaultFailure("This vault holds another CA key.", hint="Export and drop that one first.")
         if self._material.ca is None:
@@ -81,17 +83,28 @@ class SoftwareVault(ABC):
         """Return the numbers of the master keys, ascending; the last one wraps."""
         return tuple(sorted(self._material.masters.keys))
 
-    def replaced(self) -> bool:
-        """Say whether another process has replaced what this one opened."""
-        return False
+    def refresh(self) -> bool:
+        """Take in what another process has written since; False where nothing was. Nobody is asked.
+
+        Raises VaultChanged where it lies under another passphrase now, VaultFailure where it is gone.
+        """
+        there = self._load()
+        if there == self._material:
+            return False
+        if there.identity != self._material.identity:
+            raise VaultFailure("The vault holds the keys of another station.", hint="Restore into another --home.")
+        self._material = there
+        return True
 
     def add_master(self) -> None:
         """Add a master key, which wraps from now on; the old ones still unwrap. First step of a change."""
+        self.refresh()
         material = self._material
         self._replace(Material(material.identity, material.ca, material.masters.with_new()))
 
     def retire_masters(self) -> None:
         """Forget all master keys but the newest: the last step of a change, once every key is wrapped anew."""
+        self.refresh()
         material = self._material
         if len(material.masters.keys) > 1:
             self._replace(Material(material.identity, material.ca, material.masters.newest_only()))
@@ -103,6 +116,17 @@ class SoftwareVault(ABC):
     def _replace(self, material: Material) -> None:
         self._save(material)
         self._material = material
+
+    def join(self, restored: str) -> None:
+        """Take in what a backup brings (:meth:`secret_material`); raises VaultFailure if it is of another station."""
+        self.refresh()
+        joined = settle(self._material, restored)
+        if joined != self._material:
+            self._replace(joined)
+
+    @abstractmethod
+    def _load(self) -> Material:
+        """What lies there now; raises VaultChanged where this vault's passphrase does not open it, VaultFailure."""
 
     @abstractmethod
     def _save(self, material: Material) -> None:

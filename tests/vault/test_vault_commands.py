@@ -6,12 +6,13 @@ import os
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor, wait
 from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
 
-from teds_provision.errors import WrongPassphrase
+from teds_provision.errors import VaultChanged, WrongPassphrase
 from teds_provision.station.rewrap import rewrap
 from teds_provision.station.station import Station
 from teds_provision.store import StoreLock
@@ -152,7 +153,7 @@ def test_a_new_passphrase_cut_at_every_durable_write_opens_with_the_old_or_the_n
         came = False
         with dying_at(step):
             try:
-                vault.change_passphrase(asking(NEW), costs=THROWAWAY)
+                vault.new_passphrase(asking(NEW), costs=THROWAWAY)()
             except Killed:
                 came = True
         fits = []
@@ -164,7 +165,7 @@ def test_a_new_passphrase_cut_at_every_durable_write_opens_with_the_old_or_the_n
             fits.append(passphrase)
         assert len(fits) == 1, f"cut before durable step {step}"
         if fits == [NEW]:
-            FileVault.open(home, store_id, asking(NEW)).change_passphrase(asking(PASSPHRASE), costs=THROWAWAY)
+            FileVault.open(home, store_id, asking(NEW)).new_passphrase(asking(PASSPHRASE), costs=THROWAWAY)()
         assert [path.name for path in home.iterdir() if path.name.startswith(".")] == []
     assert step == 4  # the file, its name, the folder, and the run that was not cut
 
@@ -226,6 +227,49 @@ def test_nobody_changes_the_vault_while_another_command_holds_the_store(home: Pa
     assert process.json["error"]["code"] == "store-locked"
 
 
+def test_three_processes_that_wait_for_the_store_lose_no_key(home: Path) -> None:
+    """The real thing: all have opened the vault when the first of them gets the store."""
+    with ThreadPoolExecutor() as pool, StoreLock(home, command="provision"):
+        waiting = [pool.submit(spawn, "--home", home, "vault", "rewrap", passphrase=PASSPHRASE) for _ in range(2)]
+        waiting.append(pool.submit(spawn, "--home", home, "trust", "ca", "drop", "--yes", passphrase=PASSPHRASE))
+        for act in waiting:
+            wait([act], timeout=1.0)
+            assert not act.done()
+    assert [act.result().code for act in waiting] == [0, 0, 0], [act.result() for act in waiting]
+    station = opened(home)
+    assert len(keys(station)) == 5
+    assert station.vault.masters() == (3,)
+    assert station.vault.ca() is None
+    station.close()
+
+
+@pytest.mark.system
+def test_what_another_process_did_to_a_tokens_file_is_taken_in(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    from teds_provision.vault import create_vault
+    from teds_provision.vault.pkcs11 import Pkcs11Vault
+
+    forget_vaults()
+    uri, store = loaded(tmp_path, monkeypatch, ("pair",))["pair"], "77" * 16
+    try:
+        one, _ = create_vault(tmp_path, store, uri, asking(PIN))
+        other = Pkcs11Vault.open(tmp_path, store, uri, asking(PIN))
+        other.add_master()
+        set_pin = one.new_passphrase(asking(PIN, "654321"))
+        assert one.drop_ca()
+        assert Pkcs11Vault.open(tmp_path, store, uri, asking(PIN)).masters() == (1, 2)
+        late = other.new_passphrase(asking(PIN, "111111"))
+        set_pin()
+        for change in (late, other.add_master, other.retire_masters, other.drop_ca):
+            with pytest.raises(VaultChanged):
+                change()
+        Pkcs11Vault.open(tmp_path, store, uri, asking("654321")).retire_masters()
+        assert one.refresh()
+        assert one.masters() == (2,)
+    finally:
+        forget_vaults()
+        unload()
+
+
 @pytest.mark.system
 def test_a_tokens_pin_and_master_key(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     from teds_provision.station.station import initialise
@@ -238,9 +282,9 @@ def test_a_tokens_pin_and_master_key(tmp_path: Path, monkeypatch: pytest.MonkeyP
         rewrap(station)
         assert [held.key for held in station.keys.unwrapped(NODES[0])] == [bytes(16)]
         with pytest.raises(WrongPassphrase):
-            station.vault.change_passphrase(asking("0000", "654321"))
-        station.vault.change_passphrase(asking(PIN, "654321"))
-        station.vault.change_passphrase(asking("654321", PIN))
+            station.vault.new_passphrase(asking("0000", "654321"))()
+        station.vault.new_passphrase(asking(PIN, "654321"))()
+        station.vault.new_passphrase(asking("654321", PIN))()
         station.close()
     finally:
         forget_vaults()

@@ -15,7 +15,7 @@ from teds_provision import vault as vault_room
 from teds_provision.cli.context import App, pass_app, read_line
 from teds_provision.cli.options import FileToRead, command, dry_run_option, yes_option
 from teds_provision.cli.steps.build import read_file
-from teds_provision.errors import NotFound, UsageFailure, VaultFailure, WrongPassphrase
+from teds_provision.errors import NotFound, UsageFailure, VaultChanged, VaultFailure, WrongPassphrase
 
 if TYPE_CHECKING:
     from teds_provision.backup.content import Content
@@ -175,9 +175,20 @@ def _merge(app: App, store: Store, content: Content, keystore: str | None, *, ye
         return
     if plan.back:
         app.confirm("Bring this back?", yes=yes)
-    with store_room.StoreLock(app.home, command="restore", notice=app.note):
-        vault = backup_room.restore.complete_vault(store, content, app.ask_secret, keystore=keystore)
-        done = backup_room.restore.merge_sealed(store, content, vault, app.ask_secret)
+
+    def work(known: Callable[[str, bool], str]) -> Restored:
+        with store_room.StoreLock(app.home, command="restore", notice=app.note):
+            if not yes and backup_room.restore.merge(store, content, dry_run=True).back not in (plan.back, {}):
+                raise VaultChanged(
+                    "Another command changed the station while the question stood: something else would come back now. "
+                    "Nothing was changed.",
+                    hint="Run it again, and look at the new list.",
+                )
+            vault = backup_room.restore.complete_vault(store, content, known, keystore=keystore)
+            return backup_room.restore.merge_sealed(store, content, vault, known)
+
+    backup_room.restore.open_vault_of(store, app.ask_secret)
+    done = vault_room.asked_first(app.ask_secret, work)
     _emit(app, content, done, "Brought back." if done.back else "The store lacks nothing of it (nothing to do).")
 
 

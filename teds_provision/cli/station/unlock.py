@@ -44,10 +44,12 @@ def unlock(app: App, span: str) -> None:
         return said
 
     station.ask_by(ask)
-    opener = station.vault.opener() or said.encode()
+    opened = station.vault
+    opener = opened.opener() or said.encode()
     if not opener:
         raise UsageFailure("The token has a PIN pad of its own: there is nothing that could be held.")
     with station.lock("unlock", app.note):
+        opened.refresh()  # an old passphrase is not held, and an old PIN costs no try
         asking.start(app.home, kind, opener, int(seconds))
         station.audit("vault", None, "unlocked", seconds=int(seconds))
     until = (datetime.now(UTC) + timedelta(seconds=seconds)).strftime("%Y-%m-%dT%H:%M:%SZ")
