@@ -11,14 +11,17 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Literal
 
+from teds_provision.teds.channel import spans_a_turn
+
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    from collections.abc import Mapping, Sequence
 
     from numpy.typing import NDArray
 
     from teds_provision.teds import Units
 
 Kind = Literal["sensor", "event", "actuator"]
+MOST_TOLD = 3  # reasons that one line tells
 State = Literal["waiting", "running", "lost", "refused", "ended"]
 
 
@@ -56,6 +59,13 @@ class ChannelFacts:
     def key(self) -> tuple[str, int]:
         """Node and channel: what tells channels apart in a whole station."""
         return self.uuid, self.number
+
+    @property
+    def full_turn(self) -> bool:
+        """Whether its values wrap: an angle sensor over one turn."""
+        if self.kind == "actuator" or self.units is None or self.low is None or self.high is None:
+            return False
+        return spans_a_turn(self.units, self.low, self.high)
 
     @property
     def label(self) -> str:
@@ -104,6 +114,23 @@ class GroupRows:
 
 
 @dataclass(frozen=True)
+class Invalid:
+    """So many values of a channel that are not valid, and why, as half a sentence."""
+
+    channel: int
+    why: str
+    count: int
+
+
+def why_invalid(found: Sequence[Invalid]) -> str:
+    """``66 of channel 1 above its high limit, 360 °``, the largest counts first; empty where all are valid."""
+    most = sorted(found, key=lambda one: -one.count)
+    told = [f"{one.count} of channel {one.channel}: {one.why}" for one in most[:MOST_TOLD]]
+    more = sum(one.count for one in most[MOST_TOLD:])
+    return "; ".join([*told, *([f"{more} more"] if more else [])])
+
+
+@dataclass(frozen=True)
 class NodeReport:
     """How one node does; once a second, and when its state changes."""
 
@@ -117,6 +144,7 @@ class NodeReport:
     invalid: int = 0
     clock_error: float | None = None
     time: float = 0.0  # unix seconds
+    invalid_why: tuple[Invalid, ...] = ()
 
 
 @dataclass(frozen=True)

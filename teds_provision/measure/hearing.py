@@ -12,8 +12,6 @@ from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass, field
 
-import numpy as np
-
 from teds_provision.errors import LinkFailure
 from teds_provision.links.can.bus import Frame
 from teds_provision.links.can.port import CanPort
@@ -49,7 +47,6 @@ class HeardStream:
     heard: float = field(default_factory=time.monotonic)
     wrong_pattern: int = 0
     samples: int = 0
-    invalid: int = 0
     bound: float | None = None
     _came: deque[tuple[bytes, int]] = field(default_factory=deque)
     _since: float = 0.0
@@ -139,8 +136,6 @@ class HeardStream:
 
     def _deliver(self, block: Block) -> None:
         self.samples += block.value.size
-        if not block.test_pattern:
-            self.invalid += block.valid.size - int(np.count_nonzero(block.valid))
         self.bound = block.clock_error
         self.deliver(block)
 

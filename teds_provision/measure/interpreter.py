@@ -12,13 +12,15 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from teds_provision.measure.blocks import Block
+from teds_provision.measure.blocks import Block, Invalid
 from teds_provision.measure.clock import ClockMap, Monotone, Wall
 from teds_provision.protocol.operation.stream_commands import Kind
 from teds_provision.protocol.operation.subscription import Message, Plan
 from teds_provision.teds.calibration.interpreter import ChannelInterpreter
 from teds_provision.teds.calibration.many_channels import ManyChannels
 from teds_provision.teds.sheet import Sheet
+
+NODE_SAYS_SO = "the node marks them as not valid"
 
 
 class StreamInterpreter:
@@ -53,6 +55,12 @@ class StreamInterpreter:
 
         usable = [one.channel.number not in self.problems for one in self._channels]
         self._many = ManyChannels.of(self._channels, usable)
+        self._invalid: dict[tuple[int, str], int] = {}
+
+    @property
+    def invalid(self) -> tuple[Invalid, ...]:
+        """How many values of the run were not valid, and why. Of any thread."""
+        return tuple(Invalid(channel, why, count) for (channel, why), count in self._invalid.copy().items())
 
     def blocks(self, messages: Sequence[Message]) -> list[Block]:
         """Messages as blocks: one for all that follow on from each other, and another one after each gap."""
@@ -77,10 +85,14 @@ class StreamInterpreter:
         else:
             octets, flags = b"".join([one.data for one in messages]), max([one.flags for one in messages])
         raws, value, valid = self._values(octets)
+        flagged = None
         if flags:
             told = [message.valid and not message.test_pattern for message in messages]
-            valid = valid & np.repeat(told, self._n)[:, None]
+            flagged = ~np.repeat(told, self._n)
+            valid = valid & ~flagged[:, None]
             value = np.where(valid, value, np.nan)
+        if not self._test_pattern and np.count_nonzero(valid) < valid.size:
+            self._count_invalid(raws, valid, flagged)
         steps, seconds = self._spaced(first, count)
         span = int(steps[-1])
         # Whole nanoseconds first: a tick of months and an offset of years would lose microseconds as floats.
@@ -102,6 +114,26 @@ class StreamInterpreter:
             test_pattern=self._test_pattern,
             run=self._run,
         )
+
+    def _count_invalid(self, raws: np.ndarray, valid: np.ndarray, flagged: np.ndarray | None) -> None:
+        """Count why values of a block are not valid; ``flagged`` says of which instants the node says so itself."""
+        places = {number: k for k, number in enumerate(self._numbers)}
+        for k, one in enumerate(self._channels):
+            bad = ~valid[:, k]
+            if not bad.any():
+                continue
+            found: dict[str, int] = {}
+            if one.channel.number in self.problems:
+                found[self.problems[one.channel.number].removesuffix(".")] = int(np.count_nonzero(bad))
+            else:
+                if flagged is not None and flagged.any():
+                    found[NODE_SAYS_SO] = int(np.count_nonzero(bad & flagged))
+                    bad &= ~flagged
+                others = {number: raws[bad, places[number]] for number in one.others}
+                found |= one.why_invalid(raws[bad, k], others)
+            for why, count in found.items():
+                key = one.channel.number, why
+                self._invalid[key] = self._invalid.get(key, 0) + count
 
     def _spaced(self, first: Message, count: int) -> tuple[np.ndarray, np.ndarray]:
         """When so many instants are after that of the first one, in ns and in seconds.

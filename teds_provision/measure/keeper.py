@@ -30,7 +30,7 @@ from teds_provision.measure.finding.sightings import Sighting
 from teds_provision.measure.planning import BusTime, Plans, plan_node, sensors_of
 from teds_provision.measure.running.common_start import CommonStart
 from teds_provision.measure.running.patience import Patience
-from teds_provision.measure.running.streams import NodeStreams
+from teds_provision.measure.running.streams import NodeStreams, added
 from teds_provision.measure.topic_actuators import TopicActuators
 from teds_provision.measure.trusting import Standing, Trusted, claim, open_trusted
 from teds_provision.measure.wish import Events, Wish
@@ -378,6 +378,7 @@ class NodeKeeper:
             invalid=sum(one.invalid for one in sums),
             clock_error=max(errors) if errors else None,
             time=time.time(),
+            invalid_why=added(*(one.invalid_why for one in sums)),
         )
 
     def _say(self, state: State, error: TedsProvisionError | None = None, more: str = "", *, why: str = "") -> None:

@@ -107,7 +107,10 @@ def _sample(one: ChannelInterpreter, raws: dict[int, np.ndarray], good: dict[int
         found = one.values(raws[channel.number], {other: raws[other] for other in one.others})
         valid = bool(found.valid[0]) and all(good[other] for other in (channel.number, *one.others))
         value = one.unit.to_si(float(found.value[0]))
-        why = "" if valid else "the node or the datasheet says that it is not valid"
+        if not valid:
+            flagged = not all(good[other] for other in (channel.number, *one.others))
+            reasons = one.why_invalid(raws[channel.number], {other: raws[other] for other in one.others})
+            why = "the node marks it as not valid" if flagged else next(iter(reasons), "")
     uncertainty = channel.stated_uncertainty
     return Sample(
         channel=channel.number,

@@ -20,12 +20,13 @@ from typing import TYPE_CHECKING, Any, Final
 
 from teds_provision.lazy import late
 from teds_provision.measure.sinks.lines import plain
+from teds_provision.teds.channel import TURN
 
 if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
-    from teds_provision.measure.blocks import Block
+    from teds_provision.measure.blocks import Block, ChannelFacts
 else:
     np = late("numpy")
 
@@ -94,6 +95,7 @@ class _Channel:
     credit: float = _CREDIT
     times: list[NDArray[Any]] = field(default_factory=list)
     values: list[NDArray[Any]] = field(default_factory=list)
+    before: float = math.nan  # value of the last point that was given out
 
 
 class Live:
@@ -104,6 +106,7 @@ class Live:
         self._waiting: deque[Block] = deque()
         self._channels: dict[Key, _Channel] = {}
         self._last: dict[Key, Last] = {}
+        self._turning: frozenset[Key] = frozenset()
         self._listeners: set[Listener] = set()
         self._loop: asyncio.AbstractEventLoop | None = None
         self.overrun = 0
@@ -120,6 +123,12 @@ class Live:
                 self._waiting.popleft()
                 self.overrun += 1
             self._waiting.append(block)
+
+    def learn(self, facts: Iterable[ChannelFacts]) -> None:
+        """What is known of channels: no line is drawn from one end of a full turn to the other."""
+        every = list(facts)
+        turning = {one.key for one in every if one.full_turn}
+        self._turning = (self._turning - {one.key for one in every}) | turning
 
     def event(self, event: str, **facts: Any) -> None:
         """Something happened: a node, a measurement, a link, a step; told to every client in order."""
@@ -187,7 +196,10 @@ class Live:
                 continue
             times, values = np.concatenate(one.times), np.concatenate(one.values)
             one.times, one.values = [], []
-            times, values = thinned(times, values, int(one.credit))
+            turning = key in self._turning
+            times, values = thinned(times, values, int(one.credit), **({"before": one.before} if turning else {}))
+            if len(values):
+                one.before = float(values[-1])
             one.credit -= len(times)
             self.values += len(times)
             if len(times):
@@ -210,11 +222,35 @@ class Live:
         return touched
 
 
-def thinned(times: NDArray[Any], values: NDArray[Any], most: int) -> tuple[NDArray[Any], NDArray[Any]]:
+def thinned(
+    times: NDArray[Any], values: NDArray[Any], most: int, *, before: float | None = None
+) -> tuple[NDArray[Any], NDArray[Any]]:
     """At most ``most`` of these points, among them the least and the greatest of each of ``most // 2`` parts.
 
     Points stay in order and are points that were measured; of a part without a value its first is kept, as a gap.
+    ``before`` is given for angles (rad) that wrap at a full turn, and is the one that came last: where they go on at
+    the other end of the turn, a gap is put in, and there are fewer parts if need be.
     """
+    if before is None:
+        return _extremes(times, values, most)
+    for points in (most, most // 2):
+        found = _parted(*_extremes(times, values, points), before)
+        if len(found[0]) <= most:
+            return found
+    return times[:0], values[:0]
+
+
+def _parted(times: NDArray[Any], values: NDArray[Any], before: float) -> tuple[NDArray[Any], NDArray[Any]]:
+    """Angles with a gap wherever one is more than half a turn from the one before it."""
+    if not len(times):
+        return times, values
+    with np.errstate(invalid="ignore"):
+        across = np.flatnonzero(np.abs(np.diff(values, prepend=before)) > TURN / 2)
+    between = (times[np.maximum(across - 1, 0)] + times[across]) / 2
+    return np.insert(times, across, between), np.insert(values, across, np.nan)
+
+
+def _extremes(times: NDArray[Any], values: NDArray[Any], most: int) -> tuple[NDArray[Any], NDArray[Any]]:
     if len(times) <= most:
         return times, values
     parts = most // 2

@@ -10,7 +10,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from typing import Any, Final
 
 from teds_provision.errors import NodeBusy, NotFound, TedsProvisionError, UsageFailure
@@ -325,6 +325,7 @@ class Measuring:
             self._report(one, said)
 
         def facts(said: Sequence[ChannelFacts]) -> None:
+            self._live.learn(said)
             for uuid in {fact.uuid for fact in said}:
                 self._roster.show_sheet(uuid, None)
                 self._roster.refresh([uuid])
@@ -340,6 +341,7 @@ class Measuring:
     def _report(self, one: Running, said: NodeReport) -> None:
         names = ("uuid", "state", "why", "samples", "lost", "late", "bad", "invalid", "clock_error")
         report = {name: getattr(said, name) for name in names}
+        report["invalid_why"] = [asdict(one) for one in said.invalid_why]
         before = one.reports.get(said.uuid, {})
         one.reports[said.uuid] = report
         changed = (before.get("state"), before.get("why")) != (said.state, said.why)

@@ -8,20 +8,57 @@ from dataclasses import dataclass
 from datetime import datetime
 from enum import IntEnum
 from functools import cached_property
-from typing import Final
+from typing import TYPE_CHECKING, Final
 
+from teds_provision.lazy import late
 from teds_provision.teds.calibration.model import Calibration
 from teds_provision.teds.calibration.samples import DataModel, SampleForm
 from teds_provision.teds.codec.codes import AccessCode
 from teds_provision.teds.codec.decode import decode
 from teds_provision.teds.codec.model import Decoded, Units
 from teds_provision.teds.image import BlockId
-from teds_provision.teds.units import ARBITRARY, DIGITAL, RATIO, WrittenUnit, display_unit, format_value, name_of_units
+from teds_provision.teds.units import (
+    ARBITRARY,
+    DIGITAL,
+    RATIO,
+    WrittenUnit,
+    display_unit,
+    format_value,
+    name_of_units,
+    units_of,
+)
+
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
+    Ends = float | NDArray[np.float64]
+else:
+    np = late("numpy")
 
 NOT_STATED: Final = math.nan
 """Stands for a number that the TEDS do not give, or call not available: IEEE 1451.0 writes NaN for that itself."""
 ROUNDING: Final = 4 * 2.0**-23
 """Limits and coefficients are Float32: a value this much of the limit beyond it is not beyond it."""
+TURN: Final = 2 * math.pi
+_NEARLY_A_TURN: Final = 1e-5
+"""Float32 limits of 0 and 2 pi are 1.7e-7 from a turn; cli.md, "Commands of the third round", sets the bound."""
+_RADIANS: Final = units_of(radians=1)
+
+
+def spans_a_turn(units: Units, low: float, high: float) -> bool:
+    """Whether limits in SI units are one turn apart, so that an angle beyond one of them comes back at the other."""
+    return units == _RADIANS and abs(high - low - TURN) < _NEARLY_A_TURN
+
+
+def wrapped(values: NDArray[np.float64], low: Ends, high: Ends, turn: Ends) -> NDArray[np.float64]:
+    """Angles moved by whole turns into [low, high), all in one unit, in which ``turn`` is a turn; NaN where not finite.
+
+    ``high`` is Float32 and may lie short of the turn by its rounding: what falls between comes to ``low``.
+    """
+    with np.errstate(invalid="ignore"):
+        moved = low + np.mod(values - low, turn)
+    return np.where(moved >= high, low, moved)
 
 
 class Kind(IntEnum):
@@ -110,6 +147,11 @@ class Channel:
     def has_range(self) -> bool:
         """Whether both limits are stated."""
         return math.isfinite(self.low) and math.isfinite(self.high)
+
+    @property
+    def full_turn(self) -> bool:
+        """Whether its values wrap: a sensor of angles whose limits are one turn apart. A set point never wraps."""
+        return not self.actuator and spans_a_turn(self.units, self.low, self.high)
 
     @property
     def stated_uncertainty(self) -> float:

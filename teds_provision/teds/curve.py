@@ -12,10 +12,11 @@ from teds_provision.lazy import late
 from teds_provision.teds.calibration.formula import evaluate
 from teds_provision.teds.calibration.model import Calibration, CalibrationInput
 from teds_provision.teds.calibration.samples import Range
+from teds_provision.teds.channel import TURN, spans_a_turn
 from teds_provision.teds.codec.model import Units
 from teds_provision.teds.image import BlockId
 from teds_provision.teds.sheet import described
-from teds_provision.teds.units import WrittenUnit, display_unit, format_value, parse_unit
+from teds_provision.teds.units import WrittenUnit, display_unit, format_value
 
 if TYPE_CHECKING:
     import numpy as np
@@ -49,8 +50,8 @@ class Channel:
 
     @property
     def full_turn(self) -> bool:
-        """Whether its limits span one turn, so that a zero offset only turns the scale."""
-        return self.units == parse_unit("rad").units and math.isclose(self.high - self.low, 2 * math.pi, rel_tol=1e-4)
+        """Whether its values wrap, so that a zero offset only turns the scale."""
+        return not self.actuator and spans_a_turn(self.units, self.low, self.high)
 
     @property
     def tolerance(self) -> float:
@@ -98,23 +99,16 @@ class Curve:
 
     @cached_property
     def result(self) -> NDArray[np.float64]:
-        """Results with the zero offset."""
-        return self._converted(self._plain + self.calibration.zero_offset)
-
-    @cached_property
-    def unshifted(self) -> NDArray[np.float64]:
-        """Results with the zero offset left out."""
-        return self._converted(self._plain)
-
-    @cached_property
-    def _plain(self) -> NDArray[np.float64]:
-        grid = np.meshgrid(*self.axes, indexing="ij")
-        return evaluate(self.calibration, *grid).value - self.calibration.zero_offset
-
-    def _converted(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Results with the zero offset; angles over a full turn as the curve gives them, not wrapped."""
+        values = evaluate(self.calibration, *np.meshgrid(*self.axes, indexing="ij")).value
         if self.channel.actuator:
             return values
         return values * self.calibration.unit.scale + self.calibration.unit.offset
+
+    def difference(self, other: Curve) -> NDArray[np.float64]:
+        """Results of this curve less those of another one over the same axes; of angles that wrap the shorter way."""
+        less = self.result - other.result
+        return less - TURN * np.round(less / TURN) if self.channel.full_turn else less
 
     def inputs_at(self, index: int) -> tuple[float, ...]:
         """Inputs of a flat index into the results."""

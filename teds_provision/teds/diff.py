@@ -238,7 +238,7 @@ def _calibration(channel: int, blocks: Mapping[BlockId, bytes], own: Channel) ->
 
 
 def _parts(was: Curve, curve: Curve) -> list[str]:
-    difference = curve.result - was.result
+    difference = curve.difference(was)
     if not np.isfinite(difference).all():
         return ["the readings are no numbers"]
     if float(np.abs(difference).max(initial=0.0)) <= curve.noise / 4:

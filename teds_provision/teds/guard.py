@@ -18,6 +18,7 @@ from teds_provision.lazy import late
 from teds_provision.teds.calibration.decoded import from_decoded
 from teds_provision.teds.calibration.fitting import residuals
 from teds_provision.teds.calibration.model import Calibration
+from teds_provision.teds.channel import TURN
 from teds_provision.teds.codec.codes import AccessCode
 from teds_provision.teds.codec.decode import decode
 from teds_provision.teds.codec.model import Decoded
@@ -146,7 +147,11 @@ def _limits(curve: Curve) -> Iterator[Raised]:
         values, names = curve.result, ("lowest raw value", "highest raw value")
     else:
         low, high, tolerance = channel.low, channel.high, channel.tolerance
-        values, names = (curve.unshifted if channel.full_turn else curve.result), ("low limit", "high limit")
+        values, names = curve.result, ("low limit", "high limit")
+        if channel.full_turn:  # wrapped, no value is beyond a limit; but a calibration that goes round twice is wrong
+            low = float(values.min())
+            high, tolerance = low + TURN, 2 * tolerance
+            names = "low limit", "end of the turn that the channel spans"
     if not math.isfinite(low) or not math.isfinite(high):
         yield "unlimited", "warning", "the channel states no limits: the results were not held against them."
     slack = tolerance + 4 * FLOAT32_STEP * max(abs(low), abs(high), 0.0) if math.isfinite(low + high) else tolerance
@@ -246,7 +251,7 @@ def _changed(curve: Curve, before: Curve) -> Iterator[Raised]:
     if len(curve.axes) != len(before.axes) or curve.channel.actuator:
         return
     same = replace(before, axes=curve.axes)
-    over = np.abs(curve.result - same.result)
+    over = np.abs(curve.difference(same))
     at = int(np.argmax(over))
     worst, span = float(over.flat[at]), curve.channel.high - curve.channel.low
     if math.isfinite(span) and worst > LARGE_CHANGE * span > 0:

@@ -19,6 +19,7 @@ from teds_provision.teds.calibration.decoded import is_sound
 from teds_provision.teds.calibration.describe import kind_of
 from teds_provision.teds.calibration.fitting import residuals
 from teds_provision.teds.calibration.model import Calibration
+from teds_provision.teds.channel import TURN, wrapped
 from teds_provision.teds.curve import channel_of, curve_of
 from teds_provision.teds.image import BlockId
 from teds_provision.teds.sheet import Sheet, name_among
@@ -189,25 +190,42 @@ class _View:
         step = max(1, len(places) // _LINE_POINTS)
         return np.unique(np.append(places[::step], places[-1:]))
 
+    def _wrapped(self, values: Any) -> Any:
+        """Angles over a full turn as they are measured: within it."""
+        if not self.channel.full_turn:
+            return values
+        ends = sorted(self.unit.from_si(end) for end in (self.channel.low, self.channel.high))
+        return wrapped(values, ends[0], ends[1], abs(self.unit.difference_from_si(TURN)))
+
+    def _drawn(self, values: Any) -> Any:
+        """Values of a line, with a gap where an angle goes on at the other end of its turn."""
+        if not self.channel.full_turn:
+            return values
+        values = self._wrapped(values)
+        jumps = np.abs(np.diff(values)) > abs(self.unit.difference_from_si(TURN)) / 2
+        values[1:][jumps] = np.nan
+        return values
+
     def curve(self, axes: Any) -> None:
         """Draw the curve, solid where it was calibrated and dotted beyond; its points, or the nodes of a table."""
         inside = self._thinned(self.inside)
         for number, line in enumerate(self.lines):
             label = "calibration" if number == 0 else None
-            axes.plot(self.axis[inside], line[inside], color=_BLUE, linewidth=1.4, label=label, zorder=3)
+            axes.plot(self.axis[inside], self._drawn(line[inside]), color=_BLUE, linewidth=1.4, label=label, zorder=3)
             low, high = self.nodes[0], self.nodes[-1]
             first = label and "extrapolated"
             for side in (self.axis <= low, self.axis >= high):
                 places = self._thinned(side)
                 if len(places) > 1:
-                    axes.plot(self.axis[places], line[places], color=_BLUE, linestyle=":", label=first, zorder=3)
+                    drawn = self._drawn(line[places])
+                    axes.plot(self.axis[places], drawn, color=_BLUE, linestyle=":", label=first, zorder=3)
                     first = None
         if self.panel.points:
             pairs = np.asarray(self.panel.points)
             x, y = (pairs[:, 1], pairs[:, 0]) if self.channel.actuator else (pairs[:, 0], pairs[:, 1])
             axes.plot(x, y, "o", markersize=3.5, color=_ORANGE, label=f"{len(pairs)} points", zorder=4)
         elif 2 < len(self.nodes) <= _MARKED_NODES and len(self.lines) == 1:
-            heights = np.interp(self.nodes, self.axis, self.lines[0])
+            heights = self._wrapped(np.interp(self.nodes, self.axis, self.lines[0]))
             axes.plot(self.nodes, heights, "o", markersize=3, color=_ORANGE, label=f"{len(self.nodes)} nodes", zorder=4)
 
     def limits(self, axes: Any) -> None:

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import asyncio
 import json
+import math
 import socket
 import time
 from contextlib import ExitStack, suppress
 from dataclasses import replace
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -16,8 +18,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from websockets.sync.client import connect
 
-from teds_provision.measure.blocks import Block
+from teds_provision.measure.blocks import Block, ChannelFacts
 from teds_provision.ncap.live import BEAT, POINTS, Listener, Live, thinned
+from teds_provision.teds.units import parse_unit
 from tests.ncap.service import Service, virtual
 from tests.pace import PATIENCE, best_of, succeeds, until
 
@@ -36,6 +39,42 @@ def test_thinning_keeps_measured_points_in_order_and_the_extremes(values: list[f
     if most >= 2 and len(finite):
         assert np.nanmax(kept) == finite.max()
         assert np.nanmin(kept) == finite.min()
+
+
+@given(st.lists(st.floats(0, 3) | st.just(float("nan")), max_size=300), st.integers(0, 40), st.floats(0, 6.28))
+def test_no_line_crosses_the_wrap_of_a_full_turn(steps: list[float], most: int, before: float) -> None:
+    times = np.arange(len(steps), dtype=float)
+    angles = np.mod(np.cumsum(np.nan_to_num(np.array(steps))), 2 * np.pi)
+    angles[np.isnan(np.array(steps))] = np.nan
+    kept_times, kept = thinned(times, angles, most, before=before)
+    assert len(kept_times) == len(kept) <= max(most, 0)
+    assert list(kept_times) == sorted(kept_times)
+    with_before = [before, *kept]
+    assert all(np.isnan([one, other]).any() or abs(one - other) <= np.pi for one, other in pairwise(with_before))
+    if most >= 4 and len(steps):
+        assert len(kept)
+    for moment, value in zip(kept_times, kept, strict=True):
+        assert np.isnan(value) or value == angles[int(moment)]
+
+
+def test_what_is_known_of_a_channel_decides_whether_its_line_wraps() -> None:
+    angle = ChannelFacts("ab" * 10, "", 1, "angle", units=parse_unit("rad").units, low=0.0, high=2 * math.pi)
+    live = Live()
+    live.join()
+    live.learn([angle])
+
+    def given_out() -> list[float | None]:
+        live._put_aside([])
+        return live._gather(1.0)[f"{angle.uuid}/1"][1]
+
+    values = np.array([[6.0], [6.2], [0.1], [0.3]])
+    live.block(replace(block(0, 4, 0.01), value=values, raw=values))
+    assert given_out() == [6.0, 6.2, None, 0.1, 0.3]
+    live.block(replace(block(4, 4, 0.01), value=values, raw=values))
+    assert given_out()[:2] == [None, 6.0], "the one before was 0.3"
+    live.learn([replace(angle, high=6.0)])
+    live.block(replace(block(8, 4, 0.01), value=values, raw=values))
+    assert given_out() == [6.0, 6.2, 0.1, 0.3]
 
 
 def block(first: int, count: int, period: float, channels: int = 1) -> Block:

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from teds_provision.node.hardware.clock import NodeClock
 from teds_provision.node.hardware.converter import Converter
 from teds_provision.node.sources.base import Reading
-from teds_provision.teds.calibration import load_calibrations
+from teds_provision.teds.calibration import load_calibrations, read_calibrations
 from teds_provision.teds.calibration.interpreter import ChannelInterpreter
 from teds_provision.teds.image import Image
 from teds_provision.teds.profile import load_profile
@@ -51,11 +51,30 @@ def test_a_sample_is_read_back_as_the_value_within_its_step(channel: tuple[Sheet
     assert len(octets) == converter.form.octets
     back = converter.value(octets)
     assert back is not None
-    assert back == pytest.approx(min(max(value, low), high), abs=(high - low) / 2000)
+    turn = high - low
+    off = back - value
+    assert off - turn * round(off / turn) == pytest.approx(0.0, abs=turn / 2000)
     interpreter = ChannelInterpreter(sheet, 1)
     if not interpreter.problem:
-        exact = int.from_bytes(interpreter.encode(value), "big")
-        assert abs(int.from_bytes(octets, "big") - exact) <= 1
+        exact = interpreter.decode(interpreter.encode(value)).value[0]
+        off = back - exact
+        assert abs(off - turn * round(off / turn)) <= 1.5 * turn / 16384
+
+
+@settings(max_examples=60, deadline=None)
+@given(zero=st.floats(-400, 400), value=st.floats(-720, 720))
+def test_a_turned_scale_gives_the_sample_of_the_same_angle_quickly(zero: float, value: float) -> None:
+    """The second paper's sensor with its zero adjusted: a virtual one shows every angle, not the end of its scale."""
+    profile = load_profile("magnetic-angular-position-sensor")
+    text = f"# zero-offset: {zero!r}\nraw,value [deg]\n0,0\n16384,360\n"
+    calibration = read_calibrations(text, "angle.csv", profile)
+    sheet = Sheet.of(Image(UUID, profile.build(UUID, calibration=calibration).blocks))
+    converter = Converter(sheet, sheet.channels[0])
+    assert converter._table is not None
+    back = converter.value(converter.octets(Reading(value=value)))
+    assert back is not None
+    off = back - value
+    assert off - 360 * round(off / 360) == pytest.approx(0.0, abs=0.023)
 
 
 def test_raw_numbers_are_rounded_and_kept_within_the_sample(channel: tuple[Sheet, Converter]) -> None:

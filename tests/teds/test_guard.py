@@ -262,6 +262,15 @@ def test_an_adjusted_zero_of_a_full_turn_is_not_beyond_its_limits(magnetic: Prof
     assert codes(check_calibration(doubled, None, magnetic)) == {"limits"}
 
 
+def test_a_turn_of_the_scale_is_told_by_the_shorter_way(magnetic: Profile) -> None:
+    before = built(magnetic, angle_table())
+    near = built(magnetic, replace(angle_table(), zero_offset=355.0))
+    assert check_calibration(near, before, magnetic) == [], "5 degrees back"
+    far = check_calibration(built(magnetic, replace(angle_table(), zero_offset=200.0)), before, magnetic)
+    assert codes(far, "warning") == {"changed"}
+    assert "by up to 160 °" in text(far, "changed")
+
+
 def test_an_actuator_must_stay_within_its_raw_range() -> None:
     profile = load_profile("gripper", [shipped_profiles()])
     good = replace(fit([(0, 0.0), (4095, 110.0)], "linear", channel=1, actuator=True), unit=parse_unit("mm"))

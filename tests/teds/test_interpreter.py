@@ -27,6 +27,7 @@ from teds_provision.teds.calibration import (
     fit,
 )
 from teds_provision.teds.calibration.samples import DataModel, SampleForm
+from teds_provision.teds.channel import Kind
 from teds_provision.teds.image import BlockId, Image
 from teds_provision.teds.profile import load_profile
 from teds_provision.teds.units import WrittenUnit, parse_unit
@@ -185,7 +186,7 @@ def test_blocks_give_what_one_value_gives_and_what_exact_arithmetic_gives(
 @settings(max_examples=100, deadline=None)
 @given(octets=st.binary(min_size=2, max_size=40).filter(lambda b: len(b) % 2 == 0))
 def test_the_interpreter_gives_what_evaluate_gives_on_every_octet_string(octets: bytes) -> None:
-    interpreter = ChannelInterpreter(ANGLE, 1)
+    interpreter = ChannelInterpreter(LESS_THAN_A_TURN, 1)
     values = interpreter.decode(octets)
     for raw, value, valid in zip(values.raw.tolist(), values.value.tolist(), values.valid.tolist(), strict=True):
         expected = evaluate(TABLE, float(raw)).value
@@ -201,6 +202,7 @@ TABLE = replace(
     uncertainty=0.5,
 )
 ANGLE = sheet_of("magnetic-angular-position-sensor", {1: TABLE})
+LESS_THAN_A_TURN = changed(ANGLE, high=math.radians(359.9))
 
 
 def test_limits_and_uncertainty_are_told_in_the_unit_of_the_values() -> None:
@@ -213,13 +215,75 @@ def test_limits_and_uncertainty_are_told_in_the_unit_of_the_values() -> None:
 
 
 def test_a_value_beyond_the_limits_by_more_than_the_uncertainty_is_not_valid() -> None:
-    interpreter = ChannelInterpreter(ANGLE, 1)
-    raws = np.array([0, 63800, 65000], dtype=np.uint64)
+    interpreter = ChannelInterpreter(LESS_THAN_A_TURN, 1)
+    raws = np.array([0, 63750, 65000], dtype=np.uint64)
     values = interpreter.values(raws)
     assert values.valid.tolist() == [True, True, False]
-    assert 360.0 < values.value[1] < 360.5
+    assert 359.9 < values.value[1] < 360.4
     assert math.isnan(values.value[2])
     assert values.raw is raws
+    assert interpreter.why_invalid(raws) == {"above its high limit, 359.9 °": 1}
+
+
+def turned(zero: float, low: float = 0.0, counts: int = 4096) -> Sheet:
+    """The second paper's angle sensor, ``counts`` to a turn, its scale turned by ``zero`` degrees."""
+    ends = [(0, 0.0), (counts, 360.0)]
+    line = replace(fit(ends, "linear", channel=1), unit=parse_unit("degree"), uncertainty=0.5, zero_offset=zero)
+    sheet = sheet_of("magnetic-angular-position-sensor", {1: line})
+    return changed(sheet, low=low, high=low + 2 * math.pi, sample=SampleForm(DataModel.UNSIGNED, 2, 12))
+
+
+@pytest.mark.parametrize("low", [0.0, -math.pi])
+@given(zero=st.floats(-1000, 1000), raw=st.integers(0, 4095))
+def test_every_angle_of_a_full_turn_is_valid_wherever_its_zero_is(low: float, zero: float, raw: int) -> None:
+    interpreter = ChannelInterpreter(turned(zero, low), 1)
+    values = interpreter.values(np.array([raw], dtype=np.uint64))
+    assert values.valid.all()
+    begin, end = interpreter.limits
+    assert begin <= values.value[0] < end
+    off = values.value[0] - (raw * 360 / 4096 + np.float32(zero))
+    assert abs(off - 360 * round(off / 360)) < 1e-3
+    assert interpreter.why_invalid(np.array([raw], dtype=np.uint64)) == {}
+
+
+@given(zero=st.floats(-1000, 1000), angle=st.floats(-720, 720))
+def test_an_angle_finds_its_way_back_across_the_wrap(zero: float, angle: float) -> None:
+    interpreter = ChannelInterpreter(turned(zero), 1)
+    value = interpreter.decode(interpreter.encode(angle)).value[0]
+    off = value - angle
+    assert abs(off - 360 * round(off / 360)) < 360 / 4096
+
+
+def test_a_turn_is_two_pi_to_a_hundred_thousandth_and_of_sensors_of_angles_alone() -> None:
+    known = turned(90.0).channel(1)
+    assert known is not None
+    for high, more, full in (
+        (2 * math.pi + 0.9e-5, {}, True),
+        (2 * math.pi + 1.1e-5, {}, False),
+        (2 * math.pi - 0.9e-5, {}, True),
+        (2 * math.pi, {"units": parse_unit("m").units}, False),
+        (2 * math.pi, {"kind": Kind.ACTUATOR}, False),
+        (math.nan, {}, False),
+    ):
+        assert replace(known, high=high, **more).full_turn is full  # type: ignore[arg-type]
+
+
+def test_what_is_not_valid_says_why() -> None:
+    part = CalibrationInput(1, 1, (10.0, 3000.0), (0.0,))
+    line = Calibration(1, "linear", (part,), (-1.0, 0.05), unit=parse_unit("degree"))
+    sheet = sheet_of("magnetic-angular-position-sensor", {1: line})
+    sheet = changed(sheet, sample=SampleForm(0, 2, 12), high=math.radians(120), low=math.radians(1), uncertainty=0.0)
+    interpreter = ChannelInterpreter(sheet, 1)
+    raws = np.array([5, 15, 15, 100, 2600, 3500, 4096], dtype=np.uint64)
+    assert interpreter.why_invalid(raws) == {
+        "the raw value is none that the channel can give": 1,
+        "beyond the calibrated range": 2,
+        "below its low limit, 1 °": 2,
+        "above its high limit, 120 °": 1,
+    }
+    assert interpreter.values(raws).valid.tolist() == [False, False, False, True, False, False, False]
+    without = ChannelInterpreter(sheet_of("magnetic-angular-position-sensor"), 1)
+    assert without.why_invalid(raws) == {without.problem.removesuffix("."): 7}
 
 
 def test_a_raw_value_beyond_its_bits_is_not_valid_and_beyond_its_points_is_marked() -> None:
@@ -246,8 +310,8 @@ def test_floats_counts_and_bits_speak_for_themselves() -> None:
     angle = sheet_of("magnetic-angular-position-sensor")
     floats = ChannelInterpreter(changed(angle, sample=SampleForm(DataModel.FLOAT32, 4)), 1)
     assert floats.problem == ""
-    values = floats.decode(struct.pack(">3f", math.pi, 2 * math.pi, math.nan))
-    assert values.value[:2] == pytest.approx([180.0, 360.0])
+    values = floats.decode(struct.pack(">3f", math.pi, 1.75 * math.pi, math.nan))
+    assert values.value[:2] == pytest.approx([180.0, 315.0])
     assert values.valid.tolist() == [True, True, False]
     assert floats.encode(180.0) == struct.pack(">f", math.pi)
     counts = changed(angle, units=teds.Units(), sample=SampleForm(DataModel.UNSIGNED, 2), low=math.nan, high=math.nan)

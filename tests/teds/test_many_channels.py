@@ -14,7 +14,7 @@ from teds_provision.teds.calibration import ChannelInterpreter, fit
 from teds_provision.teds.calibration.many_channels import ManyChannels
 from teds_provision.teds.calibration.samples import SampleForm
 from teds_provision.teds.units import parse_unit
-from tests.teds.test_interpreter import sheet_of
+from tests.teds.test_interpreter import sheet_of, turned
 
 CURVES = {
     1: fit([(0, 0.0), (65535, 10.0)], "linear", channel=1),
@@ -49,6 +49,31 @@ def test_side_by_side_is_one_by_one(unit: str, raw: list[list[int]]) -> None:
         alone = one.values(one.reader.raw(octets[:, 2 * column : 2 * column + 2]))
         np.testing.assert_array_equal(valid[:, column], alone.valid)
         np.testing.assert_array_equal(value[:, column], alone.value * one.unit.scale + one.unit.offset)
+
+
+@given(st.lists(st.lists(st.integers(0, 65535), min_size=3, max_size=3), min_size=1, max_size=6), st.floats(-500, 500))
+@settings(max_examples=60)
+def test_angles_wrap_side_by_side_with_what_does_not(raw: list[list[int]], zero: float) -> None:
+    known = turned(zero).channel(1)
+    assert known is not None
+    wide = replace(known, sample=SampleForm(0, 2))
+    # The second has a range of less than a turn, the third gives its angles in rad.
+    degrees = replace(fit([(0, 0.0), (4096, 360.0)], "linear", channel=2), unit=parse_unit("degree"))
+    others = (
+        replace(wide, number=2, high=6.0, calibration=degrees),
+        replace(wide, number=3, calibration=fit([(0, 0.0), (65535, 10.0)], "linear", channel=3)),
+    )
+    together = replace(sheet(), channels=(wide, *others))
+    channels = [ChannelInterpreter(together, number) for number in (1, 2, 3)]
+    many = ManyChannels.of(channels, [True, True, True])
+    assert many is not None
+    octets = np.array(raw, dtype=">u2").view(np.uint8).reshape(len(raw), 6)
+    value, valid = many.values(many.raw(octets.tobytes()))
+    for column, one in enumerate(channels):
+        alone = one.values(one.reader.raw(octets[:, 2 * column : 2 * column + 2]))
+        np.testing.assert_array_equal(valid[:, column], alone.valid)
+        np.testing.assert_array_equal(value[:, column], alone.value * one.unit.scale + one.unit.offset)
+    assert valid[:, 0].all()
 
 
 @pytest.mark.parametrize("number", [1, 2, 3, 4])

@@ -198,8 +198,10 @@ def _end_lines(ended: Ended, require: Requirements | None) -> list[str]:
 
 
 def _stream_line(uuid: str, stream: Mapping[str, Any]) -> str:
-    lost = f"lost {stream['lost']}, late {stream['late']}, bad {stream['bad']}"
-    return f"{uuid}: {stream['samples']} values in {stream['messages']} messages, {lost}"
+    lost = f"lost {stream['lost']}, late {stream['late']}, bad {stream['bad']}, invalid {stream['invalid']}"
+    blocks = measure_room.blocks
+    why = blocks.why_invalid([blocks.Invalid(**one) for one in stream["invalid_why"]])
+    return f"{uuid}: {stream['samples']} values in {stream['messages']} messages, {lost}{f' ({why})' if why else ''}"
 
 
 def _recover(app: App, files: Sequence[str]) -> None:

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 from teds_provision import measure
 from teds_provision.cli.context import App
 from teds_provision.cli.rendering import shown, tidy
-from teds_provision.measure.blocks import Block, ChannelFacts, NodeReport
+from teds_provision.measure.blocks import Block, ChannelFacts, NodeReport, why_invalid
 from teds_provision.measure.runner import Watcher
 from teds_provision.measure.sinks import Sink, ThreadedSink
 from teds_provision.measure.sinks.lines import as_line, data_lines, status_line
@@ -223,7 +223,8 @@ def in_peoples_units(value: float | None, known: ChannelFacts) -> tuple[float | 
 
 def _line(report: NodeReport) -> str:
     clock = f", clock ±{report.clock_error * 1e3:.2g} ms" if report.clock_error is not None else ""
-    counts = f"lost {report.lost}, late {report.late}, bad {report.bad}, not valid {report.invalid}{clock}"
+    reasons = f" ({shown(why_invalid(report.invalid_why))})" if report.invalid_why else ""
+    counts = f"lost {report.lost}, late {report.late}, bad {report.bad}, invalid {report.invalid}{reasons}{clock}"
     why = f" ({report.why})" if report.why else ""
     return f"{report.uuid} {report.state}{why}: {counts}".replace("[", "(")
 

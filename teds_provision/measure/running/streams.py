@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Callable
+from collections import Counter
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
+from itertools import chain
 
 from teds_provision.errors import TedsProvisionError
-from teds_provision.measure.blocks import Block
+from teds_provision.measure.blocks import Block, Invalid
 from teds_provision.measure.clock import ClockMap, Monotone, Wall
 from teds_provision.measure.finding.buses import Bus
 from teds_provision.measure.hearing import HeardStream
@@ -36,6 +38,7 @@ class StreamTotals:
     bad: int = 0
     invalid: int = 0
     clock_error: float | None = None
+    invalid_why: tuple[Invalid, ...] = ()
 
     def add(self, heard: HeardStream) -> None:
         """Count a run."""
@@ -46,7 +49,8 @@ class StreamTotals:
         self.late += counts.late + counts.stale + counts.overflow
         self.bad += counts.bad + counts.junk + counts.future + counts.back + counts.unasked + heard.wrong_pattern
         self.bad += heard.assembly.wrong
-        self.invalid += heard.invalid
+        self.invalid_why = added(self.invalid_why, heard.interpreter.invalid)
+        self.invalid = sum(one.count for one in self.invalid_why)
         self.clock_error = heard.bound if heard.bound is not None else self.clock_error
 
     def with_run(self, heard: HeardStream | None) -> StreamTotals:
@@ -55,6 +59,14 @@ class StreamTotals:
         if heard is not None:
             sums.add(heard)
         return sums
+
+
+def added(*parts: Sequence[Invalid]) -> tuple[Invalid, ...]:
+    """Counts of the same channel and reason put together."""
+    counts: Counter[tuple[int, str]] = Counter()
+    for one in chain.from_iterable(parts):
+        counts[one.channel, one.why] += one.count
+    return tuple(Invalid(channel, why, count) for (channel, why), count in counts.items())
 
 
 class NodeStreams:

@@ -79,6 +79,7 @@ def status_line(report: NodeReport) -> dict[str, Any]:
         "late": report.late,
         "bad": report.bad,
         "invalid": report.invalid,
+        "invalid_why": [dataclasses.asdict(one) for one in report.invalid_why],
         "clock_error": report.clock_error,
         "time": report.time,
     }

@@ -27,7 +27,15 @@ from typing import Any
 
 import numpy as np
 
-from teds_provision.measure.blocks import Block, ChannelFacts, Command, GroupRows, NodeReport, StationFacts
+from teds_provision.measure.blocks import (
+    Block,
+    ChannelFacts,
+    Command,
+    GroupRows,
+    NodeReport,
+    StationFacts,
+    why_invalid,
+)
 from teds_provision.measure.sinks.base import CommandTaker, Item, ThreadedSink
 from teds_provision.measure.sinks.lines import facts_as_json
 from teds_provision.measure.sinks.meaning import VARIANCE_NOTE, Meaning, meaning_of, variance_of
@@ -281,6 +289,8 @@ class TopicSink(ThreadedSink):
         if level == OK and (told or any(counters.values())):
             level = WARN
         values = [("samples", str(report.samples)), *((name, str(count)) for name, count in counters.items())]
+        if report.invalid_why:
+            values.append(("why invalid", why_invalid(report.invalid_why)))
         if report.clock_error is not None:
             values.append(("clock error [s]", f"{report.clock_error:.2g}"))
         message = report.why or report.state

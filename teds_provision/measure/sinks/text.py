@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import Any
 
 from teds_provision.harmless import printable
-from teds_provision.measure.blocks import Block, ChannelFacts, NodeReport
+from teds_provision.measure.blocks import Block, ChannelFacts, NodeReport, why_invalid
 from teds_provision.measure.sinks.base import Item
 from teds_provision.measure.sinks.files import FileSink
 from teds_provision.measure.sinks.lines import facts_as_json, iso
@@ -43,7 +43,8 @@ class TextSink(FileSink):
             if self._news(item) and self._columns:
                 self._new_part()
         elif isinstance(item, NodeReport) and item.state != "running" and self._columns:
-            self._line(f"# {iso(item.time)} {item.uuid} {item.state}: {printable(item.why)}")
+            why = f"; {printable(item.why)}" if item.why else ""
+            self._line(f"# {iso(item.time)} {item.uuid} {item.state}: {counted(item)}{why}")
 
     def _begin(self) -> None:
         if self.facts:
@@ -123,6 +124,14 @@ class TextSink(FileSink):
         unsigned = any(self.facts[block.uuid, number].unsigned for number in block.channels)
         note = "test pattern" if block.test_pattern else "unsigned datasheet" if unsigned else ""
         return self._comma.join(["%.6f", block.uuid, "%d", "%.3g", note, *cells]) + "\n"
+
+
+def counted(report: NodeReport) -> str:
+    """What became of a node's values, as the lines of the file's end say it."""
+    text = (
+        f"{report.samples} values, lost {report.lost}, late {report.late}, bad {report.bad}, invalid {report.invalid}"
+    )
+    return f"{text} ({printable(why_invalid(report.invalid_why))})" if report.invalid_why else text
 
 
 def _raw_values(block: Block) -> list[list[Any]]:

@@ -91,6 +91,7 @@ SCHEMAS: Final[dict[str, Schema]] = {
         late=INTEGER,
         bad=INTEGER,
         invalid=INTEGER,
+        invalid_why=listed(members("channel why count", channel=INTEGER, why=text(), count=INTEGER)),
         clock_error=maybe("number", description="seconds"),
     ),
     "Node": members(

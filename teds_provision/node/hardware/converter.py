@@ -43,6 +43,12 @@ class Converter:
         bits = self.form.bits if 0 < self.form.bits < width else width
         self._most = (1 << bits) - 1 if self.form.integer or self.form.model == DataModel.BITS else None
         self._packing = _PACKING.get(DataModel(self.form.model))
+        self._turn = self._interpreter.turn
+        # Where values wrap, those that the curve gives begin where its raw numbers do, not at LowLimit.
+        self._from, self._to = self.low, self.high
+        if self._turn < math.inf and not self._interpreter.problem:
+            self._from, high = self._interpreter.given or (self.low, self.high)
+            self._to = min(high, self._from + self._turn * (1 - 1e-9))
         self._table = self._tabulated()
 
     @property
@@ -59,13 +65,23 @@ class Converter:
 
     def raw(self, value: float) -> float:
         """The raw number, not rounded, of a value in the unit in which people see it."""
-        value = self.low if value < self.low else self.high if value > self.high else value
+        if self._turn < math.inf:
+            value = self._wrapped(value)
+        else:
+            value = self.low if value < self.low else self.high if value > self.high else value
         if self._table is None:
             return float(self._interpreter.raw_numbers(np.array([value]))[0])
         values, raws = self._table
         at = bisect.bisect_right(values, value, 1, len(values) - 1)
         share = (value - values[at - 1]) / (values[at] - values[at - 1])
         return raws[at - 1] + share * (raws[at] - raws[at - 1])
+
+    def _wrapped(self, value: float) -> float:
+        """An angle moved by whole turns to where the curve gives it, or to the nearer of its ends."""
+        value = self._from + (value - self._from) % self._turn
+        if value <= self._to:
+            return value
+        return self._to if value - self._to <= self._from + self._turn - value else self._from
 
     def write(self, raw: float) -> bytes:
         """Octets of a raw number, rounded and kept within what a sample can hold."""
@@ -103,8 +119,8 @@ class Converter:
             return None
         ends = self.form.raw_range
         if self._interpreter.problem:
-            return ([self.low, self.high], [0.0, ends[1]]) if ends is not None else None
-        knots = np.linspace(self.low, self.high, 2 * _KNOTS - 1)
+            return ([self._from, self._to], [0.0, ends[1]]) if ends is not None else None
+        knots = np.linspace(self._from, self._to, 2 * _KNOTS - 1)
         try:
             raws = self._interpreter.raw_numbers(knots)
         except BadData:

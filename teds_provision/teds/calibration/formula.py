@@ -146,6 +146,10 @@ class PreparedInverse:
             return np.clip(np.clip(found, below[segment], above[segment]), self._low, self._high)
         return self._bisect(results, others)
 
+    def ends(self, shape: tuple[int, ...], others: Sequence[Floats] = ()) -> tuple[Floats, Floats]:
+        """Results at the low and at the high end, for as many values of the other inputs."""
+        return self._at(np.full(shape, self._low), others), self._at(np.full(shape, self._high), others)
+
     def _bisect(self, results: Floats, others: Sequence[Floats]) -> Floats:
         low = np.full(results.shape, self._low)
         high = np.full(results.shape, self._high)

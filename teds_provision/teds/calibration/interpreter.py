@@ -7,7 +7,7 @@ blocks; whoever measures hands it the octets of many samples at once.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import TYPE_CHECKING
@@ -17,7 +17,7 @@ from teds_provision.lazy import late
 from teds_provision.teds.calibration.formula import PreparedCurve, PreparedInverse
 from teds_provision.teds.calibration.reading import SampleReader
 from teds_provision.teds.calibration.samples import Range, SampleForm
-from teds_provision.teds.channel import ROUNDING
+from teds_provision.teds.channel import ROUNDING, TURN, wrapped
 from teds_provision.teds.sheet import Channel, Sheet
 from teds_provision.teds.units import WrittenUnit
 
@@ -37,8 +37,9 @@ class Values:
     """A block of samples: ``raw`` as the data model says, ``value`` in the channel's unit, NaN where not ``valid``.
 
     Not valid: the raw value cannot be (more than SigBits, not a number), or the value lies beyond the limits by more
-    than the stated uncertainty, or is no number. ``extrapolated``: an input lay outside the calibrated range; such a
-    value is valid as long as the limits hold, which the guard looked at before the datasheet was signed.
+    than the stated uncertainty, or is no number. Angles over a full turn wrap, so no limit is beyond them.
+    ``extrapolated``: an input lay outside the calibrated range; such a value is valid as long as the limits hold, which
+    the guard looked at before the datasheet was signed.
     """
 
     raw: NDArray[np.generic]
@@ -51,8 +52,9 @@ class ChannelInterpreter:
     """Reads and writes the samples of one channel of a datasheet.
 
     ``unit`` is the unit of the values, ``uncertainty`` the worst case in it (None where not stated), ``limits`` are
-    LowLimit and HiLimit in it (infinite where not stated). ``problem`` says in a sentence why raw values are all that
-    there is ("" where values can be had), for example a channel without calibration.
+    LowLimit and HiLimit in it (infinite where not stated), ``turn`` is a turn in it where values wrap into
+    ``wraps_into``, else infinite. ``problem`` says in a sentence why raw values are all that there is ("" where values
+    can be had), for example a channel without calibration.
     """
 
     def __init__(self, sheet: Sheet, number: int) -> None:
@@ -68,6 +70,9 @@ class ChannelInterpreter:
         self._readers = {part: SampleReader(form) for part, form in _forms(sheet, self.inputs).items()}
         self.problem = self._problem(sheet)
         self.limits = self._limits()
+        self.turn = abs(self.unit.difference_from_si(TURN)) if channel.full_turn else math.inf
+        ends = self.unit.from_si(channel.low), self.unit.from_si(channel.high)
+        self.wraps_into: Range = min(ends), max(ends)
         self.uncertainty = self._uncertainty()
         slack = self.uncertainty or 0.0
         low, high = self.limits
@@ -100,21 +105,53 @@ class ChannelInterpreter:
 
     def values(self, raw: NDArray[np.generic], others: Mapping[int, NDArray[np.generic]] | None = None) -> Values:
         """Values of raw values (of :meth:`SampleReader.raw`); raises BadData where an input is missing."""
+        shown, valid, extrapolated = self._computed(raw, others or {})
+        valid &= (shown >= self._floor) & (shown <= self._ceiling) & np.isfinite(shown)
+        return Values(raw, np.where(valid, shown, math.nan), valid, extrapolated)
+
+    def why_invalid(
+        self, raw: NDArray[np.generic], others: Mapping[int, NDArray[np.generic]] | None = None
+    ) -> dict[str, int]:
+        """Why raw values give none that is valid, as half a sentence each, and how many; nothing of valid ones."""
+        if self.problem:
+            return {self.problem.removesuffix("."): len(raw)}
+        shown, possible, extrapolated = self._computed(raw, others or {})
+        low, high = (f"{limit:.6g} {self.unit.text}".strip() for limit in self.limits)
+        found: dict[str, int] = {}
+        left = np.ones(len(raw), dtype=bool)
+        with np.errstate(invalid="ignore"):
+            beyond = (shown < self._floor) | (shown > self._ceiling)
+            for why, where in (
+                ("the raw value is none that the channel can give", ~possible),
+                ("beyond the calibrated range", beyond & extrapolated),
+                (f"below its low limit, {low}", shown < self._floor),
+                (f"above its high limit, {high}", shown > self._ceiling),
+                ("the calibration gives no number", ~np.isfinite(shown)),
+            ):
+                count = int(np.count_nonzero(left & where))
+                left &= ~where
+                if count:
+                    found[why] = count
+        return found
+
+    def _computed(
+        self, raw: NDArray[np.generic], others: Mapping[int, NDArray[np.generic]]
+    ) -> tuple[Floats, NDArray[np.bool_], NDArray[np.bool_]]:
+        """Values before the limits are looked at; which raw values can be; which lie beyond the calibrated range."""
         numbers, valid = self.reader.numbers(raw)
         if self.problem or (self.channel.actuator and self._curve is not None and self._way_back is None):
             nothing = np.full(len(raw), math.nan)
-            return Values(raw, nothing, np.zeros(len(raw), dtype=bool), np.zeros(len(raw), dtype=bool))
+            return nothing, np.zeros(len(raw), dtype=bool), np.zeros(len(raw), dtype=bool)
         if self.channel.actuator and self._way_back is not None:
             shown = self._shown(self._way_back(numbers))
             extrapolated = np.zeros(len(raw), dtype=bool)
         elif self._curve is not None:
-            inputs, valid = self._inputs(numbers, valid, others or {})
+            inputs, valid = self._inputs(numbers, valid, others)
             shown = self._shown(self._curve(*inputs))
             extrapolated = self._curve.outside(*inputs)
         else:
             shown, extrapolated = self._shown(numbers), np.zeros(len(raw), dtype=bool)
-        valid &= (shown >= self._floor) & (shown <= self._ceiling) & np.isfinite(shown)
-        return Values(raw, np.where(valid, shown, math.nan), valid, extrapolated)
+        return self.within_turn(shown), valid, extrapolated
 
     def encode(self, values: Floats | float, others: Mapping[int, NDArray[np.generic]] | None = None) -> bytes:
         """Octets of values in :attr:`unit`: kept within the limits, converted, rounded to what the sample can hold.
@@ -122,7 +159,7 @@ class ChannelInterpreter:
         For an actuator the set point to send, for a virtual sensor the sample that it would give. Raises BadData where
         there is no way back (no calibration, a curve that turns, a value that is not finite).
         """
-        values = np.clip(np.atleast_1d(np.asarray(values, dtype=np.float64)), *self.limits)
+        values = np.clip(self.within_turn(np.atleast_1d(np.asarray(values, dtype=np.float64))), *self.limits)
         if not np.isfinite(values).all():
             raise BadData(f"A value of channel {self.channel.number} is not finite.")
         return self.reader.write(self.raw_numbers(values, others))
@@ -140,7 +177,32 @@ class ChannelInterpreter:
             if number not in given:
                 raise BadData(f"Channel {self.channel.number} is compensated by channel {number}, which is not given.")
         more = [self._readers[n].numbers(given[n])[0] for n in self.inputs if n != self.channel.number]
-        return self._inverse(self._stated(values), more)
+        stated = self._stated(values)
+        return self._inverse(self._nearest_turn(stated, more) if math.isfinite(self.turn) else stated, more)
+
+    def within_turn(self, values: Floats) -> Floats:
+        """Values in :attr:`unit` within [LowLimit, HiLimit) where the channel spans a full turn, else as they are."""
+        return wrapped(values, *self.wraps_into, self.turn) if math.isfinite(self.turn) else values
+
+    @property
+    def given(self) -> Range | None:
+        """Lowest and highest value in :attr:`unit`, not wrapped, that the curve gives of all raw values.
+
+        None where it takes the raw values of other channels, or has no way back.
+        """
+        if self.problem or self.others or self._curve is None:
+            return None
+        ends = [float(self._shown(end)) for end in self._inverse.ends(())]
+        return min(ends), max(ends)
+
+    def _nearest_turn(self, values: Floats, others: Sequence[Floats]) -> Floats:
+        """Angles, in the unit of the curve, moved by whole turns to where the curve gives them, or comes nearest."""
+        assert self.channel.calibration is not None
+        turn = self.channel.calibration.unit.difference_from_si(TURN)
+        low, high = self._inverse.ends(values.shape, others)
+        low, high = np.minimum(low, high), np.maximum(low, high)
+        above = low + np.mod(values - low, turn)
+        return np.where((above <= high) | (above - high <= low + turn - above), above, above - turn)
 
     def beyond(self, value: float) -> str:
         """Why a value may not be set, as a sentence; "" where the limits of the datasheet allow it."""

@@ -17,6 +17,7 @@ from teds_provision.teds.calibration.interpreter import ChannelInterpreter
 from teds_provision.teds.calibration.model import Calibration
 from teds_provision.teds.calibration.reading import WORD, big_endian
 from teds_provision.teds.calibration.samples import DataModel
+from teds_provision.teds.channel import wrapped
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -42,6 +43,10 @@ class ManyChannels:
         self._converts = not self._same.all()
         self._most = np.array([_most(one) for one in channels])
         self._floor, self._ceiling = (np.array(ends) for ends in zip(*(one.accepted for one in channels), strict=True))
+        self._turns = np.array([math.isfinite(one.turn) for one in channels])
+        self._turning = bool(self._turns.any())
+        self._turn = np.array([one.turn if math.isfinite(one.turn) else 1.0 for one in channels])
+        self._begin, self._end = (np.array(ends) for ends in zip(*(one.wraps_into for one in channels), strict=True))
         self._usable = None if all(usable) else np.array(usable)
         self._width = channels[0].octets
         self._columns = np.arange(len(channels))
@@ -155,6 +160,8 @@ class ManyChannels:
         if self._converts:
             converted = (total * self._own_scale + self._own_offset - self._offset) / self._scale
             total = np.where(self._same, total, converted)
+        if self._turning:
+            total = np.where(self._turns, wrapped(total, self._begin, self._end, self._turn), total)
         valid = total >= self._lows
         valid &= total <= self._highs
         if not self._bounded:

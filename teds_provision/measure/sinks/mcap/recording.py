@@ -11,6 +11,7 @@ from __future__ import annotations
 import json
 import struct
 import time
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -141,6 +142,7 @@ class McapSink(FileSink):
             for name in ("uuid", "state", "why", "samples", "lost", "late", "bad", "invalid")
         }
         words["clock_error"] = report.clock_error
+        words["invalid_why"] = [asdict(one) for one in report.invalid_why]
         self._string(f"/{self._names.station}/reports", json.dumps(words), report.time or time.time())
 
     def _stream(self, block: Block) -> tuple[int, np.ndarray]:

@@ -7,17 +7,31 @@ function places(value, uncertainty) {
   return size >= 1e5 || size === 0 ? 0 : Math.min(9, Math.max(0, 4 - Math.floor(Math.log10(size))));
 }
 
-/** A value as people read it; "–" where there is none. Very large and very small ones as 1.2345e-9. */
+/** A value as people read it; "none" where there is none. Very large and very small ones as 1.2345e-9. */
 export function number(value, uncertainty = null) {
-  if (typeof value !== "number" || !Number.isFinite(value)) return "–";
+  if (typeof value !== "number" || !Number.isFinite(value)) return "none";
   const size = Math.abs(value);
   if (size !== 0 && (size >= 1e7 || (size < 1e-4 && !(uncertainty > size)))) return sign(value.toExponential(4));
   return sign(value.toFixed(places(value, uncertainty)));
 }
 
+/** The last value of a channel in words where there is no number: never measured, raw values alone, not valid. */
+export function figure(last, channel) {
+  if (!last) return "no value yet";
+  if (typeof last.value === "number") return number(last.value, channel.uncertainty);
+  return channel.problem ? "raw value only" : "not valid";
+}
+
+/** Why a channel shows no number, for whoever points at it; empty where nothing says so. */
+export function whyNoNumber(last, channel, report) {
+  if (!last || typeof last.value === "number") return "";
+  const reasons = (report?.invalid_why ?? []).filter((one) => one.channel === channel.number);
+  return channel.problem ?? reasons.map((one) => `${one.count}: ${one.why}`).join("; ");
+}
+
 /** Like number, without the zeros that a fixed width needs. */
 export function short(value) {
-  if (typeof value !== "number" || !Number.isFinite(value)) return "–";
+  if (typeof value !== "number" || !Number.isFinite(value)) return "none";
   return sign(String(Number(value.toPrecision(4))));
 }
 
@@ -50,7 +64,7 @@ export function age(seconds) {
 
 /** Clock time of a unix second or an ISO string: 14:03:07; with the day where it is not today. */
 export function clock(time) {
-  if (time === null || time === undefined || time === "") return "–";
+  if (time === null || time === undefined || time === "") return "never";
   const moment = typeof time === "number" ? new Date(time * 1000) : new Date(time);
   if (Number.isNaN(moment.getTime())) return String(time);
   const pad = (part) => String(part).padStart(2, "0");

@@ -1,7 +1,7 @@
 // Curves that move: one frame per unit, drawn from the rings, at most 20 times a second and less where drawing is slow.
 
 import { h, fill, text } from "./dom.js";
-import { count, number } from "./format.js";
+import { count, figure } from "./format.js";
 import { changed, now, on, ringOf, state } from "./state.js";
 
 const FRAME = 50; // ms between two drawings
@@ -24,7 +24,7 @@ function theme() {
   };
 }
 
-/** A panel of moving curves. `channels`: [{uuid, number, label, unit, uncertainty}]. */
+/** A panel of moving curves. `channels`: [{uuid, number, label, unit, uncertainty, problem}]. */
 export class LivePlot {
   constructor(channels) {
     this.channels = channels;
@@ -74,7 +74,7 @@ export class LivePlot {
     const title = unit || "without unit";
     const legend = h("ul", { class: "legend" });
     const values = channels.map((channel, index) => {
-      const value = h("span", { class: "figure" }, "–");
+      const value = h("span", { class: "figure" }, "no value yet");
       const swatch = document.createElementNS("http://www.w3.org/2000/svg", "svg");
       swatch.setAttribute("class", `swatch line-${(index % COLOURS) + 1}`);
       swatch.setAttribute("viewBox", "0 0 24 4");
@@ -118,11 +118,7 @@ export class LivePlot {
     const width = this.window / columns;
     // Bins stand still in time: their edges are multiples of their width, so that curves glide and do not shimmer.
     const from = Math.floor(left / width) * width;
-    const times = new Array(2 * columns);
-    for (let index = 0; index < columns; index++) {
-      times[2 * index] = from + index * width;
-      times[2 * index + 1] = from + (index + 0.5) * width;
-    }
+    const times = Array.from({ length: 3 * columns }, (_, index) => from + (index * width) / 3);
     const courses = frame.channels.map((channel) => {
       const last = state.values.get(`${channel.uuid}/${channel.number}`);
       const silence = Math.max(0.5, 3 * (last?.period ?? 0));
@@ -136,7 +132,7 @@ export class LivePlot {
       frame.shown = time;
       frame.channels.forEach((channel, index) => {
         const last = state.values.get(`${channel.uuid}/${channel.number}`);
-        text(frame.values[index], last ? number(last.value, channel.uncertainty) : "–");
+        text(frame.values[index], figure(last, channel));
       });
     }
   }

@@ -31,21 +31,28 @@ export class Ring {
   }
 
   /**
-   * Lowest and highest of each of `columns` equal bins from `from` to `to`, two entries a bin, in the order in which they
-   * came. A bin without a point is undefined, one in a silence longer than `silence` seconds, or without a value, null.
+   * Lowest and highest of each of `columns` equal bins from `from` to `to`, in the order in which they came, and a third
+   * entry that is null where the line ends there. A bin without a point is undefined. The line ends before a silence longer
+   * than `silence` seconds, and where there is no value: none was valid, or an angle went on at the other end of its turn.
+   * Of a bin in which it ends, the piece that goes farthest is drawn.
    */
   bins(from, to, columns, silence) {
-    const out = new Array(2 * columns).fill(undefined);
+    const out = new Array(3 * columns).fill(undefined);
     const width = (to - from) / columns;
     const start = (this.next + this.size - this.held) % this.size;
     let before = NaN;
     let column = -1;
-    let [low, high, rising] = [NaN, NaN, true];
+    let pieces = []; // of this bin, as lines can be drawn through its points
+    let piece = null;
+    let ended = false; // whether the line has ended in this bin
     const settle = () => {
       if (column < 0) return;
-      const at = 2 * column;
-      if (Number.isNaN(low)) out[at] = out[at + 1] = null;
-      else [out[at], out[at + 1]] = rising ? [low, high] : [high, low];
+      const at = 3 * column;
+      const best = pieces.reduce((one, other) => (one && one.high - one.low >= other.high - other.low ? one : other), null);
+      if (!best) out[at] = out[at + 1] = null;
+      else [out[at], out[at + 1]] = best.rising ? [best.low, best.high] : [best.high, best.low];
+      if (best?.anew && at) out[at - 1] = null;
+      if (best !== piece) out[at + 2] = null;
     };
     for (let step = this.after(from); step < this.held; step++) {
       const place = (start + step) % this.size;
@@ -54,16 +61,16 @@ export class Ring {
       if (next >= columns) break;
       if (next !== column) {
         settle();
-        if (time - before > silence && next > column + 1) out[2 * next - 1] = null;
+        if (time - before > silence && next > column + 1) out[3 * next - 1] = null;
         column = next;
-        low = high = NaN;
+        [pieces, piece, ended] = [[], null, false];
       }
       before = time;
       const value = this.value[place];
-      if (Number.isNaN(value)) continue;
-      if (Number.isNaN(low)) low = high = value;
-      else if (value < low) [low, rising] = [value, false];
-      else if (value > high) [high, rising] = [value, true];
+      if (Number.isNaN(value)) [piece, ended] = [null, true];
+      else if (!piece) pieces.push((piece = { low: value, high: value, rising: true, anew: ended }));
+      else if (value < piece.low) [piece.low, piece.rising] = [value, false];
+      else if (value > piece.high) [piece.high, piece.rising] = [value, true];
     }
     settle();
     return out;

@@ -224,7 +224,7 @@ class Course {
     const moving = (one) => this.chosen.get(one.key) ?? measuring(one.node.uuid) !== null;
     const shown = all.filter(moving).slice(0, MOST);
     const names = new Set(shown.map((one) => one.node.uuid)).size > 1;
-    this.plot.show(shown.map(({ node, channel }) => ({ uuid: node.uuid, number: channel.number, label: names ? `${nameOf(node)} ${channelName(channel)}` : channelName(channel), unit: channel.unit ?? "", uncertainty: channel.uncertainty })));
+    this.plot.show(shown.map(({ node, channel }) => ({ uuid: node.uuid, number: channel.number, label: names ? `${nameOf(node)} ${channelName(channel)}` : channelName(channel), unit: channel.unit ?? "", uncertainty: channel.uncertainty, problem: channel.problem })));
     keyed(this.ticks, all, (one) => one.key, (one) => this.tick(one), (element, one) => {
       element.firstChild.checked = shown.some((each) => each.key === one.key);
       text(element.lastChild, `${nameOf(one.node)}: ${channelName(one.channel)}`);

@@ -1,7 +1,7 @@
 // The nodes that are there, and the one that is open.
 
 import { chip, empty, fill, h, icon, keyed, text } from "../dom.js";
-import { channelName, count, nameOf, number, verdict } from "../format.js";
+import { channelName, count, figure, nameOf, verdict } from "../format.js";
 import { isStale, lastOf, now, on, state } from "../state.js";
 import { facts } from "./facts.js";
 import { NodePanel } from "./node.js";
@@ -99,7 +99,7 @@ export function nodesView(main, rest) {
       element.firstChild,
       h("span", { class: "card-head" }, h("span", { class: "name" }, nameOf(node)), chip(tone, sign, words, why)),
       h("span", { class: "facts" }, facts(node)),
-      values.length ? h("span", { class: "peek" }, values.map((channel) => h("span", { "data-channel": channel.number }, `${channelName(channel)} `, h("b", {}, "–"), channel.unit ? ` ${channel.unit}` : ""))) : null,
+      values.length ? h("span", { class: "peek" }, values.map((channel) => h("span", { "data-channel": channel.number }, `${channelName(channel)} `, h("b", {}, "no value yet"), h("span", {}, channel.unit ? ` ${channel.unit}` : "")))) : null,
     );
   }
 
@@ -110,7 +110,8 @@ export function nodesView(main, rest) {
         const channel = node?.channels?.find((one) => one.number === Number(peek.dataset.channel));
         if (!channel) continue;
         const last = lastOf(uuid, channel);
-        text(peek.querySelector("b"), last ? number(last.value, channel.uncertainty) : "–");
+        text(peek.querySelector("b"), figure(last, channel));
+        peek.lastChild.hidden = typeof last?.value !== "number";
         peek.classList.toggle("stale", isStale(last));
       }
     }

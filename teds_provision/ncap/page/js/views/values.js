@@ -2,7 +2,7 @@
 
 import { paths, post, Refusal, remove } from "../api.js";
 import { button, chip, empty, field, fill, h, icon, keyed, say, text, trouble } from "../dom.js";
-import { age, channelName, count, hertz, nameOf, number, range, short } from "../format.js";
+import { age, channelName, count, figure as words, hertz, nameOf, number, range, short, whyNoNumber } from "../format.js";
 import { LivePlot, WINDOWS } from "../plot.js";
 import { isStale, lastOf, measuring, now, on, refresh, state } from "../state.js";
 import { ActuatorPanel } from "./actuator.js";
@@ -76,7 +76,7 @@ export class LiveTab {
       fill(this.plotBox, h("h3", {}, "Course"), h("p", { class: "hint" }, "Press Measure above: the curves move here."));
       return;
     }
-    const shown = channels.slice(0, MOVING).map((channel) => ({ uuid: this.uuid, number: channel.number, label: channelName(channel), unit: channel.unit ?? "", uncertainty: channel.uncertainty }));
+    const shown = channels.slice(0, MOVING).map((channel) => ({ uuid: this.uuid, number: channel.number, label: channelName(channel), unit: channel.unit ?? "", uncertainty: channel.uncertainty, problem: channel.problem }));
     if (this.plot) {
       this.plot.show(shown);
       return;
@@ -87,21 +87,25 @@ export class LiveTab {
 
   values() {
     const time = now();
+    const report = measuring(this.uuid)?.nodes?.find((one) => one.uuid === this.uuid);
     for (const channel of this.node.channels ?? []) {
       const element = this.rows.keyed?.get(`${channel.number}`);
       if (!element) continue;
       const last = lastOf(this.uuid, channel);
       const stale = isStale(last);
-      const { figure, old, bar } = element.parts;
+      const { figure, old, bar, unit } = element.parts;
       if (channel.kind === "actuator") {
         const told = channel.actuator;
-        text(figure, told?.safe === false ? number(told.value, channel.uncertainty) : "–");
-        text(old, told?.safe === true ? "safe state" : "");
+        const set = told?.safe === false;
+        text(figure, set ? number(told.value, channel.uncertainty) : told?.safe === true ? "safe state" : "not moved");
+        if (unit) unit.hidden = !set;
         element.classList.toggle("actuator-row", true);
         if (bar) bar.value = told?.safe === false ? told.value : channel.low;
         continue;
       }
-      text(figure, last ? (last.value === null ? "not valid" : number(last.value, channel.uncertainty)) : "–");
+      text(figure, words(last, channel));
+      figure.title = whyNoNumber(last, channel, report);
+      if (unit) unit.hidden = typeof last?.value !== "number";
       text(old, last ? (stale ? age(time - last.time) : "") : "");
       element.classList.toggle("stale", stale);
       element.classList.toggle("fresh", !stale);
@@ -119,10 +123,10 @@ export class LiveTab {
 }
 
 function row() {
-  const figure = h("span", { class: "figure" }, "–");
+  const figure = h("span", { class: "figure" }, "no value yet");
   const old = h("span", { class: "old" });
   const element = h("tr", {});
-  element.parts = { figure, old, bar: null };
+  element.parts = { figure, old, bar: null, unit: null };
   return element;
 }
 
@@ -134,15 +138,16 @@ function facts(element, channel) {
   const bounded = typeof channel.low === "number" && typeof channel.high === "number" && channel.high > channel.low;
   const bar = bounded ? h("meter", { min: channel.low, max: channel.high, "aria-label": `${channelName(channel)} within its range` }) : null;
   element.parts.bar = bar;
+  element.parts.unit = channel.unit ? h("span", { class: "unit" }, ` ${channel.unit}`) : null;
   const kind = { actuator: ["plain", "play", "Actuator"], event: ["plain", "clock", "Event"] }[channel.kind];
   fill(
     element,
     h("th", { scope: "row" }, h("span", { class: "number" }, `${channel.number}`), h("span", { class: "name" }, channelName(channel)), kind ? chip(...kind) : null),
-    h("td", { class: "n value" }, figure, channel.unit ? h("span", { class: "unit" }, ` ${channel.unit}`) : null),
+    h("td", { class: "n value" }, figure, element.parts.unit),
     h("td", { class: "within" }, bar, old),
     h("td", { "data-label": "Range" }, range(channel)),
     h("td", { "data-label": "Uncertainty" }, typeof channel.uncertainty === "number" ? `± ${short(channel.uncertainty)}${channel.unit ? ` ${channel.unit}` : ""}` : "not stated"),
-    h("td", { "data-label": "Fastest" }, channel.kind === "actuator" ? "–" : hertz(channel.rate)),
+    h("td", { "data-label": "Fastest" }, channel.kind === "actuator" ? "by set point" : hertz(channel.rate)),
     h("td", { "data-label": "Calibrated" }, calibrated(channel)),
   );
 }
@@ -180,7 +185,7 @@ class ModePanel {
     this.uuid = uuid;
     this.rate = h("input", { type: "number", min: "0.01", step: "any", inputmode: "decimal", placeholder: "datasheet's", class: "narrow" });
     this.idle = button("Idle", { onclick: () => this.idle.busy(() => this.stop()) }, "stop");
-    this.run = button("Measure", { class: "main", onclick: () => this.run.busy(() => this.start()) }, "play");
+    this.run = button("Measure", { onclick: () => this.run.busy(() => this.start()) }, "play");
     this.state = h("p", { class: "state" });
     this.setPoints = new SetPoints();
     this.error = h("div", {});
@@ -253,6 +258,12 @@ export function requireRate(uuids, rate) {
   }
 }
 
+/** Why values are not valid, the most frequent reasons first. */
+function invalid(node) {
+  const most = [...(node.invalid_why ?? [])].sort((one, other) => other.count - one.count).slice(0, 3);
+  return most.map((one) => `channel ${one.channel}: ${one.why}`).join("; ") || "the station does not say why";
+}
+
 /** How a node of a measurement fares, in words. */
 export function told(measurement, uuid) {
   const node = measurement.nodes?.find((one) => one.uuid === uuid);
@@ -261,6 +272,7 @@ export function told(measurement, uuid) {
   if (typeof node?.samples === "number") parts.push(count(node.samples, "sample"), node.lost ? `${node.lost} lost` : "none lost");
   if (node?.late) parts.push(`${node.late} late`);
   if (node?.bad) parts.push(`${node.bad} bad`);
+  if (node?.invalid) parts.push(`${node.invalid} invalid (${invalid(node)})`);
   const why = node?.why ?? measurement.why;
   return [icon(word === "running" ? "wave" : word === "refused" || word === "lost" ? "warn" : "clock"), ` ${parts.join(", ")}.`, why ? ` ${why}` : ""];
 }

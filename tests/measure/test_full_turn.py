@@ -1,0 +1,67 @@
+"""An angle sensor whose zero was adjusted: every angle of the turn is measured; what is not valid says why."""
+
+from __future__ import annotations
+
+import csv
+import json
+from pathlib import Path
+
+import pytest
+
+from tests.e2e.desk import ANGLE
+from tests.measure import hall as halls
+from tests.measure.hall import Hall
+
+pytestmark = pytest.mark.link
+
+
+def hall_with(folder: Path, monkeypatch: pytest.MonkeyPatch, calibration: str) -> Hall:
+    monkeypatch.setitem(halls.CALIBRATIONS, ANGLE, calibration)
+    return Hall(folder / "hall", {"a": ANGLE})
+
+
+def values_of(path: Path) -> list[str]:
+    lines = [line for line in path.read_text().splitlines() if not line.startswith("#")]
+    return [row[5] for row in list(csv.reader(lines))[1:]]
+
+
+def test_a_zero_offset_of_90_degrees_loses_no_angle(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    hall = hall_with(tmp_path, monkeypatch, "# zero-offset: 90\nraw,value [degree]\n0,0\n65536,360\n")
+    try:
+        hall.nodes["a"].start()  # a ramp over the whole turn every 2 s
+        run = tmp_path / "run.csv"
+        end = hall.measure("a", "--rate", 100, "--duration", 2.5, "--to", run)[-1]
+        (stream,) = end["nodes"][0]["streams"]
+        assert (stream["invalid"], stream["invalid_why"]) == (0, [])
+        values = [float(text) for text in values_of(run)]
+        assert len(values) == stream["samples"] > 200
+        assert 0 <= min(values) < 0.2
+        assert 6.1 < max(values) < 6.2832
+        assert "invalid 0" in run.read_text().splitlines()[-1]
+        (sampled,) = hall.ask("sample", "a")["samples"]
+        assert sampled["valid"]
+    finally:
+        hall.close()
+
+
+def test_what_is_not_valid_is_counted_in_every_summary_and_says_why(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    hall = hall_with(tmp_path, monkeypatch, "# high-limit: 180\nraw,value [degree]\n0,0\n65535,359.9\n")
+    try:
+        hall.nodes["a"].start("--source", "ramp:1")
+        run, lines = tmp_path / "run.csv", tmp_path / "run.jsonl"
+        told = hall.measure("a", "--rate", 100, "--duration", 2, "--to", run, "--to", lines)
+        (stream,) = told[-1]["nodes"][0]["streams"]
+        limit = "above its high limit, 180 °"
+        assert stream["invalid_why"] == [{"channel": 1, "why": limit, "count": stream["invalid"]}]
+        assert stream["invalid"] == sum(text == "" for text in values_of(run)) > 10
+        footer = run.read_text().splitlines()[-1]
+        assert f"invalid {stream['invalid']} ({stream['invalid']} of channel 1: {limit})" in footer
+        last = [json.loads(line) for line in lines.read_text().splitlines()][-1]
+        assert (last["event"], last["invalid"]) == ("status", stream["invalid"])
+        assert last["invalid_why"] == stream["invalid_why"]
+        person = hall.station.run("measure", "a", "--rate", 100, "--duration", 1, "--can", hall.can)
+        assert f"of channel 1: {limit}" in person.out + person.err
+    finally:
+        hall.close()
