@@ -42,7 +42,7 @@ ROUNDING: Final = 4 * 2.0**-23
 """Limits and coefficients are Float32: a value this much of the limit beyond it is not beyond it."""
 TURN: Final = 2 * math.pi
 _NEARLY_A_TURN: Final = 1e-5
-"""Float32 limits of 0 and 2 pi are 1.7e-7 from a turn; cli.md, "Commands of the third round", sets the bound."""
+"""Float32 limits of 0 and 2 pi are 1.7e-7 from a turn; the bound is that of the contract (docs/calibration.md)."""
 _RADIANS: Final = units_of(radians=1)
 
 
