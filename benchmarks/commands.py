@@ -23,7 +23,7 @@ from pathlib import Path
 
 import teds_provision
 from benchmarks.provisioning import PROFILE, SLOW, next_node, next_nodes, nodes
-from teds_provision.links.loopback import free_port
+from teds_provision.links.ports import free_port
 from teds_provision.station.station import initialise
 from teds_provision.vault import forget_vaults
 from teds_provision.vault.passphrase import THROWAWAY

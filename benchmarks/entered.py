@@ -19,7 +19,7 @@ from types import FrameType
 
 from benchmarks.provisioning import PROFILE, next_node, nodes
 from teds_provision.links import LinkSettings, Notice, open_port
-from teds_provision.links.loopback import free_port
+from teds_provision.links.ports import free_port
 from teds_provision.station.station import Station, initialise
 from teds_provision.steps.build import BuildOrder
 from teds_provision.steps.build_order import prepare

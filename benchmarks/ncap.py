@@ -25,7 +25,7 @@ from websockets.sync.client import connect
 from benchmarks.commands import PROVISION, Rows, finished, started, station
 from benchmarks.provisioning import nodes
 from teds_provision import client
-from teds_provision.links.loopback import free_port
+from teds_provision.links.ports import free_port
 
 RATE = 100.0
 _EVERY = 60.0

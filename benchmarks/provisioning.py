@@ -29,7 +29,7 @@ from typing import Any, NamedTuple
 
 from benchmarks import limits
 from teds_provision.links import Capabilities, Contact, LinkSettings, Notice, open_port
-from teds_provision.links.loopback import free_port
+from teds_provision.links.ports import free_port
 from teds_provision.protocol.announce import default_can_address
 from teds_provision.station.station import Station, initialise
 from teds_provision.steps.build import BuildOrder

@@ -23,7 +23,7 @@ from pathlib import Path
 from typing import Any
 
 from teds_provision.links import LinkSettings
-from teds_provision.links.loopback import free_port
+from teds_provision.links.ports import free_port
 from teds_provision.station.station import Station, initialise
 from teds_provision.steps.build import BuildOrder
 from teds_provision.steps.identify import Identified

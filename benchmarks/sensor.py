@@ -24,7 +24,7 @@ from pathlib import Path
 
 from benchmarks.provisioning import PROFILE
 from teds_provision.links.can.wire.pacing import classic_bits, fd_seconds
-from teds_provision.links.loopback import free_port
+from teds_provision.links.ports import free_port
 from teds_provision.protocol.operation.can_frames import cut
 
 RATE = 10_000

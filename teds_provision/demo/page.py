@@ -23,7 +23,7 @@ from typing import Any, Final
 
 from teds_provision import client, vault
 from teds_provision.errors import LinkFailure, TedsProvisionError
-from teds_provision.links.loopback import free_port
+from teds_provision.links.ports import free_port
 from teds_provision.station.station import initialise
 
 RATE: Final = 50.0

@@ -6,34 +6,233 @@ end. Nothing leaves the machine: NFC goes over UDP on 127.0.0.1, CAN over multic
 
 from __future__ import annotations
 
+import csv
 import json
 import secrets
 import shutil
 import subprocess
 import sys
 import tempfile
+import threading
+import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
-from dataclasses import dataclass
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass, field
+from datetime import UTC, datetime
 from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
 
 from teds_provision import steps as steps_room
 from teds_provision import vault
-from teds_provision.demo.desk import Demo, provision_over
-from teds_provision.demo.handover import hand_over
-from teds_provision.demo.measuring import (
-    GRIPPER,
-    calibrate_sensor,
-    calibrations,
-    measure_group,
-    move_gripper,
-    provision_gripper,
-)
-from teds_provision.errors import LinkFailure
+from teds_provision.errors import LinkFailure, NotAuthentic, PolicyRefused
+from teds_provision.handover.export_keys import export_keys, plan_export
+from teds_provision.handover.import_keys import Imported, import_keys, plan_import
+from teds_provision.handover.pending import close
+from teds_provision.handover.prove import Proven, prove_nodes
+from teds_provision.handover.selection import ExportOrder
+from teds_provision.handover.trust import Candidate, add
+from teds_provision.lazy import late
+from teds_provision.links import LinkSettings, can
+from teds_provision.links.ports import free_port
+from teds_provision.protocol.keys import fingerprint
 from teds_provision.station.station import Station, initialise
-from teds_provision.steps.build import BuildOrder
+from teds_provision.steps.agree import require_session
+from teds_provision.steps.build_order import BuildOrder
+from teds_provision.steps.identify import identify
+from teds_provision.steps.provision import Provisioned, provision
+from teds_provision.steps.read import read_image
+from teds_provision.steps.verify import require_authentic
+from teds_provision.steps.verify_node import verify_node
+from teds_provision.store import TrustRecord
 from teds_provision.talk.meeting import meet
-from teds_provision.talk.progress import Reporter, StepResult
+from teds_provision.talk.progress import Reporter, StepResult, Steps
+
+if TYPE_CHECKING:
+    from teds_provision.measure import blocks, finding, held_actuator, runner, sinks, trusting, wish
+else:  # numpy and what measuring needs are loaded when the demo gets there
+    blocks, finding, held_actuator, runner, sinks, trusting, wish = (
+        late(f"teds_provision.measure.{name}")
+        for name in ("blocks", "finding", "held_actuator", "runner", "sinks", "trusting", "wish")
+    )
+
+
+# The last part of the demo: the station that now holds the key measures two nodes and moves a gripper.
+
+# The second half of the demo: the key goes to another station, first as a copy, then for good.
+
+# What the demo works on: its folder, its links, the node, and the look at it from one station.
+
+
+@dataclass
+class Demo:
+    """What the demo is at: its folder, stations, links and the steps so far."""
+
+    folder: Path
+    reporter: Reporter
+    say: Callable[[str], None]
+    nfc: str = ""
+    can: str = ""
+    uuid: bytes = b""
+    stack: ExitStack = field(default_factory=ExitStack)
+
+    def __post_init__(self) -> None:
+        self.steps = Steps(self.reporter)
+        self.nfc = f"udp:127.0.0.1:{free_port()}"
+        self.can = f"udp_multicast:239.74.163.2?port={free_port()}"
+
+    def over(self, via: str) -> LinkSettings:
+        """Link options of a station in this demo."""
+        return LinkSettings(via, self.nfc, self.can, timeout=15.0)
+
+
+def provision_over(demo: Demo, station: Station, via: str, uuid: bytes, order: BuildOrder) -> Provisioned:
+    """Every step of provisioning, from one station over one link; raises unless the node is authentic at the end."""
+    with meet(station, demo.over(via), uuid, demo.reporter) as node:
+        done = provision(station, node, order, accept=lambda who: None, reporter=demo.reporter)
+    require_authentic(done.verified)
+    demo.steps.done += done.steps
+    return done
+
+
+def verify_from(demo: Demo, station: Station, what: str) -> None:
+    """Verify the node from one station over CAN, in a session under its key; raises unless it is authentic."""
+    with demo.steps.step(what) as step:
+        with meet(station, demo.over("can"), demo.uuid, demo.reporter) as node:
+            who = identify(station, node)
+            held = require_session(station, node)
+            verified = verify_node(station, node, read_image(node), who.point)
+        if verified.verdict != "authentic":
+            raise NotAuthentic(f"The demo's node is {verified.verdict} as seen from {station.name}.")
+        step.detail = f"{station.name} finds it {verified.verdict}, key epoch {held.record.epoch}"
+
+
+def hand_over(demo: Demo, first: Station, second: Station) -> None:
+    """Copy: both stations reach the node. Move: only the second does."""
+    with demo.steps.step("trust") as step:
+        for station, other in ((first, second), (second, first)):
+            record = TrustRecord(other.name, "station", other.point, fingerprint(other.point))
+            add(station, [Candidate(record, demo.folder)])
+        step.detail = "each station trusts the other's key, by a person's word"
+    _send(demo, first, second, "copy")
+    verify_from(demo, second, "verify")
+    verify_from(demo, first, "verify")
+    _send(demo, first, second, "move")
+    verify_from(demo, second, "verify")
+    with demo.steps.step("refuse") as step:
+        try:
+            first.policy.require_whitelisted(demo.uuid)
+        except PolicyRefused as refused:
+            step.detail = refused.message
+        else:
+            raise LinkFailure("The demo's first station still uses a key that it gave away.")
+
+
+def _send(demo: Demo, sender: Station, receiver: Station, mode: Literal["copy", "move"]) -> None:
+    bundle = demo.folder / f"{mode}.jwe"
+    with demo.steps.step("export-keys") as step:
+        plan = plan_export(sender, ExportOrder((receiver.name,), (demo.uuid,), mode))
+        sealed = export_keys(sender, plan, bundle)
+        step.detail = f"{mode}: {sealed.octets} octets, sealed to {receiver.fingerprint[:16]}"
+    with demo.steps.step("import-keys") as step:
+        planned = plan_import(receiver, bundle.read_bytes())
+        taken = planned if isinstance(planned, Imported) else import_keys(receiver, planned)
+        outcome = prove_nodes(receiver, demo.over("can"), taken.uuids, demo.reporter)[0]
+        if not isinstance(outcome, Proven):
+            raise LinkFailure(f"The node was not reached after the import: {outcome.why}")
+        rotated = ", key rotated, the sender is locked out" if outcome.rotated else ""
+        step.detail = f"proven in a session{rotated}"
+    with demo.steps.step("receipt") as step:
+        close(sender, taken.receipt)
+        step.detail = f"{sender.name} has {receiver.name}'s signed receipt"
+
+
+GRIPPER = "gripper"
+RATE = 100.0
+SECONDS = 1.0
+OPENING = 40.0
+_HALF_WAY = 0.5
+
+
+def calibrations(folder: Path) -> dict[str, Path]:
+    """Calibration files of today for both nodes: straight lines over the whole raw range."""
+    today = datetime.now(UTC).date().isoformat()
+    angle = folder / "angle.csv"
+    angle.write_text(f"# date: {today}\nraw,value [degree]\n0,0\n65535,360\n")
+    gripper = folder / "gripper.toml"
+    ranges = {1: ("mm", 110), 2: ("mm", 110), 3: ("N", 140)}
+    gripper.write_text(
+        "\n".join(
+            f'[[calibration]]\nchannel = {channel}\ndate = {today}\nunit = "{unit}"\n'
+            f"points = [[0, 0], [4095, {high}]]\n"
+            for channel, (unit, high) in ranges.items()
+        )
+    )
+    return {"angle": angle, GRIPPER: gripper}
+
+
+def provision_gripper(demo: Demo, station: Station, uuid: bytes, calibration: Path) -> None:
+    """The same steps for a node without NFC, over the bus that it hangs on."""
+    provision_over(demo, station, "can", uuid, BuildOrder(GRIPPER, calibration=calibration, name="hand"))
+
+
+def calibrate_sensor(demo: Demo, station: Station, calibration: Path) -> None:
+    """A new datasheet for the sensor, with its calibration; signed and written by its new owner."""
+    order = BuildOrder("magnetic-angular-position-sensor", calibration=calibration, name="crane slew angle")
+    provision_over(demo, station, "can", demo.uuid, order)
+
+
+def measure_group(demo: Demo, station: Station, uuids: tuple[bytes, ...]) -> None:
+    """Both nodes at once: sessions, datasheets verified, claims, streams, calibrated values in a file."""
+    file = demo.folder / "run.csv"
+    station.groups.create("robot", list(uuids))
+    with demo.steps.step("measure") as step:
+        port: Any = can.port.open_port(demo.can)
+        try:
+            sink = sinks.open_sink(str(file))
+            facts = blocks.StationFacts(station.name, group="robot", started=time.time())
+            asked = wish.Wish(rate=RATE, timeout=15.0)
+            with finding.buses.Buses([port]) as buses:
+                ended = runner.Measurement(station, buses, uuids, asked, [sink], facts).run(threading.Event(), SECONDS)
+        finally:
+            port.close()
+        if ended.error is not None:
+            raise ended.error
+        streams = [stream for node in ended.nodes for stream in node["streams"]]
+        values, lost = sum(stream["samples"] for stream in streams), sum(stream["lost"] for stream in streams)
+        step.detail = f"group robot, {len(uuids)} nodes: {values} values, {lost} lost; last {_last_row(file)}"
+
+
+def _last_row(file: Path) -> str:
+    """The newest calibrated value of each column that has a unit, as people read it."""
+    with file.open(encoding="utf-8", newline="") as lines:
+        rows = list(csv.reader(line for line in lines if not line.startswith("#")))
+    newest = {
+        name: next((row[place] for row in reversed(rows[1:]) if row[place]), "none")
+        for place, name in enumerate(rows[0])
+        if "[" in name
+    }
+    return ", ".join(_told(name, value) for name, value in newest.items())
+
+
+def _told(column: str, value: str) -> str:
+    """``hand/opening [m]`` and ``0.04`` as ``opening 0.04 m``."""
+    name, _, unit = column.rpartition("/")[2].partition(" [")
+    return f"{name} {float(value):.4g} {unit.rstrip(']')}" if value != "none" else f"{name} none"
+
+
+def move_gripper(demo: Demo, station: Station, uuid: bytes) -> None:
+    """Operate the gripper within its limits for a moment, let go, and see that it is safe."""
+    with demo.steps.step("set") as step:
+        with meet(station, demo.over("can"), uuid, demo.reporter) as node:
+            trusted = trusting.open_trusted(station, node)
+            with held_actuator.HeldActuator(trusted, 1, unit="mm") as hand:
+                applied = hand.apply(OPENING)
+                time.sleep(min(hand.pause, _HALF_WAY))
+                hand.apply(OPENING)
+            if not hand.safe:
+                raise LinkFailure("The demo's gripper is not in its safe state.")
+        step.detail = f"hand: opening {applied.value:.4g} {applied.unit}, then let go: safe state"
+
 
 PROFILE = "magnetic-angular-position-sensor"
 _START_SECONDS = 20.0

@@ -55,7 +55,7 @@ class Place:
 
 Look = Callable[[Place], Iterator[Finding]]
 CHECKS: Final[dict[str, tuple[Room, Look]]] = {}
-_MODULES: Final = ("machine", "links", "bluetooth", "station", "fleet")
+_MODULES: Final = ("machine", "links", "station", "fleet")
 
 
 def check(name: str, room: Room) -> Callable[[Look], Look]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import socket
 import threading
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
@@ -297,3 +298,13 @@ class LinkSettings:
     def after_agreeing(self) -> LinkSettings:
         """The links of a command that needs no tap: BLE, where a reader is named beside it."""
         return replace(self, via="ble") if self.onward else self
+
+
+# Ports of this machine's own loopback: for simulated readers and buses, and for a page that is tried out.
+
+
+def free_port(kind: socket.SocketKind = socket.SOCK_DGRAM) -> int:
+    """A port of 127.0.0.1 that nothing uses now; another program may take it in the next moment."""
+    with socket.socket(socket.AF_INET, kind) as probe:
+        probe.bind(("127.0.0.1", 0))
+        return int(probe.getsockname()[1])

@@ -15,8 +15,7 @@ from typing import Final
 from teds_provision import __version__
 from teds_provision.errors import BadData
 from teds_provision.links.ports import Direction
-from teds_provision.trace.can_words import can_words
-from teds_provision.trace.nfc_words import nfc_words
+from teds_provision.trace.frames import can_words, nfc_words
 from teds_provision.trace.record import Record
 
 _SECTION, _INTERFACE, _PACKET = 0x0A0D0D0A, 1, 6

@@ -5,16 +5,18 @@ from __future__ import annotations
 import os
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Final
 
-from teds_provision.errors import NotFound, StoreFailure
-from teds_provision.files import PRIVATE, require_new
+from teds_provision.errors import BadData, NotFound, StoreFailure
+from teds_provision.files import PRIVATE, read_limited, require_new
 from teds_provision.links.ports import Direction
-from teds_provision.trace import lines, pcapng
-from teds_provision.trace.can_words import can_words
-from teds_provision.trace.nfc_words import nfc_words
-from teds_provision.trace.record import Record
+from teds_provision.trace import pcapng
+from teds_provision.trace import record as line_form
+from teds_provision.trace.frames import can_words, nfc_words
+from teds_provision.trace.pcapng import is_pcapng, read_pcapng
+from teds_provision.trace.record import Record, is_lines, read_lines
 
 PCAPNG = ".pcapng"
 
@@ -43,8 +45,8 @@ class Recorder:
         self.path, self.failure = path, ""
         self._descriptor, self._tell = descriptor, tell
         self._lock = threading.Lock()
-        form = pcapng if path.suffix == PCAPNG else lines
-        self._encode = pcapng.block if form is pcapng else lines.line
+        form = pcapng if path.suffix == PCAPNG else line_form
+        self._encode = pcapng.block if form is pcapng else line_form.line
         self._write(form.head())
 
     def frame(
@@ -104,3 +106,18 @@ class Recorder:
             except OSError as error:
                 self.failure = error.strerror or "it failed"
         self._tell(f"The trace {self.path} ends here: {self.failure}. The command goes on.")
+
+
+# Reading a trace, in either form; a capture of CAN frames by another program is read as well.
+
+_MOST_OCTETS: Final = 1 << 30
+
+
+def read_trace(path: Path) -> Iterator[Record]:
+    """Every record of a file. Raises NotFound, and BadData where it is no trace (told before the first record)."""
+    octets = read_limited(path, _MOST_OCTETS, "trace")
+    if is_lines(octets):
+        return read_lines(octets)
+    if is_pcapng(octets):
+        return read_pcapng(octets)
+    raise BadData(f"{path} is no trace.", hint="Traces are what --trace FILE wrote, or pcapng with CAN frames.")

@@ -18,7 +18,7 @@ from teds_provision.errors import NoNode, NoReader
 from teds_provision.links.can import bus as can_bus
 from teds_provision.links.can.spec import parse_spec
 from teds_provision.links.nfc.port import NfcPort
-from teds_provision.trace import lines
+from teds_provision.trace import record
 from teds_provision.trace.record import Record
 from tests.bench import PASSPHRASE
 
@@ -186,8 +186,8 @@ def test_a_number_that_is_none_is_no_number_of_anything(home: Path) -> None:
 
 def test_a_list_that_breaks_off_is_one_json_object_all_the_same(home: Path, tmp_path: Path) -> None:
     """What was told before stands, the error beside it, and its code is the command's."""
-    line = lines.line(Record(1.0, "out", "can", "frame", b"\1", "a frame"))
-    (tmp_path / "b.trace").write_bytes(lines.head() + line + b"{]\n" + line)
+    line = record.line(Record(1.0, "out", "can", "frame", b"\1", "a frame"))
+    (tmp_path / "b.trace").write_bytes(record.head() + line + b"{]\n" + line)
     told = call(home, "--json", "trace", "show", tmp_path / "b.trace")
     assert told.code == 8
     assert len(told.json["frames"]) == 1

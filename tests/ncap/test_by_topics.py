@@ -13,7 +13,7 @@ from typing import Any
 import pytest
 
 from teds_provision import client
-from teds_provision.trace.reading import read_trace
+from teds_provision.trace.recorder import read_trace
 from tests.e2e.desk import ROOT
 from tests.measure.hall import Hall
 from tests.measure.sinks.test_ros1 import Master, master, pytestmark  # noqa: F401  the fixture, and what it needs

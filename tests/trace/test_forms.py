@@ -12,12 +12,11 @@ from hypothesis import strategies as st
 
 from teds_provision.errors import BadData, NotFound, UsageFailure
 from teds_provision.links.ports import Direction
-from teds_provision.trace import lines, pcapng
-from teds_provision.trace.can_words import can_words
-from teds_provision.trace.nfc_words import nfc_words
-from teds_provision.trace.reading import read_trace
+from teds_provision.trace import pcapng
+from teds_provision.trace import record as lines
+from teds_provision.trace.frames import can_words, nfc_words
 from teds_provision.trace.record import Record
-from teds_provision.trace.recorder import open_trace
+from teds_provision.trace.recorder import open_trace, read_trace
 
 NODE = bytes.fromhex("0102030405060708090a")
 directions: st.SearchStrategy[Direction] = st.sampled_from(["out", "in"])

@@ -16,10 +16,10 @@ from teds_provision.harmless import harmless
 from teds_provision.lazy import late
 
 if TYPE_CHECKING:
-    from teds_provision.trace import reading
+    from teds_provision.trace import recorder
     from teds_provision.trace.record import Record
 else:  # the help of this command does without
-    reading = late("teds_provision.trace.reading")
+    recorder = late("teds_provision.trace.recorder")
 
 _ARROWS = {"out": ">", "in": "<"}
 _SHOWN = 24
@@ -49,7 +49,7 @@ def show(app: App, file: Path, messages: bool, whole: bool) -> None:
 
     FILE is what --trace wrote, in either form, or another program's pcapng of a CAN bus. Exit 8 where it is no trace.
     """
-    records = (record for record in reading.read_trace(file) if not messages or record.layer == "message")
+    records = (record for record in recorder.read_trace(file) if not messages or record.layer == "message")
     if app.json:
         print_json_list("frames", (record.as_json() for record in records))
         return

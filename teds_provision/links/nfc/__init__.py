@@ -5,19 +5,6 @@ from typing import TYPE_CHECKING
 from teds_provision.lazy import lazy
 
 if TYPE_CHECKING:
-    from teds_provision.links.nfc import (
-        hints,
-        message,
-        nfcpy,
-        pcsc,
-        pieces,
-        poller,
-        port,
-        reader,
-        tag,
-        tnep,
-        udp,
-        visit,
-    )
+    from teds_provision.links.nfc import hints, message, nfcpy, pcsc, pieces, poller, port, reader, tag, tnep, udp
 else:
     __getattr__ = lazy(__name__)

@@ -25,7 +25,7 @@ from typing import Any, Final
 
 from teds_provision.errors import NotFound, UsageFailure
 from teds_provision.files import write_whole
-from teds_provision.links.loopback import free_port
+from teds_provision.links.ports import free_port
 from teds_provision.ncap.live import Live
 from teds_provision.ncap.settings import own_source, with_source
 from teds_provision.node.described import create

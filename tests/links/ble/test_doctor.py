@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from teds_provision.doctor import bluetooth
+from teds_provision.doctor import links
 from teds_provision.doctor.registry import Finding, Place
 from teds_provision.links.ble.port import BlePort
 
@@ -29,11 +29,11 @@ def switch(there: Place, kind: str, *, soft: int = 0, hard: int = 0) -> list[Fin
     folder.mkdir(parents=True)
     for name, text in {"type": kind, "name": "hci0", "soft": soft, "hard": hard}.items():
         (folder / name).write_text(f"{text}\n")
-    return list(bluetooth.switches(there))
+    return list(links.switches(there))
 
 
 def test_switches_are_read_from_the_kernel(tmp_path: Path) -> None:
-    assert [each.result for each in bluetooth.switches(place(tmp_path))] == ["skipped"]
+    assert [each.result for each in links.switches(place(tmp_path))] == ["skipped"]
     assert [each.result for each in switch(place(tmp_path), "wlan", soft=1)] == ["ok"]
     (soft,) = switch(place(tmp_path), "bluetooth", soft=1)
     assert (soft.result, soft.fix) == ("warning", "rfkill unblock bluetooth")
@@ -46,12 +46,12 @@ def test_a_switch_of_the_machine_is_named(tmp_path: Path) -> None:
 
 def test_no_bus_is_a_failure_only_where_ble_was_asked_for(tmp_path: Path) -> None:
     nowhere = f"unix:path={tmp_path}/nothing"
-    (quiet,) = bluetooth.bluetooth(place(tmp_path, nowhere))
-    (asked,) = bluetooth.bluetooth(place(tmp_path, nowhere, ble="auto"))
+    (quiet,) = links.bluetooth(place(tmp_path, nowhere))
+    (asked,) = links.bluetooth(place(tmp_path, nowhere, ble="auto"))
     assert (quiet.result, quiet.fix) == ("skipped", "")
     assert asked.result == "failed"
     assert "systemctl start bluetooth" in asked.fix
-    (wrong,) = bluetooth.bluetooth(place(tmp_path, nowhere, ble="hci0?speed=3"))
+    (wrong,) = links.bluetooth(place(tmp_path, nowhere, ble="hci0?speed=3"))
     assert "no option" in wrong.why
 
 
@@ -63,14 +63,14 @@ def test_adapters_as_bluetoothd_has_them(
     radio = air(1)
 
     def look(ble: str | None = "auto") -> Finding:
-        (found,) = bluetooth.bluetooth(place(tmp_path, radio.address, ble))
+        (found,) = links.bluetooth(place(tmp_path, radio.address, ble))
         return found
 
     assert look().result == "ok"
     assert "0 connections held: --ble hci0" in look().why
     port().find(lambda _: True, seconds=20, notice=lambda _: None)
     assert "1 connection held" in look().why
-    monkeypatch.setattr(bluetooth, "_MANY", 1)
+    monkeypatch.setattr(links, "_MANY", 1)
     assert look().result == "warning"
     assert "add an adapter" in look().fix
     assert look("hci7").result == "failed"

@@ -166,4 +166,4 @@ def test_without_pyscard_the_extra_is_named(monkeypatch: pytest.MonkeyPatch) -> 
     monkeypatch.setitem(sys.modules, "smartcard", None)
     with pytest.raises(NoReader) as caught:
         open_reader("pcsc")
-    assert "pyscard" in caught.value.hint
+    assert "teds-provision[pcsc]" in caught.value.hint
