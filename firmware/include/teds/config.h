@@ -1,0 +1,82 @@
+/* Sizes of a node, set when it is built (-DTEDS_STAGING=8192 or a teds_user_config.h). All of it is RAM in teds_node. */
+#ifndef TEDS_CONFIG_H
+#define TEDS_CONFIG_H
+
+#ifdef TEDS_USER_CONFIG
+#include "teds_user_config.h"
+#endif
+
+/* maxMessage of wire.md: the longest whole command or reply frame, 512 to 4094. */
+#ifndef TEDS_MAX_MESSAGE
+#define TEDS_MAX_MESSAGE 1024
+#endif
+
+/* The staging arena: all TEDS images between their first Write and the commit, 4 octets of bookkeeping each. */
+#ifndef TEDS_STAGING
+#define TEDS_STAGING 4096
+#endif
+
+/* Sessions, and half-open Opens, over all links; two or more. */
+#ifndef TEDS_SESSIONS
+#define TEDS_SESSIONS 2
+#endif
+
+/* Stored replies. One for each session and one for everyone else, so that a stranger's question meets room. */
+#ifndef TEDS_REPLIES
+#define TEDS_REPLIES (TEDS_SESSIONS + 1)
+#endif
+
+/* Stations that a node keeps ISO-TP state for at once (sources F1 to F7). */
+#ifndef TEDS_CAN_LINES
+#define TEDS_CAN_LINES 4
+#endif
+
+/* 1: answers CAN FD in FD. 0: classic frames alone. */
+#ifndef TEDS_CAN_FD
+#define TEDS_CAN_FD 1
+#endif
+
+/* What flow control asks a station for: frames in a block (0: no limit), STmin as on the wire (ISO 15765-2). */
+#ifndef TEDS_CAN_BLOCK
+#define TEDS_CAN_BLOCK 16
+#endif
+#ifndef TEDS_CAN_STMIN
+#define TEDS_CAN_STMIN 0
+#endif
+
+/* 1: measures (operation.md). 0: provisioning alone; every command of operation.md gets 1. */
+#ifndef TEDS_OPERATION
+#define TEDS_OPERATION 1
+#endif
+
+/* Channels of the board, at most 32. */
+#ifndef TEDS_CHANNELS
+#define TEDS_CHANNELS 8
+#endif
+
+/* Streams over all sessions, at least 1. */
+#ifndef TEDS_STREAMS
+#define TEDS_STREAMS 2
+#endif
+
+/* Octets of the port's running SHA-256 (br_sha256_context 112, psa_hash_operation_t of Mbed TLS 2.28 232). */
+#ifndef TEDS_SHA256_OCTETS
+#define TEDS_SHA256_OCTETS 112
+#endif
+
+/* 1: the node has NFC, so a tap is a tap. 0: its wired bus counts as tapped in factory state (security-teds.md, 2). */
+#ifndef TEDS_NFC
+#define TEDS_NFC 0
+#endif
+
+#if TEDS_MAX_MESSAGE < 512 || TEDS_MAX_MESSAGE > 4094
+#error "TEDS_MAX_MESSAGE is 512 to 4094"
+#endif
+#if TEDS_SESSIONS < 2 || TEDS_REPLIES <= TEDS_SESSIONS
+#error "two sessions at least, and a stored reply more than sessions"
+#endif
+#if TEDS_CHANNELS > 32 || TEDS_STREAMS < 1 || TEDS_STAGING > 60000
+#error "at most 32 channels, one stream at least, staging at most 60000"
+#endif
+
+#endif

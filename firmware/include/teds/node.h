@@ -1,0 +1,256 @@
+/* A node (TIM) of the teds-provision profile: frames in, frames out.
+ *
+ * One teds_node is one node; there is nothing global. Nothing here allocates, recurses or blocks but inside a call of
+ * the port's cryptography or flash. All functions are called from one thread or main loop.
+ *
+ * int functions give 0, or a negative TEDS_E_ for a misuse or a port that failed. What a peer did wrong is a refusal in
+ * the reply, never an error of the call. Times are ns of the port's clock.
+ */
+#ifndef TEDS_NODE_H
+#define TEDS_NODE_H
+
+#include "teds/port.h"
+
+enum {
+    TEDS_E_USAGE = -1,    /* a port or configuration that cannot be */
+    TEDS_E_FLASH = -2,    /* flash failed */
+    TEDS_E_RANDOM = -3,   /* no randomness */
+    TEDS_E_IDENTITY = -4, /* the identity area is torn: a node never makes a second key over a first */
+    TEDS_E_CRYPTO = -5
+};
+
+/* A link is the station's address: F1 to F7 on CAN, 1 on NFC, 2 and up on BLE. */
+typedef uint8_t teds_link;
+
+enum { TEDS_CAN = 1, TEDS_AT_NFC = 2, TEDS_AT_BLE = 3 };
+
+/* Where and when a command came. */
+typedef struct teds_arrival {
+    uint8_t kind;    /* TEDS_CAN, TEDS_AT_NFC, TEDS_AT_BLE */
+    bool tapped;     /* it came over NFC, or the wired bus counts as tapped */
+    bool fd;         /* by CAN FD */
+    uint64_t tick;   /* when its last octet came */
+} teds_arrival;
+
+/* A TEDS that is part of the firmware and cannot be written; channel and code ascending in the table. */
+typedef struct teds_fixed {
+    uint8_t channel, code;
+    uint16_t length;
+    const uint8_t *octets; /* Length to Checksum */
+} teds_fixed;
+
+typedef struct teds_config {
+    uint8_t uuid[10]; /* used at the very first start alone; afterwards the stored one counts */
+    const teds_fixed *fixed;
+    size_t fixed_count;
+    bool quick_points; /* the chip's point arithmetic takes 5 ms at most */
+} teds_config;
+
+typedef struct teds_can_frame {
+    uint32_t identifier; /* 29 bits */
+    uint8_t length;
+    bool fd;
+    uint8_t data[TEDS_CAN_FD ? 64 : 8];
+} teds_can_frame;
+
+/* -- the inside; stands here so that a board can own it. Nothing outside src/ looks into it. ------------------------ */
+
+typedef struct teds_state {
+    uint8_t flags; /* 1 keyed, 2 provisioned */
+    uint8_t address;
+    uint32_t epoch, sequence;
+    uint8_t key[16], station[65], ca[65];
+} teds_state;
+
+typedef struct teds_keys {
+    uint8_t to_node[16], to_station[16], messages[32];
+} teds_keys;
+
+typedef struct teds_session {
+    bool used, staged;
+    teds_link link;
+    uint8_t kind;
+    uint32_t counter;
+    uint64_t good_at, staged_at;
+    teds_keys keys;
+#if TEDS_OPERATION
+    uint32_t claims;      /* bits by place in the port's channel table */
+    uint64_t lease;       /* ns */
+    uint64_t mark;
+    uint16_t run;
+    struct {
+        bool armed;
+        uint64_t until;
+        uint8_t commitment[16];
+    } arms[3];
+#endif
+} teds_session;
+
+typedef struct teds_half_open {
+    bool used;
+    teds_link link;
+    uint64_t at;
+    teds_keys keys;
+} teds_half_open;
+
+typedef struct teds_stored_reply {
+    bool used, stored;
+    teds_link link;
+    uint8_t digest[32];
+    uint64_t at;
+    uint16_t length;
+    uint8_t octets[1 + TEDS_MAX_MESSAGE]; /* transaction, reply */
+} teds_stored_reply;
+
+typedef struct teds_one_time {
+    bool ready;
+    teds_key_ref key;
+    uint8_t point[65];
+} teds_one_time;
+
+typedef struct teds_pending {
+    bool used;
+    teds_link link;
+    int8_t session; /* its place in the table, -1: outside */
+    uint64_t at;
+    uint32_t epoch;
+    uint8_t key[16], tag[16], station[65], ca[65];
+} teds_pending;
+
+#if TEDS_OPERATION
+#define TEDS_MESSAGE 240
+typedef struct teds_stream {
+    bool used, ready, waits, full, ended;
+    int8_t session;
+    uint8_t number, kind, n, count, octets, pattern, flags, full_flags;
+    bool fd;
+    uint8_t channels[16]; /* places in the port's table */
+    uint8_t held;
+    uint16_t gap, run, length, fill;
+    uint32_t counter, full_counter;
+    uint64_t period, start, missed;
+    uint8_t key[16];
+    uint8_t filling[TEDS_MESSAGE - 12], waiting[TEDS_MESSAGE - 12];
+} teds_stream;
+#endif
+
+typedef struct teds_line {
+    bool used, fd;
+    uint8_t source, own;
+    uint64_t touched;
+    /* what is being sent */
+    const uint8_t *out;
+    uint16_t out_length, out_at;
+    uint8_t out_state, out_number, out_block, out_waits;
+    uint32_t out_gap;      /* ns between consecutive frames */
+    uint64_t out_due;      /* next frame, or when a flow control is given up */
+    int8_t out_reply;      /* the stored reply that it is, -1: everyone's */
+    uint8_t flow;          /* a flow control is due: its first octet, 0: none */
+    uint8_t single[6];     /* a refusal as a single frame: length, transaction, 00 00 01 reason; length 0: none */
+    bool asked;            /* a functional Identify waits for its time */
+    uint8_t asked_transaction;
+    bool asked_fd;
+    uint64_t asked_due;
+    uint8_t everyone[27];
+} teds_line;
+
+typedef struct teds_can {
+    bool started, announces;
+    uint8_t address, moves_to; /* moves_to: where 128.10 leads once its reply has left; 0: nowhere */
+    int8_t moves_line;
+    uint64_t announce_due;
+    uint32_t announced[20];
+    uint8_t announced_at;
+    uint8_t heard[30];
+    /* the one long request that may be coming in */
+    int8_t rx_line;
+    uint8_t rx_number, rx_block;
+    uint16_t rx_length, rx_at;
+    uint64_t rx_until;
+    uint8_t rx[1 + TEDS_MAX_MESSAGE];
+    teds_line lines[TEDS_CAN_LINES];
+#if TEDS_OPERATION
+    /* the one data message that is being sent */
+    int8_t data_stream;
+    uint8_t data_segment;
+    uint16_t data_at, data_length;
+    uint64_t data_free_at;
+    uint8_t data[TEDS_MESSAGE];
+#endif
+} teds_can;
+
+typedef struct teds_node {
+    const teds_port *port;
+    const teds_config *config;
+    uint8_t uuid[10];
+    teds_key_ref key;
+    uint8_t point[65], signature[64]; /* field 102 */
+    teds_state state;
+    uint8_t slot;          /* the one that counts */
+    bool free_slot_dirty, old_slot_due;
+    uint32_t slot_counter, records_at, records_end;
+    uint64_t opens;        /* c */
+    uint64_t address_written_at, stranger_at;
+    bool address_written, stranger_seen;
+    teds_session sessions[TEDS_SESSIONS];
+    teds_half_open half_open[TEDS_SESSIONS];
+    teds_stored_reply replies[TEDS_REPLIES];
+    teds_one_time one_time;
+    teds_pending pending;
+    uint16_t staging_end;
+    uint8_t staging[TEDS_STAGING];
+#if TEDS_OPERATION
+    uint32_t safe, stopped;         /* bits by place */
+    uint64_t deadline[TEDS_CHANNELS];
+    uint16_t dead_man[TEDS_CHANNELS];
+    int8_t actuator_of[TEDS_CHANNELS]; /* session that claims an actuator */
+    teds_stream streams[TEDS_STREAMS];
+    uint64_t missed;
+#endif
+    teds_can can;
+} teds_node;
+
+/* -- public functions --------------------------------------------------------------------------------------------- */
+
+/* Read both slots, take the newer good one, erase the other if it is not blank; make the identity key at the very first
+ * start. `config` and `port` must outlive the node. */
+int teds_node_init(teds_node *node, const teds_config *config, const teds_port *port);
+
+/* One whole command frame to one whole reply frame; gives its length. `frame` is never written and does not overlap
+ * `reply`, which has room for TEDS_MAX_MESSAGE octets. Call teds_node_reply_left when its last frame was taken. */
+size_t teds_node_handle(teds_node *node, teds_link link, const teds_arrival *arrival, const uint8_t *frame,
+                        size_t length, uint8_t *reply);
+void teds_node_reply_left(teds_node *node, teds_link link);
+
+/* Loss of a link or field: its session, half-open Open, pending agreement and stored reply go. */
+void teds_node_link_lost(teds_node *node, teds_link link);
+
+/* The bus is gone: all CAN links are lost. teds_can_start when it is back. */
+void teds_node_bus_off(teds_node *node);
+
+/* Button, pad or magnet held 5 s: the effect of Reset. 0, or TEDS_E_FLASH. */
+int teds_node_reset_by_hand(teds_node *node);
+
+/* What Identify says: 23 octets. */
+void teds_node_identify(const teds_node *node, uint8_t out[23]);
+
+/* Leases, samples, time-outs, erasing what is due. Gives when it is due again; UINT64_MAX: not by itself. */
+uint64_t teds_node_poll(teds_node *node, uint64_t now);
+
+/* Make the next one-time key while nothing else is to do; true where there was something to do. */
+bool teds_idle_work(teds_node *node);
+
+/* The controller is on the bus: announce after a random 0 to 500 ms. */
+void teds_can_start(teds_node *node, uint64_t now);
+
+/* A frame came; `tick` is its end. From the main loop, never from an interrupt: keep a ring of 20 frames or more. */
+void teds_can_rx(teds_node *node, const teds_can_frame *frame, uint64_t tick);
+
+/* The next frame that may leave now; false: none. Ask when the controller is free for one: commands and replies go
+ * before data, and what is still here can be taken back. */
+bool teds_can_tx(teds_node *node, teds_can_frame *frame, uint64_t now);
+
+/* Data messages that could not leave in time, since the start. */
+uint64_t teds_node_missed(const teds_node *node);
+
+#endif

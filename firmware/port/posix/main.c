@@ -1,0 +1,317 @@
+/* teds-node: a node of the profile as a program, for benches and tests. */
+#define _GNU_SOURCE
+#include "host.h"
+#include "teds_bearssl.h"
+
+#include <errno.h>
+#include <poll.h>
+#include <signal.h>
+#include <stdio.h>
+#include <stdlib.h>
+#include <string.h>
+#include <sys/random.h>
+#include <time.h>
+
+typedef struct board {
+    teds_bearssl crypto; /* first: the port of BearSSL looks here */
+    host_flash flash;
+    host_channels channels;
+    host_bus bus;
+    uint64_t started, seed;
+} board;
+
+static volatile sig_atomic_t stopping, by_hand;
+
+static void on_signal(int number)
+{
+    if (number == SIGUSR1) {
+        by_hand = 1;
+    } else {
+        stopping = 1;
+    }
+}
+
+static uint64_t monotonic(void)
+{
+    struct timespec now;
+    (void)clock_gettime(CLOCK_MONOTONIC, &now);
+    return (uint64_t)now.tv_sec * 1000000000u + (uint64_t)now.tv_nsec;
+}
+
+static int port_erase(void *user, int area)
+{
+    return host_flash_erase(&((board *)user)->flash, area);
+}
+
+static int port_write(void *user, int area, uint32_t at, const uint8_t *octets, size_t length)
+{
+    return host_flash_write(&((board *)user)->flash, area, at, octets, length);
+}
+
+static int port_read(void *user, int area, uint32_t at, uint8_t *out, size_t length)
+{
+    return host_flash_read(&((board *)user)->flash, area, at, out, length);
+}
+
+/* With --seed what is drawn is known: for tests alone. */
+static int port_random(void *user, uint8_t *out, size_t length)
+{
+    board *own = user;
+    if (own->seed == 0) {
+        return getrandom(out, length, 0) == (ssize_t)length ? 0 : -1;
+    }
+    for (size_t i = 0; i < length; i++) {
+        own->seed = own->seed * 6364136223846793005u + 1442695040888963407u;
+        out[i] = (uint8_t)(own->seed >> 56);
+    }
+    return 0;
+}
+
+static uint64_t port_now(void *user)
+{
+    return monotonic() - ((board *)user)->started;
+}
+
+static bool port_sample(void *user, uint8_t channel, uint64_t tick, uint8_t *out)
+{
+    return host_sample(&((board *)user)->channels, channel, tick, out);
+}
+
+static int place_of(const board *own, uint8_t channel)
+{
+    for (size_t i = 0; i < own->channels.count; i++) {
+        if (own->channels.table[i].number == channel) {
+            return (int)i;
+        }
+    }
+    return -1;
+}
+
+static bool port_bears(void *user, uint8_t channel, const uint8_t *octets)
+{
+    (void)octets;
+    return place_of(user, channel) >= 0;
+}
+
+static void port_set(void *user, uint8_t channel, const uint8_t *octets)
+{
+    board *own = user;
+    int place = place_of(own, channel);
+    memcpy(own->channels.set_points[place], octets, own->channels.table[place].octets);
+}
+
+static void port_set_point(void *user, uint8_t channel, uint8_t *out)
+{
+    board *own = user;
+    int place = place_of(own, channel);
+    memcpy(out, own->channels.set_points[place], own->channels.table[place].octets);
+}
+
+static void port_safe(void *user, uint8_t channel)
+{
+    board *own = user;
+    memset(own->channels.set_points[place_of(own, channel)], 0, 8);
+}
+
+static void fill_port(teds_port *port, board *own)
+{
+    memset(port, 0, sizeof *port);
+    port->user = own;
+    port->slot_octets = HOST_SLOT;
+    port->identity_octets = HOST_IDENTITY;
+    port->unit = HOST_UNIT;
+    port->erased = 0xFF;
+    port->erase = port_erase;
+    port->write = port_write;
+    port->read = port_read;
+    port->random = port_random;
+    port->now = port_now;
+    port->step = 1;
+    port->drift = 50;
+    teds_bearssl_fill(port);
+    port->channels = own->channels.table;
+    port->channel_count = own->channels.count;
+    port->sample = port_sample;
+    port->bears = port_bears;
+    port->set = port_set;
+    port->set_point = port_set_point;
+    port->safe = port_safe;
+    own->crypto.random = port_random;
+}
+
+/* -- options --------------------------------------------------------------------------------------------------------------- */
+
+typedef struct options {
+    const char *flash, *can, *uuid, *channels, *source, *cut, *seed;
+    bool fd;
+} options;
+
+static int usage(void)
+{
+    (void)fprintf(stderr, "teds-node --flash FILE --can SPEC [--fd] [--uuid HEX] [--channels FILE]\n"
+                          "          [--source noise|sine:S|ramp:S] [--cut N[:torn]] [--seed N]\n");
+    return 2;
+}
+
+static int read_options(int count, char **words, options *out)
+{
+    const struct {
+        const char *name;
+        const char **value;
+    } known[] = {{"--flash", &out->flash}, {"--can", &out->can},       {"--uuid", &out->uuid},
+                 {"--channels", &out->channels}, {"--source", &out->source}, {"--cut", &out->cut},
+                 {"--seed", &out->seed}};
+    for (int i = 1; i < count; i++) {
+        bool found = strcmp(words[i], "--fd") == 0;
+        out->fd = out->fd || found;
+        for (size_t k = 0; k < sizeof known / sizeof known[0] && !found; k++) {
+            if (strcmp(words[i], known[k].name) == 0 && i + 1 < count) {
+                *known[k].value = words[++i];
+                found = true;
+            }
+        }
+        if (!found) {
+            return usage();
+        }
+    }
+    return out->flash != NULL && out->can != NULL ? 0 : usage();
+}
+
+static int read_uuid(const char *text, uint8_t out[10])
+{
+    unsigned octet;
+    if (strlen(text) != 20) {
+        return -1;
+    }
+    for (size_t i = 0; i < 10; i++) {
+        if (sscanf(text + 2 * i, "%2x", &octet) != 1) {
+            return -1;
+        }
+        out[i] = (uint8_t)octet;
+    }
+    return 0;
+}
+
+static void print_hex(const uint8_t *octets, size_t length)
+{
+    for (size_t i = 0; i < length; i++) {
+        (void)printf("%02x", (unsigned)octets[i]);
+    }
+}
+
+static void say_ready(const teds_node *node, const teds_port *port, const char *source)
+{
+    uint8_t identity[23], hash[32];
+    teds_sha256 state;
+    teds_node_identify(node, identity);
+    port->sha256_start(port->user, &state);
+    port->sha256_update(port->user, &state, node->point, 65);
+    port->sha256_finish(port->user, &state, hash);
+    (void)printf("{\"uuid\": \"");
+    print_hex(identity + 1, 10);
+    (void)printf("\", \"fingerprint\": \"");
+    print_hex(hash, 32);
+    (void)printf("\", \"links\": [\"can\"], \"source\": \"%s\", \"ready\": true}\n", source);
+    (void)fflush(stdout);
+}
+
+/* -- the loop ---------------------------------------------------------------------------------------------------------------- */
+
+static void wait_for(const board *own, uint64_t until)
+{
+    struct pollfd ready = {own->bus.in, POLLIN, 0};
+    uint64_t now = port_now((void *)(uintptr_t)own);
+    uint64_t wait = until <= now ? 0 : until - now;
+    struct timespec time;
+    wait = wait < 500000000u ? wait : 500000000u;
+    time.tv_sec = 0;
+    time.tv_nsec = (long)wait;
+    (void)ppoll(&ready, 1, &time, NULL);
+}
+
+static int run(board *own, teds_node *node)
+{
+    teds_can_frame frame;
+    int came;
+    teds_can_start(node, port_now(own));
+    while (!stopping) {
+        uint64_t due;
+        bool busy = false;
+        if (by_hand) {
+            by_hand = 0;
+            (void)teds_node_reset_by_hand(node);
+        }
+        while ((came = host_bus_receive(&own->bus, &frame)) == 1) {
+            teds_can_rx(node, &frame, port_now(own));
+            busy = true;
+            while (teds_can_tx(node, &frame, port_now(own))) {
+                (void)host_bus_send(&own->bus, &frame);
+            }
+        }
+        if (came < 0) {
+            (void)fprintf(stderr, "The bus is gone.\n");
+            return 5;
+        }
+        due = teds_node_poll(node, port_now(own));
+        while (teds_can_tx(node, &frame, port_now(own))) {
+            (void)host_bus_send(&own->bus, &frame);
+            busy = true;
+        }
+        if (!busy && due > port_now(own) + 1000000u && teds_idle_work(node)) {
+            continue;
+        }
+        if (busy) {
+            due = teds_node_poll(node, port_now(own));
+        }
+        wait_for(own, due);
+    }
+    return 0;
+}
+
+int main(int count, char **words)
+{
+    static board own;
+    static teds_node node;
+    static teds_config config;
+    static teds_port port;
+    struct sigaction action;
+    options given = {.source = "noise"};
+    int failed = read_options(count, words, &given);
+    if (failed) {
+        return failed;
+    }
+    own.started = monotonic();
+    own.seed = given.seed != NULL ? strtoull(given.seed, NULL, 10) : 0;
+    own.flash.cut = given.cut != NULL ? atol(given.cut) : 0;
+    own.flash.torn = given.cut != NULL && strstr(given.cut, ":torn") != NULL;
+    if (host_flash_open(&own.flash, given.flash) != 0) {
+        (void)fprintf(stderr, "%s is no flash file: %s.\n", given.flash, strerror(errno));
+        return 2;
+    }
+    if (host_source(&own.channels, given.source) != 0 ||
+        (given.channels != NULL && host_channels_read(&own.channels, given.channels) != 0)) {
+        return 2;
+    }
+    fill_port(&port, &own);
+    config.quick_points = true;
+    if (given.uuid != NULL ? read_uuid(given.uuid, config.uuid) != 0 : port_random(&own, config.uuid, 10) != 0) {
+        return usage();
+    }
+    failed = teds_node_init(&node, &config, &port);
+    if (failed) {
+        (void)fprintf(stderr, failed == TEDS_E_IDENTITY ? "The identity in %s is torn; erase the board.\n"
+                                                        : "The node does not start (%s).\n",
+                      given.flash);
+        return 1;
+    }
+    if (host_bus_open(&own.bus, given.can, given.fd) != 0) {
+        return 5;
+    }
+    memset(&action, 0, sizeof action);
+    action.sa_handler = on_signal;
+    (void)sigaction(SIGTERM, &action, NULL);
+    (void)sigaction(SIGINT, &action, NULL);
+    (void)sigaction(SIGUSR1, &action, NULL);
+    say_ready(&node, &port, given.source);
+    return run(&own, &node);
+}

@@ -1,0 +1,499 @@
+/* CAN (wire.md): lines to stations, one long request at a time, replies, Identify asked of everyone, Announce and Claim,
+ * and what leaves next. */
+#include "inside.h"
+
+#define PHYSICAL 0x18DA0000u
+#define FUNCTIONAL 0x18DBFF00u
+#define ANNOUNCE 0x1CFF0000u
+#define TRIGGER 0x18FF0000u
+#define FIRST_STATION 0xF1u
+#define LAST_STATION 0xF7u
+#define CR_NS TEDS_SECOND
+#define KEEP_NS (20u * TEDS_SECOND)
+#define EVERYONE_NS (50u * 1000000u)
+#define START_NS (500u * 1000000u)
+#define UNIT_BITS 26 /* of the Announce times kept: 67 ms */
+#define A_MINUTE (60u * TEDS_SECOND >> UNIT_BITS)
+
+uint8_t teds_default_address(const uint8_t uuid[10])
+{
+    return (uint8_t)(1 + teds_crc32(0, uuid, 10) % TEDS_LAST_ADDRESS);
+}
+
+static bool is_sending(const teds_line *line)
+{
+    return line->used && line->out_state != TEDS_OUT_IDLE;
+}
+
+bool teds_can_sending(const teds_node *node)
+{
+    for (size_t i = 0; i < TEDS_CAN_LINES; i++) {
+        if (is_sending(&node->can.lines[i])) {
+            return true;
+        }
+    }
+    return false;
+}
+
+/* A random wait of up to `most` ns; 0 where the chip has no randomness now. */
+static uint64_t spread(const teds_node *node, uint64_t most)
+{
+    uint8_t octets[2];
+    if (node->port->random(node->port->user, octets, sizeof octets) != 0) {
+        return 0;
+    }
+    return most * teds_get16(octets) >> 16;
+}
+
+/* -- lines ------------------------------------------------------------------------------------------------------------ */
+
+static teds_line *line_of(teds_node *node, uint8_t source, uint64_t now)
+{
+    teds_line *found = NULL;
+    for (size_t i = 0; i < TEDS_CAN_LINES; i++) {
+        teds_line *each = &node->can.lines[i];
+        if (each->used && each->source == source) {
+            each->touched = now;
+            return each;
+        }
+        if (is_sending(each) || node->can.rx_line == (int8_t)i) {
+            continue;
+        }
+        if (found == NULL || (found->used && (!each->used || each->touched < found->touched))) {
+            found = each;
+        }
+    }
+    if (found != NULL) {
+        memset(found, 0, sizeof *found);
+        found->used = true;
+        found->source = source;
+        found->own = node->can.address;
+        found->touched = now;
+        found->out_reply = -1;
+    }
+    return found;
+}
+
+static void lose_all(teds_node *node)
+{
+    for (uint8_t source = FIRST_STATION; source <= LAST_STATION; source++) {
+        teds_node_link_lost(node, source);
+    }
+    memset(node->can.lines, 0, sizeof node->can.lines);
+    node->can.rx_line = -1;
+}
+
+void teds_can_lose(teds_node *node)
+{
+    lose_all(node);
+    node->can.moves_to = 0;
+    node->can.announces = false;
+}
+
+void teds_node_bus_off(teds_node *node)
+{
+    teds_can_lose(node);
+    node->can.started = false;
+}
+
+/* Every link is a pair of addresses: with a new own one all begin anew. */
+static void move(teds_node *node, uint8_t address)
+{
+    if (address != node->can.address) {
+        node->can.address = address;
+        lose_all(node);
+    }
+    node->can.moves_to = 0;
+}
+
+/* A message has left, or was given up. */
+static void left(teds_node *node, teds_line *line)
+{
+    line->out_state = TEDS_OUT_IDLE;
+    if (line->out_reply < 0) {
+        return;
+    }
+    node->replies[line->out_reply].at = teds_now(node);
+    line->out_reply = -1;
+    teds_node_reply_left(node, line->source);
+    if (node->can.moves_to != 0 && node->can.moves_line == (int8_t)(line - node->can.lines)) {
+        move(node, node->can.moves_to);
+    }
+}
+
+/* -- requests ----------------------------------------------------------------------------------------------------------- */
+
+/* Identify, Prove, List, Query and Read outside Sealed are always run anew. */
+static bool always_anew(const uint8_t *frame, size_t length)
+{
+    if (length < 4) {
+        return false;
+    }
+    if (frame[2] == TEDS_CLASS_COMMON) {
+        return frame[3] == TEDS_QUERY || frame[3] == TEDS_READ;
+    }
+    return frame[2] == TEDS_CLASS_SECURITY &&
+           (frame[3] == TEDS_IDENTIFY || frame[3] == TEDS_PROVE || frame[3] == TEDS_LIST);
+}
+
+static void request(teds_node *node, teds_line *line, const uint8_t *body, size_t length, bool fd, uint64_t tick)
+{
+    const teds_part whole = {body, length};
+    const teds_arrival arrival = {TEDS_CAN, TEDS_NFC == 0 && teds_in_factory(node), fd, tick};
+    const uint8_t own = line->own;
+    uint64_t now = teds_now(node);
+    teds_stored_reply *place;
+    uint8_t digest[32];
+    if (is_sending(line)) { /* whoever asks again has not taken that answer up */
+        left(node, line);
+        if (!line->used || line->own != own) {
+            return; /* the node has moved: nobody answers at the old address */
+        }
+    }
+    place = teds_reply_place(node, line->source);
+    teds_sha256_parts(node, &whole, 1, digest);
+    if (!place->stored || memcmp(digest, place->digest, 32) != 0 || now - place->at >= KEEP_NS ||
+        always_anew(body + 1, length - 1)) {
+        place->stored = false;
+        node->can.moves_to = 0;
+        place->length = (uint16_t)(1 + teds_node_handle(node, line->source, &arrival, body + 1, length - 1,
+                                                        place->octets + 1));
+        place->octets[0] = body[0];
+        memcpy(place->digest, digest, 32);
+        place->used = true; /* its link may have ended by its own command */
+        place->stored = true;
+        place->link = line->source;
+        place->at = teds_now(node);
+        if (node->can.moves_to != 0) {
+            node->can.moves_line = (int8_t)(line - node->can.lines);
+        }
+    }
+    line->out_reply = (int8_t)(place - node->replies);
+    teds_isotp_begin(line, place->octets, place->length, fd);
+}
+
+/* A refusal in place of a flow control, as one frame; the stored reply stays. */
+static void refuse(teds_line *line, uint8_t transaction, uint8_t reason, bool fd)
+{
+    const uint8_t single[6] = {5, transaction, 0, 0, 1, reason};
+    memcpy(line->single, single, sizeof single);
+    if (!is_sending(line)) {
+        line->fd = fd && TEDS_CAN_FD;
+    }
+}
+
+static void first_frame(teds_node *node, teds_line *line, const teds_can_frame *frame, uint64_t now)
+{
+    teds_can *can = &node->can;
+    size_t length = (size_t)(frame->data[0] & 15u) << 8 | frame->data[1], head = 2;
+    if (frame->length < 8) {
+        return;
+    }
+    if (length == 0) { /* more than 4095 octets */
+        length = teds_get32(frame->data + 2);
+        head = 6;
+    } else if (length < frame->length - 1u) {
+        return; /* would fit one frame: not to be answered (ISO 15765-2) */
+    }
+    if (length > sizeof can->rx) {
+        refuse(line, frame->data[head], TEDS_TOO_LARGE, frame->fd);
+        return;
+    }
+    if (can->rx_line >= 0 && &can->lines[can->rx_line] != line && now < can->rx_until) {
+        refuse(line, frame->data[head], TEDS_BUSY, frame->fd);
+        return;
+    }
+    can->rx_line = (int8_t)(line - can->lines);
+    can->rx_length = (uint16_t)length;
+    can->rx_at = (uint16_t)(frame->length - head);
+    can->rx_number = 1;
+    can->rx_block = TEDS_CAN_BLOCK;
+    can->rx_until = now + CR_NS;
+    memcpy(can->rx, frame->data + head, can->rx_at);
+    line->flow = 0x30;
+    if (!is_sending(line)) {
+        line->fd = frame->fd;
+    }
+}
+
+static void consecutive_frame(teds_node *node, teds_line *line, const teds_can_frame *frame, uint64_t now)
+{
+    teds_can *can = &node->can;
+    uint8_t number = frame->data[0] & 15;
+    size_t octets = (size_t)(can->rx_length - can->rx_at);
+    if (can->rx_line < 0 || &can->lines[can->rx_line] != line) {
+        return;
+    }
+    if (number == ((can->rx_number + 15u) & 15u) && can->rx_at > 8) {
+        return; /* the same frame twice: an error in its last bit doubles a frame on CAN */
+    }
+    octets = octets < frame->length - 1u ? octets : frame->length - 1u;
+    if (number != can->rx_number || now >= can->rx_until || octets == 0) {
+        can->rx_line = -1;
+        return;
+    }
+    memcpy(can->rx + can->rx_at, frame->data + 1, octets);
+    can->rx_at = (uint16_t)(can->rx_at + octets);
+    can->rx_number = (uint8_t)((number + 1) & 15);
+    can->rx_until = now + CR_NS;
+    if (can->rx_at == can->rx_length) {
+        line->flow = 0;
+        request(node, line, can->rx, can->rx_length, frame->fd, now);
+        can->rx_line = -1;
+    } else if (TEDS_CAN_BLOCK != 0 && --can->rx_block == 0) {
+        can->rx_block = TEDS_CAN_BLOCK;
+        line->flow = 0x30;
+    }
+}
+
+static void physical(teds_node *node, const teds_can_frame *frame, uint64_t tick)
+{
+    const uint8_t own = (uint8_t)(frame->identifier >> 8), source = (uint8_t)frame->identifier;
+    const uint8_t *body;
+    size_t octets;
+    teds_line *line;
+    if (own != node->can.address) {
+        return;
+    }
+    line = line_of(node, source, tick);
+    if (line == NULL || frame->length < 2) {
+        return;
+    }
+    switch (frame->data[0] >> 4) {
+    case 0:
+        if (teds_isotp_single(frame->data, frame->length, &body, &octets)) {
+            if (node->can.rx_line == (int8_t)(line - node->can.lines)) {
+                node->can.rx_line = -1; /* a new message of the same station ends the one before */
+            }
+            request(node, line, body, octets, frame->fd, tick);
+        }
+        break;
+    case 1: first_frame(node, line, frame, tick); break;
+    case 2: consecutive_frame(node, line, frame, tick); break;
+    case 3: teds_isotp_flow(line, frame->data, frame->length, tick); break;
+    default: break;
+    }
+}
+
+/* -- everyone ------------------------------------------------------------------------------------------------------------- */
+
+static void functional(teds_node *node, const teds_can_frame *frame, uint64_t now)
+{
+    static const uint8_t identify[6] = {0, 0, TEDS_CLASS_SECURITY, TEDS_IDENTIFY, 0, 0};
+    const uint8_t *body;
+    size_t octets;
+    teds_line *line;
+    if (!teds_isotp_single(frame->data, frame->length, &body, &octets) || octets != 7 ||
+        memcmp(body + 1, identify, 6) != 0) {
+        return; /* nothing else that is asked of everyone is answered */
+    }
+    line = line_of(node, (uint8_t)frame->identifier, now);
+    if (line != NULL) { /* a newer one of the same station takes its place */
+        line->asked = true;
+        line->asked_transaction = body[0];
+        line->asked_fd = frame->fd;
+        line->asked_due = now + spread(node, EVERYONE_NS);
+    }
+}
+
+/* It leaves the stored reply alone. */
+static void answer_everyone(teds_node *node, teds_line *line)
+{
+    line->asked = false;
+    line->everyone[0] = line->asked_transaction;
+    line->everyone[1] = 1;
+    teds_put16(line->everyone + 2, 23);
+    teds_node_identify(node, line->everyone + 4);
+    line->out_reply = -1;
+    teds_isotp_begin(line, line->everyone, sizeof line->everyone, line->asked_fd);
+}
+
+/* -- Announce and Claim ------------------------------------------------------------------------------------------------------ */
+
+static void announce_soon(teds_node *node, uint64_t now, uint64_t most)
+{
+    node->can.announces = true;
+    node->can.announce_due = now + spread(node, most);
+}
+
+void teds_can_start(teds_node *node, uint64_t now)
+{
+    node->can.started = true;
+    announce_soon(node, now, START_NS);
+}
+
+static uint8_t next_free(const teds_node *node, uint8_t own)
+{
+    for (uint32_t step = 0; step < TEDS_LAST_ADDRESS - 1; step++) {
+        uint8_t address = (uint8_t)((own + step) % TEDS_LAST_ADDRESS + 1);
+        if ((node->can.heard[address >> 3] >> (address & 7) & 1) == 0) {
+            return address;
+        }
+    }
+    return own; /* every address is taken: nothing is better than here */
+}
+
+static void announced(teds_node *node, const teds_can_frame *frame, uint64_t now)
+{
+    uint8_t address = (uint8_t)frame->identifier;
+    uint32_t crc, own = teds_crc32(0, node->uuid, 10);
+    bool stays = false;
+    if (address != node->can.address || frame->length != 8 || frame->data[0] != 1 || frame->data[1] > 2) {
+        return;
+    }
+    crc = teds_get32(frame->data + 2);
+    if (crc == own) {
+        return; /* a conflict for a person, or our own frame given back */
+    }
+    announce_soon(node, now, EVERYONE_NS);
+#if TEDS_OPERATION
+    stays = teds_actuator_claimed(node);
+#endif
+    if (crc < own && !stays) {
+        move(node, next_free(node, node->can.address));
+    }
+}
+
+/* At most 20 a minute; more are left out. */
+static bool may_announce(teds_node *node, uint64_t now)
+{
+    teds_can *can = &node->can;
+    uint32_t at = (uint32_t)(now >> UNIT_BITS) + 1;
+    uint32_t oldest = can->announced[can->announced_at];
+    if (oldest != 0 && at - oldest < A_MINUTE + 1) {
+        return false;
+    }
+    can->announced[can->announced_at] = at;
+    can->announced_at = (uint8_t)((can->announced_at + 1) % 20);
+    return true;
+}
+
+static void announce(const teds_node *node, teds_can_frame *frame)
+{
+    uint8_t identity[23];
+    teds_node_identify(node, identity);
+    frame->identifier = ANNOUNCE | node->can.address;
+    frame->fd = false;
+    frame->length = 8;
+    memset(frame->data, 0, 8);
+    frame->data[0] = 1;
+    frame->data[1] = identity[11];
+    teds_put32(frame->data + 2, teds_crc32(0, node->uuid, 10));
+}
+
+/* -- in and out ---------------------------------------------------------------------------------------------------------------- */
+
+void teds_can_rx(teds_node *node, const teds_can_frame *frame, uint64_t tick)
+{
+    uint8_t source = (uint8_t)frame->identifier;
+    if (frame->length > (frame->fd && TEDS_CAN_FD ? 64 : 8)) {
+        return;
+    }
+    if (source >= 1 && source <= TEDS_LAST_ADDRESS) {
+        node->can.heard[source >> 3] |= (uint8_t)(1u << (source & 7));
+    }
+    if ((frame->identifier & 0x1FFFFF00u) == ANNOUNCE) {
+        announced(node, frame, tick);
+        return;
+    }
+    if (source < FIRST_STATION || source > LAST_STATION) {
+        return;
+    }
+    if ((frame->identifier & 0x1FFFFF00u) == FUNCTIONAL) {
+        functional(node, frame, tick);
+    } else if ((frame->identifier & 0x1FFF0000u) == PHYSICAL) {
+        physical(node, frame, tick);
+    }
+#if TEDS_OPERATION
+    else if ((frame->identifier & 0x1FFFFF00u) == (TRIGGER) && frame->length == 8) {
+        teds_trigger(node, source, frame->data, tick);
+    }
+#endif
+}
+
+static void flow_control(teds_line *line, teds_can_frame *frame)
+{
+    frame->fd = line->fd;
+    frame->data[0] = line->flow;
+    frame->data[1] = TEDS_CAN_BLOCK;
+    frame->data[2] = TEDS_CAN_STMIN;
+    teds_can_pad(frame, 3);
+    line->flow = 0;
+}
+
+/* What a line has to say now, flow controls first: somebody waits for them. */
+static bool line_next(teds_node *node, teds_line *line, teds_can_frame *frame, uint64_t now)
+{
+    frame->identifier = PHYSICAL | (uint32_t)line->source << 8 | line->own;
+    if (line->flow != 0) {
+        flow_control(line, frame);
+        return true;
+    }
+    if (line->single[0] != 0) {
+        frame->fd = line->fd;
+        memcpy(frame->data, line->single, sizeof line->single);
+        teds_can_pad(frame, sizeof line->single);
+        line->single[0] = 0;
+        return true;
+    }
+    if (line->asked && now >= line->asked_due &&
+        (!is_sending(line) || (line->out_reply < 0 && line->out_state == TEDS_OUT_WAITS))) {
+        answer_everyone(node, line);
+    }
+    if (!is_sending(line) || !teds_isotp_next(line, frame, now)) {
+        return false;
+    }
+    if (line->out_state == TEDS_OUT_IDLE) {
+        left(node, line);
+    }
+    return true;
+}
+
+bool teds_can_tx(teds_node *node, teds_can_frame *frame, uint64_t now)
+{
+    for (size_t i = 0; i < TEDS_CAN_LINES; i++) {
+        if (node->can.lines[i].used && line_next(node, &node->can.lines[i], frame, now)) {
+            return true;
+        }
+    }
+    if (node->can.announces && now >= node->can.announce_due) {
+        node->can.announces = false;
+        if (may_announce(node, now)) {
+            announce(node, frame);
+            return true;
+        }
+    }
+#if TEDS_OPERATION
+    return teds_data_next(node, frame, now);
+#else
+    return false;
+#endif
+}
+
+uint64_t teds_can_poll(teds_node *node, uint64_t now)
+{
+    uint64_t due = node->can.announces ? node->can.announce_due : TEDS_NEVER;
+    if (node->can.rx_line >= 0) {
+        if (now >= node->can.rx_until) {
+            node->can.rx_line = -1;
+        } else {
+            due = node->can.rx_until < due ? node->can.rx_until : due;
+        }
+    }
+    for (size_t i = 0; i < TEDS_CAN_LINES; i++) {
+        teds_line *line = &node->can.lines[i];
+        if (is_sending(line) && line->out_state == TEDS_OUT_WAITS && now >= line->out_due) {
+            left(node, line); /* its flow control failed to come */
+        }
+        if (is_sending(line) && line->out_due < due) {
+            due = line->out_due;
+        }
+        if (line->used && line->asked && line->asked_due < due && !is_sending(line)) {
+            due = line->asked_due;
+        }
+        if (line->used && (line->flow != 0 || line->single[0] != 0)) {
+            due = now;
+        }
+    }
+    return due;
+}

@@ -1,0 +1,228 @@
+/* What the files of src/ ask of each other. Not for boards. */
+#ifndef TEDS_INSIDE_H
+#define TEDS_INSIDE_H
+
+#include "octets.h"
+#include "teds/node.h"
+
+/* Why a node refuses (security-teds.md 4, operation.md 8). Handlers give octets of payload, or a reason negated. */
+enum {
+    TEDS_UNKNOWN_COMMAND = 1,
+    TEDS_WRONG_STATE = 2,
+    TEDS_NOT_PERMITTED = 3,
+    TEDS_BAD_FORM = 4,
+    TEDS_BAD_SIGNATURE = 5,
+    TEDS_DIGEST_MISMATCH = 6,
+    TEDS_STALE_SEQUENCE = 7,
+    TEDS_WRONG_EPOCH = 8,
+    TEDS_WRONG_UUID = 9,
+    TEDS_TOO_LARGE = 10,
+    TEDS_FAILURE = 11,
+    TEDS_BAD_TAG = 12,
+    TEDS_REPLAY = 13,
+    TEDS_UNTRUSTED = 14,
+    TEDS_BAD_POINT = 15,
+    TEDS_UNKNOWN_KEY = 16,
+    TEDS_BUSY = 17,
+    TEDS_NO_SUCH_TEDS = 18,
+    TEDS_OUT_OF_RANGE = 19,
+    TEDS_TOO_LATE = 20,
+    TEDS_DOES_NOT_FIT = 21,
+    TEDS_NO_ROOM = 22,
+    TEDS_FAULT_REASON = 23
+};
+
+enum { TEDS_CLASS_COMMON = 1, TEDS_CLASS_OPERATE = 3, TEDS_CLASS_EITHER = 4, TEDS_CLASS_SECURITY = 128 };
+
+/* Functions of class 128. */
+enum {
+    TEDS_REQUEST = 1,
+    TEDS_CONFIRM = 2,
+    TEDS_OPEN = 3,
+    TEDS_SEALED = 4,
+    TEDS_CLOSE = 5,
+    TEDS_IDENTIFY = 7,
+    TEDS_PROVE = 8,
+    TEDS_RESET = 9,
+    TEDS_SET_CAN_ADDRESS = 10,
+    TEDS_LIST = 11,
+    TEDS_SAMPLE = 12,
+    TEDS_SET = 13,
+    TEDS_SUBSCRIBE = 14,
+    TEDS_STOP = 15,
+    TEDS_CLOCK = 16,
+    TEDS_ARM = 17,
+    TEDS_POWER = 18,
+    TEDS_OPERATION_STATE = 19,
+    TEDS_DRIVE = 20
+};
+
+/* Functions of class 1. */
+enum { TEDS_QUERY = 1, TEDS_READ = 2, TEDS_WRITE = 3, TEDS_UPDATE = 4, TEDS_SELF_TEST = 5 };
+
+#define TEDS_SECOND UINT64_C(1000000000)
+#define TEDS_NEVER UINT64_MAX
+#define TEDS_KEYED 1u
+#define TEDS_PROVISIONED 2u
+#define TEDS_LAST_ADDRESS 239u
+#define TEDS_SECURITY_ID 0x0080u /* channel 0, access code 128 */
+#define TEDS_INITIAL_OCTETS 237u
+/* Payload that a reply in a session carries: headers, counter, tag and the longest padding taken off. */
+#define TEDS_ROOM (TEDS_MAX_MESSAGE - 42u)
+
+typedef struct teds_command {
+    uint16_t channel;
+    uint8_t command_class, function;
+    const uint8_t *payload;
+    size_t length;
+} teds_command;
+
+/* What is to end when the reply is made. */
+enum { TEDS_AFTER_NOTHING, TEDS_AFTER_END_SESSION, TEDS_AFTER_END_ALL };
+
+typedef struct teds_origin {
+    teds_link link;
+    const teds_arrival *arrival;
+    int8_t session; /* its place in the table, -1 outside */
+    uint8_t after;
+} teds_origin;
+
+static inline uint64_t teds_now(const teds_node *node)
+{
+    return node->port->now(node->port->user);
+}
+
+/* -- agree.c: Request, Confirm, hashes and keys ------------------------------------------------------------------- */
+void teds_sha256_parts(const teds_node *node, const teds_part *parts, size_t count, uint8_t out[32]);
+int teds_hkdf_expand(const teds_node *node, const uint8_t prk[32], const teds_part *info, size_t count, uint8_t *out,
+                     size_t length);
+int teds_hkdf(const teds_node *node, const uint8_t *salt, size_t salt_length, const uint8_t *ikm, size_t ikm_length,
+              const teds_part *info, size_t count, uint8_t *out, size_t length);
+bool teds_point_good(const teds_node *node, const uint8_t point[65]);
+bool teds_verify(const teds_node *node, const uint8_t point[65], const uint8_t hash[32], const uint8_t signature[64]);
+int teds_sign(const teds_node *node, const uint8_t hash[32], uint8_t out[64]);
+int teds_one_time_take(teds_node *node, teds_one_time *out);
+void teds_one_time_wipe(const teds_node *node, teds_one_time *key);
+int teds_request(teds_node *node, const teds_command *command, const teds_origin *origin, uint8_t *out);
+int teds_confirm(teds_node *node, const teds_command *command, teds_origin *origin);
+void teds_pending_forget(teds_node *node);
+void teds_key_id(const teds_node *node, const uint8_t key[16], uint8_t out[8]);
+
+/* -- session.c ----------------------------------------------------------------------------------------------------- */
+int teds_open(teds_node *node, const teds_command *command, const teds_origin *origin, uint8_t *out);
+int8_t teds_session_on(const teds_node *node, teds_link link);
+bool teds_any_on(const teds_node *node, teds_link link);
+void teds_sessions_expire(teds_node *node, uint64_t now);
+uint64_t teds_sessions_due(const teds_node *node);
+typedef struct teds_taken {
+    int8_t session; /* -1: there was no room for it */
+    uint32_t counter;
+    uint8_t to_station[16];
+    size_t length; /* of the inner frame */
+} teds_taken;
+int teds_take_sealed(teds_node *node, teds_link link, const teds_arrival *arrival, const uint8_t *payload,
+                     size_t length, uint8_t *plain, teds_taken *taken);
+int teds_seal_reply(const teds_node *node, const uint8_t key[16], uint32_t counter, uint8_t *payload, size_t inner,
+                    size_t *length);
+void teds_session_end(teds_node *node, int8_t session);
+void teds_end_everything(teds_node *node);
+
+/* -- security_teds.c ----------------------------------------------------------------------------------------------- */
+typedef struct teds_signed {
+    const uint8_t *node_key, *node_signature;      /* base64, 88 each */
+    uint8_t signature[64], station[65], station_signature[64];
+    uint32_t sequence, epoch;
+    const uint8_t *blocks; /* the first tuple of type 108 */
+    size_t block_count;
+    size_t signature_at; /* of its tuple, in the data block */
+} teds_signed;
+void teds_initial(const teds_node *node, uint8_t out[TEDS_INITIAL_OCTETS]);
+bool teds_security_parse(const uint8_t *block, size_t length, teds_signed *out);
+void teds_base64(const uint8_t *octets, size_t length, uint8_t *out);
+uint16_t teds_checksum(uint32_t sum);
+bool teds_own_check(uint8_t code, const uint8_t *teds, size_t length);
+
+/* -- teds_store.c -------------------------------------------------------------------------------------------------- */
+/* A TEDS is named channel << 8 | access code. */
+typedef struct teds_source {
+    uint32_t length, at;
+    const uint8_t *octets; /* NULL: in flash, at `at`; the initial Security TEDS: length alone */
+    bool initial, read_only;
+} teds_source;
+int teds_store_load(teds_node *node);
+bool teds_storable(uint16_t channel, uint8_t code);
+bool teds_find(const teds_node *node, uint16_t id, teds_source *out);
+int teds_source_read(const teds_node *node, const teds_source *source, uint32_t at, uint8_t *out, size_t length);
+int teds_source_hash(const teds_node *node, const teds_source *source, uint8_t out[32]);
+bool teds_next_id(const teds_node *node, int32_t after, uint16_t *out);
+int teds_query(const teds_node *node, const teds_command *command, uint8_t *out);
+int teds_read(const teds_node *node, const teds_command *command, uint8_t *out);
+int teds_write(teds_node *node, const teds_command *command, teds_origin *origin);
+int teds_update(teds_node *node, const teds_command *command, teds_origin *origin, uint8_t *out);
+const uint8_t *teds_staged(const teds_node *node, uint16_t id, size_t *length);
+bool teds_next_staged(const teds_node *node, int32_t after, uint16_t *out);
+void teds_staging_drop(teds_node *node);
+int teds_make_blank(teds_node *node);
+/* Write a whole new state: the stored TEDS for which `keep` says so, all staged ones where `staged`. */
+typedef bool (*teds_keep)(const void *what, uint16_t id);
+int teds_store_write(teds_node *node, const teds_state *state, teds_keep keep, const void *what, bool staged);
+void teds_store_poll(teds_node *node);
+
+/* -- commit.c ------------------------------------------------------------------------------------------------------ */
+int teds_commit(teds_node *node);
+int teds_to_factory(teds_node *node);
+int teds_store_state(teds_node *node, const teds_state *state);
+
+/* -- node.c -------------------------------------------------------------------------------------------------------- */
+teds_stored_reply *teds_reply_place(teds_node *node, teds_link link);
+static inline bool teds_in_factory(const teds_node *node)
+{
+    return (node->state.flags & TEDS_KEYED) == 0;
+}
+
+/* -- isotp.c ------------------------------------------------------------------------------------------------------- */
+enum { TEDS_OUT_IDLE, TEDS_OUT_FIRST, TEDS_OUT_WAITS, TEDS_OUT_RUNS };
+void teds_isotp_begin(teds_line *line, const uint8_t *octets, size_t length, bool fd);
+bool teds_isotp_next(teds_line *line, teds_can_frame *frame, uint64_t now);
+void teds_isotp_flow(teds_line *line, const uint8_t *data, size_t length, uint64_t now);
+bool teds_isotp_single(const uint8_t *data, size_t length, const uint8_t **body, size_t *octets);
+void teds_can_pad(teds_can_frame *frame, size_t used);
+
+/* -- can.c --------------------------------------------------------------------------------------------------------- */
+void teds_can_lose(teds_node *node);
+bool teds_can_sending(const teds_node *node);
+uint64_t teds_can_poll(teds_node *node, uint64_t now);
+uint8_t teds_default_address(const uint8_t uuid[10]);
+
+/* -- operation.c, stream.c ----------------------------------------------------------------------------------------- */
+#if TEDS_OPERATION
+void teds_operation_start(teds_node *node);
+bool teds_operation_knows(const teds_command *command);
+int teds_operation_run(teds_node *node, const teds_command *command, teds_origin *origin, uint8_t *out);
+int teds_demand_configuration(teds_node *node, const teds_origin *origin, bool writes);
+void teds_yield_sensors(teds_node *node, int8_t session);
+void teds_claims_end(teds_node *node, int8_t session, uint32_t places, bool stopped);
+void teds_operation_session_ended(teds_node *node, int8_t session);
+void teds_everything_safe(teds_node *node);
+uint64_t teds_operation_poll(teds_node *node, uint64_t now);
+uint32_t teds_claims_of(const teds_node *node, int8_t session);
+bool teds_actuator_claimed(const teds_node *node);
+int teds_place_of(const teds_node *node, uint8_t channel);
+bool teds_value(const teds_node *node, int place, uint64_t tick, uint8_t *out);
+int teds_channel_fits(const teds_node *node, int place, uint64_t *period);
+int teds_channel_list(const uint8_t *octets, size_t length, size_t most);
+
+int teds_subscribe(teds_node *node, const teds_command *command, const teds_origin *origin, uint8_t *out);
+int teds_stop(teds_node *node, const teds_command *command, const teds_origin *origin, uint8_t *out);
+int teds_arm(teds_node *node, const teds_command *command, const teds_origin *origin);
+void teds_trigger(teds_node *node, teds_link link, const uint8_t *token, uint64_t tick);
+void teds_streams_sample(teds_node *node, uint64_t now);
+uint64_t teds_streams_due(const teds_node *node);
+void teds_streams_end(teds_node *node, int8_t session, uint32_t places);
+void teds_streams_ready(teds_node *node, int8_t session);
+bool teds_streams_running(const teds_node *node);
+bool teds_data_next(teds_node *node, teds_can_frame *frame, uint64_t now);
+uint64_t teds_data_due(const teds_node *node);
+#endif
+
+#endif

@@ -1,0 +1,693 @@
+/* Measurement operation inside a session (operation.md, 1, 2, 5): claims, leases, dead-men, single values. Streams,
+ * clock and trigger are stream.c. Checks run in the order in which operation.md writes them. */
+#include "inside.h"
+
+#if TEDS_OPERATION
+
+#define MOST_SAMPLE 64u
+#define MILLI UINT64_C(1000000)
+
+bool teds_operation_knows(const teds_command *command)
+{
+    switch (command->command_class) {
+    case TEDS_CLASS_SECURITY: return command->function >= TEDS_SAMPLE && command->function <= TEDS_DRIVE;
+    case TEDS_CLASS_EITHER:
+    case TEDS_CLASS_OPERATE: return command->function == 1 || command->function == 2;
+    case TEDS_CLASS_COMMON: return command->function == TEDS_SELF_TEST;
+    default: return false;
+    }
+}
+
+/* -- the board --------------------------------------------------------------------------------------------------------- */
+
+static const teds_channel *facts(const teds_node *node, int place)
+{
+    return &node->port->channels[place];
+}
+
+static bool is_actuator(const teds_node *node, int place)
+{
+    return facts(node, place)->kind == TEDS_ACTUATOR;
+}
+
+int teds_place_of(const teds_node *node, uint8_t channel)
+{
+    for (size_t i = 0; i < node->port->channel_count; i++) {
+        if (node->port->channels[i].number == channel) {
+            return (int)i;
+        }
+    }
+    return -1;
+}
+
+static bool has_fault(const teds_node *node, int place)
+{
+    return node->port->fault != NULL && node->port->fault(node->port->user, facts(node, place)->number);
+}
+
+static bool is_testing(const teds_node *node, int place)
+{
+    return node->port->testing != NULL && node->port->testing(node->port->user, facts(node, place)->number);
+}
+
+static teds_power power_of(const teds_node *node)
+{
+    teds_power power = {0, 0xFF, 0xFFFF, 0x7FFF, 0x7F};
+    if (node->port->power != NULL) {
+        node->port->power(node->port->user, &power);
+    }
+    return power;
+}
+
+bool teds_value(const teds_node *node, int place, uint64_t tick, uint8_t *out)
+{
+    const teds_port *port = node->port;
+    uint8_t number = facts(node, place)->number;
+    memset(out, 0, facts(node, place)->octets);
+    if (is_actuator(node, place)) {
+        if (port->set_point != NULL) {
+            port->set_point(port->user, number, out);
+        }
+        return true;
+    }
+    return port->sample != NULL && port->sample(port->user, number, tick, out) && !is_testing(node, place) &&
+           !has_fault(node, place);
+}
+
+static void go_safe(teds_node *node, int place)
+{
+    const teds_port *port = node->port;
+    if (port->arm != NULL) {
+        port->arm(port->user, facts(node, place)->number, 0);
+    }
+    if (port->safe != NULL) {
+        port->safe(port->user, facts(node, place)->number);
+    }
+    node->safe |= UINT32_C(1) << place;
+}
+
+void teds_operation_start(teds_node *node)
+{
+    for (size_t i = 0; i < node->port->channel_count; i++) {
+        node->actuator_of[i] = -1;
+        if (is_actuator(node, (int)i)) {
+            go_safe(node, (int)i);
+        }
+    }
+    node->can.data_stream = -1;
+}
+
+/* -- what the stored Channel TEDS says ----------------------------------------------------------------------------------- */
+
+typedef struct walk {
+    const teds_node *node;
+    teds_source source;
+    uint32_t at, end, width;
+} walk;
+
+static uint32_t number_at(const walk *in, uint32_t at, uint32_t octets)
+{
+    uint8_t read[4] = {0};
+    if (octets > 4 || at + octets > in->source.length ||
+        teds_source_read(in->node, &in->source, at, read + 4 - octets, octets) != 0) {
+        return UINT32_MAX;
+    }
+    return teds_get32(read);
+}
+
+/* The next tuple: its type, and where its value lies; false at the end or where one runs past it. */
+static bool next_tuple(walk *in, uint8_t *type, uint32_t *value, uint32_t *length)
+{
+    if (in->at + 1 + in->width > in->end) {
+        return false;
+    }
+    *type = (uint8_t)number_at(in, in->at, 1);
+    *length = number_at(in, in->at + 1, in->width);
+    *value = in->at + 1 + in->width;
+    if (*length > in->end - *value) {
+        return false;
+    }
+    in->at = *value + *length;
+    return true;
+}
+
+/* Float32 seconds as ns, less 1 ppm; 0 where it is not positive or no number. */
+static uint64_t period_of(uint32_t bits)
+{
+    uint32_t exponent = bits >> 23 & 255;
+    uint64_t ns = (uint64_t)((bits & 0x7FFFFF) | 0x800000) * TEDS_SECOND;
+    if (bits >> 31 != 0 || exponent == 0 || (exponent == 255 && (bits & 0x7FFFFF) != 0)) {
+        return 0;
+    }
+    if (exponent >= 127 + 20) { /* a million seconds stands for every longer one */
+        return 1000000 * TEDS_SECOND;
+    }
+    ns = exponent >= 150 ? ns << (exponent - 150) : 150 - exponent < 64 ? ns >> (150 - exponent) : 0;
+    return ns - (ns + 999999) / 1000000;
+}
+
+/* Whether the stored TEDS says of a channel what the firmware is; its SPeriod in ns (0: none). */
+int teds_channel_fits(const teds_node *node, int place, uint64_t *period)
+{
+    const teds_channel *own = facts(node, place);
+    walk in = {.node = node, .at = 10, .width = 1};
+    uint32_t value, length, kind = UINT32_MAX, model = UINT32_MAX, octets = UINT32_MAX, halt = UINT32_MAX;
+    uint8_t type;
+    *period = 0;
+    if (!teds_find(node, (uint16_t)(own->number << 8 | 3), &in.source) || in.source.length < 12) {
+        return 0;
+    }
+    in.end = in.source.length - 2;
+    in.at = number_at(&in, 5, 1) == 5 ? 11 : 10;
+    in.width = number_at(&in, in.at - 1, 1);
+    in.width = in.width >= 1 && in.width <= 4 ? in.width : 1;
+    while (next_tuple(&in, &type, &value, &length)) {
+        if (type == 11 && length == 1) {
+            kind = number_at(&in, value, 1);
+        } else if (type == 36 && length == 1) {
+            halt = number_at(&in, value, 1);
+        } else if (type == 23 && length == 4) {
+            *period = period_of(number_at(&in, value, 4));
+        } else if (type == 18) {
+            walk within = in;
+            within.at = value;
+            within.end = value + length;
+            while (next_tuple(&within, &type, &value, &length)) {
+                model = type == 40 && length == 1 ? number_at(&in, value, 1) : model;
+                octets = type == 41 && length == 1 ? number_at(&in, value, 1) : octets;
+            }
+        }
+    }
+    if (own->kind == TEDS_ACTUATOR && halt != UINT32_MAX && halt != own->halt) {
+        return 0;
+    }
+    return kind == own->kind && model == own->model && octets == own->octets;
+}
+
+/* -- claims ---------------------------------------------------------------------------------------------------------------- */
+
+uint32_t teds_claims_of(const teds_node *node, int8_t session)
+{
+    return node->sessions[session].used ? node->sessions[session].claims : 0;
+}
+
+static uint32_t all_claims(const teds_node *node)
+{
+    uint32_t claims = 0;
+    for (int8_t i = 0; i < TEDS_SESSIONS; i++) {
+        claims |= teds_claims_of(node, i);
+    }
+    return claims;
+}
+
+bool teds_actuator_claimed(const teds_node *node)
+{
+    for (size_t i = 0; i < node->port->channel_count; i++) {
+        if (is_actuator(node, (int)i) && node->actuator_of[i] >= 0) {
+            return true;
+        }
+    }
+    return false;
+}
+
+void teds_claims_end(teds_node *node, int8_t session, uint32_t places, bool stopped)
+{
+    uint32_t going = teds_claims_of(node, session) & places;
+    if (going == 0) {
+        return;
+    }
+    for (int i = 0; i < (int)node->port->channel_count; i++) {
+        if ((going >> i & 1) != 0 && is_actuator(node, i)) {
+            node->actuator_of[i] = -1;
+            go_safe(node, i);
+            node->stopped |= stopped ? UINT32_C(1) << i : 0;
+        }
+    }
+    node->sessions[session].claims &= ~going;
+    teds_streams_end(node, session, going);
+    if (node->sessions[session].claims == 0) {
+        memset(node->sessions[session].arms, 0, sizeof node->sessions[session].arms);
+    }
+}
+
+void teds_operation_session_ended(teds_node *node, int8_t session)
+{
+    teds_claims_end(node, session, UINT32_MAX, false);
+}
+
+static void release_all(teds_node *node)
+{
+    for (int8_t i = 0; i < TEDS_SESSIONS; i++) {
+        teds_claims_end(node, i, UINT32_MAX, false);
+    }
+}
+
+void teds_everything_safe(teds_node *node)
+{
+    release_all(node);
+    for (int i = 0; i < (int)node->port->channel_count; i++) {
+        if (is_actuator(node, i) && (node->safe >> i & 1) == 0) {
+            go_safe(node, i);
+        }
+    }
+}
+
+void teds_yield_sensors(teds_node *node, int8_t session)
+{
+    for (int8_t i = 0; i < TEDS_SESSIONS; i++) {
+        if (i != session) {
+            teds_claims_end(node, i, UINT32_MAX, false); /* no actuator is claimed: that was demanded before */
+        }
+    }
+}
+
+/* 1.3, 1.4, 128.10: 2 in a session that claims, 17 where another does. */
+int teds_demand_configuration(teds_node *node, const teds_origin *origin, bool writes)
+{
+    (void)teds_operation_poll(node, teds_now(node));
+    if (origin->session >= 0 && teds_claims_of(node, origin->session) != 0) {
+        return -TEDS_WRONG_STATE;
+    }
+    if (all_claims(node) == 0 || (writes && origin->arrival->kind == TEDS_AT_NFC && !teds_actuator_claimed(node))) {
+        return 0;
+    }
+    return -TEDS_BUSY;
+}
+
+uint64_t teds_operation_poll(teds_node *node, uint64_t now)
+{
+    uint64_t due = TEDS_NEVER, at;
+    if (all_claims(node) != 0 && (power_of(node).flags & TEDS_POWER_TOO_LOW) != 0) {
+        release_all(node);
+    }
+    for (int i = 0; i < (int)node->port->channel_count; i++) {
+        if (is_actuator(node, i) && node->actuator_of[i] >= 0) {
+            if (now >= node->deadline[i]) {
+                teds_claims_end(node, node->actuator_of[i], UINT32_C(1) << i, true);
+            } else if (node->deadline[i] < due) {
+                due = node->deadline[i];
+            }
+        }
+    }
+    for (int8_t i = 0; i < TEDS_SESSIONS; i++) {
+        if (teds_claims_of(node, i) != 0) {
+            at = node->sessions[i].good_at + node->sessions[i].lease;
+            if (now >= at) {
+                teds_claims_end(node, i, UINT32_MAX, false);
+            } else if (at < due) {
+                due = at;
+            }
+        }
+    }
+    teds_streams_sample(node, now);
+    at = teds_streams_due(node);
+    return at < due ? at : due;
+}
+
+static uint32_t sensors_to_claim(const teds_node *node)
+{
+    uint32_t wanted = 0;
+    uint64_t period;
+    for (int i = 0; i < (int)node->port->channel_count; i++) {
+        if (!is_actuator(node, i) && !has_fault(node, i) && teds_channel_fits(node, i, &period)) {
+            wanted |= UINT32_C(1) << i;
+        }
+    }
+    return wanted;
+}
+
+static bool has_sensors(const teds_node *node)
+{
+    for (int i = 0; i < (int)node->port->channel_count; i++) {
+        if (!is_actuator(node, i)) {
+            return true;
+        }
+    }
+    return false;
+}
+
+static int operate(teds_node *node, const teds_command *command, const teds_origin *origin)
+{
+    int place = command->channel >= 1 && command->channel <= 255 ? teds_place_of(node, (uint8_t)command->channel) : -1;
+    bool acting = place >= 0 && is_actuator(node, place);
+    teds_session *session = &node->sessions[origin->session];
+    teds_source security = {0};
+    uint8_t digest[32], lease;
+    uint16_t dead_man = 0;
+    uint32_t wanted;
+    uint64_t period;
+    if (place < 0 && (command->channel != 0 || !has_sensors(node))) {
+        return -TEDS_UNKNOWN_COMMAND;
+    }
+    if (command->length != (acting ? 19u : 17u)) {
+        return -TEDS_BAD_FORM;
+    }
+    if (!teds_find(node, TEDS_SECURITY_ID, &security) || teds_source_hash(node, &security, digest) != 0) {
+        return -TEDS_FAILURE;
+    }
+    if (memcmp(digest, command->payload, 16) != 0) {
+        return -TEDS_DIGEST_MISMATCH;
+    }
+    wanted = place < 0 ? sensors_to_claim(node)
+                       : teds_channel_fits(node, place, &period) ? UINT32_C(1) << place : 0;
+    if (wanted == 0) {
+        return -TEDS_DIGEST_MISMATCH;
+    }
+    lease = command->payload[16];
+    dead_man = acting ? teds_get16(command->payload + 17) : 20;
+    if (lease < 1 || lease > 60 || dead_man < 20 || dead_man > 10000) {
+        return -TEDS_OUT_OF_RANGE;
+    }
+    if (acting && node->actuator_of[place] >= 0) {
+        return node->actuator_of[place] == origin->session ? -TEDS_WRONG_STATE : -TEDS_BUSY;
+    }
+    if ((power_of(node).flags & TEDS_POWER_TOO_LOW) != 0 || (place >= 0 && has_fault(node, place))) {
+        return -TEDS_FAULT_REASON;
+    }
+    session->claims |= wanted;
+    session->lease = lease * TEDS_SECOND;
+    if (acting) {
+        go_safe(node, place);
+        node->stopped &= ~(UINT32_C(1) << place);
+        node->actuator_of[place] = origin->session;
+        node->dead_man[place] = dead_man;
+        node->deadline[place] = teds_now(node) + dead_man * MILLI;
+        if (node->port->arm != NULL) {
+            node->port->arm(node->port->user, facts(node, place)->number, dead_man);
+        }
+    }
+    return 0;
+}
+
+static int idle(teds_node *node, const teds_command *command, const teds_origin *origin)
+{
+    int place = command->channel >= 1 && command->channel <= 255 ? teds_place_of(node, (uint8_t)command->channel) : -1;
+    if (command->channel != 0 && place < 0) {
+        return -TEDS_UNKNOWN_COMMAND;
+    }
+    if (command->length != 0) {
+        return -TEDS_BAD_FORM;
+    }
+    teds_claims_end(node, origin->session, place < 0 ? UINT32_MAX : UINT32_C(1) << place, false);
+    return 0;
+}
+
+static int operation(const teds_node *node, const teds_command *command, const teds_origin *origin, uint8_t *out)
+{
+    int length = 1;
+    if (command->length != 0) {
+        return -TEDS_BAD_FORM;
+    }
+    out[0] = all_claims(node) != 0;
+    for (int i = 0; i < (int)node->port->channel_count; i++) {
+        uint32_t state = is_actuator(node, i) ? 1 : facts(node, i)->kind == TEDS_EVENT_SENSOR ? 8 : 0;
+        uint8_t claimant = 0;
+        for (int8_t s = 0; s < TEDS_SESSIONS; s++) {
+            if ((teds_claims_of(node, s) >> i & 1) != 0) {
+                state |= s == origin->session ? 2 : 4;
+                claimant = node->sessions[s].link > claimant ? node->sessions[s].link : claimant;
+            }
+        }
+        state |= is_actuator(node, i) ? (node->safe >> i & 1) << 4 | (node->stopped >> i & 1) << 5 : 0;
+        state |= (is_testing(node, i) ? 64u : 0) | (has_fault(node, i) ? 128u : 0);
+        out[length] = facts(node, i)->number;
+        out[length + 1] = (uint8_t)state;
+        out[length + 2] = claimant;
+        length += 3;
+    }
+    return length;
+}
+
+/* -- one value at a time ------------------------------------------------------------------------------------------------------ */
+
+/* Whether these are 1 to `most` channels, none 0 and none twice; 0 or a reason negated. */
+int teds_channel_list(const uint8_t *octets, size_t length, size_t most)
+{
+    if (length < 1 || length > most) {
+        return -TEDS_BAD_FORM;
+    }
+    for (size_t i = 0; i < length; i++) {
+        if (octets[i] == 0 || memchr(octets, octets[i], i) != NULL) {
+            return -TEDS_BAD_FORM;
+        }
+    }
+    return 0;
+}
+
+static bool is_claimed(const teds_node *node, const teds_origin *origin, int place)
+{
+    return place >= 0 && (teds_claims_of(node, origin->session) >> place & 1) != 0;
+}
+
+static int read_data_set(const teds_node *node, const teds_command *command, const teds_origin *origin, uint8_t *out)
+{
+    int place = command->channel >= 1 && command->channel <= 255 ? teds_place_of(node, (uint8_t)command->channel) : -1;
+    if (place < 0) {
+        return -TEDS_UNKNOWN_COMMAND;
+    }
+    if (command->length != 4) {
+        return -TEDS_BAD_FORM;
+    }
+    if (!is_claimed(node, origin, place)) {
+        return -TEDS_WRONG_STATE;
+    }
+    if (teds_get32(command->payload) != 0) {
+        return -TEDS_OUT_OF_RANGE;
+    }
+    if (has_fault(node, place)) {
+        return -TEDS_FAULT_REASON;
+    }
+    teds_put32(out, 0);
+    (void)teds_value(node, place, teds_now(node), out + 4);
+    return 4 + facts(node, place)->octets;
+}
+
+static int sample(const teds_node *node, const teds_command *command, const teds_origin *origin, uint8_t *out)
+{
+    uint8_t channels[MOST_SAMPLE]; /* a copy: the reply grows over the command */
+    const size_t count = command->length;
+    size_t length = 9;
+    uint64_t tick;
+    int refused = teds_channel_list(command->payload, count, MOST_SAMPLE);
+    if (refused) {
+        return refused;
+    }
+    memcpy(channels, command->payload, count);
+    for (size_t i = 0; i < count; i++) {
+        int place = teds_place_of(node, channels[i]);
+        if (!is_claimed(node, origin, place)) {
+            return -TEDS_WRONG_STATE;
+        }
+        length += facts(node, place)->octets;
+    }
+    if (length > TEDS_ROOM - 4) {
+        return -TEDS_TOO_LARGE;
+    }
+    for (size_t i = 0; i < count; i++) {
+        if (has_fault(node, teds_place_of(node, channels[i]))) {
+            return -TEDS_FAULT_REASON;
+        }
+    }
+    tick = teds_now(node);
+    teds_put64(out, tick);
+    out[8] = 0;
+    length = 9;
+    for (size_t i = 0; i < count; i++) {
+        int place = teds_place_of(node, channels[i]);
+        out[8] |= teds_value(node, place, tick, out + length) ? 0 : 1;
+        length += facts(node, place)->octets;
+    }
+    return (int)length;
+}
+
+/* Give actuators their values: `pairs` of channel and data set, checked to be claimed here. */
+static int apply(teds_node *node, const uint8_t *pairs, size_t length)
+{
+    const teds_port *port = node->port;
+    uint64_t now = teds_now(node);
+    for (size_t at = 0; at < length; at += 1u + facts(node, teds_place_of(node, pairs[at]))->octets) {
+        if (port->bears == NULL || port->set == NULL || !port->bears(port->user, pairs[at], pairs + at + 1)) {
+            return -TEDS_OUT_OF_RANGE;
+        }
+    }
+    for (size_t at = 0; at < length; at += 1u + facts(node, teds_place_of(node, pairs[at]))->octets) {
+        if (has_fault(node, teds_place_of(node, pairs[at]))) {
+            return -TEDS_FAULT_REASON;
+        }
+    }
+    for (size_t at = 0; at < length; at += 1u + facts(node, teds_place_of(node, pairs[at]))->octets) {
+        int place = teds_place_of(node, pairs[at]);
+        port->set(port->user, pairs[at], pairs + at + 1);
+        if (port->kick != NULL) {
+            port->kick(port->user, pairs[at]);
+        }
+        node->deadline[place] = now + node->dead_man[place] * MILLI;
+        node->safe &= ~(UINT32_C(1) << place);
+    }
+    return 0;
+}
+
+static int write_data_set(teds_node *node, const teds_command *command, const teds_origin *origin)
+{
+    uint8_t pair[256];
+    int place = command->channel >= 1 && command->channel <= 255 ? teds_place_of(node, (uint8_t)command->channel) : -1;
+    if (place < 0) {
+        return -TEDS_UNKNOWN_COMMAND;
+    }
+    if (command->length != 4u + facts(node, place)->octets) {
+        return -TEDS_BAD_FORM;
+    }
+    if (!is_claimed(node, origin, place)) {
+        return -TEDS_WRONG_STATE;
+    }
+    if (!is_actuator(node, place)) {
+        return -TEDS_NOT_PERMITTED;
+    }
+    if (teds_get32(command->payload) != 0) {
+        return -TEDS_OUT_OF_RANGE;
+    }
+    pair[0] = (uint8_t)command->channel;
+    memcpy(pair + 1, command->payload + 4, command->length - 4);
+    return apply(node, pair, command->length - 3);
+}
+
+static int set(teds_node *node, const teds_command *command, const teds_origin *origin)
+{
+    const uint8_t *pairs = command->payload;
+    uint32_t seen = 0;
+    size_t at = 0;
+    int place;
+    if (command->length == 0) {
+        return -TEDS_BAD_FORM;
+    }
+    while (at < command->length) {
+        place = teds_place_of(node, pairs[at]);
+        if (pairs[at] == 0) {
+            return -TEDS_BAD_FORM;
+        }
+        if (place < 0) { /* it has no width, so nothing after it can be read */
+            return -TEDS_WRONG_STATE;
+        }
+        if ((seen >> place & 1) != 0 || at + 1 + facts(node, place)->octets > command->length) {
+            return -TEDS_BAD_FORM;
+        }
+        seen |= UINT32_C(1) << place;
+        at += 1u + facts(node, place)->octets;
+    }
+    if ((seen & ~teds_claims_of(node, origin->session)) != 0) {
+        return -TEDS_WRONG_STATE;
+    }
+    for (place = 0; place < (int)node->port->channel_count; place++) {
+        if ((seen >> place & 1) != 0 && !is_actuator(node, place)) {
+            return -TEDS_NOT_PERMITTED;
+        }
+    }
+    return apply(node, pairs, command->length);
+}
+
+static int self_test(teds_node *node, const teds_command *command, const teds_origin *origin)
+{
+    int place = command->channel >= 1 && command->channel <= 255 ? teds_place_of(node, (uint8_t)command->channel) : -1;
+    uint32_t wanted = place < 0 ? UINT32_MAX : UINT32_C(1) << place;
+    if (command->channel != 0 && place < 0) {
+        return -TEDS_UNKNOWN_COMMAND;
+    }
+    if (command->length != 1) {
+        return -TEDS_BAD_FORM;
+    }
+    if (command->payload[0] != 0) {
+        return -TEDS_OUT_OF_RANGE;
+    }
+    for (int8_t i = 0; i < TEDS_SESSIONS; i++) {
+        if (i != origin->session && (teds_claims_of(node, i) & wanted) != 0) {
+            return -TEDS_BUSY;
+        }
+    }
+    for (int i = 0; i < (int)node->port->channel_count; i++) {
+        if ((wanted >> i & 1) != 0 && node->port->self_test != NULL) {
+            node->port->self_test(node->port->user, facts(node, i)->number);
+        }
+    }
+    return 0;
+}
+
+static int power(const teds_node *node, const teds_command *command, uint8_t *out)
+{
+    teds_power now = power_of(node);
+    if (command->length != 0) {
+        return -TEDS_BAD_FORM;
+    }
+    out[0] = now.flags;
+    out[1] = now.level;
+    teds_put16(out + 2, now.voltage);
+    teds_put16(out + 4, (uint16_t)now.current);
+    out[6] = (uint8_t)now.temperature;
+    return 7;
+}
+
+static int clock_of(const teds_node *node, const teds_command *command, const teds_origin *origin, uint8_t *out)
+{
+    if (command->length != 0) {
+        return -TEDS_BAD_FORM;
+    }
+    teds_put64(out, origin->arrival->tick);
+    teds_put64(out + 16, node->sessions[origin->session].mark);
+    teds_put32(out + 24, node->port->step);
+    teds_put16(out + 28, node->port->drift);
+    teds_put32(out + 30, UINT32_MAX);
+    teds_put64(out + 8, teds_now(node));
+    return 34;
+}
+
+/* Drive: its channels are checked; a build without it has no room for one. */
+static int drive(const teds_node *node, const teds_command *command, const teds_origin *origin)
+{
+    int refused = teds_channel_list(command->payload, command->length, 16);
+    if (refused) {
+        return refused;
+    }
+    if (origin->arrival->kind == TEDS_AT_NFC) {
+        return -TEDS_DOES_NOT_FIT;
+    }
+    for (size_t i = 0; i < command->length; i++) {
+        if (!is_claimed(node, origin, teds_place_of(node, command->payload[i]))) {
+            return -TEDS_WRONG_STATE;
+        }
+    }
+    for (size_t i = 0; i < command->length; i++) {
+        if (!is_actuator(node, teds_place_of(node, command->payload[i]))) {
+            return -TEDS_NOT_PERMITTED;
+        }
+    }
+    return -TEDS_NO_ROOM;
+}
+
+int teds_operation_run(teds_node *node, const teds_command *command, teds_origin *origin, uint8_t *out)
+{
+    /* what is due by now goes first: a lease or dead-man that ran out, samples taken before a Stop */
+    (void)teds_operation_poll(node, teds_now(node));
+    switch (command->command_class) {
+    case TEDS_CLASS_EITHER:
+        return command->function == 1 ? operate(node, command, origin) : idle(node, command, origin);
+    case TEDS_CLASS_OPERATE:
+        return command->function == 1 ? read_data_set(node, command, origin, out)
+                                      : write_data_set(node, command, origin);
+    case TEDS_CLASS_COMMON: return self_test(node, command, origin);
+    default: break;
+    }
+    switch (command->function) {
+    case TEDS_SAMPLE: return sample(node, command, origin, out);
+    case TEDS_SET: return set(node, command, origin);
+    case TEDS_SUBSCRIBE: return teds_subscribe(node, command, origin, out);
+    case TEDS_STOP: return teds_stop(node, command, origin, out);
+    case TEDS_CLOCK: return clock_of(node, command, origin, out);
+    case TEDS_ARM: return teds_arm(node, command, origin);
+    case TEDS_POWER: return power(node, command, out);
+    case TEDS_OPERATION_STATE: return operation(node, command, origin, out);
+    default: return drive(node, command, origin);
+    }
+}
+
+#else
+typedef int teds_operation_is_left_out;
+#endif

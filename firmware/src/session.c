@@ -1,0 +1,305 @@
+/* Sessions (security-teds.md, 4): Open, Sealed, their lives and ends. Sessions and half-open Opens are tables apart, so
+ * that nobody's plain question, and nobody's Open, ends a session. */
+#include "inside.h"
+
+#define HALF_OPEN_NS (60u * TEDS_SECOND)
+#define IDLE_NS (600u * TEDS_SECOND)
+#define OPEN_OCTETS 89u
+#define LABEL(text) {(const uint8_t *)(text), sizeof(text)}
+#define MAC_LABEL(text) {(const uint8_t *)(text), sizeof(text) - 1u}
+
+int8_t teds_session_on(const teds_node *node, teds_link link)
+{
+    for (int8_t i = 0; i < TEDS_SESSIONS; i++) {
+        if (node->sessions[i].used && node->sessions[i].link == link) {
+            return i;
+        }
+    }
+    return -1;
+}
+
+static teds_half_open *half_open_on(teds_node *node, teds_link link)
+{
+    for (size_t i = 0; i < TEDS_SESSIONS; i++) {
+        if (node->half_open[i].used && node->half_open[i].link == link) {
+            return &node->half_open[i];
+        }
+    }
+    return NULL;
+}
+
+bool teds_any_on(const teds_node *node, teds_link link)
+{
+    if (teds_session_on(node, link) >= 0) {
+        return true;
+    }
+    for (size_t i = 0; i < TEDS_SESSIONS; i++) {
+        if (node->half_open[i].used && node->half_open[i].link == link) {
+            return true;
+        }
+    }
+    return false;
+}
+
+void teds_session_end(teds_node *node, int8_t session)
+{
+    teds_session *own;
+    if (session < 0 || !node->sessions[session].used) {
+        return;
+    }
+    own = &node->sessions[session];
+#if TEDS_OPERATION
+    teds_operation_session_ended(node, session);
+#endif
+    if (own->staged) {
+        teds_staging_drop(node);
+    }
+    if (node->pending.used && node->pending.session == session) {
+        teds_pending_forget(node);
+    }
+    teds_wipe(own, sizeof *own);
+}
+
+void teds_end_everything(teds_node *node)
+{
+    for (int8_t i = 0; i < TEDS_SESSIONS; i++) {
+        teds_session_end(node, i);
+    }
+    teds_wipe(node->half_open, sizeof node->half_open);
+    teds_pending_forget(node);
+}
+
+void teds_sessions_expire(teds_node *node, uint64_t now)
+{
+    for (int8_t i = 0; i < TEDS_SESSIONS; i++) {
+        if (node->sessions[i].used && now - node->sessions[i].good_at >= IDLE_NS) {
+            teds_session_end(node, i);
+        }
+        if (node->half_open[i].used && now - node->half_open[i].at >= HALF_OPEN_NS) {
+            teds_wipe(&node->half_open[i], sizeof node->half_open[i]);
+        }
+    }
+    if (node->pending.used && now - node->pending.at >= HALF_OPEN_NS) {
+        teds_pending_forget(node);
+    }
+}
+
+uint64_t teds_sessions_due(const teds_node *node)
+{
+    uint64_t due = node->pending.used ? node->pending.at + HALF_OPEN_NS : TEDS_NEVER;
+    for (size_t i = 0; i < TEDS_SESSIONS; i++) {
+        if (node->sessions[i].used && node->sessions[i].good_at + IDLE_NS < due) {
+            due = node->sessions[i].good_at + IDLE_NS;
+        }
+        if (node->half_open[i].used && node->half_open[i].at + HALF_OPEN_NS < due) {
+            due = node->half_open[i].at + HALF_OPEN_NS;
+        }
+    }
+    return due;
+}
+
+static void keep_half_open(teds_node *node, teds_link link, const teds_keys *keys)
+{
+    teds_half_open *place = half_open_on(node, link);
+    for (size_t i = 0; place == NULL && i < TEDS_SESSIONS; i++) {
+        if (!node->half_open[i].used) {
+            place = &node->half_open[i];
+        }
+    }
+    if (place == NULL) { /* beyond its room the oldest goes */
+        place = &node->half_open[0];
+        for (size_t i = 1; i < TEDS_SESSIONS; i++) {
+            if (node->half_open[i].at < place->at) {
+                place = &node->half_open[i];
+            }
+        }
+    }
+    place->used = true;
+    place->link = link;
+    place->at = teds_now(node);
+    place->keys = *keys;
+}
+
+/* Keys of the session and the node's tag, from Es, the node's one-time key and K. */
+static int derive(const teds_node *node, const uint8_t es[65], const teds_one_time *own, const uint8_t key_id[8],
+                  teds_keys *keys, uint8_t tag[16])
+{
+    const teds_port *port = node->port;
+    const teds_part info[] = {LABEL("TEDS1 session"), {node->uuid, 10}, {es, 65}, {own->point, 65}};
+    const teds_part tagged[] = {MAC_LABEL("node open"), {key_id, 8}, {es, 65}, {own->point, 65}};
+    uint8_t z[32], okm[96], mac[32];
+    int failed = port->p256_ecdh(port->user, &own->key, es, z) != 0 ||
+                 teds_hkdf(node, node->state.key, 16, z, 32, info, 4, okm, 96) != 0 ||
+                 port->hmac(port->user, okm + 32, 32, tagged, 4, mac) != 0;
+    if (!failed) {
+        memcpy(keys->to_node, okm, 16);
+        memcpy(keys->to_station, okm + 16, 16);
+        memcpy(keys->messages, okm + 64, 32);
+        memcpy(tag, mac, 16);
+    }
+    teds_wipe(z, sizeof z);
+    teds_wipe(okm, sizeof okm);
+    return failed;
+}
+
+/* keyId and mac before the point: a stranger costs no point arithmetic, and each Open is good once. */
+static int check_open(teds_node *node, const uint8_t *payload, uint8_t key_id[8])
+{
+    const uint8_t *es = payload + 8;
+    uint8_t counter[8], mac[32];
+    const teds_part parts[] = {MAC_LABEL("station open"), {node->uuid, 10}, {counter, 8}, {es, 65}};
+    teds_key_id(node, node->state.key, key_id);
+    if (!teds_equal(payload, key_id, 8)) {
+        return -TEDS_UNKNOWN_KEY;
+    }
+    teds_put64(counter, node->opens);
+    if (node->port->hmac(node->port->user, node->state.key, 16, parts, 4, mac) != 0) {
+        return -TEDS_FAILURE;
+    }
+    if (!teds_equal(payload + 73, mac, 16)) {
+        return -TEDS_BAD_TAG;
+    }
+    node->opens++;
+    return teds_point_good(node, es) && memcmp(es, node->state.station, 65) != 0 ? 0 : -TEDS_BAD_POINT;
+}
+
+int teds_open(teds_node *node, const teds_command *command, const teds_origin *origin, uint8_t *out)
+{
+    const uint8_t *payload = command->payload;
+    uint8_t key_id[8];
+    teds_one_time own = {0};
+    teds_keys keys;
+    int failed;
+    if (command->length == 0) {
+        teds_put64(out, node->opens);
+        return 8;
+    }
+    if (command->length != OPEN_OCTETS) {
+        return -TEDS_BAD_FORM;
+    }
+    failed = check_open(node, payload, key_id);
+    if (failed) {
+        return failed;
+    }
+    failed = teds_one_time_take(node, &own) != 0;
+    if (!failed) {
+        memcpy(out, own.point, 65);
+        failed = derive(node, payload + 8, &own, key_id, &keys, out + 65);
+    }
+    if (!failed) {
+        keep_half_open(node, origin->link, &keys);
+    }
+    teds_wipe(&keys, sizeof keys);
+    teds_one_time_wipe(node, &own);
+    return failed ? -TEDS_FAILURE : 81;
+}
+
+/* A place for the session that a half-open Open becomes: its link's own, a free one, that of the session without a
+ * claim which was silent longest; -1 where all have claims. */
+static int8_t make_room(teds_node *node, teds_link link)
+{
+    int8_t place = teds_session_on(node, link);
+    if (place >= 0) {
+        return place;
+    }
+    for (int8_t i = 0; i < TEDS_SESSIONS; i++) {
+        if (!node->sessions[i].used) {
+            return i;
+        }
+#if TEDS_OPERATION
+        if (teds_claims_of(node, i) != 0) {
+            continue;
+        }
+#endif
+        if (place < 0 || node->sessions[i].good_at < node->sessions[place].good_at) {
+            place = i;
+        }
+    }
+    return place;
+}
+
+/* Octets of the inner frame behind the padding of RFC 5652 6.3; -1 where the padding is wrong. */
+static int unpadded(const uint8_t *plain, size_t length)
+{
+    uint8_t count = length > 0 ? plain[length - 1] : 0;
+    uint8_t wrong = (uint8_t)(count == 0 || count > 16 || length % 16 != 0);
+    for (size_t i = 0; i < 16 && i < length; i++) {
+        wrong |= (uint8_t)((i < count) & (plain[length - 1 - i] != count));
+    }
+    return wrong ? -1 : (int)(length - count);
+}
+
+static int unseal(const teds_node *node, const teds_keys *keys, const uint8_t *payload, size_t length, uint8_t *plain)
+{
+    uint8_t nonce[13] = {0};
+    memcpy(nonce + 9, payload, 4);
+    if (!node->port->ccm_open(node->port->user, keys->to_node, nonce, payload + 4, length - 20, plain, 16)) {
+        return -1;
+    }
+    return unpadded(plain, length - 20);
+}
+
+int teds_take_sealed(teds_node *node, teds_link link, const teds_arrival *arrival, const uint8_t *payload,
+                     size_t length, uint8_t *plain, teds_taken *taken)
+{
+    int8_t session = teds_session_on(node, link);
+    teds_half_open *half = half_open_on(node, link);
+    const teds_keys *keys = NULL;
+    uint32_t last = 0;
+    int inner = -1;
+    if (length < 36) {
+        return -TEDS_BAD_FORM;
+    }
+    if (session >= 0) {
+        keys = &node->sessions[session].keys;
+        last = node->sessions[session].counter;
+        inner = unseal(node, keys, payload, length, plain);
+    }
+    if (inner >= 0) {
+        half = NULL;
+    } else if (half != NULL) {
+        keys = &half->keys;
+        last = 0;
+        inner = unseal(node, keys, payload, length, plain);
+    }
+    if (inner < 0 || keys == NULL) {
+        return -TEDS_BAD_TAG;
+    }
+    taken->counter = teds_get32(payload);
+    if (taken->counter <= last) {
+        return -TEDS_REPLAY;
+    }
+    taken->length = (size_t)inner;
+    memcpy(taken->to_station, keys->to_station, 16);
+    if (half != NULL) {
+        session = make_room(node, link);
+        if (session >= 0) {
+            teds_session *own = &node->sessions[session];
+            teds_session_end(node, session);
+            own->used = true;
+            own->link = link;
+            own->kind = arrival->kind;
+            own->keys = half->keys;
+        }
+        teds_wipe(half, sizeof *half);
+    }
+    taken->session = session;
+    if (session >= 0) {
+        node->sessions[session].counter = taken->counter;
+        node->sessions[session].good_at = teds_now(node);
+    }
+    return 0;
+}
+
+/* `payload` has room for counter, padding and tag around `inner` octets that stand at payload + 4. */
+int teds_seal_reply(const teds_node *node, const uint8_t key[16], uint32_t counter, uint8_t *payload, size_t inner,
+                    size_t *length)
+{
+    uint8_t nonce[13] = {0};
+    size_t count = 16 - inner % 16;
+    memset(payload + 4 + inner, (int)count, count);
+    teds_put32(payload, counter);
+    teds_put32(nonce + 9, counter);
+    *length = 4 + inner + count + 16;
+    return node->port->ccm_seal(node->port->user, key, nonce, payload + 4, inner + count, payload + 4, 16);
+}

@@ -1,0 +1,553 @@
+/* Streams and trigger (operation.md, 3, 4, 5): Subscribe, Stop, samples when they are due, data messages sealed and cut
+ * into frames, Arm. A stream has one message being filled and one that waits; a waiting one is dropped when the next is
+ * full: newest wins. One message at a time is being sent. */
+#include "inside.h"
+
+#if TEDS_OPERATION
+
+#define LONGEST_PERIOD UINT64_C(1000000000000)
+#define LATEST_START (60u * TEDS_SECOND)
+#define SOON_NS (30u * UINT64_C(1000000))
+#define AFTER_MARK_NS (10u * UINT64_C(1000000))
+#define WAITS UINT64_MAX
+#define MICRO 1000u
+#define MILLION 1000000u
+#define DATA 0x1CFF0000u
+#define PATTERN 0x80u
+enum { PERIODIC = 0, EVENT = 1, FREE = 2 };
+
+typedef struct asked {
+    uint8_t stream, kind, pattern, n, count, octets;
+    uint16_t gap;
+    uint64_t period, start;
+    uint8_t places[16];
+} asked;
+
+static uint64_t span(const teds_stream *stream)
+{
+    return stream->n * stream->period;
+}
+
+static uint64_t frames(uint32_t length, bool fd)
+{
+    uint32_t room = fd ? 64 : 8;
+    return (length + room - 1) / room;
+}
+
+static uint64_t share(uint64_t count, uint64_t gap, uint64_t instants)
+{
+    return (count * gap * TEDS_SECOND + instants - 1) / instants;
+}
+
+static teds_stream *find(teds_node *node, int8_t session, uint8_t number)
+{
+    for (size_t i = 0; i < TEDS_STREAMS; i++) {
+        teds_stream *each = &node->streams[i];
+        if (each->used && each->session == session && each->number == number) {
+            return each;
+        }
+    }
+    return NULL;
+}
+
+static void end(teds_node *node, teds_stream *stream)
+{
+    node->missed += stream->missed;
+    if (node->can.data_stream == (int8_t)(stream - node->streams)) {
+        node->can.data_stream = -1; /* what was not sent yet is taken back */
+    }
+    teds_wipe(stream, sizeof *stream);
+}
+
+bool teds_streams_running(const teds_node *node)
+{
+    for (size_t i = 0; i < TEDS_STREAMS; i++) {
+        if (node->streams[i].used) {
+            return true;
+        }
+    }
+    return false;
+}
+
+void teds_streams_end(teds_node *node, int8_t session, uint32_t places)
+{
+    for (size_t i = 0; i < TEDS_STREAMS; i++) {
+        teds_stream *each = &node->streams[i];
+        bool touched = false;
+        for (size_t c = 0; each->used && c < each->count; c++) {
+            touched = touched || (places >> each->channels[c] & 1) != 0;
+        }
+        if (each->used && each->session == session && touched) {
+            end(node, each);
+        }
+    }
+}
+
+void teds_streams_ready(teds_node *node, int8_t session)
+{
+    for (size_t i = 0; i < TEDS_STREAMS; i++) {
+        if (node->streams[i].used && node->streams[i].session == session) {
+            node->streams[i].ready = true;
+        }
+    }
+}
+
+/* -- Subscribe ------------------------------------------------------------------------------------------------------------ */
+
+static int read_asked(const teds_command *command, asked *out)
+{
+    const uint8_t *payload = command->payload;
+    int refused;
+    memset(out, 0, sizeof *out);
+    if (command->length <= 21) {
+        return -TEDS_BAD_FORM;
+    }
+    refused = teds_channel_list(payload + 21, command->length - 21, 16);
+    out->stream = payload[0];
+    out->kind = payload[1] & 0x7F;
+    out->pattern = payload[1] & PATTERN;
+    out->n = payload[2];
+    out->gap = teds_get16(payload + 3);
+    out->period = teds_get64(payload + 5);
+    out->start = teds_get64(payload + 13);
+    out->count = (uint8_t)(command->length - 21);
+    if (refused || out->stream > 3 || out->kind > FREE || out->n == 0) {
+        return -TEDS_BAD_FORM;
+    }
+    return out->kind == EVENT && (out->n != 1 || out->count != 1) ? -TEDS_BAD_FORM : 0;
+}
+
+static int check_channels(const teds_node *node, const teds_command *command, const teds_origin *origin, asked *in)
+{
+    uint32_t octets = 0;
+    bool acts = false, events = false, others = false;
+    for (size_t i = 0; i < in->count; i++) {
+        int place = teds_place_of(node, command->payload[21 + i]);
+        if (place < 0 || (teds_claims_of(node, origin->session) >> place & 1) == 0) {
+            return -TEDS_WRONG_STATE;
+        }
+        in->places[i] = (uint8_t)place;
+        octets += node->port->channels[place].octets;
+        acts = acts || node->port->channels[place].kind == TEDS_ACTUATOR;
+        events = events || node->port->channels[place].kind == TEDS_EVENT_SENSOR;
+        others = others || node->port->channels[place].kind == TEDS_SENSOR;
+    }
+    in->octets = (uint8_t)(octets < 255 ? octets : 255);
+    if (acts) {
+        return -TEDS_NOT_PERMITTED;
+    }
+    return (in->kind == EVENT ? others : events) ? -TEDS_OUT_OF_RANGE : 0;
+}
+
+static int check_period(const teds_node *node, const asked *in)
+{
+    uint64_t shortest = 1, said;
+    for (size_t i = 0; i < in->count; i++) {
+        uint64_t own = node->port->channels[in->places[i]].shortest;
+        (void)teds_channel_fits(node, in->places[i], &said);
+        shortest = own > shortest ? own : shortest;
+        shortest = said > shortest ? said : shortest;
+    }
+    return in->period < shortest || in->period > LONGEST_PERIOD ? -TEDS_OUT_OF_RANGE : 0;
+}
+
+/* The node's budget on the bus, with one more stream in place of `old`. */
+static int check_budget(const teds_node *node, const asked *in, uint32_t length, bool fd, const teds_stream *old)
+{
+    uint64_t gap = in->gap > 0 ? in->gap : 1, sum = 0;
+    for (size_t i = 0; i < TEDS_STREAMS; i++) {
+        const teds_stream *each = &node->streams[i];
+        if (each->used && each != old && each->gap > gap) {
+            gap = each->gap;
+        }
+    }
+    for (size_t i = 0; i < TEDS_STREAMS; i++) {
+        const teds_stream *each = &node->streams[i];
+        if (each->used && each != old) {
+            sum += share(frames(each->length, each->fd), gap, span(each));
+        }
+    }
+    sum += share(frames(length, fd), gap, in->n * in->period);
+    return sum > MILLION ? -TEDS_DOES_NOT_FIT : 0;
+}
+
+static int check_start(const asked *in, const teds_origin *origin, uint64_t now)
+{
+    if (in->start == WAITS) {
+        return origin->arrival->kind == TEDS_CAN ? 0 : -TEDS_DOES_NOT_FIT;
+    }
+    if (in->start != 0 && (in->start <= now || in->start > now + LATEST_START)) {
+        return -TEDS_TOO_LATE;
+    }
+    return 0;
+}
+
+static teds_stream *room_for(teds_node *node, teds_stream *old)
+{
+    if (old != NULL) {
+        return old;
+    }
+    for (size_t i = 0; i < TEDS_STREAMS; i++) {
+        if (!node->streams[i].used) {
+            return &node->streams[i];
+        }
+    }
+    return NULL;
+}
+
+/* Key of a run: HKDF-Expand(k_m, "TEDS1 stream", 00, run, 16). */
+static int key_of(const teds_node *node, const teds_session *session, uint8_t out[16])
+{
+    uint8_t run[2];
+    const teds_part info[] = {{(const uint8_t *)"TEDS1 stream", 13}, {run, 2}};
+    teds_put16(run, session->run);
+    return teds_hkdf_expand(node, session->keys.messages, info, 2, out, 16);
+}
+
+int teds_subscribe(teds_node *node, const teds_command *command, const teds_origin *origin, uint8_t *out)
+{
+    teds_session *session = &node->sessions[origin->session];
+    const bool fd = origin->arrival->fd && TEDS_CAN_FD;
+    uint64_t now = teds_now(node);
+    teds_stream *old, *stream;
+    uint8_t key[16];
+    uint32_t length;
+    asked in;
+    int refused = read_asked(command, &in);
+    if (refused) {
+        return refused;
+    }
+    if (origin->arrival->kind != TEDS_CAN) {
+        return -TEDS_DOES_NOT_FIT;
+    }
+    refused = check_channels(node, command, origin, &in);
+    if (!refused) {
+        refused = check_period(node, &in);
+    }
+    if (refused) {
+        return refused;
+    }
+    length = 13u + (uint32_t)in.n * in.octets + (in.kind == PERIODIC ? 0 : 8);
+    if (length > TEDS_MESSAGE) {
+        return -TEDS_TOO_LARGE;
+    }
+    old = find(node, origin->session, in.stream);
+    refused = check_budget(node, &in, length, fd, old);
+    if (!refused) {
+        refused = check_start(&in, origin, now);
+    }
+    if (refused) {
+        return refused;
+    }
+    stream = room_for(node, old);
+    if (session->run == UINT16_MAX || stream == NULL) {
+        return -TEDS_NO_ROOM;
+    }
+    session->run++;
+    if (key_of(node, session, key) != 0) {
+        return -TEDS_FAILURE;
+    }
+    if (old != NULL) {
+        end(node, old);
+    }
+    memset(stream, 0, sizeof *stream);
+    stream->used = true;
+    stream->session = origin->session;
+    stream->number = in.stream;
+    stream->kind = in.kind;
+    stream->pattern = in.pattern;
+    stream->n = in.n;
+    stream->count = in.count;
+    stream->octets = in.octets;
+    stream->gap = in.gap;
+    stream->fd = fd;
+    stream->run = session->run;
+    stream->length = (uint16_t)length;
+    stream->period = in.period;
+    stream->waits = in.start == WAITS;
+    stream->start = in.start == 0 ? now + SOON_NS : in.start;
+    memcpy(stream->channels, in.places, sizeof in.places);
+    memcpy(stream->key, key, sizeof key);
+    teds_wipe(key, sizeof key);
+    teds_put16(out, stream->run);
+    teds_put16(out + 2, stream->length);
+    teds_put64(out + 4, stream->start);
+    return 12;
+}
+
+int teds_stop(teds_node *node, const teds_command *command, const teds_origin *origin, uint8_t *out)
+{
+    teds_stream *stream;
+    if (command->length != 1) {
+        return -TEDS_BAD_FORM;
+    }
+    stream = find(node, origin->session, command->payload[0]);
+    if (stream == NULL) {
+        return -TEDS_WRONG_STATE;
+    }
+    teds_put32(out, stream->ended ? UINT32_MAX : stream->counter);
+    end(node, stream);
+    return 4;
+}
+
+/* -- samples --------------------------------------------------------------------------------------------------------------- */
+
+static void count(teds_stream *stream)
+{
+    stream->ended = stream->counter == UINT32_MAX;
+    stream->counter++;
+}
+
+static void full(teds_stream *stream)
+{
+    stream->missed += stream->full;
+    stream->full = true;
+    stream->full_counter = stream->counter;
+    stream->full_flags = stream->flags | stream->pattern;
+    memcpy(stream->waiting, stream->filling, stream->fill);
+    stream->fill = 0;
+    stream->flags = 0;
+    stream->held = 0;
+    count(stream);
+}
+
+/* Sample k of a channel in a test pattern: (k + channel) mod 2^(8 octets). */
+static void pattern(uint8_t channel, uint8_t octets, uint64_t index, uint8_t *out)
+{
+    uint64_t value = index + channel;
+    for (size_t i = octets; i-- > 0; value >>= 8) {
+        out[i] = (uint8_t)value;
+    }
+}
+
+static void instant(teds_node *node, teds_stream *stream, uint64_t tick)
+{
+    uint64_t index = (uint64_t)stream->counter * stream->n + stream->held;
+    if (stream->held == 0 && stream->kind == FREE) {
+        teds_put64(stream->filling, tick);
+        stream->fill = 8;
+    }
+    for (size_t i = 0; i < stream->count; i++) {
+        const teds_channel *own = &node->port->channels[stream->channels[i]];
+        uint8_t *at = stream->filling + stream->fill;
+        if (stream->pattern != 0) {
+            pattern(own->number, own->octets, index, at);
+        } else if (!teds_value(node, stream->channels[i], tick, at)) {
+            stream->flags |= 1;
+        }
+        stream->fill = (uint16_t)(stream->fill + own->octets);
+    }
+    stream->held++;
+    if (stream->held == stream->n) {
+        full(stream);
+    }
+}
+
+static uint64_t next_instant(const teds_stream *stream)
+{
+    if (stream->waits || stream->ended || (stream->kind == EVENT && stream->pattern == 0)) {
+        return TEDS_NEVER;
+    }
+    return stream->start + ((uint64_t)stream->counter * stream->n + stream->held) * stream->period;
+}
+
+static void sample_stream(teds_node *node, teds_stream *stream, uint64_t now)
+{
+    uint64_t due;
+    while ((due = next_instant(stream)) <= now) {
+        if (stream->kind == EVENT) {
+            teds_put64(stream->filling, due);
+            pattern(node->port->channels[stream->channels[0]].number, stream->octets, stream->counter,
+                    stream->filling + 8);
+            stream->fill = (uint16_t)(8 + stream->octets);
+            full(stream);
+            continue;
+        }
+        if (stream->held == 0 && now - due >= 3 * span(stream) && stream->counter < UINT32_MAX) {
+            /* the board slept: those messages are lost, and shown as lost */
+            uint64_t lost = (now - due) / span(stream) - 1;
+            lost = lost < UINT32_MAX - stream->counter ? lost : UINT32_MAX - stream->counter;
+            stream->counter += (uint32_t)lost;
+            stream->missed += lost;
+            continue;
+        }
+        instant(node, stream, due);
+    }
+}
+
+void teds_streams_sample(teds_node *node, uint64_t now)
+{
+    for (size_t i = 0; i < TEDS_STREAMS; i++) {
+        teds_stream *each = &node->streams[i];
+        if (each->used) {
+            sample_stream(node, each, now);
+            if (each->ended && !each->full && node->can.data_stream != (int8_t)i) {
+                end(node, each); /* the last counter was sent */
+            }
+        }
+    }
+}
+
+uint64_t teds_streams_due(const teds_node *node)
+{
+    uint64_t due = teds_data_due(node);
+    for (size_t i = 0; i < TEDS_STREAMS; i++) {
+        if (node->streams[i].used) {
+            uint64_t at = next_instant(&node->streams[i]);
+            due = at < due ? at : due;
+        }
+    }
+    return due;
+}
+
+/* -- data messages ------------------------------------------------------------------------------------------------------------ */
+
+/* Of messages that wait, the one of the smaller n * period goes next; -1: none. */
+static int8_t choice(const teds_node *node)
+{
+    int8_t chosen = -1;
+    for (int8_t i = 0; i < TEDS_STREAMS; i++) {
+        const teds_stream *each = &node->streams[i];
+        if (each->used && each->ready && each->full && (chosen < 0 || span(each) < span(&node->streams[chosen]))) {
+            chosen = i;
+        }
+    }
+    return chosen;
+}
+
+uint64_t teds_data_due(const teds_node *node)
+{
+    return node->can.data_stream >= 0 || choice(node) >= 0 ? node->can.data_free_at : TEDS_NEVER;
+}
+
+static bool begin(teds_node *node)
+{
+    teds_can *can = &node->can;
+    int8_t chosen = choice(node);
+    uint8_t nonce[13] = {0};
+    teds_stream *stream;
+    if (chosen < 0) {
+        return false;
+    }
+    stream = &node->streams[chosen];
+    stream->full = false;
+    teds_put32(can->data, stream->full_counter);
+    teds_put32(nonce + 9, stream->full_counter);
+    can->data[4] = stream->full_flags;
+    memcpy(can->data + 5, stream->waiting, stream->length - 13u);
+    if (node->port->ccm_seal(node->port->user, stream->key, nonce, can->data + 4, stream->length - 12u, can->data + 4,
+                             8) != 0) {
+        stream->missed++;
+        return false;
+    }
+    can->data_stream = chosen;
+    can->data_at = 0;
+    can->data_length = stream->length;
+    can->data_segment = 0;
+    return true;
+}
+
+static uint64_t gap_of_bus(const teds_node *node)
+{
+    uint64_t gap = 1;
+    for (size_t i = 0; i < TEDS_STREAMS; i++) {
+        gap = node->streams[i].used && node->streams[i].gap > gap ? node->streams[i].gap : gap;
+    }
+    return gap * MICRO;
+}
+
+bool teds_data_next(teds_node *node, teds_can_frame *frame, uint64_t now)
+{
+    teds_can *can = &node->can;
+    const teds_stream *stream;
+    size_t octets, room;
+    uint32_t s;
+    if (now < can->data_free_at || (can->data_stream < 0 && !begin(node))) {
+        return false;
+    }
+    stream = &node->streams[can->data_stream];
+    room = stream->fd ? 64 : 8;
+    octets = (size_t)(can->data_length - can->data_at) < room ? (size_t)(can->data_length - can->data_at) : room;
+    s = (node->sessions[stream->session].link & 7u) << 5 | (uint32_t)stream->number << 3 | can->data_segment;
+    frame->identifier = DATA | s << 8 | can->address;
+    frame->fd = stream->fd;
+    memcpy(frame->data, can->data + can->data_at, octets);
+    frame->length = (uint8_t)octets;
+    if (stream->fd && octets > 8) {
+        teds_can_pad(frame, octets);
+    }
+    can->data_free_at = now + gap_of_bus(node);
+    can->data_at = (uint16_t)(can->data_at + octets);
+    can->data_segment = (uint8_t)(can->data_segment % 7 + 1);
+    if (can->data_at == can->data_length) {
+        can->data_stream = -1;
+    }
+    return true;
+}
+
+/* -- trigger ------------------------------------------------------------------------------------------------------------------- */
+
+int teds_arm(teds_node *node, const teds_command *command, const teds_origin *origin)
+{
+    const uint8_t *payload = command->payload;
+    teds_session *session = &node->sessions[origin->session];
+    if (command->length != 18) {
+        return -TEDS_BAD_FORM;
+    }
+    if (payload[16] > 60 || payload[17] > 2) {
+        return -TEDS_OUT_OF_RANGE;
+    }
+    if (origin->arrival->kind != TEDS_CAN) {
+        return -TEDS_DOES_NOT_FIT;
+    }
+    session->arms[payload[17]].armed = payload[16] != 0;
+    session->arms[payload[17]].until = teds_now(node) + payload[16] * TEDS_SECOND;
+    memcpy(session->arms[payload[17]].commitment, payload, 16);
+    return 0;
+}
+
+static void act(teds_node *node, int8_t session, size_t action, uint64_t tick)
+{
+    uint32_t acting = 0;
+    node->sessions[session].mark = tick;
+    if (action == 1) {
+        for (size_t i = 0; i < TEDS_STREAMS; i++) {
+            teds_stream *each = &node->streams[i];
+            if (each->used && each->session == session && each->waits) {
+                each->waits = false;
+                each->start = tick + AFTER_MARK_NS;
+            }
+        }
+    } else if (action == 2) {
+        for (size_t i = 0; i < node->port->channel_count; i++) {
+            acting |= node->port->channels[i].kind == TEDS_ACTUATOR ? UINT32_C(1) << i : 0;
+        }
+        teds_claims_end(node, session, acting, true);
+    }
+}
+
+void teds_trigger(teds_node *node, teds_link link, const uint8_t *token, uint64_t tick)
+{
+    const teds_part parts[] = {{(const uint8_t *)"TEDS1 trigger", 14}, {token, 8}};
+    int8_t session = teds_session_on(node, link);
+    uint64_t now = teds_now(node);
+    uint8_t seen[32];
+    if (session < 0) {
+        return;
+    }
+    teds_sha256_parts(node, parts, 2, seen);
+    for (size_t i = 0; i < 3; i++) {
+        if (node->sessions[session].arms[i].armed && now >= node->sessions[session].arms[i].until) {
+            node->sessions[session].arms[i].armed = false;
+        }
+        if (node->sessions[session].arms[i].armed &&
+            teds_equal(seen, node->sessions[session].arms[i].commitment, 16)) {
+            node->sessions[session].arms[i].armed = false;
+            act(node, session, i, tick);
+        }
+    }
+}
+
+#else
+typedef int teds_stream_is_left_out;
+#endif
