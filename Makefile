@@ -5,7 +5,7 @@ PYTHON ?= python3
 VENV ?= .venv
 BIN := $(VENV)/bin
 
-.PHONY: demo demo-page page-picture test test-system lint types unit quick bench bench-teds bench-handover bench-measure bench-ncap bench-scale fuzz faults model house man coverage api test-other vectors-c sbom clean
+.PHONY: demo demo-page page-picture test test-system lint types unit quick bench bench-teds bench-handover bench-measure bench-ncap bench-scale fuzz faults model house man coverage api test-other vectors-c sbom firmware clean
 
 demo: $(VENV)/.run
 	@$(BIN)/teds-provision demo
@@ -158,6 +158,10 @@ $(VENV)/.dev: $(VENV)/.made pyproject.toml
 	$(PYTHON) -m venv .venv-fuzz
 	.venv-fuzz/bin/python -m pip install --quiet --editable '.[fuzz]'
 	@touch $@
+
+# The node in C: the host port and its C tests (firmware/README.md).
+firmware:
+	$(MAKE) --no-print-directory -C firmware all
 
 # What is in an installation, as a CycloneDX bill of materials.
 sbom: .venv-sbom/.ready

@@ -1,0 +1,55 @@
+"""What ``firmware/Makefile`` builds for the tests, and why a test of it is skipped where that cannot be built."""
+
+from __future__ import annotations
+
+import fcntl
+import functools
+import os
+import shutil
+import subprocess
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[2]
+FIRMWARE = ROOT / "firmware"
+BUILD = FIRMWARE / "build"
+AT_THE_GATE = os.environ.get("CI", "").lower() not in ("", "0", "false")
+
+
+def missing(*programs: str, headers: tuple[str, ...] = ("bearssl.h",)) -> str:
+    """What of these is not on this machine, as a sentence; "" where all is there."""
+    lacks = [name for name in programs if shutil.which(name) is None]
+    lacks += [name for name in headers if not Path("/usr/include", name).exists()]
+    return f"{', '.join(lacks)} missing: scripts/install-test-packages installs it" if lacks else ""
+
+
+def need(*programs: str, headers: tuple[str, ...] = ("bearssl.h",)) -> None:
+    """Skip the test where something is missing; at the gate it has to be there."""
+    if lack := missing(*programs, headers=headers):
+        assert not AT_THE_GATE, lack
+        pytest.skip(lack)
+
+
+@functools.cache
+def make(*words: str) -> None:
+    """Run make in firmware/, one process at a time; fails with what the compiler says."""
+    BUILD.mkdir(exist_ok=True)
+    with (BUILD / ".lock").open("w") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        done = subprocess.run(["make", "-C", str(FIRMWARE), *words], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stdout + done.stderr
+
+
+def host() -> Path:
+    """The host port, built."""
+    need("make", "gcc")
+    make("host")
+    return BUILD / "host" / "teds-node"
+
+
+def library() -> Path:
+    """The node over flash in memory, built."""
+    need("make", "gcc")
+    make("library")
+    return BUILD / "host" / "libteds-memory.so"

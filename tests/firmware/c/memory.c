@@ -1,0 +1,282 @@
+#include "memory.h"
+
+#include <bearssl.h>
+
+#include <stdlib.h>
+#include <string.h>
+
+static uint32_t start_of(int area)
+{
+    return area == TEDS_IDENTITY ? 0 : area == TEDS_SLOT_A ? MEMORY_IDENTITY : MEMORY_IDENTITY + MEMORY_SLOT;
+}
+
+static uint32_t octets_of(int area)
+{
+    return area == TEDS_IDENTITY ? MEMORY_IDENTITY : MEMORY_SLOT;
+}
+
+/* The power is gone: nothing of this board works any more. */
+static bool fails_now(memory_board *board)
+{
+    board->steps++;
+    if (board->cut != 0 && board->steps == board->cut) {
+        board->dead = true;
+    }
+    return board->dead;
+}
+
+static int erase(void *user, int area)
+{
+    memory_board *board = user;
+    bool was_dead = board->dead, fails = fails_now(board);
+    if (was_dead) {
+        return -1;
+    }
+    if (!fails || board->torn) {
+        memset(board->flash + start_of(area), board->port.erased, fails ? octets_of(area) / 2 : octets_of(area));
+    }
+    board->next[area] = 0;
+    return fails ? -1 : 0;
+}
+
+static int write(void *user, int area, uint32_t at, const uint8_t *octets, size_t length)
+{
+    memory_board *board = user;
+    bool was_dead = board->dead, fails = fails_now(board);
+    uint8_t *there = board->flash + start_of(area) + at;
+    if (was_dead) {
+        return -1;
+    }
+    if (at + length > octets_of(area) || at % board->port.unit != 0 || length % board->port.unit != 0 ||
+        at < board->next[area]) {
+        board->misused = true;
+        return -1;
+    }
+    for (size_t i = 0; i < length; i++) {
+        board->misused = board->misused || there[i] != board->port.erased;
+    }
+    if (!fails || board->torn) {
+        memcpy(there, octets, fails ? length / 2 : length);
+    }
+    board->next[area] = at + (uint32_t)length;
+    return fails ? -1 : 0;
+}
+
+static int read(void *user, int area, uint32_t at, uint8_t *out, size_t length)
+{
+    const memory_board *board = user;
+    if (board->dead || at + length > octets_of(area)) {
+        return -1;
+    }
+    memcpy(out, board->flash + start_of(area) + at, length);
+    return 0;
+}
+
+static int octets(void *user, uint8_t *out, size_t length)
+{
+    const memory_board *board = user;
+    return board->random('n', out, length);
+}
+
+static int scalar(void *user, int use, teds_key_ref *key, uint8_t point[65])
+{
+    memory_board *board = user;
+    if (board->random(use == TEDS_KEY_SIGNS ? 'i' : 'o', key->octets, 32) != 0) {
+        return -1;
+    }
+    return br_ec_p256_m31.mulgen(point, key->octets, 32, BR_EC_secp256r1) == 65 ? 0 : -1;
+}
+
+static uint64_t clock_now(void *user)
+{
+    return ((memory_board *)user)->now;
+}
+
+static size_t place_of(const memory_board *board, uint8_t channel)
+{
+    size_t place = 0;
+    while (board->channels[place].number != channel) {
+        place++;
+    }
+    return place;
+}
+
+/* A value that follows from the channel and the time alone. */
+static bool sample(void *user, uint8_t channel, uint64_t tick, uint8_t *out)
+{
+    const memory_board *board = user;
+    const teds_channel *own = &board->channels[place_of(board, channel)];
+    uint64_t value = tick / 1000000u + channel;
+    for (size_t i = own->octets; i-- > 0; value >>= 8) {
+        out[i] = (uint8_t)value;
+    }
+    return true;
+}
+
+static bool bears(void *user, uint8_t channel, const uint8_t *value)
+{
+    (void)user;
+    (void)channel;
+    return value[0] < 0xF0;
+}
+
+static void set(void *user, uint8_t channel, const uint8_t *value)
+{
+    memory_board *board = user;
+    size_t place = place_of(board, channel);
+    memcpy(board->values[place], value, board->channels[place].octets);
+}
+
+static void set_point(void *user, uint8_t channel, uint8_t *out)
+{
+    const memory_board *board = user;
+    size_t place = place_of(board, channel);
+    memcpy(out, board->values[place], board->channels[place].octets);
+}
+
+static void safe(void *user, uint8_t channel)
+{
+    memory_board *board = user;
+    memset(board->values[place_of(board, channel)], 0, 8);
+}
+
+memory_board *memory_new(const uint8_t uuid[10], uint8_t unit, uint8_t erased, memory_random random)
+{
+    memory_board *board = calloc(1, sizeof *board);
+    if (board == NULL) {
+        return NULL;
+    }
+    board->random = random;
+    board->crypto.random = octets;
+    memcpy(board->config.uuid, uuid, 10);
+    board->config.quick_points = true;
+    board->port.user = board;
+    board->port.slot_octets = MEMORY_SLOT;
+    board->port.identity_octets = MEMORY_IDENTITY;
+    board->port.unit = unit;
+    board->port.erased = erased;
+    board->port.erase = erase;
+    board->port.write = write;
+    board->port.read = read;
+    board->port.random = octets;
+    board->port.now = clock_now;
+    board->port.step = 1;
+    board->port.drift = 50;
+    teds_bearssl_fill(&board->port);
+    board->port.p256_make = scalar;
+    board->port.channels = board->channels;
+    board->port.sample = sample;
+    board->port.bears = bears;
+    board->port.set = set;
+    board->port.set_point = set_point;
+    board->port.safe = safe;
+    memset(board->flash, erased, sizeof board->flash);
+    return board;
+}
+
+void memory_free(memory_board *board)
+{
+    free(board);
+}
+
+/* Power comes (back). */
+int memory_start(memory_board *board)
+{
+    board->dead = false;
+    board->cut = 0;
+    board->steps = 0;
+    memset(board->next, 0, sizeof board->next);
+    return teds_node_init(&board->node, &board->config, &board->port);
+}
+
+void memory_channel(memory_board *board, uint8_t number, uint8_t kind, uint8_t model, uint8_t octets_of_one,
+                    uint32_t shortest)
+{
+    teds_channel *own = &board->channels[board->port.channel_count++];
+    own->number = number;
+    own->kind = kind;
+    own->model = model;
+    own->octets = octets_of_one;
+    own->shortest = shortest;
+}
+
+void memory_at(memory_board *board, uint64_t now)
+{
+    board->now = now;
+}
+
+void memory_cut(memory_board *board, long step, bool torn)
+{
+    board->steps = 0;
+    board->cut = step;
+    board->torn = torn;
+}
+
+long memory_steps(const memory_board *board)
+{
+    return board->steps;
+}
+
+bool memory_dead(const memory_board *board)
+{
+    return board->dead;
+}
+
+bool memory_misused(const memory_board *board)
+{
+    return board->misused;
+}
+
+size_t memory_flash(const memory_board *board, uint8_t *out)
+{
+    memcpy(out, board->flash, sizeof board->flash);
+    return sizeof board->flash;
+}
+
+size_t memory_handle(memory_board *board, uint8_t link, uint8_t kind, bool tapped, const uint8_t *frame,
+                     size_t length, uint8_t *reply)
+{
+    const teds_arrival arrival = {kind, tapped, false, board->now};
+    return teds_node_handle(&board->node, link, &arrival, frame, length, reply);
+}
+
+uint64_t memory_poll(memory_board *board)
+{
+    return teds_node_poll(&board->node, board->now);
+}
+
+void memory_lost(memory_board *board, uint8_t link)
+{
+    teds_node_link_lost(&board->node, link);
+}
+
+int memory_by_hand(memory_board *board)
+{
+    return teds_node_reset_by_hand(&board->node);
+}
+
+void memory_can_rx(memory_board *board, uint32_t identifier, const uint8_t *data, uint8_t length, bool fd)
+{
+    teds_can_frame frame = {identifier, length, fd, {0}};
+    if (length <= sizeof frame.data) {
+        memcpy(frame.data, data, length);
+        teds_can_rx(&board->node, &frame, board->now);
+    }
+}
+
+int memory_can_tx(memory_board *board, uint32_t *identifier, uint8_t *data, bool *fd)
+{
+    teds_can_frame frame;
+    if (!teds_can_tx(&board->node, &frame, board->now)) {
+        return -1;
+    }
+    *identifier = frame.identifier;
+    *fd = frame.fd;
+    memcpy(data, frame.data, frame.length);
+    return frame.length;
+}
+
+size_t memory_node_octets(void)
+{
+    return sizeof(teds_node);
+}

@@ -1,0 +1,51 @@
+/* A node over flash in memory, with a clock and randomness that a test gives: for C tests, fuzzers, and by ctypes. */
+#ifndef TEDS_MEMORY_H
+#define TEDS_MEMORY_H
+
+#include "teds/node.h"
+#include "teds_bearssl.h"
+
+#define MEMORY_IDENTITY 256u
+#define MEMORY_SLOT 8192u
+
+/* `kind` n: octets for a nonce or counter; i, o: the scalar of an identity or one-time key. */
+typedef int (*memory_random)(char kind, uint8_t *out, size_t length);
+
+typedef struct memory_board {
+    teds_bearssl crypto; /* first: the port of BearSSL looks here */
+    teds_port port;
+    teds_config config;
+    teds_node node;
+    uint8_t flash[MEMORY_IDENTITY + 2 * MEMORY_SLOT];
+    uint32_t next[3]; /* where the next unit of an area may be written */
+    long steps, cut;  /* the power fails at this step; 0: never */
+    bool torn, dead, misused;
+    uint64_t now;
+    memory_random random;
+    teds_channel channels[TEDS_CHANNELS];
+    uint8_t values[TEDS_CHANNELS][8];
+    size_t sent;
+} memory_board;
+
+memory_board *memory_new(const uint8_t uuid[10], uint8_t unit, uint8_t erased, memory_random random);
+void memory_free(memory_board *board);
+int memory_start(memory_board *board);
+void memory_channel(memory_board *board, uint8_t number, uint8_t kind, uint8_t model, uint8_t octets,
+                    uint32_t shortest);
+void memory_at(memory_board *board, uint64_t now);
+void memory_cut(memory_board *board, long step, bool torn);
+long memory_steps(const memory_board *board);
+bool memory_dead(const memory_board *board);
+bool memory_misused(const memory_board *board);
+size_t memory_flash(const memory_board *board, uint8_t *out);
+size_t memory_handle(memory_board *board, uint8_t link, uint8_t kind, bool tapped, const uint8_t *frame,
+                     size_t length, uint8_t *reply);
+uint64_t memory_poll(memory_board *board);
+void memory_lost(memory_board *board, uint8_t link);
+int memory_by_hand(memory_board *board);
+void memory_can_rx(memory_board *board, uint32_t identifier, const uint8_t *data, uint8_t length, bool fd);
+/* Length of the frame, -1: none. */
+int memory_can_tx(memory_board *board, uint32_t *identifier, uint8_t *data, bool *fd);
+size_t memory_node_octets(void);
+
+#endif

@@ -1,0 +1,71 @@
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from tests.bench import make_station
+from tests.e2e.desk import Desk, Running, Station
+from tests.firmware import builds
+
+
+@dataclass
+class CNode:
+    """A node in C as a process; its flash is a file."""
+
+    desk: Desk
+    program: Path
+    flash: Path
+    uuid: str
+    channels: str = ""
+    ready: dict[str, Any] = field(default_factory=dict)
+    process: Running | None = None
+
+    def start(self, *options: object, can: str | None = None) -> CNode:
+        """Power on, and wait until it is on the bus."""
+        words: list[object] = ["--flash", self.flash, "--can", can or self.desk.links.can, "--uuid", self.uuid]
+        if self.channels:
+            table = self.flash.with_suffix(".channels")
+            table.write_text(self.channels)
+            words += ["--channels", table]
+        self.process = self.desk.start(*words, *options, program=(str(self.program),), fork=False)
+        (self.ready,) = self.process.wait_for_lines(1)
+        assert self.ready["ready"] is True
+        assert self.ready["uuid"] == self.uuid
+        return self
+
+    def kill(self) -> None:
+        """Cut its power."""
+        assert self.process is not None
+        self.process.process.kill()
+        self.process.end()
+
+
+@pytest.fixture(scope="session")
+def prepared(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Homes of two owners' stations, with passphrase vaults at the lowest cost."""
+    folder = tmp_path_factory.mktemp("stations")
+    for name in ("bench", "rival"):
+        make_station(folder / name, name).close()
+    return folder
+
+
+@pytest.fixture
+def desk(tmp_path: Path, prepared: Path) -> Iterator[Desk]:
+    desk = Desk(tmp_path, prepared)
+    yield desk
+    desk.clear()
+
+
+@pytest.fixture
+def station(desk: Desk) -> Station:
+    return desk.station()
+
+
+@pytest.fixture
+def node(desk: Desk) -> CNode:
+    """A new node in C that is not powered yet."""
+    return CNode(desk, builds.host(), desk.folder / "flash.bin", desk.new_uuid().hex())

@@ -1,0 +1,100 @@
+"""The node in C under the station's commands, over real frames."""
+
+from __future__ import annotations
+
+import re
+import signal
+
+import pytest
+
+from teds_provision.protocol.announce import default_can_address
+from tests.e2e.desk import ANGLE, Desk, Station, results
+from tests.firmware.conftest import CNode
+from tests.handover.desk import Pair
+
+pytestmark = pytest.mark.system
+
+ANGLE_CHANNELS = "1 sensor 0 2 100000\n"
+
+
+@pytest.mark.parametrize("fd", [False, True], ids=["classic", "fd"])
+def test_it_keeps_every_rule_of_the_profile(desk: Desk, station: Station, node: CNode, fd: bool) -> None:
+    node.start(*(["--fd"] if fd else []))
+    links = ["--via", "can", "--can", desk.links.can + ("&fd=1" if fd else "")]
+    checked = station.ask("node", "check", "--factory", "--yes", *links)
+    wrong = [rule for rule in checked["checks"] if rule["result"] == "failed"]
+    assert not wrong
+    skipped = {rule["rule"] for rule in checked["checks"] if rule["result"] == "skipped"}
+    assert skipped == {"nfc-wait-time", "nfc-wtx", "confirm-elsewhere"}
+
+
+def test_it_is_provisioned_verified_rotated_and_reset(desk: Desk, station: Station, node: CNode) -> None:
+    node.start()
+    links = desk.links.over("can")
+    done = station.provision("can", "--profile", ANGLE, "--name", "slew angle")
+    assert set(results(done).values()) == {"done"}
+    assert (done["uuid"], done["verdict"]) == (node.uuid, "authentic")
+    assert station.ask("agree", node.uuid, "--rotate", *links)["epoch"] == 2
+    assert station.ask("verify", node.uuid, *links)["verdict"] == "authentic"
+    assert station.ask("reset", node.uuid, "--yes", *links)["receipt"]
+    assert station.provision("can", "--profile", ANGLE)["verdict"] == "authentic"
+
+
+def test_what_it_holds_outlives_its_power(desk: Desk, station: Station, node: CNode) -> None:
+    node.start()
+    assert station.provision("can", "--profile", ANGLE)["verdict"] == "authentic"
+    fingerprint = node.ready["fingerprint"]
+    node.kill()
+    node.start()
+    assert node.ready["fingerprint"] == fingerprint
+    assert station.ask("verify", node.uuid, *desk.links.over("can"))["verdict"] == "authentic"
+    node.kill()
+    node.start("--source", "ramp:1")
+    assert node.process is not None
+    node.process.signal(signal.SIGUSR1)  # the button
+    again = station.ask("identify", *desk.links.over("can"))
+    assert again["state"] == "factory"
+
+
+@pytest.mark.parametrize("kind", ["periodic", "free"])
+def test_its_stream_loses_nothing(desk: Desk, station: Station, node: CNode, kind: str) -> None:
+    node.channels = ANGLE_CHANNELS
+    node.start("--source", "sine:2")
+    links = desk.links.over("can")
+    assert station.provision("can", "--profile", ANGLE)["verdict"] == "authentic"
+    wish = ["--rate", "500", "--duration", "2", "--kind", kind, "--test-pattern"]
+    said = station.run("measure", node.uuid, *wish, *links)
+    assert said.code == 0, said
+    counts = re.search(r"(\d+) values in (\d+) messages, lost (\d+), late (\d+), bad (\d+)", said.out + said.err)
+    assert counts is not None, said
+    values, messages, lost, late, bad = map(int, counts.groups())
+    assert values >= 900
+    assert messages >= 20
+    assert (lost, late, bad) == (0, 0, 0)
+
+
+@pytest.mark.parametrize("mode", ["copy", "move"])
+def test_its_keys_go_over_to_another_station(desk: Desk, node: CNode, mode: str) -> None:
+    Pair.make(desk.folder, 0).close()
+    north, south = Station(desk, desk.folder / "north"), Station(desk, desk.folder / "south")
+    node.start()
+    links = desk.links.over("can")
+    assert north.provision("can", "--profile", ANGLE)["verdict"] == "authentic"
+    bundle = desk.folder / "keys.jwe"
+    north.ask("export-keys", node.uuid, "--to", "south", "--mode", mode, "--output", bundle, "--yes")
+    taken = south.ask("import-keys", bundle, "--yes")
+    assert taken["imported"] == [node.uuid]
+    assert south.ask("verify", node.uuid, *links)["verdict"] == "authentic"
+    north.ask("handover", "receipt", taken["receipt"])
+    assert south.ask("agree", node.uuid, "--rotate", *links)["epoch"] > 1  # a node that was moved is rotated at once
+    assert south.ask("verify", node.uuid, *links)["verdict"] == "authentic"
+
+
+def test_a_node_in_c_and_one_in_python_lie_on_one_bus(desk: Desk, station: Station, node: CNode) -> None:
+    node.start()
+    other = desk.node().start(nfc=False, can=True)
+    for uuid in (node.uuid, other.uuid):
+        links = ["--via", "can", "--can", desk.links.can]
+        where = [*links[:-1], f"{links[-1]}&node={default_can_address(bytes.fromhex(uuid))}"]
+        done = station.ask("provision", "--profile", ANGLE, "--yes", *where)
+        assert (done["uuid"], done["verdict"]) == (uuid, "authentic")
