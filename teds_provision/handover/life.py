@@ -62,25 +62,25 @@ def revoke(station: Station, uuid: bytes, why: str) -> Revoked:
 
 def is_retired(record: NodeRecord | None) -> bool:
     """Whether a node was taken out of service."""
-    return record is not None and (record.verdict or "").startswith((DECOMMISSIONED, REPLACED))
+    return record is not None and (record.retired or "").startswith((DECOMMISSIONED, REPLACED))
 
 
 def is_finished(station: Station, uuid: bytes) -> bool:
     """Whether a node was taken out of service and signed that it is in factory state."""
     record = station.nodes.get(uuid)
-    return record is not None and is_retired(record) and not (record.verdict or "").endswith(UNCONFIRMED)
+    return record is not None and is_retired(record) and not (record.retired or "").endswith(UNCONFIRMED)
 
 
 def retire(station: Station, uuid: bytes, receipt: ResetReceipt | None, *, as_: str = DECOMMISSIONED) -> None:
     """Take a node out of service. Without its receipt that is unconfirmed, and its keys stay for another try."""
     record = station.nodes.get(uuid)
-    verdict = as_ if receipt is not None else as_ + UNCONFIRMED
+    retired = as_ if receipt is not None else as_ + UNCONFIRMED
     with station.transaction():
         station.pins.remove(uuid)
         station.nodes.drop_draft(uuid)
-        station.nodes.remember(uuid, name=None, groups=(), verdict=verdict)
+        station.nodes.remember(uuid, name=None, groups=(), retired=retired)
         detail = {"proof": receipt.proof.hex()} if receipt is not None else {}
-        station.audit("decommission", uuid, verdict, name=record.name if record else None, **detail)
+        station.audit("decommission", uuid, retired, name=record.name if record else None, **detail)
 
 
 @dataclass(frozen=True)
@@ -94,7 +94,7 @@ class TakeOver:
     @property
     def done(self) -> bool:
         """Whether the spare is in its place already."""
-        return (self.old.verdict or "").startswith(f"{REPLACED} {self.new.uuid.hex()}")
+        return (self.old.retired or "").startswith(f"{REPLACED} {self.new.uuid.hex()}")
 
 
 def plan_takeover(station: Station, old: bytes, new: bytes, *, copy_calibration: bool) -> TakeOver:

@@ -15,7 +15,7 @@ from teds_provision.station.station import Station
 from teds_provision.store import NodeRecord, Shown, pages
 
 DEFAULT_DAYS = 7
-OUT_OF_SERVICE = ("decommissioned", "replaced by")  # verdicts that workflow.life gives
+OUT_OF_SERVICE = ("decommissioned", "replaced by")  # the words of handover/life.py
 _UNKNOWN = "its public key is not known"
 _CURE = "See teds-provision nodes UUID; settle it by any session, or: teds-provision agree UUID --rotate"
 
@@ -157,7 +157,7 @@ def _listed(nodes: dict[bytes, NodeRecord]) -> list[NodeRecord]:
 
 
 def _why_node_stays(node: NodeRecord | Shown, pin: str) -> str:
-    if (node.verdict or "").startswith(OUT_OF_SERVICE):
+    if (node.retired or "").startswith(OUT_OF_SERVICE):
         return "it is out of service"
     if node.point is None:
         return _UNKNOWN

@@ -182,7 +182,7 @@ class NodeKeeper:
         standing = Standing(self._station, self.uuid)
         with Conversation(sighting.contact(), notice=lambda _notice: None, busy_seconds=BUSY) as node:
             try:
-                trusted = open_trusted(self._station, node, unsigned=self._wish.unsigned)
+                trusted = open_trusted(self._station, node, by=self._wish.by, unsigned=self._wish.unsigned)
             finally:
                 self._proven = node.sealed
             if self._wish.require is not None:

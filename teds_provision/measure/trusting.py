@@ -32,6 +32,7 @@ class Trusted:
 
     ``digest`` is what Operate takes (16 octets), ``fingerprint`` the SHA-256 of the Security TEDS in hex.
     ``unsigned``: nobody has signed the datasheet; there are raw values alone, and nothing is moved.
+    ``kept``: all but its Security TEDS was read before the node's last start; values come from the signed copy.
     """
 
     node: Conversation
@@ -39,6 +40,7 @@ class Trusted:
     fingerprint: str
     name: str
     unsigned: bool = False
+    kept: bool = False
 
     @property
     def uuid(self) -> str:
@@ -66,22 +68,21 @@ class Trusted:
         return found
 
 
-def open_trusted(station: Station, node: Conversation, *, unsigned: bool = False) -> Trusted:
-    """Open a session and verify the datasheet; ``unsigned`` also takes one that nobody has signed yet.
+def open_trusted(station: Station, node: Conversation, *, by: str, unsigned: bool = False) -> Trusted:
+    """Open a session and verify the datasheet for the command ``by``; ``unsigned`` also takes one that nobody signed.
 
     Raises PolicyRefused (no key, banned), NotAuthentic and Unproven (the datasheet), LinkFailure.
     """
     require_session(station, node)
-    looked = look_in_session(station, node)
+    looked = look_in_session(station, node, by=by)
     image = looked.image
     bare = unsigned and looked.verified.verdict == "unsigned"
     if not bare:
         require_authentic(looked.verified)
-    if looked.read and not bare:
-        station.nodes.keep_datasheet(image)
     record = station.nodes.get(node.uuid)
     name = record.name if record is not None and record.name else ""
-    return Trusted(node, Sheet.of(image), hashlib.sha256(image.security or b"").hexdigest(), name, bare)
+    digest = hashlib.sha256(image.security or b"").hexdigest()
+    return Trusted(node, Sheet.of(image), digest, name, bare, looked.kept)
 
 
 def require_whitelisted(station: Station, uuid: bytes) -> None:

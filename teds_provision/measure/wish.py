@@ -27,6 +27,7 @@ class Wish:
     patient: bool = False  # whether a node is waited for, and tried again, for ever: no refusal is final
     unsigned: bool = False  # whether raw values of a node are wanted whose datasheet nobody has signed
     require: Requirements | None = None
+    by: str = "measure"  # the command that a reading of the datasheet is put down to
 
 
 @dataclass

@@ -75,11 +75,16 @@ def own_values(teds: SecurityTeds) -> bool:
 
 def station_signature_good(teds: SecurityTeds, ca: bytes, verify: Verify | None = None) -> bool:
     """Whether 104 is the CA's signature over 103, and 103 a point; a node brings its chip's own ``verify``."""
+    if verify is None:
+        return is_certified(ca, teds.station_key, teds.station_key_signature)
     if teds.station_key is None or teds.station_key_signature is None or not is_point(teds.station_key):
         return False
-    if verify is not None:
-        return verify(ca, station_key_message(teds.station_key), teds.station_key_signature)
-    return _certified(ca, teds.station_key, teds.station_key_signature)
+    return verify(ca, station_key_message(teds.station_key), teds.station_key_signature)
+
+
+def is_certified(ca: bytes, station: bytes | None, signature: bytes | None) -> bool:
+    """Whether ``signature`` (field 104) is that of ``ca`` over ``station`` (field 103), and that a point."""
+    return station is not None and signature is not None and is_point(station) and _certified(ca, station, signature)
 
 
 @lru_cache(maxsize=256)

@@ -9,7 +9,6 @@ if TYPE_CHECKING:
         groups,
         handovers,
         identity,
-        inventory,
         label,
         node_keys,
         nodes,

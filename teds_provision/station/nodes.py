@@ -6,16 +6,18 @@ from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
+from teds_provision.errors import BadData
 from teds_provision.lazy import late
 from teds_provision.station.seals import Seals
-from teds_provision.store import DatasheetRecord, Draft, Handed, Known, NodeRecord, Search, Shown, Store
+from teds_provision.store import DatasheetRecord, Draft, Handed, Known, NodeRecord, Reading, Search, Shown, Store
 from teds_provision.teds.codec.codes import AccessCode
 from teds_provision.teds.image import Image
 
 if TYPE_CHECKING:
     from teds_provision.teds import sheet
+    from teds_provision.teds.codec import security
 else:  # TEDS: a list decodes none
-    sheet = late("teds_provision.teds.sheet")
+    sheet, security = late("teds_provision.teds.sheet"), late("teds_provision.teds.codec.security")
 
 
 class Nodes:
@@ -30,7 +32,7 @@ class Nodes:
         return self._store.nodes()
 
     def each_shown(self) -> Iterator[Shown]:
-        """Identity key and verdict of all nodes, by UUID, a page at a time."""
+        """Identity key of all nodes, and whether each was retired, by UUID, a page at a time."""
         return self._store.each_shown()
 
     def of_page(self, uuids: Sequence[bytes]) -> dict[bytes, NodeRecord]:
@@ -104,15 +106,19 @@ class Nodes:
     # -- datasheets ------------------------------------------------------------------------------------------------
 
     def datasheet(self, uuid: bytes) -> Image | None:
-        """The image that a node had when it was last read or written, None if it never was."""
+        """The image that a node had when it was last read or written whole, None if it never was."""
         record = self._store.datasheet(uuid)
-        return record.image if record is not None else None
+        return record.image if record is not None and is_whole(record.image) else None
 
     def keep_datasheet(self, image: Image, profile: str | None = None) -> None:
         """Remember what a node has: every TEDS as it was read or written; the one before goes into its history.
 
-        A draft of the same content is done with. ``profile`` names the type, where that is known.
+        A draft of the same content is done with. ``profile`` names the type, where that is known. What is not a whole
+        datasheet (a Security TEDS alone, or a TEDS of its field 108 missing) is not kept: it would stand in for octets
+        that nobody read.
         """
+        if not is_whole(image):
+            return
         with self._store.together():
             draft = self._store.draft(image.uuid)
             if draft is not None and draft.image == image:
@@ -127,6 +133,44 @@ class Nodes:
         What was read of a node before this station knew more than its Security TEDS is not among them.
         """
         return [record for record in self._store.history(uuid) if record.image.unsigned_blocks()]
+
+    # -- readings --------------------------------------------------------------------------------------------------
+
+    def reading(self, uuid: bytes) -> Reading | None:
+        """What was read of a node last, which its verdict is judged from; None where nothing was."""
+        return self._store.reading_of(uuid)
+
+    def reads_well(self, uuid: bytes) -> bool:
+        """Whether a node's datasheet was read in a session and nothing in it was wrong: a hint, trust is not asked."""
+        row = self.reading(uuid)
+        return row is not None and row.in_session and not row.failed
+
+    def readings_of(self, uuids: Sequence[bytes]) -> dict[bytes, Reading]:
+        """What was read last of a page of nodes, by UUID."""
+        return self._store.readings_of(uuids)
+
+    def keep_reading(self, reading: Reading, image: Image | None = None, profile: str | None = None) -> bool:
+        """Keep what was read of a node, with the datasheet where that is worth keeping, at one moment.
+
+        Only a reading in a session replaces one made in a session: False where it did not.
+        """
+        with self._store.together():
+            kept = self._store.put_reading(reading)
+            if image is not None:
+                self.keep_datasheet(image, profile)
+        return kept
+
+    def started_anew(self, uuid: bytes, c: bytes) -> None:
+        """A session with this ``c`` (8 octets) shows that the node has started since it was read.
+
+        Nobody waits for the disk: what a crash forgets is seen again in the next session.
+        """
+        with self._store.transaction(later=True):
+            self._store.put_start(uuid, c)
+
+    def forget_reading(self, uuid: bytes) -> None:
+        """The node was reset: what was read of it is not there any more."""
+        self._store.drop_reading(uuid)
 
     def drafts(self) -> list[Draft]:
         """Every image that was built and not written, by UUID."""
@@ -143,6 +187,18 @@ class Nodes:
     def drop_draft(self, uuid: bytes) -> bool:
         """Forget the image that a node was to be given; False if there was none."""
         return self._store.drop_draft(uuid)
+
+
+def is_whole(image: Image) -> bool:
+    """Whether an image is a whole datasheet: more than a Security TEDS, and every TEDS of field 108 is in it."""
+    if not image.unsigned_blocks():
+        return False
+    if image.security is None:
+        return True
+    try:
+        return security.decode(image.security).signed_blocks.keys() <= image.blocks.keys()
+    except BadData:
+        return True  # not of this profile: it lists nothing
 
 
 def _first_due(image: Image) -> str | None:

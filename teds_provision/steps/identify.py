@@ -9,7 +9,7 @@ from contextlib import suppress
 from dataclasses import dataclass, replace
 
 from teds_provision import teds
-from teds_provision.errors import BadData, NodeRefused, NoKeyring, NotAuthentic, WrongPassphrase
+from teds_provision.errors import NodeRefused, NoKeyring, NotAuthentic, WrongPassphrase
 from teds_provision.harmless import printable
 from teds_provision.protocol.fingerprints import is_whole
 from teds_provision.protocol.keys import CHALLENGE_OCTETS, fingerprint, node_key_good, prove_message, verify
@@ -17,11 +17,12 @@ from teds_provision.protocol.messages.frames import Function, security_command
 from teds_provision.protocol.messages.identity import NodeState
 from teds_provision.station.station import Station
 from teds_provision.steps.read import read_block
+from teds_provision.steps.reading import keep_shown
 from teds_provision.store import WhitelistEntry, utc_now
 from teds_provision.talk.conversation import Conversation
 from teds_provision.teds.codec import security
 from teds_provision.teds.codec.codes import AccessCode
-from teds_provision.teds.image import SECURITY, Image
+from teds_provision.teds.image import SECURITY
 
 
 @dataclass(frozen=True)
@@ -80,7 +81,7 @@ def identify(
             told = {"fingerprint": pinned.fingerprint, "assurance": pinned.assurance}
             station.audit("whitelist", node.uuid, "pinned", **told)
         if known_key(station, node.uuid) != who.point:
-            station.nodes.keep_datasheet(Image(node.uuid, {SECURITY: who.security_teds}))
+            keep_shown(station, node.uuid, who.security_teds, by="identify")
     return who
 
 
@@ -145,12 +146,8 @@ def examine(station: Station, node: Conversation) -> Identified:
 
 def known_key(station: Station, uuid: bytes) -> bytes | None:
     """P(node) of the Security TEDS that was last read from this UUID, None where there is none of this profile."""
-    image = station.nodes.datasheet(uuid)
-    octets = image.security if image is not None else None
-    try:
-        return security.decode(octets).node_key if octets is not None else None
-    except BadData:
-        return None
+    row = station.nodes.reading(uuid)
+    return row.node_key if row is not None else None
 
 
 @dataclass(frozen=True)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -101,7 +101,28 @@ def remember(station: Station) -> Remembered:
         _Policy(
             {revocation.uuid: revocation for revocation in station.policy.revocations()},
             tuple(station.policy.trusted_cas()),
-            station.keys.cas_of_nodes(),
+            _counting(station, station.keys.cas_of_nodes()),
             tuple(station.policy.trusted_stations()),
         ),
     )
+
+
+def remember_page(station: Station, uuids: Sequence[bytes]) -> Remembered:
+    """As :func:`remember`, of what is asked for a page of nodes alone: a list of 100,000 is never held whole."""
+    entries = station.pins.of_page(uuids)
+    return Remembered(
+        station.point,
+        _Pins(station.pins.among(station.nodes.of_page(uuids).values(), entries.values()), entries),
+        _Policy(
+            {uuid: revocation for uuid in uuids if (revocation := station.policy.revocation(uuid)) is not None},
+            tuple(station.policy.trusted_cas()),
+            _counting(station, station.keys.cas_of_page(uuids)),
+            tuple(station.policy.trusted_stations()),
+        ),
+    )
+
+
+def _counting(station: Station, cas: Mapping[bytes, bytes]) -> dict[bytes, bytes]:
+    """Those of the CAs that nodes keep in which trust was not ended; a CA is asked about once."""
+    counts = {ca: station.policy.counts(ca) for ca in set(cas.values())}
+    return {uuid: ca for uuid, ca in cas.items() if counts[ca]}

@@ -36,7 +36,8 @@ def reset_node(station: Station, node: Conversation, who: Identified) -> ResetRe
     receipt = proof_of_reset(node, who.point)
     with station.durable("reset"):
         station.keys.remove(who.uuid)
-        station.nodes.remember(who.uuid, state=int(NodeState.FACTORY), verdict=None)
+        station.nodes.remember(who.uuid, state=int(NodeState.FACTORY), retired=None)
+        station.nodes.forget_reading(who.uuid)
         told = {"challenge": receipt.challenge.hex(), "proof": receipt.proof.hex()}
         station.audit("reset", who.uuid, "done", epoch=receipt.epoch, **told)
     return receipt

@@ -56,6 +56,12 @@ def known_node_keys(station: Station, uuid: bytes, image: Image | None = None) -
             keys = node_keys_of(uuid, source.security)
             station.pins.check(uuid, keys.key)
             return keys
+    row = station.nodes.reading(uuid)
+    if row is not None and row.node_key is not None and row.node_key_signature is not None:
+        if not node_key_good(uuid, row.node_key, row.node_key_signature):
+            raise BadData(f"The Security TEDS of {uuid.hex()} belongs to another node (field 102).")
+        station.pins.check(uuid, row.node_key)
+        return NodeKeys(uuid, row.node_key, row.node_key_signature)
     raise NotFound(
         f"The key of node {uuid.hex()} is not known yet.",
         hint="Identify it first: teds-provision identify",

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
-from typing import Literal, NamedTuple
+from typing import Final, Literal, NamedTuple
 
 from teds_provision.errors import BadData, NotAuthentic, TedsProvisionError, Unproven
 from teds_provision.protocol import datasheet
@@ -21,17 +21,27 @@ from teds_provision.teds.image import SECURITY, Image
 Outcome = Literal["passed", "failed", "skipped"]
 Verdict = Literal["authentic", "unsigned", "not authentic", "unproven"]
 Scope = Literal["node", "image"]
-_MERELY_UNSIGNED = {"signed", "every TEDS is signed"}
+MERELY_UNSIGNED: Final = frozenset({"signed", "every TEDS is signed"})
+"""Checks that fail where nothing is wrong but that nobody signed (all of) it."""
 _FRESHNESS = {"sequence", "key epoch"}
 _SESSION = "session"
 
 
 class Check(NamedTuple):  # a tuple: thirteen of them for each of ten thousand files
-    """One check of the datasheet; ``why`` says what was found."""
+    """One check of the datasheet; ``why`` says what was found.
+
+    ``kept``: the TEDS that it is about were not read again since the node last started; those of the last reading are
+    judged in their place.
+    """
 
     name: str
     result: Outcome
     why: str = ""
+    kept: bool = False
+
+    def to_json(self) -> dict[str, str]:
+        """As `verify --json` and the API have it."""
+        return {"name": self.name, "result": self.result, "why": self.why, **({"from": "kept"} if self.kept else {})}
 
 
 @dataclass(frozen=True)
@@ -52,7 +62,7 @@ class Verified:
         failed = {check.name for check in self.checks if check.result == "failed"}
         if _SESSION in failed:  # what came without a session proves nothing, except that it is too old
             return "not authentic" if failed & _FRESHNESS else "unproven"
-        if failed - _MERELY_UNSIGNED:
+        if failed - MERELY_UNSIGNED:
             return "not authentic"
         return "unsigned" if failed else "authentic"
 
@@ -80,7 +90,9 @@ def known_of(station: Station, uuid: bytes, identity: Identity | None) -> Known:
         shown = None
     if image is None or octets is None or shown is None or not shown.signed:
         return Known(identity)
-    trusted = _station(station, uuid, shown).result == "passed" and datasheet.signature_good(shown, octets, uuid)
+    signers = Signers.of(shown)
+    counts = _station(station, signers, _certifier(station, uuid, signers)).result == "passed"
+    trusted = counts and datasheet.signature_good(shown, octets, uuid)
     return Known(identity, shown.sequence, shown.key_epoch) if trusted else Known(identity)
 
 
@@ -124,6 +136,56 @@ def _proofs(image: Image) -> _Proofs:
 
 
 def _checks(station: Judging, image: Image, proofs: _Proofs, known: Known | None) -> list[Check]:
+    return judge(station, image.uuid, _octets(image, proofs, known), Signers.of(proofs.shown))
+
+
+class Signers(NamedTuple):
+    """Fields 101 to 104 of a Security TEDS, which today's pins and trust are held against; None where there is none."""
+
+    node_key: bytes | None = None
+    node_key_signature: bytes | None = None
+    station_key: bytes | None = None
+    station_key_signature: bytes | None = None
+
+    @classmethod
+    def of(cls, shown: SecurityTeds | NotCanonical | None) -> Signers:
+        """Those of a Security TEDS that was read; none of one that is absent or not of this profile."""
+        if not isinstance(shown, SecurityTeds):
+            return cls()
+        signed = (shown.station_key, shown.station_key_signature) if shown.signed else (None, None)
+        return cls(shown.node_key, shown.node_key_signature, *signed)
+
+
+def what_octets_say(image: Image, known: Known | None) -> tuple[list[Check], Signers]:
+    """The checks that no later change of trust alters, and what :func:`judge` needs for the others."""
+    proofs = _proofs(image)
+    return _octets(image, proofs, known), Signers.of(proofs.shown)
+
+
+def judge(station: Judging, uuid: bytes, octets: Iterable[Check], signers: Signers) -> list[Check]:
+    """All checks of a datasheet: those of its ``octets``, and those of today's pins, bans and trust."""
+    checks = {check.name: check for check in octets}
+    if signers.node_key is not None:
+        if "node key" not in checks:
+            checks["node key"] = _pinned(station, uuid, signers.node_key)
+        checks["not revoked"] = _not_revoked(station, uuid)
+    if signers.station_key is not None:
+        certifier = _certifier(station, uuid, signers)
+        checks["signing station"] = _station(station, signers, certifier)
+        checks["station certificate"] = _certificate(station, signers, certifier)
+    return sorted(checks.values(), key=lambda check: _ORDER.index(check.name))
+
+
+_ORDER: Final = (
+    "form", "canonical form", "algorithms", "node key", "key epoch", "sequence", "not revoked", "signed",
+    "signing station", "station certificate", "signature", "signed TEDS", "every TEDS is signed", "UUID",
+    "possession", _SESSION,
+)  # fmt: skip
+ABOUT_THE_REST: Final = frozenset({"form", "signed TEDS", "every TEDS is signed", "UUID"})
+"""Checks of other TEDS than the Security TEDS."""
+
+
+def _octets(image: Image, proofs: _Proofs, known: Known | None) -> list[Check]:
     checks, shown = [_form(image)], proofs.shown
     if shown is None:
         return [*checks, Check("signed", "failed", "the image holds no Security TEDS")]
@@ -132,15 +194,13 @@ def _checks(station: Judging, image: Image, proofs: _Proofs, known: Known | None
         why = shown.message if ours else "the Security TEDS is not of this profile: shown, never trusted"
         return [*checks, Check("canonical form", "failed", why)]
     checks += [Check("canonical form", "passed"), _algorithms(shown)]
-    checks += [_node_key(station, image.uuid, shown, signed=proofs.node_key)]
+    if not proofs.node_key:
+        checks.append(Check("node key", "failed", "field 102 does not sign this key for this UUID"))
     checks += [_epoch(shown, known), _sequence(shown, known)]
-    checks.append(_not_revoked(station, image.uuid))
     if not shown.signed:
         return [*checks, Check("signed", "failed", "this is the initial Security TEDS: nobody has signed it yet")]
     checks += [
         Check("signed", "passed"),
-        _station(station, image.uuid, shown),
-        _certificate(station, image.uuid, shown),
         _check("signature", proofs.datasheet, _CHANGED),
         _blocks(image, shown),
         _unlisted(image, shown),
@@ -207,17 +267,15 @@ def _algorithms(shown: SecurityTeds) -> Check:
     return _check("algorithms", not wrong, why, "ECDSA P-256, SHA-256, AES-128")
 
 
-def _node_key(station: Judging, uuid: bytes, shown: SecurityTeds, *, signed: bool) -> Check:
+def _pinned(station: Judging, uuid: bytes, node_key: bytes) -> Check:
     name = "node key"
-    if not signed:
-        return Check(name, "failed", "field 102 does not sign this key for this UUID")
     try:
-        station.pins.check(uuid, shown.node_key)
+        station.pins.check(uuid, node_key)
+        entry = station.pins.entry(uuid)
     except TedsProvisionError as error:
         return Check(name, "failed", error.message)
-    entry = station.pins.entry(uuid)
     pinned = "pinned" if entry is not None and entry.fingerprint else "not pinned here"
-    return Check(name, "passed", f"{fingerprint(shown.node_key)[:16]}, {pinned}")
+    return Check(name, "passed", f"{fingerprint(node_key)[:16]}, {pinned}")
 
 
 _FILE_ALONE = "a file does not say what its node has now"
@@ -251,24 +309,30 @@ def _not_revoked(station: Judging, uuid: bytes) -> Check:
     return _check("not revoked", revoked is None, f"revoked: {revoked.why}" if revoked else "")
 
 
-def _station(station: Judging, uuid: bytes, shown: SecurityTeds) -> Check:
-    key = shown.station_key or b""
+def _certifier(station: Judging, uuid: bytes, signers: Signers) -> bytes | None:
+    """The CA of those that count here which signed field 104, None where none did."""
+    for ca in station.policy.trusted_cas(uuid):
+        if datasheet.is_certified(ca, signers.station_key, signers.station_key_signature):
+            return ca
+    return None
+
+
+def _station(station: Judging, signers: Signers, certifier: bytes | None) -> Check:
+    key = signers.station_key or b""
     digits = fingerprint(key)[:16]
-    certified = any(datasheet.station_signature_good(shown, ca) for ca in station.policy.trusted_cas(uuid))
     return _check(
         "signing station",
-        key in station.policy.trusted_stations() or certified,
+        certifier is not None or key in station.policy.trusted_stations(),
         f"station {digits} is not trusted here, nor certified by a trusted CA",
         digits,
     )
 
 
-def _certificate(station: Judging, uuid: bytes, shown: SecurityTeds) -> Check:
+def _certificate(station: Judging, signers: Signers, certifier: bytes | None) -> Check:
     name = "station certificate"
-    for ca in station.policy.trusted_cas(uuid):
-        if datasheet.station_signature_good(shown, ca):
-            return Check(name, "passed", f"CA {fingerprint(ca)[:16]}")
-    if shown.station_key == station.point or shown.station_key not in station.policy.trusted_stations():
+    if certifier is not None:
+        return Check(name, "passed", f"CA {fingerprint(certifier)[:16]}")
+    if signers.station_key == station.point or signers.station_key not in station.policy.trusted_stations():
         return Check(name, "failed", "field 104 does not verify under any trusted CA")
     return Check(name, "skipped", "the station is trusted itself; its CA is not known here")
 

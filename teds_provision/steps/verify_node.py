@@ -8,6 +8,7 @@ from hashlib import sha256
 from teds_provision.errors import LinkFailure, NodeRefused, NotAuthentic
 from teds_provision.protocol.messages.identity import Identity, NodeState
 from teds_provision.station.station import Station
+from teds_provision.steps import reading
 from teds_provision.steps.agree import agreed_elsewhere, session_if_keyed
 from teds_provision.steps.identify import Identified, prove
 from teds_provision.steps.read import read_block, read_identity, read_image
@@ -21,11 +22,11 @@ from teds_provision.teds.image import SECURITY, Image
 
 @dataclass(frozen=True)
 class Looked:
-    """A node's TEDS, and what they are worth; ``read`` False: they are those that were kept from an earlier reading."""
+    """A node's TEDS, and what they are worth; ``kept``: all but the Security TEDS as read before its last start."""
 
     image: Image
     verified: Verified
-    read: bool = True
+    kept: bool = False
 
 
 def look_at_node(station: Station, node: Conversation, who: Identified) -> Looked:
@@ -34,6 +35,7 @@ def look_at_node(station: Station, node: Conversation, who: Identified) -> Looke
     One in which the node answers nothing but that it is busy is as good as none: then all is read without it.
     """
     why = open_or_say_why(station, node)
+    c = node.c
     try:
         image = read_image(node)
     except NodeRefused as refusal:
@@ -41,23 +43,27 @@ def look_at_node(station: Station, node: Conversation, who: Identified) -> Looke
             raise
         node.forget()
         why, image = _said(refusal), read_image(node)
-    return Looked(image, verify_node(station, node, image, who.point, why=why))
+    return Looked(image, verify_node(station, node, image, who.point, why=why, c=c))
 
 
-def look_in_session(station: Station, node: Conversation) -> Looked:
-    """Judge the TEDS of a node in the session that is open. Raises LinkFailure, NodeRefused; records nothing.
+def look_in_session(station: Station, node: Conversation, *, by: str) -> Looked:
+    """Judge the TEDS of a node in the session that is open. Raises LinkFailure, NodeRefused.
 
-    Where its Security TEDS is octet for octet the one that was kept, the rest need not be read again: it names the
-    digest of every other TEDS. Everything is judged anew all the same: trust, bans and pins may have changed since.
+    Where its Security TEDS is octet for octet the one that was read before, and nothing spoke against the rest then,
+    the rest is not read again here: it names the digest of every other TEDS. c of the session tells whether the node
+    has started since; then what is said of the rest is ``kept``, until somebody reads it (:mod:`.reading`). Everything
+    is judged anew all the same: trust, bans and pins may have changed.
     """
-    identity = read_identity(node)
+    identity, c = read_identity(node), node.c
     octets = read_block(node, SECURITY)
-    kept = station.nodes.datasheet(node.uuid)
-    known = kept is not None and kept.security == octets
-    image = kept if kept is not None and known else read_image(node)
-    checks = verify_image(station, image, known=known_of(station, node.uuid, identity))
-    checks.append(session("opened under the key that is held here", ""))
-    return Looked(image, Verified(node.uuid, tuple(checks)), read=not known)
+    known = known_of(station, node.uuid, identity)
+    image = reading.stands(station, node, octets, known)
+    if image is not None:
+        judged = reading.verdict_of(station, node.uuid)
+        assert judged is not None, "a reading that stands is there"
+        return Looked(image, judged.verified, kept=judged.origin == "kept")
+    image = read_image(node)
+    return Looked(image, reading.keep(station, node, image, by=by, known=known, c=c).verified)
 
 
 def open_or_say_why(station: Station, node: Conversation) -> str:
@@ -81,36 +87,40 @@ def _said(refusal: NodeRefused) -> str:
     return refusal.message.removeprefix(HEARD).rstrip(".")
 
 
-def verify_node(station: Station, node: Conversation, image: Image, point: bytes, *, why: str = "") -> Verified:
-    """Check what was read off a node, have it prove its key, and record the verdict. Raises only for the link.
+def verify_node(
+    station: Station,
+    node: Conversation,
+    image: Image,
+    point: bytes,
+    *,
+    why: str = "",
+    by: str = "verify",
+    c: bytes | None = None,
+) -> Verified:
+    """Check what was read off a node, have it prove its key, and keep the reading. Raises only for the link.
 
-    ``why`` says why there is no session although a key is held: then nothing of what was read is recorded.
+    ``why`` says why there is no session although a key is held: then nothing of what was read is kept. ``by`` is the
+    command that asks, ``c`` that of the session in which the reading began.
     """
     identity = (node.proven or read_identity(node)) if node.sealed else None
-    with station.reading():
-        checks: list[Check] = verify_image(station, image, known=known_of(station, node.uuid, identity))
-    checks.append(possession(lambda: prove(node, point)))
-    checks.append(vouched(node, point, why))
-    verified = Verified(node.uuid, tuple(checks))
-    if verified.verdict == "unproven" or checks[-1].result == "failed":
+    known = known_of(station, node.uuid, identity)
+    possessed, vouch = possession(lambda: prove(node, point)), vouched(node, point, why)
+    if vouch.result == "failed":
+        with station.reading():
+            verified = Verified(node.uuid, (*verify_image(station, image, known=known), possessed, vouch))
         station.audit("verify", node.uuid, verified.verdict, why=why)
         return verified
-    facts = _facts(image, verified, identity)
+    more = [possessed] if node.sealed or vouch.result == "skipped" else [possessed, vouch]
     with station.durable("verify"):
-        worth = identity is not None and verified.verdict != "not authentic"  # else what it had stays known
-        if worth and station.nodes.datasheet(node.uuid) != image:
-            station.nodes.keep_datasheet(image)
-        station.nodes.remember(node.uuid, **facts)
-        station.audit("verify", node.uuid, verified.verdict)
-    return verified
+        judged = reading.keep(station, node, image, by=by, known=known, c=c, more=more)
+        station.nodes.remember(node.uuid, **_facts(image, identity))
+        station.audit("verify", node.uuid, judged.verified.verdict)
+    return judged.verified
 
 
-def _facts(image: Image, verified: Verified, identity: Identity | None) -> dict[str, object]:
+def _facts(image: Image, identity: Identity | None) -> dict[str, object]:
     """What is remembered of a node that was read; ``identity`` is what it said in a session, None outside one."""
-    facts: dict[str, object] = {
-        "verdict": verified.verdict,
-        "channels": len({c for c, code in image if code == AccessCode.CHANNEL}),
-    }
+    facts: dict[str, object] = {"channels": len({c for c, code in image if code == AccessCode.CHANNEL})}
     if image.security is not None:
         facts["teds_sha256"] = sha256(image.security).hexdigest()
     if identity is not None:
@@ -120,6 +130,7 @@ def _facts(image: Image, verified: Verified, identity: Identity | None) -> dict[
             "sequence": identity.sequence,
             "can_address": identity.can_address,
             "last_seen": utc_now(),
+            "retired": None,
         }
     return facts
 

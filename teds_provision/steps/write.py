@@ -20,7 +20,9 @@ from teds_provision.protocol.messages.identity import Identity, NodeState
 from teds_provision.protocol.operation.commands import POWER, Power, PowerFlag
 from teds_provision.station.station import Station
 from teds_provision.steps.read import Survey, read_block, read_identity, read_image
+from teds_provision.steps.reading import keep
 from teds_provision.steps.sign import known_image, node_keys_of, sign
+from teds_provision.steps.verify import known_of
 from teds_provision.talk.conversation import Conversation, SessionLost
 from teds_provision.teds.codec import security
 from teds_provision.teds.codec.security import SecurityTeds
@@ -81,6 +83,9 @@ def write(
     if (has.security if has is not None else read_block(node, SECURITY)) == image.security:
         has = has or read_image(node)
         if all(has.blocks.get(block) == image.blocks[block] for block in image):
+            known = known_of(station, image.uuid, node.proven or read_identity(node))
+            with station.durable("write", more_follows=True):
+                keep(station, node, has, by="write", known=known)
             return Written(0, time.monotonic() - started, has)
     identity = node.proven or read_identity(node)
     _require_newer(signed, identity, jump=jump)
@@ -93,19 +98,29 @@ def write(
         has = between
     octets += _commit(station, node, image, has, progress)
     node.proven = replace(identity, sequence=signed.sequence, state=NodeState.PROVISIONED)
+    c = node.c
     back = read_image(node)
-    _conclude(station, image, back, facts, octets=octets, sequence=signed.sequence)
+    _conclude(station, node, image, back, facts, c=c, octets=octets, sequence=signed.sequence)
     return Written(octets, time.monotonic() - started, back)
 
 
 def _conclude(
-    station: Station, image: Image, back: Image, facts: Mapping[str, object], *, octets: int, sequence: int
+    station: Station,
+    node: Conversation,
+    image: Image,
+    back: Image,
+    facts: Mapping[str, object],
+    *,
+    c: bytes | None,
+    octets: int,
+    sequence: int,
 ) -> None:
     """Record what was read back, and whether it is what was written; raises NotAuthentic where it is not."""
     differing = [block for block in image if back.blocks.get(block) != image.blocks[block]]
     with station.durable("write", more_follows=True):
         profile = facts.get("profile")
-        station.nodes.keep_datasheet(back, profile if isinstance(profile, str) else None)
+        named = profile if isinstance(profile, str) else None
+        keep(station, node, back, by="write", known=known_of(station, image.uuid, node.proven), c=c, profile=named)
         if differing:
             channel, access_code = differing[0]
             station.audit("write", image.uuid, "read-back differs", block=[channel, access_code])

@@ -5,6 +5,7 @@ UUIDs are 10 octets, fingerprints 64 hex digits, points 65 octets (SEC 1 uncompr
 
 from __future__ import annotations
 
+import json
 import time
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
@@ -60,6 +61,7 @@ class NodeRecord:
 
     ``state`` is that of Identify (0 factory, 1 keyed, 2 provisioned); ``can_address`` 1 to 239, 0 for none;
     ``teds_sha256`` is the digest (hex) of the Security TEDS last committed; ``channels`` counts TransducerChannels;
+    ``retired`` is a person's word that it is out of service;
     ``due`` is the day (ISO 8601) on which the first calibration of its datasheet ends; ``charging`` what it last said
     of its charge, JSON with the time ``at``, which nobody authenticated.
     """
@@ -74,7 +76,7 @@ class NodeRecord:
     can_address: int = 0
     groups: tuple[str, ...] = ()
     teds_sha256: str | None = None
-    verdict: str | None = None
+    retired: str | None = None
     last_seen: str | None = None
     channels: int = 0
     point_mac: bytes | None = field(default=None, repr=False, compare=False)
@@ -82,13 +84,58 @@ class NodeRecord:
     charging: str | None = None
 
 
+@dataclass(frozen=True, slots=True)
+class Reading:
+    """The one row that a node's verdict is judged from: what was read of it last, and what those octets say.
+
+    ``at`` is when its TEDS were read, ``by`` the command that did; ``c`` (8 octets) that of the newest session with the
+    node, None for a reading in no session. ``whole``: every TEDS that it lists was read, in a session since its last
+    start; else the Security TEDS alone was, and the rest of ``digests`` is as it was read before. ``digests`` are
+    channel u16 ‖ access code u8 ‖ SHA-256 of every TEDS, ascending. Then fields 101 to 104 of the Security TEDS (None
+    where it cannot be read, or nobody signed it), and ``checks``: those that no later change of trust can alter, JSON.
+    """
+
+    uuid: bytes
+    at: str
+    by: str
+    c: bytes | None
+    whole: bool
+    digests: bytes = field(repr=False)
+    node_key: bytes | None = None
+    node_key_signature: bytes | None = field(default=None, repr=False)
+    station_key: bytes | None = None
+    station_key_signature: bytes | None = field(default=None, repr=False)
+    checks: str = "[]"
+
+    @property
+    def in_session(self) -> bool:
+        """Whether the node is known to have said it: it was read in a session."""
+        return self.c is not None
+
+    @property
+    def is_datasheet(self) -> bool:
+        """Whether a datasheet was read at all: the Security TEDS alone, which a plain contact shows, is none."""
+        return self.whole or self.c is not None
+
+    @property
+    def failed(self) -> frozenset[str]:
+        """Names of the checks of its octets that failed."""
+        return frozenset(name for name, result, *_ in json.loads(self.checks) if result == "failed")
+
+    def is_of_this_start(self, c: bytes) -> bool:
+        """Whether a session with this c is of the same power-up of the node (profile.md, "Sessions")."""
+        if self.c is None:
+            return False
+        return (int.from_bytes(c, "big") - int.from_bytes(self.c, "big")) % (1 << 64) < 1 << 32
+
+
 class Shown(NamedTuple):
-    """Of one node, what says whether it may leave: its identity key with its seal, and the last verdict."""
+    """Of one node, what says whether it may leave: its identity key with its seal, and whether it was retired."""
 
     uuid: bytes
     point: bytes | None
     point_mac: bytes | None
-    verdict: str | None
+    retired: str | None
 
 
 class Handed(NamedTuple):

@@ -9,7 +9,7 @@ from __future__ import annotations
 from typing import Final
 
 APPLICATION_ID: Final = 0x54454453  # "TEDS"
-SCHEMA_VERSION: Final = 6
+SCHEMA_VERSION: Final = 7
 
 _VERSION_1: Final = (
     "CREATE TABLE meta(name TEXT PRIMARY KEY, value TEXT NOT NULL) STRICT, WITHOUT ROWID",
@@ -167,6 +167,20 @@ _VERSION_6: Final = (
     "ALTER TABLE measurements ADD COLUMN require TEXT NOT NULL DEFAULT ''",
 )
 
+# What came with version 7: the one row of reading of each node. What stood as a verdict was not judged from one; of that
+# column a person's word is left that a node is out of service.
+_VERSION_7: Final = (
+    """CREATE TABLE readings(
+        uuid BLOB PRIMARY KEY CHECK(length(uuid) = 10), at TEXT NOT NULL, by TEXT NOT NULL,
+        c BLOB CHECK(length(c) = 8), whole INTEGER NOT NULL CHECK(whole IN (0, 1)), digests BLOB NOT NULL,
+        node_key BLOB CHECK(length(node_key) = 65), node_key_signature BLOB CHECK(length(node_key_signature) = 64),
+        station_key BLOB CHECK(length(station_key) = 65),
+        station_key_signature BLOB CHECK(length(station_key_signature) = 64), checks TEXT NOT NULL)
+        STRICT, WITHOUT ROWID""",
+    "ALTER TABLE nodes RENAME COLUMN verdict TO retired",
+    "UPDATE nodes SET retired = NULL WHERE NOT (retired GLOB 'decommissioned*' OR retired GLOB 'replaced by*')",
+)
+
 # STEPS_TO[n] are the statements that bring a store of version n - 1 to version n.
 STEPS_TO: Final[dict[int, tuple[str, ...]]] = {
     1: _VERSION_1,
@@ -175,4 +189,5 @@ STEPS_TO: Final[dict[int, tuple[str, ...]]] = {
     4: _VERSION_4,
     5: _VERSION_5,
     6: _VERSION_6,
+    7: _VERSION_7,
 }

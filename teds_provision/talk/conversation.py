@@ -123,6 +123,8 @@ class Conversation:
         self._notice, self._busy_seconds = notice, busy_seconds
         self._key: bytes | None = None
         self._session: StationSession | None = None
+        self.c: bytes | None = None
+        """c of the Open of this session, 8 octets: it tells whether the node has started anew since another one."""
         self._release: Callable[[], object] = _nothing
 
     def __enter__(self) -> Conversation:
@@ -168,7 +170,7 @@ class Conversation:
         if not reply.ok:
             raise refused(reply.reason, _OPENING)
         session.accept(reply.payload)
-        self._session, self._key = session, key
+        self._session, self._key, self.c = session, key, session.c
 
     def _open(self, key: bytes) -> tuple[StationSession, Reply]:
         """Ask for c and send one Open; each has a one-time key of its own."""

@@ -131,5 +131,4 @@ def the_one(station: Station, contacts: list[Contact]) -> Contact:
 
 
 def _finished(station: Station, identity: Identity) -> bool:
-    known = station.nodes.get(identity.uuid)
-    return identity.state == NodeState.PROVISIONED and known is not None and known.verdict == "authentic"
+    return identity.state == NodeState.PROVISIONED and station.nodes.reads_well(identity.uuid)

@@ -23,7 +23,7 @@ def station(tmp_path: Path) -> Iterator[Station]:
     made = make_station(tmp_path / "home")
     for uuid in (ONE, TWO):
         made.pins.put(WhitelistEntry(uuid, assurance="tap"))
-        made.nodes.put(NodeRecord(uuid, POINT, state=2, epoch=1, sequence=5, verdict="authentic"))
+        made.nodes.put(NodeRecord(uuid, POINT, state=2, epoch=1, sequence=5))
         add_key(made, uuid, 1)
         made.nodes.keep_datasheet(Image(uuid))
     add_key(made, TWO, 2, active=False)

@@ -107,7 +107,7 @@ def test_a_newer_state_brings_a_rolled_back_store_forward(station: Station, tmp_
         place(content.copy, stale)
     shutil.copy(home / "vault.json", stale / "vault.json")
     new_key = add_key(station, ONE, 2)
-    station.nodes.put(NodeRecord(ONE, POINT, epoch=2, sequence=9, verdict="authentic"))
+    station.nodes.put(NodeRecord(ONE, POINT, epoch=2, sequence=9))
     station._store.put_tombstone(Tombstone(TWO, "cd" * 32, "id"))
     station.keys.put_holder(Holder(ONE, "cd" * 32))
     station.audit("sign", ONE, "done")

@@ -34,7 +34,6 @@ def known(home: Path) -> Path:
                 sequence=7,
                 can_address=0x21,
                 groups=("hand",),
-                verdict="authentic",
                 last_seen="2026-01-31T12:00:00Z",
                 channels=4,
             )
@@ -62,7 +61,8 @@ def test_json_holds_all_that_is_known_but_no_key(known: Path) -> None:
         "fingerprint": None,
         "whitelisted": True,
         "assurance": "tap",
-        "verdict": "authentic",
+        "verdict": None,
+        "reading": None,
         "last_seen": "2026-01-31T12:00:00Z",
         "channels": 4,
         "can_address": 0x21,
@@ -96,7 +96,6 @@ def test_one_node_by_uuid_prefix_or_name(known: Path, text: str) -> None:
 def test_people_see_a_table_with_what_is_odd(known: Path) -> None:
     shown = call(known, "nodes").out
     assert "revoked: lost; moved to cdcdcdcdcdcdcdcd; not whitelisted" in shown
-    assert "authentic" in shown
 
 
 def test_nothing_known_says_what_to_do(home: Path) -> None:

@@ -94,7 +94,7 @@ def test_cleaned_text_steers_nothing_and_json_still_says_the_same() -> None:
 )
 def test_a_name_that_steers_terminals_is_cleaned_on_one(home: Path, words: tuple[str, ...]) -> None:
     with Store.open(home) as store:
-        store.put_node(NodeRecord(UUID, name=STEERING, profile=STEERING, verdict=STEERING))
+        store.put_node(NodeRecord(UUID, name=STEERING, profile=STEERING, retired=STEERING))
     environment = clean_environment(TERM="xterm", NO_COLOR="1", COLUMNS="200")
     told = on_terminal(home, *words, environment=environment)
     assert told.code == 0

@@ -17,6 +17,7 @@ from teds_provision.links import LinkSettings
 from teds_provision.links.nfc import port
 from teds_provision.station.station import Station as BaseStation
 from teds_provision.steps.build_order import BuildOrder
+from teds_provision.steps.inventory import inventory
 from teds_provision.steps.many.boards import Boards, Questions, Request
 from teds_provision.talk.progress import Silent
 from tests.bench import PASSPHRASE
@@ -69,7 +70,9 @@ def pull_at_each(home: Path, field: Field, path: str, lying: list[tuple[str, str
                 done = next(came)
                 assert (done.uuid.hex(), done.result) == (next_uuid, "passed"), (point, done, done.failure)
                 field.lift()
-        known = {node.uuid.hex(): node.verdict for node in station.nodes.all()}
+        known = {
+            node["uuid"]: node["verdict"] for node in inventory(station, [node.uuid for node in station.nodes.all()])
+        }
         assert known == dict.fromkeys(dict(lying), "authentic")
     finally:
         run.stop.set()

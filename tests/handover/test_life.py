@@ -128,7 +128,7 @@ def test_a_node_that_does_not_answer_is_unconfirmed_and_can_be_tried_again(pair:
     assert not is_finished(pair.north, pair.board.uuid)
     record = pair.north.nodes.get(pair.board.uuid)
     assert record is not None
-    assert record.verdict == "decommissioned, unconfirmed"
+    assert record.retired == "decommissioned, unconfirmed"
     with pytest.raises(PolicyRefused, match="out of service"):
         plan_export(pair.north, ExportOrder(("south",), (pair.board.uuid,)))
     retire(pair.north, pair.board.uuid, reset(pair.north, pair.board))
@@ -150,7 +150,7 @@ def test_a_spare_takes_over_name_groups_and_profile(pair: Pair) -> None:
     assert pair.north.nodes.resolve("finger 1") == spare.uuid
     old = pair.north.nodes.get(pair.board.uuid)
     assert old is not None
-    assert (old.name, old.verdict) == (None, f"replaced by {spare.uuid.hex()}, unconfirmed")
+    assert (old.name, old.retired) == (None, f"replaced by {spare.uuid.hex()}, unconfirmed")
     assert plan_takeover(pair.north, pair.board.uuid, spare.uuid, copy_calibration=False).done
 
 

@@ -54,12 +54,12 @@ def _bus_meant(links: LinkSettings, said: set[str]) -> str | None:
 
 
 @contextmanager
-def trusted_node(app: App, station: Station, links: LinkSettings, uuid: bytes) -> Iterator[Trusted]:
-    """A node in a session, its datasheet verified; left in order."""
+def trusted_node(app: App, station: Station, links: LinkSettings, uuid: bytes, *, by: str) -> Iterator[Trusted]:
+    """A node in a session, its datasheet verified for the command ``by``; left in order."""
     reporter = reporter_for(app)
     with talk.meeting.meet(station, over_the_bus(links), uuid, reporter, before=lambda: station.unlock(uuid)) as node:
         try:
-            yield measure.trusting.open_trusted(station, node)
+            yield measure.trusting.open_trusted(station, node, by=by)
         except talk.conversation.SessionLost as lost:
             raise lost.cause from lost
 
@@ -76,7 +76,7 @@ def sample(app: App, node: str, channels: Sequence[int], links: LinkSettings) ->
     """Take one reading now: datasheet verified, values calibrated. Without channels every sensor is read."""
     station = app.station()
     uuid = station.nodes.resolve(node)
-    with trusted_node(app, station, links, uuid) as trusted:
+    with trusted_node(app, station, links, uuid, by="sample") as trusted:
         samples = measure.sampling.take_samples(trusted, channels)
     result = {"uuid": uuid.hex(), "samples": [one.as_json() for one in samples]}
     app.emit(result, lambda console: _samples(console, samples))
@@ -103,7 +103,7 @@ def mode(app: App, node: str, links: LinkSettings) -> None:
     station = app.station()
     uuid = station.nodes.resolve(node)
     power: operation.commands.Power | None = None
-    with trusted_node(app, station, links, uuid) as trusted:
+    with trusted_node(app, station, links, uuid, by="mode") as trusted:
         found = measure.trusting.operation(trusted.node)
         try:
             power = operation.commands.Power.decode(trusted.node.send(operation.commands.POWER, "to tell its power"))
@@ -195,7 +195,7 @@ def set_value(
     links = over_the_bus(links)
     with (
         measure.finding.sources.beside(station, links, f"set {uuid.hex()}"),
-        trusted_node(app, station, links, uuid) as trusted,
+        trusted_node(app, station, links, uuid, by="set") as trusted,
         ending(stop),
     ):
         actuator = measure.held_actuator.HeldActuator(trusted, channel, unit=unit, dead_man=dead_man)

@@ -17,7 +17,7 @@ from teds_provision.cli.moments import moment
 from teds_provision.cli.options import WholeNumber, command
 from teds_provision.cli.rendering import local_time, print_json_list, shown
 from teds_provision.cli.station.fits import show_fits
-from teds_provision.station.inventory import STATES, inventory, search
+from teds_provision.steps.inventory import STATES, inventory, search
 
 if TYPE_CHECKING:
     from teds_provision.station.station import Station
@@ -169,6 +169,19 @@ def _remarks(node: dict[str, Any]) -> str:
     return "; ".join(remarks)
 
 
+def _verdict(node: dict[str, Any]) -> str:
+    """The verdict, and what it rests on."""
+    read = node["reading"]
+    if read is None:
+        return node["verdict"] or "never verified"
+    how = {
+        "session": "read in a session",
+        "kept": "its Security TEDS read in a session, the rest kept since",
+        "plain": "read in no session",
+    }
+    return f"{node['verdict']} ({how[read['from']]} {local_time(read['at'])}, by {read['by']})"
+
+
 def _charge(charging: dict[str, Any] | None) -> str:
     """What the node last said of it; nobody vouches for that."""
     return f"{shown(charging['text'])} (at {local_time(charging['at'])}, as it says)" if charging else ""
@@ -190,7 +203,7 @@ _LINES: tuple[tuple[str, Callable[[dict[str, Any]], str | list[str]]], ...] = (
     ("epoch", lambda node: f"{node['epoch']}, sequence {node['sequence']}"),
     ("key", lambda node: (node["fingerprint"] or "not pinned yet")[:32]),
     ("whitelist", lambda node: f"yes, assurance {node['assurance']}" if node["whitelisted"] else "no"),
-    ("verdict", lambda node: node["verdict"] or "never verified"),
+    ("verdict", _verdict),
     ("last seen", lambda node: local_time(node["last_seen"]) if node["last_seen"] else "never"),
     ("calibration", lambda node: f"due {node['due']}" if node["due"] else ""),
     ("charging", lambda node: _charge(node["charging"])),

@@ -50,7 +50,7 @@ def verify(app: App, what: tuple[str, ...], links: LinkSettings, accept_calibrat
         "uuid": verified.uuid.hex(),
         "scope": verified.scope,
         "verdict": verified.verdict,
-        "checks": [{"name": check.name, "result": check.result, "why": check.why} for check in verified.checks],
+        "checks": [check.to_json() for check in verified.checks],
         "warnings": list(done.warnings),
     }
     for warning in done.warnings:

@@ -223,7 +223,7 @@ class Holding:
         if contact is None:
             raise NoNode(f"Node {uuid} is on no bus of this station.", hint="Connect it; see /nodes.")
         with self._turns.of(uuid, "its actuators are held"), Conversation(contact, notice=_quiet) as node:
-            yield open_trusted(self._station, node)
+            yield open_trusted(self._station, node, by="ncap")
 
     def _hold(self, held: _Held, session: Measured) -> None:
         """Claim, feed until it is let go or nobody asks again, let go."""

@@ -30,11 +30,17 @@ STRANGERS_SECONDS: Final = 60.0
 
 @dataclass(frozen=True)
 class Look:
-    """What was found out. ``sheet`` is that of a node whose datasheet is not kept here, None otherwise."""
+    """What was found out. ``sheet`` is that of a node whose datasheet is not kept here, None otherwise.
+
+    ``in_session``: the node's row of reading says it all; else it is shown beside that row. ``kept``: but for its
+    Security TEDS the datasheet is still to be read.
+    """
 
     verified: Verified
     sheet: Sheet | None = None
     power: dict[str, Any] | None = None
+    in_session: bool = False
+    kept: bool = False
 
 
 def is_listed(station: Station, uuid: bytes) -> bool:
@@ -57,12 +63,10 @@ def _in_session(station: Station, node: Conversation) -> Look | None:
     """In a session, as before a measurement."""
     if session_if_keyed(station, node) is None:
         return None
-    looked = look_in_session(station, node)
+    looked = look_in_session(station, node, by="ncap")
     image, verified = looked.image, looked.verified
-    if verified.verdict != "not authentic" and looked.read:
-        with station.durable("verify"):
-            station.nodes.keep_datasheet(image)
-    return Look(verified, Sheet.of(image) if verified.verdict == "not authentic" else None, power_of(node))
+    sheet = Sheet.of(image) if verified.verdict == "not authentic" else None
+    return Look(verified, sheet, power_of(node), in_session=True, kept=looked.kept)
 
 
 def _stranger(station: Station, node: Conversation, who: Identified) -> Look:

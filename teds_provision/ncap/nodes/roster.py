@@ -15,8 +15,8 @@ from datetime import UTC, datetime
 from typing import Any, Final
 
 from teds_provision.ncap.live import Live
-from teds_provision.station.inventory import inventory
 from teds_provision.station.station import Station
+from teds_provision.steps.inventory import inventory
 from teds_provision.store import Search
 from teds_provision.store.records import iso
 from teds_provision.teds.sheet import Channel, Sheet

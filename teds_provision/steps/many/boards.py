@@ -24,6 +24,7 @@ from teds_provision.steps.many.report import check_report, write_report
 from teds_provision.steps.many.sheet import Row, read_sheet
 from teds_provision.steps.provision import Accept, Provisioned, provision
 from teds_provision.steps.read import survey
+from teds_provision.steps.reading import verdict_of
 from teds_provision.steps.write import Low, wait_for_charge
 from teds_provision.talk.conversation import Conversation, SessionLost
 from teds_provision.talk.meeting import meet, refuse_twins, without_twins
@@ -256,8 +257,8 @@ class Boards:
         if not listed or self.progress is not None:
             self._station.notice(f"Left alone: node {uuid.hex()} is not {'in the sheet' if listed else 'whitelisted'}.")
             return False
-        known = self._station.nodes.get(uuid)
-        verified = known is not None and known.verdict == "authentic"
+        judged = verdict_of(self._station, uuid)
+        verified = judged is not None and judged.verified.verdict == "authentic"
         return not (verified and contact.identity.state == NodeState.PROVISIONED)
 
     def _board(self, contact: Contact, place: str, questions: Questions) -> Board:

@@ -12,10 +12,11 @@ from teds_provision.station.station import Station
 from teds_provision.steps.address import set_address
 from teds_provision.steps.agree import Agreed, agree
 from teds_provision.steps.build_order import guard, own_name
-from teds_provision.steps.read import read_image
+from teds_provision.steps.read import read_identity, read_image
+from teds_provision.steps.reading import keep
 from teds_provision.steps.reset import ResetReceipt, reset_node
 from teds_provision.steps.sign import known_image
-from teds_provision.steps.verify import Verified, require_authentic, session, unproven, verify_image
+from teds_provision.steps.verify import Verified, known_of, require_authentic, session, unproven, verify_image
 from teds_provision.steps.verify_node import look_at_node, open_or_say_why, vouched
 from teds_provision.steps.visits.visit import at_node, node_or_image, read_image_file
 from teds_provision.steps.write import Low, Written, wait_for_charge, write
@@ -92,12 +93,13 @@ def read_at(station: Station, links: LinkSettings, node: str, reporter: Reporter
     uuid = station.nodes.resolve(node)
     with at_node(station, links.after_agreeing(), uuid, reporter) as visit:
         why = open_or_say_why(station, visit.node)
+        c = visit.node.c
         image = read_image(visit.node)
         check = vouched(visit.node, visit.who.point, why)
-        verdict = Verified(uuid, tuple(verify_image(station, image))).verdict
-        if visit.node.sealed and verdict != "not authentic":
+        if visit.node.sealed:
+            known = known_of(station, uuid, visit.node.proven or read_identity(visit.node))
             with station.durable("read"):
-                station.nodes.keep_datasheet(image)
+                keep(station, visit.node, image, by="read", known=known, c=c)
         return ReadDone(image, unproven(uuid, check.why) if check.result == "failed" else None)
 
 

@@ -98,7 +98,8 @@ def _one(station: Station, node: Conversation, add: bool) -> Found:
     known = station.nodes.get(who.uuid)
     name = (known.name if known else None) or described.name
     facts: dict[str, object] = {}
-    if known is None or known.verdict is None:  # nothing is verified here: it stands for what is not known better
+    read = station.nodes.reading(who.uuid)
+    if read is None or not read.is_datasheet:  # nothing is verified here: it stands for what is not known better
         facts["channels"] = described.channels
         if name is not None and station.nodes.all_named(name) in ([], [who.uuid]):
             facts["name"] = name

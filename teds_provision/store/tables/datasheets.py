@@ -1,17 +1,21 @@
-"""Drafts, and the datasheets that each node had: the present one and ten older ones, as octets, each once."""
+"""Drafts, what was read of each node last, and the datasheets that it had: the present one and ten older ones."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from dataclasses import fields
 from typing import Any
 
-from teds_provision.store.database import Database
+from teds_provision.store.database import Database, places
 from teds_provision.store.packing import datasheet_row, packed, unpacked
-from teds_provision.store.records import DatasheetRecord, Draft, utc_now
+from teds_provision.store.records import DatasheetRecord, Draft, Reading, utc_now
 from teds_provision.teds.image import Image
 
 KEPT = 11
 """The present datasheet of a node and ten older ones."""
 
+READING_FIELDS = tuple(column.name for column in fields(Reading))
+_READING = ", ".join(READING_FIELDS)
 _COLUMNS = "uuid, sequence, epoch, signed, profile, seen, digest, blocks"
 
 
@@ -69,6 +73,38 @@ class DatasheetTables:
             )
         return True
 
+    # -- readings --------------------------------------------------------------------------------------------------
+
+    def reading_of(self, uuid: bytes) -> Reading | None:
+        """Return what was read of this node last, None where nothing was."""
+        return self._database.read_one(_reading, f"SELECT {_READING} FROM readings WHERE uuid = ?", (uuid,))
+
+    def readings_of(self, uuids: Sequence[bytes]) -> dict[bytes, Reading]:
+        """Return what was read last of these nodes (a page of them), by UUID."""
+        statement = f"SELECT {_READING} FROM readings WHERE uuid IN ({places(uuids)})"
+        return {reading.uuid: reading for reading in self._database.read(_reading, statement, uuids)}
+
+    def put_reading(self, reading: Reading) -> bool:
+        """Keep a reading in place of the one before; False where that was made in a session and this one was not."""
+        values = tuple(getattr(reading, name) for name in READING_FIELDS)
+        changed = ", ".join(f"{name} = excluded.{name}" for name in READING_FIELDS[1:])
+        return (
+            self._database.change(
+                f"INSERT INTO readings({_READING}) VALUES({places(values)}) ON CONFLICT(uuid) DO UPDATE SET {changed}"
+                " WHERE excluded.c IS NOT NULL OR readings.c IS NULL",
+                values,
+            )
+            > 0
+        )
+
+    def put_start(self, uuid: bytes, c: bytes) -> None:
+        """The node has started anew, and shows the same Security TEDS: the rest is as it was read before."""
+        self._database.execute("UPDATE readings SET c = ?, whole = 0 WHERE uuid = ?", (c, uuid))
+
+    def drop_reading(self, uuid: bytes) -> None:
+        """Forget what was read of a node: it was reset."""
+        self._database.execute("DELETE FROM readings WHERE uuid = ?", (uuid,))
+
     def put_history(self, records: list[DatasheetRecord]) -> None:
         """Keep datasheets of a node, oldest first, in place of those that are there (for restore)."""
         with self._database.together():
@@ -77,6 +113,11 @@ class DatasheetTables:
             for record in records:
                 row = datasheet_row(record.image, record.profile, record.seen)
                 self._database.execute(f"INSERT INTO datasheets({_COLUMNS}) VALUES(?, ?, ?, ?, ?, ?, ?, ?)", row)
+
+
+def _reading(*row: Any) -> Reading:
+    values = dict(zip(READING_FIELDS, row, strict=True))
+    return Reading(**(values | {"whole": bool(values["whole"])}))
 
 
 def _draft(uuid: bytes, blocks: bytes, stage: Any, profile: str | None, created: str) -> Draft:

@@ -75,9 +75,9 @@ class NodeTables:
         return self._database.read(_node, f"SELECT {_NODE_COLUMNS} FROM nodes ORDER BY uuid")
 
     def each_shown(self) -> Iterator[Shown]:
-        """Give identity key and verdict of all nodes, by UUID, a page at a time."""
+        """Give identity key and retirement of all nodes, by UUID, a page at a time."""
         after = b""
-        statement = "SELECT uuid, point, point_mac, verdict FROM nodes WHERE uuid > ? ORDER BY uuid LIMIT ?"
+        statement = "SELECT uuid, point, point_mac, retired FROM nodes WHERE uuid > ? ORDER BY uuid LIMIT ?"
         while page := self._database.read(Shown, statement, (after, PAGE)):
             yield from page
             after = page[-1].uuid
@@ -136,7 +136,9 @@ class NodeTables:
 
     def unpin_node(self, uuid: bytes) -> None:
         """Forget the identity key of a node on its owner's explicit order; epoch and sequence stay."""
-        self._database.execute("UPDATE nodes SET point = NULL, point_mac = NULL WHERE uuid = ?", (uuid,))
+        with self._database.together():
+            self._database.execute("UPDATE nodes SET point = NULL, point_mac = NULL WHERE uuid = ?", (uuid,))
+            self._database.execute("DELETE FROM readings WHERE uuid = ?", (uuid,))  # of the board that it was
 
     def resolve(self, text: str) -> bytes:
         """Return the UUID that ``text`` means, looking at nodes and whitelist.

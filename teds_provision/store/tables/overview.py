@@ -94,8 +94,10 @@ class OverviewTables:
             ),
             some("SELECT uuid FROM drafts ORDER BY uuid"),
             some(
-                "SELECT DISTINCT k.uuid FROM keys k LEFT JOIN nodes n ON n.uuid = k.uuid WHERE k.state = 'active'"
-                f" AND n.verdict IS NULL AND k.uuid NOT IN {gone} ORDER BY k.uuid"
+                "SELECT DISTINCT k.uuid FROM keys k WHERE k.state = 'active' AND k.uuid NOT IN"
+                " (SELECT uuid FROM readings WHERE c IS NOT NULL"
+                " UNION SELECT uuid FROM nodes WHERE retired IS NOT NULL)"
+                f" AND k.uuid NOT IN {gone} ORDER BY k.uuid"
             ),
             some("SELECT uuid FROM marks WHERE rotation IS NOT NULL ORDER BY uuid"),
         )
@@ -151,7 +153,7 @@ class OverviewTables:
 
 
 _NODE = (
-    "point", "name", "profile", "state", "epoch", "sequence", "can_address", "groups", "teds_sha256", "verdict",
+    "point", "name", "profile", "state", "epoch", "sequence", "can_address", "groups", "teds_sha256", "retired",
     "last_seen", "channels", "due", "charging",
 )  # fmt: skip
 
@@ -194,6 +196,6 @@ def _add_state(state: str | int, add: Any) -> None:
     elif state in tables:
         add(f"k.uuid IN (SELECT uuid FROM {tables[state]})")
     elif state == "retired":
-        add("(n.verdict GLOB 'decommissioned*' OR n.verdict GLOB 'replaced by*')")
+        add("n.retired IS NOT NULL")
     else:
         add(f"(n.uuid IS NULL OR NOT {seen})")

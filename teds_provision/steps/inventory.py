@@ -5,12 +5,23 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Iterator, Sequence
-from typing import Any
+from itertools import islice
+from typing import TYPE_CHECKING, Any
 
 from teds_provision.errors import NotFound
+from teds_provision.lazy import late
 from teds_provision.protocol.messages.identity import NodeState
 from teds_provision.station.station import Station
 from teds_provision.store import Known, Search
+
+if TYPE_CHECKING:
+    from teds_provision.steps import reading
+    from teds_provision.steps.reading import Judged
+else:  # cryptography: a list of nodes that nobody verified yet needs none
+    reading = late("teds_provision.steps.reading")
+
+PAGE = 256
+"""Nodes that are judged together."""
 
 STATES = ("factory", "keyed", "provisioned", "moved", "revoked", "retired", "unseen")
 """What a node can be searched by: the states of Identify, and what the station has noted."""
@@ -41,11 +52,22 @@ def _exact(station: Station, text: str) -> bytes | None:
 
 
 def inventory(station: Station, uuids: Sequence[bytes]) -> Iterator[dict[str, Any]]:
-    """Describe nodes, in their order, a page at a time."""
-    return map(_described, station.nodes.overview(uuids))
+    """Describe nodes, in their order, a page at a time; ``verdict`` is judged now, from each one's row of reading."""
+    return (node for node, _ in with_verdicts(station, uuids))
 
 
-def _described(known: Known) -> dict[str, Any]:
+def with_verdicts(station: Station, uuids: Sequence[bytes]) -> Iterator[tuple[dict[str, Any], Judged | None]]:
+    """As :func:`inventory`, each with the whole verdict; None where no datasheet of the node was read."""
+    known = station.nodes.overview(uuids)
+    while page := list(islice(known, PAGE)):
+        listed = [one.uuid for one in page]
+        judged = reading.verdicts_of(station, listed, [one.uuid for one in page if one.keys and one.moved is None])
+        for one in page:
+            found = judged.get(one.uuid)
+            yield _described(one, found), found
+
+
+def _described(known: Known, judged: Judged | None) -> dict[str, Any]:
     node, entry, moved, revoked = known.node or {}, known.whitelist or {}, known.moved, known.revoked
     point = node.get("point")
     groups = list(dict.fromkeys((*json.loads(node.get("groups", "[]")), *known.groups)))
@@ -59,7 +81,8 @@ def _described(known: Known) -> dict[str, Any]:
         "fingerprint": hashlib.sha256(point).hexdigest() if point is not None else entry.get("fingerprint"),
         "whitelisted": known.whitelist is not None,
         "assurance": entry.get("assurance"),
-        "verdict": node.get("verdict"),
+        "verdict": node.get("retired") or (judged.verified.verdict if judged is not None else None),
+        "reading": judged and {"from": judged.origin, "at": judged.at, "by": judged.by},
         "last_seen": node.get("last_seen"),
         "due": node.get("due"),
         "charging": json.loads(node["charging"]) if node.get("charging") else None,
