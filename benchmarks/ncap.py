@@ -138,7 +138,7 @@ def main(words: list[str] | None = None) -> None:
         link = stack.enter_context(whole_bus(home, options.nodes))
         process, url = stack.enter_context(daemon(home, link))
         here = stack.enter_context(client.connect(home=home))
-        taken = until(lambda: sum(node["verdict"] == "authentic" for node in here.nodes()) >= options.nodes)
+        taken = until(lambda: sum(bool(node["verified"]) for node in here.nodes()) >= options.nodes)
         rows.tell(f"{options.nodes} nodes found and verified after the start", taken, "s")
         made = here.request("POST", "/virtual", {"profile": "gripper", "name": "hand", "source": "sine:2"})
         until(lambda: here.node(made["uuid"])["verdict"] == "authentic")

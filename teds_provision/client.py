@@ -2,7 +2,7 @@
 
     with client.connect() as station:                     # this user's own, by the Unix socket in its home
         for node in station.nodes():
-            print(node["uuid"], node["verdict"])
+            print(node["uuid"], node["verdict"]["verdict"])
     with client.connect("https://bench:8351", token=…) as station: …
 
 Every method is one request of the API (api.md) and gives its JSON; what the daemon refuses is raised as

@@ -61,6 +61,10 @@ class NotAuthentic(TedsProvisionError):
     code = "not-authentic"
 
 
+class BadDatasheet(NotAuthentic):
+    """A datasheet that was read is not authentic: no disturbed frame, which another try would cure."""
+
+
 class LinkFailure(TedsProvisionError):
     """The way to the node failed: no reader, no node, unplugged, garbled, bus-off (exit 5)."""
 

@@ -75,7 +75,7 @@ def _measured(api: client.Client) -> None:
         made = api.request("POST", "/virtual", {"profile": profile, "name": name, "source": source})
         uuids.append(made["uuid"])
     until = time.monotonic() + _READY
-    while any(api.node(uuid)["verdict"] != "authentic" for uuid in uuids):
+    while any((api.node(uuid)["verdict"] or {}).get("verdict") != "authentic" for uuid in uuids):
         if time.monotonic() > until:
             raise LinkFailure(f"The virtual transducers were not ready within {_READY:.0f} s.", hint="Try again.")
         time.sleep(0.2)

@@ -100,7 +100,7 @@ def verify_from(demo: Demo, station: Station, what: str) -> None:
         with meet(station, demo.over("can"), demo.uuid, demo.reporter) as node:
             who = identify(station, node)
             held = require_session(station, node)
-            verified = verify_node(station, node, read_image(node), who.point)
+            verified = verify_node(station, node, read_image(node), who.point).verified
         if verified.verdict != "authentic":
             raise NotAuthentic(f"The demo's node is {verified.verdict} as seen from {station.name}.")
         step.detail = f"{station.name} finds it {verified.verdict}, key epoch {held.record.epoch}"
@@ -224,7 +224,7 @@ def move_gripper(demo: Demo, station: Station, uuid: bytes) -> None:
     """Operate the gripper within its limits for a moment, let go, and see that it is safe."""
     with demo.steps.step("set") as step:
         with meet(station, demo.over("can"), uuid, demo.reporter) as node:
-            trusted = trusting.open_trusted(station, node)
+            trusted = trusting.open_trusted(station, node, by="demo")
             with held_actuator.HeldActuator(trusted, 1, unit="mm") as hand:
                 applied = hand.apply(OPENING)
                 time.sleep(min(hand.pause, _HALF_WAY))

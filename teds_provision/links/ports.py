@@ -178,6 +178,13 @@ class Timed(Protocol):
     came: float
 
 
+@runtime_checkable
+class Spaced(Protocol):
+    """A link on which a reply can be asked for with a ``gap`` (ms) between its frames, so that data find room there."""
+
+    gap: int
+
+
 @dataclass(frozen=True)
 class Contact:
     """A node that was found: its unauthenticated Identify, its link, and where it was found.

@@ -16,6 +16,7 @@ if TYPE_CHECKING:
         interpreter,
         keeper,
         planning,
+        rest,
         runner,
         running,
         sampling,

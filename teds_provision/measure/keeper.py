@@ -16,6 +16,7 @@ from contextlib import suppress
 
 from teds_provision.errors import (
     BadData,
+    BadDatasheet,
     Bug,
     LinkFailure,
     NodeRefused,
@@ -28,6 +29,7 @@ from teds_provision.measure.clock import AT_FIRST, Wall
 from teds_provision.measure.finding.buses import Bus, Buses
 from teds_provision.measure.finding.sightings import Sighting
 from teds_provision.measure.planning import BusTime, Plans, plan_node, sensors_of
+from teds_provision.measure.rest import Rest
 from teds_provision.measure.running.common_start import CommonStart
 from teds_provision.measure.running.patience import Patience
 from teds_provision.measure.running.streams import NodeStreams, added
@@ -126,7 +128,8 @@ class NodeKeeper:
                     return
                 if time.monotonic() - began > LAST_PAUSE:
                     pause = FIRST_PAUSE
-                self._say("lost" if self.ever_ran else "waiting", error, f"; again in {patience.again(pause)}")
+                lost: State = "refused" if isinstance(error, BadDatasheet) else "lost"
+                self._say(lost if self.ever_ran else "waiting", error, f"; again in {patience.again(pause)}")
                 self._wait(min(pause, patience.left), began)
                 pause = min(2 * pause, LAST_PAUSE)
             self._say("ended")
@@ -193,7 +196,7 @@ class NodeKeeper:
             try:
                 self._measure(bus, trusted, sighting.address)
                 standing.drives = self._driven is not None
-                self._keep(trusted, standing)
+                self._keep(bus, trusted, standing)
                 answers = True
             except (NotAuthentic, PolicyRefused, BadData):
                 answers = True  # what it was asked for would go on until its lease ends
@@ -297,8 +300,16 @@ class NodeKeeper:
             slower=2**self._halved,
         )
 
-    def _keep(self, trusted: Trusted, standing: Standing) -> None:
+    def _keep(self, bus: Bus, trusted: Trusted, standing: Standing) -> None:
         """Clock every lease / 3 until the end, or until the node is lost, or may not be measured any more."""
+        rest = Rest(self._station, trusted, bus, by=self._wish.by) if trusted.kept else None
+        try:
+            self._watch(trusted, standing, rest)
+        finally:
+            if rest is not None:
+                rest.close()
+
+    def _watch(self, trusted: Trusted, standing: Standing, rest: Rest | None) -> None:
         told = time.monotonic()
         every = self._wish.lease / 3
         lied = False
@@ -310,6 +321,9 @@ class NodeKeeper:
                 with self.turn:
                     self.streams.tell_time(trusted)
                 told = now
+            elif rest is not None:
+                with self.turn:
+                    rest = rest if rest.step() else None
             if self.streams.clock.lie and not lied:
                 lied = True
                 self._say("running", why=f"its clock lies: {self.streams.clock.lie}")

@@ -21,6 +21,7 @@ from teds_provision.measure.runner import Watcher
 from teds_provision.measure.running.job import Job
 from teds_provision.measure.sinks import Sink, open_sink
 from teds_provision.measure.trusting import DEAD_MAN, Trusted
+from teds_provision.measure.wish import Wish
 from teds_provision.ncap.live import Live
 from teds_provision.ncap.nodes.looking import as_problem
 from teds_provision.ncap.nodes.roster import Roster
@@ -282,6 +283,7 @@ class Measuring:
                 one.kept,
                 more=lambda take: self._sinks.more(one.kept, take),
                 admits=self._admits if self._sinks.moves(one.kept) else None,
+                wish=Wish(patient=True, by="ncap"),
             )
             one.job = job
             self._say(one, "starting")
@@ -349,9 +351,11 @@ class Measuring:
         if said.state == "running":
             facts |= {"present": True, "seen": time.time(), "problem": None}
             if before.get("state") != "running":
-                facts |= {"verdict": "authentic", "looked": time.time()}
+                facts |= {"heard": None, "looked": time.time()}  # in a session: what it said outside one is past
         elif said.state in ("lost", "refused", "waiting") and said.why:
             facts["problem"] = as_problem(TedsProvisionError(said.why))
+        if changed:
+            self._roster.refresh([said.uuid])
         self._roster.note(said.uuid, said.state if changed else None, **facts)
         if changed and one.job is not None and not one.stop.is_set():
             self._say(one, *_state_of(one, one.job))

@@ -82,6 +82,7 @@ def _described(known: Known, judged: Judged | None) -> dict[str, Any]:
         "whitelisted": known.whitelist is not None,
         "assurance": entry.get("assurance"),
         "verdict": node.get("retired") or (judged.verified.verdict if judged is not None else None),
+        "retired": node.get("retired"),
         "reading": judged and {"from": judged.origin, "at": judged.at, "by": judged.by},
         "last_seen": node.get("last_seen"),
         "due": node.get("due"),

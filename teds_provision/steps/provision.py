@@ -199,7 +199,7 @@ class _Run:
 
     def _verify(self, who: Identified, written: Written) -> Verified:
         with self.steps.step("verify") as step:
-            verified = verify_node(self.station, self.node, written.on_node, who.point, by="provision")
+            verified = verify_node(self.station, self.node, written.on_node, who.point, by="provision").verified
             step.detail = verified.verdict
         return verified
 

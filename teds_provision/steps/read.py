@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Generator
 from dataclasses import dataclass
 
 from teds_provision.errors import BadData, Garbled, NodeRefused
+from teds_provision.links.ports import Spaced
 from teds_provision.protocol.messages.frames import (
     IDENTIFY,
     Attribute,
@@ -118,6 +120,47 @@ def read_image(node: Conversation, *, initial: bytes | None = None) -> Image:
         total += len(blocks[block])
         if total > LARGEST_IMAGE:
             raise BadData("The node lists more than 4 MiB of TEDS.")
+    return Image(node.uuid, blocks)
+
+
+def read_in_between(node: Conversation, *, gap: int) -> Generator[None, None, Image]:
+    """As :func:`read_image`, in the session that is open, one exchange for each ``next``; its value is the image.
+
+    For a node that measures meanwhile: who steps through it chooses when the bus is free, and frames of a reply are
+    asked for with ``gap`` ms between them. No new session is opened where the old one is gone: it carries the streams.
+    Raises SessionLost, LinkFailure, NodeRefused, BadData.
+    """
+
+    def sent(command: Command, what: str) -> bytes:
+        link = node.contact.link
+        if not isinstance(link, Spaced):
+            return node.send(command, what)
+        link.gap = gap
+        try:
+            return node.send(command, what)
+        finally:
+            link.gap = 0
+
+    listed = decode_list(sent(security_command(Function.LIST), "to list its TEDS"))
+    blocks: dict[BlockId, bytes] = {}
+    for channel, code in listed:
+        yield
+        octets = bytearray()
+        total = largest = LARGEST_SECURITY if (channel, code) == SECURITY else LARGEST_TEDS
+        while len(octets) < total:
+            what = f"to read TEDS {code} of channel {channel}"
+            payload = sent(read_teds(channel, code, len(octets)), what)
+            if len(payload) < 4 or int.from_bytes(payload[:4], "big") != len(octets):
+                raise Garbled(f"The node read TEDS {code} of channel {channel} from another offset than was asked.")
+            if len(payload) == 4:
+                break
+            octets += payload[4:]
+            total = 4 + int.from_bytes(octets[:4], "big") if len(octets) >= 4 else largest
+            if total > largest or sum(map(len, blocks.values())) + total > LARGEST_IMAGE:
+                raise BadData(f"TEDS {code} of channel {channel} claims {total} octets: too many.")
+            if len(octets) < total:
+                yield
+        blocks[channel, code] = bytes(octets)
     return Image(node.uuid, blocks)
 
 

@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from typing import Final, Literal, NamedTuple
 
-from teds_provision.errors import BadData, NotAuthentic, TedsProvisionError, Unproven
+from teds_provision.errors import BadData, BadDatasheet, NotAuthentic, TedsProvisionError, Unproven
 from teds_provision.protocol import datasheet
 from teds_provision.protocol.keys import fingerprint, node_key_good
 from teds_provision.protocol.messages.identity import Identity
@@ -246,7 +246,7 @@ def require_authentic(verified: Verified) -> None:
     if verified.verdict == "unproven":
         raise unproven(verified.uuid, failed[_SESSION].why)
     told = next((failed[name] for name in _FRESHNESS if name in failed), next(iter(reversed(failed.values()))))
-    raise NotAuthentic(f"The datasheet is {verified.verdict}: {told.why or told.name}.")
+    raise BadDatasheet(f"The datasheet is {verified.verdict}: {told.why or told.name}.")
 
 
 def _check(name: str, holds: bool, why: str, good: str = "") -> Check:

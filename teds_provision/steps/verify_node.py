@@ -12,6 +12,7 @@ from teds_provision.steps import reading
 from teds_provision.steps.agree import agreed_elsewhere, session_if_keyed
 from teds_provision.steps.identify import Identified, prove
 from teds_provision.steps.read import read_block, read_identity, read_image
+from teds_provision.steps.reading import Judged
 from teds_provision.steps.reset import proof_of_reset
 from teds_provision.steps.verify import Check, Verified, known_of, possession, session, verify_image
 from teds_provision.store import utc_now
@@ -22,11 +23,20 @@ from teds_provision.teds.image import SECURITY, Image
 
 @dataclass(frozen=True)
 class Looked:
-    """A node's TEDS, and what they are worth; ``kept``: all but the Security TEDS as read before its last start."""
+    """A node's TEDS, and what they are worth."""
 
     image: Image
-    verified: Verified
-    kept: bool = False
+    judged: Judged
+
+    @property
+    def verified(self) -> Verified:
+        """All checks, and the verdict."""
+        return self.judged.verified
+
+    @property
+    def kept(self) -> bool:
+        """Whether all but the Security TEDS is as it was read before the node's last start."""
+        return self.judged.origin == "kept"
 
 
 def look_at_node(station: Station, node: Conversation, who: Identified) -> Looked:
@@ -61,9 +71,9 @@ def look_in_session(station: Station, node: Conversation, *, by: str) -> Looked:
     if image is not None:
         judged = reading.verdict_of(station, node.uuid)
         assert judged is not None, "a reading that stands is there"
-        return Looked(image, judged.verified, kept=judged.origin == "kept")
+        return Looked(image, judged)
     image = read_image(node)
-    return Looked(image, reading.keep(station, node, image, by=by, known=known, c=c).verified)
+    return Looked(image, reading.keep(station, node, image, by=by, known=known, c=c))
 
 
 def open_or_say_why(station: Station, node: Conversation) -> str:
@@ -96,7 +106,7 @@ def verify_node(
     why: str = "",
     by: str = "verify",
     c: bytes | None = None,
-) -> Verified:
+) -> Judged:
     """Check what was read off a node, have it prove its key, and keep the reading. Raises only for the link.
 
     ``why`` says why there is no session although a key is held: then nothing of what was read is kept. ``by`` is the
@@ -109,13 +119,15 @@ def verify_node(
         with station.reading():
             verified = Verified(node.uuid, (*verify_image(station, image, known=known), possessed, vouch))
         station.audit("verify", node.uuid, verified.verdict, why=why)
-        return verified
+        return Judged(verified, "plain", utc_now(), by)
     more = [possessed] if node.sealed or vouch.result == "skipped" else [possessed, vouch]
     with station.durable("verify"):
         judged = reading.keep(station, node, image, by=by, known=known, c=c, more=more)
-        station.nodes.remember(node.uuid, **_facts(image, identity))
+        row = station.nodes.reading(node.uuid)
+        if identity is not None or (row is not None and not row.in_session):
+            station.nodes.remember(node.uuid, **_facts(image, identity))
         station.audit("verify", node.uuid, judged.verified.verdict)
-    return judged.verified
+    return judged
 
 
 def _facts(image: Image, identity: Identity | None) -> dict[str, object]:

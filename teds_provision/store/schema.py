@@ -167,8 +167,8 @@ _VERSION_6: Final = (
     "ALTER TABLE measurements ADD COLUMN require TEXT NOT NULL DEFAULT ''",
 )
 
-# What came with version 7: the one row of reading of each node. What stood as a verdict was not judged from one; of that
-# column a person's word is left that a node is out of service.
+# What came with version 7: the one row of reading of each node. What stood as a verdict was not judged from one: a
+# person's word is left there that a node is out of service.
 _VERSION_7: Final = (
     """CREATE TABLE readings(
         uuid BLOB PRIMARY KEY CHECK(length(uuid) = 10), at TEXT NOT NULL, by TEXT NOT NULL,

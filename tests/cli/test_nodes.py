@@ -63,6 +63,7 @@ def test_json_holds_all_that_is_known_but_no_key(known: Path) -> None:
         "assurance": "tap",
         "verdict": None,
         "reading": None,
+        "retired": None,
         "last_seen": "2026-01-31T12:00:00Z",
         "channels": 4,
         "can_address": 0x21,

@@ -75,7 +75,7 @@ def test_a_moved_node_can_still_be_verified_by_its_former_station(pair: Pair) ->
     pair.export("move")
     with talk(pair.board) as node:
         who = identify(pair.north, node)
-        assert verify_node(pair.north, node, read_image(node), who.point).verdict == "authentic"
+        assert verify_node(pair.north, node, read_image(node), who.point).verified.verdict == "authentic"
 
 
 def test_the_receiver_of_a_move_rotates_at_its_first_contact(pair: Pair) -> None:

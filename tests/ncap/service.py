@@ -151,10 +151,15 @@ def verified(service: Service, uuid: str) -> dict[str, Any]:
     with service.client() as asked:
         return dict(
             until(
-                lambda: next((n for n in asked.nodes() if n["uuid"] == uuid and n["verdict"] and n["present"]), None),
+                lambda: next((n for n in asked.nodes() if n["uuid"] == uuid and n["verified"] and n["present"]), None),
                 uuid,
             )
         )
+
+
+def verdict(node: dict[str, Any]) -> str | None:
+    """The verdict on a node in a word, None where it has none yet."""
+    return node["verdict"] and str(node["verdict"]["verdict"])
 
 
 def virtual(service: Service, profile: str = "gripper", name: str = "hand", source: str = "sine:2") -> str:
@@ -162,5 +167,5 @@ def virtual(service: Service, profile: str = "gripper", name: str = "hand", sour
     with service.client() as asked:
         made = asked.request("POST", "/virtual", {"profile": profile, "name": name, "source": source})
     node = verified(service, made["uuid"])
-    assert node["verdict"] == "authentic", node
+    assert verdict(node) == "authentic", node
     return str(made["uuid"])

@@ -12,7 +12,7 @@ import pytest
 
 from teds_provision.client import ApiError, Client
 from tests.e2e.desk import ANGLE
-from tests.ncap.service import Service, verified, virtual
+from tests.ncap.service import Service, verdict, verified, virtual
 from tests.pace import best_of, succeeds, until
 
 pytestmark = pytest.mark.link
@@ -77,10 +77,11 @@ def test_status_says_what_runs(service: Service, asked: Client) -> None:
 
 def test_a_node_has_its_verdict_with_checks_and_its_channels_with_units(asked: Client, hand: str) -> None:
     node = asked.node("hand")
-    assert (node["uuid"], node["verdict"], node["state"], node["present"]) == (hand, "authentic", "provisioned", True)
+    assert (node["uuid"], verdict(node), node["state"], node["present"]) == (hand, "authentic", "provisioned", True)
     assert node["virtual"] is True
-    assert {check["name"] for check in node["checks"]} >= {"signature", "session", "not revoked"}
-    assert not [check for check in node["checks"] if check["result"] == "failed"]
+    assert {check["name"] for check in node["verdict"]["checks"]} >= {"signature", "session", "not revoked"}
+    assert not [check for check in node["verdict"]["checks"] if check["result"] == "failed"]
+    assert (node["verdict"]["from"], node["heard"]) == ("session", None)
     opening = node["channels"][1]
     assert (opening["name"], opening["kind"], opening["unit"], opening["low"]) == ("opening", "sensor", "m", 0.0)
     assert opening["high"] == pytest.approx(0.11)
@@ -263,7 +264,7 @@ def test_a_virtual_transducer_is_made_from_a_document_under_a_uuid_of_its_own(
     copy = document.replace(f"<octets>{hand}</octets>", f"<octets>{'00' * 10}</octets>")
     made = asked.request("POST", "/virtual", {"content": copy, "name": "copy", "source": "ramp:1"})
     node = verified(service, made["uuid"])
-    assert (node["verdict"], node["virtual"], len(node["channels"])) == ("authentic", True, 3)
+    assert (verdict(node), node["virtual"], len(node["channels"])) == ("authentic", True, 3)
     assert {one["name"] for one in asked.request("GET", "/virtual")["virtual"]} == {"hand", "copy"}
     asked.request("DELETE", f"/virtual/{made['uuid']}")
     until(lambda: asked.node(made["uuid"])["present"] is False)
@@ -288,7 +289,7 @@ def test_detection_decides_who_is_shown(service: Service, asked: Client) -> None
     assert node.uuid not in {one["uuid"] for one in asked.nodes()}
     assert service.station.ask("ncap", "detection", "transparent") == {"detection": "transparent"}
     seen = verified(service, node.uuid)
-    assert (seen["verdict"], seen["state"], seen["whitelisted"]) == ("unsigned", "factory", False)
+    assert (verdict(seen), seen["state"], seen["whitelisted"]) == ("unsigned", "factory", False)
     assert asked.request("PUT", "/detection", {"mode": "whitelist"}) == {"mode": "whitelist"}
     until(lambda: asked.status()["strangers"] == 1)
     done = asked.request("POST", f"/nodes/{node.uuid}/provision", {"profile": ANGLE, "name": "angle"})
@@ -310,7 +311,7 @@ def test_detection_decides_who_is_shown(service: Service, asked: Client) -> None
     ]
     assert asked.node("angle")["whitelisted"] is True
     asked.request("PUT", "/detection", {"mode": "whitelist"})
-    assert verified(service, node.uuid)["verdict"] == "authentic"
+    assert verdict(verified(service, node.uuid)) == "authentic"
     refused(asked, 404, "not-found", "POST", f"/nodes/{node.uuid}/provision", {"profile": "no-such-type"})
 
 

@@ -18,7 +18,7 @@ from tests.e2e.desk import ROOT
 from tests.measure.hall import Hall
 from tests.measure.sinks.test_ros1 import Master, master, pytestmark  # noqa: F401  the fixture, and what it needs
 from tests.measure.test_actuator_safety import DEAD_MAN, TOPIC, Journal, Ros1, Ros2, children, hall_on, ros_of
-from tests.ncap.service import Service, verified
+from tests.ncap.service import Service, verdict, verified
 from tests.pace import until
 
 Publishers = list[subprocess.Popen[bytes]]
@@ -52,7 +52,7 @@ def listening(hall: Hall, ros: Ros1 | Ros2, *words: object, measured: bool = Tru
     hall.desk.links = type(hall.desk.links)(hall.desk.links.nfc, hall.can)
     service = Service(hall.desk, hall.station, (*ros.words, *words)).start(environment=ros.environment)
     uuid = hall.nodes["g"].uuid
-    assert verified(service, uuid)["verdict"] == "authentic"
+    assert verdict(verified(service, uuid)) == "authentic"
     if measured:
         with service.client() as asked:
             body = {"uuids": [uuid], "rate": 20, "dead_man": int(DEAD_MAN * 1000), **more}

@@ -15,7 +15,7 @@ import pytest
 from teds_provision.ncap.nodes.roster import MOST_GONE, Roster
 from tests.e2e.desk import ANGLE
 from tests.measure.hall import Hall, events
-from tests.ncap.service import Service, until
+from tests.ncap.service import Service, until, verdict
 from tests.strangers.attackers import Attacker, always_new, silent_strangers
 from tests.strangers.wire import of_spec
 
@@ -60,7 +60,8 @@ def test_a_node_of_the_whitelist_does_not_wait_for_strangers(hall: Hall, tmp_pat
         asked = service.start().client()
         until(lambda: sum(one["present"] for one in asked.nodes()) == len(STRANGERS))
         hall.nodes["a"].start(can=hall.desk.links.can)
-        until(lambda: asked.node(hall.nodes["a"].uuid)["verdict"] == "authentic")
+        until(lambda: asked.node(hall.nodes["a"].uuid)["verified"])
+        assert verdict(asked.node(hall.nodes["a"].uuid)) == "authentic"
         waiting = sum(one["verdict"] is None and one["problem"] is None for one in asked.nodes())
         assert waiting > len(STRANGERS) / 2, "the strangers still waited when it had been looked at"
     service.end()
@@ -88,7 +89,7 @@ def test_reads_of_a_node_that_does_not_answer_hold_up_no_other_request(hall: Hal
     service = Service(hall.desk, hall.station, ("--detection", "whitelist"))
     node = hall.nodes["a"].start(can=hall.desk.links.can)
     asked = service.start().client()
-    until(lambda: asked.node(node.uuid)["verdict"] == "authentic")
+    until(lambda: asked.node(node.uuid)["verified"])
     reader = {"Authorization": f"Bearer {service.token('reader', '--read-only')}"}
     writer = {"Authorization": f"Bearer {service.token('writer')}", "Content-Type": "application/json"}
     node.kill()

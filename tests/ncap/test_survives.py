@@ -23,7 +23,7 @@ from teds_provision.store import Store
 from tests.bench import make_station
 from tests.cli.shell import clean_environment
 from tests.e2e.desk import ANGLE, Desk, Node, Station, limited
-from tests.ncap.service import Service, verified, virtual
+from tests.ncap.service import Service, verdict, verified, virtual
 from tests.pace import best_of, succeeds, until
 
 pytestmark = pytest.mark.link
@@ -183,12 +183,12 @@ def test_a_node_that_starts_anew_is_measured_on(lab: Lab) -> None:
 
 def test_a_node_that_leaves_is_shown_as_away_and_comes_back_verified(lab: Lab) -> None:
     lab.service.start()
-    assert verified(lab.service, lab.node.uuid)["verdict"] == "authentic"
+    assert verdict(verified(lab.service, lab.node.uuid)) == "authentic"
     lab.node.kill()
     until(lambda: not lab.state()["present"])
     lab.power()
     until(lambda: lab.state()["present"])
-    assert verified(lab.service, lab.node.uuid)["verdict"] == "authentic"
+    assert verdict(verified(lab.service, lab.node.uuid)) == "authentic"
     lab.service.end()
 
 
@@ -337,7 +337,7 @@ def test_two_daemons_on_one_bus_measure_their_own_nodes(lab: Lab, prepared: Path
         second = Service(other, Station(other, home)).start("--detection", "transparent")
         with second.client() as asked, lab.service.client() as own:
             until(lambda: [node["uuid"] for node in asked.nodes() if node["present"]] == [lab.node.uuid])
-            until(lambda: asked.node(lab.node.uuid)["verdict"] or asked.node(lab.node.uuid)["problem"])
+            until(lambda: asked.node(lab.node.uuid)["verified"] or asked.node(lab.node.uuid)["problem"])
             assert lab.flows()["measuring"]["state"] == "running"
             assert [one.status()["links"][0]["notice"] for one in (asked, own)] == [None, None]
         second.end()

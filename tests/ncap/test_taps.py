@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 
 from tests.e2e.desk import ANGLE, Desk
-from tests.ncap.service import Service
+from tests.ncap.service import Service, verdict
 from tests.pace import until
 
 pytestmark = pytest.mark.link
@@ -43,7 +43,7 @@ def test_a_provisioning_waits_for_the_tap_and_every_step_is_told(desk: Desk) -> 
         tapped = next(one for one in events if one.get("event") == "node" and one["state"] == "tapped")
         assert tapped["uuid"] == node.uuid
         found = asked.node(node.uuid)
-        assert (found["name"], found["verdict"], found["via"]) == ("crane", "authentic", "nfc")
+        assert (found["name"], verdict(found), found["via"]) == ("crane", "authentic", "nfc")
         node.stop()
         until(lambda: not asked.node(node.uuid)["present"])
         node.start()  # a tap that nobody asked for anything: it is looked at
@@ -63,7 +63,7 @@ def test_the_next_board_that_is_tapped_is_provisioned_whichever_it_is(desk: Desk
 
 def service_run(asked: Any, uuid: str) -> Any:
     found = next((one for one in asked.nodes() if one["uuid"] == uuid), None)
-    if found is None or found["verdict"] != "authentic":
+    if found is None or verdict(found) != "authentic":
         return None
     run = asked.request("GET", f"/nodes/{uuid}/provision")
     return run if run["state"] in ("done", "failed") else None
@@ -77,5 +77,6 @@ def test_a_command_borrows_the_reader_and_gives_it_back(desk: Desk) -> None:
         done = service.station.provision("nfc", "--profile", ANGLE)
         assert (done["uuid"], done["verdict"]) == (node.uuid, "authentic")
         until(lambda: asked.status()["links"][1]["state"] == "up")
-        until(lambda: asked.node(node.uuid)["verdict"] == "authentic")
+        until(lambda: asked.node(node.uuid)["verified"])
+        assert verdict(asked.node(node.uuid)) == "authentic"
     service.end()

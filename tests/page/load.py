@@ -60,7 +60,11 @@ def run(browser: Browser, lab: Lab, seconds: float) -> Load:
     with client.connect(home=lab.station.home) as station:
         asked = [{"profile": "tactile-finger-sensor", "name": name, "source": "sine:3"} for name in ("index", "thumb")]
         uuids = [station.request("POST", "/virtual", one)["uuid"] for one in asked]
-        until(lambda: all(station.node(uuid)["verdict"] == "authentic" for uuid in uuids), "not provisioned", 30)
+        until(
+            lambda: all((station.node(uuid)["verdict"] or {}).get("verdict") == "authentic" for uuid in uuids),
+            "not provisioned",
+            30,
+        )
         with opened(browser, lab, route="measure") as page:
             kept = station.request("POST", "/measurements", {"uuids": uuids, "rate": RATE})["id"]
             until(lambda: told(page)["received"] > RATE * SHOWN, "no points arrive", 30)

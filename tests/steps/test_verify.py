@@ -167,7 +167,7 @@ def on_node(station: Station, board: Board) -> Verified:
     with talk(board) as node:
         who = identify(station, node)
         require_session(station, node)
-        return verify_node(station, node, read_image(node), who.point)
+        return verify_node(station, node, read_image(node), who.point).verified
 
 
 def test_a_provisioned_node_is_authentic(station: Station, board: Board, image: Image) -> None:

@@ -32,11 +32,18 @@ def _status(console: Console, found: dict[str, Any]) -> None:
     for node in found["nodes"]:
         there = "there" if node["present"] else "away"
         name = shown(node["name"]) or "no name"
-        console.print(f"{node['uuid']}  {name}  {there}  {node['verdict'] or 'not looked at yet'}", markup=False)
+        console.print(f"{node['uuid']}  {name}  {there}  {_verdict(node)}", markup=False)
     for one in found.get("measurements", ()):
         console.print(f"measurement {one['id']}: {one['state']}", markup=False)
     for one in found.get("sinks", ()):
         console.print(f"{shown(one['name'])}: {one['state']}, {one['dropped']} dropped", markup=False)
+
+
+def _verdict(node: dict[str, Any]) -> str:
+    if node["verdict"] is None:
+        return "not looked at yet"
+    kept = " (all but its Security TEDS as last read)" if node["verdict"]["from"] == "kept" else ""
+    return f"{node['verdict']['verdict']}{kept}"
 
 
 def _link(link: dict[str, Any]) -> str:

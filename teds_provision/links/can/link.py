@@ -67,6 +67,7 @@ class CanLink:
         self.address = address
         self._last = 0
         self.left = self.came = 0.0  # see links.ports.Timed
+        self.gap = 0  # see links.ports.Spaced
         self._reply_seconds = REPLY_SECONDS if reply_seconds is None else reply_seconds
 
     @property
@@ -140,6 +141,7 @@ class CanLink:
         bus = self._bus()
         try:
             with bus.line(self.address, self._source).exchange(transaction) as line:
+                line.gap = self.gap
                 exchange = _Exchange(bus, line, bytes([transaction]) + frame, tries, seconds, prompt=prompt)
                 self.left = self.left or time.monotonic()
                 reply, self.came = exchange.run()

@@ -120,6 +120,7 @@ class Line:
     partial: Reassembly | None = None
     gathering: Gathering | None = None
     heard_at: float = 0.0
+    gap: int = 0  # ms that the node is asked to leave between the frames of its reply
     asked: deque[int] = field(default_factory=lambda: deque(maxlen=_REMEMBERED))
 
     @contextmanager
@@ -331,7 +332,7 @@ class SharedBus:
             elif other is not None and not other.number:
                 return  # the same frame twice
             line.partial, line.gathering = partial, None
-            self._reply(flow(line.node, line.own, CONTINUE, fd=frame.fd))
+            self._reply(flow(line.node, line.own, CONTINUE, fd=frame.fd, gap=line.gap))
             line.events.put(Event("begun"))
         elif self._gathered(line, frame, transaction):
             return
@@ -362,7 +363,7 @@ class SharedBus:
                 line.partial = None
                 line.events.put(Event("whole", bytes(partial.octets), frame.at))
             case "block":
-                self._reply(flow(line.node, line.own, CONTINUE, fd=partial.fd))
+                self._reply(flow(line.node, line.own, CONTINUE, fd=partial.fd, gap=line.gap))
             case "torn":
                 line.partial = None
                 self._reply(flow(line.node, line.own, OVERFLOW, fd=partial.fd))  # it need not send the rest

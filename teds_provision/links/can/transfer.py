@@ -73,9 +73,12 @@ class Reassembly:
         return "more"
 
 
-def flow(peer: int, own: int, status: int, *, fd: bool) -> Frame:
-    """A flow control frame to ``peer``: 16 frames a block, no gap (profile.md, "CAN")."""
-    return Frame(physical_id(peer, own), padded(bytes([status, BLOCK_SIZE, 0]), fd=fd), fd)
+def flow(peer: int, own: int, status: int, *, fd: bool, gap: int = 0) -> Frame:
+    """A flow control frame to ``peer``: 16 frames a block, and ``gap`` ms (0 to 127) between them (profile.md, "CAN").
+
+    Without a gap a reply takes the bus, as it goes before all data; with one the data find room between its frames.
+    """
+    return Frame(physical_id(peer, own), padded(bytes([status, BLOCK_SIZE, gap]), fd=fd), fd)
 
 
 def first_frame(body: bytes, *, fd: bool) -> tuple[bytes, bytes]:

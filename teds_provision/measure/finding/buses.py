@@ -5,6 +5,7 @@ Measurements, detection and commands share them: they are opened once, and close
 
 from __future__ import annotations
 
+import threading
 from collections.abc import Callable, Iterable, Sequence
 from types import TracebackType
 
@@ -28,6 +29,8 @@ class Bus:
         self, port: CanPort | BlePort, hearing: Hearing, share: BusShare, lookout: Lookout | AirLookout
     ) -> None:
         self.port, self.hearing, self.share, self.lookout = port, hearing, share, lookout
+        self.reading = threading.Lock()
+        """Held while a datasheet is read behind a measurement: one node at a time."""
 
     @property
     def place(self) -> str:

@@ -8,6 +8,7 @@ from collections.abc import Callable
 
 from teds_provision.errors import (
     BadData,
+    BadDatasheet,
     Bug,
     NodeRefused,
     NotAuthentic,
@@ -26,6 +27,7 @@ class Patience:
 
     def __init__(self, timeout: float | None) -> None:
         self._until = math.inf if timeout is None else time.monotonic() + timeout
+        self._ends = timeout is not None
 
     def has_run(self) -> None:
         """Its first value is there: from now on anyone could have sent a refusal, so it is tried again for ever."""
@@ -47,8 +49,8 @@ class Patience:
         ``proven``: the error came in a session. Outside one anybody on the bus can have given himself the node's UUID
         and refuse to open one: then it is looked for ``elsewhere``.
         """
-        if self.left == math.inf:
-            return False
+        if self.left == math.inf:  # a datasheet that was changed under its values ends what has an end
+            return self._ends and proven and isinstance(error, BadDatasheet)
         passing = isinstance(error, NodeRefused) and error.reason in CURED_BY_TIME
         if not isinstance(error, _FINAL) or passing:
             return not self.left

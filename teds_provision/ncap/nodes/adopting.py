@@ -11,7 +11,7 @@ from collections.abc import Callable
 from typing import Any
 
 from teds_provision.ncap.live import Live
-from teds_provision.ncap.nodes.roster import Roster, check_lines
+from teds_provision.ncap.nodes.roster import Roster
 from teds_provision.ncap.nodes.virtual import Virtuals
 from teds_provision.protocol.messages.identity import NodeState
 from teds_provision.station.station import Station
@@ -74,7 +74,7 @@ class Adopting:
         return done.verified
 
     def _note(self, uuid: str, *, verified: float, verdict: Verified) -> None:
-        facts: dict[str, Any] = {"verdict": verdict.verdict, "checks": check_lines(verdict.checks), "looked": verified}
+        facts: dict[str, Any] = {"verdict": verdict.verdict, "heard": None, "looked": verified}
         self._roster.show_sheet(uuid, None)
         self._roster.refresh([uuid])
         self._roster.note(uuid, "verified", problem=None, **facts)

@@ -16,9 +16,11 @@ from teds_provision.protocol.operation.commands import POWER, Power
 from teds_provision.station.station import Station
 from teds_provision.steps.agree import session_if_keyed
 from teds_provision.steps.identify import Identified, identify
-from teds_provision.steps.read import list_blocks, read_block
+from teds_provision.steps.read import list_blocks, read_block, read_identity, read_image
+from teds_provision.steps.reading import Judged, is_keyed, keep
 from teds_provision.steps.verify import Verified, known_of, session, verify_image
 from teds_provision.steps.verify_node import look_in_session
+from teds_provision.store import utc_now
 from teds_provision.talk.conversation import Conversation
 from teds_provision.teds.image import SECURITY, Image
 from teds_provision.teds.sheet import Sheet
@@ -32,15 +34,12 @@ STRANGERS_SECONDS: Final = 60.0
 class Look:
     """What was found out. ``sheet`` is that of a node whose datasheet is not kept here, None otherwise.
 
-    ``in_session``: the node's row of reading says it all; else it is shown beside that row. ``kept``: but for its
-    Security TEDS the datasheet is still to be read.
+    A ``judged`` that came in no session is shown beside the node's row of reading, and changes no row.
     """
 
-    verified: Verified
+    judged: Judged
     sheet: Sheet | None = None
     power: dict[str, Any] | None = None
-    in_session: bool = False
-    kept: bool = False
 
 
 def is_listed(station: Station, uuid: bytes) -> bool:
@@ -64,9 +63,19 @@ def _in_session(station: Station, node: Conversation) -> Look | None:
     if session_if_keyed(station, node) is None:
         return None
     looked = look_in_session(station, node, by="ncap")
-    image, verified = looked.image, looked.verified
-    sheet = Sheet.of(image) if verified.verdict == "not authentic" else None
-    return Look(verified, sheet, power_of(node), in_session=True, kept=looked.kept)
+    sheet = Sheet.of(looked.image) if looked.verified.verdict == "not authentic" else None
+    return Look(looked.judged, sheet, power_of(node))
+
+
+def read_anew(station: Station, node: Conversation) -> tuple[Image, Judged] | None:
+    """Read every TEDS of a node in a session, and keep that reading; None where no session comes about."""
+    if session_if_keyed(station, node) is None:
+        return None
+    c, identity = node.c, read_identity(node)
+    image = read_image(node)
+    known = known_of(station, node.uuid, identity)
+    with station.durable("read"):
+        return image, keep(station, node, image, by="ncap", known=known, c=c)
 
 
 def _stranger(station: Station, node: Conversation, who: Identified) -> Look:
@@ -81,9 +90,9 @@ def _stranger(station: Station, node: Conversation, who: Identified) -> Look:
             raise BadData(f"TEDS {block[1]} of channel {block[0]} has {len(octets)} octets: too long for a stranger's.")
         blocks[block] = octets
     image = Image(node.uuid, blocks)
-    why = "the node opens no session under any key that is held here" if station.keys.held(node.uuid) else ""
+    why = "the node opens no session under any key that is held here" if is_keyed(station, node.uuid) else ""
     checks = (*verify_image(station, image, known=known_of(station, node.uuid, None)), session("", why))
-    return Look(Verified(node.uuid, checks), Sheet.of(image))
+    return Look(Judged(Verified(node.uuid, checks), "plain", utc_now(), "ncap"), Sheet.of(image))
 
 
 def power_of(node: Conversation) -> dict[str, Any] | None:

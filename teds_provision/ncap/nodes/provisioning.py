@@ -20,7 +20,7 @@ from teds_provision.links.ports import Notice
 from teds_provision.ncap.live import Live
 from teds_provision.ncap.nodes.desk import Desk, Errand
 from teds_provision.ncap.nodes.looking import as_problem
-from teds_provision.ncap.nodes.roster import Roster, check_lines
+from teds_provision.ncap.nodes.roster import Roster
 from teds_provision.protocol.messages.frames import Reason
 from teds_provision.station.station import Station
 from teds_provision.steps.build_order import BuildOrder, prepare
@@ -171,8 +171,7 @@ class Provisioning:
         self._roster.show_sheet(uuid, None)
         with suppress(TedsProvisionError):
             self._roster.refresh([uuid])
-        checks = check_lines(done.verified.checks)
-        self._roster.note(uuid, "verified", verdict=run.verdict, checks=checks, looked=time.time(), problem=None)
+        self._roster.note(uuid, "verified", verdict=run.verdict, heard=None, looked=time.time(), problem=None)
         self._tell(run)
 
     def _fail(self, run: Run, error: dict[str, str]) -> None:

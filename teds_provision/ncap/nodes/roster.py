@@ -9,14 +9,15 @@ import json
 import math
 import threading
 import time
-from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
 from datetime import UTC, datetime
 from typing import Any, Final
 
 from teds_provision.ncap.live import Live
 from teds_provision.station.station import Station
-from teds_provision.steps.inventory import inventory
+from teds_provision.steps.inventory import with_verdicts
+from teds_provision.steps.reading import Judged
 from teds_provision.store import Search
 from teds_provision.store.records import iso
 from teds_provision.teds.sheet import Channel, Sheet
@@ -37,8 +38,7 @@ class Seen:
     seen: float = 0.0
     tapped: float = 0.0
     says: str | None = None  # its state by a plain Identify: a hint, for who is not known
-    verdict: str | None = None
-    checks: list[dict[str, str]] = field(default_factory=list)
+    heard: dict[str, Any] | None = None  # the verdict on what it last said in no session: shown beside, never instead
     looked: float = 0.0
     problem: dict[str, str] | None = None
     power: dict[str, Any] | None = None
@@ -59,6 +59,7 @@ class Roster:
         self._lock, self._reading = threading.RLock(), threading.Lock()
         self._seen: dict[str, Seen] = {}
         self._rows: dict[str, dict[str, Any]] = {}
+        self._judged: dict[str, Judged | None] = {}  # as the store and today's trust have it, beside each row
         self._channels: dict[str, tuple[str, list[dict[str, Any]]]] = {}
         self.changes = 0  # grows with each change of a node's name or datasheet
         self._strangers: dict[str, set[str]] = {}
@@ -71,13 +72,16 @@ class Roster:
         with self._reading:  # what was read earlier never takes the place of what was read later
             every = self._station.nodes.find(Search()) if uuids is None else map(bytes.fromhex, dict.fromkeys(uuids))
             wanted = list(every)
-            rows = {row["uuid"]: row for row in inventory(self._station, wanted)}
+            found = list(with_verdicts(self._station, wanted))
+            rows = {row["uuid"]: row for row, _ in found}
+            judged = {row["uuid"]: verdict for row, verdict in found}
             with self._lock:
                 self.changes += 1
                 if uuids is None:
-                    self._rows = rows
+                    self._rows, self._judged = rows, judged
                 else:
                     self._rows |= rows
+                    self._judged |= judged
 
     def _sheet(self, uuid: str) -> list[dict[str, Any]]:
         """The channels of the datasheet that a node had last; decoded once for each datasheet."""
@@ -106,6 +110,7 @@ class Roster:
 
     def note(self, uuid: str, state: str | None = None, **facts: Any) -> None:
         """Change what is known of a node; with ``state`` every client is told (``came``, ``left``, ``verified`` …)."""
+        verdict = facts.pop("verdict", None)  # for the event: what is shown is judged from the row of reading
         with self._lock:
             seen = self._seen.setdefault(uuid, Seen())
             seen.version += 1
@@ -114,7 +119,8 @@ class Roster:
             if state == "left":
                 self._forget_strangers()
         if state is not None:
-            told = {key: value for key, value in facts.items() if key in ("verdict", "problem", "place", "busy")}
+            told = {key: value for key, value in facts.items() if key in ("problem", "place", "busy")}
+            told |= {} if verdict is None else {"verdict": verdict}
             self._live.event("node", uuid=uuid, state=state, **told)
 
     def _forget_strangers(self) -> None:
@@ -227,10 +233,9 @@ class Roster:
                 "epoch": row.get("epoch", 0),
                 "sequence": row.get("sequence", 0),
                 "due": row.get("due"),
-                "verdict": seen.verdict,
-                "known_verdict": row.get("verdict"),
+                **self._verdicts(uuid, seen),
                 "verified": _moment(seen.looked),
-                "checks": seen.checks,
+                "retired": row.get("retired"),
                 "problem": seen.problem,
                 "busy": seen.busy or None,
                 "group": row.get("group"),
@@ -243,6 +248,16 @@ class Roster:
         out["mode"] = _mode(seen)
         out["channels"] = [{**one, **self._now(uuid, one["number"])} for one in channels]
         return out
+
+    def _verdicts(self, uuid: str, seen: Seen) -> dict[str, Any]:
+        """The one verdict on a node, from its row of reading; and beside it what it said in no session.
+
+        Of a node that was never read in a session, nor kept, the latter is all that is known.
+        """
+        judged = self._judged.get(uuid)
+        if judged is None or (judged.origin == "plain" and seen.heard is not None):
+            return {"verdict": seen.heard, "heard": None}
+        return {"verdict": judged.to_json(), "heard": seen.heard}
 
     def _now(self, uuid: str, channel: int) -> dict[str, Any]:
         """What changes of a channel."""
@@ -290,11 +305,6 @@ def channel_facts(one: Channel) -> dict[str, Any]:
         "overdue": one.overdue(now),
         "problem": one.value_problem or None,
     }
-
-
-def check_lines(checks: Sequence[Any]) -> list[dict[str, str]]:
-    """Checks as the API shows them."""
-    return [{"name": one.name, "result": one.result, "why": one.why} for one in checks]
 
 
 def _finite(number: float) -> float | None:

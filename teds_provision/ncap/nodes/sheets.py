@@ -10,14 +10,16 @@ from typing import TYPE_CHECKING, Any, Final
 from teds_provision.errors import BadData, NotFound, TedsProvisionError, UsageFailure
 from teds_provision.lazy import late
 from teds_provision.ncap.nodes.desk import Desk
-from teds_provision.ncap.nodes.roster import Roster, check_lines
+from teds_provision.ncap.nodes.looking import read_anew
+from teds_provision.ncap.nodes.roster import Roster
 from teds_provision.station.station import Station
-from teds_provision.steps.agree import session_if_keyed
 from teds_provision.steps.build_order import guard
 from teds_provision.steps.identify import identify
-from teds_provision.steps.read import read_identity, read_image
+from teds_provision.steps.read import read_image
+from teds_provision.steps.reading import Judged, is_keyed, verdict_of
 from teds_provision.steps.verify import Verified, known_of, session, verify_image
 from teds_provision.steps.visits.sheet_file import SheetPlan, plan_sheet, write_sheet
+from teds_provision.store import utc_now
 from teds_provision.talk.conversation import Conversation
 from teds_provision.talk.progress import Silent, StepResult
 from teds_provision.teds.calibration.decoded import is_finite
@@ -41,7 +43,7 @@ class ReadSheet:
     """What a node has, or had when it was last read (``now`` False)."""
 
     image: Image
-    verified: Verified
+    judged: Judged
     now: bool
 
 
@@ -54,38 +56,28 @@ class Sheets:
     def read(self, uuid: str) -> ReadSheet:
         """From the node where it is on a bus, else as it was last read; raises NotFound, and what reading raises."""
         held = self._measured(uuid)
-        if held is not None:
-            return ReadSheet(held, self._judged(held, "verified in the session that measures it"), True)
-        if self._desk.on_a_bus(uuid):
+        if held is None and self._desk.on_a_bus(uuid):
             found = self._desk.with_node(uuid, "its datasheet is read", self._read)
             self._roster.refresh([uuid])
             return found
-        kept = self._station.nodes.datasheet(bytes.fromhex(uuid))
-        if kept is None:
+        kept = held or self._station.nodes.datasheet(bytes.fromhex(uuid))
+        judged = verdict_of(self._station, bytes.fromhex(uuid))
+        if kept is None or judged is None:
             raise NotFound(
                 f"The datasheet of node {uuid} was never read.", hint="Connect it to the bus, or hold it to the reader."
             )
-        return ReadSheet(kept, self._judged(kept, ""), False)
-
-    def _judged(self, image: Image, opened: str) -> Verified:
-        checks = verify_image(self._station, image, known=known_of(self._station, image.uuid, None))
-        return Verified(image.uuid, (*checks, session(opened, "")), scope="node" if opened else "image")
+        return ReadSheet(kept, judged, now=held is not None)
 
     def _read(self, node: Conversation) -> ReadSheet:
         station = self._station
-        held = session_if_keyed(station, node)
-        if held is None:
-            identify(station, node)
+        found = read_anew(station, node)
+        if found is not None:
+            return ReadSheet(*found, now=True)
+        identify(station, node)
         image = read_image(node)
-        identity = read_identity(node) if held is not None else None
-        checks = verify_image(station, image, known=known_of(station, node.uuid, identity))
-        why = "" if held is not None or not station.keys.held(node.uuid) else "it opens no session under our key"
-        checks.append(session("opened under the key that is held here" if held is not None else "", why))
-        verified = Verified(node.uuid, tuple(checks))
-        if held is not None and verified.verdict != "not authentic":
-            with station.durable("read"):
-                station.nodes.keep_datasheet(image)
-        return ReadSheet(image, verified, True)
+        why = "it opens no session under our key" if is_keyed(station, node.uuid) else ""
+        checks = (*verify_image(station, image, known=known_of(station, node.uuid, None)), session("", why))
+        return ReadSheet(image, Judged(Verified(node.uuid, checks), "plain", utc_now(), "ncap"), now=True)
 
     def document(self, uuid: str, form: str) -> tuple[str, str]:
         """The datasheet as a document, and its media type; raises UsageFailure for a format that is none of ours."""
@@ -107,8 +99,7 @@ class Sheets:
         return {
             "uuid": uuid,
             "read_now": found.now,
-            "verdict": found.verified.verdict,
-            "checks": check_lines(found.verified.checks),
+            **found.judged.to_json(),
             "teds": teds,
             "guard": self._guarded(found.image),
             "curves": curves(blocks),

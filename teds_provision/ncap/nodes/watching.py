@@ -26,8 +26,8 @@ from teds_provision.measure.finding.sightings import Sighting
 from teds_provision.measure.finding.sources import sole_user
 from teds_provision.ncap.live import Live
 from teds_provision.ncap.nodes.leaving import StillThere
-from teds_provision.ncap.nodes.looking import Look, as_problem, is_listed, look
-from teds_provision.ncap.nodes.roster import Roster, check_lines
+from teds_provision.ncap.nodes.looking import Look, as_problem, is_listed, look, read_anew
+from teds_provision.ncap.nodes.roster import Roster
 from teds_provision.ncap.nodes.turns import Turns
 from teds_provision.station.station import Station
 from teds_provision.talk.conversation import Conversation, SessionLost
@@ -91,6 +91,7 @@ class Watch:
         self._stop, self._anew = threading.Event(), threading.Event()
         self._workers = ThreadPoolExecutor(WORKERS, thread_name_prefix=f"look {place[:20]}")
         self._for_strangers = ThreadPoolExecutor(STRANGERS, thread_name_prefix=f"stranger {place[:20]}")
+        self._for_rest = ThreadPoolExecutor(1, thread_name_prefix=f"rest {place[:20]}")
         self._strangers_told, self._strangers_at = 0, -TELL_STRANGERS
         self._pending: set[str] = set()
         self._guard = threading.Lock()
@@ -110,7 +111,7 @@ class Watch:
     def join(self, seconds: float) -> None:
         """Wait for its end, and close the link."""
         self._thread.join(seconds)
-        for workers in (self._workers, self._for_strangers):
+        for workers in (self._workers, self._for_strangers, self._for_rest):
             workers.shutdown(wait=False, cancel_futures=True)
         port, self.port = self.port, None
         if port is not None:
@@ -359,9 +360,32 @@ class Watch:
         self._roster.note(
             uuid,
             "verified",
-            verdict=found.verified.verdict,
-            checks=check_lines(found.verified.checks),
+            verdict=found.judged.verified.verdict,
+            heard=found.judged.to_json() if found.judged.origin == "plain" else None,
             looked=time.time(),
             power=found.power,
             problem=None,
         )
+        if found.judged.origin == "kept" and not node.contact.link.capabilities.tapped:
+            self._for_rest.submit(self._read_rest, node.contact)
+
+    def _read_rest(self, contact: Contact) -> None:
+        """Read all of a node that has started since it was read, one node of the link at a time.
+
+        One that is measured meanwhile is read by its measurement, in what its data leave free.
+        """
+        uuid = contact.identity.uuid.hex()
+        try:
+            with (
+                self._turns.of(uuid, "the rest of its datasheet is read"),
+                Conversation(contact, notice=self._notice) as node,
+            ):
+                found = read_anew(self._station, node)
+        except (TedsProvisionError, SessionLost):
+            return  # it was not read: what is shown stays as it was kept, and is read at the next look
+        except Exception:  # noqa: BLE001 - a worker has nobody else who would tell of it
+            _log.exception("Reading the rest of node %s failed.", uuid)
+            return
+        self._roster.refresh([uuid])
+        if found is not None:
+            self._roster.note(uuid, "verified", verdict=found[1].verified.verdict, looked=time.time())

@@ -28,8 +28,9 @@ def ref(name: str) -> Schema:
 
 
 def members(required: str = "", *, closed: bool = False, **properties: Schema) -> Schema:
-    """An object; ``required`` are names with spaces between, ``closed`` takes no others."""
-    out: Schema = {"type": "object", "properties": properties}
+    """An object; ``required`` are names with spaces between, ``closed`` takes no others; ``from_`` stands for from."""
+    named = {name.removesuffix("_"): schema for name, schema in properties.items()}
+    out: Schema = {"type": "object", "properties": named}
     if required:
         out["required"] = required.split()
     if closed:
@@ -94,8 +95,16 @@ SCHEMAS: Final[dict[str, Schema]] = {
         invalid_why=listed(members("channel why count", channel=INTEGER, why=text(), count=INTEGER)),
         clock_error=maybe("number", description="seconds"),
     ),
+    "Verdict": members(
+        "verdict checks from at by",
+        verdict=text(enum=["authentic", "unsigned", "unverified", "not authentic", "unproven"]),
+        checks=listed(ref("Check")),
+        at=text(),
+        by=text(),
+        from_=text(enum=["session", "kept", "plain"]),
+    ),
     "Node": members(
-        "uuid name link via present state verdict checks problem channels groups measurement power whitelisted virtual",
+        "uuid name link via present state verdict heard problem channels groups measurement power whitelisted virtual",
         uuid=UUID,
         name=maybe("string"),
         profile=maybe("string"),
@@ -113,10 +122,10 @@ SCHEMAS: Final[dict[str, Schema]] = {
         epoch=INTEGER,
         sequence=INTEGER,
         due=maybe("string"),
-        verdict=maybe("string", enum=["authentic", "unsigned", "not authentic", "unproven", None]),
-        known_verdict=maybe("string"),
+        verdict=or_null(ref("Verdict")),
+        heard=or_null(ref("Verdict")),
         verified=maybe("string"),
-        checks=listed(ref("Check")),
+        retired=maybe("string"),
         problem=or_null(ref("Problem")),
         busy=maybe("string"),
         group=maybe("string"),
@@ -206,14 +215,17 @@ SCHEMAS: Final[dict[str, Schema]] = {
     ),
     "Finding": members("severity message hint", severity=text(), message=text(), hint=text()),
     "Sheet": members(
-        "uuid read_now verdict checks teds guard curves",
+        "uuid read_now verdict checks from at by teds guard curves",
         uuid=UUID,
         read_now=FLAG,
         verdict=text(),
+        at=text(),
+        by=text(),
         checks=listed(ref("Check")),
         teds=listed({"type": "object"}),
         guard=listed(ref("Finding")),
         curves=listed(members("channel name x_unit y_unit points", channel=INTEGER, points=listed(listed(NUMBER)))),
+        from_=text(enum=["session", "kept", "plain"]),
     ),
     "SheetPlan": members(
         "uuid dry_run changes guard steps verdict",

@@ -114,7 +114,7 @@ def write_sheet(
         step.result = DONE if written.octets else NOTHING
         step.detail = f"{written.octets} octets" if written.octets else ""
     with steps.step("verify") as step:
-        verified = verify_node(station, node, written.on_node, keys.key, by="write")
+        verified = verify_node(station, node, written.on_node, keys.key, by="write").verified
         step.detail = verified.verdict
     require_authentic(verified)
     return SheetWritten(plan, tuple(steps.done), verified)

@@ -96,14 +96,15 @@ export function grouped(hex) {
 const VERDICTS = {
   authentic: ["good", "good", "Authentic", "Signature, trust and key proof hold."],
   unproven: ["warn", "ask", "Unproven", "The node could not prove that it holds its key."],
+  unverified: ["warn", "warn", "Unverified", "It was keyed here as it came: nobody signed this datasheet."],
   unsigned: ["warn", "warn", "Unsigned", "Nobody signed this datasheet."],
   "not authentic": ["bad", "bad", "Not authentic", "A check failed: do not trust its values."],
 };
 
 /** Tone, sign, word and meaning of the verdict on a node or a datasheet. */
 export function verdict(of) {
-  if (VERDICTS[of.verdict]) return VERDICTS[of.verdict];
-  const earlier = VERDICTS[of.earlier];
-  if (earlier) return ["plain", "clock", `${earlier[2]} when last read`, "It was not looked at since this station started."];
+  const known = VERDICTS[of.verdict];
+  if (known && of.from === "kept") return [...known.slice(0, 3), `${known[3]} All but its Security TEDS is as it was last read.`];
+  if (known) return known;
   return ["plain", "ask", "Not checked", "Nobody has verified this node yet."];
 }

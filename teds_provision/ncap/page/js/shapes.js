@@ -54,14 +54,18 @@ function power(wire) {
   };
 }
 
-/** A node; `known_verdict` is what was said of it before it was looked at now. */
+/** A node; its verdict is judged from the station's one row of reading, `heard` is what it said in no session. */
 export function node(wire) {
   return {
     ...wire,
     name: wire.name ?? "",
     link: wire.via ?? null,
     seen: moment(wire.last_seen),
-    earlier: wire.verdict ? null : (wire.known_verdict ?? null),
+    verdict: wire.verdict?.verdict ?? null,
+    checks: wire.verdict?.checks ?? [],
+    from: wire.verdict?.from ?? null,
+    read: wire.verdict ? { at: moment(wire.verdict.at), by: wire.verdict.by } : null,
+    looked: moment(wire.verified),
     why: wire.problem?.message ?? "",
     cure: wire.problem?.hint ?? "",
     groups: wire.groups ?? [],

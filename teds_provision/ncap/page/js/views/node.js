@@ -46,7 +46,9 @@ export class NodePanel {
     if (!node) return;
     text(this.title, nameOf(node));
     const [tone, sign, words, why] = verdict(node);
-    fill(this.head, chip(tone, sign, words, why), node.whitelisted ? chip("plain", "list", "On the whitelist") : null, facts(node), node.why ? h("span", { class: "warn" }, icon("warn"), node.why, node.cure ? ` ${node.cure}` : "") : null);
+    const heard = node.heard && node.heard.verdict !== node.verdict ? chip("warn", "ask", `Heard in no session: ${node.heard.verdict}`, "Anyone on the link could have said this: it changes nothing.") : null;
+    const kept = node.from === "kept" ? chip("plain", "clock", "Kept", "It has started since its datasheet was read: the rest is being read again.") : null;
+    fill(this.head, chip(tone, sign, words, why), kept, heard, node.whitelisted ? chip("plain", "list", "On the whitelist") : null, facts(node), node.why ? h("span", { class: "warn" }, icon("warn"), node.why, node.cure ? ` ${node.cure}` : "") : null);
     const checks = node.checks ?? [];
     this.checks.hidden = !checks.length && !node.fingerprint;
     const passed = checks.filter((check) => check.result === "passed").length;

@@ -90,7 +90,7 @@ export function nodesView(main, rest) {
     else element.firstChild.removeAttribute("aria-current");
     element.classList.toggle("tapped", state.tapped?.uuid === node.uuid && performance.now() - state.tapped.at < MARKED);
     element.classList.toggle("absent", node.present === false);
-    const told = JSON.stringify([node.name, node.verdict, node.earlier, node.busy, node.virtual, node.link, node.present, node.state, node.mode, node.power, node.groups, node.whitelisted, node.channels?.map((one) => one.name)]);
+    const told = JSON.stringify([node.name, node.verdict, node.from, node.busy, node.virtual, node.link, node.present, node.state, node.mode, node.power, node.groups, node.whitelisted, node.channels?.map((one) => one.name)]);
     if (element.told === told) return;
     element.told = told;
     const [tone, sign, words, why] = verdict(node);
