@@ -35,7 +35,7 @@ OPTIONS: Final[dict[str, frozenset[str]]] = {
     "log": frozenset({"follow", "last", "today", "since", "act", "failed"}),
     "trace show": frozenset({"messages", "whole"}),
     "show": frozenset({"format", "edition", "diff", "plot", "strict"}),
-    "measure": frozenset({"rate", "duration", "channel", "kind", "trigger", "test-pattern", "unsigned", "to", "ros1", "ros2", "mqtt", "actuators", "dead-man", "require", "scalar-rate", "via", "nfc", "can", "ble", "timeout", "trace"}),
+    "measure": frozenset({"rate", "duration", "channel", "kind", "trigger", "test-pattern", "unsigned", "to", "output", "ros1", "ros2", "mqtt", "actuators", "dead-man", "require", "scalar-rate", "via", "nfc", "can", "ble", "timeout", "trace"}),
     "sample": frozenset({"via", "nfc", "can", "ble", "timeout", "trace"}),
     "set": frozenset({"unit", "hold", "dead-man", "via", "nfc", "can", "ble", "timeout", "trace"}),
     "mode": frozenset({"via", "nfc", "can", "ble", "timeout", "trace"}),

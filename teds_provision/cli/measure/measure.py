@@ -5,7 +5,7 @@ from __future__ import annotations
 import threading
 from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -19,7 +19,7 @@ from teds_provision.cli.context import App, pass_app
 from teds_provision.cli.measure.values import ending, over_the_bus
 from teds_provision.cli.options import Channel, FileToRead, Number, WholeNumber, command, link_options
 from teds_provision.cli.steps.build import read_file
-from teds_provision.errors import UsageFailure
+from teds_provision.errors import BadData, UsageFailure
 from teds_provision.links import LINKS, LinkSettings, ble, can
 from teds_provision.store import Measurement
 
@@ -27,8 +27,10 @@ if TYPE_CHECKING:
     from teds_provision.measure.runner import Ended
     from teds_provision.measure.running.job import Job
     from teds_provision.measure.running.requirements import Requirements
+    from teds_provision.measure.sinks.mcap.recover import Recovered
     from teds_provision.station.station import Station
 
+MOST_NAMED = 3
 KINDS = ("periodic", "event", "free")
 
 
@@ -47,6 +49,12 @@ KINDS = ("periodic", "event", "free")
 @click.option("--test-pattern", is_flag=True, help="Stream the test pattern and check it: no measurement.")
 @click.option("--unsigned", is_flag=True, help="Also raw values of nodes whose datasheet nobody has signed, marked.")
 @click.option("--to", "files", multiple=True, metavar="FILE", help="Record: .csv, .txt, .mcap, .jsonl.")
+@click.option(
+    "--output",
+    type=click.Path(path_type=Path),
+    metavar="FILE",
+    help="Of recover: write what is whole to this new file.",
+)
 @click.option("--ros1", is_flag=True, help="Publish to ROS 1 (ROS_MASTER_URI).")
 @click.option("--ros2", is_flag=True, help="Publish to ROS 2 (ROS_DOMAIN_ID), on this machine.")
 @click.option("--mqtt", metavar="URL", help="Publish to a broker: mqtt://HOST, with Home Assistant discovery.")
@@ -67,15 +75,19 @@ def measure(
     files: Sequence[str],
     mqtt: str | None,
     require: Path | None,
+    output: Path | None,
     **wished: Any,
 ) -> None:
     """Measure a group or nodes: session, datasheet verified, claim, stream; ends by Ctrl-C or --duration.
 
-    `measure recover FILE` makes a recording whole that was cut.
+    `measure recover FILE` makes a recording whole that was cut. Where it is damaged inside it stays as it is, and all
+    but the damaged chunks goes to FILE.recovered, or to --output (exit 8).
     """
     if what[0] == "recover":
-        _recover(app, what[1:])
+        _recover(app, what[1:], output)
         return
+    if output is not None:
+        raise UsageFailure("--output is for `measure recover`.", hint="Record with --to FILE.")
     links = over_the_bus(links, streams=True)
     if mqtt is not None and not mqtt.startswith(("mqtt://", "mqtts://")):
         raise UsageFailure(f"--mqtt {mqtt!r} names no broker.", hint="Write it like mqtt://HOST or mqtts://USER@HOST.")
@@ -204,14 +216,30 @@ def _stream_line(uuid: str, stream: Mapping[str, Any]) -> str:
     return f"{uuid}: {stream['samples']} values in {stream['messages']} messages, {lost}{f' ({why})' if why else ''}"
 
 
-def _recover(app: App, files: Sequence[str]) -> None:
+def _recover(app: App, files: Sequence[str], output: Path | None) -> None:
     if len(files) != 1:
         raise UsageFailure("Name one recording.", hint="teds-provision measure recover FILE.mcap")
-
-    done = measure_room.sinks.mcap.recover.recover(Path(files[0]))
+    done = measure_room.sinks.mcap.recover.recover(Path(files[0]), output)
     until = measure_room.sinks.lines.iso(done.until) if done.until is not None else None
+    result: dict[str, Any] = {
+        "recovered": {"messages": done.messages, "until": until},
+        "file": files[0],
+        "cut": done.cut,
+        "damaged": [asdict(one) for one in done.damaged],
+    }
     told = "is whole" if done.was_whole else f"made whole ({done.cut} octets of a torn end cut off)"
-    app.emit(
-        {"recovered": {"messages": done.messages, "until": until}, "file": files[0], "cut": done.cut},
-        f"{files[0]} {told}: {done.messages} messages" + (f" until {until}" if until else ""),
+    if done.output is not None:
+        result["output"] = str(done.output)
+        told = f"is not changed; what is whole of it is in {done.output}"
+    error = _damage(files[0], done) if done.damaged else None
+    text = f"{files[0]} {told}: {done.messages} messages" + (f" until {until}" if until else "")
+    app.conclude(result, text, error)
+
+
+def _damage(file: str, done: Recovered) -> BadData:
+    named = [f"a {one.what} at octet {one.offset} ({one.octets} octets)" for one in done.damaged[:MOST_NAMED]]
+    more = len(done.damaged) - len(named)
+    return BadData(
+        f"{file} is damaged inside: {', '.join(named)}{f' and {more} more' if more else ''}.",
+        hint=f"The file is as it was; everything else is in {done.output}. Look after the disk.",
     )

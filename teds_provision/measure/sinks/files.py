@@ -6,12 +6,14 @@ second (power loss). If the disk fills up, the file is cut back to the last whol
 
 from __future__ import annotations
 
+import fcntl
 import os
 import time
 from contextlib import suppress
 from pathlib import Path
 
 from teds_provision.errors import TedsProvisionError
+from teds_provision.files import sync_folder
 from teds_provision.measure.blocks import ChannelFacts, StationFacts
 from teds_provision.measure.sinks.base import ThreadedSink, as_sink_failure
 
@@ -23,11 +25,14 @@ LARGEST_PART = 1 << 30  # octets; then the next part begins
 
 
 class Part:
-    """One file that grows by whole pieces; made new, mode 0644 less the umask."""
+    """One file that grows by whole pieces; made new, mode 0644 less the umask, and locked as long as it is written."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
         self._file = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o644)
+        with suppress(OSError):  # some network folders have no locks
+            fcntl.flock(self._file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        sync_folder(path.parent)
         self.size = 0
         self._waiting: list[bytes] = []
         self.waiting_octets = 0

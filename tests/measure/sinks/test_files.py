@@ -18,17 +18,19 @@ from typing import Any
 import numpy as np
 import pytest
 from hypothesis import example, given, settings
+from hypothesis import strategies as st
 from mcap.reader import make_reader
 from mcap.stream_reader import StreamReader
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
-from teds_provision.errors import BadData, NotFound, TedsProvisionError, UsageFailure
+from teds_provision.errors import BadData, NotFound, StoreLocked, TedsProvisionError, UsageFailure
 from teds_provision.measure.blocks import Block, ChannelFacts, NodeReport, StationFacts
 from teds_provision.measure.sinks import open_sink
-from teds_provision.measure.sinks.mcap.recording import SAMPLES, TYPE
+from teds_provision.measure.sinks.mcap.recording import SAMPLES, TYPE, McapSink
 from teds_provision.measure.sinks.mcap.recover import recover
+from tests.cli.shell import call
 from tests.measure.sinks.parts import ANGLE, ARM, FORCE, HAND, STATION, block, blocks, fill
-from tests.pace import best_of
+from tests.pace import best_of, until
 
 
 def record(
@@ -274,15 +276,122 @@ def test_what_is_no_recording_is_refused_by_recover(tmp_path: Path) -> None:
         recover(tmp_path / "words.mcap")
 
 
-@pytest.mark.parametrize("offset", range(200, 2000, 150))
-def test_damage_inside_a_recording_leaves_what_is_before_it(tmp_path: Path, offset: int) -> None:
-    path = tmp_path / "run.mcap"
-    record(path, [block(index=3 * k) for k in range(50)])
-    octets = bytearray(path.read_bytes()[:-60])
-    octets[min(offset, len(octets) - 1)] ^= 0xFF
-    path.write_bytes(bytes(octets))
-    recover(path)
+Finished = tuple[bytes, list[tuple[int, int]], list[float]]
+
+
+@pytest.fixture(scope="module")
+def long(tmp_path_factory: pytest.TempPathFactory) -> Finished:
+    """A finished recording of many chunks: its octets, where each chunk begins and ends, times of its samples."""
+    path = tmp_path_factory.mktemp("long") / "run.mcap"
+    sink = McapSink(path)
+    sink.open([ANGLE], STATION)
+    for k in range(16):
+        sink.write(block(index=3 * k, start=1e9 + k))
+        time.sleep(0.15)
+    sink.close()
+    chunks, octets, at = [], path.read_bytes(), 8
+    while octets[at] != 0x0F:
+        length = int.from_bytes(octets[at + 1 : at + 9], "little")
+        if octets[at] == 0x06:
+            chunks.append((at, at + 9 + length))
+        at += 9 + length
+    assert len(chunks) >= 14
+    return octets, chunks, readable(path)
+
+
+def readable(path: Path) -> list[float]:
+    """Times of all samples, as a strict reader finds them by the index."""
+    with path.open("rb") as file:
+        reader = make_reader(file, validate_crcs=True)
+        summary = reader.get_summary()
+        assert summary is not None
+        assert summary.statistics is not None
+        assert len(list(reader.iter_messages())) == summary.statistics.message_count
+    return [one[2] / 1e9 for one in samples(path)]
+
+
+@pytest.mark.parametrize(
+    "shape", ["a bit", "a zero page", "the length", "the first chunk", "two places", "no end either"]
+)
+def test_damage_inside_costs_the_damaged_chunk_alone(long: Finished, tmp_path: Path, shape: str) -> None:
+    octets, chunks, before = long  # the first chunk holds schemas alone
+    hurt, path = bytearray(octets), tmp_path / "run.mcap"
+    begin, end = chunks[0 if shape == "the first chunk" else 7]
+    lost = 3
+    if shape == "a zero page":  # the chunk, its index and the head of the next one
+        hurt[begin - 20 : chunks[8][0] + 4] = bytes(chunks[8][0] + 24 - begin)
+        lost = 6
+    elif shape == "the length":
+        hurt[begin + 3] ^= 0x10
+    else:
+        hurt[end - 20] ^= 0x04
+    if shape == "two places":
+        hurt[chunks[11][1] - 20] ^= 0x01
+        lost = 6
+    if shape == "no end either":
+        del hurt[chunks[-1][0] + 30 :]
+        lost = 6
+    path.write_bytes(bytes(hurt))
+    done = recover(path)
+    assert path.read_bytes() == bytes(hurt), "the original stays"
+    assert done.output == tmp_path / "run.mcap.recovered"
+    assert len(done.damaged) == (2 if shape == "two places" else 1)
+    assert done.damaged[0].offset <= begin < done.damaged[0].offset + done.damaged[0].octets
+    left = readable(done.output)
+    assert set(left) <= set(before)
+    assert len(before) - len(left) <= lost
+    if shape != "no end either":
+        assert left[-1] == before[-1], "everything behind it stays"
+    assert recover(done.output).was_whole
+    with pytest.raises(UsageFailure, match="exists already"):
+        recover(path)
+    assert recover(path, tmp_path / "other.mcap").output == tmp_path / "other.mcap"
+
+
+def test_no_octet_that_is_wrong_costs_more_than_its_chunk_or_changes_the_file(long: Finished, tmp_path: Path) -> None:
+    octets, _, before = long
+    for count, place in enumerate(range(9, len(octets) - 1, 61)):
+        path = tmp_path / f"{count}.mcap"
+        hurt = bytearray(octets)
+        hurt[place] ^= 0xFF
+        path.write_bytes(bytes(hurt))
+        done = recover(path)
+        assert done.messages >= len(before) - 3
+        if place < len(octets) - 8:  # else it has lost the mark of its end, and gets it again
+            assert path.read_bytes() == bytes(hurt)
+        if done.output is not None:
+            assert len(readable(done.output)) >= len(before) - 3
+
+
+@settings(max_examples=60, deadline=None)
+@given(data=st.data())
+def test_whatever_is_behind_a_recording_that_was_cut_its_whole_records_stay(
+    long: Finished, tmp_path_factory: pytest.TempPathFactory, data: st.DataObject
+) -> None:
+    octets, chunks, _ = long
+    cut = data.draw(st.integers(9, chunks[-1][1]))
+    rubbish = data.draw(st.sampled_from([b"", bytes(4096), b"\xff" * 300]) | st.binary(max_size=60))
+    path = tmp_path_factory.mktemp("cut") / "run.mcap"
+    path.write_bytes(octets[:cut] + rubbish)
+    done = recover(path)
+    assert not done.damaged
+    kept = [end for _, end in chunks if end <= cut]
+    assert path.read_bytes()[: kept[-1] if kept else 8] == octets[: kept[-1] if kept else 8]
+    assert len(samples(path)) == 3 * max(0, len(kept) - 1), "the first chunk holds schemas alone"
     assert recover(path).was_whole
+
+
+@pytest.mark.parametrize("name", ["run.mcap", "run.csv", "run.jsonl"])
+def test_a_file_whose_recorder_writes_is_refused(tmp_path: Path, name: str) -> None:
+    sink = open_sink(str(tmp_path / name))
+    sink.open([ANGLE], STATION)
+    try:
+        sink.write(block())
+        until(lambda: (tmp_path / name).stat().st_size > 8, "nothing is written")
+        with pytest.raises(StoreLocked, match="is being recorded now"):
+            recover(tmp_path / name)
+    finally:
+        sink.close()
 
 
 def test_a_folder_that_is_not_there_is_told_before_anything_is_measured(tmp_path: Path) -> None:
@@ -296,6 +405,7 @@ RECORDER = """
 import sys, time, resource
 sys.path.insert(0, {root!r})
 from pathlib import Path
+from tests.cli.shell import call
 from tests.measure.sinks.parts import ANGLE, STATION, block
 from teds_provision.measure.sinks import open_sink
 if {limit}: resource.setrlimit(resource.RLIMIT_FSIZE, ({limit}, {limit}))
@@ -373,3 +483,22 @@ def test_writing_never_waits_for_the_disk(tmp_path: Path) -> None:
         return took
 
     best_of(5, 2.0, waited)
+
+
+def test_the_command_names_what_is_damaged_and_exits_with_8(long: Finished, tmp_path: Path) -> None:
+    octets, chunks, _ = long
+    hurt, path = bytearray(octets), tmp_path / "run.mcap"
+    hurt[chunks[5][1] - 20] ^= 1
+    path.write_bytes(bytes(hurt))
+    told = call(tmp_path / "home", "--json", "measure", "recover", str(path))
+    assert told.code == 8
+    assert told.json["output"] == f"{path}.recovered"
+    [damage] = told.json["damaged"]
+    assert (damage["what"], damage["offset"]) == ("chunk", chunks[5][0])
+    assert f"a chunk at octet {chunks[5][0]}" in told.json["error"]["message"]
+    assert call(tmp_path / "home", "measure", "recover", str(path)).code == 2
+    again = call(tmp_path / "home", "--json", "measure", "recover", str(path), "--output", str(tmp_path / "b.mcap"))
+    assert (again.code, again.json["output"]) == (8, str(tmp_path / "b.mcap"))
+    good = call(tmp_path / "home", "--json", "measure", "recover", str(tmp_path / "b.mcap"))
+    assert (good.code, good.json["damaged"]) == (0, [])
+    assert call(tmp_path / "home", "measure", "8d4d", "--can", "virtual:x", "--output", "y").code == 2

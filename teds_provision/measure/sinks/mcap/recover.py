@@ -1,27 +1,37 @@
-"""Makes an MCAP recording whole that a kill or a power cut left without its end.
+"""Makes an MCAP recording whole: one without its end in place, one with damage inside as another file.
 
-Whole records are kept as they stand; what follows the last of them is of no use, so it is cut off and the summary that
-the writer would have written is appended.
+A kill or a power cut leaves a torn end. Every whole record stays as it is; what follows the last of them is cut off,
+and the summary that the writer would have written is appended. Damage inside is another thing: the file is not touched,
+and everything but the damaged pieces goes into a new one. Chunks are found again by their form wherever a record's
+length is no longer true.
 """
 
 from __future__ import annotations
 
+import fcntl
+import mmap
 import os
+import stat
 import struct
 import zlib
-from collections.abc import Iterable, Iterator
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import BinaryIO
+from typing import Final
 
-from teds_provision.errors import BadData, NotFound
+from teds_provision.errors import BadData, NotFound, StoreLocked
+from teds_provision.files import SHARED, new_file, require_new
 from teds_provision.measure.sinks.base import as_sink_failure
 from teds_provision.measure.sinks.mcap.writer import (
+    ATTACHMENT,
     CHANNEL,
     CHUNK,
     CHUNK_HEAD,
     DATA_END,
+    FOOTER,
     HEAD,
+    HEADER,
     MAGIC,
     MESSAGE,
     MESSAGE_INDEX,
@@ -34,28 +44,51 @@ from teds_provision.measure.sinks.mcap.writer import (
     text,
 )
 
-LARGEST_RECORD = 1 << 28  # a length beyond it is damage
+LARGEST_RECORD: Final = 1 << 28  # a length beyond it is damage
+_PRIVATE: Final = 0x80  # op codes from here on are free for anybody
+_FOOTER_OCTETS: Final = HEAD.size + 20
+_ZSTD: Final = text("zstd")
+_IN_A_CHUNK: Final = HEAD.size + CHUNK_HEAD.size  # where the name of the compression stands
+
+
+@dataclass(frozen=True)
+class Damage:
+    """A piece that is damaged: ``what`` it is, where it stands and how long it is."""
+
+    what: str
+    offset: int
+    octets: int
 
 
 @dataclass(frozen=True)
 class Recovered:
-    """What an unfinished recording holds: messages, the last one's time (unix seconds), whether it was whole before."""
+    """What a recording holds: messages, the last one's time (unix seconds), whether it was whole before.
+
+    ``cut`` octets at its end were of no use. ``damaged`` pieces inside are left out of ``output``, the new file; that
+    is None where the recording itself is whole now.
+    """
 
     messages: int
     until: float | None
     was_whole: bool
-    cut: int  # octets at the end that were of no use
+    cut: int
+    damaged: tuple[Damage, ...] = ()
+    output: Path | None = None
 
 
-def recover(path: Path) -> Recovered:
-    """Make an unfinished MCAP whole, in place; one that is whole stays as it is.
+def recover(path: Path, output: Path | None = None) -> Recovered:
+    """Make an MCAP whole: a torn end in place, or all but what is damaged inside as ``output`` (``FILE.recovered``).
 
-    Only the torn end is cut off. A cut in the middle of this leaves an unfinished file again, so it can be run again.
-    Raises NotFound, BadData (no MCAP, damage inside the file), TedsProvisionError (disk).
+    With ``output`` the file itself is never changed. Killed at any instant it can be run again. Raises NotFound,
+    StoreLocked (its recorder still writes), UsageFailure (``output`` exists), BadData (no MCAP), StoreFailure (disk).
     """
+    if output is not None:
+        require_new(output)
     try:
-        with path.open("r+b") as file:
-            return _recover(file, path)
+        with _held(path) as (file, octets):
+            scan = _Scan(octets, path)
+            scan.walk()
+            return _finished(scan, file, path, output)
     except FileNotFoundError:
         raise NotFound(f"There is no file {path}.", hint="Name the recording that was cut.") from None
     except IsADirectoryError:
@@ -64,108 +97,411 @@ def recover(path: Path) -> Recovered:
         raise as_sink_failure(error, str(path)) from error
 
 
-def _recover(file: BinaryIO, path: Path) -> Recovered:
-    if file.read(len(MAGIC)) != MAGIC:
-        raise BadData(f"{path} is no MCAP file.", hint="A text or JSON-line recording needs no recovery.")
-    size = os.fstat(file.fileno()).st_size
-    whole_part = _WholePart()
-    whole = False
-    for code, offset, content in _records(file, size):
-        if code == DATA_END:
-            file.seek(-len(MAGIC), os.SEEK_END)
-            whole = file.read(len(MAGIC)) == MAGIC
-            break
-        if not whole_part.take(code, offset, content):
-            break
-    whole_part.close_chunk()
-    summary, end = whole_part.summary, whole_part.end
+@contextmanager
+def _held(path: Path) -> Iterator[tuple[int, mmap.mmap]]:
+    """The octets of a file that no recorder writes; none begins to while this is open."""
+    file = os.open(path, os.O_RDONLY | os.O_CLOEXEC | os.O_NONBLOCK)
+    try:
+        status = os.fstat(file)
+        if stat.S_ISDIR(status.st_mode):
+            raise IsADirectoryError
+        if not stat.S_ISREG(status.st_mode) or status.st_size < len(MAGIC):
+            raise _no_mcap(path)
+        try:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            raise StoreLocked(
+                f"{path} is being recorded now.", hint="End that measurement, or wait until it is over."
+            ) from None
+        except OSError:  # a file system without locks
+            pass
+        with mmap.mmap(file, 0, access=mmap.ACCESS_READ) as octets:
+            yield file, octets
+    finally:
+        os.close(file)
+
+
+def _no_mcap(path: Path) -> BadData:
+    return BadData(f"{path} is no MCAP file.", hint="A text or JSON-line recording needs no recovery.")
+
+
+def _finished(scan: _Scan, file: int, path: Path, output: Path | None) -> Recovered:
+    whole = scan.ended and not scan.damaged
+    if whole or not (scan.damaged or output):
+        summary = scan.assembled(None)
+        if not whole:
+            _end_in_place(scan, summary, file, path)
+    else:
+        output = output or path.with_name(path.name + ".recovered")
+        with new_file(output, mode=SHARED) as out:
+            summary = scan.assembled(out.write)
     messages = sum(summary.counts.values())
     until = summary.last / 1e9 if messages else None
-    if whole:
-        return Recovered(messages, until, True, 0)
-    file.seek(end)
-    file.truncate()
-    file.write(summary.tail(end))
-    file.flush()
-    os.fsync(file.fileno())
-    return Recovered(messages, until, False, size - end)
+    cut = 0 if whole else len(scan.octets) - scan.end
+    return Recovered(messages, until, whole, cut, tuple(scan.damaged), None if whole else output)
 
 
-class _WholePart:
-    """What of a file stands whole: ``summary`` of its records, ``end`` where the next one would begin."""
+def _end_in_place(scan: _Scan, summary: Summary, file: int, path: Path) -> None:
+    """Cut the torn end off and write the one that belongs there; cut off itself, it leaves a torn end again."""
+    with path.open("r+b") as same:
+        if not os.path.samestat(os.fstat(file), os.fstat(same.fileno())):
+            raise BadData(f"{path} was replaced meanwhile.", hint="Run the same command again.")
+        same.seek(scan.end)
+        same.truncate()
+        indexes = scan.end_indexes
+        same.write(b"".join(indexes) + summary.tail(scan.end + sum(map(len, indexes))))
+        same.flush()
+        os.fsync(same.fileno())
 
-    def __init__(self) -> None:
-        self.summary = Summary()
-        self.end = len(MAGIC)
-        self._pending: _Pending | None = None
 
-    def take(self, code: int, offset: int, content: bytes) -> bool:
-        """Take a whole record into the summary; False for one that is of no use, nor is what follows it."""
-        if code == MESSAGE_INDEX:
-            if self._pending is None:
-                return False
-            self._pending.index(content, offset, len(content) + HEAD.size)
-        else:
-            self.close_chunk()
-            if code == CHUNK:
-                self._pending = _whole_chunk(content, offset, self.summary)
-                if self._pending is None:
-                    return False
-            elif code == METADATA:
-                self._metadata(offset, content)
-            else:
-                _count(code, content, self.summary)
-        self.end = offset + HEAD.size + len(content)
+@dataclass
+class _Chunk:
+    """A chunk whose checksum holds; what it holds is read again where it is needed, for there are many.
+
+    ``indexes`` are (channel, offset, octets) of the message indexes behind it; ``found`` their contents until it is
+    known whether they name exactly its messages.
+    """
+
+    offset: int
+    begin: int  # of its indexes: where it ends itself
+    end: int  # of its indexes
+    packed: int
+    unpacked: int
+    span: tuple[int, int]  # earliest and latest log time, as its messages have them
+    counts: dict[int, tuple[int, int, int]]  # by channel: messages, earliest, latest
+    described: list[tuple[int, bytes]]  # schemas and channels in it: op code, content
+    indexes: list[tuple[int, int, int]] = field(default_factory=list)
+    found: dict[int, bytes] | None = field(default_factory=dict)
+    indexed: bool = False
+
+
+_Places = dict[int, list[tuple[int, int]]]
+"""(log time, offset in the chunk) of messages by channel."""
+
+
+def _places(body: bytes) -> _Places:
+    found: _Places = {}
+    for place, code, one in _inside(body):
+        if code == MESSAGE and len(one) >= 22:
+            channel, time = int.from_bytes(one[:2], "little"), int.from_bytes(one[6:14], "little")
+            found.setdefault(channel, []).append((time, place))
+    return found
+
+
+def _indexes(places: _Places) -> list[bytes]:
+    """Message indexes of a chunk, made anew."""
+    return [
+        record(MESSAGE_INDEX, struct.pack("<HI", key, 16 * len(one)) + b"".join(struct.pack("<QQ", *e) for e in one))
+        for key, one in places.items()
+    ]
+
+
+def _names_all(found: dict[int, bytes], places: _Places) -> bool:
+    """Whether the contents of message indexes name exactly these messages."""
+    told = {channel: sorted(struct.iter_unpack("<QQ", one[6:])) for channel, one in found.items() if len(one) > 6}
+    return told == {channel: sorted(entries) for channel, entries in places.items()}
+
+
+class _Scan:
+    """Walks through a file: what of it is whole, what is damaged, and where a torn end begins."""
+
+    def __init__(self, octets: mmap.mmap, path: Path) -> None:
+        if octets[: len(MAGIC)] != MAGIC:
+            raise _no_mcap(path)
+        self.octets, self.path = octets, path
+        self.damaged: list[Damage] = []
+        self.end = len(MAGIC)  # of what is whole
+        self.chunk: _Chunk | None = None  # the last one
+        self.ended = False
+        self._kept: list[tuple[int, int] | _Chunk] = []  # records by place and length, chunks with their indexes
+        self._spoiled: list[bytes] = []  # bodies of damaged chunks
+        self._limit = len(octets)
+        self._summary = b""
+
+    def walk(self) -> None:
+        """Judge every record."""
+        finished = self.octets[-len(MAGIC) :] == MAGIC and len(self.octets) >= 2 * len(MAGIC)
+        good = finished and self._read_end()
+        at = len(MAGIC)
+        while at < self._limit:
+            head = self._head(at)
+            if head is not None and head[0] == DATA_END:
+                self.ended = finished
+                break
+            after = self._take(at, *head) if head is not None else None
+            if after is None:
+                after = self._next_chunk(at + 1)
+                self._damage("record" if head is None else "chunk" if head[0] == CHUNK else "record", at, after)
+            at = after
+        self._close_chunk(torn=not finished)
+        if finished and not good:
+            self._damage("summary", at, len(self.octets))
+        if not finished:
+            self._leave_torn_end()
+        self._join_damage()
+
+    def _read_end(self) -> bool:
+        """Whether the summary of a finished file holds; then its data end where it says."""
+        foot = len(self.octets) - len(MAGIC) - _FOOTER_OCTETS
+        if foot < len(MAGIC) or HEAD.unpack_from(self.octets, foot) != (FOOTER, 20):
+            return False
+        start, _, checksum = struct.unpack_from("<QQI", self.octets, foot + HEAD.size)
+        start = start or foot
+        at = start - HEAD.size - 4
+        if not len(MAGIC) <= at < foot or HEAD.unpack_from(self.octets, at) != (DATA_END, 4):
+            return False
+        if checksum and zlib.crc32(self.octets[start : foot + _FOOTER_OCTETS - 4]) != checksum:
+            return False
+        self._limit, self._summary, self.ended = at, self.octets[start:foot], True
         return True
 
-    def close_chunk(self) -> None:
-        """No message index of the last chunk follows any more."""
-        if self._pending is not None:
-            self.summary.chunk_indexes.append(self._pending.record())
-        self._pending = None
+    def _head(self, at: int) -> tuple[int, int] | None:
+        """Op code and length of a record that fits into the file; None where there is none."""
+        if at + HEAD.size > len(self.octets):
+            return None
+        code, length = HEAD.unpack_from(self.octets, at)
+        known = code in (HEADER, SCHEMA, CHANNEL, MESSAGE, CHUNK, MESSAGE_INDEX, ATTACHMENT, METADATA, DATA_END)
+        if not (known or code >= _PRIVATE) or length > LARGEST_RECORD or at + HEAD.size + length > self._limit:
+            return None if code != DATA_END or length != 4 or at != self._limit else (code, length)
+        return code, length
 
-    def _metadata(self, offset: int, content: bytes) -> None:
-        name = content[4 : 4 + int.from_bytes(content[:4], "little")]
-        index = struct.pack("<QQ", offset, len(content) + HEAD.size) + text(name.decode(errors="replace"))
-        self.summary.metadata_indexes.append(record(METADATA_INDEX, index))
+    def _take(self, at: int, code: int, length: int) -> int | None:
+        """Keep a record; where the next one begins, or None where it is damaged."""
+        after = at + HEAD.size + length
+        content = self.octets[at + HEAD.size : after]
+        if code == MESSAGE_INDEX:
+            if length < 6 or length != 6 + int.from_bytes(content[2:6], "little") or length % 16 != 6:
+                return None
+            if self.chunk is None:  # of a chunk that is damaged
+                if not self.damaged or self.damaged[-1].offset + self.damaged[-1].octets != at:
+                    return None
+                self._damage("chunk", at, after)
+                return after
+            channel = int.from_bytes(content[:2], "little")
+            assert self.chunk.found is not None
+            self.chunk.found[channel] = self.chunk.found.get(channel, b"\0" * 6) + content[6:]
+            self.chunk.indexes.append((channel, at, after - at))
+            self.chunk.end = self.end = after
+            return after
+        if code == CHUNK:
+            chunk = self._whole_chunk(at, content)
+            self._close_chunk()
+            if chunk is None:
+                if not _fits(content):
+                    return None
+                self._damage("chunk", at, after)
+                return after
+            self.chunk = chunk
+            self._kept.append(chunk)
+            self.end = after
+            return after
+        if not _parses(code, content):
+            return None
+        self._close_chunk()
+        self._kept.append((at, after))
+        self.end = after
+        return after
 
-
-def _records(file: BinaryIO, size: int) -> Iterator[tuple[int, int, bytes]]:
-    """Whole records from the start: op code, offset, content; ends where one is torn."""
-    at = len(MAGIC)
-    while at + HEAD.size <= size:
-        file.seek(at)
-        code, length = HEAD.unpack(file.read(HEAD.size))
-        if code == 0 or length > LARGEST_RECORD or at + HEAD.size + length > size:
+    def _close_chunk(self, *, torn: bool = False) -> None:
+        """No message index of the last chunk follows any more; of a torn file's last chunk some may be missing."""
+        chunk = self.chunk
+        if chunk is None or chunk.found is None:
             return
-        yield code, at, file.read(length)
-        at += HEAD.size + length
+        body = self._body(chunk)
+        chunk.indexed, stated = _names_all(chunk.found, _places(body)), chunk.found
+        chunk.found = None
+        head = CHUNK_HEAD.unpack_from(self.octets, chunk.offset + HEAD.size)[:2]
+        if chunk.counts and head != chunk.span:
+            self._damage("head of a chunk, mended", chunk.offset, chunk.begin)
+        elif torn and not chunk.indexed:
+            self.end = chunk.begin
+            return
+        elif stated and not chunk.indexed:
+            self._damage("index of a chunk, made anew", chunk.begin, chunk.end)
+        self.chunk = None
+
+    def _body(self, chunk: _Chunk) -> bytes:
+        unpacked = _unpacked(self.octets[chunk.offset + HEAD.size : chunk.begin], self.path)
+        assert unpacked is not None, "it was unpacked before"
+        return unpacked[0]
+
+    def _damage(self, what: str, at: int, after: int) -> None:
+        self.damaged.append(Damage(what, at, after - at))
+
+    def _join_damage(self) -> None:
+        """What touches is one piece, called by what begins it."""
+        joined: list[Damage] = []
+        for one in sorted(self.damaged, key=lambda one: one.offset):
+            last = joined[-1] if joined else None
+            if last is not None and last.offset + last.octets >= one.offset:
+                octets = max(last.offset + last.octets, one.offset + one.octets) - last.offset
+                joined[-1] = Damage(last.what, last.offset, octets)
+            else:
+                joined.append(one)
+        self.damaged = joined
+
+    def _leave_torn_end(self) -> None:
+        """What is damaged behind the last good record of an unfinished file is its torn end."""
+        self.damaged = [one for one in self.damaged if one.offset < self.end]
+
+    def _next_chunk(self, at: int) -> int:
+        """Where something stands that has the form of a chunk; the end of the data where nothing does."""
+        place = at + _IN_A_CHUNK
+        while (place := self.octets.find(_ZSTD, place, self._limit)) >= 0:
+            begin = place - _IN_A_CHUNK
+            head = self._head(begin)
+            if (
+                head is not None
+                and head[0] == CHUNK
+                and _fits(self.octets[begin + HEAD.size : begin + HEAD.size + head[1]])
+            ):
+                return begin
+            place += 1
+        return self._limit
+
+    def _whole_chunk(self, at: int, content: bytes) -> _Chunk | None:
+        """A chunk with its messages; None where its checksum does not hold, or it cannot be unpacked."""
+        unpacked = _unpacked(content, self.path)
+        if unpacked is None:
+            return None
+        body, whole = unpacked
+        if not whole:
+            self._spoiled.append(body)
+            return None
+        counts = {
+            channel: (len(entries), min(entries)[0], max(entries)[0]) for channel, entries in _places(body).items()
+        }
+        span = min((one[1] for one in counts.values()), default=0), max((one[2] for one in counts.values()), default=0)
+        described = [(code, one) for _, code, one in _inside(body) if code in (SCHEMA, CHANNEL)]
+        packed = len(content) - CHUNK_HEAD.size - 12 - int.from_bytes(content[CHUNK_HEAD.size :][:4], "little")
+        begin = at + HEAD.size + len(content)
+        return _Chunk(at, begin, begin, packed, len(body), span, counts, described)
+
+    # -- the end that belongs to it -----------------------------------------------------------------------------------
+
+    def assembled(self, put: Callable[[bytes], object] | None) -> Summary:
+        """The summary of all that is whole, as it stands, or as ``put`` gets it, from the first octet to the last."""
+        summary, at = Summary(), len(MAGIC)
+        if put is not None:
+            put(MAGIC)
+        for count, one in enumerate(self._kept):
+            if isinstance(one, _Chunk):
+                at = self._chunk_into(summary, one, at, put)
+            else:
+                octets = self.octets[one[0] : one[1]]
+                at = _record_into(summary, octets, at, put)
+            if put is not None and count == 0:  # behind the header
+                for described in self._rescued():
+                    at = _record_into(summary, described, at, put)
+        if put is not None:
+            put(summary.tail(at))
+        return summary
+
+    def _chunk_into(self, summary: Summary, chunk: _Chunk, at: int, put: Callable[[bytes], object] | None) -> int:
+        for code, content in chunk.described:
+            _describe(summary, code, content)
+        for channel, (count, first, last) in chunk.counts.items():
+            summary.saw(channel, count, first, last)
+        length = chunk.begin - chunk.offset
+        anew = _indexes(_places(self._body(chunk))) if not chunk.indexed and (put or chunk is self.chunk) else None
+        if anew is not None:
+            indexes = [(int.from_bytes(one[HEAD.size :][:2], "little"), len(one)) for one in anew]
+        else:
+            indexes = [(channel, octets) for channel, _, octets in chunk.indexes]
+        places, end = b"", at + length
+        for channel, octets in indexes:
+            places += struct.pack("<HQ", channel, end)
+            end += octets
+        sizes = chunk.packed, chunk.unpacked
+        summary.chunk_indexes.append(chunk_index(*chunk.span, at, length, places, end, *sizes))
+        if put is not None:
+            head = HEAD.pack(CHUNK, length - HEAD.size) + struct.pack("<QQ", *chunk.span)
+            if not chunk.counts:
+                head = self.octets[chunk.offset : chunk.offset + len(head)]
+            put(head + self.octets[chunk.offset + len(head) : chunk.begin])
+            put(b"".join(anew) if anew is not None else self.octets[chunk.begin : chunk.end])
+        return end
+
+    @property
+    def end_indexes(self) -> list[bytes]:
+        """Message indexes that the last chunk of a torn file lacks."""
+        return _indexes(_places(self._body(self.chunk))) if self.chunk is not None else []
+
+    def _rescued(self) -> list[bytes]:
+        """Schemas and channels of messages that are whole, which stood in a damaged chunk: as the summary has them."""
+        known, used = Summary(), set[int]()
+        for one in self._kept:
+            if isinstance(one, _Chunk):
+                used |= one.counts.keys()
+                for code, content in one.described:
+                    _describe(known, code, content)
+        elsewhere = Summary()
+        for body in (*self._spoiled, self._summary):  # the summary, whose checksum holds, has the last word
+            for _, code, content in _inside(body):
+                if code in (SCHEMA, CHANNEL) and _parses(code, content):
+                    _describe(elsewhere, code, content)
+        lost = [number for number in used if number not in known.channels]
+        channels = {number: elsewhere.channels.get(number) or _nameless(number) for number in lost}
+        described = (*known.channels.values(), *channels.values())
+        schemas = {int.from_bytes(one[HEAD.size + 2 : HEAD.size + 4], "little") for one in described} - {0}
+        wanted = [number for number in sorted(schemas) if number not in known.schemas]
+        return [*(elsewhere.schemas.get(number) or _shapeless(number) for number in wanted), *channels.values()]
 
 
-class _Pending:
-    """A chunk whose message indexes are being read."""
-
-    def __init__(self, first: int, last: int, offset: int, length: int, packed: int, unpacked: int) -> None:
-        self._parts = (first, last, offset, length)
-        self._sizes = (packed, unpacked)
-        self._places = b""
-        self._end = offset + length
-
-    def index(self, content: bytes, offset: int, length: int) -> None:
-        """A message index that stands behind the chunk."""
-        self._places += content[:2] + struct.pack("<Q", offset)
-        self._end = offset + length
-
-    def record(self) -> bytes:
-        """The index of the chunk."""
-        return chunk_index(*self._parts, self._places, self._end, *self._sizes)
+def _shapeless(number: int) -> bytes:
+    """A schema of which nothing is known any more."""
+    return record(SCHEMA, struct.pack("<H", number) + text("recovered/unknown") + text("") + bytes(4))
 
 
-def _whole_chunk(content: bytes, offset: int, summary: Summary) -> _Pending | None:
-    """A chunk whose checksum holds: its schemas, channels and messages counted; None where it is damaged."""
+def _nameless(number: int) -> bytes:
+    """A channel of which nothing is known any more but its messages."""
+    note = text("note") + text("the description of this topic stood in a damaged chunk")
+    topic = text(f"/recovered/channel_{number}")
+    content = struct.pack("<HH", number, 0) + topic + text("cdr") + struct.pack("<I", len(note)) + note
+    return record(CHANNEL, content)
+
+
+def _record_into(summary: Summary, octets: bytes, at: int, put: Callable[[bytes], object] | None) -> int:
+    code, content = octets[0], octets[HEAD.size :]
+    if code == METADATA:
+        name = content[4 : 4 + int.from_bytes(content[:4], "little")]
+        index = struct.pack("<QQ", at, len(octets)) + text(name.decode(errors="replace"))
+        summary.metadata_indexes.append(record(METADATA_INDEX, index))
+    elif code == MESSAGE:
+        time = int.from_bytes(content[6:14], "little")
+        summary.saw(int.from_bytes(content[:2], "little"), 1, time, time)
+    else:
+        _describe(summary, code, content)
+    if put is not None:
+        put(octets)
+    return at + len(octets)
+
+
+def _describe(summary: Summary, code: int, content: bytes) -> None:
+    """Take a schema or a channel into the summary, wherever it stands."""
+    number = int.from_bytes(content[:2], "little")
+    if code == SCHEMA:
+        summary.schemas[number] = record(SCHEMA, content)
+    elif code == CHANNEL:
+        summary.channels[number] = record(CHANNEL, content)
+
+
+def _fits(content: bytes) -> bool:
+    """Whether the lengths within a chunk and the chunk's own agree."""
+    if len(content) < CHUNK_HEAD.size + 12:
+        return False
+    name = int.from_bytes(content[CHUNK_HEAD.size : CHUNK_HEAD.size + 4], "little")
+    at = CHUNK_HEAD.size + 4 + name
+    return at + 8 <= len(content) and at + 8 + int.from_bytes(content[at : at + 8], "little") == len(content)
+
+
+def _unpacked(content: bytes, path: Path) -> tuple[bytes, bool] | None:
+    """The records in a chunk, and whether its checksum holds; None where it cannot be unpacked at all."""
     import zstandard
 
-    first, last, unpacked, checksum = CHUNK_HEAD.unpack_from(content)
+    if not _fits(content):
+        return None
+    _, _, unpacked, checksum = CHUNK_HEAD.unpack_from(content)
     at = CHUNK_HEAD.size
     name_length = int.from_bytes(content[at : at + 4], "little")
     compression = content[at + 4 : at + 4 + name_length]
@@ -179,30 +515,54 @@ def _whole_chunk(content: bytes, offset: int, summary: Summary) -> _Pending | No
             return None
     elif compression == b"":
         body = packed
+    elif compression == b"lz4":
+        raise BadData(f"A chunk of {path} is compressed with lz4, which is not known here.")
     else:
-        raise BadData(f"A chunk is compressed with {compression!r}, which is not known here.")
-    if checksum and zlib.crc32(body) != checksum:
         return None
-    for code, one in _inside(body):
-        _count(code, one, summary)
-    return _Pending(first, last, offset, len(content) + HEAD.size, len(packed), unpacked)
+    return body, len(body) == unpacked and (not checksum or zlib.crc32(body) == checksum)
 
 
-def _count(code: int, content: bytes, summary: Summary) -> None:
-    """Take a schema, a channel or a message into the summary, wherever it stands."""
-    number = int.from_bytes(content[:2], "little")
-    if code == SCHEMA:
-        summary.schemas[number] = record(SCHEMA, content)
-    elif code == CHANNEL:
-        summary.channels[number] = record(CHANNEL, content)
-    elif code == MESSAGE:
-        time = int.from_bytes(content[6:14], "little")
-        summary.saw(number, 1, time, time)
+def _parses(code: int, content: bytes) -> bool:
+    """Whether the parts of a record end where it ends; of others than these nothing is known."""
+    try:
+        if code == METADATA:
+            return _after_map(content, _after_text(content, 0)) == len(content)
+        if code == HEADER:
+            return _after_text(content, _after_text(content, 0)) <= len(content)
+        if code == CHANNEL:
+            return _after_map(content, _after_text(content, _after_text(content, 4))) == len(content)
+        if code == SCHEMA:
+            at = _after_text(content, _after_text(content, 2))
+            return at + 4 + int.from_bytes(content[at : at + 4], "little") == len(content)
+        if code == MESSAGE:
+            return len(content) >= 22
+    except (ValueError, struct.error):
+        return False
+    return True
 
 
-def _inside(body: bytes) -> Iterable[tuple[int, bytes]]:
+def _after_text(content: bytes, at: int) -> int:
+    """Where a text ends; raises ValueError where it is none."""
+    end = at + 4 + int(struct.unpack_from("<I", content, at)[0])
+    if end > len(content):
+        raise ValueError("beyond the record")
+    content[at + 4 : end].decode()
+    return end
+
+
+def _after_map(content: bytes, at: int) -> int:
+    end = at + 4 + int(struct.unpack_from("<I", content, at)[0])
+    at += 4
+    while at < end:
+        at = _after_text(content, at)
+    return end
+
+
+def _inside(body: bytes) -> Iterator[tuple[int, int, bytes]]:
+    """Records of a chunk or of a summary: offset, op code, content."""
     at = 0
     while at + HEAD.size <= len(body):
-        code, length = HEAD.unpack_from(body, at)
-        yield code, body[at + HEAD.size : at + HEAD.size + length]
-        at += HEAD.size + length
+        with suppress(struct.error):
+            code, length = HEAD.unpack_from(body, at)
+            yield at, code, body[at + HEAD.size : at + HEAD.size + length]
+            at += HEAD.size + length
