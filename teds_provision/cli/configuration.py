@@ -25,6 +25,8 @@ else:
 PARAMETERS: Final = {"json": "as_json", "format": "form", "to": "receivers", "all": "everything"}
 """Options that the code calls otherwise than the command line does."""
 NEVER_IN_FILE: Final = frozenset({"home", "help", "version", "passphrase-fd"})
+BROKERS: Final = "ncap brokers"
+"""A table of names and URLs, not of options."""
 _MOST_OCTETS: Final = 1 << 20
 
 
@@ -120,12 +122,26 @@ def _problems_of_command(command: str, values: dict[str, Any], text: str) -> Ite
         plain = name.replace("_", "-")
         if isinstance(value, dict):
             inner = f"{command} {plain}"
-            if inner in OPTIONS:
+            if inner == BROKERS:
+                yield from _problems_of_brokers(value, text)
+            elif inner in OPTIONS:
                 yield from _problems_of_command(inner, value, text)
             else:
                 yield f"{_line(text, name)}: there is no command {inner!r}."
         elif plain in NEVER_IN_FILE or plain not in _options_below(command):
             yield f"{_line(text, name)}: {command} has no option --{plain}.{_near(plain, _options_below(command))}"
+
+
+def _problems_of_brokers(values: dict[str, Any], text: str) -> Iterator[str]:
+    for name, url in values.items():
+        if not isinstance(url, str):
+            yield f'{_line(text, name)}: a broker is named with its URL: {name} = "mqtts://HOST".'
+
+
+def brokers_of(path: Path) -> dict[str, str]:
+    """The brokers that requests may name, ``[ncap.brokers]``; raises BadData as :func:`read_config`."""
+    ncap = (read_config(path) or {}).get("ncap", {})
+    return dict(ncap.get("brokers", {})) if isinstance(ncap, dict) else {}
 
 
 def _options_below(command: str) -> set[str]:

@@ -15,7 +15,7 @@ from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass, field
 from typing import Any
 
-from teds_provision.errors import NoNode, StoreFailure, TedsProvisionError
+from teds_provision.errors import LinkFailure, NoNode, StoreFailure, TedsProvisionError
 from teds_provision.measure.blocks import Block, ChannelFacts, Command, GroupRows, NodeReport, StationFacts
 from teds_provision.measure.clock import Wall
 from teds_provision.measure.finding.buses import Buses
@@ -262,7 +262,7 @@ class Measurement:
     def _ended(self) -> Ended:
         nodes = [_summary(keeper) for keeper in self.keepers]
         errors = [keeper.error for keeper in self.keepers if keeper.error is not None]
-        errors += [_as_error(sink) for sink in self.sinks if sink.stats.error]
+        errors += [error for sink in self.sinks if (error := _as_error(sink)) is not None]
         worst = min(errors, key=_rank) if errors else None
         files = [name for sink in self.sinks for name in sink.files]
         sinks = [{"sink": one.name, "written": one.stats.written, "dropped": one.stats.dropped} for one in self.sinks]
@@ -278,10 +278,14 @@ def _summary(keeper: NodeKeeper) -> dict[str, Any]:
     return node
 
 
-def _as_error(sink: Sink) -> TedsProvisionError:
-    """What ended a sink: of a recording it is the disk (7)."""
+def _as_error(sink: Sink) -> TedsProvisionError | None:
+    """What ended a sink: of a recording it is the disk (7), of one that took nothing of what came the way to it (5)."""
+    stats = sink.stats
+    if stats.dropped and not stats.written and not sink.files:
+        why = stats.error or f"{sink.name} took nothing: all {stats.dropped} values were dropped."
+        return LinkFailure(why, hint=stats.hint or "See whether it runs, and where it listens.")
     kind = StoreFailure if sink.files else TedsProvisionError
-    return kind(sink.stats.error, hint=sink.stats.hint)
+    return kind(stats.error, hint=stats.hint) if stats.error else None
 
 
 def _rank(error: TedsProvisionError) -> int:

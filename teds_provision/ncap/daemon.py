@@ -48,7 +48,13 @@ class Daemon:
         self.roster = Roster(station, self.live)
         self.buses = Buses(news=self._saw)
         self.desk = Desk(self.roster, self.turns, self._port_of)
-        sinks = DaemonSinks(station.home, settings.sinks, settings.record, actuators=settings.actuators)
+        sinks = DaemonSinks(
+            station.home,
+            settings.sinks,
+            settings.record,
+            actuators=settings.actuators,
+            brokers=settings.brokers,
+        )
         self.measuring = Measuring(
             station, self.roster, self.live, self.turns, self.buses, sinks, self._admits, dead_man=settings.dead_man
         )

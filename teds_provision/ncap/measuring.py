@@ -19,7 +19,7 @@ from teds_provision.measure.finding.buses import Buses
 from teds_provision.measure.planning import period_of, sensors_of
 from teds_provision.measure.runner import Watcher
 from teds_provision.measure.running.job import Job
-from teds_provision.measure.sinks import Sink, open_sink
+from teds_provision.measure.sinks import Sink
 from teds_provision.measure.trusting import DEAD_MAN, Trusted
 from teds_provision.measure.wish import Wish
 from teds_provision.ncap.live import Live
@@ -140,7 +140,7 @@ class Measuring:
                 raise NodeBusy(f"Node {uuid.hex()} is measured already ({other}).", hint="End that measurement first.")
             self._require_plan(uuid, kept)
         for spec in kept.sinks:
-            open_sink(spec)
+            self._sinks.open(spec)
         with self._station.durable("measure"):
             kept = self._station.measurements.keep(kept)
             self._station.audit("measure", None, "begun", id=kept.id, group=group, nodes=[one.hex() for one in nodes])
@@ -284,6 +284,7 @@ class Measuring:
                 more=lambda take: self._sinks.more(one.kept, take),
                 admits=self._admits if self._sinks.moves(one.kept) else None,
                 wish=Wish(patient=True, by="ncap"),
+                opened=self._sinks.open,
             )
             one.job = job
             self._say(one, "starting")

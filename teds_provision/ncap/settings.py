@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import ipaddress
 import zlib
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Final, Literal
 
@@ -23,7 +24,8 @@ class Settings:
     """``places`` are links as ``can:…`` and ``nfc:…``; ``detection`` None: as it was last set, else ``whitelist``.
 
     ``http`` is (host, port) or None: then only the Unix socket of the home is served. ``sinks`` take what is measured,
-    beside those of each measurement; ``record`` is a folder for a recording of each measurement. ``actuators``: whether
+    beside those of each measurement; ``brokers`` are URLs by the names under which a measurement may name them;
+    ``record`` is a folder for a recording of each measurement. ``actuators``: whether
     set points may come by topics of ROS. ``dead_man`` in ms holds for whatever is moved, where a measurement says no
     other. ``trace`` is an open one: every frame of every link is written to it.
     """
@@ -37,6 +39,7 @@ class Settings:
     key: Path | None = None
     record: Path | None = None
     sinks: tuple[str, ...] = ()
+    brokers: Mapping[str, str] = field(default_factory=dict)
     actuators: bool = True
     dead_man: int = DEAD_MAN
     metrics: bool = False

@@ -1,52 +1,86 @@
-"""Where the daemon's measurements go: the sinks it was started with, and those that a measurement names itself."""
+"""Where the daemon's measurements go: the sinks it was started with, and those that a measurement names itself.
+
+A request names a sink and never says where that is: ``ros1``, ``ros2``, a broker by its name (``mqtt``: the one that
+the daemon was started with; the others stand in config.toml), or a file by its bare name. So a token makes the daemon
+talk to no host, and read no file, that its owner did not name.
+"""
 
 from __future__ import annotations
 
 import re
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Final
+from urllib.parse import urlsplit
 
 from teds_provision.errors import UsageFailure
 from teds_provision.measure.sinks import FILES, CommandTaker, Sink, open_sink
 from teds_provision.store import Measurement
 
 RECORDINGS: Final = "recordings"
+STARTED: Final = "mqtt"
+"""Name of the broker that the daemon was started with."""
 _ROS: Final = frozenset({"ros1", "ros2"})
-_SERVICE: Final = re.compile(r"ros1\Z|ros2\Z|mqtts?://\S+\Z")
+_BROKER: Final = re.compile(r"[A-Za-z][A-Za-z0-9_-]{0,40}\Z")
 _NAME: Final = re.compile(r"[A-Za-z0-9][A-Za-z0-9._ -]{0,80}\Z")
+_USER: Final = re.compile(r"([a-z]+://)[^\s/@]*@")
+_QUERY: Final = re.compile(r"([a-z]+://[^\s?]*)\?\S*")
+_FOLDERS: Final = re.compile(r"(?<![^\s'\"(=])/(?:[^/\s'\"]+/)+")
 
 
 class DaemonSinks:
     """``specs`` are the words of the sinks that take every measurement, ``record`` a folder for recordings of each.
 
-    ``actuators``: whether set points may come by the topics of any of them.
+    ``brokers``: URLs by the names that config.toml gives them. ``actuators``: whether set points may come by the topics
+    of any of the sinks. Raises UsageFailure for a name or URL that is none.
     """
 
-    def __init__(self, home: Path, specs: Sequence[str] = (), record: Path | None = None, *, actuators: bool) -> None:
+    def __init__(
+        self,
+        home: Path,
+        specs: Sequence[str] = (),
+        record: Path | None = None,
+        *,
+        actuators: bool,
+        brokers: Mapping[str, str] | None = None,
+    ) -> None:
         self._home, self._specs, self.actuators = home, tuple(specs), actuators
         self._record = record.absolute() if record is not None else None
+        started = [spec for spec in self._specs if urlsplit(spec).scheme.startswith("mqtt")]
+        self._brokers: dict[str, str] = {STARTED: started[0]} if started else {}
+        for name, url in (brokers or {}).items():
+            _require_broker(name, url)
+            self._brokers[name] = url
 
     def whole(self, spec: str) -> str:
-        """The words for a sink: a service, or a file by its bare name, which lies in the folder of recordings.
-
-        Raises UsageFailure.
-        """
-        if _SERVICE.match(spec):
+        """The words for a sink that a request names; a file lies in the folder of recordings. Raises UsageFailure."""
+        if spec in _ROS or spec in self._brokers:
             return spec
         if not _NAME.match(spec) or Path(spec).suffix.lower() not in FILES:
+            named = ", ".join(sorted(_ROS | self._brokers.keys()))
             raise UsageFailure(
-                f"{spec!r} is no sink.", hint=f"Use ros1, ros2, mqtt://HOST, or a file name in {', '.join(FILES)}."
+                f"{spec!r} is no sink that a request may name.",
+                hint=f"Use {named}, or a file name in {', '.join(FILES)}. Brokers: config.toml, [ncap.brokers]",
             )
         return str(self._folder() / spec)
+
+    def open(self, spec: str, take: CommandTaker | None = None) -> Sink:
+        """The sink of a kept measurement, not yet opened; raises UsageFailure, also for a name that is gone."""
+        if spec not in self._brokers and _BROKER.match(spec) and spec not in _ROS:
+            raise UsageFailure(
+                f"There is no broker {spec!r} any more.",
+                hint=f'Name it in config.toml: [ncap.brokers], {spec} = "mqtts://HOST".',
+            )
+        return open_sink(self._brokers.get(spec, spec), take)
 
     def more(self, kept: Measurement, take: CommandTaker | None) -> list[Sink]:
         """The daemon's own sinks for one run of a measurement, without those that it names itself.
 
         ``take`` takes set points of topics.
         """
-        specs = [spec for spec in self._specs if spec not in kept.sinks]
+        own = {self._brokers.get(spec, spec) for spec in kept.sinks}
+        specs = [spec for spec in self._specs if spec not in own]
         if self._record is not None:
             stamp = time.strftime("%Y%m%d-%H%M%S")
             specs.append(str(self._folder() / f"{_plain(kept.group or kept.id)}-{stamp}.csv"))
@@ -67,6 +101,17 @@ class DaemonSinks:
         return folder
 
 
+def _require_broker(name: str, url: str) -> None:
+    if not _BROKER.match(name) or name in _ROS or name == STARTED:
+        raise UsageFailure(
+            f"{name!r} cannot be the name of a broker.",
+            hint="Use letters, digits, _ and -, beginning with a letter; not ros1, ros2, mqtt.",
+        )
+    if urlsplit(url).scheme not in ("mqtt", "mqtts"):
+        raise UsageFailure(f"The broker {name!r} of config.toml has no MQTT URL.", hint='Write "mqtts://USER@HOST".')
+    open_sink(url)
+
+
 def sink_json(measurement: str, sink: Sink) -> dict[str, Any]:
     """A sink as the API shows it, with what became of what it was given."""
     stats = sink.stats
@@ -84,6 +129,15 @@ def sink_json(measurement: str, sink: Sink) -> dict[str, Any]:
         "recorder": bool(getattr(sink, "recorder", False)),
         "files": [str(file) for file in sink.files],
     }
+
+
+def for_readers(told: Any) -> Any:
+    """What a token that may only read is shown: files by their names, brokers without user and query."""
+    if isinstance(told, str):
+        return _FOLDERS.sub("", _QUERY.sub(r"\1", _USER.sub(r"\1", told))) if "/" in told else told
+    if isinstance(told, dict):
+        return {key: for_readers(value) for key, value in told.items()}
+    return [for_readers(one) for one in told] if isinstance(told, list | tuple) else told
 
 
 def _plain(name: str) -> str:

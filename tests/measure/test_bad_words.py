@@ -64,10 +64,12 @@ def test_recover_names_what_it_is(hall: Hall, words: tuple[str, ...]) -> None:
 
 def test_a_broker_that_is_not_there_is_told_and_what_it_cost(hall: Hall) -> None:
     place = f"mqtt://127.0.0.1:{free_tcp_port()}"
-    lines = hall.measure(hall.nodes["g"].uuid, "--rate", 10, "--duration", 5, "--mqtt", place)
-    [told] = [line for line in lines if line["event"] == "sink"]
+    lines = hall.measure(hall.nodes["g"].uuid, "--rate", 10, "--duration", 5, "--mqtt", place, code=5)
+    told = next(line for line in lines if line["event"] == "sink")
     assert (told["state"], told["sink"]) == ("waiting", "mqtt://127.0.0.1")
-    assert "waits for the broker" in told["why"]
+    assert "nobody listens at 127.0.0.1" in told["why"]
+    assert lines[-1]["error"]["code"] == "link"
+    assert "took nothing: nobody listens at 127.0.0.1" in lines[-1]["error"]["message"]
     [sink] = lines[-1]["sinks"]
     assert (sink["written"], sink["dropped"] > 0) == (0, True)
     assert of(lines, channel=2), "the measurement goes on"

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 import click
 
+from teds_provision.cli.configuration import brokers_of, config_path
 from teds_provision.cli.context import App, pass_app, to_json
 from teds_provision.cli.options import FileToRead, WholeNumber, command
 from teds_provision.cli.tracing import tracing
@@ -86,6 +87,7 @@ def run(
         places=tuple(dict.fromkeys(places)),
         http=None if http is None else settings.parse_http(http),
         sinks=tuple(sinks),
+        brokers=brokers_of(config_path(app.home)),
         **wished,
     )
     settings.require_safe(wanted)

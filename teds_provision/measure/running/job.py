@@ -49,8 +49,8 @@ class Job:
     """One measurement: ``sinks`` are made (and opened by the run), ``ended`` is how the last run ended.
 
     ``more`` makes the sinks beside those that are kept, anew for each run; it gets what takes set points of topics.
-    ``admits`` says of each set point whether it may pass; None: none may, whatever is kept. Raises UsageFailure where
-    a sink cannot be named so.
+    ``admits`` says of each set point whether it may pass; None: none may, whatever is kept. ``opened`` makes a sink of
+    a kept word. Raises UsageFailure where a sink cannot be named so.
     """
 
     def __init__(
@@ -61,11 +61,12 @@ class Job:
         more: Callable[[CommandTaker | None], Sequence[Sink]] = lambda _take: (),
         wish: Wish | None = None,
         admits: Callable[[Command], bool] | None = lambda _command: True,
+        opened: Callable[[str, CommandTaker | None], Sink] = open_sink,
     ) -> None:
         self.station, self.kept = station, kept
         self._moves = kept.actuators and admits is not None
         self.wish = replace(wish_of(kept, wish or Wish(patient=True)), actuators=self._moves)
-        self._more, self._admits = more, admits
+        self._more, self._admits, self._opened = more, admits, opened
         self._commands: Callable[[Command], None] = lambda _command: None
         self.sinks = self._new_sinks()
         self.measurement: Measurement | None = None
@@ -170,7 +171,7 @@ class Job:
 
     def _new_sinks(self) -> list[Sink]:
         take = self._take if self._moves else None
-        return [*(open_sink(spec, take) for spec in self.kept.sinks), *self._more(take)]
+        return [*(self._opened(spec, take) for spec in self.kept.sinks), *self._more(take)]
 
     def _take(self, command: Command) -> None:
         """A set point that came by a topic."""

@@ -7,22 +7,28 @@ for several may run and one that ends must not end the others. An entity is avai
 runs, so the last value of a node that is lost is not taken for one of now. Values are in the unit for people (°C), for
 Home Assistant knows units by their signs. Nothing is subscribed: no actuator is moved by MQTT.
 
-A password is read from the file that the URL names (``mqtt://user@host?password-file=PATH``): never from the URL.
+A password is read from the file that the URL names (``mqtt://user@host?password-file=PATH``): never from the URL. With
+TLS (``mqtts://``) the broker's certificate has to verify, by the system's CAs or those of ``ca=PATH``, for the name in
+the URL; ``cert=PATH`` and ``key=PATH`` are this client's own certificate. Files are regular and small, and read when
+the sink opens. Why a broker does not take anything is told in words, and kept as the reason where it never did.
 """
 
 from __future__ import annotations
 
 import json
 import math
+import stat
+import sys
 import threading
 import time
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
-from urllib.parse import parse_qs, urlsplit
+from typing import TYPE_CHECKING, Any, Final
+from urllib.parse import parse_qsl, urlsplit
 
 from teds_provision import __version__
-from teds_provision.errors import TedsProvisionError, UsageFailure
-from teds_provision.lazy import how_to_install
+from teds_provision.errors import BadData, NotFound, TedsProvisionError, UsageFailure
+from teds_provision.files import read_limited
+from teds_provision.lazy import how_to_install, late
 from teds_provision.measure.blocks import Block, ChannelFacts, NodeReport, StationFacts
 from teds_provision.measure.sinks.base import CommandTaker, Item, ThreadedSink
 from teds_provision.measure.sinks.lines import status_line
@@ -30,9 +36,17 @@ from teds_provision.measure.sinks.names import Topics, slug
 from teds_provision.teds.units import display_unit, short_unit
 
 if TYPE_CHECKING:
+    import socket
+    import ssl
+
     from teds_provision.teds.units import WrittenUnit
+else:
+    socket, ssl = late("socket"), late("ssl")
 
 DISCOVERY = "homeassistant"
+FILES: Final = ("password-file", "ca", "cert", "key")
+"""Keys of the URL; each names a file."""
+_MOST_OCTETS: Final = 1 << 20
 PORTS = {"mqtt": 1883, "mqtts": 8883}
 KEEP_ALIVE = 15  # seconds: the broker says offline after one and a half of it
 WAITING = 1000  # messages that the library may hold for a slow broker
@@ -41,11 +55,16 @@ DEVICE_CLASSES = {"°C": "temperature", "Pa": "pressure", "hPa": "pressure", "kP
 
 
 class MqttSink(ThreadedSink):
-    """``mqtt://[USER@]HOST[:PORT][?password-file=PATH]``, ``mqtts://…`` with TLS."""
+    """``mqtt://[USER@]HOST[:PORT][?password-file=PATH]``, ``mqtts://…[?ca=PATH&cert=PATH&key=PATH]`` with TLS."""
 
     def __init__(self, spec: str, commands: CommandTaker | None = None) -> None:
-        parts = urlsplit(spec)
-        if parts.scheme not in PORTS or not parts.hostname:
+        try:
+            parts = urlsplit(spec)
+            port = parts.port or PORTS[parts.scheme]
+            (parts.hostname or "").encode("idna")
+        except (ValueError, KeyError):
+            parts, port = urlsplit(""), 0
+        if not parts.hostname or parts.path.strip("/") or parts.fragment:
             raise UsageFailure(f"{spec!r} is no MQTT URL.", hint="Write mqtt://HOST or mqtts://USER@HOST:8883.")
         if parts.password is not None:
             raise UsageFailure(
@@ -54,7 +73,12 @@ class MqttSink(ThreadedSink):
             )
         super().__init__(f"{parts.scheme}://{parts.hostname}")
         self._parts = parts
-        self._password_file = parse_qs(parts.query).get("password-file", [""])[0]
+        self._host, self._port = parts.hostname, port
+        self._files = _files_of(parts.query, tls=parts.scheme == "mqtts")
+        if "password-file" in self._files and not parts.username:
+            raise UsageFailure("A password without a user is of no use.", hint=f"Write {parts.scheme}://USER@HOST?…")
+        self._why, self._greeted = "", False
+        """Why it is not connected, as far as that is known; whether the broker has ever taken this client."""
         self._client: Any = None
         self._connected = threading.Event()
         self._anew = threading.Event()  # connected, and not announced since
@@ -76,12 +100,13 @@ class MqttSink(ThreadedSink):
         client = paho.Client(CallbackAPIVersion.VERSION2)
         client.max_queued_messages_set(WAITING)
         if self._parts.scheme == "mqtts":
-            client.tls_set()
+            client.tls_set_context(self._tls())
         if self._parts.username:
             client.username_pw_set(self._parts.username, self._password())
         client.will_set(self._status, "offline", qos=1, retain=True)
         client.reconnect_delay_set(1, 30)
         client.on_connect = self._on_connect
+        client.on_connect_fail = self._on_connect_fail
         client.on_disconnect = self._on_disconnect
         self._client = client
 
@@ -91,29 +116,61 @@ class MqttSink(ThreadedSink):
         return "/".join(filter(None, (self._topics.station, slug(self._station.instance), "status")))
 
     def _password(self) -> str | None:
-        if not self._password_file:
+        if "password-file" not in self._files:
             return None
         try:
-            return Path(self._password_file).read_text(encoding="utf-8").rstrip("\n")
-        except (OSError, UnicodeDecodeError) as error:
-            raise TedsProvisionError(
-                f"The password file {self._password_file} cannot be read.", hint="Check its path and mode."
-            ) from error
+            return _octets("password-file", self._files["password-file"]).decode().rstrip("\r\n")
+        except UnicodeDecodeError as error:
+            raise BadData(f"The password file {self._files['password-file']} is no UTF-8 text.") from error
+
+    def _tls(self) -> ssl.SSLContext:
+        """How the broker is checked, and what this client shows; raises NotFound, BadData."""
+        for named, path in self._files.items():
+            _octets(named, path)  # the library reads by name and knows no limit
+        try:
+            context = ssl.create_default_context(cafile=self._files.get("ca"))
+        except (ssl.SSLError, OSError) as error:
+            raise BadData(f"{self._files.get('ca')} holds no CA certificate in PEM.") from error
+        if "cert" in self._files:
+            own, key = self._files["cert"], self._files.get("key")
+            try:
+                context.load_cert_chain(own, key, password=_no_password)
+            except (ssl.SSLError, OSError, ValueError) as error:
+                raise BadData(
+                    f"{own} and {key or own} are no certificate with its key (PEM, not encrypted).",
+                    hint="Name them by cert=PATH and key=PATH; openssl pkey takes the passphrase off a key.",
+                ) from error
+        return context
 
     def _on_connect(self, _client: Any, _userdata: Any, _flags: Any, reason: Any, _properties: Any) -> None:
         if reason.is_failure:
-            self._say("waiting", f"the broker refuses: {reason}")
+            self._waits(f"the broker at {self._host} refuses: {str(reason).lower()}")
             return
+        self._greeted = True
         self._connected.set()
         self._anew.set()
 
+    def _on_connect_fail(self, *_: Any) -> None:
+        """No connection came about; the library calls this where it caught why."""
+        error = sys.exc_info()[1]
+        self._waits(_in_words(error, self._host, self._port) if error is not None else "")
+
     def _on_disconnect(self, *_: Any) -> None:
-        self._connected.clear()
-        self._say("waiting", f"waits for the broker at {self._parts.hostname}")
+        if self._connected.is_set():
+            self._connected.clear()
+            self._waits(f"the broker at {self._host} has gone")
+        elif not self._why:  # with TLS 1.3 a server refuses a client's certificate after the client's handshake
+            tls = self._parts.scheme == "mqtts"
+            may = "; it may want another client certificate (cert=, key=)" if tls else "; it may speak TLS (mqtts://)"
+            self._waits(f"the broker at {self._host}:{self._port} ends the connection before it answers{may}")
+
+    def _waits(self, why: str) -> None:
+        self._why = why
+        self._say("waiting", why or f"waits for the broker at {self._host}")
 
     def _begin(self) -> None:
-        self._say("waiting", f"waits for the broker at {self._parts.hostname}")
-        self._client.connect_async(self._parts.hostname, self._parts.port or PORTS[self._parts.scheme], KEEP_ALIVE)
+        self._waits("")
+        self._client.connect_async(self._host, self._port, KEEP_ALIVE)
         self._client.loop_start()
 
     def _learn(self, facts: tuple[ChannelFacts, ...]) -> None:
@@ -141,7 +198,8 @@ class MqttSink(ThreadedSink):
         """After each connection: who is here, and what there is."""
         if self._anew.is_set():
             self._anew.clear()
-            self._say("running", f"connected to {self._parts.hostname}")
+            self._why = ""
+            self._say("running", f"connected to {self._host}")
             self._client.publish(self._status, "online", qos=1, retain=True)
             self._discover()
 
@@ -215,3 +273,54 @@ class MqttSink(ThreadedSink):
             said.wait_for_publish(2.0)
         self._client.disconnect()
         self._client.loop_stop()
+        if not self._greeted and self.stats.dropped:
+            why = self._why or f"the broker at {self._host}:{self._port} does not answer"
+            self._fail(TedsProvisionError(f"{self.name} took nothing: {why}.", hint="Mend that, and measure again."))
+
+
+def _files_of(query: str, *, tls: bool) -> dict[str, str]:
+    """The files that a URL names; raises UsageFailure for another key, one that comes twice, a CA without TLS."""
+    known = FILES if tls else FILES[:1]
+    named: dict[str, str] = {}
+    for key, path in parse_qsl(query, keep_blank_values=True):
+        if key not in known or key in named or not path:
+            what = "comes twice or is empty" if key in known else "is not known there"
+            more = "" if tls else f"; with mqtts:// also {', '.join(FILES[1:])}"
+            raise UsageFailure(f"{key!r} in the URL of a broker {what}.", hint=f"Known: {', '.join(known)}{more}.")
+        named[key] = path
+    if "key" in named and "cert" not in named:
+        raise UsageFailure("'key' in the URL of a broker needs 'cert'.", hint="cert=PATH&key=PATH, both in PEM.")
+    return named
+
+
+def _octets(key: str, path: str) -> bytes:
+    """A small regular file that the URL names by this key; raises NotFound, BadData."""
+    try:
+        if not stat.S_ISREG(Path(path).stat().st_mode):  # a pipe would hold the sink up until somebody writes
+            raise BadData(f"{key}={path} is no regular file.", hint="Check the URL of the broker.")
+    except (OSError, ValueError) as error:
+        raise NotFound(f"{key}={path} cannot be read.", hint="Check its path and mode.") from error
+    return read_limited(Path(path), _MOST_OCTETS, "password or certificate", failure=NotFound)
+
+
+def _no_password() -> str:
+    """Nobody is asked for a key's passphrase: the library would do so on the terminal."""
+    raise ValueError("the key is encrypted")
+
+
+def _in_words(error: BaseException, host: str, port: int) -> str:
+    """Why no connection came about."""
+    if isinstance(error, ssl.SSLCertVerificationError):
+        said = error.verify_message or str(error)
+        return f"the certificate of {host} does not verify: {said} (ca=PATH names the CA)"
+    if isinstance(error, ssl.SSLError):
+        return f"TLS with {host}:{port} fails: {error.reason or error}"
+    if isinstance(error, socket.gaierror):
+        return f"the host {host} is not known"
+    if isinstance(error, ConnectionRefusedError):
+        return f"nobody listens at {host}:{port}"
+    if isinstance(error, TimeoutError):
+        return f"{host}:{port} does not answer"
+    if isinstance(error, ConnectionResetError):  # while TLS begins
+        return f"{host}:{port} ends the connection; it may speak no TLS (mqtt://)"
+    return f"{host}:{port} cannot be reached: {getattr(error, 'strerror', None) or error}"

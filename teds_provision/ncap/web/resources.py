@@ -15,6 +15,7 @@ from teds_provision.errors import NotFound, PolicyRefused, UsageFailure
 from teds_provision.ncap.daemon import Daemon
 from teds_provision.ncap.nodes.holding import LONGEST
 from teds_provision.ncap.nodes.roster import MOST_SHOWN
+from teds_provision.ncap.sinks import for_readers
 from teds_provision.ncap.web.answers import Body
 from teds_provision.ncap.web.guard import CALLER, Caller
 from teds_provision.ncap.web.openapi import document
@@ -76,7 +77,7 @@ class Resources:
         """GET /status."""
         caller: Caller = request.scope[CALLER]
         found = await asyncio.to_thread(self._daemon.status)
-        return JSONResponse({**found, "write": not caller.read_only})
+        return _shown(request, {**found, "write": not caller.read_only})
 
     async def detection(self, request: Request) -> Response:
         """GET, PUT /detection."""
@@ -106,7 +107,7 @@ class Resources:
         limit = _integer(request, "limit", 200, _MOST_ENTRIES)
         uuid = request.query_params.get("uuid")
         found = await asyncio.to_thread(self._log, limit, uuid)
-        return JSONResponse(found)
+        return _shown(request, found)
 
     def _log(self, limit: int, uuid: str | None) -> dict[str, Any]:
         log = self._daemon.station.audit_log
@@ -268,7 +269,7 @@ class Resources:
         """GET, POST /measurements."""
         measuring = self._daemon.measuring
         if request.method == "GET":
-            return JSONResponse({"measurements": await asyncio.to_thread(measuring.all)})
+            return _shown(request, {"measurements": await asyncio.to_thread(measuring.all)})
         body = await Body.of(request)
         asked: dict[str, Any] = {
             "group": body.take("group", str),
@@ -338,6 +339,12 @@ class Resources:
             raise NotFound(f"{uuid} is no virtual transducer of this station.")
         await changing(self._daemon.drop_virtual, uuid)
         return JSONResponse({"virtual": self._daemon.virtuals.all()})
+
+
+def _shown(request: Request, found: dict[str, Any]) -> JSONResponse:
+    """An answer that may name files and users of this machine, which are nothing for a token that may only read."""
+    caller: Caller = request.scope[CALLER]
+    return JSONResponse(for_readers(found) if caller.read_only else found)
 
 
 def _integer(request: Request, name: str, default: int, most: int, least: int = 1) -> int:

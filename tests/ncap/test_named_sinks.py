@@ -1,0 +1,110 @@
+"""Where values may go by a request: to names that the daemon's owner gave, never to a host or file of the request."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from teds_provision.cli.configuration import brokers_of
+from teds_provision.client import ApiError
+from teds_provision.errors import BadData, TedsProvisionError, UsageFailure
+from teds_provision.ncap.sinks import DaemonSinks, for_readers
+from teds_provision.store import Measurement
+from tests.e2e.desk import Desk
+from tests.ncap.service import Service, virtual
+from tests.places import free_tcp_port
+
+LAB = "mqtts://arm@broker.lab?password-file=/home/arm/secret"
+
+
+def test_a_request_names_a_sink_and_never_says_where_it_is(tmp_path: Path) -> None:
+    sinks = DaemonSinks(tmp_path, ("ros2", "mqtt://own"), actuators=True, brokers={"lab": LAB})
+    assert [sinks.whole(name) for name in ("ros1", "ros2", "mqtt", "lab")] == ["ros1", "ros2", "mqtt", "lab"]
+    assert sinks.whole("run.csv") == str(tmp_path / "recordings" / "run.csv")
+    for spec in (
+        "mqtt://evil@host?password-file=/etc/shadow",
+        "mqtt://own",
+        LAB,
+        "ros1:http://evil:11311",
+        "ros2:7",
+        "other",
+        "lab?password-file=/etc/shadow",
+        "/tmp/x.csv",
+        "../x.csv",
+        "a/b.csv",
+        ".csv",
+        "x.csv\n",
+    ):
+        with pytest.raises(UsageFailure):
+            sinks.whole(spec)
+
+
+def test_a_name_stands_for_its_url_when_it_is_opened_and_is_told_where_it_is_gone(tmp_path: Path) -> None:
+    sinks = DaemonSinks(tmp_path, ("mqtt://own",), actuators=True, brokers={"lab": LAB})
+    assert (sinks.open("lab").name, sinks.open("mqtt").name) == ("mqtts://broker.lab", "mqtt://own")
+    kept = Measurement("m", sinks=("mqtt",))
+    assert sinks.more(kept, None) == [], "the daemon's own broker is not served twice"
+    assert [sink.name for sink in sinks.more(Measurement("m", sinks=("lab",)), None)] == ["mqtt://own"]
+    with pytest.raises(UsageFailure, match="no broker 'lab' any more"):
+        DaemonSinks(tmp_path, actuators=True).open("lab")
+
+
+@pytest.mark.parametrize(
+    ("name", "url"),
+    [("mqtt", LAB), ("ros1", LAB), ("a/b", LAB), ("", LAB), ("lab", "/etc/passwd.csv"), ("lab", "mqtts://x?cafile=/y")],
+)
+def test_a_broker_that_is_none_is_refused_at_the_start(tmp_path: Path, name: str, url: str) -> None:
+    with pytest.raises(TedsProvisionError):
+        DaemonSinks(tmp_path, actuators=True, brokers={name: url})
+
+
+def test_brokers_stand_in_config_toml(tmp_path: Path) -> None:
+    file = tmp_path / "config.toml"
+    assert brokers_of(file) == {}
+    file.write_text(f'[ncap.run]\nmetrics = true\n[ncap.brokers]\nlab = "{LAB}"\n')
+    assert brokers_of(file) == {"lab": LAB}
+    file.write_text("[ncap.brokers]\nlab = 5\n")
+    with pytest.raises(BadData, match="line 2"):
+        brokers_of(file)
+
+
+def test_readers_see_names_of_files_and_no_users() -> None:
+    told = {
+        "name": "/home/me/records/run.csv",
+        "error": "/home/me/records/run.csv cannot be written: the disk is full.",
+        "sinks": ["mqtts://arm@broker.lab:8883?password-file=/home/arm/secret", "ros1"],
+        "rate": 50,
+        "unit": "m/s",
+        "topic": "/bench/hand/opening",
+    }
+    assert for_readers(told) | {"topic": None} == {
+        "name": "run.csv",
+        "error": "run.csv cannot be written: the disk is full.",
+        "sinks": ["mqtts://broker.lab:8883", "ros1"],
+        "rate": 50,
+        "unit": "m/s",
+        "topic": None,
+    }
+
+
+@pytest.mark.link
+def test_a_running_daemon_takes_the_names_of_its_owner(desk: Desk) -> None:
+    station = desk.station()
+    port = free_tcp_port()
+    (station.home / "config.toml").write_text(f'[ncap.brokers]\nlab = "mqtt://arm@127.0.0.1:{port}"\n')
+    service = Service(desk, station).start()
+    hand = virtual(service)
+    with service.client(service.token("writer")) as asked, service.client(service.token("eye", "--read-only")) as eye:
+        for sinks in (["mqtt://evil@127.0.0.1?password-file=/etc/passwd"], [f"mqtt://127.0.0.1:{port}"], ["mqtt"]):
+            with pytest.raises(ApiError) as refusal:
+                asked.request("POST", "/measurements", {"uuids": [hand], "sinks": sinks})
+            assert (refusal.value.status, refusal.value.code) == (422, "usage")
+        made = asked.request("POST", "/measurements", {"uuids": [hand], "sinks": ["lab", "run.csv"]})
+        assert made["sinks"][0] == "lab"
+        assert made["sinks"][1].startswith("/")
+        [seen] = eye.request("GET", "/measurements")["measurements"]
+        assert seen["sinks"] == ["lab", "run.csv"]
+        assert str(station.home) not in str(eye.request("GET", "/status"))
+        asked.end_measurement(made["id"])
+    service.end()
