@@ -5,7 +5,7 @@ PYTHON ?= python3
 VENV ?= .venv
 BIN := $(VENV)/bin
 
-.PHONY: demo demo-page page-picture test test-system lint types unit quick bench bench-teds bench-handover bench-measure bench-ncap bench-scale fuzz faults model house man coverage api test-other vectors-c sbom firmware clean
+.PHONY: demo demo-page page-picture test test-system lint types unit quick bench bench-teds bench-handover bench-measure bench-ncap bench-scale fuzz faults model house man coverage mutants api test-other vectors-c sbom firmware clean
 
 demo: $(VENV)/.run
 	@$(BIN)/teds-provision demo
@@ -99,6 +99,12 @@ fuzz: .venv-fuzz/.ready
 # Cuts at every durable write and message of every changing command, failing disks, power loss; an hour, or all (FULL=1).
 faults: $(VENV)/.dev
 	$(BIN)/python -m tests.faults.bench $(if $(FULL),--full,--minutes 60)
+
+# Does a test notice when the code is broken? Rules of the profile by pattern, and random mutants; prints the survivors.
+# 300 within the hour on two cores: make mutants ROOM=steps COUNT=100, or ROOM=protocol/commit.py
+COUNT ?= 300
+mutants: $(VENV)/.dev
+	$(BIN)/python -m tests.mutants.run --count $(COUNT) $(if $(ROOM),--room $(ROOM))
 
 # What follows from the command line's own definitions: option names, docs/configuration.md, the man page.
 man: $(VENV)/.dev

@@ -16,6 +16,33 @@
  *   BREAK_OLD_PENDING  any pending key that opens ends a due rotation, also one made before the rotation was due
  *   BREAK_REFUSAL a refused Open deletes the key that was tried
  *   BREAK_LATE    a late receipt deletes the key though the node has come back since
+ *   BREAK_EPOCH_BACK     a reset puts the node's epoch back
+ *   BREAK_SEQUENCE_BACK  a reset puts the node's sequence back
+ *   BREAK_SIGNER         the signer does not look at the node's sequence
+ *   BREAK_STALE_EPOCH    the node takes a datasheet that was signed for an earlier epoch
+ *   BREAK_MOVE_ORDER     the file of a move is written before its tombstone
+ *   BREAK_COPY_ORDER     the file of a copy is written before the receiver is noted as a holder
+ *   BREAK_MOVE_NO_ROTATION  the receiver of a move does not rotate
+ *   BREAK_UNDO           a move that is taken back demands no rotation
+ *   BREAK_EARLY_DELETE   the old key is deleted when the new one is stored, before an Open has proven it
+ *   BREAK_DROP_PENDING   a new agreement drops the pending key of the one before it
+ *   BREAK_ROTATED_EARLY  a due rotation counts as done when the new key is stored
+ *   BREAK_NEVER_FORGETS  a Request is good for longer than the station waits for it
+ *   BREAK_ANY_CONFIRM    a Confirm is good for another agreement than its own
+ *   BREAK_BEFORE_OPEN    an Open is not needed: Confirm alone makes the new key the only one
+ *   BREAK_RECEIPT_FIRST  the receipt leaves before what it tells of is durable
+ *   BREAK_RECEIPT_OTHER  a receipt closes whatever move stands, not the one that it names
+ *   BREAK_IMPORT_OLDER   a bundle with an older key is taken in, in the place of the key that is held
+ *   BREAK_IMPORT_REPLACES  a bundle's key takes the place of the held one before an Open has proven it
+ *   BREAK_RESET_REPLAY   an old proof of a reset counts (no fresh challenge)
+ *   BREAK_RESET_UNPROVEN a station believes that a node was reset because it says so
+ *   BREAK_RESET_RAM      a reset leaves the agreement under way
+ *   BREAK_RESET_FACTORY  a Reset in factory state leaves it
+ *   BREAK_KEEPS_OLD      the node opens sessions under the key before the present one too
+ *   BREAK_SESSION        a session outlives the Confirm that replaces its key
+ *   BREAK_SESSION_RESET  a session outlives a reset
+ *   BREAK_MEASURED_ON    a session goes on although the station has given the node away
+ *   BREAK_ERASE          a node that was cut in Confirm does not erase the old key when it starts
  */
 
 #ifndef AGREEMENTS
@@ -44,6 +71,20 @@
 /* ---- the node ------------------------------------------------------------------------------------------------- */
 byte node_key, node_epoch, node_sequence;
 byte ram;			/* the key that a good Request left in RAM */
+byte top_epoch, top_sequence;	/* for the properties alone: the highest that the node ever had */
+byte overtaken;			/* likewise: the key of an agreement that a reset came into */
+#ifdef BREAK_KEEPS_OLD
+byte node_before;
+#endif
+#ifdef BREAK_ERASE
+#define SLOTS
+#endif
+#ifdef SLOTS
+bool booting, residue;		/* a cut in Confirm; an old key still lies in flash */
+#define UP !booting
+#else
+#define UP true
+#endif
 
 /* ---- keys ------------------------------------------------------------------------------------------------------ */
 byte keys = 1;			/* the next key to be made */
@@ -71,6 +112,15 @@ byte backed_up = NOBODY;
 /* ---- stations: what a cut takes -------------------------------------------------------------------------------- */
 mtype = { idle, replied, stored, confirming, signed_, given };
 mtype at[STATIONS];
+#if defined(BREAK_SESSION) || defined(BREAK_SESSION_RESET) || defined(BREAK_MEASURED_ON)
+#define SESSIONS_TOO
+#endif
+#ifdef SESSIONS_TOO
+byte session[STATIONS];		/* the key under which it is open, 0 for none */
+#define END_SESSIONS session[0] = 0; session[1] = 0; session[2] = 0
+#else
+#define END_SESSIONS skip
+#endif
 byte fresh[STATIONS];		/* the key of the agreement under way */
 byte number[STATIONS];		/* the sequence being written, or the bundle being made */
 
@@ -85,10 +135,20 @@ bool restored;			/* a store was lost and came back older: keys may be gone (docs
 byte commits, restores, resets;
 
 #define HOLDS(s, k) ((k) != 0 && (st[s].held & BIT(k)))
-#define USABLE(s) (st[s].tombstone == NOBODY && HOLDS(s, node_key))
+#ifdef BREAK_KEEPS_OLD
+#define KNOWN(s) (HOLDS(s, node_key) || HOLDS(s, node_before))
+#else
+#define KNOWN(s) HOLDS(s, node_key)
+#endif
+#define USABLE(s) (UP && st[s].tombstone == NOBODY && KNOWN(s))
 #define FREE(s) (USABLE(s) && !st[s].due)
 
+#ifdef SESSIONS_TOO
+inline cut(s) { at[s] = idle; fresh[s] = 0; number[s] = 0; session[s] = 0 }
+#else
 inline cut(s) { at[s] = idle; fresh[s] = 0; number[s] = 0 }
+#endif
+inline done(s) { at[s] = idle; fresh[s] = 0; number[s] = 0 }
 
 inline demand_rotation(s) { st[s].due = true; st[s].due_since = keys }
 
@@ -107,7 +167,11 @@ inline select_receiver(s) {
 }
 
 /* No epoch goes back; and after a move only the station that the node went to may hand it back. */
+#ifdef BREAK_IMPORT_OLDER
+#define NOT_OLDER(s, n) true
+#else
 #define NOT_OLDER(s, n) (st[s].present_key == 0 || epoch_of[bundle[n].key] >= epoch_of[st[s].present_key])
+#endif
 #define HANDED_BACK(s, n) (bundle[n].move && bundle[n].sender == bundle[st[s].tombstone].receiver)
 #ifdef BREAK_M2
 #define MAY_COME(s, n) true
@@ -131,18 +195,31 @@ inline take_in(s, n) {
 	:: else
 	fi;
 	if
+#ifdef BREAK_MOVE_NO_ROTATION
+	:: bundle[n].move
+#else
 	:: bundle[n].move -> demand_rotation(s)
+#endif
 	:: else -> st[s].shared = true
 	fi;
 #ifdef BREAK_M1
 	st[s].sequence = LIE;
 #endif
+#if defined(BREAK_IMPORT_OLDER) || defined(BREAK_IMPORT_REPLACES)
+	st[s].held = BIT(bundle[n].key); st[s].present_key = bundle[n].key;
+#else
 	st[s].held = st[s].held | BIT(bundle[n].key);
+#endif
 	st[s].imported = st[s].imported | BIT(n);
 	bundle[n].receipt = true
 }
 
-#define RECEIVABLE(s, n) (at[s] == idle && n < bundles && bundle[n].sender == s && bundle[n].receipt && \
+#ifdef BREAK_RECEIPT_FIRST
+#define RECEIPT_LEFT(n) (bundle[n].receipt || bundle[n].made)
+#else
+#define RECEIPT_LEFT(n) bundle[n].receipt
+#endif
+#define RECEIVABLE(s, n) (at[s] == idle && n < bundles && bundle[n].sender == s && RECEIPT_LEFT(n) && \
 	!(st[s].closed & BIT(n)))
 
 inline close_handover(s, n) {
@@ -150,6 +227,10 @@ inline close_handover(s, n) {
 	if
 #ifdef BREAK_LATE
 	:: bundle[n].move && !(st[s].undone & BIT(n)) ->
+#elif defined(BREAK_RECEIPT_OTHER)
+	:: st[s].tombstone != NOBODY ->		/* whichever stands */
+		st[s].closed = st[s].closed | BIT(st[s].tombstone);
+		st[s].held = st[s].held & ~BIT(bundle[st[s].tombstone].key);
 #else
 	:: bundle[n].move && st[s].tombstone == n ->	/* only while this very move stands */
 #endif
@@ -208,7 +289,7 @@ end:
 	:: atomic { at[s] != idle -> cut(s) }
 
 	/* -- agreement, first or rotation: Request and its reply (128.1), by tap or in a session -------------------- */
-	:: atomic { at[s] == idle && st[s].tombstone == NOBODY && keys < KEYS &&
+	:: atomic { UP && at[s] == idle && st[s].tombstone == NOBODY && keys < KEYS &&
 		(keys > 1 || s == 0) ->	/* who begins makes no difference: stations are alike */
 		ram = keys; epoch_of[keys] = node_epoch + 1; maker[keys] = s;
 		if
@@ -220,13 +301,27 @@ end:
 	:: atomic { at[s] == replied -> confirm_sent[fresh[s]] = true; at[s] = stored }
 	:: atomic { at[s] == stored -> st[s].held = st[s].held | BIT(fresh[s]); at[s] = confirming }
 #else
-	:: atomic { at[s] == replied -> st[s].held = st[s].held | BIT(fresh[s]); at[s] = stored }
+	:: atomic { at[s] == replied ->
+#ifdef BREAK_EARLY_DELETE
+		st[s].held = 0; st[s].present_key = fresh[s];
+#endif
+#ifdef BREAK_DROP_PENDING
+		st[s].held = st[s].held & BIT(st[s].present_key);
+#endif
+#ifdef BREAK_ROTATED_EARLY
+		st[s].due = false; st[s].shared = false; given_to[s] = NOBODY;
+#endif
+		st[s].held = st[s].held | BIT(fresh[s]); at[s] = stored }
 	:: atomic { at[s] == stored -> confirm_sent[fresh[s]] = true; at[s] = confirming }
+#endif
+#ifdef BREAK_BEFORE_OPEN
+	:: atomic { at[s] == confirming -> st[s].held = BIT(fresh[s]); st[s].present_key = fresh[s]; cut(s) }
 #endif
 	:: atomic { at[s] == confirming -> cut(s) }	/* the reply came or not: an Open tells */
 
 	/* -- Open under each key held, newest pending first: one succeeds --------------------------------------------- */
 	:: atomic { at[s] == idle && USABLE(s) && (st[s].present_key != node_key || OLDER_HELD(s)) ->
+		assert(epoch_of[node_key] >= epoch_of[st[s].present_key]);	/* no epoch goes back at a station either */
 		st[s].present_key = node_key;
 		keep_newer(s);			/* now, and only now, others are deleted */
 		if
@@ -240,11 +335,18 @@ end:
 		fi }
 	/* 60 seconds after its Request the node has forgotten it: a newer key that did not open goes after all */
 	:: atomic { at[s] == idle && USABLE(s) && st[s].present_key == node_key && st[s].held != BIT(node_key) ->
+#ifndef BREAK_NEVER_FORGETS
 		if
 		:: ram != 0 && HOLDS(s, ram) -> ram = 0
 		:: else
 		fi;
+#endif
 		st[s].held = BIT(node_key) }
+#ifdef SESSIONS_TOO
+	/* -- a session, under the key that the node has now ----------------------------------------------------------- */
+	:: atomic { at[s] == idle && FREE(s) && st[s].present_key == node_key && session[s] == 0 -> session[s] = node_key }
+	:: atomic { session[s] != 0 && at[s] == idle -> session[s] = 0 }
+#endif
 #ifdef BREAK_REFUSAL
 	:: atomic { at[s] == idle && st[s].tombstone == NOBODY && st[s].present_key != 0 && st[s].held != BIT(st[s].present_key) ->
 		st[s].held = BIT(st[s].present_key) }	/* "16" to a pending key, perhaps forged */
@@ -253,37 +355,69 @@ end:
 	/* -- sign and commit, in a session ---------------------------------------------------------------------------- */
 	:: atomic { at[s] == idle && FREE(s) && st[s].present_key == node_key && commits < COMMITS ->
 		commits++;
+#ifdef BREAK_SIGNER
+		st[s].sequence = st[s].sequence + 1;
+#else
 		st[s].sequence = (st[s].sequence > node_sequence -> st[s].sequence : node_sequence) + 1;
-		number[s] = st[s].sequence; at[s] = signed_ }
+#endif
+		assert(st[s].sequence > node_sequence);	/* signed in a session, it is newer than what the node has */
+		number[s] = st[s].sequence; fresh[s] = node_key; at[s] = signed_ }
 	:: atomic { at[s] == signed_ && USABLE(s) ->
 		assert(number[s] <= node_sequence + STEP);	/* else the node refuses for ever (7) */
 		if
-		:: number[s] > node_sequence -> node_sequence = number[s]
+#ifdef BREAK_STALE_EPOCH
+		:: number[s] > node_sequence ->
+#else
+		:: number[s] > node_sequence && epoch_of[fresh[s]] == node_epoch ->
+#endif
+			assert(epoch_of[fresh[s]] == node_epoch);	/* a datasheet is of the epoch that it names */
+			assert(number[s] > top_sequence);	/* no sequence goes back */
+			node_sequence = number[s]; top_sequence = number[s]
 		:: else					/* stale: somebody else was faster; sign again */
 		fi;
-		cut(s) }
+		done(s) }
 
 	/* -- move: the tombstone before the file ------------------------------------------------------------------------ */
 	:: atomic { at[s] == idle && st[s].tombstone == NOBODY && st[s].present_key != 0 && bundles < BUNDLES && SETTLED(s) ->
 		select_receiver(s);
 		bundle[bundles].sender = s; bundle[bundles].receiver = b; bundle[bundles].key = st[s].present_key;
-		bundle[bundles].move = true;
-		st[s].tombstone = bundles; given_to[s] = b; number[s] = bundles; at[s] = given; bundles++ }
-	:: atomic { at[s] == given -> bundle[number[s]].made = true; cut(s) }
+		bundle[bundles].move = true; given_to[s] = b;
+#ifdef BREAK_MOVE_ORDER
+		bundle[bundles].made = true;
+#else
+		st[s].tombstone = bundles;
+#endif
+#if defined(SESSIONS_TOO) && !defined(BREAK_MEASURED_ON)
+		session[s] = 0;
+#endif
+		number[s] = bundles; at[s] = given; bundles++ }
+#ifdef BREAK_MOVE_ORDER
+	:: atomic { at[s] == given -> st[s].tombstone = number[s]; done(s) }
+#else
+	:: atomic { at[s] == given -> bundle[number[s]].made = true; done(s) }
+#endif
 	/* cut between the two: the same move again makes the file */
 	:: atomic { at[s] == idle && st[s].tombstone != NOBODY && !bundle[st[s].tombstone].made ->
 		bundle[st[s].tombstone].made = true }
 	/* undo, before the receipt */
 	:: atomic { at[s] == idle && st[s].tombstone != NOBODY && !(st[s].closed & BIT(st[s].tombstone)) ->
 		st[s].undone = st[s].undone | BIT(st[s].tombstone);
-		st[s].tombstone = NOBODY; demand_rotation(s); given_to[s] = NOBODY }
+#ifndef BREAK_UNDO
+		demand_rotation(s);
+#endif
+		st[s].tombstone = NOBODY; given_to[s] = NOBODY }
 
 	/* -- copy: noted before the file ----------------------------------------------------------------------------------- */
 	:: atomic { at[s] == idle && st[s].tombstone == NOBODY && st[s].present_key != 0 && !st[s].due && bundles < BUNDLES &&
 		st[s].held == BIT(st[s].present_key) ->
 		select_receiver(s);
 		bundle[bundles].sender = s; bundle[bundles].receiver = b; bundle[bundles].key = st[s].present_key;
+#ifdef BREAK_COPY_ORDER
+		bundle[bundles].made = true; number[s] = bundles; at[s] = given; bundles++ }
+	:: atomic { at[s] == given && !bundle[number[s]].move -> st[s].shared = true; done(s) }
+#else
 		bundle[bundles].made = true; st[s].shared = true; bundles++ }
+#endif
 
 	/* -- import, at any time, once: the file may come late, and again after that ------------------------------------- */
 	:: atomic { IMPORTABLE(s, 0) -> take_in(s, 0) }
@@ -314,7 +448,34 @@ end:
 		}
 
 	/* -- reset, by hand or in a session: the node forgets its key, never epoch and sequence ------------------------------------ */
-	:: atomic { resets < RESETS && node_key != 0 -> resets++; node_key = 0; ram = 0 }
+	:: atomic { UP && resets < RESETS && node_key != 0 ->
+		resets++; node_key = 0; overtaken = ram;
+#ifndef BREAK_RESET_RAM
+		ram = 0;
+#endif
+#ifdef BREAK_EPOCH_BACK
+		node_epoch = 0;
+#endif
+#ifdef BREAK_SEQUENCE_BACK
+		node_sequence = 0;
+#endif
+#ifndef BREAK_SESSION_RESET
+		END_SESSIONS
+#endif
+		}
+	/* the node signs that it was reset, over the station's challenge of this moment: then its keys go here */
+#if defined(BREAK_RESET_REPLAY)
+#define SHOWS_RESET (resets > 0)
+#elif defined(BREAK_RESET_UNPROVEN)
+#define SHOWS_RESET true
+#else
+#define SHOWS_RESET (UP && resets > 0 && node_key == 0)
+#endif
+	:: atomic { SHOWS_RESET && at[s] == idle && st[s].present_key != 0 && st[s].tombstone == NOBODY ->
+#if !defined(BREAK_RESET_FACTORY) && !defined(BREAK_RESET_REPLAY) && !defined(BREAK_RESET_UNPROVEN)
+		ram = 0;		/* the Reset that brings the proof ends an agreement under way, in factory state too */
+#endif
+		st[s].held = 0; st[s].present_key = 0 }
 	od
 }
 
@@ -324,9 +485,33 @@ proctype node()
 end:
 	do
 	/* Confirm (128.2): one flash transaction; a doubled or late one finds nothing pending */
-	:: atomic { ram != 0 && confirm_sent[ram] ->
-		assert(epoch_of[ram] > node_epoch);	/* no epoch goes back */
-		node_key = ram; node_epoch = epoch_of[ram]; ram = 0 }
+#ifdef BREAK_ANY_CONFIRM
+	:: atomic { UP && ram != 0 && (confirm_sent[ram] || confirm_sent[ram - 1]) ->
+#else
+	:: atomic { UP && ram != 0 && confirm_sent[ram] ->
+#endif
+		assert(epoch_of[ram] > top_epoch);	/* no epoch goes back, and none is given twice */
+		assert(ram != overtaken);		/* a reset ends what was begun before it */
+#ifdef BREAK_KEEPS_OLD
+		node_before = node_key;
+#endif
+#ifdef SLOTS
+		if
+		:: node_key != 0 -> residue = true; booting = true	/* a cut before the old slot is erased */
+		:: skip
+		fi;
+#endif
+#ifndef BREAK_SESSION
+		END_SESSIONS;
+#endif
+		node_key = ram; node_epoch = epoch_of[ram]; top_epoch = node_epoch; ram = 0 }
+#ifdef SLOTS
+	:: atomic { booting ->
+#ifndef BREAK_ERASE
+		residue = false;
+#endif
+		booting = false }
+#endif
 	/* a cut, a lost link, 60 seconds: what lay in RAM is gone */
 	:: atomic { ram != 0 -> ram = 0 }
 	od
@@ -334,6 +519,20 @@ end:
 
 /* A node whose key nobody can use for ever: no living station holds it that may use it or may take it back. */
 #define REACHES(s) (HOLDS(s, node_key) && (st[s].tombstone == NOBODY || !(st[s].closed & BIT(st[s].tombstone))))
+/* A key left in a file, by its sender's hand or into its receiver's: who uses it still knows that it is not alone. */
+#define IN_FILE(s, n) (n < bundles && bundle[n].made && bundle[n].key == node_key && \
+	(bundle[n].sender == s || (bundle[n].receiver == s && (st[s].imported & BIT(n)))))
+#if BUNDLES > 2
+#define LEFT(s) (IN_FILE(s, 0) || IN_FILE(s, 1) || IN_FILE(s, 2))
+#elif BUNDLES > 1
+#define LEFT(s) (IN_FILE(s, 0) || IN_FILE(s, 1))
+#else
+#define LEFT(s) IN_FILE(s, 0)
+#endif
+#define UNAWARE(s) (FREE(s) && !st[s].shared && LEFT(s))
+#ifdef SESSIONS_TOO
+#define OUTLIVED(s) (session[s] != 0 && (session[s] != node_key || given_to[s] != NOBODY))
+#endif
 #define TWO_OWNERS(x, y) (FREE(x) && FREE(y) && !(st[x].shared && st[y].shared))
 
 active proctype watch()
@@ -343,6 +542,13 @@ end:
 	:: atomic { TWO_OWNERS(0, 1) || TWO_OWNERS(0, 2) || TWO_OWNERS(1, 2) -> assert(false) }	/* never two owners without a rotation due */
 	:: atomic { (given_to[0] != NOBODY && FREE(0)) || (given_to[1] != NOBODY && FREE(1)) ||
 		(given_to[2] != NOBODY && FREE(2)) -> assert(false) }	/* who gave a node away does not use it */
+	:: atomic { UNAWARE(0) || UNAWARE(1) || UNAWARE(2) -> assert(false) }	/* who uses a key that left in a file knows of it */
+#ifdef SESSIONS_TOO
+	:: atomic { OUTLIVED(0) || OUTLIVED(1) || OUTLIVED(2) -> assert(false) }	/* no session outlives its key, or a move */
+#endif
+#ifdef SLOTS
+	:: atomic { !booting && residue -> assert(false) }	/* a node that answers has one key in its flash */
+#endif
 	:: atomic { node_key != 0 && !restored && !(REACHES(0) || REACHES(1) || REACHES(2)) -> assert(false) }	/* no key is lost */
 	od
 }

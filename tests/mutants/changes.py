@@ -1,0 +1,192 @@
+"""Mutants: what may be changed in a module, as spans of its text; by name (a rule of the profile) or by chance.
+
+A pattern names a function and an expression in it, not a file or a line, so that it outlives a move. A random one is
+drawn from what a slip of the hand could be: a comparison, and for or, a lost not, a condition that always or never
+holds, a number one off, a step or a refusal that is left out, the other of True and False.
+"""
+
+from __future__ import annotations
+
+import ast
+import re
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parents[2]
+PACKAGE = ROOT / "teds_provision"
+
+_COMPARISONS: dict[type[ast.cmpop], str] = {
+    ast.Lt: "<=", ast.LtE: "<", ast.Gt: ">=", ast.GtE: ">", ast.Eq: "!=", ast.NotEq: "==", ast.Is: "is not",
+    ast.IsNot: "is", ast.In: "not in", ast.NotIn: "in",
+}  # fmt: skip
+_SAID_ONLY = ("notice", "debug", "info", "warning", "warn", "note", "tell", "say", "_say", "_tell", "emit")
+_DOERS = (ast.Call, ast.Await)
+_NAME = re.compile(r"[A-Za-z_]+")
+_JOINED = re.compile(r"[A-Z]?[a-z]+|[A-Z]+")
+
+
+@dataclass(frozen=True)
+class Mutant:
+    """One change: in ``path`` (from the root) the characters ``start`` to ``end`` become ``text``."""
+
+    path: str
+    start: int
+    end: int
+    text: str
+    function: str
+    line: int
+    told: str
+    words: frozenset[str] = frozenset()
+
+    def __str__(self) -> str:
+        return f"{self.path}:{self.line} {self.function}: {self.told}"
+
+    def applied(self, source: str) -> str:
+        """The module with the change in it."""
+        return source[: self.start] + self.text + source[self.end :]
+
+
+@dataclass(frozen=True)
+class Pattern:
+    """A rule, and what holds it: in ``function`` (``name``, ``Class.name``) the expression ``was`` becomes ``now``."""
+
+    rule: str
+    function: str
+    was: str
+    now: str
+
+
+class Module:
+    """One module of the package: its text, its tree, and where each node lies in the text."""
+
+    def __init__(self, name: str, source: str) -> None:
+        self.name, self.source = name, source
+        self.tree = ast.parse(self.source)
+        self._begins = [0]
+        for line in self.source.splitlines(keepends=True):
+            self._begins.append(self._begins[-1] + len(line))
+        self._lines = self.source.splitlines(keepends=True)
+
+    def span(self, node: ast.expr | ast.stmt) -> tuple[int, int]:
+        """Where a node begins and ends, in characters."""
+        assert node.end_lineno is not None
+        assert node.end_col_offset is not None
+        return self._at(node.lineno, node.col_offset), self._at(node.end_lineno, node.end_col_offset)
+
+    def _at(self, line: int, octets: int) -> int:
+        text = self._lines[line - 1]
+        return self._begins[line - 1] + (octets if text.isascii() else len(text.encode()[:octets].decode()))
+
+    def functions(self) -> Iterator[tuple[str, ast.FunctionDef | ast.AsyncFunctionDef]]:
+        """Every function with its name, that of its class before it."""
+        yield from _functions(self.tree, "")
+
+    def mutant(
+        self, node: ast.expr | ast.stmt, text: str, function: str, told: str = "", words: frozenset[str] = frozenset()
+    ) -> Mutant:
+        """A mutant that puts ``text`` in the place of a node; ``words`` are those of its function."""
+        start, end = self.span(node)
+        was = " ".join(self.source[start:end].split())
+        return Mutant(self.name, start, end, text, function, node.lineno, told or f"{was[:90]}  ->  {text}", words)
+
+
+def _functions(node: ast.AST, of: str) -> Iterator[tuple[str, ast.FunctionDef | ast.AsyncFunctionDef]]:
+    for child in ast.iter_child_nodes(node):
+        if isinstance(child, ast.FunctionDef | ast.AsyncFunctionDef):
+            yield f"{of}{child.name}", child
+            yield from _functions(child, f"{of}{child.name}.")
+        elif isinstance(child, ast.ClassDef):
+            yield from _functions(child, f"{child.name}.")
+        elif not isinstance(child, ast.expr):
+            yield from _functions(child, of)
+
+
+def modules(room: str = "") -> list[Module]:
+    """Every module of the package below ``room`` (``steps``, ``protocol/tim``, ``steps/agree.py``)."""
+    place = PACKAGE / room
+    paths = [place] if place.is_file() else sorted(place.rglob("*.py"))
+    return [Module(path.relative_to(ROOT).as_posix(), path.read_text()) for path in paths]
+
+
+def words_of(text: str) -> frozenset[str]:
+    """The words of a text in lower case, names cut where they are joined."""
+    return frozenset(
+        word.lower() for name in _NAME.findall(text) for word in (name, *_JOINED.findall(name)) if len(word) > 2
+    )
+
+
+def _words(module: Module, tree: ast.stmt) -> frozenset[str]:
+    return words_of(module.source[slice(*module.span(tree))])
+
+
+def found(pattern: Pattern, where: list[Module]) -> list[Mutant]:
+    """The places of a pattern: an expression, or a statement that is one expression; one, where all is well."""
+    wanted, told = ast.unparse(ast.parse(pattern.was, mode="eval")), f"{pattern.rule}: {pattern.was}  ->  {pattern.now}"
+    return [
+        module.mutant(node, pattern.now, function, told, _words(module, tree))
+        for module in where
+        for function, tree in module.functions()
+        if function == pattern.function
+        for node in ast.walk(tree)
+        if isinstance(node, ast.expr) and ast.unparse(node) == wanted
+    ]
+
+
+def any_of(module: Module) -> list[Mutant]:
+    """Every mutant of a module that chance may draw."""
+    return [mutant for function, tree in module.functions() for mutant in _of_function(module, function, tree)]
+
+
+def _of_function(module: Module, function: str, tree: ast.FunctionDef | ast.AsyncFunctionDef) -> Iterator[Mutant]:
+    if tree.name in ("__repr__", "__str__"):
+        return
+    words = _words(module, tree)
+    for node in _inner(tree):
+        for text, part in _changes(module, node):
+            yield module.mutant(part, text, function, words=words)
+
+
+def _inner(tree: ast.AST) -> Iterator[ast.AST]:
+    """The nodes of a function's body; not those of functions in it, of annotations, defaults and what errors say."""
+    body = tree.body if isinstance(tree, ast.FunctionDef | ast.AsyncFunctionDef) else ast.iter_child_nodes(tree)
+    for child in body:
+        if isinstance(child, ast.FunctionDef | ast.AsyncFunctionDef | ast.ClassDef | ast.JoinedStr):
+            continue
+        yield child
+        if isinstance(child, ast.Raise | ast.Assert) or _says_only(child):
+            continue
+        yield from _inner(child)
+
+
+def _says_only(node: ast.AST) -> bool:
+    if not (isinstance(node, ast.Expr) and isinstance(node.value, ast.Call)):
+        return False
+    called = node.value.func
+    return (called.attr if isinstance(called, ast.Attribute) else getattr(called, "id", "")) in _SAID_ONLY
+
+
+def _changes(module: Module, node: ast.AST) -> Iterator[tuple[str, ast.expr | ast.stmt]]:
+    match node:
+        case ast.Compare(ops=[op]) if type(op) in _COMPARISONS:
+            left, right = (module.source[slice(*module.span(side))] for side in (node.left, node.comparators[0]))
+            yield f"({left}) {_COMPARISONS[type(op)]} ({right})", node
+        case ast.BoolOp():
+            other = " or " if isinstance(node.op, ast.And) else " and "
+            yield "(" + other.join(f"({module.source[slice(*module.span(one))]})" for one in node.values) + ")", node
+        case ast.UnaryOp(op=ast.Not()):
+            yield f"({module.source[slice(*module.span(node.operand))]})", node
+        case ast.If() | ast.IfExp() | ast.While():
+            yield "False", node.test
+            if not isinstance(node, ast.While):
+                yield "True", node.test
+        case ast.Constant(value=bool(value)):
+            yield str(not value), node
+        case ast.Constant(value=int(value)):
+            yield str(value + 1), node
+        case ast.Raise() | ast.Continue() | ast.Break():
+            yield "pass", node
+        case ast.Expr(value=value) if isinstance(value, _DOERS) and not _says_only(node):
+            yield "pass", node
+        case ast.AugAssign():
+            yield "pass", node

@@ -1,0 +1,127 @@
+"""Rules of the profile and of the house, each with the expression that holds it: whoever breaks one must be noticed."""
+
+from __future__ import annotations
+
+from tests.mutants.changes import Pattern
+
+PATTERNS = (
+    # keys and their life (steps, station, handover)
+    Pattern("a pending key out of a backup is no rotation", "_activate", "station.keys.restored(uuid)", "False"),
+    Pattern("an imported key that opens is no rotation", "_activate", "record.source == 'agreement'", "True"),
+    Pattern("Identify alone makes no node new", "_agree_anew", "only_new and not agreed.unsigned", "False"),
+    Pattern("a returning node shows that it was reset", "_agree_anew", "returning and not agreed.unsigned", "False"),
+    Pattern(
+        "a lost-out station never agrees by itself",
+        "_Word.require",
+        "station.keys.held(node.uuid) and not self.rotate",
+        "False",
+    ),
+    Pattern("a takeover needs a word", "_agree", "word.require(station, node)", "None"),
+    Pattern(
+        "restored: no bus without a word", "open_session", "station.policy.require_not_restored(node.uuid)", "None"
+    ),
+    Pattern("given away: no session", "open_session", "station.policy.require_not_given_away(node.uuid)", "None"),
+    Pattern(
+        "a due rotation is made at contact",
+        "session_if_keyed",
+        "station.keys.rotation_due(node.uuid) is not None",
+        "False",
+    ),
+    Pattern("only a tap pins", "_pin_for", "node.tapped", "True"),
+    Pattern("only a new node's bus pins", "_pin_for", "who.state == NodeState.FACTORY and node.wired", "node.wired"),
+    Pattern("a held-back Confirm finds its key", "NodeKeys.outdated", "other.created >= late", "False"),
+    Pattern("eight pending keys", "NodeKeys.add_pending", "pending[MAX_PENDING - 1:]", "[]"),
+    Pattern(
+        "a due rotation makes pending keys imported",
+        "NodeKeys.demand_rotation",
+        "self._store.count_as_imported(uuid)",
+        "None",
+    ),
+    Pattern("another board's epoch does not count", "Pins.epoch_to_exceed", "not same_key(former, pinned)", "False"),
+    Pattern(
+        "only its receiver hands back",
+        "_Judge._obstacle",
+        "self.sender != tombstone.to_fingerprint or self.mode != 'move'",
+        "False",
+    ),
+    Pattern("no epoch goes back by a bundle", "_Judge._stale_key", "node.epoch < latest", "False"),
+    Pattern("no second key of one epoch", "_Judge._stale_key", "node.epoch == active", "False"),
+    Pattern(
+        "a known UUID keeps its key",
+        "_Judge._obstacle",
+        "pin is not None and (not same_key(pin, fingerprint(node.node_key)))",
+        "False",
+    ),
+    Pattern(
+        "a receipt closes its own move",
+        "_delete_what_left",
+        "tombstone is None or tombstone.handover_id != row.id",
+        "tombstone is None",
+    ),
+    Pattern("a receipt deletes the key of its bundle", "_delete_what_left", "key.key_id == in_bundle", "True"),
+    Pattern("a receipt is for this bundle", "_check_receipt", "receipt.bundle_sha256 not in notes.files", "False"),
+    Pattern(
+        "after undo a rotation is due",
+        "_lift",
+        "station.keys.demand_rotation(uuid, f'the move {row.id} did not happen')",
+        "None",
+    ),
+    Pattern("a reset forgets the pending agreement's key", "Agreeing.forget", "self._pending.link == link", "False"),
+    # the node
+    Pattern("a Request dies after 60 s", "Agreeing.confirm", "self._clock() - pending.at >= PENDING_SECONDS", "False"),
+    Pattern("Confirm comes by its link", "Agreeing.confirm", "pending.link != origin.link", "False"),
+    Pattern("Confirm comes in its session", "Agreeing.confirm", "pending.session is not origin.session", "False"),
+    Pattern("the node keeps one CA", "Agreeing.request", "flash.ca is not None and request.ca != flash.ca", "False"),
+    Pattern("the first CA stays", "Agreeing.confirm", "flash.ca is None", "True"),
+    Pattern(
+        "a sequence grows",
+        "verified_commit",
+        "0 < ahead <= datasheet.SEQUENCE_WINDOW",
+        "ahead <= datasheet.SEQUENCE_WINDOW",
+    ),
+    Pattern(
+        "a sequence grows by 65,536 at most", "verified_commit", "0 < ahead <= datasheet.SEQUENCE_WINDOW", "0 < ahead"
+    ),
+    Pattern("a datasheet is for this epoch", "verified_commit", "signed.key_epoch == flash.epoch", "True"),
+    Pattern("every staged image is listed", "_listed_blocks", "staged.keys() - {SECURITY} <= blocks.keys()", "True"),
+    # verdicts
+    Pattern("an epoch seen before", "_epoch", "shown.key_epoch >= known.key_epoch", "True"),
+    Pattern("a sequence seen before", "_sequence", "shown.sequence >= known.sequence", "True"),
+    Pattern("an epoch of the future", "_epoch", "shown.key_epoch > known.identity.epoch", "False"),
+    Pattern("only good signatures are floors", "known_of", "datasheet.signature_good(shown, octets, uuid)", "True"),
+    Pattern("no session, no verdict", "Verified.verdict", "_SESSION in failed", "False"),
+    Pattern("write refuses another epoch", "_require_newer", "signed.key_epoch != identity.epoch", "False"),
+    Pattern(
+        "write asks before a jump",
+        "_require_newer",
+        "signed.sequence > identity.sequence + SEQUENCE_WINDOW and (not jump)",
+        "False",
+    ),
+    Pattern(
+        "an image's sequence is hearsay",
+        "_last_known",
+        "highest and brought.sequence > highest + SEQUENCE_WINDOW",
+        "False",
+    ),
+    Pattern("a signature is used again for a newer number only", "sign", "number > node_sequence", "True"),
+    # measuring and the service
+    Pattern(
+        "a node that was moved is measured no more",
+        "Standing.require",
+        "policy.require_not_given_away(self._uuid)",
+        "None",
+    ),
+    Pattern(
+        "off the whitelist nothing moves", "Standing.require", "require_whitelisted(self._station, self._uuid)", "None"
+    ),
+    Pattern("a set point grows old", "TopicActuators._left", "age > self._dead_man / 1000", "False"),
+    Pattern("a set point grows old in the queue", "TopicActuators._send", "self._left(command)", "None"),
+    Pattern("a browser's token ends", "Tokens.find", "one.until > now", "True"),
+    Pattern("a login link ends", "Tokens.login", "until < time.monotonic()", "False"),
+    Pattern(
+        "a login link works once",
+        "Tokens.login",
+        "self._logins.pop(digest_of(token), (0.0, False))",
+        "self._logins.get(digest_of(token), (0.0, False))",
+    ),
+)

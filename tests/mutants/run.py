@@ -1,0 +1,203 @@
+"""Break the code, a mutant at a time, and see whether the tests nearest to it notice.
+
+Mutants are the rules of patterns.py and random ones of changes.py. Each is made in a copy of the checkout below
+build/mutants, with an environment of its own, so that processes that tests start run it too. The nearest test files run
+until one fails; that test is then run without the mutant once, so that none dies of a test that fails by itself. What
+no test notices is printed at the end and kept in build/mutants/survivors.txt: it is a missing test, a rule that nothing
+needs, or a change that changes nothing, and only a reader can tell which.
+
+Usage: python -m tests.mutants.run [--count N] [--room ROOM] [--minutes M] [--jobs J] [--seed S] [--patterns]
+Exits 1 where a pattern survived, 2 where one is not found in the code.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import random
+import re
+import shutil
+import signal
+import subprocess
+import sys
+import threading
+import time
+import venv
+from collections import Counter
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
+from dataclasses import dataclass
+from queue import SimpleQueue
+
+from tests.mutants.changes import ROOT, Mutant, any_of, found, modules
+from tests.mutants.nearest import Suite
+from tests.mutants.patterns import PATTERNS
+
+PLACE = ROOT / "build" / "mutants"
+FILES = 14
+LEAST, MOST = 15.0, 75.0
+"""Seconds that the tests of one mutant get, whatever the time that is left says."""
+MARKS = "not slow and not soak and not machine and not realtime"
+_FAILED = re.compile(r"^(?:FAILED|ERROR) (\S+)", re.MULTILINE)
+
+
+@dataclass(frozen=True)
+class Fate:
+    """What became of a mutant: the test that noticed it ("" for none), and whether its time ran out before."""
+
+    mutant: Mutant
+    by: str
+    seconds: float
+    late: bool = False
+
+
+class Copy:
+    """A copy of the checkout, and a Python that takes the package from there and all else from this environment."""
+
+    def __init__(self, number: int) -> None:
+        self.folder = PLACE / f"copy{number}"
+        self.python = PLACE / f"python{number}" / "bin" / "python"
+        shutil.rmtree(self.folder, ignore_errors=True)
+        shutil.rmtree(self.python.parents[1], ignore_errors=True)
+        listed = subprocess.run(
+            ["git", "ls-files", "-z", "--cached", "--others", "--exclude-standard"],
+            cwd=ROOT,
+            capture_output=True,
+            check=True,
+        ).stdout.decode()
+        for name in filter(None, listed.split("\0")):
+            if (ROOT / name).is_file():
+                (self.folder / name).parent.mkdir(parents=True, exist_ok=True)
+                shutil.copy2(ROOT / name, self.folder / name)
+        venv.create(self.python.parents[1], symlinks=True)
+        (site,) = self.python.parents[1].glob("lib/python*/site-packages")
+        usual = next(path for path in sys.path if path.endswith("site-packages"))
+        (site / "a_copy.pth").write_text(f"{self.folder}\n")  # before what is installed, and no .pth of there counts
+        (site / "b_usual.pth").write_text(f"{usual}\n")
+        self._moment = int(time.time()) - 1_000_000
+
+    def run(self, words: list[str], seconds: float) -> tuple[int | None, str]:
+        """Run pytest; its exit code (None: its time was over) and what it said."""
+        command = [str(self.python), "-m", "pytest", "-x", "-q", "-p", "no:cacheprovider", "-p", "no:xdist",
+                   "--hypothesis-profile", "quick", "--timeout", "40", "-m", MARKS, *words]  # fmt: skip
+        running = subprocess.Popen(
+            command, cwd=self.folder, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=subprocess.STDOUT,
+            start_new_session=True, env=os.environ | {"PYTHONDONTWRITEBYTECODE": "1"}, text=True,
+        )  # fmt: skip
+        try:
+            said, _ = running.communicate(timeout=seconds)
+        except subprocess.TimeoutExpired:
+            with suppress(ProcessLookupError):
+                os.killpg(running.pid, signal.SIGTERM)
+            try:
+                said, _ = running.communicate(timeout=20)
+            except subprocess.TimeoutExpired:
+                os.killpg(running.pid, signal.SIGKILL)
+                said, _ = running.communicate()
+            return None, said
+        return running.returncode, said
+
+    def put(self, name: str, source: str) -> None:
+        """Write a module, so that no compiled form of another text can pass for it."""
+        path = self.folder / name
+        path.write_text(source)
+        self._moment += 2
+        os.utime(path, (self._moment, self._moment))
+        for compiled in (path.parent / "__pycache__").glob(f"{path.stem}.*.pyc"):
+            compiled.unlink()
+
+
+class Bench:
+    """Tries mutants, each in the copy that is free."""
+
+    def __init__(self, jobs: int, until: float, sources: dict[str, str]) -> None:
+        """``sources`` are the texts that the mutants were cut from; the checkout may change meanwhile."""
+        self._sources = sources
+        PLACE.mkdir(parents=True, exist_ok=True)
+        self._tests, self._until, self._jobs = Suite(), until, jobs
+        self._copies: SimpleQueue[Copy] = SimpleQueue()
+        self._good: dict[str, bool] = {}
+        self._told = threading.Lock()
+        self.left = 0
+        for number in range(jobs):
+            self._copies.put(Copy(number))
+
+    def try_one(self, mutant: Mutant) -> Fate | None:
+        """Whether the nearest tests notice a mutant; None where the time is over."""
+        if time.monotonic() > self._until:
+            return None
+        copy = self._copies.get()
+        source = self._sources[mutant.path]
+        began = time.monotonic()
+        share = (self._until - began) * self._jobs / max(1, self.left) * 2  # half of them end at once
+        try:
+            copy.put(mutant.path, mutant.applied(source))
+            files = self._tests.nearest(mutant, FILES)
+            code, said = copy.run(files, min(MOST, max(LEAST, share)))
+            copy.put(mutant.path, source)
+            by = ""
+            if code not in (0, None, 5):
+                by = (_FAILED.findall(said) or ["(the run itself)"])[-1]
+                if by.startswith("tests/") and not self._is_good(copy, by):
+                    by = ""
+        finally:
+            copy.put(mutant.path, source)
+            self._copies.put(copy)
+        fate = Fate(mutant, by, time.monotonic() - began, code is None)
+        with self._told:
+            self.left -= 1
+            word = f"noticed by {by}" if by else "SURVIVED" + (" (its time was over)" if fate.late else "")
+            print(f"{fate.seconds:5.1f} s  {mutant}\n         {word}", flush=True)
+        return fate
+
+    def _is_good(self, copy: Copy, test: str) -> bool:
+        if test not in self._good:
+            self._good[test] = copy.run([test], MOST)[0] == 0
+        return self._good[test]
+
+
+def drawn(count: int, room: str, chance: random.Random) -> list[Mutant]:
+    """Random mutants: a module by its weight, then any of it; none twice."""
+    every = [mutant for module in modules(room) for mutant in any_of(module)]
+    return chance.sample(every, min(count, len(every)))
+
+
+def main(arguments: list[str]) -> int:
+    """Run the bench."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--count", type=int, default=300, help="patterns and random ones together")
+    parser.add_argument("--room", default="", help="a room or a module: steps, protocol/tim, steps/agree.py")
+    parser.add_argument("--minutes", type=float, default=60)
+    parser.add_argument("--jobs", type=int, default=os.cpu_count() or 1)
+    parser.add_argument("--seed", type=int, default=0, help="0: another sample each time, told")
+    parser.add_argument("--patterns", action="store_true", help="no random ones")
+    chosen = parser.parse_args(arguments)
+    seed = chosen.seed or random.SystemRandom().randrange(1, 100_000)
+    where = modules(chosen.room)
+    everywhere = where if not chosen.room else modules()
+    lost = [pattern for pattern in PATTERNS if len(found(pattern, everywhere)) != 1]
+    for pattern in lost:
+        print(f"{pattern.function}: {pattern.was} is not there once ({pattern.rule})", file=sys.stderr)
+    if lost:
+        return 2
+    named = [mutant for pattern in PATTERNS for mutant in found(pattern, where)]
+    others = [] if chosen.patterns else drawn(max(0, chosen.count - len(named)), chosen.room, random.Random(seed))
+    sources = {module.name: module.source for module in everywhere}
+    bench = Bench(chosen.jobs, time.monotonic() + 60 * chosen.minutes, sources)
+    bench.left = len(named) + len(others)
+    print(f"{len(named)} patterns, {len(others)} random ones (--seed {seed})", flush=True)
+    with ThreadPoolExecutor(chosen.jobs) as pool:
+        fates = [fate for fate in pool.map(bench.try_one, [*named, *others]) if fate is not None]
+    survivors = [fate for fate in fates if not fate.by]
+    lines = [f"{fate.mutant}{' (its time was over)' if fate.late else ''}" for fate in survivors]
+    (PLACE / "survivors.txt").write_text("".join(f"{line}\n" for line in lines))
+    rooms = Counter("/".join(fate.mutant.path.split("/")[:2]) for fate in survivors)
+    print(f"\n{len(fates)} of {len(named) + len(others)} tried, {len(fates) - len(survivors)} noticed; survivors:")
+    print("".join(f"  {line}\n" for line in lines), end="")
+    print("  by room: " + ", ".join(f"{room} {count}" for room, count in rooms.most_common()) if rooms else "  none")
+    rules = {(mutant.path, mutant.start) for mutant in named}
+    return 1 if any((fate.mutant.path, fate.mutant.start) in rules for fate in survivors) else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))
