@@ -23,13 +23,11 @@ from pathlib import Path
 from cryptography.hazmat.primitives.ciphers.aead import AESGCM
 from jwcrypto import jwe, jwk, jws
 
-from teds_provision.handover.export_keys import export_keys, plan_export
-from teds_provision.handover.import_keys import Imported, import_keys, plan_import
-from teds_provision.handover.selection import ExportOrder
+from teds_provision.handover.incoming import Imported, import_bundle, plan_import
+from teds_provision.handover.outgoing import ExportOrder, export_bundle, plan_export
 from teds_provision.protocol.agreement import key_id
 from teds_provision.protocol.handover import jose
-from teds_provision.protocol.handover.bundle import TYPE, open_bundle
-from teds_provision.protocol.handover.contents import payload_of
+from teds_provision.protocol.handover.bundle import TYPE, open_bundle, payload_of
 from teds_provision.protocol.handover.strict_json import dump, load_object
 from teds_provision.protocol.keys import SoftwareKey, fingerprint
 from teds_provision.station.station import Station, initialise
@@ -159,12 +157,12 @@ def main(count: int = 10_000) -> None:
                 station.policy.trust(TrustRecord(other.name, "station", other.point, other.fingerprint))
             bundle = place / f"{number}.jwe"
             order = ExportOrder((south.name,), None, "copy")
-            exports.append(timed(lambda o=order, b=bundle: export_keys(north, plan_export(north, o), b))[0])
+            exports.append(timed(lambda o=order, b=bundle: export_bundle(north, plan_export(north, o), b))[0])
 
             def take(station: Station = south, path: Path = bundle) -> Imported:
                 plan = plan_import(station, path.read_bytes())
                 assert not isinstance(plan, Imported)
-                return import_keys(station, plan)
+                return import_bundle(station, plan)
 
             seconds, done = timed(take)
             assert isinstance(done, Imported)
@@ -195,8 +193,8 @@ def memory(place: Path, north: Station, count: int) -> None:
         station.policy.trust(TrustRecord(other.name, "station", other.point, other.fingerprint))
     bundle = place / "memory.jwe"
     for name, work in (
-        ("export", lambda: export_keys(north, plan_export(north, ExportOrder(("memory",), None, "copy")), bundle)),
-        ("import", lambda: import_keys(south, plan_import(south, bundle.read_bytes()))),  # type: ignore[arg-type]
+        ("export", lambda: export_bundle(north, plan_export(north, ExportOrder(("memory",), None, "copy")), bundle)),
+        ("import", lambda: import_bundle(south, plan_import(south, bundle.read_bytes()))),  # type: ignore[arg-type]
     ):
         tracemalloc.start()
         work()

@@ -25,11 +25,9 @@ from typing import TYPE_CHECKING, Any, Literal
 from teds_provision import steps as steps_room
 from teds_provision import vault
 from teds_provision.errors import LinkFailure, NotAuthentic, PolicyRefused
-from teds_provision.handover.export_keys import export_keys, plan_export
-from teds_provision.handover.import_keys import Imported, import_keys, plan_import
+from teds_provision.handover.incoming import Imported, Proven, import_bundle, plan_import, prove_nodes
+from teds_provision.handover.outgoing import ExportOrder, export_bundle, plan_export
 from teds_provision.handover.pending import close
-from teds_provision.handover.prove import Proven, prove_nodes
-from teds_provision.handover.selection import ExportOrder
 from teds_provision.handover.trust import Candidate, add
 from teds_provision.lazy import late
 from teds_provision.links import LinkSettings, can
@@ -131,11 +129,11 @@ def _send(demo: Demo, sender: Station, receiver: Station, mode: Literal["copy", 
     bundle = demo.folder / f"{mode}.jwe"
     with demo.steps.step("export-keys") as step:
         plan = plan_export(sender, ExportOrder((receiver.name,), (demo.uuid,), mode))
-        sealed = export_keys(sender, plan, bundle)
+        sealed = export_bundle(sender, plan, bundle)
         step.detail = f"{mode}: {sealed.octets} octets, sealed to {receiver.fingerprint[:16]}"
     with demo.steps.step("import-keys") as step:
         planned = plan_import(receiver, bundle.read_bytes())
-        taken = planned if isinstance(planned, Imported) else import_keys(receiver, planned)
+        taken = planned if isinstance(planned, Imported) else import_bundle(receiver, planned)
         outcome = prove_nodes(receiver, demo.over("can"), taken.uuids, demo.reporter)[0]
         if not isinstance(outcome, Proven):
             raise LinkFailure(f"The node was not reached after the import: {outcome.why}")

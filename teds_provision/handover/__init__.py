@@ -5,17 +5,6 @@ from typing import TYPE_CHECKING
 from teds_provision.lazy import lazy
 
 if TYPE_CHECKING:
-    from teds_provision.handover import (
-        arrivals,
-        certify,
-        deny,
-        export_keys,
-        import_keys,
-        life,
-        pending,
-        prove,
-        selection,
-        trust,
-    )
+    from teds_provision.handover import deny, incoming, life, outgoing, pending, trust
 else:
     __getattr__ = lazy(__name__)

@@ -9,9 +9,9 @@ any UUID could take other people's nodes out of service.
 from __future__ import annotations
 
 from teds_provision.protocol.fingerprints import same_key
-from teds_provision.protocol.handover.contents import Bundle
-from teds_provision.protocol.handover.payload import time_text
+from teds_provision.protocol.handover.bundle import Bundle
 from teds_provision.protocol.handover.revocation import Revocation as Statement
+from teds_provision.protocol.handover.strict_json import time_text
 from teds_provision.protocol.keys import fingerprint
 from teds_provision.station.station import Station
 from teds_provision.store import Revocation

@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING
 from teds_provision.errors import BadData, NotFound, UsageFailure
 from teds_provision.handover.deny import deny
 from teds_provision.protocol.fingerprints import is_whole
-from teds_provision.protocol.handover.payload import is_label
 from teds_provision.protocol.handover.revocation import seal_revocation
+from teds_provision.protocol.handover.strict_json import is_label
 from teds_provision.station.station import Station
 from teds_provision.steps.build import BuildOrder, build
 from teds_provision.steps.sign import known_image

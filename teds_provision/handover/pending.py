@@ -15,7 +15,7 @@ from operator import attrgetter
 from typing import Any
 
 from teds_provision.errors import BadData, NotAuthentic, NotFound, PolicyRefused
-from teds_provision.protocol.handover.contents import Bundle
+from teds_provision.protocol.handover.bundle import Bundle
 from teds_provision.protocol.handover.receipt import Receipt, open_receipt
 from teds_provision.protocol.handover.strict_json import decode_base64url, load_object
 from teds_provision.station.station import Station

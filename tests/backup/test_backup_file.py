@@ -112,7 +112,7 @@ def test_a_backup_that_another_key_has_signed_is_not_the_stations(station: Stati
 def test_the_jose_tool_opens_a_backup_with_the_recovery_key(station: Station, tmp_path: Path) -> None:
     if shutil.which("jose") is None:
         pytest.skip("the Debian package jose is not installed (scripts/install-test-packages)")
-    from teds_provision.protocol.handover.jwk import public_jwk
+    from teds_provision.protocol.handover.jose import public_jwk
     from teds_provision.protocol.handover.strict_json import encode_base64url
 
     recovery = SoftwareKey.generate()

@@ -16,8 +16,7 @@ from cryptography.hazmat.primitives.asymmetric import ec, rsa
 from cryptography.hazmat.primitives.serialization import Encoding, NoEncryption, PrivateFormat, PublicFormat
 
 from teds_provision.protocol.handover import jose
-from teds_provision.protocol.handover.bundle import TYPE, seal_bundle
-from teds_provision.protocol.handover.contents import Bundle, BundledNode, payload_of
+from teds_provision.protocol.handover.bundle import TYPE, Bundle, BundledNode, payload_of, seal_bundle
 from teds_provision.protocol.handover.strict_json import base64url, decode_base64url, dump
 from teds_provision.protocol.keys import SoftwareKey, fingerprint, station_key_message, to_pem
 from teds_provision.vault import forget_vaults

@@ -303,13 +303,13 @@ def _trusted(kid: str) -> bytes | None:
 
 def check_bundle(data: bytes) -> None:
     """A bundle from outside in; even first octet: the sealed file, odd: what stands inside, under a right signature."""
-    from teds_provision.protocol.handover import bundle, contents, jose
+    from teds_provision.protocol.handover import bundle, jose
 
     if not data:
         return
     body = data[1:]
     if data[0] & 1:
-        reads(lambda: contents.from_json(bytearray(body)))
+        reads(lambda: bundle.from_json(bytearray(body)))
     else:
         reads(
             lambda: bundle.peek_bundle(body),
@@ -319,11 +319,11 @@ def check_bundle(data: bytes) -> None:
 
 
 def bundle_seeds() -> Iterable[bytes]:
-    from teds_provision.protocol.handover import bundle, contents
+    from teds_provision.protocol.handover import bundle
     from teds_provision.protocol.keys import fingerprint
 
     one, other = _key(1), _key(2)
-    whole = contents.Bundle(
+    whole = bundle.Bundle(
         id="A" * 22,
         sender=fingerprint(one.point),
         to=(fingerprint(other.point),),
@@ -331,10 +331,10 @@ def bundle_seeds() -> Iterable[bytes]:
         expires=NOW + timedelta(days=1),
         mode="copy",
         ca=one.point,
-        nodes=(contents.BundledNode(bytes(10), one.point, bytes(16), 1, 5, name="x", teds_sha256="0" * 64),),
+        nodes=(bundle.BundledNode(bytes(10), one.point, bytes(16), 1, 5, name="x", teds_sha256="0" * 64),),
     )
     yield b"\0" + bundle.seal_bundle(whole, one, [other.point])
-    yield b"\1" + contents.payload_of(whole)
+    yield b"\1" + bundle.payload_of(whole)
 
 
 def check_receipt(data: bytes) -> None:

@@ -6,11 +6,10 @@ from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
-from teds_provision.handover.export_keys import Exported, export_keys, plan_export
-from teds_provision.handover.import_keys import Imported, ImportPlan, import_keys, plan_import
-from teds_provision.handover.selection import ExportOrder
+from teds_provision.handover.incoming import Imported, ImportPlan, import_bundle, plan_import
+from teds_provision.handover.outgoing import Exported, ExportOrder, export_bundle, plan_export
 from teds_provision.protocol.agreement import key_id
-from teds_provision.protocol.handover.contents import Mode
+from teds_provision.protocol.handover.bundle import Mode
 from teds_provision.protocol.keys import SoftwareKey, fingerprint
 from teds_provision.station.station import Station
 from teds_provision.steps.agree import agree, require_session
@@ -85,12 +84,12 @@ class Pair:
         self.files += 1
         path = output or self.folder / f"bundle{self.files}.jwe"
         plan = plan_export(self.north, ExportOrder(to, nodes, mode))
-        return path, export_keys(self.north, plan, path)
+        return path, export_bundle(self.north, plan, path)
 
     def take(self, path: Path, station: Station | None = None) -> Imported:
         station = station or self.south
         plan = plan_import(station, path.read_bytes())
-        return import_keys(station, plan) if isinstance(plan, ImportPlan) else plan
+        return import_bundle(station, plan) if isinstance(plan, ImportPlan) else plan
 
 
 def held(station: Station, board: Board) -> list[tuple[str, int, str]]:

@@ -7,8 +7,8 @@ from pathlib import Path
 import pytest
 
 from teds_provision.errors import PolicyRefused
+from teds_provision.handover.incoming import prove_node
 from teds_provision.handover.pending import close
-from teds_provision.handover.prove import prove_node
 from teds_provision.steps.agree import agree
 from teds_provision.steps.identify import identify
 from teds_provision.steps.read import read_image

@@ -10,10 +10,9 @@ from pathlib import Path
 import pytest
 
 from teds_provision.errors import NotFound, PolicyRefused, UsageFailure
-from teds_provision.handover.export_keys import plan_export
-from teds_provision.handover.import_keys import ImportPlan, plan_import
+from teds_provision.handover.incoming import ImportPlan, plan_import
+from teds_provision.handover.outgoing import ExportOrder, plan_export
 from teds_provision.handover.pending import close, find_handover, undo
-from teds_provision.handover.selection import ExportOrder
 from teds_provision.protocol.handover.bundle import open_bundle
 from tests.bench import Board, make_station
 from tests.handover.desk import Pair, everything, key_up, provisioned, session, trust

@@ -9,19 +9,19 @@ from pathlib import Path
 import pytest
 
 from teds_provision.errors import BadData, NodeSilent, NotAuthentic, NotFound, PolicyRefused
-from teds_provision.handover import certify as fleet
-from teds_provision.handover.certify import (
+from teds_provision.handover import trust as fleet
+from teds_provision.handover.incoming import ImportPlan, import_bundle, plan_import
+from teds_provision.handover.outgoing import ExportOrder, export_bundle, plan_export
+from teds_provision.handover.trust import (
+    add,
     adopt_certificate,
     ask_for_certificate,
+    candidate,
     read_certificate,
     read_request,
     sign_request,
     write_certificate,
 )
-from teds_provision.handover.export_keys import export_keys, plan_export
-from teds_provision.handover.import_keys import ImportPlan, import_keys, plan_import
-from teds_provision.handover.selection import ExportOrder
-from teds_provision.handover.trust import add, candidate
 from teds_provision.protocol.messages.identity import NodeState
 from teds_provision.station.station import Station, initialise
 from teds_provision.steps.agree import agree, require_session
@@ -258,11 +258,11 @@ def test_they_hand_over_once_they_have_each_others_certificate(
     path.write_bytes(write_certificate(known))
     add(one, [candidate(one, other.name, path, "station")])
     bundle = tmp_path / "bundle.jwe"
-    export_keys(one, plan_export(one, order), bundle)
+    export_bundle(one, plan_export(one, order), bundle)
     plan = plan_import(other, bundle.read_bytes())
     assert isinstance(plan, ImportPlan)
     assert plan.ca_is_known
-    import_keys(other, plan)
+    import_bundle(other, plan)
     assert session(other, board) == 2
 
 
@@ -305,7 +305,7 @@ def test_a_certificate_is_for_one_station(tmp_path: Path, owner: Station) -> Non
 
 
 def forged() -> bytes:
-    from teds_provision.handover.certify import Certificate
+    from teds_provision.handover.trust import Certificate
     from teds_provision.protocol.keys import SoftwareKey
 
     station, stranger = SoftwareKey(31), SoftwareKey(32)

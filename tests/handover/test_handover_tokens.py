@@ -7,12 +7,11 @@ from pathlib import Path
 
 import pytest
 
-from teds_provision.handover import certify as fleet
-from teds_provision.handover.export_keys import export_keys, plan_export
-from teds_provision.handover.import_keys import ImportPlan, import_keys, plan_import
+from teds_provision.handover import trust as fleet
+from teds_provision.handover.incoming import ImportPlan, import_bundle, plan_import
 from teds_provision.handover.life import revoke
+from teds_provision.handover.outgoing import ExportOrder, export_bundle, plan_export
 from teds_provision.handover.pending import close
-from teds_provision.handover.selection import ExportOrder
 from teds_provision.station.station import Station, initialise
 from teds_provision.vault import forget_vaults
 from tests.handover.desk import boards, held, key_up, provisioned, session, trust
@@ -47,10 +46,10 @@ def test_copy_move_receipt_and_revocation_with_keys_in_tokens(uris: dict[str, st
     for mode, board in (("copy", one), ("move", other)):
         bundle = tmp_path / f"{mode}.jwe"
         order = ExportOrder(("south",), (board.uuid,), mode)  # type: ignore[arg-type]
-        export_keys(north, plan_export(north, order), bundle)
+        export_bundle(north, plan_export(north, order), bundle)
         plan = plan_import(south, bundle.read_bytes())
         assert isinstance(plan, ImportPlan)
-        taken = import_keys(south, plan)
+        taken = import_bundle(south, plan)
         assert session(south, board) == (2 if mode == "move" else 1)
         assert close(north, taken.receipt).fresh
     assert session(north, one) == 1

@@ -16,15 +16,13 @@ import pytest
 from teds_provision.errors import PolicyRefused, UsageFailure
 from teds_provision.files import new_file
 from teds_provision.handover.deny import lift
-from teds_provision.handover.export_keys import export_all, export_keys, outputs_of, plan_exports
-from teds_provision.handover.import_keys import Imported, ImportPlan, import_keys, plan_import
+from teds_provision.handover.incoming import Imported, ImportPlan, import_bundle, plan_import
 from teds_provision.handover.life import revoke
+from teds_provision.handover.outgoing import ExportOrder, export_all, export_bundle, outputs_of, plan_exports
 from teds_provision.handover.pending import close, find_handover, undo
-from teds_provision.handover.selection import ExportOrder
 from teds_provision.handover.trust import plan_removal, remove
 from teds_provision.protocol.datasheet import SEQUENCE_WINDOW
-from teds_provision.protocol.handover.bundle import seal_bundle
-from teds_provision.protocol.handover.contents import Bundle, BundledNode, Mode
+from teds_provision.protocol.handover.bundle import Bundle, BundledNode, Mode, seal_bundle
 from teds_provision.protocol.handover.jose import verify_compact
 from teds_provision.protocol.handover.receipt import TYPE, open_receipt, seal_receipt
 from teds_provision.protocol.handover.revocation import seal_revocation
@@ -82,7 +80,7 @@ def forged(
 
 def taken(station: Station, octets: bytes) -> Imported:
     plan = plan_import(station, octets)
-    return import_keys(station, plan) if isinstance(plan, ImportPlan) else plan
+    return import_bundle(station, plan) if isinstance(plan, ImportPlan) else plan
 
 
 # -- M1: sequence and epoch are hearsay ------------------------------------------------------------------------------
@@ -148,11 +146,11 @@ def test_a_node_that_comes_back_is_rotated_and_the_plan_says_so(pair: Pair) -> N
     session(pair.south, pair.board)
     (plan,) = plan_exports(pair.south, ExportOrder(("north",), None, "move"))
     back = pair.folder / "back.jwe"
-    export_keys(pair.south, plan, back)
+    export_bundle(pair.south, plan, back)
     shown = plan_import(pair.north, back.read_bytes())
     assert isinstance(shown, ImportPlan)
     assert shown.nodes[0].notes == ("it comes back: its key is rotated at the first contact",)
-    import_keys(pair.north, shown)
+    import_bundle(pair.north, shown)
     assert pair.north.keys.rotation_due(pair.board.uuid) is not None
     assert session(pair.north, pair.board) == 3
     assert pair.north.keys.rotation_due(pair.board.uuid) is None
@@ -202,7 +200,7 @@ def test_a_receipt_that_comes_after_the_nodes_return_deletes_nothing(pair: Pair)
     receipt = pair.take(path).receipt
     session(pair.south, pair.board)
     (plan,) = plan_exports(pair.south, ExportOrder(("north",), None, "move"))
-    export_keys(pair.south, plan, pair.folder / "back.jwe")
+    export_bundle(pair.south, plan, pair.folder / "back.jwe")
     pair.take(pair.folder / "back.jwe", pair.north)
     before = held(pair.north, pair.board)
     close(pair.north, receipt)
@@ -301,7 +299,7 @@ def test_a_ban_counts_only_from_a_station_with_authority_and_for_the_key_it_name
     assert isinstance(plan, ImportPlan)
     assert plan.denied == ()
     assert ["no authority" in why or "nothing is known" in why for _, why in plan.passed_over] == [True, True]
-    import_keys(pair.south, plan)
+    import_bundle(pair.south, plan)
     assert pair.south.policy.revocations() == []
     pair.take(pair.export("copy")[0])  # north holds this node's key, so its word counts, for this key
     north = pair.north.vault.identity()
@@ -346,7 +344,7 @@ def test_names_of_a_bundle_never_stand_for_two_nodes_or_for_digits(pair: Pair) -
     assert isinstance(plan, ImportPlan)
     assert [one.name for one in plan.nodes] == ["gripper-0101", "gripper-0202", "8d4d-0303"]
     assert all("is called" in one.notes[0] for one in plan.nodes)
-    import_keys(pair.south, plan)
+    import_bundle(pair.south, plan)
     assert pair.south.nodes.resolve("gripper") == mine
     assert pair.south.nodes.resolve("gripper-0202") == boards[1].uuid
 
@@ -390,7 +388,7 @@ def test_a_move_in_several_bundles_that_was_cut_is_carried_on(
                 raise KeyboardInterrupt
 
     with monkeypatch.context() as patch:
-        patch.setattr("teds_provision.handover.export_keys.new_file", dying)
+        patch.setattr("teds_provision.handover.outgoing.new_file", dying)
         with pytest.raises(KeyboardInterrupt):
             several(pair, "move", output)
     assert len(pair.north.policy.tombstones()) == 5  # all of them rest before the first file exists

@@ -9,10 +9,9 @@ from pathlib import Path
 import pytest
 
 from teds_provision.errors import NodeRefused, NotAuthentic, PolicyRefused
-from teds_provision.handover.export_keys import export_keys, plan_export
-from teds_provision.handover.import_keys import Imported, ImportPlan, import_keys, plan_import
+from teds_provision.handover.incoming import Imported, ImportPlan, import_bundle, plan_import
+from teds_provision.handover.outgoing import ExportOrder, export_bundle, plan_export
 from teds_provision.handover.pending import close
-from teds_provision.handover.selection import ExportOrder
 from teds_provision.protocol.agreement import key_id
 from teds_provision.steps.agree import agree
 from teds_provision.steps.identify import identify
@@ -55,7 +54,7 @@ def test_an_id_that_came_before_with_other_content(pair: Pair) -> None:
     key_up(pair.north, other)
     plan = replace(plan_export(pair.north, ExportOrder(("south",), None)), id=exported.plan.id)
     forged = pair.folder / "forged.jwe"
-    export_keys(pair.north, plan, forged)
+    export_bundle(pair.north, plan, forged)
     before = everything(pair.south)
     with pytest.raises(PolicyRefused, match="replayed or forged"):
         plan_import(pair.south, forged.read_bytes())
@@ -81,7 +80,7 @@ def test_a_newer_epoch_comes_in_beside_the_old_key_until_it_is_proven(pair: Pair
     plan = plan_import(pair.south, pair.export("copy")[0].read_bytes())
     assert isinstance(plan, ImportPlan)
     assert [node.decision for node in plan.nodes] == ["newer"]
-    import_keys(pair.south, plan)
+    import_bundle(pair.south, plan)
     assert held(pair.south, pair.board) == [("pending", 2, "import"), ("active", 1, "import")]
     assert session(pair.south, pair.board) == 2
     assert held(pair.south, pair.board) == [("active", 2, "import")]
@@ -95,7 +94,7 @@ def test_a_newer_key_under_another_ca_counts_once_it_is_proven(pair: Pair) -> No
     key_again(pair.south, pair.board)
     assert pair.board.state.ca == pair.south.ca
     bundle = pair.folder / "back.jwe"
-    export_keys(pair.south, plan_export(pair.south, ExportOrder(("north",), None)), bundle)
+    export_bundle(pair.south, plan_export(pair.south, ExportOrder(("north",), None)), bundle)
     pair.take(bundle, pair.north)
     assert pair.north.keys.ca_of(pair.board.uuid) == pair.north.ca
     assert session(pair.north, pair.board) == 2
@@ -112,7 +111,7 @@ def test_a_claimed_key_under_another_ca_does_not_spoil_the_one_in_use(pair: Pair
     pair.south.keys.promote(pair.board.uuid, key_id(key).hex())
     pair.south.keys.set_ca_of(pair.board.uuid, pair.south.ca)
     bundle = pair.folder / "lie.jwe"
-    export_keys(pair.south, plan_export(pair.south, ExportOrder(("north",), None)), bundle)
+    export_bundle(pair.south, plan_export(pair.south, ExportOrder(("north",), None)), bundle)
     pair.take(bundle, pair.north)
     assert session(pair.north, pair.board) == 1
     assert provisioned(pair.north, pair.board).verified.verdict == "authentic"
@@ -126,7 +125,7 @@ def test_a_uuid_known_with_another_node_key_is_refused_and_the_rest_comes_in(tmp
     assert isinstance(plan, ImportPlan)
     assert [node.decision for node in plan.nodes] == ["new", "refused"]
     assert "another node key" in plan.nodes[1].why
-    import_keys(pair.south, plan)
+    import_bundle(pair.south, plan)
     assert session(pair.south, clone) == 1
     assert session(pair.south, pair.boards[0]) == 1
     pair.close()
@@ -148,7 +147,7 @@ def test_the_same_keys_again_in_a_new_bundle(pair: Pair) -> None:
     plan = plan_import(pair.south, second.read_bytes())
     assert isinstance(plan, ImportPlan)
     assert [node.decision for node in plan.nodes] == ["same"]
-    import_keys(pair.south, plan)
+    import_bundle(pair.south, plan)
     assert len(held(pair.south, pair.board)) == 1
 
 

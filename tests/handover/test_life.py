@@ -8,10 +8,9 @@ from pathlib import Path
 import pytest
 
 from teds_provision.errors import NotFound, NotWhitelisted, PolicyRefused, UsageFailure
-from teds_provision.handover.export_keys import plan_export
-from teds_provision.handover.import_keys import ImportPlan, import_keys, plan_import
+from teds_provision.handover.incoming import ImportPlan, import_bundle, plan_import
 from teds_provision.handover.life import is_finished, plan_takeover, retire, revoke, take_over
-from teds_provision.handover.selection import ExportOrder
+from teds_provision.handover.outgoing import ExportOrder, plan_export
 from teds_provision.protocol.messages.identity import NodeState
 from teds_provision.station.station import Station
 from teds_provision.steps.agree import agree
@@ -73,7 +72,7 @@ def test_the_deny_list_travels_in_every_bundle_and_is_honoured(pair: Pair) -> No
     plan = plan_import(pair.south, path.read_bytes())
     assert isinstance(plan, ImportPlan)
     assert [one.why for one in plan.denied] == ["lost in transit"]
-    import_keys(pair.south, plan)
+    import_bundle(pair.south, plan)
     with talk(lost) as node, pytest.raises(PolicyRefused, match="was revoked: lost in transit"):
         agree(pair.south, node, identify(pair.south, node))
     assert session(pair.south, good) == 1

@@ -9,11 +9,9 @@ from pathlib import Path
 import pytest
 
 from teds_provision.errors import BadData, NotAuthentic, PolicyRefused, UsageFailure
-from teds_provision.handover.export_keys import export_keys, plan_export
-from teds_provision.handover.import_keys import ImportPlan, plan_import
+from teds_provision.handover.incoming import ImportPlan, plan_import, prove_node, proven_of
+from teds_provision.handover.outgoing import ExportOrder, export_bundle, plan_export
 from teds_provision.handover.pending import content_digest
-from teds_provision.handover.prove import prove_node, proven_of
-from teds_provision.handover.selection import ExportOrder
 from teds_provision.steps.agree import agree
 from teds_provision.steps.identify import identify
 from teds_provision.steps.read import read_image
@@ -46,7 +44,7 @@ def test_what_lies_there_before_the_key_rests_opens_for_nobody(pair: Pair, monke
         raise KeyboardInterrupt
 
     with monkeypatch.context() as patch:
-        patch.setattr("teds_provision.handover.export_keys._record", dying)
+        patch.setattr("teds_provision.handover.outgoing._record", dying)
         with pytest.raises(KeyboardInterrupt):
             pair.export("move")
     assert not pair.north.policy.tombstones()
@@ -155,7 +153,7 @@ def test_a_node_goes_there_and_back(pair: Pair) -> None:
     pair.take(pair.export("move")[0])
     session(pair.south, pair.board)
     back = pair.folder / "back.jwe"
-    export_keys(pair.south, plan_export(pair.south, ExportOrder(("north",), None, "move")), back)
+    export_bundle(pair.south, plan_export(pair.south, ExportOrder(("north",), None, "move")), back)
     pair.take(back, pair.north)
     assert session(pair.north, pair.board) == 3
     assert pair.north.policy.tombstone(pair.board.uuid) is None

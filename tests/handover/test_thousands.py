@@ -9,10 +9,8 @@ from pathlib import Path
 
 import pytest
 
-from teds_provision.handover.export_keys import export_keys, plan_export
-from teds_provision.handover.import_keys import ImportPlan, import_keys, plan_import
-from teds_provision.handover.prove import proven_of
-from teds_provision.handover.selection import ExportOrder
+from teds_provision.handover.incoming import ImportPlan, import_bundle, plan_import, proven_of
+from teds_provision.handover.outgoing import ExportOrder, export_bundle, plan_export
 from teds_provision.protocol.keys import SoftwareKey
 from teds_provision.station.station import Station
 from teds_provision.store import Batch, NodeRecord
@@ -64,13 +62,13 @@ def test_export_and_import_take_less_than_twice_the_memory_of_more_bundle(
         nodes = tuple(sorted(uuid_of(number) for number in range(count))) if count == FEW else None
 
         def export(nodes: tuple[bytes, ...] | None = nodes, path: Path = path) -> None:
-            export_keys(north, plan_export(north, ExportOrder(("south",), nodes)), path)
+            export_bundle(north, plan_export(north, ExportOrder(("south",), nodes)), path)
 
         def take(path: Path = path) -> None:
             with path.open("rb") as file:
                 plan = plan_import(south, file)
                 assert isinstance(plan, ImportPlan)
-                import_keys(south, plan)
+                import_bundle(south, plan)
 
         export_peak, import_peak = peak_of(export), peak_of(take)
         took[count] = path.stat().st_size, export_peak, import_peak
@@ -100,7 +98,7 @@ def test_names_and_keys_are_held_against_all_that_a_large_receiver_knows(
     other = NodeRecord(last, SoftwareKey(77).point, "another board")
     south.nodes.put(other)
     south.nodes.put(NodeRecord(bytes(10), name="finger 7"))
-    export_keys(north, plan_export(north, ExportOrder(("south",), None)), tmp_path / "all.jwe")
+    export_bundle(north, plan_export(north, ExportOrder(("south",), None)), tmp_path / "all.jwe")
     with (tmp_path / "all.jwe").open("rb") as file:
         plan = plan_import(south, file)
     assert isinstance(plan, ImportPlan)
@@ -109,7 +107,7 @@ def test_names_and_keys_are_held_against_all_that_a_large_receiver_knows(
     ]
     renamed = {one.node.name: one.name for one in plan.taken if one.name != one.node.name}
     assert renamed == {"finger 7": f"finger 7-{uuid_of(7).hex()[-4:]}"}
-    import_keys(south, plan)
+    import_bundle(south, plan)
     assert len(south.nodes.all()) == COUNT + 1
     assert south.nodes.get(last) == other
     assert {len(south.keys.of(uuid_of(number))) for number in range(COUNT) if uuid_of(number) != last} == {1}

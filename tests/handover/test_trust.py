@@ -164,7 +164,7 @@ def test_an_empty_or_missing_folder(north: Station, keys: Path) -> None:
 
 
 def test_a_certificate_that_does_not_verify(north: Station, keys: Path) -> None:
-    from teds_provision.handover.certify import Certificate, write_certificate
+    from teds_provision.handover.trust import Certificate, write_certificate
 
     forged = Certificate("lab", OTHER.point, north.ca, OTHER.sign(b"something else"))
     (keys / "lab.cert").write_bytes(write_certificate(forged))

@@ -12,9 +12,8 @@ from typing import Any
 from unittest.mock import patch
 
 from teds_provision import files
-from teds_provision.handover.export_keys import export_keys, plan_export
-from teds_provision.handover.import_keys import ImportPlan, import_keys, plan_import
-from teds_provision.handover.selection import ExportOrder
+from teds_provision.handover.incoming import ImportPlan, import_bundle, plan_import
+from teds_provision.handover.outgoing import ExportOrder, export_bundle, plan_export
 from teds_provision.station.station import Station
 from teds_provision.store.database import Database
 from tests.bench import PASSPHRASE
@@ -61,13 +60,13 @@ def open_station(home: Path) -> Station:
 
 def export(station: Station, bundle: Path) -> None:
     """A move of all nodes, as the command does it."""
-    export_keys(station, plan_export(station, ExportOrder(("south",), None, "move")), bundle)
+    export_bundle(station, plan_export(station, ExportOrder(("south",), None, "move")), bundle)
 
 
 def take(station: Station, bundle: Path) -> bytes:
     """An import, as the command does it; returns the receipt."""
     plan = plan_import(station, bundle.read_bytes())
-    done = import_keys(station, plan) if isinstance(plan, ImportPlan) else plan
+    done = import_bundle(station, plan) if isinstance(plan, ImportPlan) else plan
     return done.receipt
 
 

@@ -9,8 +9,7 @@ from datetime import UTC, datetime, timedelta
 from typing import Any
 
 from teds_provision.protocol.handover import jose
-from teds_provision.protocol.handover.bundle import TYPE
-from teds_provision.protocol.handover.contents import Bundle, BundledNode, payload_of
+from teds_provision.protocol.handover.bundle import TYPE, Bundle, BundledNode, payload_of
 from teds_provision.protocol.handover.strict_json import base64url, dump
 from teds_provision.protocol.keys import SoftwareKey, fingerprint, station_key_message
 

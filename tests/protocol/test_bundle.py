@@ -16,14 +16,14 @@ from teds_provision.protocol.handover import jose
 from teds_provision.protocol.handover.bundle import (
     CLOCK_TOLERANCE,
     TYPE,
+    BundledNode,
+    _node_to_json,
     open_bundle,
     peek_bundle,
     seal_bundle,
 )
-from teds_provision.protocol.handover.contents import BundledNode, _node_to_json
-from teds_provision.protocol.handover.payload import LAST_U32
 from teds_provision.protocol.handover.revocation import seal_revocation
-from teds_provision.protocol.handover.strict_json import dump, encode_base64url
+from teds_provision.protocol.handover.strict_json import LAST_U32, dump, encode_base64url
 from teds_provision.protocol.keys import SoftwareKey, fingerprint, station_key_message
 from tests.protocol.handover_parts import (
     NODE_KEY,

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from teds_provision.errors import BadData, NotAuthentic, PolicyRefused
 from teds_provision.protocol.handover import jose
 from teds_provision.protocol.handover.bundle import TYPE, open_bundle
-from teds_provision.protocol.handover.jwk import link_key_of, point_of, public_jwk
+from teds_provision.protocol.handover.jose import link_key_of, point_of, public_jwk
 from teds_provision.protocol.handover.strict_json import base64url, decode_base64url, dump, encode_base64url
 from teds_provision.protocol.keys import GROUP_ORDER, SoftwareKey, fingerprint, is_point
 from tests.protocol.handover_parts import LIMIT, NOW, RECEIVER, SENDER, STRANGER, THIRD, sealed_jws, trusts

@@ -10,9 +10,8 @@ import pytest
 
 from teds_provision.errors import NotAuthentic
 from teds_provision.protocol.handover import jose
-from teds_provision.protocol.handover.bundle import TYPE, open_bundle, seal_bundle
-from teds_provision.protocol.handover.contents import payload_of
-from teds_provision.protocol.handover.jwk import public_jwk
+from teds_provision.protocol.handover.bundle import TYPE, open_bundle, payload_of, seal_bundle
+from teds_provision.protocol.handover.jose import public_jwk
 from teds_provision.protocol.handover.receipt import open_receipt, seal_receipt
 from teds_provision.protocol.handover.strict_json import encode_base64url
 from teds_provision.protocol.keys import fingerprint

@@ -278,7 +278,7 @@ def test_another_jose_opens_every_good_bundle(document: Entry, entry: Entry) -> 
 
     def key(name: str, *, private: bool) -> Any:
         held = SoftwareKey(int(document["keys"][name]["d"], 16))
-        from teds_provision.protocol.handover.jwk import public_jwk
+        from teds_provision.protocol.handover.jose import public_jwk
         from teds_provision.protocol.handover.strict_json import encode_base64url
 
         members = public_jwk(held.point) | ({"d": encode_base64url(held.secret())} if private else {})

@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from teds_provision.errors import BadData, NotAuthentic, PolicyRefused, TedsProvisionError
-from teds_provision.protocol.handover import jose, sealing, strict_json
+from teds_provision.protocol.handover import envelope, jose, strict_json
 from teds_provision.protocol.keys import SoftwareKey, fingerprint
 from tests.protocol.handover_parts import LIMIT, RECEIVER, SENDER, THIRD, trusts
 
@@ -18,12 +18,12 @@ NOTE = b'{"note": "an iron ring, found beside the river"}'
 
 
 def seal(payload, receivers=(RECEIVER,)):
-    made = sealing.Sealing(payload, SENDER, [key.point for key in receivers], typ="note", cty="JWS")
+    made = envelope.Sealing(payload, SENDER, [key.point for key in receivers], typ="note", cty="JWS")
     return b"".join([*made.body(), made.end()]), made
 
 
 def unseal(octets, key=RECEIVER):
-    return sealing.unseal(octets, key, trusts(SENDER), typ="note", cty="JWS", max_octets=LIMIT)
+    return envelope.unseal(octets, key, trusts(SENDER), typ="note", cty="JWS", max_octets=LIMIT)
 
 
 def whole(octets, key=RECEIVER):
@@ -47,11 +47,11 @@ def test_what_was_sealed_in_pieces_is_opened_by_either_reader(pieces, size):
     signed = jose.decrypt(octets, RECEIVER, cty="JWS", max_octets=LIMIT)
     assert told(whole, octets) == (fingerprint(SENDER.point), b"".join(pieces))
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(sealing, "PIECE", size)
+        patch.setattr(envelope, "PIECE", size)
         found = unseal(io.BytesIO(octets))
     assert bytes(found.payload) == b"".join(pieces)
     assert (found.sha256, found.signed_sha256) == (made.sha256, made.signed_sha256)
-    assert sealing.hashlib.sha256(signed).hexdigest() == made.signed_sha256
+    assert envelope.hashlib.sha256(signed).hexdigest() == made.signed_sha256
     assert made.octets == len(octets)
 
 
@@ -63,13 +63,13 @@ def test_both_readers_say_the_same_of_a_changed_file(data):
     change = data.draw(st.sampled_from([b"", b"A", b'"', b"\\", b"\\u0041", b" ", b"\xff", b"}", b"-_-_"]))
     changed = octets[:at] + change + octets[at + data.draw(st.integers(0, 40)) :]
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(sealing, "PIECE", size)
+        patch.setattr(envelope, "PIECE", size)
         assert told(unseal, changed) == told(whole, changed)
 
 
 @pytest.mark.parametrize("size", [16, 64])
 def test_a_long_member_beside_the_ciphertext_is_passed_over(size, monkeypatch):
-    monkeypatch.setattr(sealing, "PIECE", size)
+    monkeypatch.setattr(envelope, "PIECE", size)
     members = json.loads(seal([NOTE * 9])[0])
     members.pop("tag"), members.pop("iv")
     with pytest.raises(BadData):
@@ -81,7 +81,7 @@ def test_a_long_member_beside_the_ciphertext_is_passed_over(size, monkeypatch):
 
 @pytest.mark.parametrize("size", [16, 64])
 def test_an_escape_is_read_wherever_a_piece_of_the_file_ends(size, monkeypatch):
-    monkeypatch.setattr(sealing, "PIECE", size)
+    monkeypatch.setattr(envelope, "PIECE", size)
     text = seal([NOTE * 9])[0].decode()
     begin = text.index('"ciphertext"') + len('"ciphertext":"') + 1
     for at in range(begin, begin + 2 * size):
@@ -104,7 +104,7 @@ def test_a_bundle_that_is_cut_off_anywhere_is_no_bundle():
 
 
 def test_what_was_written_before_the_end_opens_for_nobody():
-    made = sealing.Sealing([NOTE * 2000], SENDER, [RECEIVER.point], typ="note", cty="JWS")
+    made = envelope.Sealing([NOTE * 2000], SENDER, [RECEIVER.point], typ="note", cty="JWS")
     body = b"".join(made.body())
     for closed in (body, body + b'"}', body + b'","tag":"' + strict_json.base64url(bytes(16)) + b'"}'):
         with pytest.raises((BadData, NotAuthentic)):
@@ -132,7 +132,7 @@ def test_a_file_that_changes_while_it_is_read_is_refused(tmp_path):
 
 
 def test_the_tag_is_looked_at_before_anything_that_came_out():
-    made = sealing.Sealing([NOTE], SENDER, [RECEIVER.point], typ="note", cty="JWS")
+    made = envelope.Sealing([NOTE], SENDER, [RECEIVER.point], typ="note", cty="JWS")
     signature_of_other = b"".join([*made.body(), made.end()])
     members = json.loads(signature_of_other)
     text = members["ciphertext"]
@@ -152,7 +152,7 @@ def test_a_signed_text_of_another_form_is_no_document(monkeypatch):
 @given(st.binary(max_size=300))
 def test_a_signature_of_the_digest_is_that_of_the_message(message):
     key = SoftwareKey(0x1F2E3D)
-    assert key.sign_digest(sealing.hashlib.sha256(message).digest()) == key.sign(message)
+    assert key.sign_digest(envelope.hashlib.sha256(message).digest()) == key.sign(message)
 
 
 JSON = st.recursive(

@@ -13,8 +13,7 @@ from pathlib import Path
 import pytest
 
 from teds_provision.errors import PolicyRefused, StoreChanged, WrongPassphrase
-from teds_provision.handover.export_keys import plan_export
-from teds_provision.handover.selection import ExportOrder
+from teds_provision.handover.outgoing import ExportOrder, plan_export
 from teds_provision.protocol.keys import SoftwareKey, fingerprint
 from teds_provision.station.rewrap import rewrap
 from teds_provision.station.station import Station, initialise

@@ -8,8 +8,7 @@ from dataclasses import replace
 import pytest
 
 from teds_provision.errors import PolicyRefused, VaultFailure
-from teds_provision.protocol.handover.bundle import open_bundle, seal_bundle
-from teds_provision.protocol.handover.contents import payload_of
+from teds_provision.protocol.handover.bundle import open_bundle, payload_of, seal_bundle
 from teds_provision.protocol.handover.receipt import open_receipt, seal_receipt
 from teds_provision.protocol.handover.revocation import open_revocation, seal_revocation
 from teds_provision.protocol.keys import fingerprint, station_key_message

@@ -15,8 +15,7 @@ from teds_provision.cli.rendering import count_of, first_lines, local_time
 from teds_provision.errors import PolicyRefused
 
 if TYPE_CHECKING:
-    from teds_provision.handover.export_keys import Exported, ExportPlan
-    from teds_provision.handover.selection import Leaving
+    from teds_provision.handover.outgoing import Exported, ExportPlan, Leaving
     from teds_provision.station.station import Station
 
 _SHOWN = 20
@@ -76,11 +75,11 @@ def export_keys(
         raise click.UsageError("Name the nodes, or say --all.")
     station = app.station()
     nodes = None if everything else tuple(station.nodes.resolve(uuid) for uuid in uuids)
-    order = handover.selection.ExportOrder(receivers, nodes, mode, expires, ca)
+    order = handover.outgoing.ExportOrder(receivers, nodes, mode, expires, ca)
     if not dry_run:
         station.unlock()
-    shown = handover.export_keys.plan_exports(station, order)
-    outputs = handover.export_keys.outputs_of(output, len(shown))
+    shown = handover.outgoing.plan_exports(station, order)
+    outputs = handover.outgoing.outputs_of(output, len(shown))
     if dry_run:
         told = _exported(shown, outputs, station)
         id_ = None if shown[0].earlier is None else shown[0].id
@@ -90,10 +89,10 @@ def export_keys(
     app.note(_plan_text(shown, station))
     app.confirm(f"{mode.capitalize()} {_count(shown)}?", yes=yes)
     with station.lock("export-keys", app.note):
-        plans = shown if station.version() == state else handover.export_keys.plan_exports(station, order)
+        plans = shown if station.version() == state else handover.outgoing.plan_exports(station, order)
         require_same([plan.content for plan in plans] == [plan.content for plan in shown])
         told = _exported(plans, outputs, station)
-        done = handover.export_keys.export_all(station, plans, outputs)
+        done = handover.outgoing.export_all(station, plans, outputs)
     _tell_export(app, plans, outputs, told, done)
 
 

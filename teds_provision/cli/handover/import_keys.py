@@ -25,8 +25,7 @@ from teds_provision.links import LinkSettings
 if TYPE_CHECKING:
     from contextlib import AbstractContextManager
 
-    from teds_provision.handover.arrivals import PlannedNode
-    from teds_provision.handover.import_keys import Imported, ImportPlan
+    from teds_provision.handover.incoming import Imported, ImportPlan, PlannedNode
     from teds_provision.station.station import Station
 
 _SHOWN = 40
@@ -74,17 +73,17 @@ def import_keys(
     with _bundle_file(file) as bundle:
         receipt = receipt or file.with_name(file.name + ".receipt")
         station.unlock()
-        shown = handover.import_keys.plan_import(station, bundle)
+        shown = handover.incoming.plan_import(station, bundle)
         state = station.version()
         if dry_run:
             app.emit({**_import_plan(shown), "receipt": None, "plan": True}, _import_text(station, shown))
             return
-        if not isinstance(shown, handover.import_keys.Imported):
+        if not isinstance(shown, handover.incoming.Imported):
             require_new(receipt)
             app.note(_import_text(station, shown))
             app.confirm(f"Take {count_of(len(shown.taken))} in?", yes=yes)
         with station.lock("import-keys", app.note):
-            plan = shown if station.version() == state else handover.import_keys.plan_import(station, bundle)
+            plan = shown if station.version() == state else handover.incoming.plan_import(station, bundle)
             done = _take_in(station, plan, shown)
             _write_receipt(receipt, done.receipt)
     outcomes: list[dict[str, Any]] = []
@@ -127,15 +126,15 @@ def _is_sealed(file: BinaryIO) -> bool:
 
 def _take_in(station: Station, plan: ImportPlan | Imported, shown: ImportPlan | Imported) -> Imported:
     """Import what was ``shown``, under the lock; nothing to do where it was taken in before."""
-    if isinstance(plan, handover.import_keys.Imported):
+    if isinstance(plan, handover.incoming.Imported):
         return plan
-    require_same(not isinstance(shown, handover.import_keys.Imported) and plan.nodes == shown.nodes)
-    return handover.import_keys.import_keys(station, plan)
+    require_same(not isinstance(shown, handover.incoming.Imported) and plan.nodes == shown.nodes)
+    return handover.incoming.import_bundle(station, plan)
 
 
 def _import_plan(plan: ImportPlan | Imported) -> dict[str, Any]:
     """The result as far as it is known before anything happens."""
-    if isinstance(plan, handover.import_keys.Imported):
+    if isinstance(plan, handover.incoming.Imported):
         return _taken_before(plan)
     bundle = plan.opened.bundle
     nodes = ((one.node.uuid.hex(), one.decision, one.why) for one in plan.nodes)
@@ -155,7 +154,7 @@ def _taken_before(done: Imported) -> dict[str, Any]:
 
 def _import_text(station: Station, plan: ImportPlan | Imported) -> str:
     """The plan for people."""
-    if isinstance(plan, handover.import_keys.Imported):
+    if isinstance(plan, handover.incoming.Imported):
         return f"This bundle was taken in on {plan.row.created}; nothing is left to do."
     bundle, nodes = plan.opened.bundle, plan.nodes
     lines = [f"A {bundle.mode} of {count_of(len(nodes))} from {handover.pending.peer_name(station, bundle.sender)}"]
@@ -205,16 +204,16 @@ def _write_receipt(receipt: Path, octets: bytes) -> None:
 
 
 def _prove(app: App, station: Station, done: Imported, links: LinkSettings) -> list[dict[str, Any]]:
-    proven = handover.prove.proven_of(station, done.uuids)
+    proven = handover.incoming.proven_of(station, done.uuids)
     waiting = [uuid for uuid in done.uuids if uuid not in proven]
 
     def hold() -> AbstractContextManager[None]:
         return station.lock("import-keys", app.note)
 
-    outcomes = handover.prove.prove_nodes(station, links, waiting, reporter_for(app), hold=hold) if waiting else []
+    outcomes = handover.incoming.prove_nodes(station, links, waiting, reporter_for(app), hold=hold) if waiting else []
     return [
         {"uuid": one.uuid.hex(), "rotated": one.rotated, "why": ""}
-        if isinstance(one, handover.prove.Proven)
+        if isinstance(one, handover.incoming.Proven)
         else {"uuid": one.uuid.hex(), "rotated": False, "why": one.why}
         for one in outcomes
     ]
@@ -224,7 +223,7 @@ def _tell_import(
     app: App, station: Station, done: Imported, receipt: Path, told: dict[str, Any], outcomes: list[dict[str, Any]]
 ) -> None:
     imported = told["imported"]
-    known = handover.prove.proven_of(station, map(bytes.fromhex, imported))
+    known = handover.incoming.proven_of(station, map(bytes.fromhex, imported))
     proven = [uuid for uuid in imported if bytes.fromhex(uuid) in known] if known else []
     pending = [uuid for uuid in imported if bytes.fromhex(uuid) not in known] if known else imported
     not_met = {one["uuid"]: one["why"] for one in outcomes if one["why"]}

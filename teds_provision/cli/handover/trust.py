@@ -231,7 +231,7 @@ def ca() -> None:
 def create(app: App) -> None:
     """Show the CA key, which init made; a station that another CA certified has none."""
     station = app.station()
-    handover.certify.require_ca(station)
+    handover.trust.require_ca(station)
     digits, pem = protocol.keys.fingerprint(station.ca), protocol.keys.to_pem(station.ca)
     app.emit({"fingerprint": digits, "public_key": pem, "here": True}, f"CA key {digits[:16]}, in this vault\n\n{pem}")
 
@@ -249,7 +249,7 @@ def create(app: App) -> None:
 def sign(app: App, request: Path, output: Path, yes: bool, dry_run: bool) -> None:
     """Certify the station that made REQUEST (init --request): it may then key and write this owner's nodes."""
     station = app.station()
-    wanted = handover.certify.read_request(read_limited(request, handover.certify.MAX_OCTETS, "request"))
+    wanted = handover.trust.read_request(read_limited(request, handover.trust.MAX_OCTETS, "request"))
     digits = protocol.keys.fingerprint(wanted.station)
     told = {
         "name": wanted.name,
@@ -265,7 +265,7 @@ def sign(app: App, request: Path, output: Path, yes: bool, dry_run: bool) -> Non
     app.note(shown)
     app.confirm("Certify it? Whoever holds its key can then write and rekey every node of this owner.", yes=yes)
     with station.lock("trust ca sign", app.note):
-        octets = handover.certify.write_certificate(handover.certify.sign_request(station, wanted))
+        octets = handover.trust.write_certificate(handover.trust.sign_request(station, wanted))
         fresh = not holds(output, octets)
         if fresh:
             write_new(output, octets)
@@ -290,7 +290,7 @@ def export(app: App, file: Path) -> None:
     vault = station.vault
     passphrase = app.ask_secret("New passphrase for the CA key's file", confirm=True)
     with station.lock("trust ca export", app.note):
-        handover.certify.export_ca(station, vault, file, passphrase)
+        handover.trust.export_ca(station, vault, file, passphrase)
     app.emit({"file": str(file)}, f"The CA key is in {file}. Keep it away, then: teds-provision trust ca drop")
 
 
@@ -303,7 +303,7 @@ def drop(app: App, yes: bool) -> None:
     station.unlock()
     app.confirm("Delete the CA key from this vault? Only its exported file can bring it back.", yes=yes)
     with station.lock("trust ca drop", app.note):
-        dropped = handover.certify.drop_ca(station)
+        dropped = handover.trust.drop_ca(station)
     app.emit({"dropped": dropped}, "The CA key is not in this vault any more." if dropped else "Nothing to do.")
 
 
@@ -316,6 +316,6 @@ def import_(app: App, file: Path) -> None:
     vault = station.vault
     passphrase = app.ask_secret("Passphrase of the CA key's file")
     with station.lock("trust ca import", app.note):
-        handover.certify.import_ca(station, vault, file, passphrase)
+        handover.trust.import_ca(station, vault, file, passphrase)
     digits = protocol.keys.fingerprint(station.ca)
     app.emit({"fingerprint": digits}, f"The CA key {digits[:16]} is in this vault.")

@@ -94,8 +94,8 @@ def _require_same(station: Station, name: str | None, keystore: str | None) -> N
 def _request(app: App, name: str | None, keystore: str | None, path: Path) -> None:
     if not path.exists():
         require_new(path)
-    octets = handover.certify.ask_for_certificate(app.home, name=name, keystore=keystore, ask=app.ask_secret)
-    asked = handover.certify.read_request(octets)
+    octets = handover.trust.ask_for_certificate(app.home, name=name, keystore=keystore, ask=app.ask_secret)
+    asked = handover.trust.read_request(octets)
     fresh = not _is_request_of(path, asked.station)
     if fresh:
         write_new(path, octets)
@@ -119,16 +119,14 @@ def _is_request_of(path: Path, point: bytes) -> bool:
     try:
         if not path.exists():
             return False
-        return (
-            handover.certify.read_request(read_limited(path, handover.certify.MAX_OCTETS, "request")).station == point
-        )
+        return handover.trust.read_request(read_limited(path, handover.trust.MAX_OCTETS, "request")).station == point
     except TedsProvisionError:
         return False
 
 
 def _adopt(app: App, path: Path, yes: bool) -> None:
-    certificate = handover.certify.read_certificate(read_limited(path, handover.certify.MAX_OCTETS, "certificate"))
+    certificate = handover.trust.read_certificate(read_limited(path, handover.trust.MAX_OCTETS, "certificate"))
     digits = protocol.keys.fingerprint(certificate.ca)
     app.note(f"The CA of this certificate, for comparison by voice:\n  {handover.trust.spoken(digits)}")
     app.confirm("Trust this CA as the owner of this station's nodes?", yes=yes)
-    handover.certify.adopt_certificate(app.home, certificate, ask=app.ask_secret).close()
+    handover.trust.adopt_certificate(app.home, certificate, ask=app.ask_secret).close()

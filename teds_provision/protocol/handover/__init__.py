@@ -8,6 +8,6 @@ from typing import TYPE_CHECKING
 from teds_provision.lazy import lazy
 
 if TYPE_CHECKING:
-    from teds_provision.protocol.handover import bundle, contents, jose, jwk, payload, receipt, revocation, strict_json
+    from teds_provision.protocol.handover import bundle, jose, receipt, revocation, strict_json
 else:
     __getattr__ = lazy(__name__)

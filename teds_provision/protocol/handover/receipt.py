@@ -13,8 +13,7 @@ from datetime import datetime
 from teds_provision.errors import BadData, NotAuthentic
 from teds_provision.limits import check_size
 from teds_provision.protocol.handover import jose
-from teds_provision.protocol.handover.payload import Members, time_text
-from teds_provision.protocol.handover.strict_json import dump, load_object
+from teds_provision.protocol.handover.strict_json import Members, dump, load_object, time_text
 from teds_provision.protocol.keys import PrivateKey, fingerprint
 
 FORMAT = "teds-receipt/1"

@@ -7,26 +7,159 @@ the CA's signature over this station, the deny list and the receipt. The same bu
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import AbstractContextManager, nullcontext
+from dataclasses import dataclass, replace
 from datetime import UTC, datetime
+from typing import Any, Literal
 
-from teds_provision.errors import NotAuthentic, PolicyRefused
-from teds_provision.handover import collector
-from teds_provision.handover.arrivals import Arrivals, Decision, PlannedNode
+from teds_provision.errors import LinkFailure, NoNode, NotAuthentic, PolicyRefused, TedsProvisionError
+from teds_provision.handover import gc_pause
 from teds_provision.handover.deny import deny_all, why_not
 from teds_provision.handover.pending import IMPORTED, Notes, digest_of
-from teds_provision.protocol.fingerprints import same_key
-from teds_provision.protocol.handover.bundle import OpenedBundle, check_times, open_bundle
-from teds_provision.protocol.handover.contents import Bundle, BundledNode
-from teds_provision.protocol.handover.payload import time_text
+from teds_provision.links import LinkSettings, open_port
+from teds_provision.protocol.fingerprints import is_whole, same_key
+from teds_provision.protocol.handover.bundle import Bundle, BundledNode, OpenedBundle, check_times, open_bundle
+from teds_provision.protocol.handover.envelope import Source
 from teds_provision.protocol.handover.receipt import Receipt, RefusedNode, seal_receipt
 from teds_provision.protocol.handover.revocation import Revocation as Statement
-from teds_provision.protocol.handover.sealing import Source
+from teds_provision.protocol.handover.strict_json import time_text
 from teds_provision.protocol.keys import fingerprint, station_key_message, verify
+from teds_provision.protocol.messages.identity import NodeState
 from teds_provision.station.node_keys import MAX_PENDING
 from teds_provision.station.station import Station
-from teds_provision.store import Handover, pages
+from teds_provision.steps.agree import require_session
+from teds_provision.steps.identify import identify
+from teds_provision.store import Batch, Handover, Holder, KeyRecord, NodeRecord, WhitelistEntry, pages, utc_now
+from teds_provision.talk.conversation import Conversation
+from teds_provision.talk.progress import Reporter
+
+# Nodes that come with a bundle: what becomes of each, and the rows of those that are taken in.
+
+Decision = Literal["new", "newer", "same", "refused"]
+
+
+@dataclass(frozen=True, slots=True)
+class PlannedNode:
+    """What becomes of one node of the bundle, and why where it is refused.
+
+    ``name`` is the one that it gets here, ``notes`` say what a person should know of a node that is taken.
+    """
+
+    node: BundledNode
+    decision: Decision
+    why: str = ""
+    name: str | None = None
+    notes: tuple[str, ...] = ()
+
+
+class Arrivals:
+    """The rows of the nodes that are taken in, made and written a page at a time; the caller holds the transaction."""
+
+    def __init__(self, station: Station, bundle: Bundle) -> None:
+        self.station, self.bundle = station, bundle
+        self.resting = {tombstone.uuid for tombstone in station.policy.tombstones()}
+        self.others = sorted({bundle.sender, *bundle.to} - {station.fingerprint})
+        self.now = utc_now()
+        self._turn_to([])
+
+    def take_in(self, nodes: Iterable[PlannedNode]) -> None:
+        """Write all of them."""
+        self.station.keys.refresh()
+        for taken in pages(nodes):
+            self._turn_to([one.node.uuid for one in taken])
+            self._take_back([one.node.uuid for one in taken if one.node.uuid in self.resting])
+            self.station.handovers.take_in(self._rows(taken))
+
+    def _rows(self, taken: Sequence[PlannedNode]) -> Batch:
+        return Batch(
+            nodes=[self._node(one) for one in taken],
+            whitelist=[entry for entry in map(self._entry, taken) if entry is not None],
+            keys=[self._key(one.node) for one in taken if one.decision != "same"],
+            holders=[holder for one in taken for holder in self._holders(one.node)],
+            marks=self._marks(taken),
+        )
+
+    def _turn_to(self, uuids: Sequence[bytes]) -> None:
+        """Read what is known here of a page of nodes."""
+        station = self.station
+        self.known = station.nodes.of_page(uuids)
+        self.pins = station.pins.of_page(uuids)
+        self.slots = station.keys.slots_of(uuids)
+        self.cas = station.keys.cas_of_page(uuids)
+
+    def _take_back(self, uuids: list[bytes]) -> None:
+        self.station.policy.take_back(uuids)
+        for uuid in uuids:
+            self.station.audit("handover", uuid, "came back", handover=self.bundle.id)
+
+    def _holders(self, node: BundledNode) -> list[Holder]:
+        """The other stations that have this key from now on: the sender, and who else the bundle is for."""
+        return [Holder(node.uuid, other, self.now, self.bundle.mode) for other in self.others]
+
+    def _key(self, node: BundledNode) -> KeyRecord:
+        return self.station.keys.wrapped(
+            node.uuid,
+            key=node.key,
+            key_id=bytes.fromhex(node.kid),
+            epoch=node.epoch,
+            slot=self.slots.get(node.uuid, 0) + 1,
+            source="import",
+            created=self.now,
+        )
+
+    def _entry(self, one: PlannedNode) -> WhitelistEntry | None:
+        """The whitelist entry, pinned to the node's key; None where it is pinned already."""
+        node = one.node
+        pin, digits = self.pins.get(node.uuid), fingerprint(node.node_key)
+        if pin is None:
+            return WhitelistEntry(node.uuid, digits, self.now, "import", one.name)
+        return None if is_whole(pin.fingerprint) else replace(pin, fingerprint=digits, assurance="import")
+
+    def _node(self, one: PlannedNode) -> NodeRecord:
+        """What is known of the node from now on; not its epoch and sequence, which a session has to tell."""
+        node = one.node
+        state = int(NodeState.PROVISIONED if node.teds_sha256 else NodeState.KEYED)
+        known = self.known.get(node.uuid)
+        if known is None:
+            return NodeRecord(
+                node.uuid,
+                node.node_key,
+                one.name,
+                node.profile,
+                state,
+                groups=node.groups,
+                teds_sha256=node.teds_sha256,
+            )
+        return replace(
+            known,
+            point=node.node_key,
+            name=known.name or one.name,
+            profile=known.profile or node.profile,
+            groups=tuple(dict.fromkeys((*known.groups, *node.groups))),
+            state=known.state or state,
+            teds_sha256=known.teds_sha256 or node.teds_sha256,
+        )
+
+    def _marks(self, taken: Iterable[PlannedNode]) -> dict[bytes, dict[str, Any]]:
+        """Rotations that are due after a move; the CA that each node keeps, or keeps once its new key is proven."""
+        ca, own = self.bundle.ca, self.station.ca
+        marks: dict[bytes, dict[str, Any]] = {}
+        for one in taken:
+            uuid = one.node.uuid
+            if uuid in self.resting:
+                marks[uuid] = {"rotation": f"it came back by {self.bundle.id}: others have had this key"}
+            if self.bundle.mode == "move":
+                marks[uuid] = {"rotation": f"moved here by {self.bundle.id}: the sender has had this key"}
+            if one.decision == "same" or self.cas.get(uuid, own) == ca:
+                continue
+            if one.decision == "newer":  # the key held now stays good, under its CA, until the new one is proven
+                kept: dict[str, Any] = {"next_key_id": one.node.kid, "next_ca": ca}
+            else:
+                kept = {"ca": ca}
+            marks[uuid] = {**marks.get(uuid, {}), **kept}
+        return marks
+
 
 _LIKE_UUID = re.compile("(0x)?[0-9a-f]{4,}", re.IGNORECASE)
 
@@ -70,7 +203,7 @@ class Imported:
         return tuple(bytes.fromhex(uuid) for uuid in self.notes.uuids if uuid not in refused)
 
 
-@collector.put_off()
+@gc_pause.put_off()
 def plan_import(station: Station, source: Source, now: datetime | None = None) -> ImportPlan | Imported:
     """Open and check a bundle (octets, or a file), and say what would become of each node; changes nothing.
 
@@ -115,8 +248,8 @@ def _is_known_ca(station: Station, ca: bytes) -> bool:
     return station.policy.counts(ca) and (certified or ca in station.policy.trusted_cas())
 
 
-@collector.put_off()
-def import_keys(station: Station, plan: ImportPlan, now: datetime | None = None) -> Imported:
+@gc_pause.put_off()
+def import_bundle(station: Station, plan: ImportPlan, now: datetime | None = None) -> Imported:
     """Take the bundle in, all of it in one transaction, and sign its receipt."""
     bundle = plan.opened.bundle
     receipt = Receipt(
@@ -289,3 +422,83 @@ def _keep_ca(station: Station, plan: ImportPlan) -> None:
         if not verify(bundle.ca, station_key_message(point), signature):
             raise NotAuthentic(f"The bundle's CA signature over station {digits[:16]} does not verify.")
         station.identity.keep_certificate(bundle.ca, point, signature)
+
+
+# A node counts as taken over when it opened a session here, under a key that after a move is new.
+
+
+@dataclass(frozen=True)
+class Proven:
+    """A node that opened a session; ``rotated``: under a new key, so that the former holders are locked out."""
+
+    uuid: bytes
+    epoch: int
+    rotated: bool
+
+
+@dataclass(frozen=True)
+class NotProven:
+    """A node that did not, and why."""
+
+    uuid: bytes
+    why: str
+
+
+def prove_node(station: Station, node: Conversation) -> Proven:
+    """Have one node prove its identity key and open a session; a move's key is rotated in it.
+
+    Raises TedsProvisionError: link, other key, unknown key.
+    """
+    due = station.keys.rotation_due(node.uuid) is not None
+    identify(station, node)
+    held = require_session(station, node)
+    station.audit("handover", node.uuid, "taken over", epoch=held.record.epoch, rotated=due)
+    return Proven(node.uuid, held.record.epoch, rotated=due)
+
+
+def proven_of(station: Station, uuids: Iterable[bytes]) -> set[bytes]:
+    """Those of many nodes with which a session was opened under the key that is held, and no rotation is due."""
+    proven: set[bytes] = set()
+    for page in pages(uuids):
+        active = {key.uuid for key in station.keys.of_page(page) if key.state == "active"}
+        proven |= active - station.keys.due_of_page(page)
+    return proven
+
+
+def prove_nodes(
+    station: Station,
+    links: LinkSettings,
+    uuids: Sequence[bytes],
+    reporter: Reporter,
+    *,
+    hold: Callable[[], AbstractContextManager[object]] = nullcontext,
+) -> list[Proven | NotProven]:
+    """Meet each of these nodes on the chosen link, in whatever order they come; ends when none comes in time.
+
+    ``hold`` holds the store for as long as one node is worked on, never while one is waited for.
+    """
+    waiting, outcomes = set(uuids), dict[bytes, Proven | NotProven]()
+    try:
+        port = open_port(links)
+    except LinkFailure as error:
+        return [NotProven(uuid, error.message) for uuid in uuids]
+    try:
+        while waiting:
+            try:
+                contact = port.find(
+                    lambda identity: identity.uuid in waiting, seconds=links.timeout, notice=reporter.notice
+                )
+            except NoNode:
+                break
+            uuid = contact.identity.uuid
+            waiting.discard(uuid)
+            try:
+                with Conversation(contact, notice=reporter.notice) as node, hold():
+                    outcomes[uuid] = prove_node(station, node)
+            except TedsProvisionError as error:
+                outcomes[uuid] = NotProven(uuid, error.message)
+    except LinkFailure as error:
+        return [outcomes.get(uuid, NotProven(uuid, error.message)) for uuid in uuids]
+    finally:
+        port.close()
+    return [outcomes.get(uuid, NotProven(uuid, "it was not met")) for uuid in uuids]

@@ -13,20 +13,179 @@ from dataclasses import dataclass, replace
 from datetime import UTC, datetime, timedelta
 from operator import attrgetter
 from pathlib import Path
+from typing import NamedTuple
 
 from teds_provision.errors import NotFound, PolicyRefused, UsageFailure
 from teds_provision.files import new_file, require_new
-from teds_provision.handover import collector
+from teds_provision.handover import gc_pause
 from teds_provision.handover.pending import OPEN, Notes, content_digest
-from teds_provision.handover.selection import Chosen, ExportOrder, Leaving, Selection
 from teds_provision.handover.trust import find_trusted
-from teds_provision.protocol.handover.bundle import sealing
-from teds_provision.protocol.handover.contents import Bundle, BundledNode, Mode
-from teds_provision.protocol.handover.payload import time_text
-from teds_provision.protocol.handover.sealing import Sealing
+from teds_provision.protocol.fingerprints import same_key
+from teds_provision.protocol.handover.bundle import Bundle, BundledNode, Mode, seal_pieces
+from teds_provision.protocol.handover.envelope import Sealing
+from teds_provision.protocol.handover.strict_json import time_text
 from teds_provision.protocol.keys import fingerprint
 from teds_provision.station.station import Station
-from teds_provision.store import Batch, Handover, Holder, Tombstone, TrustRecord, pages, utc_now
+from teds_provision.store import Batch, Handover, Holder, NodeRecord, Shown, Tombstone, TrustRecord, pages, utc_now
+
+# Which nodes an export takes, and why others stay.
+
+DEFAULT_DAYS = 7
+OUT_OF_SERVICE = ("decommissioned", "replaced by")  # the words of handover/life.py
+_UNKNOWN = "its public key is not known"
+_CURE = "See teds-provision nodes UUID; settle it by any session, or: teds-provision agree UUID --rotate"
+
+
+@dataclass(frozen=True)
+class ExportOrder:
+    """What to hand over: to whom (as typed), which nodes (None: all that can be), how, and for how many days."""
+
+    to: tuple[str, ...]
+    nodes: tuple[bytes, ...] | None
+    mode: Mode = "copy"
+    days: int = DEFAULT_DAYS
+    ca: str | None = None
+
+
+class Leaving(NamedTuple):
+    """A node that goes, by its UUID, and the key that it has now: the rest is read when it is sealed."""
+
+    uuid: bytes
+    key_id: str
+    epoch: int
+
+
+Chosen = list[Leaving]
+
+
+class Selection:
+    """Which nodes go, by the tables as they are now (read once, a page at a time: there may be ten thousand)."""
+
+    def __init__(self, station: Station, order: ExportOrder, receivers: set[str]) -> None:
+        self.order, self.receivers = order, receivers
+        self.keys: dict[bytes, Leaving] = {}
+        self.pending: set[bytes] = set()
+        for uuid, key_id, epoch, state in _keys(station, order.nodes):
+            if state == "active":
+                self.keys[uuid] = Leaving(uuid, key_id, epoch)
+            else:
+                self.pending.add(uuid)
+        self.stays = _why_nodes_stay(station, order.nodes)
+        self.due = station.keys.rotations_due().keys()
+        self.tombstones = {tombstone.uuid: tombstone for tombstone in station.policy.tombstones()}
+        self.revoked = {revocation.uuid for revocation in station.policy.revocations()}
+        self.rows = [row for row in station.handovers.all() if row.direction == "out" and row.state == OPEN]
+        self.open = {row.id: row for row in self.rows}
+
+    def parts(self, nodes: Chosen, most: int) -> list[Chosen]:
+        """Divide the nodes into bundles: those of an open move as they were, the others by ``most``."""
+        resting: dict[str, Chosen] = {}
+        free: Chosen = []
+        for node in nodes:
+            tombstone = self.tombstones.get(node.uuid)
+            (free if tombstone is None else resting.setdefault(tombstone.handover_id, [])).append(node)
+        return [*resting.values(), *(free[start : start + most] for start in range(0, len(free), most))]
+
+    def choose(self) -> tuple[Chosen, list[tuple[bytes, str]]]:
+        """The nodes with their keys, and those that ``--all`` leaves out."""
+        why = self._every() if self.order.nodes is None else self._named(self.order.nodes)
+        chosen = [self.keys[uuid] for uuid, obstacle in why.items() if not obstacle]
+        if not chosen:
+            raise NotFound("There is no node to hand over.", hint="Name nodes, or see: teds-provision nodes")
+        return chosen, [(uuid, obstacle) for uuid, obstacle in why.items() if obstacle]
+
+    def _named(self, nodes: tuple[bytes, ...]) -> dict[bytes, str]:
+        """The nodes that were named; raises PolicyRefused where one cannot go."""
+        why = {uuid: self._obstacle(uuid) for uuid in sorted(set(nodes))}
+        for uuid, obstacle in why.items():
+            if obstacle:
+                raise PolicyRefused(f"Node {uuid.hex()} cannot be handed over: {obstacle}.", hint=_CURE)
+        return why
+
+    def _every(self) -> dict[bytes, str]:
+        """Every node of which a key is held, with what keeps it here; where all stay, those of a move that was cut."""
+        why = {uuid: self._obstacle(uuid) for uuid in sorted(self.keys.keys() | self.pending)}
+        if all(why.values()):
+            return dict.fromkeys(self._cut_move(), "") or why
+        return why
+
+    def _obstacle(self, uuid: bytes) -> str:
+        return self._key_stays(uuid) or self.stays.get(uuid, _UNKNOWN)
+
+    def _key_stays(self, uuid: bytes) -> str:
+        tombstone = self.tombstones.get(uuid)
+        if uuid in self.revoked:
+            return "it is revoked"
+        if tombstone is not None and not (self.order.nodes is not None and self._is_cut(uuid)):
+            return f"it was moved to station {tombstone.to_fingerprint[:16]}"
+        if uuid not in self.keys:
+            return "its key was never proven in a session" if uuid in self.pending else "no key of it is held here"
+        if self.order.mode == "move" and uuid in self.pending:
+            return "an agreement with it is not settled: the key that it has now may be a newer one"
+        if uuid in self.due:
+            return "its key must be rotated first"
+        return ""
+
+    def _is_cut(self, uuid: bytes) -> bool:
+        """Whether this node rests because of a move to the same receiver that is still open."""
+        tombstone = self.tombstones[uuid]
+        return (
+            self.order.mode == "move"
+            and tombstone.handover_id in self.open
+            and tombstone.to_fingerprint in self.receivers
+        )
+
+    def _cut_move(self) -> list[bytes]:
+        """The nodes of the newest open move to this receiver, and of the bundles that one command made with it.
+
+        ``--all`` again after a cut means these.
+        """
+        if self.order.mode != "move":
+            return []
+        rows = [row for row in self.open.values() if row.mode == "move" and set(row.peers) == self.receivers]
+        together = _of_the_last_run([Notes.from_json(row.nodes) for row in rows])
+        return sorted(bytes.fromhex(uuid) for one in together for uuid in one.uuids)
+
+
+def _keys(station: Station, wanted: tuple[bytes, ...] | None) -> Iterator[tuple[bytes, str, int, str]]:
+    """UUID, key id, epoch and state of the keys of the nodes that are wanted, or of all."""
+    if wanted is None:
+        return station.keys.each_name()
+    records = (key for page in pages(wanted) for key in station.keys.of_page(page))
+    return ((key.uuid, key.key_id, key.epoch, key.state) for key in records)
+
+
+def _why_nodes_stay(station: Station, wanted: tuple[bytes, ...] | None) -> dict[bytes, str]:
+    """Why each node of the wanted ones, or of all, cannot go, whatever its key is; "" for nothing."""
+    known: Iterable[Sequence[NodeRecord | Shown]] = (
+        pages(station.nodes.each_shown()) if wanted is None else map(_listed, map(station.nodes.of_page, pages(wanted)))
+    )
+    stays: dict[bytes, str] = {}
+    for page in known:
+        entries = station.pins.of_page([node.uuid for node in page])
+        pins = station.pins.among(page, entries.values())
+        stays |= {node.uuid: _why_node_stays(node, pins.get(node.uuid, "")) for node in page}
+    return stays
+
+
+def _listed(nodes: dict[bytes, NodeRecord]) -> list[NodeRecord]:
+    return list(nodes.values())
+
+
+def _why_node_stays(node: NodeRecord | Shown, pin: str) -> str:
+    if (node.retired or "").startswith(OUT_OF_SERVICE):
+        return "it is out of service"
+    if node.point is None:
+        return _UNKNOWN
+    if not same_key(pin, fingerprint(node.point)):
+        return "the key that it showed last is not the one that it is pinned to"
+    return ""
+
+
+def _of_the_last_run(notes: list[Notes]) -> list[Notes]:
+    """The newest bundle, with all that one command made together with it."""
+    return [one for one in notes if one.run and one.run == notes[-1].run] or notes[-1:]
+
 
 NODES_IN_A_BUNDLE = 50_000
 """Well below what a bundle can hold (64 MiB), so that a few long names do not burst one."""
@@ -73,7 +232,7 @@ def plan_export(station: Station, order: ExportOrder) -> ExportPlan:
     return plans[0]
 
 
-@collector.put_off()
+@gc_pause.put_off()
 def plan_exports(station: Station, order: ExportOrder, *, most: int = NODES_IN_A_BUNDLE) -> list[ExportPlan]:
     """Find the receivers and nodes, and the CA's signature over each receiver; changes nothing.
 
@@ -138,8 +297,8 @@ class _Common:
         )
 
 
-@collector.put_off()
-def export_keys(station: Station, plan: ExportPlan, output: Path, now: datetime | None = None) -> Exported:
+@gc_pause.put_off()
+def export_bundle(station: Station, plan: ExportPlan, output: Path, now: datetime | None = None) -> Exported:
     """Seal the bundle into a new file of mode 0600; a move's keys rest from before anybody could open that file.
 
     What is written before the store has it is a draft without signature and tag, under a name of its own.
@@ -164,7 +323,7 @@ def export_keys(station: Station, plan: ExportPlan, output: Path, now: datetime 
 def export_all(station: Station, plans: Sequence[ExportPlan], outputs: Sequence[Path]) -> list[Exported]:
     """Seal each plan into its file. Of several, all keys of a move rest before the first file exists.
 
-    Raises what :func:`export_keys` raises; the same command carries on.
+    Raises what :func:`export_bundle` raises; the same command carries on.
     """
     for plan, output in zip(plans, outputs, strict=True):
         if _already(plan, output) is None:
@@ -174,7 +333,7 @@ def export_all(station: Station, plans: Sequence[ExportPlan], outputs: Sequence[
         run = plans[0].earlier and Notes.from_json(plans[0].earlier.nodes).run
         with station.transaction():
             ready = [plan if plan.earlier else _announced(station, plan, run or plans[0].id) for plan in plans]
-    return [export_keys(station, plan, output) for plan, output in zip(ready, outputs, strict=True)]
+    return [export_bundle(station, plan, output) for plan, output in zip(ready, outputs, strict=True)]
 
 
 def _announced(station: Station, plan: ExportPlan, run: str) -> ExportPlan:
@@ -273,7 +432,7 @@ def _sealing(station: Station, plan: ExportPlan, now: datetime) -> Sealing:
         revoked=tuple(revocation.statement for revocation in station.policy.revocations()),
     )
     to = [record.point for record in plan.receivers]
-    return sealing(bundle, _bundled(station, plan.nodes), len(plan.nodes), station.vault.identity(), to)
+    return seal_pieces(bundle, _bundled(station, plan.nodes), len(plan.nodes), station.vault.identity(), to)
 
 
 def _bundled(station: Station, nodes: Iterable[Leaving]) -> Iterator[BundledNode]:
