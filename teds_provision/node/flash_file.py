@@ -16,6 +16,7 @@ from teds_provision.files import whole_file
 from teds_provision.protocol.announce import default_can_address
 from teds_provision.protocol.flash import Flash, FlashFailure, in_factory_state
 from teds_provision.protocol.keys import SoftwareKey, node_key_message
+from teds_provision.protocol.messages.frames import LIST_OVERHEAD
 from teds_provision.teds.image import BlockId
 
 FORMAT = "teds-virtual-node/3"
@@ -62,6 +63,12 @@ class FlashFile:
         except OSError as error:
             raise _unusable(folder, error) from error
         uuid = secrets.token_bytes(10) if uuid is None else uuid
+        least = LIST_OVERHEAD + 3 * (len(blocks or {}) + 1)
+        if max_message < least:
+            raise UsageFailure(
+                f"A node with {len(blocks or {})} TEDS needs messages of {least} octets to list them.",
+                hint=f"--max-message {least}",
+            )
         key = SoftwareKey.generate()
         flash = Flash(
             uuid,

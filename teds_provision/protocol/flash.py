@@ -15,6 +15,10 @@ class FlashFailure(Exception):
     """Raised by a :class:`Flash` whose commit did not happen; the old state stands (reason 11)."""
 
 
+class ChipFailure(Exception):
+    """Raised by a node's random source, key or one-time key that does not work: nothing was done (reason 11)."""
+
+
 @dataclass(frozen=True)
 class Flash:
     """A node's durable state.

@@ -180,7 +180,6 @@ class NodeSession:
         self.reply = node + self._keys.node_tag
         self.counter = 0
         self.good_at = 0.0
-        self.staging: dict[tuple[int, int], bytes] = {}
 
     @property
     def message_key(self) -> bytes:

@@ -26,8 +26,8 @@ from teds_provision.teds.codec.frame import unframe
 from teds_provision.teds.image import SECURITY, BlockId, Image
 
 LARGEST_TEDS = 1 << 20
-LARGEST_SECURITY = 4094 - 78
-"""It fits into the sealed reply to Request, a frame of at most 4094 octets (profile.md, "Command frames")."""
+LARGEST_SECURITY = 65535
+"""Room for 1,700 signed TEDS; it is read before anything is known of a node."""
 LARGEST_IMAGE = 4 << 20
 _NOISY_READS = 4
 _REFUSED_READS = 2
@@ -40,7 +40,7 @@ def read_block(node: Conversation, block: BlockId, *, until: float | None = None
 
     Outside a session, where no tag tells noise from a bad TEDS, one whose checksum is wrong is read again: what comes
     twice alike is what the node has. ``until`` is a monotonic time. Raises NodeRefused (18: no such TEDS) and,
-    for a Length beyond 1 MiB (of a Security TEDS, 4016 octets), BadData in a session, Garbled outside one.
+    for a Length beyond 1 MiB (of a Security TEDS, 65535 octets), BadData in a session, Garbled outside one.
     """
     octets = _read_once(node, block, until)
     for _ in range(_NOISY_READS):

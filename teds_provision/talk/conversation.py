@@ -47,7 +47,7 @@ _MEANING = {
     Reason.WRONG_EPOCH: "the datasheet was signed for another key epoch",
     Reason.WRONG_UUID: "the Meta-TEDS names another UUID",
     Reason.TOO_LARGE: "the TEDS is too large for it",
-    Reason.FLASH_FAILURE: "its flash failed",
+    Reason.FLASH_FAILURE: "its flash or a chip of it failed",
     Reason.BAD_TAG: "a tag is wrong",
     Reason.REPLAY: "a counter was used before",
     Reason.UNTRUSTED_STATION: "it belongs to another owner's CA",

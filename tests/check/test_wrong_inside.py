@@ -86,11 +86,11 @@ def confirm_from_anywhere(patch: Patch) -> None:
 def write_keeps_the_rest(patch: Patch) -> None:
     original = teds_access.TedsAccess.write
 
-    def write(self: Any, flash: Flash, command: Command, staging: dict[Any, bytes]) -> Reply:
+    def write(self: Any, flash: Flash, command: Command, staging: Any, session: Any, *, now: float) -> Reply:
         block = (command.channel, command.payload[0])
-        before = staging.get(block, b"")
-        reply = original(self, flash, command, staging)
-        staging[block] += before[len(staging[block]) :]
+        before = staging.of(session).get(block, b"")
+        reply = original(self, flash, command, staging, session, now=now)
+        staging._images[block] += before[len(staging._images[block]) :]
         return reply
 
     patch.setattr(teds_access.TedsAccess, "write", write)
@@ -99,20 +99,16 @@ def write_keeps_the_rest(patch: Patch) -> None:
 def any_size(patch: Patch) -> None:
     original = teds_access.TedsAccess.write
 
-    def write(self: Any, *args: Any) -> Reply:
-        return original(replace(self, max_teds=self.max_teds + 100), *args)
+    def write(self: Any, *args: Any, now: float) -> Reply:
+        return original(replace(self, max_teds=self.max_teds + 100), *args, now=now)
 
     patch.setattr(teds_access.TedsAccess, "write", write)
 
 
 def staging_for_ever(patch: Patch) -> None:
-    original, shared = NodeSession.__init__, dict[tuple[int, int], bytes]()
-
-    def init(self: NodeSession, *args: Any) -> None:
-        original(self, *args)
-        self.staging = shared
-
-    patch.setattr(NodeSession, "__init__", init)
+    patch.setattr(teds_access.Staging, "of", lambda self, session: self._images)
+    patch.setattr(teds_access.Staging, "require", lambda self, session, untouched=None: None)
+    patch.setattr(teds_access.Staging, "end", lambda self, session=None: None if session else self._images.clear())
 
 
 def listed_is_enough(patch: Patch) -> None:
@@ -193,11 +189,11 @@ def the_first_open_stays(patch: Patch) -> None:
 def a_refused_write_drops(patch: Patch) -> None:
     original = teds_access.TedsAccess.write
 
-    def write(self: Any, flash: Flash, command: Command, staging: dict[Any, bytes]) -> Reply:
+    def write(self: Any, flash: Flash, command: Command, staging: Any, session: Any, *, now: float) -> Reply:
         try:
-            return original(self, flash, command, staging)
+            return original(self, flash, command, staging, session, now=now)
         except Refused:
-            staging.pop((command.channel, command.payload[0]), None)
+            staging._images.pop((command.channel, command.payload[0]), None)
             raise
 
     patch.setattr(teds_access.TedsAccess, "write", write)
@@ -206,10 +202,10 @@ def a_refused_write_drops(patch: Patch) -> None:
 def an_empty_write_stages_nothing(patch: Patch) -> None:
     original = teds_access.TedsAccess.write
 
-    def write(self: Any, flash: Flash, command: Command, staging: dict[Any, bytes]) -> Reply:
-        reply = original(self, flash, command, staging)
+    def write(self: Any, flash: Flash, command: Command, staging: Any, session: Any, *, now: float) -> Reply:
+        reply = original(self, flash, command, staging, session, now=now)
         if len(command.payload) == 5:
-            del staging[command.channel, command.payload[0]]
+            del staging._images[command.channel, command.payload[0]]
         return reply
 
     patch.setattr(teds_access.TedsAccess, "write", write)

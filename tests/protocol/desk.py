@@ -126,6 +126,21 @@ class Desk:
         assert self.stage(SECURITY, self.signed(blocks) if teds is None else teds).ok
         return self.sealed(update_teds(*SECURITY))
 
+    def commit_in_pieces(self, blocks: dict[BlockId, bytes], *, piece: int) -> None:
+        """Stage and commit in Writes of at most so many octets."""
+        for block, octets in {**blocks, SECURITY: self.signed(blocks)}.items():
+            for at in range(0, len(octets), piece):
+                assert self.sealed(write_teds(*block, at, octets[at : at + piece])).ok
+        assert self.sealed(update_teds(*SECURITY)).ok
+
+    def agree_in_session(self) -> None:
+        """Rotate inside the open session."""
+        agreement, teds = StationAgreement(CREDENTIALS, UUID), self.flash.security_teds()
+        reply = self.sealed(agreement.request())
+        agreed = agreement.accept(reply.payload, teds, pinned=None, epoch=self.flash.epoch)
+        assert self.sealed(agreed.confirm) == Reply(True)
+        self.key = agreed.key
+
 
 def digest(teds: bytes) -> bytes:
     return hashlib.sha256(teds).digest()

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import pytest
 from hypothesis import given, settings
@@ -11,8 +11,10 @@ from hypothesis import strategies as st
 from teds_provision.protocol.keys import GROUP_ORDER, SoftwareKey, station_key_message, verify
 from teds_provision.protocol.messages.frames import (
     Attribute,
+    Command,
     Function,
     Reason,
+    Reply,
     TedsStatus,
     decode_list,
     query_teds,
@@ -22,6 +24,8 @@ from teds_provision.protocol.messages.frames import (
     update_teds,
     write_teds,
 )
+from teds_provision.protocol.messages.identity import NodeState
+from teds_provision.protocol.session import StationSession
 from teds_provision.protocol.tim.node import Tim
 from teds_provision.teds.codec import security
 from teds_provision.teds.codec.frame import frame
@@ -101,6 +105,110 @@ def test_a_gap_gets_4_and_changes_nothing(desk: Desk) -> None:
     assert desk.sealed(update_teds(1, 12)).ok
 
 
+# -- one staging area --------------------------------------------------------------------------------------------------
+
+
+@dataclass
+class Two:
+    """Two sessions, over NFC and over CAN."""
+
+    desk: Desk
+    here: StationSession
+    there: StationSession
+
+    def one(self, command: Command) -> Reply:
+        self.desk.session = self.here
+        return self.desk.sealed(command)
+
+    def other(self, command: Command) -> Reply:
+        self.desk.session = self.there
+        return self.desk.sealed(command, link="can:f1")
+
+
+@pytest.fixture
+def two(desk: Desk) -> Two:
+    here = desk.session
+    there = desk.open(link="can:f1").session
+    assert here is not None
+    assert there is not None
+    two = Two(desk, here, there)
+    assert two.other(security_command(Function.LIST)).ok  # half-open no longer
+    return two
+
+
+BUSY = refusal(Reason.BUSY)
+
+
+def test_while_something_is_staged_write_and_update_in_another_session_get_17(two: Two) -> None:
+    assert two.one(write_teds(1, 12, 0, NAME)).ok
+    assert two.other(write_teds(0, 1, 0, META)) == BUSY
+    assert two.other(update_teds(0, 128)) == BUSY
+    assert two.other(update_teds(1, 12)) == BUSY
+    assert two.other(query_teds(1, 12)).ok, "to look is free"
+    assert two.one(update_teds(1, 12)).ok, "and it is all there"
+
+
+def test_the_17_of_the_staging_area_comes_after_4_3_and_18_and_before_10() -> None:
+    block = frame(bytes.fromhex("0304050d0101"))
+    desk = Desk(blocks={(0, 13): block}, read_only=frozenset({(0, 13)}))
+    desk.agree().open()
+    here, there = desk.session, desk.open(link="can:f1").session
+    assert here is not None
+    assert there is not None
+    two = Two(desk, here, there)
+    assert two.one(write_teds(1, 12, 0, NAME)).ok
+    assert two.other(Command(1, 1, 3, b"\x0c\0\0\0")) == refusal(Reason.BAD_FORM)
+    assert two.other(write_teds(1, 12, 1, b"x")) == refusal(Reason.BAD_FORM), "its own staging is empty"
+    assert two.other(write_teds(0, 13, 0, b"x")) == refusal(Reason.NOT_PERMITTED)
+    assert two.other(write_teds(0, 127, 0, b"x")) == refusal(Reason.NO_SUCH_TEDS)
+    assert two.other(update_teds(0, 127)) == refusal(Reason.NO_SUCH_TEDS)
+    assert two.other(write_teds(1, 12, 0, bytes(1900))) == BUSY
+
+
+@pytest.mark.parametrize(("seconds", "reply"), [(59.9, BUSY), (60.0, Reply(True))])
+def test_staging_that_was_not_touched_for_60_seconds_gives_way_to_a_write(
+    two: Two, seconds: float, reply: Reply
+) -> None:
+    assert two.one(write_teds(1, 12, 0, NAME)).ok
+    two.desk.now += 30
+    assert two.one(update_teds(1, 12)).ok  # this touches it
+    two.desk.now += seconds
+    assert two.other(update_teds(0, 1)) == BUSY, "an Update makes nothing give way"
+    assert two.other(write_teds(0, 1, 0, META)) == reply
+    if reply.ok:
+        assert two.one(update_teds(1, 12)) == BUSY, "what it had is gone"
+        assert two.other(update_teds(0, 1)).ok
+
+
+def test_a_write_that_is_refused_makes_nothing_give_way(two: Two) -> None:
+    assert two.one(write_teds(1, 12, 0, NAME)).ok
+    two.desk.now += 60
+    two.desk.tim._teds = replace(two.desk.tim._teds, max_teds=10)
+    assert two.other(write_teds(0, 1, 0, META)) == refusal(Reason.TOO_LARGE)
+    assert two.one(update_teds(1, 12)).ok
+
+
+@pytest.mark.parametrize("end", ["close", "link", "commit"])
+def test_the_staging_area_is_free_when_its_session_or_its_commit_is_over(two: Two, end: str) -> None:
+    assert two.one(write_teds(1, 12, 0, NAME)).ok
+    if end == "close":
+        assert two.one(security_command(Function.CLOSE)).ok
+    elif end == "link":
+        two.desk.tim.link_lost("nfc")
+    else:
+        two.desk.session = two.here
+        assert two.desk.commit(BLOCKS).ok
+    assert two.other(write_teds(0, 1, 0, META)).ok
+
+
+def test_a_node_takes_no_teds_that_its_list_could_not_name(desk: Desk) -> None:
+    desk.tim._teds = replace(desk.tim._teds, max_message=42 + 3 * 3)
+    assert desk.sealed(write_teds(0, 1, 0, META)).ok
+    assert desk.sealed(write_teds(1, 12, 0, NAME)).ok
+    assert desk.sealed(write_teds(2, 12, 0, NAME)) == refusal(Reason.TOO_LARGE)
+    assert desk.sealed(write_teds(1, 12, 0, NAME)).ok, "one that is there already may change"
+
+
 def test_a_read_only_teds_gets_3_and_survives_unlisted() -> None:
     desk = Desk(blocks={(0, 13): frame(bytes.fromhex("0304050d0101"))}, read_only=frozenset({(0, 13)}))
     desk.agree().open()
@@ -112,8 +220,23 @@ def test_a_read_only_teds_gets_3_and_survives_unlisted() -> None:
 
 def test_too_much_gets_10(desk: Desk) -> None:
     limit = status(desk, 0, 128).max_size
-    assert desk.sealed(write_teds(0, 128, 0, bytes(limit))).ok
+    for at in range(0, limit, 1024):
+        assert desk.sealed(write_teds(0, 128, at, bytes(min(1024, limit - at)))).ok
     assert desk.sealed(write_teds(0, 128, limit, b"x")) == refusal(Reason.TOO_LARGE)
+
+
+def test_a_frame_longer_than_max_message_gets_10_whatever_it_says(desk: Desk) -> None:
+    longest = write_teds(0, 18, 0, bytes(desk.max_message - 11)).encode()
+    assert desk.raw(longest) == refusal(Reason.NOT_PERMITTED)
+    assert desk.raw(longest + b"\0") == refusal(Reason.TOO_LARGE)
+
+
+def test_a_node_of_512_octets_takes_everything_that_provisioning_sends() -> None:
+    desk = Desk(max_message=512)
+    desk.agree().open().commit_in_pieces({(0, 1): META, (1, 12): NAME}, piece=512 - 53)
+    assert desk.flash.state == NodeState.PROVISIONED
+    desk.agree_in_session()
+    assert desk.flash.epoch == 2
 
 
 def test_a_write_of_what_can_never_be_held_gets_18(desk: Desk) -> None:

@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+from typing import Any
+
 import pytest
 
 from teds_provision.protocol.agreement import StationAgreement, key_id
+from teds_provision.protocol.flash import ChipFailure
 from teds_provision.protocol.keys import prove_message, reset_message, verify
 from teds_provision.protocol.messages.frames import (
     Command,
@@ -146,6 +150,57 @@ def test_an_address_is_durable() -> None:
     assert desk.plain(COMMANDS["address"]).ok
     desk.restart()
     assert desk.tim.identity().can_address == 0x21
+
+
+def address(number: int) -> Command:
+    return security_command(Function.SET_CAN_ADDRESS, bytes([number]))
+
+
+def test_a_second_change_of_the_address_within_10_s_gets_17_and_4_goes_before() -> None:
+    desk = Desk()
+    assert desk.plain(address(240)) == refusal(Reason.BAD_FORM)
+    assert desk.plain(address(0x21)).ok, "what was refused does not count"
+    desk.now += 9.9
+    assert desk.plain(address(0x22)) == refusal(Reason.BUSY)
+    assert desk.plain(address(240)) == refusal(Reason.BAD_FORM)
+    desk.now += 0.1
+    assert desk.plain(address(0x22)).ok, "nor does the 17"
+    desk.restart()
+    assert desk.plain(address(0x23)).ok, "the 10 s are of one power-up"
+
+
+def test_the_address_that_stands_in_flash_is_not_written_again_and_a_claim_is_undone() -> None:
+    desk = Desk()
+    assert desk.plain(address(0x21)).ok
+    desk.memory.fail = True  # a write would be refused with 11
+    assert desk.plain(address(0x21)).ok
+    desk.tim.take_can_address(0x40)
+    assert desk.plain(address(0x21)).ok
+    assert desk.tim.can_address == 0x21
+    desk.memory.fail = False
+    assert desk.plain(address(0x22)) == refusal(Reason.BUSY), "only writes count, and one was made"
+
+
+def test_a_change_of_the_address_that_flash_refused_does_not_count() -> None:
+    desk = Desk()
+    desk.memory.fail = True
+    assert desk.plain(address(0x21)) == refusal(Reason.FLASH_FAILURE)
+    desk.memory.fail = False
+    assert desk.plain(address(0x21)).ok
+
+
+@pytest.mark.parametrize("chip", ["random", "one_time", "key"])
+def test_a_chip_that_does_not_work_gets_11_and_nothing_has_happened(chip: str) -> None:
+    def broken(*_: object) -> Any:
+        raise ChipFailure
+
+    desk = Desk()
+    if chip == "key":
+        desk.tim._agreeing._key = SimpleNamespace(point=NODE.point, sign=broken)  # type: ignore[assignment]
+    else:
+        setattr(desk.tim._agreeing, f"_{chip}", broken)
+    assert desk.plain(REQUEST) == refusal(Reason.FLASH_FAILURE)
+    assert desk.plain(security_command(Function.CONFIRM, bytes(16))) == refusal(Reason.WRONG_STATE)
 
 
 # -- reset -------------------------------------------------------------------------------------------------------------

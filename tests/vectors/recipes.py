@@ -279,10 +279,14 @@ def sessions() -> Iterator[Scene]:
         (security_command(Function.CONFIRM, bytes(16)), "Confirm with nothing pending: 2."),
         (security_command(Function.SET_CAN_ADDRESS, b"\0"), "CAN address 0: 4."),
         (security_command(Function.SET_CAN_ADDRESS, b"\x21"), "CAN address 0x21: good, durable."),
+        (security_command(Function.SET_CAN_ADDRESS, b"\x21"), "The same again: good, nothing is written."),
+        (security_command(Function.SET_CAN_ADDRESS, b"\x22"), "Another within 10 s of that write: 17."),
+        (security_command(Function.SET_CAN_ADDRESS, b"\xf0"), "CAN address 240: 4 goes before 17."),
         (Command(0, 128, 7, b"\0"), "Identify with a payload: 4."),
     ]
     for command, note in inner:
         scene.sealed("a", command, note)
+    scene.later(10.0).sealed("a", security_command(Function.SET_CAN_ADDRESS, b"\x22"), "10 s after the write: good.")
     yield scene
 
 

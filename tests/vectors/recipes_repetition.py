@@ -121,7 +121,7 @@ def repetition() -> Iterator[Scene]:
     address = security_command(Function.SET_CAN_ADDRESS, b"\x21")
     line.send(2, address, "Set CAN address: run.")
     line.send(2, address, "Equal: the stored reply.")
-    line.send(2, replace(address, payload=b"\x22"), "The same transaction, another body: run.")
+    line.later(10.0).send(2, replace(address, payload=b"\x22"), "The same transaction, another body: run.")
     yield line
 
 

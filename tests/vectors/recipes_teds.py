@@ -268,12 +268,42 @@ def _staging() -> Iterator[Scene]:
     yield scene
 
     scene = Scene(
-        "too-large", "maxMessage 1024: a Security TEDS has at most 1024 - 78 = 946 octets.", "keyed", max_message=1024
+        "too-large",
+        "maxMessage 512, the least: a Write carries at most 459 octets, a Read 466; a TEDS has at most 900 here.",
+        "provisioned",
+        max_message=512,
+        max_teds=900,
     )
     scene.open("a", "Open.")
     scene.sealed("a", query_teds(*SECURITY), "MaxTEDSSize says it.")
-    scene.sealed("a", write_teds(*SECURITY, 0, bytes(946)), "946 octets: taken.")
-    scene.sealed("a", write_teds(*SECURITY, 946, b"x"), "One more: 10, and the staged ones stay.")
+    scene.sealed("a", read_teds(*SECURITY, 0), "466 octets.")
+    scene.sealed("a", write_teds(*SECURITY, 0, bytes(459)), "459 octets: taken; the sealed frame has 506.")
+    scene.sealed("a", write_teds(*SECURITY, 459, bytes(441)), "900 octets in all: taken.")
+    scene.sealed("a", write_teds(*SECURITY, 900, b"x"), "One more: 10, and the staged ones stay.")
+    scene.say(write_teds(*SECURITY, 0, bytes(502)).encode(), "A frame of 513 octets, plain: 10 goes before 3.")
+    yield scene
+
+    scene = Scene(
+        "one-staging-area",
+        "What one session has staged keeps the others out, for 60 s after it last touched it.",
+        "keyed",
+    )
+    scene.open("a", "Open by tap.")
+    scene.open("b", "Open over CAN.", link="can:f1")
+    scene.sealed("b", security_command(Function.LIST), "Its first good frame.")
+    scene.sealed("a", write_teds(1, 12, 0, name), "Write by tap.")
+    scene.sealed(
+        "b", write_teds(1, 12, 1, name[:1]), "Over CAN from an offset beyond its own staging: 4 goes before 17."
+    )
+    scene.sealed("b", write_teds(0, 18, 0, b"x"), "Access code 18: 18 goes before 17.")
+    scene.sealed("b", write_teds(1, 12, 0, name), "Write over CAN: 17.")
+    scene.sealed("b", update_teds(*SECURITY), "Update over CAN: 17.")
+    scene.later(30.0).sealed("a", update_teds(1, 12), "Update by tap: the staged one's size; it touches the staging.")
+    scene.later(59.9).sealed("b", write_teds(1, 12, 0, name), "59.9 s later, over CAN: 17.")
+    scene.later(0.1).sealed("b", write_teds(1, 12, 0, name), "60 s later: taken, what was staged by tap is gone.")
+    scene.sealed("a", update_teds(1, 12), "By tap: 17 now.")
+    scene.sealed("b", security_command(Function.CLOSE), "The session over CAN closes: its staging goes.")
+    scene.sealed("a", write_teds(1, 12, 0, name), "Write by tap: taken.")
     yield scene
 
     scene = Scene(

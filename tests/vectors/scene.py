@@ -106,10 +106,17 @@ class Scene:
     """One entry: ``name``, a note in words, the node's state at the start, steps, and what is so at the end."""
 
     def __init__(
-        self, name: str, note: str, state: str = "factory", *, max_message: int = 2048, **changes: Any
+        self,
+        name: str,
+        note: str,
+        state: str = "factory",
+        *,
+        max_message: int = 2048,
+        max_teds: int = 16384,
+        **changes: Any,
     ) -> None:
         self.name, self.note = name, note
-        self.max_message = max_message
+        self.max_message, self.max_teds = max_message, max_teds
         self.memory = RamFlash(flash(state, **changes))
         self.start = self.memory.state
         self.now = 0.0
@@ -125,6 +132,7 @@ class Scene:
             self.memory,
             lambda: self.now,
             max_message=self.max_message,
+            max_teds=self.max_teds,
             random=self._draw,
             one_time=self._draw_key,
         )

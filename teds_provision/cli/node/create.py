@@ -54,7 +54,7 @@ def _name(_ctx: click.Context, _parameter: click.Parameter, text: str) -> str:
 @click.option("--profile", metavar="P", help="Its datasheet and hardware: those of a transducer type.")
 @click.option(
     "--max-message",
-    type=WholeNumber(1024, 4094),
+    type=WholeNumber(512, 4094),
     default=2048,
     show_default=True,
     metavar="OCTETS",

@@ -113,6 +113,8 @@ class Pair:
         if kind == _CONSECUTIVE and data == self._last:
             return True  # the same frame twice: an error in its last bit doubles a frame on CAN
         self._last = data if kind == _CONSECUTIVE else b""
+        if kind == _SINGLE and self.waits_for_flow:
+            self.stop_sending()  # a refusal in place of a flow control, or a new question: can-isotp would wait on
         if kind != _FLOW:
             self.speak(fd=frame.fd)
         if kind == _SINGLE and self._take_single(data):

@@ -14,7 +14,7 @@ from teds_provision.links.can.isotp import FUNCTIONAL, physical_id, single
 from teds_provision.links.can.shared import Line, SharedBus
 from teds_provision.links.can.transfer import OVERFLOW, WAIT, consecutive_frames, first_frame, gap_seconds
 from teds_provision.links.ports import CAN, Capabilities
-from teds_provision.protocol.messages.frames import IDENTIFY, decode_reply
+from teds_provision.protocol.messages.frames import IDENTIFY, Reason, decode_reply, refusal
 from teds_provision.protocol.messages.identity import Identity
 from teds_provision.protocol.repetition import REPEAT_SECONDS, REPLY_SECONDS, TRIES
 
@@ -29,6 +29,10 @@ _FLOW_SECONDS: Final = (0.25, 0.5, 1.0)
 _GAP_SECONDS: Final = 0.5
 """The wait for the next consecutive frame (N_Cr, at most 1 s)."""
 _HELLO_SECONDS: Final = 1.0
+_BUSY: Final = refusal(Reason.BUSY).encode()
+BUSY_SECONDS: Final = 10.0
+BUSY_PAUSE: Final = 0.1
+"""A node that cannot take a long request now is sent it again after each pause, for so long (profile.md, "CAN")."""
 _LONGEST_TRY: Final = 120.0
 """Seconds: 4095 octets at the longest gap (127 ms) that a node may ask for take 75 s."""
 
@@ -39,6 +43,14 @@ def conflict(node: int) -> AddressConflict:
         f"Two nodes answer under the CAN address 0x{node:02X}.",
         hint="Tap one of them, or connect it alone, and: teds-provision address UUID NEW.",
     )
+
+
+class _Answered(Exception):
+    """The reply came as a single frame in place of a flow control: most of the request was not sent."""
+
+    def __init__(self, reply: tuple[bytes, float]) -> None:
+        super().__init__()
+        self.reply = reply
 
 
 class _NoFlow(Exception):
@@ -177,6 +189,12 @@ class _Exchange:
         while whole < self._tries:
             try:
                 self._send(self._flow_patience(refused))
+            except _Answered as answered:
+                busy = answered.reply[0][1:] == _BUSY and not self._prompt
+                if not busy or time.monotonic() - began >= BUSY_SECONDS:
+                    return answered.reply
+                time.sleep(BUSY_PAUSE)  # it cannot take a long request now; the same octets again, no repetition
+                continue
             except _NoFlow as lost:
                 refused += 1
                 if lost.begun:
@@ -247,6 +265,10 @@ class _Exchange:
                 break
             if len(data) < 3:
                 self._bus.check()
+                with suppress(Empty):
+                    event = self._line.events.get_nowait()
+                    if event.kind == "whole":
+                        raise _Answered((event.body, event.at))
                 continue
             if data[0] == OVERFLOW:
                 raise TooLongForNode(

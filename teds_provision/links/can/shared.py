@@ -314,6 +314,7 @@ class SharedBus:
             return
         if body[0] == line.transaction:
             line.events.put(Event("whole", body, frame.at))
+            line.flows.put(b"")  # whoever waits for a flow control has its answer
         elif not self._gathered(line, frame, body[0]) and body[0] not in line.asked:
             self.rivals.unasked(line.node)
 

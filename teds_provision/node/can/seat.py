@@ -96,7 +96,7 @@ class Seat:
         self.measuring = measuring
         self.address = handler.can_address()
         identity = Identity.decode(handler.identify())
-        self.uuid = identity.uuid
+        self.uuid, self.max_message = identity.uuid, identity.max_message
         self.claim = Claim(uuid_crc(identity.uuid))
         self.lines: dict[int, Line] = {}
         self.spoken_from: set[int] = set()

@@ -15,14 +15,15 @@ from typing import Final
 
 from teds_provision.errors import LinkFailure, NoReader, TedsProvisionError
 from teds_provision.links.can.bus import Bus, Frame
-from teds_provision.links.can.isotp import FUNCTIONAL, Pair, addresses, read_single
+from teds_provision.links.can.isotp import FUNCTIONAL, Pair, addresses, physical_id, read_single, single
 from teds_provision.links.can.spec import FIRST_STATION, LAST_STATION, parse_spec
+from teds_provision.links.can.transfer import Reassembly
 from teds_provision.node.can.addresses import Addresses
 from teds_provision.node.can.seat import Line, Request, Seat, link_name
 from teds_provision.node.can.workers import Crew
 from teds_provision.node.handler import Measuring, NodeHandler
 from teds_provision.protocol.announce import is_announce
-from teds_provision.protocol.messages.frames import IDENTIFY, Reply
+from teds_provision.protocol.messages.frames import IDENTIFY, Reason, Reply, refusal
 from teds_provision.protocol.operation.can_frames import drive_address, trigger_station
 
 _SPREAD_SECONDS: Final = 0.05
@@ -248,6 +249,11 @@ class CanServer:
             self._flow_control_of_old_address(station, own, frame)
 
     def _request(self, seat: Seat, line: Line, pair: Pair, frame: Frame) -> None:
+        begun = Reassembly.begin(pair.peer, frame)
+        if begun is not None and begun.length > seat.max_message + 1:  # refused in place of a flow control
+            said = single(bytes(begun.octets[:1]) + refusal(Reason.TOO_LARGE).encode(), fd=frame.fd)
+            self._out(seat, Frame(physical_id(pair.peer, pair.own), said, frame.fd))
+            return
         pair.take(frame)
         while (body := pair.received()) is not None:
             if pair.waits_for_flow:

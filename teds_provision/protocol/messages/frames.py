@@ -133,6 +133,8 @@ def refusal(reason: Reason) -> Reply:
 
 READ_OVERHEAD: Final = 46
 """Octets of a longest message that a reply to Read in a session does not carry: its frame, its seal, its offset."""
+LIST_OVERHEAD: Final = 42
+"""The same for a reply to List or Operation, which has no offset."""
 
 
 def security_command(function: Function, payload: bytes = b"") -> Command:

@@ -10,6 +10,8 @@ from teds_provision.errors import BadData
 
 _LAYOUT = struct.Struct(">B10sBIIHB")
 IDENTITY_OCTETS = _LAYOUT.size  # 23
+LEAST_MESSAGE, MOST_MESSAGE = 512, 4094
+"""Octets of maxMessage."""
 
 
 class NodeState(IntEnum):
@@ -49,8 +51,9 @@ class Identity:
             raise BadData(f"The node speaks version {version} of the profile; this tool speaks version 1.")
         if state > NodeState.PROVISIONED:
             raise BadData(f"Identify names a state {state} that the profile does not know.")
-        if not 1024 <= max_message <= 4094:
-            raise BadData(f"Identify names a maxMessage of {max_message}; the profile allows 1024 to 4094.")
+        if not LEAST_MESSAGE <= max_message <= MOST_MESSAGE:
+            least, most = LEAST_MESSAGE, MOST_MESSAGE
+            raise BadData(f"Identify names a maxMessage of {max_message}; the profile allows {least} to {most}.")
         if address > 239:
             raise BadData(f"Identify names a CAN address {address}; the profile allows 1 to 239, 0 for none.")
         return cls(uuid, NodeState(state), epoch, sequence, max_message, address)

@@ -5,9 +5,10 @@ from __future__ import annotations
 import os
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from typing import Final
 
 from teds_provision.protocol.announce import LAST_ADDRESS
-from teds_provision.protocol.flash import Flash, FlashFailure, FlashMemory, in_factory_state
+from teds_provision.protocol.flash import ChipFailure, Flash, FlashFailure, FlashMemory, in_factory_state
 from teds_provision.protocol.keys import (
     CHALLENGE_OCTETS,
     PrivateKey,
@@ -38,14 +39,17 @@ from teds_provision.protocol.tim.agreeing import Agreeing
 from teds_provision.protocol.tim.origin import Origin
 from teds_provision.protocol.tim.permission import Permission, of_teds
 from teds_provision.protocol.tim.sessions import Sessions
-from teds_provision.protocol.tim.teds_access import TedsAccess
+from teds_provision.protocol.tim.teds_access import Staging, TedsAccess
+
+_ADDRESS_SECONDS: Final = 10.0
+"""Between two writes of the address to flash: whoever taps, or opens a session, could wear it out."""
 
 
 @dataclass
 class Tim:
     """One transducer interface module.
 
-    ``max_message`` octets (1024 to 4094); ``clock`` gives monotonic seconds; ``random`` gives that many octets, good
+    ``max_message`` octets (512 to 4094); ``clock`` gives monotonic seconds; ``random`` gives that many octets, good
     from the first moment after a start; ``one_time`` makes the key pair of one Open or one Request (a board may have
     one ready), ``verify`` checks a signature.
     ``sessions`` and ``streams`` are its room for them; ``hardware`` is what it measures and acts with, None: nothing.
@@ -69,6 +73,8 @@ class Tim:
         self._flash = self.memory.load()
         self._taken_address: int | None = None
         self._ending: list[Callable[[], None]] = []
+        self._address_written_at: float | None = None
+        self._staging = Staging()
         self._teds = TedsAccess(self.max_message, self.max_teds, self.verify)
         self._agreeing = Agreeing(self.key, self.clock, self.random, self.one_time, self.verify)
         self._sessions = Sessions(
@@ -235,6 +241,8 @@ class Tim:
 
     def _run(self, frame: bytes, origin: Origin) -> Reply:
         try:
+            if len(frame) > self.max_message:
+                raise Refused(Reason.TOO_LARGE)
             if len(frame) < COMMAND_HEADER:
                 raise Refused(Reason.BAD_FORM)
             length = int.from_bytes(frame[4:6], "big")
@@ -245,7 +253,7 @@ class Tim:
             return self._known(command, origin)
         except Refused as refused:
             return refusal(refused.reason)
-        except FlashFailure:
+        except (FlashFailure, ChipFailure):
             return refusal(Reason.FLASH_FAILURE)
 
     def _known(self, command: Command, origin: Origin) -> Reply:
@@ -309,6 +317,7 @@ class Tim:
         self._ending.append(lambda: self._sessions.end(origin.link, session))
 
     def _session_ended(self, session: NodeSession) -> None:
+        self._staging.end(session)
         if self._role is not None:
             self._role.session_ended(session)
 
@@ -327,16 +336,16 @@ class Tim:
                 return teds.read(flash, command)
             case TedsFunction.WRITE:
                 assert session is not None
-                reply = teds.write(flash, command, session.staging)
+                reply = teds.write(flash, command, self._staging, session, now=self.clock())
                 if self._role is not None and origin.port.kind == "nfc":
                     self._role.claims.yield_sensors(session)
                 return reply
             case TedsFunction.UPDATE:
                 assert session is not None
-                reply, state = teds.update(flash, command, session.staging)
+                reply, state = teds.update(flash, command, self._staging, session, now=self.clock())
                 if state is not None:
                     self._commit(state)
-                    session.staging.clear()
+                    self._staging.end()
                 return reply
 
     def _reset(self, payload: bytes, origin: Origin) -> bytes:
@@ -354,7 +363,12 @@ class Tim:
         _length(payload, 1)
         if not 1 <= payload[0] <= LAST_ADDRESS:
             raise Refused(Reason.BAD_FORM)
-        self._commit(replace(self._flash, can_address=payload[0]))
+        if payload[0] != self._flash.can_address:  # what stands there already is not written again
+            now, last = self.clock(), self._address_written_at
+            if last is not None and now - last < _ADDRESS_SECONDS:
+                raise Refused(Reason.BUSY)
+            self._commit(replace(self._flash, can_address=payload[0]))
+            self._address_written_at = now
         self._taken_address = None
         return b""
 

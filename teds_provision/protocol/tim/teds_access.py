@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Final
 
 from teds_provision.protocol.commit import verified_commit
 from teds_provision.protocol.datasheet import can_be_stored, passes_own_check
 from teds_provision.protocol.flash import Flash
 from teds_provision.protocol.keys import Verify, verify
 from teds_provision.protocol.messages.frames import (
+    LIST_OVERHEAD,
     READ_OVERHEAD,
     Attribute,
     Command,
@@ -17,12 +20,51 @@ from teds_provision.protocol.messages.frames import (
     Reply,
     TedsStatus,
 )
+from teds_provision.protocol.session import NodeSession
 from teds_provision.teds.codec.codes import MANUFACTURER, TEXT_BASED
 from teds_provision.teds.image import SECURITY, BlockId
 
-REQUEST_REPLY_OVERHEAD = 78
+STAGED_SECONDS: Final = 60.0
+"""What a session has staged and not touched for so long gives way to a Write in another one."""
+_ENTRY_OCTETS: Final = 3
 
-Staging = dict[BlockId, bytes]
+
+@dataclass
+class Staging:
+    """The node's one staging area: images by TEDS, and the session that they belong to and go with."""
+
+    _owner: NodeSession | None = None
+    _images: dict[BlockId, bytes] = field(default_factory=dict)
+    _touched_at: float = 0.0
+
+    def of(self, session: NodeSession) -> Mapping[BlockId, bytes]:
+        """What this session has staged."""
+        return self._images if session is self._owner else {}
+
+    def require(self, session: NodeSession, *, untouched: float | None = None) -> None:
+        """Raise Refused (17) where something is staged in another session.
+
+        ``untouched``: seconds (monotonic) now, for a Write, to which what lies there for too long gives way.
+        """
+        gives_way = untouched is not None and untouched - self._touched_at >= STAGED_SECONDS
+        if self._images and session is not self._owner and not gives_way:
+            raise Refused(Reason.BUSY)
+
+    def put(self, session: NodeSession, block: BlockId, image: bytes, now: float) -> None:
+        """Stage an image; what another session had there goes."""
+        if session is not self._owner:
+            self._owner, self._images = session, {}
+        self._images[block], self._touched_at = image, now
+
+    def touch(self, session: NodeSession, now: float) -> None:
+        """The session has looked after what it staged."""
+        if session is self._owner:
+            self._touched_at = now
+
+    def end(self, session: NodeSession | None = None) -> None:
+        """What this session has staged goes; None: whatever is there."""
+        if session is None or session is self._owner:
+            self._owner, self._images = None, {}
 
 
 @dataclass(frozen=True)
@@ -51,39 +93,49 @@ class TedsAccess:
         octets = teds[offset : offset + self.max_message - READ_OVERHEAD]
         return Reply(True, offset.to_bytes(4, "big") + octets)
 
-    def write(self, flash: Flash, command: Command, staging: Staging) -> Reply:
-        """Write TEDS segment (1.3) into the staged image; what lay after the written octets is dropped."""
+    def write(self, flash: Flash, command: Command, staging: Staging, session: NodeSession, *, now: float) -> Reply:
+        """Write TEDS segment (1.3) into the staged image; what lay after the written octets is dropped.
+
+        ``now`` is a monotonic time in seconds.
+        """
         if len(command.payload) < 5:
             raise Refused(Reason.BAD_FORM)
         block = _block(command, len(command.payload))
         if block in flash.read_only:
             raise Refused(Reason.NOT_PERMITTED)
-        staged = staging.get(block, b"")
+        staged = staging.of(session).get(block, b"")
         offset = int.from_bytes(command.payload[1:5], "big")
         if offset > len(staged):
             raise Refused(Reason.BAD_FORM)
+        staging.require(session, untouched=now)
         image = staged[:offset] + command.payload[5:]
-        if len(image) > self._largest(block):
+        if len(image) > self.max_teds or not self._can_list({*flash.blocks, *staging.of(session), block, SECURITY}):
             raise Refused(Reason.TOO_LARGE)
-        staging[block] = image
+        staging.put(session, block, image, now)
         return Reply(True)
 
-    def update(self, flash: Flash, command: Command, staging: Staging) -> tuple[Reply, Flash | None]:
+    def update(
+        self, flash: Flash, command: Command, staging: Staging, session: NodeSession, *, now: float
+    ) -> tuple[Reply, Flash | None]:
         """Update TEDS (1.4): the reply, and the state to commit where it is that of access code 128."""
         block = _block(command, 1)
-        if block not in staging:
-            if block == SECURITY and staging:
+        staging.require(session)
+        staged = staging.of(session)
+        staging.touch(session, now)
+        if block not in staged:
+            if block == SECURITY and staged:
                 raise Refused(Reason.WRONG_STATE)
             return self.query(flash, command), None
         state = None
         if block == SECURITY:
-            state = verified_commit(flash, staging, self.verify)
-        elif not passes_own_check(block, staging[block]):
+            state = verified_commit(flash, staged, self.verify)
+        elif not passes_own_check(block, staged[block]):
             raise Refused(Reason.BAD_FORM)
-        return Reply(True, self._status(flash, block, staging[block]).encode()), state
+        return Reply(True, self._status(flash, block, staged[block]).encode()), state
 
-    def _largest(self, block: BlockId) -> int:
-        return min(self.max_teds, self.max_message - REQUEST_REPLY_OVERHEAD) if block == SECURITY else self.max_teds
+    def _can_list(self, blocks: set[BlockId]) -> bool:
+        """Whether the reply to List, sealed, still fits into one message."""
+        return _ENTRY_OCTETS * len(blocks) <= self.max_message - LIST_OVERHEAD
 
     def _status(self, flash: Flash, block: BlockId, teds: bytes | None) -> TedsStatus:
         attributes = 0
@@ -94,8 +146,8 @@ class TedsAccess:
         if block in flash.read_only:
             attributes |= Attribute.READ_ONLY
         if teds is None:
-            return TedsStatus(attributes | Attribute.NOT_AVAILABLE, 0, 0, self._largest(block))
-        return TedsStatus(attributes, len(teds), int.from_bytes(teds[-2:], "big"), self._largest(block))
+            return TedsStatus(attributes | Attribute.NOT_AVAILABLE, 0, 0, self.max_teds)
+        return TedsStatus(attributes, len(teds), int.from_bytes(teds[-2:], "big"), self.max_teds)
 
 
 def _block(command: Command, octets: int) -> BlockId:
