@@ -97,7 +97,7 @@ void teds_node_bus_off(teds_node *node)
 }
 
 /* Every link is a pair of addresses: with a new own one all begin anew. */
-static void move(teds_node *node, uint8_t address)
+void teds_can_move(teds_node *node, uint8_t address)
 {
     if (address != node->can.address) {
         node->can.address = address;
@@ -116,9 +116,6 @@ static void left(teds_node *node, teds_line *line)
     node->replies[line->out_reply].at = teds_now(node);
     line->out_reply = -1;
     teds_node_reply_left(node, line->source);
-    if (node->can.moves_to != 0 && node->can.moves_line == (int8_t)(line - node->can.lines)) {
-        move(node, node->can.moves_to);
-    }
 }
 
 /* -- requests ----------------------------------------------------------------------------------------------------------- */
@@ -155,7 +152,6 @@ static void request(teds_node *node, teds_line *line, const uint8_t *body, size_
     if (!place->stored || memcmp(digest, place->digest, 32) != 0 || now - place->at >= KEEP_NS ||
         always_anew(body + 1, length - 1)) {
         place->stored = false;
-        node->can.moves_to = 0;
         place->length = (uint16_t)(1 + teds_node_handle(node, line->source, &arrival, body + 1, length - 1,
                                                         place->octets + 1));
         place->octets[0] = body[0];
@@ -164,9 +160,6 @@ static void request(teds_node *node, teds_line *line, const uint8_t *body, size_
         place->stored = true;
         place->link = line->source;
         place->at = teds_now(node);
-        if (node->can.moves_to != 0) {
-            node->can.moves_line = (int8_t)(line - node->can.lines);
-        }
     }
     line->out_reply = (int8_t)(place - node->replies);
     teds_isotp_begin(line, place->octets, place->length, fd);
@@ -350,7 +343,7 @@ static void announced(teds_node *node, const teds_can_frame *frame, uint64_t now
     stays = teds_actuator_claimed(node);
 #endif
     if (crc < own && !stays) {
-        move(node, next_free(node, node->can.address));
+        teds_can_move(node, next_free(node, node->can.address));
     }
 }
 

@@ -190,6 +190,7 @@ void teds_can_pad(teds_can_frame *frame, size_t used);
 
 /* -- can.c --------------------------------------------------------------------------------------------------------- */
 void teds_can_lose(teds_node *node);
+void teds_can_move(teds_node *node, uint8_t address);
 bool teds_can_sending(const teds_node *node);
 uint64_t teds_can_poll(teds_node *node, uint64_t now);
 uint8_t teds_default_address(const uint8_t uuid[10]);

@@ -186,7 +186,7 @@ static int reset(teds_node *node, const teds_command *command, teds_origin *orig
     return 64;
 }
 
-static int set_can_address(teds_node *node, const teds_command *command)
+static int set_can_address(teds_node *node, const teds_command *command, const teds_origin *origin)
 {
     teds_state state = node->state;
     uint64_t now = teds_now(node);
@@ -207,6 +207,7 @@ static int set_can_address(teds_node *node, const teds_command *command)
         node->address_written_at = now;
     }
     node->can.moves_to = command->payload[0]; /* when the reply has left */
+    node->can.moves_link = origin->link;
     return 0;
 }
 
@@ -250,7 +251,7 @@ static int run_known(teds_node *node, const teds_command *command, teds_origin *
         case TEDS_IDENTIFY: return identify(node, command, out);
         case TEDS_PROVE: return prove(node, command, out);
         case TEDS_RESET: return reset(node, command, origin, out);
-        case TEDS_SET_CAN_ADDRESS: return set_can_address(node, command);
+        case TEDS_SET_CAN_ADDRESS: return set_can_address(node, command, origin);
         case TEDS_LIST: return list(node, command, out);
         default: /* Close */
             if (command->length != 0) {
@@ -450,10 +451,10 @@ void teds_node_reply_left(teds_node *node, teds_link link)
 {
 #if TEDS_OPERATION
     teds_streams_ready(node, teds_session_on(node, link));
-#else
-    (void)node;
-    (void)link;
 #endif
+    if (node->can.moves_to != 0 && node->can.moves_link == link) {
+        teds_can_move(node, node->can.moves_to);
+    }
 }
 
 void teds_node_link_lost(teds_node *node, teds_link link)

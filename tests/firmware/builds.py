@@ -48,8 +48,9 @@ def host() -> Path:
     return BUILD / "host" / "teds-node"
 
 
-def library() -> Path:
-    """The node over flash in memory, built."""
+def library(max_message: int = 1024, staging: int = 4096) -> Path:
+    """The node over flash in memory, built for these sizes."""
     need("make", "gcc")
-    make("library")
-    return BUILD / "host" / "libteds-memory.so"
+    path = BUILD / "host" / f"memory-{max_message}-{staging}.so"
+    make(str(path.relative_to(FIRMWARE)))
+    return path

@@ -157,7 +157,7 @@ typedef struct teds_line {
 typedef struct teds_can {
     bool started, announces;
     uint8_t address, moves_to; /* moves_to: where 128.10 leads once its reply has left; 0: nowhere */
-    int8_t moves_line;
+    teds_link moves_link;
     uint64_t announce_due;
     uint32_t announced[20];
     uint8_t announced_at;

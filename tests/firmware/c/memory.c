@@ -1,5 +1,7 @@
 #include "memory.h"
 
+#include "inside.h"
+
 #include <bearssl.h>
 
 #include <stdlib.h>
@@ -29,7 +31,7 @@ static int erase(void *user, int area)
 {
     memory_board *board = user;
     bool was_dead = board->dead, fails = fails_now(board);
-    if (was_dead) {
+    if (was_dead || board->fails) {
         return -1;
     }
     if (!fails || board->torn) {
@@ -44,7 +46,7 @@ static int write(void *user, int area, uint32_t at, const uint8_t *octets, size_
     memory_board *board = user;
     bool was_dead = board->dead, fails = fails_now(board);
     uint8_t *there = board->flash + start_of(area) + at;
-    if (was_dead) {
+    if (was_dead || board->fails) {
         return -1;
     }
     if (at + length > octets_of(area) || at % board->port.unit != 0 || length % board->port.unit != 0 ||
@@ -65,7 +67,7 @@ static int write(void *user, int area, uint32_t at, const uint8_t *octets, size_
 static int read(void *user, int area, uint32_t at, uint8_t *out, size_t length)
 {
     const memory_board *board = user;
-    if (board->dead || at + length > octets_of(area)) {
+    if (board->dead || length > octets_of(area) || at + length > octets_of(area)) {
         return -1;
     }
     memcpy(out, board->flash + start_of(area) + at, length);
@@ -182,8 +184,15 @@ void memory_free(memory_board *board)
 /* Power comes (back). */
 int memory_start(memory_board *board)
 {
+    return memory_start_cut(board, 0, false);
+}
+
+/* The same, and it fails at this step. */
+int memory_start_cut(memory_board *board, long step, bool torn)
+{
     board->dead = false;
-    board->cut = 0;
+    board->cut = step;
+    board->torn = torn;
     board->steps = 0;
     memset(board->next, 0, sizeof board->next);
     return teds_node_init(&board->node, &board->config, &board->port);
@@ -212,6 +221,12 @@ void memory_cut(memory_board *board, long step, bool torn)
     board->torn = torn;
 }
 
+/* Flash that refuses to be written or erased, and works again. */
+void memory_fails(memory_board *board, bool fails)
+{
+    board->fails = fails;
+}
+
 long memory_steps(const memory_board *board)
 {
     return board->steps;
@@ -229,8 +244,15 @@ bool memory_misused(const memory_board *board)
 
 size_t memory_flash(const memory_board *board, uint8_t *out)
 {
-    memcpy(out, board->flash, sizeof board->flash);
+    if (out != NULL) {
+        memcpy(out, board->flash, sizeof board->flash);
+    }
     return sizeof board->flash;
+}
+
+void memory_put_flash(memory_board *board, const uint8_t *octets_of_it)
+{
+    memcpy(board->flash, octets_of_it, sizeof board->flash);
 }
 
 size_t memory_handle(memory_board *board, uint8_t link, uint8_t kind, bool tapped, const uint8_t *frame,
@@ -243,6 +265,51 @@ size_t memory_handle(memory_board *board, uint8_t link, uint8_t kind, bool tappe
 uint64_t memory_poll(memory_board *board)
 {
     return teds_node_poll(&board->node, board->now);
+}
+
+void memory_reply_left(memory_board *board, uint8_t link)
+{
+    teds_node_reply_left(&board->node, link);
+}
+
+static bool keep_none(const void *what, uint16_t id)
+{
+    (void)what;
+    (void)id;
+    return false;
+}
+
+int memory_put(memory_board *board, uint8_t flags, uint8_t address, uint32_t epoch, uint32_t sequence,
+               const uint8_t key[16], const uint8_t station[65], const uint8_t ca[65], const uint8_t *teds,
+               size_t length)
+{
+    teds_state state = {0};
+    int failed;
+    if (length > TEDS_STAGING) {
+        return -1;
+    }
+    state.flags = flags;
+    state.address = address;
+    state.epoch = epoch;
+    state.sequence = sequence;
+    memcpy(state.key, key, 16);
+    memcpy(state.station, station, 65);
+    memcpy(state.ca, ca, 65);
+    memcpy(board->node.staging, teds, length);
+    board->node.staging_end = (uint16_t)length;
+    failed = teds_store_write(&board->node, &state, keep_none, NULL, true);
+    board->node.staging_end = 0;
+    return failed ? failed : memory_start(board);
+}
+
+void memory_fixed(memory_board *board, uint8_t channel, uint8_t code, const uint8_t *octets_of_it, uint16_t length)
+{
+    teds_fixed *own = &board->fixed[board->config.fixed_count++];
+    own->channel = channel;
+    own->code = code;
+    own->length = length;
+    own->octets = octets_of_it;
+    board->config.fixed = board->fixed;
 }
 
 void memory_lost(memory_board *board, uint8_t link)

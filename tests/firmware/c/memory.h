@@ -6,7 +6,7 @@
 #include "teds_bearssl.h"
 
 #define MEMORY_IDENTITY 256u
-#define MEMORY_SLOT 8192u
+#define MEMORY_SLOT (TEDS_STAGING + 4096u)
 
 /* `kind` n: octets for a nonce or counter; i, o: the scalar of an identity or one-time key. */
 typedef int (*memory_random)(char kind, uint8_t *out, size_t length);
@@ -24,23 +24,35 @@ typedef struct memory_board {
     memory_random random;
     teds_channel channels[TEDS_CHANNELS];
     uint8_t values[TEDS_CHANNELS][8];
-    size_t sent;
+    teds_fixed fixed[8];
+    bool fails;
 } memory_board;
 
 memory_board *memory_new(const uint8_t uuid[10], uint8_t unit, uint8_t erased, memory_random random);
 void memory_free(memory_board *board);
 int memory_start(memory_board *board);
+int memory_start_cut(memory_board *board, long step, bool torn);
 void memory_channel(memory_board *board, uint8_t number, uint8_t kind, uint8_t model, uint8_t octets,
                     uint32_t shortest);
 void memory_at(memory_board *board, uint64_t now);
 void memory_cut(memory_board *board, long step, bool torn);
+void memory_fails(memory_board *board, bool fails);
 long memory_steps(const memory_board *board);
 bool memory_dead(const memory_board *board);
 bool memory_misused(const memory_board *board);
+/* The whole flash: out, and in again. */
 size_t memory_flash(const memory_board *board, uint8_t *out);
+void memory_put_flash(memory_board *board, const uint8_t *octets);
 size_t memory_handle(memory_board *board, uint8_t link, uint8_t kind, bool tapped, const uint8_t *frame,
                      size_t length, uint8_t *reply);
 uint64_t memory_poll(memory_board *board);
+void memory_reply_left(memory_board *board, uint8_t link);
+/* Put a state and TEDS (id 2, length 2, octets; one after another) into flash as if they had been committed. */
+int memory_put(memory_board *board, uint8_t flags, uint8_t address, uint32_t epoch, uint32_t sequence,
+               const uint8_t key[16], const uint8_t station[65], const uint8_t ca[65], const uint8_t *teds,
+               size_t length);
+/* A TEDS of the firmware, from the next start on; `octets` stay where they are. */
+void memory_fixed(memory_board *board, uint8_t channel, uint8_t code, const uint8_t *octets, uint16_t length);
 void memory_lost(memory_board *board, uint8_t link);
 int memory_by_hand(memory_board *board);
 void memory_can_rx(memory_board *board, uint32_t identifier, const uint8_t *data, uint8_t length, bool fd);

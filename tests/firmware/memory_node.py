@@ -1,0 +1,229 @@
+"""The node in C in this process, over flash in memory: clock, randomness and power are the test's."""
+
+from __future__ import annotations
+
+import ctypes
+import functools
+from collections.abc import Callable
+from typing import Any, Final
+
+from teds_provision.protocol.flash import Flash
+from teds_provision.protocol.messages.identity import Identity
+from teds_provision.protocol.operation.hardware import Port
+from tests.firmware import builds
+
+NANOSECONDS: Final = 10**9
+_KINDS: Final = {"can": 1, "nfc": 2, "ble": 3}
+_RANDOM: Final = ctypes.CFUNCTYPE(ctypes.c_int, ctypes.c_char, ctypes.POINTER(ctypes.c_uint8), ctypes.c_size_t)
+_KEYED, _PROVISIONED = 1, 2
+Draw = Callable[[str, int], bytes]
+"""Octets for: ``n`` a nonce, counter or wait; ``i`` the scalar of the identity key; ``o`` that of a one-time key."""
+
+
+@functools.cache
+def _library(max_message: int, staging: int) -> Any:
+    library = ctypes.CDLL(str(builds.library(max_message, staging)))
+    library.memory_new.restype = ctypes.c_void_p
+    library.memory_handle.restype = library.memory_flash.restype = ctypes.c_size_t
+    library.memory_steps.restype = ctypes.c_long
+    library.memory_poll.restype = ctypes.c_uint64
+    library.memory_dead.restype = library.memory_misused.restype = ctypes.c_bool
+    return library
+
+
+def link_number(link: str) -> tuple[int, int]:
+    """A link's name (``nfc``, ``can:f1``) as the C node has it: its number and kind."""
+    kind, _, source = link.partition(":")
+    return (int(source, 16) if source else 1), _KINDS[kind]
+
+
+class MemoryNode:
+    """One node. What a Tim is asked is asked of it in the same words, so that a test of either takes both.
+
+    ``draw`` gives its randomness; ``clock`` is seconds, read before each call.
+    """
+
+    def __init__(
+        self,
+        draw: Draw,
+        clock: Callable[[], float],
+        *,
+        uuid: bytes,
+        max_message: int = 1024,
+        max_teds: int = 4092,
+        unit: int = 8,
+        erased: int = 0xFF,
+    ) -> None:
+        self._library, self._clock, self.max_message = _library(max_message, max_teds + 4), clock, max_message
+        self._draw = draw
+        self._callback = _RANDOM(self._random)  # kept: the library calls it as long as the node is there
+        self._fixed: list[Any] = []
+        self._board = ctypes.c_void_p(
+            self._library.memory_new(uuid, ctypes.c_uint8(unit), ctypes.c_uint8(erased), self._callback)
+        )
+
+    def close(self) -> None:
+        """Give its memory back."""
+        self._library.memory_free(self._board)
+
+    def _random(self, kind: bytes, out: Any, length: int) -> int:
+        octets = self._draw(kind.decode(), length)
+        assert len(octets) == length
+        ctypes.memmove(out, octets, length)
+        return 0
+
+    def _now(self) -> None:
+        self._library.memory_at(self._board, ctypes.c_uint64(round(self._clock() * NANOSECONDS)))
+
+    # -- power and flash -------------------------------------------------------------------------------------------
+
+    def start(self) -> int:
+        """Power comes (back); what teds_node_init gives."""
+        self._now()
+        return int(self._library.memory_start(self._board))
+
+    def start_cut(self, step: int, *, torn: bool) -> int:
+        """Power comes, and fails at this step of flash."""
+        self._now()
+        return int(self._library.memory_start_cut(self._board, ctypes.c_long(step), ctypes.c_bool(torn)))
+
+    def put(self, state: Flash) -> None:
+        """Have it hold this state as if it had come to it by itself; key and UUID are its own."""
+        for (channel, code), teds in sorted(state.blocks.items()):
+            if (channel, code) in state.read_only:
+                kept = ctypes.create_string_buffer(teds, len(teds))
+                self._fixed.append(kept)
+                self._library.memory_fixed(self._board, channel, code, kept, ctypes.c_uint16(len(teds)))
+        stored = {block: teds for block, teds in state.blocks.items() if block not in state.read_only}
+        image = b"".join(
+            (channel << 8 | code).to_bytes(2, "big") + len(teds).to_bytes(2, "big") + teds
+            for (channel, code), teds in stored.items()
+        )
+        flags = (_KEYED if state.key is not None else 0) | (_PROVISIONED if state.provisioned else 0)
+        failed = self._library.memory_put(
+            self._board,
+            ctypes.c_uint8(flags),
+            ctypes.c_uint8(state.can_address),
+            ctypes.c_uint32(state.epoch),
+            ctypes.c_uint32(state.sequence),
+            state.key or bytes(16),
+            state.station or bytes(65),
+            state.ca or bytes(65),
+            image,
+            ctypes.c_size_t(len(image)),
+        )
+        assert failed == 0
+
+    @property
+    def flash(self) -> bytes:
+        """Every octet of its flash; may be put back before a start."""
+        octets = ctypes.create_string_buffer(self._library.memory_flash(self._board, None))
+        self._library.memory_flash(self._board, octets)
+        return octets.raw
+
+    @flash.setter
+    def flash(self, octets: bytes) -> None:
+        self._library.memory_put_flash(self._board, octets)
+
+    def cut(self, step: int, *, torn: bool) -> None:
+        """Have the power fail at this step of flash from now on (an erase, or a unit written); 0: not."""
+        self._library.memory_cut(self._board, ctypes.c_long(step), ctypes.c_bool(torn))
+
+    def fails(self, fails: bool) -> None:
+        """Flash that refuses to be written, and works again."""
+        self._library.memory_fails(self._board, ctypes.c_bool(fails))
+
+    @property
+    def steps(self) -> int:
+        """Steps of flash since :meth:`cut`."""
+        return int(self._library.memory_steps(self._board))
+
+    @property
+    def dead(self) -> bool:
+        """Whether its power failed."""
+        return bool(self._library.memory_dead(self._board))
+
+    @property
+    def misused(self) -> bool:
+        """Whether it wrote flash as flash cannot be written."""
+        return bool(self._library.memory_misused(self._board))
+
+    # -- what a Tim is asked -----------------------------------------------------------------------------------------
+
+    def handle(
+        self, frame: bytes, *, link: str, tapped: bool, port: Port | None = None, received: int | None = None
+    ) -> bytes:
+        """One command frame to one reply frame."""
+        self._now()
+        number, kind = link_number(link)
+        reply = ctypes.create_string_buffer(self.max_message)
+        length = self._library.memory_handle(
+            self._board, ctypes.c_uint8(number), ctypes.c_uint8(kind), ctypes.c_bool(tapped), frame,
+            ctypes.c_size_t(len(frame)), reply,
+        )  # fmt: skip
+        assert length <= self.max_message
+        return reply.raw[:length]
+
+    def identity(self) -> Identity:
+        """What Identify says."""
+        return Identity.decode(self.handle(bytes.fromhex("000080070000"), link="can:f7", tapped=False)[3:])
+
+    def link_lost(self, link: str) -> None:
+        """Loss of the field or link."""
+        self._now()
+        self._library.memory_lost(self._board, ctypes.c_uint8(link_number(link)[0]))
+
+    def reset_by_hand(self) -> None:
+        """Button, pad or magnet."""
+        self._now()
+        assert self._library.memory_by_hand(self._board) == 0
+
+    def reply_left(self, link: str) -> None:
+        """The last reply of this link has left."""
+        self._now()
+        self._library.memory_reply_left(self._board, ctypes.c_uint8(link_number(link)[0]))
+
+    def poll(self) -> int:
+        """Do what is due; the tick at which something is due again."""
+        self._now()
+        return int(self._library.memory_poll(self._board))
+
+    # -- CAN ---------------------------------------------------------------------------------------------------------
+
+    def take_frame(self, identifier: int, data: bytes, *, fd: bool = False) -> None:
+        """A CAN frame came."""
+        self._now()
+        self._library.memory_can_rx(
+            self._board, ctypes.c_uint32(identifier), data, ctypes.c_uint8(len(data)), ctypes.c_bool(fd)
+        )
+
+    def next_frame(self) -> tuple[int, bytes, bool] | None:
+        """The next CAN frame that may leave now: identifier, data, whether it is FD."""
+        self._now()
+        identifier, fd, data = ctypes.c_uint32(), ctypes.c_bool(), ctypes.create_string_buffer(64)
+        length = self._library.memory_can_tx(self._board, ctypes.byref(identifier), data, ctypes.byref(fd))
+        return None if length < 0 else (identifier.value, data.raw[:length], fd.value)
+
+    def add_channel(self, number: int, kind: int, octets: int, *, model: int = 0, shortest: int = 1) -> None:
+        """One more channel, before the start."""
+        self._library.memory_channel(
+            self._board, ctypes.c_uint8(number), ctypes.c_uint8(kind), ctypes.c_uint8(model), ctypes.c_uint8(octets),
+            ctypes.c_uint32(shortest),
+        )  # fmt: skip
+
+    def blocks(self) -> dict[tuple[int, int], bytes]:
+        """Every TEDS that it lists, the initial Security TEDS too; read as a station does."""
+        listed = self.handle(bytes.fromhex("0000800b0000"), link="can:f7", tapped=False)[3:]
+        return {
+            (int.from_bytes(listed[at : at + 2], "big"), listed[at + 2]): self._read(listed[at : at + 3])
+            for at in range(0, len(listed), 3)
+        }
+
+    def _read(self, block: bytes) -> bytes:
+        teds = b""
+        while True:
+            frame = block[:2] + b"\x01\x02\x00\x05" + block[2:] + len(teds).to_bytes(4, "big")
+            piece = self.handle(frame, link="can:f7", tapped=False)[7:]
+            if not piece:
+                return teds
+            teds += piece
