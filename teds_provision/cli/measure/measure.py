@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
+from click.core import ParameterSource
 
 from teds_provision import links as links_room
 from teds_provision import measure as measure_room
@@ -49,12 +50,7 @@ KINDS = ("periodic", "event", "free")
 @click.option("--test-pattern", is_flag=True, help="Stream the test pattern and check it: no measurement.")
 @click.option("--unsigned", is_flag=True, help="Also raw values of nodes whose datasheet nobody has signed, marked.")
 @click.option("--to", "files", multiple=True, metavar="FILE", help="Record: .csv, .txt, .mcap, .jsonl.")
-@click.option(
-    "--output",
-    type=click.Path(path_type=Path),
-    metavar="FILE",
-    help="Of recover: write what is whole to this new file.",
-)
+@click.option("--output", type=click.Path(path_type=Path), metavar="FILE", help="recover: the new file.")
 @click.option("--ros1", is_flag=True, help="Publish to ROS 1 (ROS_MASTER_URI).")
 @click.option("--ros2", is_flag=True, help="Publish to ROS 2 (ROS_DOMAIN_ID), on this machine.")
 @click.option("--mqtt", metavar="URL", help="Publish to a broker: mqtt://HOST, with Home Assistant discovery.")
@@ -86,7 +82,7 @@ def measure(
     if what[0] == "recover":
         _recover(app, what[1:], output)
         return
-    if output is not None:
+    if click.get_current_context().get_parameter_source("output") is ParameterSource.COMMANDLINE:
         raise UsageFailure("--output is for `measure recover`.", hint="Record with --to FILE.")
     links = over_the_bus(links, streams=True)
     if mqtt is not None and not mqtt.startswith(("mqtt://", "mqtts://")):

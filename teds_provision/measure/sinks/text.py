@@ -70,11 +70,14 @@ class TextSink(FileSink):
         self._line(self._comma.join(map(self._cell, _heads(known))))
 
     def _cell(self, text: str) -> str:
-        """A name from a datasheet as a cell: quoted where needed, never a formula of a spreadsheet."""
+        """A name from a datasheet as a cell: quoted where needed, never a formula of a spreadsheet.
+
+        A # outside quotes would begin a comment for whoever skips the lines above (pandas).
+        """
         text = printable(text)
         if text.startswith(FORMULA):
             text = "'" + text
-        if self._comma in text or '"' in text:
+        if self._comma in text or '"' in text or "#" in text:
             return '"' + text.replace('"', '""') + '"'
         return text
 

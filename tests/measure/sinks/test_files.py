@@ -6,11 +6,13 @@ import csv
 import io
 import json
 import os
+import re
 import signal
 import subprocess
 import sys
 import time
 from collections.abc import Iterable
+from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -404,6 +406,7 @@ def test_a_folder_that_is_not_there_is_told_before_anything_is_measured(tmp_path
 RECORDER = """
 import sys, time, resource
 sys.path.insert(0, {root!r})
+from dataclasses import replace
 from pathlib import Path
 from tests.cli.shell import call
 from tests.measure.sinks.parts import ANGLE, STATION, block
@@ -502,3 +505,16 @@ def test_the_command_names_what_is_damaged_and_exits_with_8(long: Finished, tmp_
     good = call(tmp_path / "home", "--json", "measure", "recover", str(tmp_path / "b.mcap"))
     assert (good.code, good.json["damaged"]) == (0, [])
     assert call(tmp_path / "home", "measure", "8d4d", "--can", "virtual:x", "--output", "y").code == 2
+
+
+@pytest.mark.parametrize("suffix", ["csv", "txt"])
+def test_a_number_sign_in_a_name_begins_no_comment(tmp_path: Path, suffix: str) -> None:
+    """As pandas.read_csv(comment="#") reads it: a comment begins at a # outside quotes, wherever in a line."""
+    path = tmp_path / f"run.{suffix}"
+    record(path, [block()], facts=(replace(ANGLE, node="arm #2", name="motor #1"),))
+    lines = [line for line in path.read_text().splitlines() if not line.startswith("#")]
+    for line in lines:
+        assert "#" not in re.sub(r'"(?:[^"]|"")*"', "", line)
+    [first, *_] = rows(path.read_text(), "," if suffix == "csv" else "\t")
+    assert first["arm #2/motor #1 [rad]"] == "0.1"
+    assert first["arm #2/motor #1 raw"] == "1"
