@@ -137,6 +137,12 @@ class Frozen(PolicyRefused):
     code = "frozen"
 
 
+class CalibrationMisfit(PolicyRefused):
+    """A calibration that a node has does not fit the channel that it would be kept for."""
+
+    code = "calibration-misfit"
+
+
 class NodeRefused(PolicyRefused):
     """The node refused a command; ``reason`` is the u8 of profile.md, "Reasons"."""
 

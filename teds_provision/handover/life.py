@@ -116,6 +116,9 @@ def _calibration_of(station: Station, old: NodeRecord) -> dict[BlockId, bytes]:
     blocks = {
         block: octets for block, octets in image.blocks.items() if block[1] == AccessCode.CALIBRATION and block[0]
     }
+    # What a calibration was made for says whether it fits the spare's channel.
+    described = [(number, AccessCode.CHANNEL) for number, _ in blocks]
+    blocks |= {block: image.blocks[block] for block in described if block in image.blocks}
     if not blocks:
         raise NotFound(f"No calibration of node {old.uuid.hex()} is known here.", hint="Leave --copy-calibration away.")
     if old.profile is None:

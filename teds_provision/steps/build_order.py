@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
 from teds_provision import teds
-from teds_provision.errors import BadData, NotFound, PolicyRefused, UsageFailure
+from teds_provision.errors import BadData, CalibrationMisfit, NotFound, PolicyRefused, UsageFailure
 from teds_provision.harmless import printable
 from teds_provision.lazy import late
 from teds_provision.station.station import Station
@@ -16,7 +16,7 @@ from teds_provision.teds.codec.codes import AccessCode
 from teds_provision.teds.image import Image
 from teds_provision.teds.profile.load import default_folders, load_profile, passed_over
 from teds_provision.teds.profile.reader import NAME_OCTETS
-from teds_provision.teds.sheet import Sheet
+from teds_provision.teds.sheet import Sheet, described
 
 if TYPE_CHECKING:
     from teds_provision.teds import calibration
@@ -195,7 +195,7 @@ def compose(
     calibrations = prepared.calibrations if prepared.calibrations is not None else _from_file(order, profile)
     warnings: tuple[str, ...] = ()
     if calibrations is None:
-        calibrations, warnings = _kept_calibrations(order, has)
+        calibrations, warnings = _kept_calibrations(order, has, profile)
     kept = order.name or name or (_known_name(station, uuid) if as_known else None)
     made = _made(profile, uuid, calibrations, kept, edition)
     return Composed(profile, wanted, kept, calibrations, made.blocks, merged((*passed, *warnings, *made.warnings)))
@@ -206,13 +206,34 @@ def _known_name(station: Station, uuid: bytes) -> str | None:
     return record.name if record is not None else None
 
 
-def _kept_calibrations(order: BuildOrder, has: Image | None) -> tuple[dict[int, Calibration], tuple[str, ...]]:
-    """The calibrations that the node has and the order does not drop, and a warning where there are any."""
+def _kept_calibrations(
+    order: BuildOrder, has: Image | None, profile: Profile
+) -> tuple[dict[int, Calibration], tuple[str, ...]]:
+    """The calibrations that the node has and the order does not drop, and a warning where there are any.
+
+    Raises CalibrationMisfit where one was made for another channel than the profile's.
+    """
     if order.drop_calibration or has is None:
         return {}, ()
     kept = teds_calibrations(has)
+    if not kept:
+        return {}, ()
+    require_fit(kept, has, Image(_NOBODY, dict(_made(profile, _NOBODY, {}, None, 2007).blocks)), profile)
     numbers = ", ".join(map(str, kept))
-    return kept, (f"The calibration that was given before is kept (channel {numbers}).",) if kept else ()
+    return kept, (f"The calibration that was given before is kept (channel {numbers}).",)
+
+
+def require_fit(kept: Mapping[int, Calibration], has: Image, new: Image, profile: Profile | None = None) -> None:
+    """Raise CalibrationMisfit where a calibration of ``has`` was made for another channel than ``new`` describes."""
+    for number, one in kept.items():
+        had, now = described(number, has.blocks), described(number, new.blocks)
+        own = profile.channel(number) if profile is not None else None
+        why = guarding.misfit(one, had, now, own)
+        if why:
+            raise CalibrationMisfit(
+                f"The calibration of channel {number} that the node has does not fit: {why}.",
+                hint="Give this channel's own: --calibration FILE; or leave it without one: --no-calibration.",
+            )
 
 
 def teds_calibrations(image: Image) -> dict[int, Calibration]:

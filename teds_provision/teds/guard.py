@@ -17,8 +17,11 @@ from teds_provision.errors import BadData
 from teds_provision.lazy import late
 from teds_provision.teds.calibration.decoded import from_decoded
 from teds_provision.teds.calibration.fitting import residuals
+from teds_provision.teds.calibration.formula import evaluate
 from teds_provision.teds.calibration.model import Calibration
+from teds_provision.teds.calibration.samples import Range
 from teds_provision.teds.channel import TURN
+from teds_provision.teds.channel import Channel as SheetChannel
 from teds_provision.teds.codec.codes import AccessCode
 from teds_provision.teds.codec.decode import decode
 from teds_provision.teds.codec.model import Decoded
@@ -27,7 +30,7 @@ from teds_provision.teds.image import BlockId
 
 if TYPE_CHECKING:
     from teds_provision.teds.curve import Channel
-    from teds_provision.teds.profile.model import Profile
+    from teds_provision.teds.profile.model import ChannelProfile, Profile
 
 if TYPE_CHECKING:
     import numpy as np
@@ -303,6 +306,67 @@ def check_calibration(
             )
     plain = (replace(finding, message=finding.message.removesuffix(".")) for finding in findings)
     return sorted(plain, key=lambda finding: finding.severity != "error")
+
+
+def misfit(calibration: Calibration, had: SheetChannel, now: SheetChannel, of: ChannelProfile | None) -> str:
+    """Why a calibration that was made for the channel ``had`` is none of the channel ``now``; "" where it fits.
+
+    Looked at: ChanType, DatModel, ModLenth, dimension of the unit, method, raw range, and whether its points lie within
+    the limits. ``of`` is what the profile says of the channel. Half a sentence, without a full stop.
+    """
+    if not now.described:
+        return "the datasheet has no such channel"
+    if not had.described:
+        return "nothing says for what channel it was made"
+    if had.kind is not now.kind:
+        words = [one.kind.word if one.kind is not None else "unknown" for one in (had, now)]
+        return f"it was made for another type of channel ({words[0]}, not {words[1]})"
+    if had.units != now.units:
+        return f"it was made for values in {had.si_unit}, and these are in {now.si_unit}"
+    if had.sample is None or now.sample is None:
+        return "nothing says how a sample is coded" if had.sample != now.sample else ""
+    if (had.sample.model, had.sample.octets) != (now.sample.model, now.sample.octets):
+        return f"it was made for samples of {had.sample.name}, and these are {now.sample.name}"
+    method = of.calibration.method if of is not None else None
+    if method and method != calibration.method:
+        return f"this type asks for the method {method}, and it is {calibration.method}"
+    raw = of.raw_range if of is not None else calibration.raw_range or now.sample.raw_range
+    return _beyond_raw_range(calibration, had, now, raw) or _points_beyond(calibration, had, now)
+
+
+def _beyond_raw_range(calibration: Calibration, had: SheetChannel, now: SheetChannel, raw: Range | None) -> str:
+    """Another converter: it gives raw values that were never calibrated, or not those that were."""
+    before = calibration.raw_range or (had.sample.raw_range if had.sample is not None else None)
+    if raw is None or before is None:
+        return "" if raw == before else "it was made for another range of raw values"
+    step = 4 * FLOAT32_STEP * max(map(abs, raw)) + (1.0 if now.sample is not None and now.sample.integer else 0.0)
+    told = f"raw {before[0]:.8g} to {before[1]:.8g}", f"raw {raw[0]:.8g} to {raw[1]:.8g}"
+    if raw[0] < before[0] - step or raw[1] > before[1] + step:
+        return f"it was made for {told[0]}, and this channel gives {told[1]}"
+    if now.actuator:
+        return ""
+    part = next((one for one in calibration.inputs if one.channel == now.number), calibration.inputs[0])
+    if part.boundaries[0] < raw[0] - step or part.boundaries[-1] > raw[1] + step:
+        return f"it covers raw {part.boundaries[0]:.8g} to {part.boundaries[-1]:.8g}, and this channel gives {told[1]}"
+    return ""
+
+
+def _points_beyond(calibration: Calibration, had: SheetChannel, now: SheetChannel) -> str:
+    """Points of it that new limits leave out; the old limits are the guard's matter."""
+    same = [one for one in ("low", "high") if getattr(had, one) == getattr(now, one)]
+    part = calibration.inputs[0]
+    if len(same) == 2 or now.full_turn or len(calibration.inputs) > 1 or not now.has_range:
+        return ""
+    edges = np.asarray(part.boundaries, dtype=np.float64)
+    values = edges if now.actuator else evaluate(calibration, edges).value
+    values = values * calibration.unit.scale + calibration.unit.offset
+    slack = max(now.uncertainty, 0.0) if math.isfinite(now.uncertainty) else 0.0
+    slack += 4 * FLOAT32_STEP * max(abs(now.low), abs(now.high))
+    for limit, over, name in ((now.low, now.low - values, "low"), (now.high, values - now.high, "high")):
+        at = int(np.argmax(over))
+        if float(over[at]) > slack:
+            return f"its point of {now.show(float(values[at]))} is beyond the {name} limit of {now.show(limit)}"
+    return ""
 
 
 @dataclass(frozen=True)

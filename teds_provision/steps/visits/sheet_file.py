@@ -13,7 +13,7 @@ from teds_provision.errors import BadData
 from teds_provision.protocol.datasheet import can_be_stored, passes_own_check
 from teds_provision.station.station import Station
 from teds_provision.steps.agree import require_session
-from teds_provision.steps.build_order import guard, own_name
+from teds_provision.steps.build_order import guard, own_name, require_fit, teds_calibrations
 from teds_provision.steps.read import Survey, survey
 from teds_provision.steps.sign import known_node_keys, sign
 from teds_provision.steps.verify import Verified, require_authentic
@@ -21,6 +21,7 @@ from teds_provision.steps.verify_node import verify_node
 from teds_provision.steps.write import write
 from teds_provision.talk.conversation import Conversation
 from teds_provision.talk.progress import DONE, NOTHING, Reporter, StepResult, Steps
+from teds_provision.teds.codec.codes import AccessCode
 from teds_provision.teds.diff import Change, diff_blocks
 from teds_provision.teds.formats import stated_uuid, under
 from teds_provision.teds.image import BlockId, Image
@@ -72,6 +73,12 @@ def plan_sheet(
     present = survey(node)
     keep = {block: present.image.blocks[block] for block in present.read_only}
     image = Image(node.uuid, {**keep, **under(blocks, node.uuid)})
+    same = {
+        number: one
+        for number, one in teds_calibrations(present.image).items()
+        if image.blocks.get((number, AccessCode.CALIBRATION)) == present.image.blocks[number, AccessCode.CALIBRATION]
+    }
+    require_fit(same, present.image, image)
     warnings = guard(station, image, present.image, accept_calibration, record=record)
     changes = tuple(diff_blocks(present.image.unsigned_blocks(), image.unsigned_blocks()))
     return SheetPlan(image, changes, warnings, present)
