@@ -20,6 +20,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 from teds_provision.lazy import late
 from teds_provision.measure.sinks.lines import plain
+from teds_provision.ncap.sinks import for_readers
 from teds_provision.teds.channel import TURN
 
 if TYPE_CHECKING:
@@ -50,9 +51,13 @@ class Last:
 
 
 class Listener:
-    """One client. ``wait`` gives the next messages for it, each a JSON text."""
+    """One client. ``wait`` gives the next messages for it, each a JSON text.
 
-    def __init__(self) -> None:
+    ``reader``: it may only read, so it is told no files and users of this machine.
+    """
+
+    def __init__(self, *, reader: bool = False) -> None:
+        self.reader = reader
         self._values: str | None = None
         self._events: deque[str] = deque()
         self._dropped = 0
@@ -137,7 +142,7 @@ class Live:
         text = json.dumps({"type": "event", **line})
         loop = self._loop
         if loop is not None and not loop.is_closed():
-            loop.call_soon_threadsafe(self._tell, text)
+            loop.call_soon_threadsafe(self._tell, text, json.dumps({"type": "event", **for_readers(line)}))
 
     def last(self, uuid: str, channel: int) -> Last | None:
         """The newest value of a channel."""
@@ -145,9 +150,9 @@ class Live:
 
     # -- in the loop -------------------------------------------------------------------------------------------------
 
-    def join(self) -> Listener:
+    def join(self, *, reader: bool = False) -> Listener:
         """A new client."""
-        listener = Listener()
+        listener = Listener(reader=reader)
         self._listeners.add(listener)
         return listener
 
@@ -175,11 +180,12 @@ class Live:
                     listener.values(text)
             if now - told >= _TOLD:
                 told = now
-                self._tell(json.dumps({"type": "beat", "time": time.time()}))
+                beat = json.dumps({"type": "beat", "time": time.time()})
+                self._tell(beat, beat)
 
-    def _tell(self, text: str) -> None:
+    def _tell(self, text: str, for_reader: str) -> None:
         for listener in self._listeners:
-            listener.event(text)
+            listener.event(for_reader if listener.reader else text)
 
     def _gather(self, seconds: float) -> dict[str, list[list[float | None]]]:
         """What came since the last beat, by ``uuid/channel``: times and values."""

@@ -15,6 +15,7 @@ import hashlib
 import json
 import os
 from collections.abc import Callable, Iterator, Mapping
+from contextvars import ContextVar
 from dataclasses import dataclass
 from functools import cache
 from typing import Any
@@ -22,11 +23,21 @@ from typing import Any
 from teds_provision.store.database import Database
 from teds_provision.store.records import utc_now
 
+ACTOR: ContextVar[str | None] = ContextVar("ACTOR", default=None)
+"""On whose word acts are done here, where that is not the user who runs this process: ``page``, ``token NAME``."""
 _quoted = json.encoder.encode_basestring_ascii
 _encode = json.JSONEncoder(sort_keys=True, separators=(",", ":")).encode
 _NOTED = "(SELECT value FROM meta WHERE name = 'audit-head')"
 _END = f"SELECT seq, hash, {_NOTED} FROM audit ORDER BY seq DESC LIMIT 1"
 _PAGE_OF_ENTRIES = "SELECT * FROM audit WHERE seq > ? ORDER BY seq LIMIT ?"
+
+
+_TOKEN = "token "
+
+
+def by_token(name: str) -> str:
+    """What :data:`ACTOR` says of a token of the API."""
+    return f"{_TOKEN}{name}"
 
 
 @dataclass(frozen=True)
@@ -42,6 +53,11 @@ class AuditEntry:
     detail: dict[str, Any]
     hash: str
 
+    @property
+    def actor(self) -> str:
+        """The user, the name of the API's token, or ``page``."""
+        return self.who.removeprefix(_TOKEN)
+
 
 @dataclass(frozen=True)
 class Choice:
@@ -50,6 +66,10 @@ class Choice:
     uuid: bytes | None = None
     act: str | None = None
     failed: bool = False
+    text: str | None = None
+    """Stands in act, outcome, details, actor or UUID, in either case."""
+    before: int | None = None
+    """Only entries with a smaller number."""
 
 
 FAILED = (
@@ -92,7 +112,7 @@ class AuditLog:
             count, previous, noted = last or (0, self._root, self._noted())
             if self._read(noted) != (count, previous):  # goes on, but the loss is never forgotten
                 self._database.execute("INSERT OR IGNORE INTO meta VALUES('audit-lost', ?)", (str(count + 1),))
-            row = (count + 1, utc_now(), _who(), act, uuid, outcome, text)
+            row = (count + 1, utc_now(), ACTOR.get() or _who(), act, uuid, outcome, text)
             head = _chained(previous, row)
             self._database.add("INSERT INTO audit VALUES(?, ?, ?, ?, ?, ?, ?, ?)", (*row, head))
             self._remember(count + 1, head)
@@ -222,9 +242,23 @@ def _terms(choice: Choice) -> str:
         terms += f" AND uuid = x'{choice.uuid.hex()}'"
     if choice.act is not None:
         terms += " AND act = '" + choice.act.replace("'", "''") + "'"
+    if choice.text:
+        part = _like(choice.text)
+        columns = ("act", "outcome", "detail", "who", "lower(hex(uuid))")
+        terms += " AND (" + " OR ".join(f"{column} LIKE {part} ESCAPE '!'" for column in columns) + ")"
+    if choice.before is not None:
+        terms += f" AND seq < {int(choice.before)}"
     if choice.failed:
         terms += " AND (" + " OR ".join(f"outcome GLOB '{word}*'" for word in FAILED) + ")"
     return terms
+
+
+def _like(text: str) -> str:
+    """A text as a pattern of SQL, quoted. Details are kept as canonical JSON, in ASCII."""
+    plain = _quoted(text)[1:-1]
+    for sign in "!%_":
+        plain = plain.replace(sign, f"!{sign}")
+    return "'%" + plain.replace("'", "''").replace("\0", "") + "%'"
 
 
 def _canonical(value: dict[str, Any]) -> str:

@@ -148,6 +148,7 @@ def _as_dict(entry: AuditEntry) -> dict[str, Any]:
         "seq": entry.seq,
         "at": entry.at,
         "who": entry.who,
+        "actor": entry.actor,
         "act": entry.act,
         "uuid": None if entry.uuid is None else entry.uuid.hex(),
         "outcome": entry.outcome,

@@ -7,6 +7,7 @@ and when the daemon dies the node's dead-man does (operation.md section 2). One 
 
 from __future__ import annotations
 
+import contextvars
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -117,7 +118,13 @@ class Holding:
 
         Raises PolicyRefused (whitelist, limits of the datasheet), NodeRefused (claimed by another), NoNode, BadData.
         """
-        require_whitelisted(self._station, bytes.fromhex(uuid))
+        try:
+            require_whitelisted(self._station, bytes.fromhex(uuid))
+        except TedsProvisionError as error:
+            with suppress(StoreFailure):
+                facts = {"channel": channel, "value": value, "unit": unit or "", "why": error.message}
+                self._station.audit("set", bytes.fromhex(uuid), error.code, **facts)
+            raise
         seconds = HOLD if hold is None else min(hold, LONGEST)
         held, fresh = self._held_for(uuid, channel, value, unit)
         with held.news:
@@ -142,7 +149,8 @@ class Holding:
 
     def _start(self, held: _Held, value: float, unit: str | None) -> None:
         name = f"hold {held.uuid[:8]}"
-        threading.Thread(target=self._run, args=(held, value, unit), name=name, daemon=True).start()
+        who = contextvars.copy_context()  # on whose word, for the audit log
+        threading.Thread(target=who.run, args=(self._run, held, value, unit), name=name, daemon=True).start()
 
     @staticmethod
     def _answer(held: _Held, mine: int, seconds: float) -> dict[str, Any]:
@@ -188,7 +196,9 @@ class Holding:
         finally:
             outcome = "done" if held.error is None else held.error.code
             with suppress(StoreFailure):  # a full disk must not keep who waits for this waiting
-                self._station.audit("set", node, outcome, safe=held.safe, **facts)
+                asked = {"value": held.order.value, "unit": held.order.unit or ""}
+                why = {} if held.error is None else {"why": held.error.message}
+                self._station.audit("set", node, outcome, safe=held.safe, **asked, **why, **facts)
             self._tell(held, safe=held.safe)
             with self._guard:
                 self._held.pop((held.uuid, held.channel), None)

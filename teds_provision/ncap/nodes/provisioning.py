@@ -27,6 +27,7 @@ from teds_provision.steps.build_order import BuildOrder, prepare
 from teds_provision.steps.identify import Identified
 from teds_provision.steps.provision import Provisioned, provision
 from teds_provision.steps.verify import require_authentic
+from teds_provision.store.audit import ACTOR
 from teds_provision.talk.conversation import Conversation, SessionLost
 from teds_provision.talk.progress import StepResult
 
@@ -94,8 +95,14 @@ class Provisioning:
                 self._runs.pop(uuid, None)
             raise
 
+        who = ACTOR.get()
+
         def work(node: Conversation) -> None:
-            self._work(run, node, order)
+            before = ACTOR.set(who)  # whoever asked, when a node comes to another thread
+            try:
+                self._work(run, node, order)
+            finally:
+                ACTOR.reset(before)
 
         if uuid != NEXT and self._desk.on_a_bus(uuid):
             self._tell(run)

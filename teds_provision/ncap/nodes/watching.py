@@ -88,6 +88,7 @@ class Watch:
         self._taps, self._transparent, self._buses = taps, transparent, buses
         self._trace = trace
         self._known: dict[str, Sighting] = {}
+        self._looked_for: set[str] = set()  # asked for anew: to be looked at when they answer
         self._stop, self._anew = threading.Event(), threading.Event()
         self._workers = ThreadPoolExecutor(WORKERS, thread_name_prefix=f"look {place[:20]}")
         self._for_strangers = ThreadPoolExecutor(STRANGERS, thread_name_prefix=f"stranger {place[:20]}")
@@ -173,7 +174,7 @@ class Watch:
         while not self._stop.is_set():
             if self._anew.is_set():
                 self._anew.clear()
-                self._known.clear()
+                self._look_for_all()
                 with suppress(LinkFailure):
                     bus.lookout.discover()
             failure = bus.lookout.failure
@@ -186,6 +187,10 @@ class Watch:
                 self._see_who_left(GONE_POLLS * POLL_AIR)
             self._tell_of_strangers()
             self._anew.wait(LOOK)
+
+    def _look_for_all(self) -> None:
+        """Look at everybody who answers from now on; who does not is still one that was there, and is seen to leave."""
+        self._looked_for = set(self._known)
 
     def _is_held(self, uuid: str) -> bool:
         return self._turns.holder(uuid) is not None
@@ -209,8 +214,9 @@ class Watch:
             same = (before.address, before.identity.state) == (sighting.address, identity.state)
             seen = self._roster.seen(uuid)
             retry = seen.problem is not None and time.time() - seen.seen > LOOK_AGAIN
-            if same and not retry:
+            if same and not retry and uuid not in self._looked_for:
                 return
+        self._looked_for.discard(uuid)
         self._came(sighting.contact())
 
     def _see_who_left(self, silence: float) -> None:
@@ -311,6 +317,8 @@ class Watch:
         uuid = contact.identity.uuid.hex()
         if uuid in self._known:
             self._serve(contact)
+            if uuid not in self._known:  # it left, or others came, while it was looked at
+                self._left(uuid)
             return
         with self._guard:
             self._pending.discard(uuid)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 from collections.abc import Awaitable, Callable
+from contextlib import suppress
 from pathlib import Path
 from typing import Any, Final
 
@@ -16,17 +17,23 @@ from starlette.types import Scope
 from starlette.websockets import WebSocket, WebSocketDisconnect
 
 from teds_provision.client import API
-from teds_provision.errors import NotFound, TedsProvisionError
+from teds_provision.errors import NotFound, StoreFailure, TedsProvisionError
 from teds_provision.ncap.daemon import Daemon
 from teds_provision.ncap.live import Listener
 from teds_provision.ncap.web import metrics
 from teds_provision.ncap.web.answers import answer_bug, answer_error, answer_refusal
 from teds_provision.ncap.web.clause12 import Clause12
-from teds_provision.ncap.web.guard import Refusal
+from teds_provision.ncap.web.guard import CALLER, Caller, Refusal
 from teds_provision.ncap.web.resources import Resources
+from teds_provision.ncap.web.tokens import Tokens
 
 PAGE: Final = Path(__file__).parent.parent / "page"
 MOST_LISTENERS: Final = 200
+OF_ONE_TOKEN: Final = 100
+"""Places that one token may have, while there is room."""
+LOOK_AT_TOKEN: Final = 1.0
+"""Seconds until it is noticed that a token was removed, or is over."""
+_FULL, _NOT_GOOD = 1013, 1008
 
 
 def build(daemon: Daemon) -> Starlette:
@@ -81,24 +88,91 @@ async def _nothing(_request: Request) -> Response:
     raise NotFound("There is no such resource.", hint="See /api/v1/openapi.json.")
 
 
+class Places:
+    """The places of /live, ``most`` in all and ``of_one`` for one token.
+
+    Where all are taken, a token that has fewer than the one that has most gets the newest place of that one: nobody
+    keeps the others out, however many connections he opens.
+    """
+
+    def __init__(self, most: int = MOST_LISTENERS, of_one: int = OF_ONE_TOKEN) -> None:
+        self._most, self._of_one = most, of_one
+        self._taken: dict[str, list[Callable[[], object]]] = {}
+
+    def take(self, token: str, leave: Callable[[], object]) -> bool:
+        """Have a place; ``leave`` is called where it has to be given up for another token. False: there is none."""
+        own = self._taken.get(token, [])
+        if len(own) >= self._of_one:
+            return False
+        if sum(map(len, self._taken.values())) >= self._most:
+            greedy = max(self._taken, key=lambda one: len(self._taken[one]))
+            if len(self._taken[greedy]) <= len(own) + 1:
+                return False
+            out = self._taken[greedy][-1]
+            self.give(greedy, out)
+            out()
+        self._taken.setdefault(token, []).append(leave)
+        return True
+
+    def give(self, token: str, leave: Callable[[], object]) -> None:
+        """Give it back; one that was given up already is none any more."""
+        own = self._taken.get(token, [])
+        if leave in own:
+            own.remove(leave)
+        if not own:
+            self._taken.pop(token, None)
+
+
 def _live(daemon: Daemon) -> Callable[[WebSocket], Awaitable[None]]:
+    places = Places()
+
     async def live(socket: WebSocket) -> None:
-        if daemon.live.listeners >= MOST_LISTENERS:
-            await socket.close(1013)
+        caller: Caller = socket.scope[CALLER]
+        leaving = asyncio.Event()
+        leave = leaving.set
+        if not places.take(caller.digest, leave):
+            await socket.close(_FULL)
             return
-        await socket.accept()
-        listener = daemon.live.join()
-        sender = asyncio.create_task(_send(socket, listener, daemon.hello()))
+        tasks: list[asyncio.Task[None]] = []
         try:
-            while True:
-                message = await socket.receive()
-                if message["type"] == "websocket.disconnect":
-                    break
+            await socket.accept()
+            listener = daemon.live.join(reader=caller.read_only)
+            try:
+                tasks.append(asyncio.create_task(_send(socket, listener, daemon.hello())))
+                tasks.append(asyncio.create_task(_end_in_time(socket, daemon.tokens, caller, leaving)))
+                while (await socket.receive())["type"] != "websocket.disconnect":
+                    pass
+            finally:
+                daemon.live.leave(listener)
         finally:
-            daemon.live.leave(listener)
-            sender.cancel()
+            places.give(caller.digest, leave)
+            for task in tasks:
+                task.cancel()
 
     return live
+
+
+async def _end_in_time(socket: WebSocket, tokens: Tokens, caller: Caller, leaving: asyncio.Event) -> None:
+    """End the connection where its token is not good any more, or its place is another one's."""
+    while True:
+        with suppress(TimeoutError):
+            await asyncio.wait_for(leaving.wait(), LOOK_AT_TOKEN)
+        if leaving.is_set():
+            code, why = _FULL, "Another token has too few places."
+        elif caller.kind != "socket" and not _is_good(tokens, caller.digest):
+            code, why = _NOT_GOOD, "This token is not good any more."
+        else:
+            continue
+        with suppress(WebSocketDisconnect, RuntimeError, OSError):  # it has gone by itself
+            await socket.close(code, why)
+        return
+
+
+def _is_good(tokens: Tokens, digest: str) -> bool:
+    try:
+        return tokens.is_good(digest)
+    except StoreFailure:  # a file that cannot be read lets nobody in, nor stay
+        return False
 
 
 async def _send(socket: WebSocket, listener: Listener, hello: dict[str, Any]) -> None:

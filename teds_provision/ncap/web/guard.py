@@ -19,6 +19,7 @@ from typing import Any, Final, Literal
 from urllib.parse import parse_qs
 
 from teds_provision.ncap.web.tokens import Tokens
+from teds_provision.store.audit import ACTOR, by_token
 
 Scope = MutableMapping[str, Any]
 Message = MutableMapping[str, Any]
@@ -55,6 +56,13 @@ class Caller:
     name: str
     kind: Literal["socket", "browser", "script"]
     read_only: bool = False
+    digest: str = ""
+    """Of the token, which tells two of one name apart; "" for the user himself."""
+
+    @property
+    def actor(self) -> str | None:
+        """Who stands in the audit log; None: the user who runs the daemon."""
+        return {"socket": None, "browser": "page"}.get(self.kind, by_token(self.name))
 
 
 @dataclass(eq=False)
@@ -123,6 +131,7 @@ class Guard:
         try:
             headers = _headers(scope)
             scope[CALLER] = await self._caller(scope, headers)
+            ACTOR.set(scope[CALLER].actor)
             _require_form(scope, headers, scope[CALLER])
             await self.app(scope, _limited(receive) if scope["type"] == "http" else receive, with_headers)
         except Refusal as refusal:
@@ -145,7 +154,7 @@ class Guard:
             raise await self._wrong_token()
         if scope["type"] == "websocket" and found.kind == "browser" and "origin" not in headers:
             raise Refusal(403, "no-origin", "A browser says where a WebSocket comes from; this one does not.")
-        return Caller(found.name, found.kind, found.read_only)
+        return Caller(found.name, found.kind, found.read_only, found.digest)
 
     async def _login(self, scope: Scope) -> Refusal:
         """Trade the token of `ncap open` for a cookie; told as a redirection to the page without it."""

@@ -48,7 +48,8 @@ OPERATIONS: Final = (
     ),
     Operation("GET", "/nodes/{uuid}", "One node, by UUID, prefix or name.", ref("Node")),
     Operation(
-        "GET", "/nodes/{uuid}/teds", "Its datasheet, decoded and checked; or as a document.", ref("Sheet"),
+        "GET", "/nodes/{uuid}/teds", "Its datasheet, decoded and checked; or as a document.",
+        {"anyOf": [ref("Sheet"), ref("Document")]},
         query={"format": text(enum=["json", "xml", "hex"])}, document=True,
     ),
     Operation(
@@ -89,7 +90,7 @@ OPERATIONS: Final = (
             closed=True, group=maybe("string"), uuids=listed(text()), channels=listed(INTEGER),
             rate=maybe("number", minimum=0.001, maximum=1e6),
             kind=maybe("string", enum=["periodic", "event", "free", None]), trigger=FLAG,
-            sinks=listed(text(description="ros1, ros2, mqtt://HOST, or the name of a file")),
+            sinks=listed(text(description="ros1, ros2, the name of a broker, or of a file")),
             actuators={"type": "boolean", "description": "may set points come by topics of ROS; true unless said"},
             dead_man={"type": "integer", "minimum": 20, "maximum": 10000, "description": "ms, else the station's"},
             scalar_rate={"type": "number", "minimum": 0, "maximum": 1000, "description": "Hz, 10 unless said"},
@@ -115,9 +116,17 @@ OPERATIONS: Final = (
     Operation("GET", "/profiles", "Transducer types that can be built.",
               members("profiles", profiles=listed(members("name title")))),
     Operation(
-        "GET", "/log", "The newest entries of the audit log.",
+        "GET", "/log", "The newest entries of the audit log that are meant, of those before number ``before``.",
         members("entries intact", entries=listed(ref("Entry")), intact=FLAG, why=text()),
-        query={"limit": {"type": "integer", "minimum": 1, "maximum": 10000}, "uuid": text()},
+        query={
+            "limit": {"type": "integer", "minimum": 1, "maximum": 10000},
+            "before": {"type": "integer", "minimum": 1, "maximum": 10_000_000},
+            "uuid": text(),
+            "text": {"type": "string", "maxLength": 200},
+            "act": text(),
+            "failed": text(),
+            "since": text(description="ISO 8601, or unix seconds"),
+        },
     ),
     Operation("POST", "/login-link", "The page's address with a token that works once (Unix socket alone).",
               members("url", url=text()), members(closed=True, read_only=FLAG)),

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import asyncio
+import re
 from collections.abc import AsyncIterator, Awaitable, Callable
-from datetime import datetime
+from dataclasses import replace
+from datetime import UTC, datetime
 from typing import Any, Final
 
 from starlette.requests import Request
@@ -21,6 +23,7 @@ from teds_provision.ncap.web.guard import CALLER, Caller
 from teds_provision.ncap.web.openapi import document
 from teds_provision.ncap.web.threads import changing, moving, reading
 from teds_provision.store import Choice, is_failure
+from teds_provision.store.records import iso
 from teds_provision.teds.profile import default_folders, is_profile_name, list_profiles, listed
 
 Handler = Callable[[Request], Awaitable[Response]]
@@ -32,6 +35,8 @@ _LARGEST: Final = 1e300
 _LENT_LOOK: Final = 0.5
 _DIGITS: Final = 9  # of a number in a query; Python gives up on four thousand
 _FURTHEST: Final = 10_000_000
+_LONGEST_TEXT: Final = 200
+_UNIX: Final = re.compile(r"[0-9]{1,12}(\.[0-9]{1,9})?")
 
 
 class Resources:
@@ -85,7 +90,7 @@ class Resources:
             body = await Body.of(request)
             mode = body.need("mode", str)
             body.done()
-            await asyncio.to_thread(self._daemon.set_detection, mode)
+            await changing(self._daemon.set_detection, mode)
         return JSONResponse({"mode": await asyncio.to_thread(lambda: self._daemon.detection)})
 
     async def discover(self, request: Request) -> Response:
@@ -103,22 +108,30 @@ class Resources:
         return JSONResponse({"profiles": await asyncio.to_thread(found)})
 
     async def log(self, request: Request) -> Response:
-        """GET /log: the newest entries, and whether the chain holds over them."""
+        """GET /log: the newest entries that are meant, before ``before`` where it is given, and whether they hold."""
+        words = request.query_params
         limit = _integer(request, "limit", 200, _MOST_ENTRIES)
-        uuid = request.query_params.get("uuid")
-        found = await asyncio.to_thread(self._log, limit, uuid)
-        return _shown(request, found)
+        before = _integer(request, "before", 0, _FURTHEST, least=1) or None
+        text = words.get("text")
+        if text is not None and len(text) > _LONGEST_TEXT:
+            raise UsageFailure(f"text has {_LONGEST_TEXT} characters at most.")
+        failed = words.get("failed", "0") not in ("0", "", "false")
+        choice = Choice(act=words.get("act") or None, failed=failed, text=text or None, before=before)
+        since = _moment(words["since"]) if words.get("since") else None
+        return _shown(request, await reading(self._log, choice, limit, words.get("uuid"), since))
 
-    def _log(self, limit: int, uuid: str | None) -> dict[str, Any]:
+    def _log(self, choice: Choice, limit: int, uuid: str | None, since: str | None) -> dict[str, Any]:
         log = self._daemon.station.audit_log
-        choice = Choice(bytes.fromhex(self._daemon.resolve(uuid)) if uuid else None)
-        after = log.before(choice, last=limit)
+        if uuid:
+            choice = replace(choice, uuid=bytes.fromhex(self._daemon.resolve(uuid)))
+        after = log.before(choice, since=since, last=limit)
         verdict = log.check(after)
         entries = [
             {
                 "seq": one.seq,
                 "time": datetime.fromisoformat(one.at).timestamp(),
                 "who": one.who,
+                "actor": one.actor,
                 "act": one.act,
                 "uuid": one.uuid.hex() if one.uuid is not None else None,
                 "subject": one.uuid.hex() if one.uuid is not None else "",
@@ -208,7 +221,7 @@ class Resources:
         body = await Body.of(request)
         if body.take("cancel", bool, False):
             body.done()
-            return JSONResponse(await asyncio.to_thread(runs.cancel, uuid))
+            return JSONResponse(await changing(runs.cancel, uuid))
         profile, name = _type_name(body), body.take("name", str)
         calibration, calibration_name = body.take("calibration", str), body.take("calibration_name", str)
         body.done()
@@ -218,7 +231,7 @@ class Resources:
                 uuid, profile=profile, name=name, calibration=calibration, calibration_name=calibration_name
             )
 
-        return JSONResponse(await asyncio.to_thread(begin), 202)
+        return JSONResponse(await changing(begin), 202)
 
     async def _uuid_of_a_label(self, word: str) -> str:
         """A node that nobody has seen yet is named by its whole UUID, as its label says it."""
@@ -249,7 +262,7 @@ class Resources:
             body = await Body.of(request)
             name, uuids = body.need("name", str), await self._nodes_of(body.texts("uuids"))
             body.done()
-            await asyncio.to_thread(self._daemon.make_group, name, uuids)
+            await changing(self._daemon.make_group, name, uuids)
         found = {"groups": await asyncio.to_thread(self._daemon.groups)}
         return JSONResponse(found, 201 if request.method == "POST" else 200)
 
@@ -257,12 +270,12 @@ class Resources:
         """PUT, DELETE /groups/NAME."""
         name = request.path_params["name"]
         if request.method == "DELETE":
-            await asyncio.to_thread(self._daemon.drop_group, name)
+            await changing(self._daemon.drop_group, name)
         else:
             body = await Body.of(request)
             uuids = await self._nodes_of(body.texts("uuids", needed=True))
             body.done()
-            await asyncio.to_thread(self._daemon.change_group, name, uuids)
+            await changing(self._daemon.change_group, name, uuids)
         return JSONResponse({"groups": await asyncio.to_thread(self._daemon.groups)})
 
     async def measurements(self, request: Request) -> Response:
@@ -307,7 +320,7 @@ class Resources:
             body.done()
             if not 0 <= channel <= 255:
                 raise UsageFailure(f"{channel} is no channel.")
-            await asyncio.to_thread(names.rename, uuid, channel, name or None)
+            await changing(names.rename, uuid, channel, name or None)
         return JSONResponse({"names": await asyncio.to_thread(names.all)})
 
     async def virtual(self, request: Request) -> Response:
@@ -354,6 +367,15 @@ def _integer(request: Request, name: str, default: int, most: int, least: int = 
     if not (text.isascii() and text.isdecimal() and len(text) <= _DIGITS and least <= int(text) <= most):
         raise UsageFailure(f"{name} has to be a whole number from {least} to {most}.")
     return int(text)
+
+
+def _moment(text: str) -> str:
+    """``since`` as the log writes moments: ISO 8601 with a zone, or unix seconds."""
+    try:
+        at = datetime.fromtimestamp(float(text), UTC) if _UNIX.fullmatch(text) else datetime.fromisoformat(text)
+    except (ValueError, OverflowError, OSError):
+        raise UsageFailure("since has to be a moment: 2026-11-22T10:00:00Z, or unix seconds.") from None
+    return iso(at if at.tzinfo is not None else at.replace(tzinfo=UTC))
 
 
 def _type_name(body: Body) -> str | None:

@@ -227,6 +227,11 @@ SCHEMAS: Final[dict[str, Schema]] = {
         curves=listed(members("channel name x_unit y_unit points", channel=INTEGER, points=listed(listed(NUMBER)))),
         from_=text(enum=["session", "kept", "plain"]),
     ),
+    "Document": members(
+        "format teds",
+        format=text(enum=["teds/1"]),
+        teds=listed(members("channel access_code", channel=INTEGER, access_code=INTEGER, octets=text())),
+    ),
     "SheetPlan": members(
         "uuid dry_run changes guard steps verdict",
         uuid=UUID,
@@ -263,10 +268,11 @@ SCHEMAS: Final[dict[str, Schema]] = {
         channels=INTEGER,
     ),
     "Entry": members(
-        "seq time who act uuid outcome detail failed",
+        "seq time who actor act uuid outcome detail failed",
         seq=INTEGER,
         time=TIME,
         who=text(),
+        actor=text(description="the user, the name of a token, or page"),
         act=text(),
         uuid=or_null(UUID),
         subject=text(),

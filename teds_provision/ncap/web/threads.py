@@ -7,6 +7,7 @@ only read is enough) kept every other request waiting: the status, the check of 
 from __future__ import annotations
 
 import asyncio
+import contextvars
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from typing import Final, ParamSpec, TypeVar
@@ -35,4 +36,5 @@ async def moving(work: Callable[_Words, _Found], *words: _Words.args, **more: _W
 
 
 async def _run(pool: ThreadPoolExecutor, work: Callable[[], _Found]) -> _Found:
-    return await asyncio.get_running_loop().run_in_executor(pool, work)
+    who = contextvars.copy_context()  # on whose word it is done, for the audit log
+    return await asyncio.get_running_loop().run_in_executor(pool, lambda: who.run(work))

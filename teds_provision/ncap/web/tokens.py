@@ -121,6 +121,11 @@ class Tokens:
                 found = one
         return found
 
+    def is_good(self, digest: str) -> bool:
+        """Whether the token of this digest is good still: neither removed nor over."""
+        now = time.time()
+        return any(one.digest == digest and (not one.until or one.until > now) for one in self._read())
+
     # -- the file ----------------------------------------------------------------------------------------------------
 
     def _read(self) -> list[Token]:

@@ -54,6 +54,11 @@ function power(wire) {
   };
 }
 
+/** What a measurement does with a node: it measures only while the node runs. */
+function modeOf(state) {
+  return { running: "measuring", refused: "refused, not measured", lost: "lost, not measured", ended: "not measured" }[state] ?? "waits to be measured";
+}
+
 /** A node; its verdict is judged from the station's one row of reading, `heard` is what it said in no session. */
 export function node(wire) {
   return {
@@ -69,7 +74,7 @@ export function node(wire) {
     why: wire.problem?.message ?? "",
     cure: wire.problem?.hint ?? "",
     groups: wire.groups ?? [],
-    mode: wire.measurement ? "measuring" : null,
+    mode: wire.measurement ? modeOf(wire.measuring?.state) : null,
     power: power(wire.power),
     channels: (wire.channels ?? []).map(channel),
   };

@@ -17,6 +17,7 @@ export function facts(node) {
   if (node.present === false) out.push(h("span", { class: "warn" }, icon("clock"), node.seen ? `away, seen ${age(now() - node.seen)}` : "away"));
   else if (node.busy) out.push(h("span", { class: "busy" }, icon("clock"), node.busy));
   else if (node.mode === "measuring") out.push(h("span", { class: "busy" }, icon("wave"), "measuring"));
+  else if (node.mode) out.push(h("span", { class: "warn" }, icon("clock"), node.mode));
   else if (node.state) out.push(h("span", {}, node.state));
   if (node.whitelisted === false) out.push(h("span", { class: "warn" }, icon("warn"), "not on the whitelist"));
   if (node.groups?.length) out.push(h("span", {}, icon("list"), node.groups.join(", ")));

@@ -52,6 +52,6 @@ function line(one) {
     h("th", { scope: "row" }, one.act, one.failed ? [" ", chip("bad", "bad", "failed")] : null),
     h("td", {}, node ? h("a", { href: `#/nodes/${node.uuid}` }, nameOf(node)) : ""),
     h("td", {}, one.detail ?? ""),
-    h("td", { class: "hint" }, one.who ?? ""),
+    h("td", { class: "hint" }, one.actor ?? one.who ?? ""),
   );
 }

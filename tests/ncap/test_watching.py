@@ -1,0 +1,103 @@
+"""Who is on a link: nobody stays there for ever, and nobody who makes up names fills it."""
+
+from __future__ import annotations
+
+import time
+from concurrent.futures import ThreadPoolExecutor
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+
+from teds_provision.ncap.nodes import watching
+from teds_provision.ncap.nodes.roster import MOST_GONE, Roster
+from teds_provision.ncap.nodes.turns import Turns
+from teds_provision.ncap.nodes.watching import MOST_KNOWN, Watch
+
+
+class Silence:
+    """Nobody listens."""
+
+    def event(self, *_words: Any, **_facts: Any) -> None: ...
+
+    def last(self, *_words: Any) -> None: ...
+
+
+def sighting(number: int) -> Any:
+    """A node that answered just now."""
+    identity = SimpleNamespace(uuid=number.to_bytes(10, "big"), state=SimpleNamespace(name="FACTORY"))
+    link = SimpleNamespace(capabilities=SimpleNamespace(tapped=False))
+    contact = SimpleNamespace(identity=identity, link=link, address=number % 200)
+    return SimpleNamespace(
+        uuid=identity.uuid, identity=identity, address=number % 200, at=time.monotonic(), contact=lambda: contact
+    )
+
+
+@pytest.fixture
+def watch(monkeypatch: pytest.MonkeyPatch) -> Watch:
+    nothing: Any = None
+    silence: Any = Silence()
+    monkeypatch.setattr(watching, "is_listed", lambda _station, _uuid: False)
+    roster = Roster(nothing, silence)
+    monkeypatch.setattr(roster, "refresh", lambda _uuids=None: None)
+    return Watch("can:x", nothing, roster, silence, Turns(), nothing, lambda: True, nothing)
+
+
+def present(watch: Watch) -> int:
+    return watch._roster.present(watch.place)
+
+
+def test_a_node_that_went_just_before_everybody_was_asked_is_seen_to_leave(watch: Watch) -> None:
+    """What was known was forgotten at POST /discover, so nobody ever saw that it did not answer."""
+    looked: list[str] = []
+    watch._for_strangers = SimpleNamespace(submit=lambda _work, contact: looked.append(contact.identity.uuid.hex()))  # type: ignore[assignment]
+    gone, stays = sighting(1), sighting(2)
+    for one in (gone, stays):
+        watch.saw(one)
+    watch._pending.clear()
+    watch._look_for_all()
+    watch.saw(sighting(2))
+    assert looked == [gone.uuid.hex(), stays.uuid.hex(), stays.uuid.hex()], "who answers is looked at anew"
+    assert list(watch._known) == [gone.uuid.hex(), stays.uuid.hex()]
+    gone.at -= 1000.0
+    watch._see_who_left(100.0)
+    assert not watch._roster.seen(gone.uuid.hex()).present
+    assert watch._roster.seen(stays.uuid.hex()).present
+
+
+def test_whoever_makes_up_uuids_fills_no_more_than_the_limit(watch: Watch, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Those that were being looked at when others came in their place stayed present for ever: 1,127 of them."""
+    count, most = 3 * MOST_KNOWN, 0
+
+    def serve(contact: Any) -> None:
+        uuid = contact.identity.uuid.hex()
+        with watch._turns.of(uuid, "it is looked at"):
+            time.sleep(0.001)
+        with watch._guard:
+            watch._pending.discard(uuid)
+
+    monkeypatch.setattr(watch, "_serve", serve)
+    with ThreadPoolExecutor(2) as workers:
+        watch._for_strangers = workers
+        for number in range(count):
+            watch.saw(sighting(number))
+            most = max(most, present(watch))
+            if number % 100 == 0:
+                time.sleep(0.02)  # some are looked at meanwhile
+    assert present(watch) == MOST_KNOWN
+    assert most <= MOST_KNOWN + 2 + 1, "those that are looked at just now, and the newest"
+    assert len(watch._roster._seen) <= MOST_KNOWN + MOST_GONE + 3
+
+
+def test_what_was_looked_at_while_others_took_its_place_leaves(watch: Watch, monkeypatch: pytest.MonkeyPatch) -> None:
+    one = sighting(7)
+
+    def serve(contact: Any) -> None:
+        with watch._turns.of(one.uuid.hex(), "it is looked at"):
+            watch._gone(one.uuid.hex())
+        watch._roster.note(one.uuid.hex(), "problem")
+
+    monkeypatch.setattr(watch, "_serve", serve)
+    watch._for_strangers = SimpleNamespace(submit=lambda work, contact: work(contact))  # type: ignore[assignment]
+    watch.saw(one)
+    assert present(watch) == 0
