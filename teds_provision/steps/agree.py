@@ -378,6 +378,11 @@ def _agree_anew(
     node.forget()
     node.open(agreed.key)
     identity = read_identity(node)
+    if identity.epoch != agreed.epoch:  # a datasheet for the one would never fit the other
+        raise NotAuthentic(
+            f"The node offered key epoch {agreed.epoch} and says {identity.epoch} in its session.",
+            hint="Its firmware counts epochs wrongly: node check names the rule.",
+        )
     with station.durable("agree", more_follows=True):
         station.keys.promote(uuid, key_id)
         station.nodes.remember(
