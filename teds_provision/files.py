@@ -143,7 +143,7 @@ def read_limited(
     BadData (larger than any ``what``).
     """
     with _told(path, failure):
-        octets = _read(os.open(path, os.O_RDONLY | os.O_CLOEXEC | (0 if follow else os.O_NOFOLLOW)), max_octets + 1)
+        octets = _read(_opened(path, 0 if follow else os.O_NOFOLLOW), max_octets + 1)
     if len(octets) > max_octets:
         raise BadData(f"{path} is larger than {max_octets} octets: that is no {what}.")
     return octets
@@ -162,7 +162,35 @@ def read_text(path: Path, max_octets: int, what: str, *, failure: type[TedsProvi
 def open_to_read(path: Path) -> BinaryIO:
     """Open a file to read from; raises NotFound where it is not there or cannot be read."""
     with _told(path, NotFound):
-        return open(os.open(path, os.O_RDONLY | os.O_CLOEXEC), "rb")
+        return open(_opened(path), "rb")
+
+
+def _opened(path: Path, flags: int = 0) -> int:
+    """Open what is read to its end; raises OSError, NotFound for a named pipe.
+
+    Whoever opens a pipe that nobody writes to waits for ever. The pipe of a shell's ``<(command)`` has no name but that
+    of its descriptor, and somebody writes to it.
+    """
+    descriptor = os.open(path, os.O_RDONLY | os.O_CLOEXEC | os.O_NONBLOCK | flags)
+    mode = os.fstat(descriptor).st_mode
+    if stat.S_ISREG(mode):
+        return descriptor
+    if stat.S_ISFIFO(mode) and _is_named(path):
+        os.close(descriptor)
+        raise NotFound(f"{path} is a pipe, not a file.")
+    os.set_blocking(descriptor, True)
+    return descriptor
+
+
+def require_no_pipe(path: Path) -> None:
+    """Raise NotFound where a named pipe lies, before somebody else's code opens it and waits."""
+    with suppress(OSError, ValueError):
+        if stat.S_ISFIFO(path.stat().st_mode) and _is_named(path):
+            raise NotFound(f"{path} is a pipe, not a file.")
+
+
+def _is_named(path: Path) -> bool:
+    return not str(path).startswith(("/dev/", "/proc/"))
 
 
 @contextmanager
@@ -196,7 +224,7 @@ def holds(path: Path, octets: bytes) -> bool:
     """Whether a regular file holds exactly these octets; no more of it is read than they are long. Raises OSError."""
     if not path.is_file():
         return False
-    with path.open("rb") as file:
+    with open_to_read(path) as file:
         return file.read(len(octets) + 1) == octets
 
 

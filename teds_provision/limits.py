@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import json
 import re
+import tomllib
 from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import cache
@@ -123,6 +124,17 @@ def check_toml(text: str, file: str) -> None:
             raise BadData(f"{file}:{plain.count(chr(10), 0, found.start()) + 1}: {why}.")
     if keys > LIMITS.toml_keys:
         raise BadData(f"{file}: there are {keys} keys; at most {LIMITS.toml_keys} are read.")
+
+
+def load_toml(text: str, file: str) -> dict[str, Any]:
+    """TOML that a stranger wrote, bounded in size, keys, depth and digits; raises BadData, ``file`` before it."""
+    check_toml(text, file)
+    try:
+        data = tomllib.loads(text)
+    except (ValueError, RecursionError) as error:  # a ValueError that is no TOMLDecodeError: an integer of 4,301 digits
+        raise BadData(f"{file} is not valid TOML: {error}.") from error
+    check_depth(data, LIMITS.toml_depth, file)
+    return data
 
 
 def check_xml(text: bytes, what: str) -> None:

@@ -22,6 +22,7 @@ from teds_provision.backup import version_1
 from teds_provision.backup.chunks import KEY_OCTETS, ChunkReader, ChunkWriter
 from teds_provision.backup.content import MAX_HEAD_OCTETS, Content, Head, check_digest, context_of, digest_of
 from teds_provision.errors import BadData, NotAuthentic, NotFound, PolicyRefused
+from teds_provision.files import open_to_read
 from teds_provision.protocol.handover import jose
 from teds_provision.protocol.handover.strict_json import dump, load_object
 from teds_provision.protocol.keys import SIGNATURE_OCTETS, PrivateKey, fingerprint, verify
@@ -80,7 +81,7 @@ class SealedFile:
         self.path = path
         try:
             self.octets = path.stat().st_size
-            with path.open("rb") as file:
+            with open_to_read(path) as file:
                 line = file.readline(_MAX_LINE_OCTETS)
         except OSError as error:
             raise NotFound(f"{path} cannot be read: {error.strerror}.") from error
@@ -125,7 +126,7 @@ class SealedFile:
         if len(key) != KEY_OCTETS:
             raise BadData("The backup's own key has another length than 32 octets.")
         try:
-            with self.path.open("rb") as file:
+            with open_to_read(self.path) as file:
                 file.seek(len(self._line))
                 return _content(ChunkReader(file, key, bound), bound, clear)
         except OSError as error:

@@ -16,13 +16,15 @@ from typing import Any, Final
 
 from teds_provision.backup.content import MAX_HEAD_OCTETS, Head, check_digest, context_of
 from teds_provision.errors import BadData, NotAuthentic, NotFound, PolicyRefused
+from teds_provision.files import open_to_read
 from teds_provision.protocol.handover import jose
-from teds_provision.protocol.handover.strict_json import decode_base64url, load_object
+from teds_provision.protocol.handover.strict_json import decode_base64url, load_object, refuse_many, separators
 from teds_provision.protocol.keys import PrivateKey, fingerprint
 from teds_provision.vault import passphrase as sealing
 
 FORMAT: Final = "teds-backup/1"
 MAX_OCTETS: Final = 512 * 1024 * 1024
+_MOST_MEMBERS: Final = 1000
 TYP: Final = "teds-backup+jws"
 
 
@@ -36,7 +38,7 @@ class Content(Head):
 def read(path: Path) -> bytes:
     """Read a file that should be a backup, and not endlessly; raises NotFound, BadData."""
     try:
-        with path.open("rb") as file:
+        with open_to_read(path) as file:
             head = file.read(64)
             _check_start(head)
             octets = head + file.read(MAX_OCTETS)
@@ -102,6 +104,8 @@ def _document(octets: bytes) -> dict[str, Any]:
     if len(octets) > MAX_OCTETS:
         raise BadData(f"The file is larger than {MAX_OCTETS} octets; no backup is.")
     _check_start(octets[:64])
+    # nearly all of a backup is one text of base64url; anything else is refused before it costs 25 times what it is
+    refuse_many(separators(octets), _MOST_MEMBERS, "a backup")
     return load_object(octets, "The backup")
 
 

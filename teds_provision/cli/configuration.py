@@ -6,28 +6,32 @@ table in it a command of that group. The names are those of the command line, wi
 
 from __future__ import annotations
 
+import os
 import re
 from collections.abc import Iterator
 from typing import TYPE_CHECKING, Any, Final
 
 from teds_provision.cli.option_names import OPTIONS
 from teds_provision.cli.table import COMMANDS, GROUPS
-from teds_provision.errors import BadData
+from teds_provision.errors import BadData, NotFound
 from teds_provision.lazy import late
 
 if TYPE_CHECKING:
     import difflib
-    import tomllib
     from pathlib import Path
+
+    from teds_provision import files, limits
 else:
-    difflib, tomllib = late("difflib"), late("tomllib")  # for a file that is there
+    difflib, files, limits = late("difflib"), late("teds_provision.files"), late("teds_provision.limits")  # where it is
 
 PARAMETERS: Final = {"json": "as_json", "format": "form", "to": "receivers", "all": "everything"}
 """Options that the code calls otherwise than the command line does."""
 NEVER_IN_FILE: Final = frozenset({"home", "help", "version", "passphrase-fd"})
 BROKERS: Final = "ncap brokers"
 """A table of names and URLs, not of options."""
-_MOST_OCTETS: Final = 1 << 20
+_LONGEST: Final = 40
+"""More of a name is not shown."""
+_MEND: Final = "Mend or remove the file."
 
 
 class Defaults(dict[str, Any]):
@@ -79,25 +83,25 @@ def config_path(home: Path | None) -> Path:
     return home_of(home) / "config.toml"
 
 
+def read_config_text(path: Path) -> str | None:
+    """Return the text of the file, None where there is none; raises BadData."""
+    if not os.path.lexists(path):  # or a home that cannot be one: whoever opens it says so
+        return None
+    try:
+        return files.read_text(path, limits.LIMITS.text_file, "config.toml", failure=BadData)
+    except (BadData, NotFound) as error:
+        raise BadData(error.message, hint=error.hint or _MEND) from error
+
+
 def read_config(path: Path) -> dict[str, Any] | None:
     """Return what the file says, None where there is none; raises BadData with the line of what is wrong."""
-    try:
-        with path.open("rb") as file:
-            octets = file.read(_MOST_OCTETS + 1)
-    except (FileNotFoundError, NotADirectoryError):  # a home that cannot be one: whoever opens it says so
+    text = read_config_text(path)
+    if text is None:
         return None
-    except OSError as error:
-        raise BadData(f"{path} cannot be read: {error.strerror}.", hint="Check its owner and mode.") from error
-    if len(octets) > _MOST_OCTETS:
-        raise BadData(f"{path} has more than 1 MiB.", hint="Mend or remove the file.")
     try:
-        text = octets.decode("utf-8-sig")  # some editors put a mark in front
-        values = tomllib.loads(text)
-    except UnicodeDecodeError as error:
-        why = f"{path} is not valid TOML: it is no UTF-8 text."
-        raise BadData(why, hint="Mend or remove the file.") from error
-    except (tomllib.TOMLDecodeError, RecursionError) as error:
-        raise BadData(f"{path} is not valid TOML: {error}.", hint="Mend or remove the file.") from error
+        values = limits.load_toml(text, str(path))
+    except BadData as error:
+        raise BadData(error.message, hint=_MEND) from error
     for problem in problems(values, text):
         raise BadData(f"{path}, {problem}", hint="teds-provision config show lists what there is.")
     return values
@@ -112,9 +116,9 @@ def problems(values: dict[str, Any], text: str) -> Iterator[str]:
             if plain in COMMANDS:
                 yield from _problems_of_command(plain, value, text)
             else:
-                yield f"{_line(text, name)}: there is no command {name!r}.{_near(plain, COMMANDS)}"
+                yield f"{_line(text, name)}: there is no command {name[:_LONGEST]!r}.{_near(plain, COMMANDS)}"
         elif plain not in anywhere:
-            yield f"{_line(text, name)}: no command has an option --{plain}.{_near(plain, anywhere)}"
+            yield f"{_line(text, name)}: no command has an option --{plain[:_LONGEST]}.{_near(plain, anywhere)}"
 
 
 def _problems_of_command(command: str, values: dict[str, Any], text: str) -> Iterator[str]:
@@ -127,9 +131,10 @@ def _problems_of_command(command: str, values: dict[str, Any], text: str) -> Ite
             elif inner in OPTIONS:
                 yield from _problems_of_command(inner, value, text)
             else:
-                yield f"{_line(text, name)}: there is no command {inner!r}."
+                yield f"{_line(text, name)}: there is no command {inner[:_LONGEST]!r}."
         elif plain in NEVER_IN_FILE or plain not in _options_below(command):
-            yield f"{_line(text, name)}: {command} has no option --{plain}.{_near(plain, _options_below(command))}"
+            near = _near(plain, _options_below(command))
+            yield f"{_line(text, name)}: {command} has no option --{plain[:_LONGEST]}.{near}"
 
 
 def _problems_of_brokers(values: dict[str, Any], text: str) -> Iterator[str]:
@@ -150,7 +155,7 @@ def _options_below(command: str) -> set[str]:
 
 
 def _near(name: str, known: Any) -> str:
-    near = difflib.get_close_matches(name, list(known), n=1)
+    near = difflib.get_close_matches(name[:_LONGEST], list(known), n=1)
     return f" Did you mean {near[0]!r}?" if near else ""
 
 

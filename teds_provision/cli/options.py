@@ -14,6 +14,7 @@ import click
 from teds_provision.cli.context import App
 from teds_provision.cli.tracing import tracing
 from teds_provision.errors import NotFound
+from teds_provision.files import require_no_pipe
 from teds_provision.lazy import late
 from teds_provision.links import LINKS, LinkSettings
 from teds_provision.links.ports import LISTEN_SECONDS
@@ -93,6 +94,7 @@ class FileToRead(click.Path):
             raise NotFound(f"{os.fsdecode(path)} is a folder, not a file.")
         if self._must_exist and not os.path.exists(path):
             raise NotFound(f"There is no file {os.fsdecode(path)}.")
+        require_no_pipe(Path(os.fsdecode(path)))
         return path
 
 

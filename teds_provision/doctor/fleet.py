@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-import tomllib
 from collections.abc import Iterator
 from datetime import UTC, datetime
 from typing import Any, Final
 
 from teds_provision import teds
 from teds_provision.doctor.registry import Finding, Place, check
-from teds_provision.errors import StoreChanged, StoreFailure, VaultFailure
+from teds_provision.errors import BadData, NotFound, StoreChanged, StoreFailure, VaultFailure
+from teds_provision.files import read_text
+from teds_provision.limits import LIMITS, load_toml
 from teds_provision.station.station import Station
 from teds_provision.store import Store
 from teds_provision.store.home import has_store
@@ -25,15 +26,9 @@ def config(place: Place) -> Iterator[Finding]:
         yield Finding("config", "skipped", "There is no config.toml.")
         return
     try:
-        values = tomllib.loads(path.read_text(encoding="utf-8-sig"))
-    except UnicodeDecodeError:
-        yield Finding("config", "failed", f"{path} is not valid TOML: it is no UTF-8 text.", "Mend or remove the file.")
-        return
-    except tomllib.TOMLDecodeError as error:
-        yield Finding("config", "failed", f"{path} is not valid TOML: {error}.", "Mend or remove the file.")
-        return
-    except OSError as error:
-        yield Finding("config", "failed", f"{path} cannot be read: {error.strerror}.", "Check its owner and mode.")
+        values = load_toml(read_text(path, LIMITS.text_file, "config.toml"), str(path))
+    except (BadData, NotFound) as error:
+        yield Finding("config", "failed", error.message, error.hint or "Mend or remove the file.")
         return
     unknown = list(_unknown(values, place))
     if unknown:

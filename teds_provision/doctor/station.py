@@ -13,7 +13,8 @@ from typing import Final
 
 from teds_provision import vault as vault_room
 from teds_provision.doctor.registry import Finding, Place, check
-from teds_provision.errors import NoKeyring, StoreFailure, VaultFailure
+from teds_provision.errors import NoKeyring, NotFound, StoreFailure, VaultFailure
+from teds_provision.files import open_to_read
 from teds_provision.store import Choice, Store
 from teds_provision.store.home import has_store
 from teds_provision.store.lock import holder_of
@@ -222,9 +223,9 @@ def keys_folder(place: Place) -> Iterator[Finding]:
 def holds_private_key(path: Path) -> bool:
     """Say whether a file holds a private key in PEM, a private JWK, or a private key of SSH or PKCS #8 in DER."""
     try:
-        with path.open("rb") as file:
+        with open_to_read(path) as file:
             octets = file.read(_MAX_KEY_FILE)
-    except OSError:
+    except (OSError, NotFound):
         return False
     if b"PRIVATE KEY" in octets or b"PuTTY-User-Key-File" in octets:
         return True

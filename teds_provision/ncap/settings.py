@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import ipaddress
+import ssl
 import zlib
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Final, Literal
 
-from teds_provision.errors import UsageFailure
+from teds_provision.errors import BadData, UsageFailure
+from teds_provision.files import read_limited
 from teds_provision.links import Trace
 from teds_provision.measure.trusting import DEAD_MAN
 
@@ -17,6 +19,7 @@ Detection = Literal["transparent", "whitelist"]
 _FIRST, _SOURCES = 0xF2, 6
 """Addresses of daemons on a bus, 0xF2 to 0xF7: the command line, which has 0xF1 unless told otherwise, works beside."""
 _LOCAL_NAMES: Final = ("localhost",)
+_MOST_PEM: Final = 1 << 20
 
 
 @dataclass(frozen=True)
@@ -77,10 +80,30 @@ def is_loopback(host: str) -> bool:
         return host.lower() in _LOCAL_NAMES
 
 
+def _require_pair(certificate: Path, key: Path) -> None:
+    """Raise BadData where OpenSSL cannot serve with these two files; an encrypted key is not asked for."""
+
+    def no_passphrase() -> str:
+        raise BadData(f"{key} is encrypted.", hint="A service starts without a person: decrypt it, mode 0600.")
+
+    for path in (certificate, key):
+        if len(read_limited(path, _MOST_PEM, "PEM file")) == 0:
+            raise BadData(f"{path} is empty.")
+    try:
+        ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER).load_cert_chain(certificate, key, no_passphrase)
+    except (ssl.SSLError, OSError) as error:
+        raise BadData(
+            f"{certificate} and {key} are no certificate with its key: {getattr(error, 'reason', None) or error}.",
+            hint="Both are PEM; the certificate comes first in its file.",
+        ) from error
+
+
 def require_safe(settings: Settings) -> None:
     """Raise UsageFailure where the page would go to other machines without TLS, or with half of it."""
     if (settings.certificate is None) != (settings.key is None):
         raise UsageFailure("--tls-cert and --tls-key belong together.", hint="Give both, or neither.")
+    if settings.certificate is not None and settings.key is not None:
+        _require_pair(settings.certificate, settings.key)
     if settings.http is None or is_loopback(settings.http[0]):
         return
     if settings.certificate is None:

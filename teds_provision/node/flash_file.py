@@ -12,7 +12,8 @@ from pathlib import Path
 from typing import Any
 
 from teds_provision.errors import BadData, NotFound, StoreFailure, StoreLocked, UsageFailure
-from teds_provision.files import whole_file
+from teds_provision.files import read_limited, whole_file
+from teds_provision.limits import load_json
 from teds_provision.protocol.announce import default_can_address
 from teds_provision.protocol.flash import Flash, FlashFailure, in_factory_state
 from teds_provision.protocol.keys import SoftwareKey, node_key_message
@@ -22,6 +23,7 @@ from teds_provision.teds.image import BlockId
 FORMAT = "teds-virtual-node/3"
 _OLDER = ("teds-virtual-node/1", "teds-virtual-node/2")
 FILE = "flash.json"
+_MOST_OCTETS = 64 << 20
 
 
 class FlashFile:
@@ -140,15 +142,17 @@ class FlashFile:
 
     def _read(self) -> dict[str, Any]:
         try:
-            document = json.loads(self.path.read_text(encoding="utf-8"))
-        except FileNotFoundError:
+            octets = read_limited(self.path, _MOST_OCTETS, "flash", failure=StoreFailure)
+        except NotFound:
+            if self.path.exists():
+                raise
             raise NotFound(
                 f"There is no virtual node in {self.path.parent}.",
                 hint=f"Make one: teds-provision node create {self.path.parent}",
             ) from None
-        except OSError as error:
-            raise _unusable(self.path.parent, error) from error
-        except ValueError as error:
+        try:
+            document = load_json(octets, "the flash", octets=_MOST_OCTETS)
+        except BadData as error:
             raise BadData(f"{self.path} is not a virtual node's flash.") from error
         try:
             document = _migrated(document)

@@ -17,7 +17,7 @@ from typing import Any, Final
 
 from teds_provision.errors import BadData
 from teds_provision.files import read_text
-from teds_provision.limits import load_json
+from teds_provision.limits import check_count, load_json
 from teds_provision.protocol.fingerprints import read_fingerprint, same_key
 from teds_provision.store.records import UUID_OCTETS
 
@@ -30,7 +30,8 @@ _SHOWN_MISTAKES = 10
 _MAX_NAME = 200
 _MAX_DEPTH = 16
 _MAX_TAG = 65_536
-_LONG_TAG = re.compile(f"[^<]{{{_MAX_TAG}}}")
+_MOST_TAGS = 12 * MAX_ENTRIES  # an entry of five elements with their ends, and what stands around it
+_MOST_LINES = 4 * MAX_ENTRIES
 _UUID_DIGITS = 2 * UUID_OCTETS
 _NAME_RULE = f"a name is printable and has at most {_MAX_NAME} characters"
 _ENTRY_ELEMENTS = frozenset({"transducer", "tim", "node", "entry", "item", "device", "uuid"})
@@ -193,10 +194,8 @@ def _read_xml(text: str, reading: _Reading) -> None:
             element = self.open.pop()
             _close_element(element, self.open[-1] if self.open else None, reading)
 
-    long = _LONG_TAG.search(text)  # a million attributes of one element would be held in memory all at once
-    if long is not None:
-        line = text.count("\n", 0, long.start()) + 1
-        raise BadData(f"{reading.file}:{line}: a tag or text of more than {_MAX_TAG} characters.")
+    check_count(text.count("<"), _MOST_TAGS, f"tags in {reading.file}")
+    _refuse_long(text, "<", reading.file, "a tag or text")  # a million attributes would all be held in memory at once
     parser = DefusedExpatParser(forbid_dtd=True)
     handler = Handler()
     parser.setContentHandler(handler)
@@ -210,6 +209,17 @@ def _read_xml(text: str, reading: _Reading) -> None:
         raise BadData(f"{reading.file}:{error.getLineNumber()}: this is not XML: {error.getMessage()}.") from error
     except SAXException as error:
         raise BadData(f"{reading.file}: this is not XML: {error.getMessage()}.") from error
+
+
+def _refuse_long(text: str, separator: str, file: str, what: str) -> None:
+    """Raise BadData where two separators are too far apart; linear in the text, which no regex of a count is."""
+    at = 0
+    while at < len(text):
+        end = text.find(separator, at, at + _MAX_TAG)
+        if end < 0 and at + _MAX_TAG <= len(text):
+            line = text.count("\n", 0, at) + 1
+            raise BadData(f"{file}:{line}: {what} of more than {_MAX_TAG} characters.")
+        at = end + 1 if end >= 0 else len(text)
 
 
 def _local(name: str) -> str:
@@ -284,7 +294,7 @@ def _parts(text: str) -> list[str]:
 
 
 def _read_csv(text: str, reading: _Reading) -> None:
-    rows = csv.reader(io.StringIO(text, newline=""), delimiter=_delimiter(text), strict=True)
+    rows = csv.reader(io.StringIO(text, newline=""), delimiter=_delimiter(text, reading.file), strict=True)
     columns: list[str] | None = None
     try:
         for row in rows:
@@ -303,8 +313,10 @@ def _read_csv(text: str, reading: _Reading) -> None:
         raise BadData(f"{reading.file}:{rows.line_num}: this is not CSV: {error}.") from error
 
 
-def _delimiter(text: str) -> str:
-    first = next((line for line in text.splitlines() if line.strip() and not line.startswith("#")), "")
+def _delimiter(text: str, file: str) -> str:
+    check_count(text.count("\n"), _MOST_LINES, f"lines in {file}")
+    _refuse_long(text, "\n", file, "a line")
+    first = next((line for line in text[:_MAX_TAG].splitlines() if line.strip() and not line.startswith("#")), "")
     return max(",;\t", key=first.count)
 
 

@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import math
 import re
-import tomllib
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from datetime import datetime
@@ -18,7 +17,7 @@ from difflib import get_close_matches
 from typing import Final, Literal
 
 from teds_provision.errors import BadData
-from teds_provision.limits import LIMITS, check_size, check_toml
+from teds_provision.limits import LIMITS, check_size, load_toml
 from teds_provision.teds.channel import ROUNDING
 from teds_provision.teds.codec.model import Units
 from teds_provision.teds.sheet import Channel, Sheet
@@ -139,11 +138,7 @@ def parse_require(text: str, file: str) -> tuple[Requirement, ...]:
 
     ``[angle]`` with ``range = ">= 360 deg"``, ``uncertainty = "<= 1 deg"``, ``rate = ">= 1 kHz"``.
     """
-    check_toml(text, file)
-    try:
-        data = tomllib.loads(text)
-    except (tomllib.TOMLDecodeError, RecursionError, ValueError) as error:
-        raise BadData(f"{file}: this is no TOML: {error}.") from error
+    data = load_toml(text, file)
     if not data:
         raise BadData(f"{file}: it asks for nothing.", hint='Write a table such as [angle] with range = ">= 360 deg".')
     return tuple(_table(name, table, file) for name, table in data.items())

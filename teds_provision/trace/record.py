@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import json
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -78,14 +79,13 @@ def is_lines(octets: bytes) -> bool:
 
 def read_lines(octets: bytes) -> Iterator[Record]:
     """Every record; a last line that was cut short is left out. Raises BadData with the line's number."""
-    rows = octets.split(b"\n")
-    for number, row in enumerate(rows[1:], 2):
-        if not row.strip():
+    for number, row in enumerate(io.BytesIO(octets), 1):
+        if number == 1 or not row.strip():
             continue
         try:
             yield _record(json.loads(row))
-        except (ValueError, KeyError, TypeError) as error:
-            if number == len(rows):
+        except (ValueError, KeyError, TypeError, RecursionError) as error:
+            if not row.endswith(b"\n"):
                 return
             raise BadData(f"Line {number} of the trace is no record: {error}.") from error
 

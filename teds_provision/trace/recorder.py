@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Final
 
 from teds_provision.errors import BadData, NotFound, StoreFailure
-from teds_provision.files import PRIVATE, read_limited, require_new
+from teds_provision.files import PRIVATE, open_to_read, require_new
 from teds_provision.links.ports import Direction
 from teds_provision.trace import pcapng
 from teds_provision.trace import record as line_form
@@ -111,13 +111,18 @@ class Recorder:
 # Reading a trace, in either form; a capture of CAN frames by another program is read as well.
 
 _MOST_OCTETS: Final = 1 << 30
+_HEAD_OCTETS: Final = 64
 
 
 def read_trace(path: Path) -> Iterator[Record]:
     """Every record of a file. Raises NotFound, and BadData where it is no trace (told before the first record)."""
-    octets = read_limited(path, _MOST_OCTETS, "trace")
-    if is_lines(octets):
-        return read_lines(octets)
-    if is_pcapng(octets):
-        return read_pcapng(octets)
+    with open_to_read(path) as file:
+        octets = file.read(_HEAD_OCTETS)
+        reading = read_lines if is_lines(octets) else read_pcapng if is_pcapng(octets) else None
+        if reading is not None:
+            octets += file.read(_MOST_OCTETS)
+    if len(octets) > _MOST_OCTETS:
+        raise BadData(f"{path} is larger than {_MOST_OCTETS} octets: that is no trace.")
+    if reading is not None:
+        return reading(octets)
     raise BadData(f"{path} is no trace.", hint="Traces are what --trace FILE wrote, or pcapng with CAN frames.")

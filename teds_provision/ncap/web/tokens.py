@@ -21,13 +21,14 @@ from pathlib import Path
 from typing import Any, Final, Literal
 
 from teds_provision.errors import NotFound, StoreFailure, UsageFailure
-from teds_provision.files import write_whole
+from teds_provision.files import read_limited, write_whole
 
 FILE: Final = "ncap-tokens.json"
 BROWSER_SECONDS: Final = 30 * 86_400.0
 LOGIN_SECONDS: Final = 300.0
 _MOST_BROWSERS: Final = 100
 _LONGEST_NAME: Final = 64
+_MOST_OCTETS: Final = 4 << 20
 
 
 @dataclass(frozen=True)
@@ -138,7 +139,10 @@ class Tokens:
                 return []
             stamp = status.st_mtime_ns, status.st_ino
             if stamp != self._stamp:
-                self._known, self._stamp = _parsed(path.read_bytes()), stamp
+                self._known, self._stamp = (
+                    _parsed(read_limited(path, _MOST_OCTETS, "tokens", failure=StoreFailure)),
+                    stamp,
+                )
             return self._known
 
     @contextmanager
@@ -159,7 +163,7 @@ def _parsed(octets: bytes) -> list[Token]:
     try:
         rows: list[dict[str, Any]] = json.loads(octets)["tokens"]
         return [Token(**row) for row in rows]
-    except (ValueError, KeyError, TypeError) as error:
+    except (ValueError, KeyError, TypeError, RecursionError) as error:
         raise StoreFailure(
             f"{FILE} cannot be read: nobody is let in.", hint="Remove it, and make new tokens: ncap token add NAME"
         ) from error

@@ -7,8 +7,8 @@ import secrets
 from pathlib import Path
 from typing import Final
 
-from teds_provision.errors import StoreFailure
-from teds_provision.files import whole_file
+from teds_provision.errors import StoreFailure, TedsProvisionError
+from teds_provision.files import read_limited, whole_file
 from teds_provision.links.hints import BleAddress
 
 FILE: Final = "ble.json"
@@ -60,9 +60,9 @@ class StaticAddress:
     def _read(self) -> tuple[bytes, bool]:
         """What the file says; no address where there is none, or none that can be read."""
         try:
-            said = json.loads(self._path.read_bytes())
+            said = json.loads(read_limited(self._path, 4096, "address"))
             octets = bytes.fromhex(said["address"])
-        except (OSError, ValueError, LookupError, TypeError):
+        except (TedsProvisionError, ValueError, LookupError, TypeError, RecursionError):
             return b"", False
         good = len(octets) == _OCTETS and octets[0] & _STATIC == _STATIC
         return (octets, bool(said.get("keyed"))) if good else (b"", False)

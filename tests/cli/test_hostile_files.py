@@ -1,0 +1,176 @@
+"""Files that are none of what a command wants, made to cost much: refused in words, within 10 s and 400 MB."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import threading
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+
+from tests.bench import PASSPHRASE
+from tests.places import free_bus
+
+from .shell import PROGRAM, ROOT, call, clean_environment
+from .test_files_named import READ, UUID, desk, words  # noqa: F401  (desk is a fixture)
+
+SECONDS, MEGABYTES = 10, 400
+MORE = ("CONFIG", "CONFIG doctor", "FLASH", "node run node --source file:")
+"""config.toml, the flash of a virtual node, and files that are named within an option."""
+READERS = (
+    *READ, *MORE, "ncap run --http 127.0.0.1:0 --tls-key /etc/hostname --tls-cert", "whitelist import --format xml",
+    "whitelist import --format csv", "whitelist import --format json", "build UUID --profile",
+)  # fmt: skip
+SMALL: dict[str, Callable[[], bytes]] = {
+    "dots": lambda: b"a" + b".a" * 150_000 + b" = 1\n",
+    "deep": lambda: b"[" * 300_000,
+    "deep-backup": lambda: b'{"format":"teds-backup/1","a":' + b"[" * 300_000,
+    "deep-trace": lambda: b'{"format": "teds-trace/1"}\n' + b"[" * 300_000 + b"\n",
+    "digits": lambda: b"timeout = " + b"1" * 5000 + b"\n",
+    "digits-json": lambda: b'{"format": "teds-image/1", "uuid": ' + b"1" * 5000 + b"}",
+    "digits-csv": lambda: b"raw,value [degree]\n" + b"1" * 5000 + b",0\n5,9\n",
+}
+LARGE: dict[str, tuple[Callable[[], bytes], tuple[str, ...]]] = {
+    "elements": (
+        lambda: b"<whitelist>" + b"<a/>" * 15_000_000 + b"</whitelist>",
+        ("whitelist import", "show", "restore", "trust ca import", "import-keys"),
+    ),
+    "texts": (lambda: (b"<" + b"a" * 65_000) * 900, ("whitelist import --format xml",)),
+    "objects": (
+        lambda: b'{"format":"teds-backup/1","a":[' + b"{}," * 30_000_000 + b"1]}",
+        ("restore", "import-keys", "show", "verify", "whitelist import --format json"),
+    ),
+    "lines": (lambda: b"\n" * 60_000_000, ("whitelist import --format csv", "provision --batch", "trace show")),
+    "trace": (lambda: b'{"format": "teds-trace/1"}\n' + b"{}\n" * 20_000_000, ("trace show", "show")),
+    "cells": (lambda: b"," * 60_000_000, ("whitelist import --format csv", "provision --batch")),
+}
+
+
+@pytest.fixture
+def bench(desk: Path, tmp_path: Path) -> Path:  # noqa: F811
+    call(desk, "node", "create", tmp_path / "node", "--profile", "load-cell")
+    return desk
+
+
+def arranged(home: Path, command: str, path: Path) -> list[object]:
+    """The words of a command that reads the file, after it was put where only its name counts."""
+    if command.startswith("CONFIG"):
+        (home / "config.toml").unlink(missing_ok=True)
+        (home / "config.toml").symlink_to(path)
+        return [command.partition(" ")[2] or "nodes"]
+    if command == "FLASH":
+        (flash := path.parent / "node" / "flash.json").unlink(missing_ok=True)
+        flash.symlink_to(path)
+        return ["node", "run", "node", "--can", free_bus()]
+    if command.endswith("file:"):
+        os.environ.pop("TEDS_PROVISION_NFC", None)  # the fixture puts back what was there before
+        return [*words(command.removesuffix(" file:")), f"file:{path}", "--can", free_bus()]
+    return [*words(command), path]
+
+
+@pytest.fixture
+def fifo(tmp_path: Path) -> Iterator[Path]:
+    """A pipe; whoever opens it to read gets its end at last, so that a test that fails ends."""
+    path = tmp_path / "pipe"
+    os.mkfifo(path)
+    over = threading.Event()
+
+    def let_go() -> None:
+        while not over.wait(SECONDS):
+            with open(os.open(path, os.O_RDWR | os.O_NONBLOCK), "wb"):
+                pass
+
+    helper = threading.Thread(target=let_go)
+    helper.start()
+    yield path
+    over.set()
+    helper.join()
+
+
+@pytest.mark.parametrize("command", READERS)
+def test_a_pipe_that_nobody_writes_to_is_no_file(bench: Path, command: str, fifo: Path) -> None:
+    """Every one of them waited for ever."""
+    began = time.monotonic()
+    said = call(bench, "--json", *arranged(bench, command, fifo))
+    assert time.monotonic() - began < SECONDS
+    if command == "CONFIG doctor":
+        (check,) = [one for one in said.json["checks"] if one["name"] == "config"]
+        assert (check["result"], "is a pipe" in check["why"]) == ("failed", True)
+        return
+    assert said.code in (3, 7, 8), said.out
+    assert fifo.name in said.json["error"]["message"]
+
+
+def test_what_another_command_writes_is_read_through_its_pipe(home: Path, tmp_path: Path) -> None:
+    """``<(command)`` of a shell: a pipe too, and its name is that of a descriptor."""
+    (tmp_path / "nodes.csv").write_text(f"uuid\n{UUID}\n")
+    line = f'exec "$0" -m teds_provision --home "{home}" whitelist import --format csv --dry-run <(cat nodes.csv)'
+    done = subprocess.run(
+        ["bash", "-c", line, PROGRAM[0]],
+        cwd=tmp_path,
+        env=clean_environment(PYTHONPATH=str(ROOT)),
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert (done.returncode, "1 new" in done.stdout + done.stderr) == (0, True), done
+
+
+@pytest.mark.parametrize("name", SMALL)
+def test_a_small_file_of_the_wrong_kind_is_no_bug(bench: Path, name: str, tmp_path: Path) -> None:
+    """config.toml with an integer of 5,000 digits ended with 1; 300,000 dots took minutes."""
+    path = tmp_path / name
+    path.write_bytes(SMALL[name]())
+    for command in READERS:
+        if command in ("show", "node run node --source file:"):
+            continue  # some of these are hex, or values, for all that they know
+        began = time.monotonic()
+        said = call(bench, "--json", *arranged(bench, command, path))
+        assert said.code not in (0, 1) or command == "CONFIG doctor", (command, said)
+        assert "Traceback" not in said.err
+        assert time.monotonic() - began < SECONDS, command
+        (bench / "config.toml").unlink(missing_ok=True)
+
+
+@pytest.mark.parametrize(
+    ("name", "command"), [(name, command) for name, (_, all_) in LARGE.items() for command in all_]
+)
+def test_a_large_file_of_the_wrong_kind_costs_little(bench: Path, name: str, command: str, tmp_path: Path) -> None:
+    """90 MB of JSON as a backup took 2.3 GB, 60 MB of XML elements a minute."""
+    path = tmp_path / name
+    path.write_bytes(LARGE[name][0]())
+    code, seconds, megabytes, said = measured(bench, *arranged(bench, command, path))
+    assert code not in (0, 1), said
+    assert seconds < SECONDS
+    assert megabytes < MEGABYTES
+
+
+@pytest.mark.parametrize(
+    "command", ["show", "trace show", "restore", "whitelist import", "verify", "provision --batch"]
+)
+def test_a_device_that_never_ends_is_no_file_either(bench: Path, command: str) -> None:
+    """``trace show /dev/zero`` took 2 GB."""
+    code, seconds, megabytes, said = measured(bench, *arranged(bench, command, Path("/dev/zero")))
+    assert (code in (3, 8), seconds < SECONDS, megabytes < MEGABYTES) == (True, True, True), (said, seconds, megabytes)
+
+
+def measured(home: Path, *command: object) -> tuple[int, float, float, str]:
+    """How a command ended in a process of its own: exit code, seconds of processor, megabytes at most, stdout."""
+    read, write = os.pipe()
+    os.write(write, PASSPHRASE.encode() + b"\n")
+    os.close(write)
+    line = [*PROGRAM, "--home", home, "--json", "--passphrase-fd", read, *command]
+    process = subprocess.Popen(
+        list(map(str, line)), stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, pass_fds=[read],
+        env=clean_environment(PYTHONPATH=str(ROOT)),
+    )  # fmt: skip
+    os.close(read)
+    assert process.stdout is not None
+    said = process.stdout.read().decode()
+    process.stdout.close()
+    _, status, used = os.wait4(process.pid, 0)
+    process.returncode = os.waitstatus_to_exitcode(status)
+    return process.returncode, used.ru_utime + used.ru_stime, used.ru_maxrss / 1024, said
