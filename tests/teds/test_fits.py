@@ -147,7 +147,7 @@ def test_a_sheet_of_requirements_names_quantities_and_channels() -> None:
         ("[angle]\nwidth = '3 deg'", 'no bound "width"'),
         ("[angle]\nrange = 3", "is a text"),
         ("[angle]\nrange = '3 N'", "does not measure this"),
-        ("[angle", "no TOML"),
+        ("[angle", "task.toml is not valid TOML"),
         ("a." * 40 + "a = 1", "more than 32 parts"),
     ],
 )
