@@ -15,7 +15,8 @@ class Act:
 
     ``ends`` are the exit codes with which carrying on may end. ``proof`` is the station that must then have the node
     in its hands (none: the command gives it away), ``verdicts`` the exit codes of ``verify`` that count: 0 authentic,
-    4 for a node without a datasheet; 5 and 6 mean a lost key.
+    4 for a node without a datasheet; 5 and 6 mean a lost key. ``until`` is what a command that goes on says when it has
+    done its work: then it gets SIGTERM. ``cuts_node``: the node is cut too, not only the station.
     """
 
     name: str
@@ -26,9 +27,12 @@ class Act:
     ends: tuple[int, ...] = (0,)
     proof: str = "home"
     verdicts: tuple[int, ...] = (0,)
+    until: str = ""
+    cuts_node: bool = True
 
 
 NO_SHEET = (0, 4)
+TAKEN_UP = '"verified"'
 ACTS = (
     Act("whitelist add", "new", ("whitelist", "add", "{UUID}"), node=False, proof=""),
     Act("identify", "new", ("identify", "--add", "TAP"), proof=""),
@@ -71,10 +75,31 @@ ACTS = (
     Act("revoke", "provisioned", ("revoke", "{UUID}", "--why", "lost", "--yes"), node=False, proof=""),
     Act("rewrap", "provisioned", ("vault", "rewrap", "--yes"), node=False),
     Act("decommission", "provisioned", ("decommission", "{UUID}", "--yes", "LINK"), proof=""),
+    Act("batch", "new", ("provision", "--batch", "{FILES}/sheet.csv", "--report", "{FILES}/report.csv", "TAP")),
+    Act("group", "provisioned", ("group", "create", "hand", "{UUID}"), node=False, ends=(0, 2)),
+    Act("group add", "grouped", ("group", "add", "hand", "{UUID}"), node=False),
+    Act("names", "provisioned", ("names", "set", "{UUID}", "1", "crane/slew"), node=False),
+    Act("lift", "revoked", ("revoke", "--lift", "{UUID}", "--yes"), node=False, ends=(0, 3), proof=""),
+    Act(
+        "merge",
+        "behind",
+        ("restore", "{FILES}/backup", "--backup-passphrase-fd", "{FD}", "--yes"),
+        node=False,
+    ),
+    Act("passphrase", "provisioned", ("vault", "passphrase", "--new-passphrase-fd", "{FD}"), node=False),
+    Act(
+        "trust ca",
+        "asked",
+        ("trust", "ca", "sign", "{FILES}/lab.request", "--output", "{FILES}/lab.cert", "--yes"),
+        node=False,
+    ),
+    Act("measure", "measured", ("measure", "hand", "--duration", "0.5", "--to", "{FILES}/run.csv", "LINK")),
+    Act("ncap run", "measured", ("ncap", "run", "--record", "{FILES}/runs", "BUS"), until=TAKEN_UP, cuts_node=False),
 )
+"""Every command that changes what lies on a disk or in a node."""
 
 NEXT: dict[str, tuple[str, tuple[tuple[str, tuple[str, ...]], ...]]] = {
-    # state: (from which, ((station, words), ...)); "new" is made by hand
+    # state: (from which, ((station, words), ...)); "new" and "sensor" (which can be measured) are made by hand
     "listed": ("new", (("home", ("whitelist", "add", "{UUID}")),)),
     "keyed": ("listed", (("home", ("agree", "{UUID}", "TAP")),)),
     "built": ("keyed", (("home", ("build", "{UUID}", "--profile", ANGLE)),)),
@@ -94,6 +119,20 @@ NEXT: dict[str, tuple[str, tuple[tuple[str, tuple[str, ...]], ...]]] = {
     "imported": (
         "bundled",
         (("other", ("import-keys", "{FILES}/bundle.jwe", "--yes", "--receipt", "{FILES}/receipt.jws", "TAP")),),
+    ),
+    "measured": (
+        "sensor",
+        (
+            ("home", ("provision", "--profile", ANGLE, "--yes", "TAP")),
+            ("home", ("group", "create", "hand", "{UUID}")),
+        ),
+    ),
+    "grouped": ("provisioned", (("home", ("group", "create", "hand", "{UUID}")),)),
+    "revoked": ("provisioned", (("home", ("revoke", "{UUID}", "--why", "lost", "--yes")),)),
+    "behind": ("backed up", (("home", ("whitelist", "remove", "{UUID}", "--yes")),)),
+    "asked": (
+        "provisioned",
+        (("lab", ("init", "--name", "lab", "--keystore", "file", "--request", "{FILES}/lab.request")),),
     ),
     "backed up": ("provisioned", (("home", ("backup", "{FILES}/backup", "--backup-passphrase-fd", "{FD}", "--yes")),)),
 }

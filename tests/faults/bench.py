@@ -47,7 +47,7 @@ def trials_of(bench: Bench, act: Act, share: random.Random, *, full: bool) -> li
     """All trials of one command."""
     station = [*cuts_of(bench.count(act)), *errors_of(bench.count(act, "EIO"), share, full=full)]
     node: list[Fault] = []
-    if act.node:
+    if act.node and act.cuts_node:
         node = [*cuts_of(bench.node_count(act)), *errors_of(bench.node_count(act, "EIO"), share, full=full)]
     return [Trial(act, fault, on_node=False) for fault in station] + [Trial(act, fault, on_node=True) for fault in node]
 
@@ -58,7 +58,7 @@ def quick_trials_of(bench: Bench, act: Act, share: random.Random) -> list[Trial]
     first, last = share.sample(range(1, cuts + 1), 2)
     station = [Fault(first), Fault(last, power=True), Fault(max(1, first // 2), share.choice(ERRORS), stays=True)]
     node: list[Fault] = []
-    if act.node:
+    if act.node and act.cuts_node:
         count = range(1, bench.node_count(act) + 1)
         node = [Fault(share.choice(count)), Fault(share.choice(count), power=True)]
     return [Trial(act, fault, on_node=False) for fault in station] + [Trial(act, fault, on_node=True) for fault in node]

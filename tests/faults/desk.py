@@ -8,8 +8,10 @@ import os
 import random
 import re
 import shutil
+import signal
 import socket
 import threading
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
@@ -18,12 +20,13 @@ from pathlib import Path
 from teds_provision.station.station import initialise
 from teds_provision.vault.passphrase import THROWAWAY
 from tests.cli.shell import clean_environment
-from tests.e2e.desk import Links
+from tests.e2e.desk import ANGLE, Links
 from tests.faults.acts import NEXT, UUID
 from tests.zygote import FIRST_FD, Child, Zygote
 
 PASSPHRASE = "correct horse battery"
 READY = 60.0
+WORKED = 20.0
 _LOWEST, _PORTS = 10_000, 22_000  # below those that the system deals out
 _numbers = itertools.count(random.SystemRandom().randrange(_PORTS))
 
@@ -79,6 +82,8 @@ class Desk:
                 result += self.links.over("can")
             elif word == "TAP":
                 result += self.links.over("nfc")
+            elif word == "BUS":
+                result += ["--can", self.links.can]
             else:
                 result.append(re.sub(r"\{(\w+)\}", lambda found: places.get(found[1], found[0]), word))
         return result
@@ -104,9 +109,20 @@ class Desk:
         fault: dict[str, str] | None = None,
         seconds: float = 60,
         module: str = "teds_provision",
+        until: str = "",
     ) -> Ended:
-        """Run one command of a station of this desk to its end; raises TimeoutExpired."""
-        return ended(self.start(*words, home=home, fault=fault, module=module), seconds)
+        """Run one command of a station of this desk to its end; raises TimeoutExpired.
+
+        ``until``: it gets SIGTERM when it has said that, or would have long since.
+        """
+        running = self.start(*words, home=home, fault=fault, module=module)
+        if until:
+            end = time.monotonic() + WORKED
+            while running.poll() is None and until not in running.stdout() and time.monotonic() < end:
+                time.sleep(0.05)
+            if running.poll() is None:
+                running.send_signal(signal.SIGTERM)
+        return ended(running, seconds)
 
     @contextmanager
     def node(self, fault: dict[str, str] | None = None, *, nfc: bool = True) -> Iterator[Child]:
@@ -156,8 +172,8 @@ class States:
             return place
 
     def _make(self, name: str, made: Path) -> None:
-        if name == "new":
-            self._new(made)
+        if name in ("new", "sensor"):
+            self._new(made, *(["--profile", ANGLE] if name == "sensor" else []))
             return
         before, steps = NEXT[name]
         shutil.copytree(self.of(before), made)
@@ -171,9 +187,10 @@ class States:
         if name == "backed up":
             (made / "fresh").mkdir(mode=0o700)
 
-    def _new(self, folder: Path) -> None:
+    def _new(self, folder: Path, *hardware: str) -> None:
         folder.mkdir()
         (folder / "files").mkdir()
+        (folder / "files" / "sheet.csv").write_text(f"uuid,profile\n{UUID},{ANGLE}\n")
         desk = Desk(folder, self.zygote)
         for home, name in (("home", "bench"), ("other", "crane")):
             station, _ = initialise(
@@ -182,6 +199,6 @@ class States:
             station.close()
             told = json.loads(desk.run("init", home=home).stdout)
             (folder / "files" / f"{name}.pem").write_text(told["public_key"])
-        words = ["node", "create", str(folder / "flash"), "--uuid", UUID]
+        words = ["node", "create", str(folder / "flash"), "--uuid", UUID, *hardware]
         made = ended(self.zygote.start("teds_provision", words, clean_environment()), 60)
         assert made.returncode == 0, made

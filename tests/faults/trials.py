@@ -115,14 +115,14 @@ class Bench:
         """How many changes and messages the whole command makes."""
         with self.desk(act) as desk, desk.node() if act.node else nullcontext():
             fault = Fault(0, how).environment(self.library, desk, act.home, "files")
-            _must_end(act, desk.run(*act.words, home=act.home, fault=fault))
+            _must_end(act, desk.run(*act.words, home=act.home, fault=fault, until=act.until))
             return _counted(desk)
 
     def node_count(self, act: Act, how: str = "kill") -> int:
         """How many changes of its flash, and datagrams, the node makes while the whole command runs."""
         with self.desk(act) as desk:
             with desk.node(Fault(0, how).environment(self.library, desk, "flash")):
-                _must_end(act, desk.run(*act.words, home=act.home))
+                _must_end(act, desk.run(*act.words, home=act.home, until=act.until))
             return _counted(desk)
 
     def run(self, trial: Trial) -> str:
@@ -140,6 +140,7 @@ class Bench:
                     home=act.home,
                     fault=fault.environment(self.library, desk, act.home, "files"),
                     seconds=HANGS,
+                    until=act.until,
                 )
             except subprocess.TimeoutExpired:
                 return "the command hangs"
@@ -182,7 +183,7 @@ class Bench:
             self._cores.acquire()
 
     def _again(self, desk: Desk, act: Act, first: Ended | None) -> str:
-        again = desk.run(*act.words, home=act.home)
+        again = desk.run(*act.words, home=act.home, until=act.until)
         if again.returncode in act.ends:
             return ""
         said = again.stdout[-400:] + again.stderr[-200:]

@@ -116,7 +116,8 @@ class Bench:
         PLACE.mkdir(parents=True, exist_ok=True)
         self._tests, self._until, self._jobs = Suite(), until, jobs
         self._copies: SimpleQueue[Copy] = SimpleQueue()
-        self._good: dict[str, bool] = {}
+        self._good: set[str] = set()
+        self._bad: set[str] = set()
         self._told = threading.Lock()
         self.left = 0
         for number in range(jobs):
@@ -133,13 +134,18 @@ class Bench:
         try:
             copy.put(mutant.path, mutant.applied(source))
             files = self._tests.nearest(mutant, FILES)
-            code, said = copy.run(files, min(MOST, max(LEAST, share)))
-            copy.put(mutant.path, source)
-            by = ""
-            if code not in (0, None, 5):
+            last = began + min(MOST, max(LEAST, share))
+            by, code = "", 1
+            while not by and code not in (0, None, 5):
+                without = [word for test in self._bad for word in ("--deselect", test)]
+                copy.put(mutant.path, mutant.applied(source))
+                code, said = copy.run([*without, *files], max(1.0, last - time.monotonic()))
+                if code in (0, None, 5):
+                    break
                 by = (_FAILED.findall(said) or ["(the run itself)"])[-1]
+                copy.put(mutant.path, source)
                 if by.startswith("tests/") and not self._is_good(copy, by):
-                    by = ""
+                    by = ""  # it fails by itself: the others shall say
         finally:
             copy.put(mutant.path, source)
             self._copies.put(copy)
@@ -151,9 +157,13 @@ class Bench:
         return fate
 
     def _is_good(self, copy: Copy, test: str) -> bool:
-        if test not in self._good:
-            self._good[test] = copy.run([test], MOST)[0] == 0
-        return self._good[test]
+        if test in self._good:
+            return True
+        good = copy.run([test], MOST)[0] == 0
+        (self._good if good else self._bad).add(test)
+        if not good:
+            print(f"         without any mutant {test} fails too: left out from now on", flush=True)
+        return good
 
 
 def drawn(count: int, room: str, chance: random.Random) -> list[Mutant]:
