@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from tests.e2e.desk import ANGLE
 
@@ -17,6 +17,7 @@ class Act:
     in its hands (none: the command gives it away), ``verdicts`` the exit codes of ``verify`` that count: 0 authentic,
     4 for a node without a datasheet; 5 and 6 mean a lost key. ``until`` is what a command that goes on says when it has
     done its work: then it gets SIGTERM. ``cuts_node``: the node is cut too, not only the station.
+    ``seconds``: how long it may take. ``keys``: so many lie in the store at the end (0: not counted).
     """
 
     name: str
@@ -29,6 +30,8 @@ class Act:
     verdicts: tuple[int, ...] = (0,)
     until: str = ""
     cuts_node: bool = True
+    seconds: float = 60.0
+    keys: int = 0
 
 
 NO_SHEET = (0, 4)
@@ -98,6 +101,49 @@ ACTS = (
 )
 """Every command that changes what lies on a disk or in a node."""
 
+MANY = 100_000
+_BACKUP, _MERGE = (next(act for act in ACTS if act.name == name) for name in ("backup", "merge"))
+LARGE = (
+    replace(_BACKUP, name="backup of 100,000 nodes", start="many", seconds=900.0, keys=MANY + 1),
+    replace(_MERGE, name="merge of 100,000 nodes", start="many behind", seconds=900.0, keys=MANY + 1),
+)
+"""Long ones, each cut in a few places only: a backup of very many nodes, and its merge into a store that has one."""
+
+MIXED = (
+    Act("whitelist add", "mixed", ("whitelist", "add", "{OTHER}")),
+    Act("provision", "mixed", ("provision", "--profile", ANGLE, "--name", "turned", "--yes", "LINK")),
+    Act("rotate", "mixed", ("agree", "{UUID}", "--rotate", "LINK"), verdicts=NO_SHEET),
+    Act("build", "mixed", ("build", "{UUID}", "--profile", ANGLE, "--name", "built"), verdicts=NO_SHEET),
+    Act("sign", "mixed", ("sign", "{UUID}"), verdicts=NO_SHEET),
+    Act("address", "mixed", ("address", "{UUID}", "33", "LINK")),
+    Act("reset", "mixed", ("reset", "{UUID}", "--yes", "LINK"), proof=""),
+    Act("trust add", "mixed", ("trust", "add", "lab", "{FILES}/lab.pem", "--yes")),
+    Act("trust remove", "mixed", ("trust", "remove", "crane", "--yes"), ends=(0, 3)),
+    Act(
+        "copy", "mixed", ("export-keys", "--to", "crane", "--all", "--yes", "--output", "{FILES}/c.jwe"), ends=(0, 3, 6)
+    ),
+    Act(
+        "move",
+        "mixed",
+        ("export-keys", "--to", "crane", "--all", "--mode", "move", "--yes", "--output", "{FILES}/m.jwe"),
+        ends=(0, 3, 6),
+        proof="",
+    ),
+    Act("backup", "mixed", ("backup", "{FILES}/b", "--backup-passphrase-fd", "{FD}", "--yes")),
+    Act("merge", "mixed", ("restore", "{FILES}/backup", "--backup-passphrase-fd", "{FD}", "--yes")),
+    Act("revoke", "mixed", ("revoke", "{UUID}", "--why", "lost", "--yes"), proof=""),
+    Act("lift", "mixed", ("revoke", "--lift", "{UUID}", "--yes"), ends=(0, 3)),
+    Act("rewrap", "mixed", ("vault", "rewrap", "--yes")),
+    Act("passphrase", "mixed", ("vault", "passphrase", "--new-passphrase-fd", "{FD}")),
+    Act("trust ca", "mixed", ("trust", "ca", "sign", "{FILES}/lab.request", "--output", "{FILES}/lab.cert", "--yes")),
+    Act("decommission", "mixed", ("decommission", "{UUID}", "--yes", "LINK"), proof=""),
+    Act("group", "mixed", ("group", "add", "hand", "{UUID}")),
+    Act("names", "mixed", ("names", "set", "{UUID}", "1", "crane/slew")),
+    Act("measure", "mixed", ("measure", "hand", "--duration", "0.3", "--to", "{FILES}/run.csv", "LINK")),
+    Act("ncap run", "mixed", ("ncap", "run", "BUS"), until=TAKEN_UP),
+)
+"""Commands that may all begin in one state, for two at once."""
+
 NEXT: dict[str, tuple[str, tuple[tuple[str, tuple[str, ...]], ...]]] = {
     # state: (from which, ((station, words), ...)); "new" and "sensor" (which can be measured) are made by hand
     "listed": ("new", (("home", ("whitelist", "add", "{UUID}")),)),
@@ -134,5 +180,15 @@ NEXT: dict[str, tuple[str, tuple[tuple[str, tuple[str, ...]], ...]]] = {
         "provisioned",
         (("lab", ("init", "--name", "lab", "--keystore", "file", "--request", "{FILES}/lab.request")),),
     ),
+    "mixed": (
+        "measured",
+        (
+            ("home", ("trust", "add", "crane", "{FILES}/crane.pem", "--yes")),
+            ("lab", ("init", "--name", "lab", "--keystore", "file", "--request", "{FILES}/lab.request")),
+            ("home", ("backup", "{FILES}/backup", "--backup-passphrase-fd", "{FD}", "--yes")),
+        ),
+    ),
+    "many": ("provisioned", ()),
+    "many behind": ("many", (("home", ("backup", "{FILES}/backup", "--backup-passphrase-fd", "{FD}", "--yes")),)),
     "backed up": ("provisioned", (("home", ("backup", "{FILES}/backup", "--backup-passphrase-fd", "{FD}", "--yes")),)),
 }

@@ -1,10 +1,11 @@
 """A fault bench for the shipped command: cuts at every durable write and message, failing disks, and what is left then.
 
 What one trial does stands in trials.py. This takes every cut of every changing command, of station and node, with and
-without loss of power, and a share of the failing calls (``--full``: all of them), many processes on one store, frames
-that are lost, doubled, swapped, late or corrupted, and a control: a disk that ignores fsync must lose something.
+without loss of power, and a share of the failing calls (``--full``: all of them), many processes on one store, two
+different commands at once (a share of all pairs), backups of 100,000 nodes cut and merged, frames that are lost,
+doubled, swapped, late or corrupted, and a control: a disk that ignores fsync must lose something.
 
-Usage: python -m tests.faults.bench [--full] [--quick] [--only NAME] [--jobs N] [--minutes M]
+Usage: python -m tests.faults.bench [--full] [--quick [--pairs] [--large]] [--only NAME] [--jobs N] [--minutes M]
 Prints tried, healed and lost per command, and the words of everything that was lost; exits 1 where anything was lost or
 the control lost nothing.
 """
@@ -21,13 +22,15 @@ from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import nullcontext
 
-from tests.faults.acts import ACTS, UUID, Act
+from tests.faults.acts import ACTS, LARGE, UUID, Act
 from tests.faults.disk import put_back
-from tests.faults.noise import crowd, noisy
+from tests.faults.noise import crowd, noisy, pairs
 from tests.faults.trials import Bench, Fault, Trial
 
 ERRORS = ("ENOSPC", "EIO", "EROFS", "EDQUOT")
 SHARE = 8  # one of so many failing calls is tried, unless all are
+PAIRS = 80  # of 276, unless all are
+FEW = 6
 WAITING = 24  # trials of a cut node that wait for a time-out beside those that work
 
 
@@ -64,6 +67,13 @@ def quick_trials_of(bench: Bench, act: Act, share: random.Random) -> list[Trial]
     return [Trial(act, fault, on_node=False) for fault in station] + [Trial(act, fault, on_node=True) for fault in node]
 
 
+def few_trials_of(bench: Bench, act: Act, share: random.Random) -> list[Trial]:
+    """A few cuts of a long command: at its beginning and end, and somewhere between; each with the power lost once."""
+    cuts = bench.count(act)
+    between = sorted(share.sample(range(2, cuts), min(FEW, max(0, cuts - 2))))
+    return [Trial(act, Fault(at, power=n % 2 == 1), on_node=False) for n, at in enumerate((1, *between, cuts))]
+
+
 def control(bench: Bench) -> int:
     """How many losses of power after ``whitelist add`` and ``agree`` lose something where fsync does nothing."""
     lost = 0
@@ -84,6 +94,8 @@ def main(arguments: list[str]) -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--full", action="store_true", help="every error at every change, not a share")
     parser.add_argument("--quick", action="store_true", help="a handful per command, about a minute")
+    parser.add_argument("--pairs", action="store_true", help="with --quick: all pairs of commands too")
+    parser.add_argument("--large", action="store_true", help="with --quick: the backups of 100,000 nodes too")
     parser.add_argument("--only", action="append", default=[], metavar="NAME")
     parser.add_argument("--jobs", type=int, default=2 * (os.cpu_count() or 1), help="trials at a time")
     parser.add_argument("--minutes", type=float, default=0, help="stop after so many minutes")
@@ -102,6 +114,12 @@ def main(arguments: list[str]) -> int:
         complaint = crowd(bench)
         print(f"8 processes on one store: {complaint or 'all done, nothing lost'}")
         lost += bool(complaint)
+        if chosen.pairs or not chosen.quick:
+            count = 0 if chosen.full or chosen.pairs else PAIRS
+            lost += pairs(bench, share, count=count, jobs=chosen.jobs, until=until)
+        if chosen.large or not chosen.quick:
+            large = [trial for act in LARGE for trial in few_trials_of(bench, act, share)]
+            lost += run_all(bench, large, 1, None)
         if not chosen.quick:
             lost += noisy(bench, seeds=4 if chosen.full else 2, jobs=chosen.jobs)
         seen = control(bench)

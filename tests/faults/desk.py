@@ -17,11 +17,12 @@ from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 
+from benchmarks.scale import fill
 from teds_provision.station.station import initialise
 from teds_provision.vault.passphrase import THROWAWAY
 from tests.cli.shell import clean_environment
 from tests.e2e.desk import ANGLE, Links
-from tests.faults.acts import NEXT, UUID
+from tests.faults.acts import MANY, NEXT, UUID
 from tests.zygote import FIRST_FD, Child, Zygote
 
 PASSPHRASE = "correct horse battery"
@@ -75,7 +76,7 @@ class Desk:
         files = self.folder / "files"
         bundle = files / "bundle.id"
         places = {"FILES": str(files), "UUID": UUID, "ID": bundle.read_text() if bundle.exists() else ""}
-        places["FD"] = str(FIRST_FD + 1)
+        places |= {"FD": str(FIRST_FD + 1), "OTHER": "77" * 10}
         result: list[str] = []
         for word in words:
             if word == "LINK":
@@ -180,10 +181,15 @@ class States:
         desk = Desk(made, self.zygote)
         with desk.node():
             for station, words in steps:
-                done = desk.run(*words, home=station)
+                done = desk.run(*words, home=station, seconds=900)
                 assert done.returncode == 0, f"{name}: {words}: {done.stdout}{done.stderr}"
                 if words[0] == "export-keys":
                     (made / "files" / "bundle.id").write_text(json.loads(done.stdout)["id"])
+        if name == "many":
+            fill(made / "home", MANY)
+        if name == "many behind":  # what came since is gone again: the store is as it was before the many
+            shutil.rmtree(made / "home")
+            shutil.copytree(self.of("provisioned") / "home", made / "home")
         if name == "backed up":
             (made / "fresh").mkdir(mode=0o700)
 
@@ -192,7 +198,7 @@ class States:
         (folder / "files").mkdir()
         (folder / "files" / "sheet.csv").write_text(f"uuid,profile\n{UUID},{ANGLE}\n")
         desk = Desk(folder, self.zygote)
-        for home, name in (("home", "bench"), ("other", "crane")):
+        for home, name in (("home", "bench"), ("other", "crane"), ("third", "lab")):
             station, _ = initialise(
                 folder / home, name=name, keystore="file", ask=lambda prompt, confirm=False: PASSPHRASE, costs=THROWAWAY
             )

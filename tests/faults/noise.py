@@ -1,14 +1,17 @@
-"""What the cuts do not show: many processes on one store, and a bus whose frames meet with faults."""
+"""What the cuts do not show: many processes on one store, two commands at once, a bus whose frames meet with faults."""
 
 from __future__ import annotations
 
+import itertools
 import json
+import random
 import subprocess
+import time
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 
 from tests.e2e.desk import ANGLE
-from tests.faults.acts import ACTS, UUID
+from tests.faults.acts import ACTS, MIXED, UUID, Act
 from tests.faults.trials import Bench
 
 NOISE = (
@@ -38,6 +41,59 @@ def crowd(bench: Bench, processes: int = 8) -> str:
         missing = [uuid for uuid in [*others, UUID] if uuid not in listed]
         log = json.loads(desk.run("log").stdout)
     return "; ".join(failed + missing + ([] if log["intact"] else ["the audit log does not hold"]))
+
+
+TOLD = (0, 3, 4, 5, 6, 7)
+"""How a command may end beside another one that changes what it works on; 1, 2 and 8 are no answers to that."""
+_TAKES = ("reset", "move", "revoke", "decommission")
+
+
+def pair(bench: Bench, one: Act, other: Act) -> str:
+    """Two commands at once, then each once more alone: every key opens, the log holds, nothing of either is lost."""
+    with bench.desk(one) as desk, desk.node():
+        both = (one, other)
+        with ThreadPoolExecutor(2) as pool:
+            done = list(pool.map(lambda act: desk.run(*act.words, until=act.until, seconds=150), both))
+        said = [f"{act.name} {run.returncode} {run.stdout[-200:]}{run.stderr[-200:]}"
+                for act, run in zip(both, done, strict=True) if run.buggy or run.returncode not in TOLD]  # fmt: skip
+        takes = any(act.name in _TAKES for act in both)
+        for act, first in zip(both, done, strict=True):
+            again = desk.run(*act.words, until=act.until, seconds=150)
+            if again.buggy or again.returncode not in (TOLD if takes or first.returncode else act.ends):
+                said.append(f"{act.name} again {again.returncode} {again.stdout[-200:]}{again.stderr[-200:]}")
+        opened = desk.run("vault", "rewrap", "--yes")  # unwraps every key, or fails
+        if opened.returncode:
+            said.append(f"not every key opens: {opened.returncode} {opened.stdout[-300:]}{opened.stderr[-200:]}")
+        if not json.loads(desk.run("log").stdout or '{"intact": false}')["intact"]:
+            said.append("the audit log does not hold")
+        if not takes:
+            verified = desk.run("verify", UUID, "LINK")
+            if verified.returncode not in (*one.verdicts, *other.verdicts):
+                said.append(f"verify {verified.returncode}: {verified.stdout[-300:]}")
+    return "; ".join(said)
+
+
+def pairs(bench: Bench, share: random.Random, *, count: int, jobs: int, until: float | None) -> int:
+    """Pairs of all changing commands, two at once: ``count`` of them, or all (0); prints; how many lost something."""
+    every = list(itertools.combinations_with_replacement(MIXED, 2))
+    chosen = share.sample(every, count) if count else every
+
+    def one(two: tuple[Act, Act]) -> str | None:
+        if until is not None and time.monotonic() > until:
+            return None
+        try:
+            return pair(bench, *two)
+        except Exception as error:  # noqa: BLE001  a pair that breaks is a finding, not the end of the bench
+            return f"the trial itself failed: {type(error).__name__}: {error}"
+
+    with ThreadPoolExecutor(jobs) as pool:
+        said = list(pool.map(one, chosen))
+    found = [(two, complaint) for two, complaint in zip(chosen, said, strict=True) if complaint]
+    for (first, second), complaint in found:
+        print(f"LOST  {first.name} beside {second.name}: {complaint}", flush=True)
+    tried = sum(complaint is not None for complaint in said)
+    print(f"two commands at once: tried {tried} of {len(every)} pairs, lost {len(found)}", flush=True)
+    return len(found)
 
 
 def noise(bench: Bench, shares: dict[str, float], seed: int) -> tuple[int, str]:

@@ -13,12 +13,13 @@ from __future__ import annotations
 
 import os
 import shutil
+import sqlite3
 import subprocess
 import sys
 import tempfile
 import threading
 from collections.abc import Iterator
-from contextlib import contextmanager, nullcontext
+from contextlib import closing, contextmanager, nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -115,7 +116,7 @@ class Bench:
         """How many changes and messages the whole command makes."""
         with self.desk(act) as desk, desk.node() if act.node else nullcontext():
             fault = Fault(0, how).environment(self.library, desk, act.home, "files")
-            _must_end(act, desk.run(*act.words, home=act.home, fault=fault, until=act.until))
+            _must_end(act, desk.run(*act.words, home=act.home, fault=fault, until=act.until, seconds=act.seconds))
             return _counted(desk)
 
     def node_count(self, act: Act, how: str = "kill") -> int:
@@ -139,7 +140,7 @@ class Bench:
                     *act.words,
                     home=act.home,
                     fault=fault.environment(self.library, desk, act.home, "files"),
-                    seconds=HANGS,
+                    seconds=max(HANGS, act.seconds),
                     until=act.until,
                 )
             except subprocess.TimeoutExpired:
@@ -183,7 +184,7 @@ class Bench:
             self._cores.acquire()
 
     def _again(self, desk: Desk, act: Act, first: Ended | None) -> str:
-        again = desk.run(*act.words, home=act.home, until=act.until)
+        again = desk.run(*act.words, home=act.home, until=act.until, seconds=act.seconds)
         if again.returncode in act.ends:
             return ""
         said = again.stdout[-400:] + again.stderr[-200:]
@@ -195,6 +196,11 @@ class Bench:
             return "" if listed.returncode == 0 else f"nodes: {listed.stdout[-300:]}"
         with desk.node():
             verified = desk.run("verify", UUID, "TAP", home=act.proof)
+        if act.keys:
+            with closing(sqlite3.connect(desk.folder / act.proof / "store.sqlite3")) as store:
+                (keys,) = store.execute("SELECT count(*) FROM keys").fetchone()
+            if keys != act.keys:
+                return f"{keys} keys of {act.keys}"
         return "" if verified.returncode in act.verdicts else f"verify {verified.returncode}: {verified.stdout[-400:]}"
 
 
