@@ -165,9 +165,10 @@ $(VENV)/.dev: $(VENV)/.made pyproject.toml
 	.venv-fuzz/bin/python -m pip install --quiet --editable '.[fuzz]'
 	@touch $@
 
-# The node in C: the host port and its C tests (firmware/README.md).
-firmware:
-	$(MAKE) --no-print-directory -C firmware all
+# The node in C: the host port and its C tests under the sanitizers (firmware/README.md).
+firmware: vectors-c
+	@sh scripts/install-test-packages
+	$(MAKE) --no-print-directory -C firmware all check
 
 # What is in an installation, as a CycloneDX bill of materials.
 sbom: .venv-sbom/.ready

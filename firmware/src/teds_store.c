@@ -499,11 +499,6 @@ void teds_staging_drop(teds_node *node)
     }
 }
 
-static uint32_t largest(uint16_t id)
-{
-    return id == TEDS_SECURITY_ID && TEDS_MAX_SECURITY < TEDS_STAGING - 4 ? TEDS_MAX_SECURITY : TEDS_STAGING - 4;
-}
-
 /* Another session's staging: its place, -1 where there is none. */
 static int8_t staged_elsewhere(const teds_node *node, int8_t session)
 {
@@ -523,7 +518,7 @@ static int stage(teds_node *node, uint16_t id, uint32_t offset, const uint8_t *o
     size_t at = image != NULL ? (size_t)(image - node->staging) : node->staging_end + 4u;
     size_t end = image != NULL ? node->staging_end : node->staging_end + 4u;
     size_t behind = at + before;
-    if (end - before + offset + length > TEDS_STAGING || offset + length > largest(id)) {
+    if (end - before + offset + length > TEDS_STAGING) {
         return -TEDS_TOO_LARGE;
     }
     memmove(node->staging + at + offset + length, node->staging + behind, end - behind);
@@ -558,7 +553,7 @@ static int status(uint16_t id, bool read_only, bool there, uint32_t size, uint16
     out[1] = 0;
     teds_put32(out + 2, size);
     teds_put16(out + 6, checksum);
-    teds_put32(out + 8, largest(id));
+    teds_put32(out + 8, TEDS_STAGING - 4);
     return 12;
 }
 

@@ -16,11 +16,6 @@
 #define TEDS_STAGING 4096
 #endif
 
-/* The largest Security TEDS that it takes. */
-#ifndef TEDS_MAX_SECURITY
-#define TEDS_MAX_SECURITY (TEDS_STAGING - 4)
-#endif
-
 /* Sessions, and half-open Opens, over all links; two or more. */
 #ifndef TEDS_SESSIONS
 #define TEDS_SESSIONS 2

@@ -1,0 +1,231 @@
+/* Fuzzed under ASan and UBSan with cryptography that says yes: whatever comes, nothing is read or written beyond.
+ *
+ * The first octet of an input says where it goes: CAN frames (length, then id and data), or whole commands. With
+ * -DTEDS_FUZZ_ALONE it is a program that runs the files named to it, for machines without libFuzzer. */
+#include "memory.h"
+
+#include <stdlib.h>
+#include <string.h>
+
+int LLVMFuzzerTestOneInput(const uint8_t *octets, size_t length);
+
+static int draw(char kind, uint8_t *out, size_t length)
+{
+    memset(out, kind == 'n' ? 0 : 1, length);
+    return 0;
+}
+
+/* -- cryptography that says yes ------------------------------------------------------------------------------------------ */
+
+static int make(void *user, int use, teds_key_ref *key, uint8_t point[65])
+{
+    (void)user;
+    memset(key, use + 1, sizeof *key);
+    memset(point, use + 1, 65);
+    point[0] = 4;
+    return 0;
+}
+
+static bool good(void *user, const uint8_t point[65])
+{
+    (void)user;
+    return point[0] == 4;
+}
+
+static int ecdh(void *user, const teds_key_ref *key, const uint8_t peer[65], uint8_t out[32])
+{
+    (void)user;
+    (void)key;
+    memcpy(out, peer, 32);
+    return 0;
+}
+
+static int sign(void *user, const teds_key_ref *key, const uint8_t hash[32], uint8_t out[64])
+{
+    (void)user;
+    (void)key;
+    memcpy(out, hash, 32);
+    memset(out + 32, 1, 32);
+    return 0;
+}
+
+static bool verify(void *user, const uint8_t point[65], const uint8_t hash[32], const uint8_t signature[64])
+{
+    (void)user;
+    (void)point;
+    (void)hash;
+    (void)signature;
+    return true;
+}
+
+static int hmac(void *user, const uint8_t *key, size_t key_length, const teds_part *parts, size_t count,
+                uint8_t out[32])
+{
+    (void)user;
+    (void)key;
+    (void)key_length;
+    (void)parts;
+    (void)count;
+    memset(out, 0, 32);
+    return 0;
+}
+
+static void start(void *user, teds_sha256 *state)
+{
+    (void)user;
+    memset(state, 0, sizeof *state);
+}
+
+static void update(void *user, teds_sha256 *state, const uint8_t *octets, size_t length)
+{
+    (void)user;
+    for (size_t i = 0; i < length; i++) {
+        state->octets[0] ^= octets[i];
+    }
+}
+
+static void finish(void *user, teds_sha256 *state, uint8_t out[32])
+{
+    (void)user;
+    (void)state;
+    memset(out, 0, 32);
+}
+
+static int seal(void *user, const uint8_t key[16], const uint8_t nonce[13], const uint8_t *in, size_t length,
+                uint8_t *out, size_t tag_length)
+{
+    (void)user;
+    (void)key;
+    (void)nonce;
+    memmove(out, in, length);
+    memset(out + length, 0, tag_length);
+    return 0;
+}
+
+static bool open_sealed(void *user, const uint8_t key[16], const uint8_t nonce[13], const uint8_t *in, size_t length,
+                        uint8_t *out, size_t tag_length)
+{
+    (void)user;
+    (void)key;
+    (void)nonce;
+    (void)tag_length;
+    memcpy(out, in, length);
+    return true;
+}
+
+static memory_board *board(bool keyed)
+{
+    static const uint8_t uuid[10] = {1}, key[16] = {2}, point[65] = {4};
+    memory_board *own = memory_new(uuid, 8, 0xFF, draw);
+    teds_port *port = &own->port;
+    port->p256_make = make;
+    port->p256_good = good;
+    port->p256_ecdh = ecdh;
+    port->p256_sign = sign;
+    port->p256_verify = verify;
+    port->hmac = hmac;
+    port->sha256_start = start;
+    port->sha256_update = update;
+    port->sha256_finish = finish;
+    port->ccm_seal = seal;
+    port->ccm_open = open_sealed;
+    memory_channel(own, 1, TEDS_SENSOR, 0, 2, 1000);
+    memory_channel(own, 2, TEDS_ACTUATOR, 0, 4, 1000);
+    if (memory_start(own) != 0 ||
+        memory_put(own, keyed ? 1 : 0, 0x21, 1, 1, key, point, point, (const uint8_t *)"", 0) != 0) {
+        abort();
+    }
+    return own;
+}
+
+static void frames(memory_board *own, const uint8_t *octets, size_t length)
+{
+    static const uint32_t to[] = {0x18DA21F1, 0x18DA21F2, 0x18DBFFF1, 0x1CFF0021, 0x18FF00F1, 0x18DA21F7, 0x1CFF0022};
+    uint64_t now = 0;
+    uint32_t identifier;
+    uint8_t data[64];
+    bool fd;
+    while (length >= 2) {
+        size_t octets_of_frame = octets[0] & 63;
+        octets_of_frame = octets_of_frame + 2 <= length ? octets_of_frame : length - 2;
+        now += (uint64_t)octets[1] << 20;
+        memory_at(own, now);
+        memory_can_rx(own, to[octets[1] % 7], octets + 2, (uint8_t)octets_of_frame, octets[0] >> 7 != 0);
+        (void)memory_poll(own);
+        for (int i = 0; i < 4 && memory_can_tx(own, &identifier, data, &fd) >= 0; i++) {
+            if (octets[0] >> 6 & 1) { /* a station that wants to hear on */
+                memory_can_rx(own, 0x18DA21F1, (const uint8_t *)"\x30\x00\x00", 3, fd);
+            }
+        }
+        octets += 2 + octets_of_frame;
+        length -= 2 + octets_of_frame;
+    }
+}
+
+/* Commands: length 2, link, frame. A seal that fits everything lets inner commands in. */
+static void commands(memory_board *own, const uint8_t *octets, size_t length)
+{
+    static uint8_t reply[TEDS_MAX_MESSAGE];
+    uint64_t now = 0;
+    while (length >= 3) {
+        size_t frame = (size_t)(octets[0] & 7) << 8 | octets[1];
+        uint8_t *copy; /* of its own, so that the sanitizer sees what is read beyond it */
+        frame = frame + 3 <= length ? frame : length - 3;
+        copy = malloc(frame > 0 ? frame : 1);
+        if (copy == NULL) {
+            abort();
+        }
+        memcpy(copy, octets + 3, frame);
+        now += (uint64_t)octets[0] << 24;
+        memory_at(own, now);
+        if (memory_handle(own, (uint8_t)(0xF1 + octets[2] % 3), octets[2] & 0x40 ? TEDS_AT_NFC : TEDS_CAN,
+                          octets[2] >> 7 != 0, copy, frame, reply) > sizeof reply) {
+            abort();
+        }
+        free(copy);
+        memory_reply_left(own, 0xF1);
+        (void)memory_poll(own);
+        octets += 3 + frame;
+        length -= 3 + frame;
+    }
+}
+
+int LLVMFuzzerTestOneInput(const uint8_t *octets, size_t length)
+{
+    memory_board *own;
+    if (length < 2) {
+        return 0;
+    }
+    own = board((octets[0] & 2) != 0);
+    if (octets[0] & 1) {
+        frames(own, octets + 1, length - 1);
+    } else {
+        commands(own, octets + 1, length - 1);
+    }
+    if (memory_misused(own)) {
+        abort();
+    }
+    memory_free(own);
+    return 0;
+}
+
+#ifdef TEDS_FUZZ_ALONE
+#include <stdio.h>
+
+int main(int count, char **names)
+{
+    static uint8_t octets[65536];
+    for (int i = 1; i < count; i++) {
+        FILE *file = fopen(names[i], "rb");
+        size_t length;
+        if (file == NULL) {
+            return 1;
+        }
+        length = fread(octets, 1, sizeof octets, file);
+        (void)fclose(file);
+        (void)LLVMFuzzerTestOneInput(octets, length);
+    }
+    (void)printf("fuzz: %d inputs of the corpus\n", count - 1);
+    return 0;
+}
+#endif

@@ -1,0 +1,249 @@
+/* ISO-TP, Announce and Claim as the bus sees them: frames in, frames out, time in the test's hands. */
+#include "check.h"
+#include "inside.h"
+#include "memory.h"
+
+#include <string.h>
+
+#define MS UINT64_C(1000000)
+#define OWN 0x21u
+#define TO_NODE (0x18DA0000u | OWN << 8 | 0xF1u)
+
+static uint64_t now;
+static uint8_t serial;
+
+static int draw(char kind, uint8_t *out, size_t length)
+{
+    memset(out, 0, length);
+    if (kind != 'n') {
+        out[31] = ++serial;
+    }
+    return 0;
+}
+
+static memory_board *fresh(void)
+{
+    static const uint8_t uuid[10] = {1, 2, 3, 4, 5, 6, 7, 8, 9, 10}, none[65] = {0};
+    memory_board *board = memory_new(uuid, 8, 0xFF, draw);
+    now = 100 * MS;
+    if (board != NULL && memory_start(board) == 0) {
+        (void)memory_put(board, 0, OWN, 0, 0, none, none, none, none, 0);
+    }
+    return board;
+}
+
+static void in(memory_board *board, uint32_t identifier, const char *octets, uint8_t length, bool fd)
+{
+    memory_at(board, now);
+    memory_can_rx(board, identifier, (const uint8_t *)octets, length, fd);
+}
+
+/* The next frame that leaves by now; its length, -1: none. */
+static int out(memory_board *board, uint32_t *identifier, uint8_t data[64])
+{
+    bool fd;
+    memory_at(board, now);
+    (void)memory_poll(board);
+    return memory_can_tx(board, identifier, data, &fd);
+}
+
+static int silent(memory_board *board)
+{
+    uint32_t identifier;
+    uint8_t data[64];
+    return out(board, &identifier, data) < 0;
+}
+
+/* A Read of the Security TEDS: its first frame, then `frames` more after a flow control. */
+static void asks_for_much(memory_board *board)
+{
+    in(board, TO_NODE, "\x10\x0c\x05\x00\x00\x01\x02\x00", 8, false);
+}
+
+static void rest_of_question(memory_board *board)
+{
+    in(board, TO_NODE, "\x21\x05\x80\x00\x00\x00\x00\xcc", 8, false);
+}
+
+static void a_long_answer_waits_for_flow_control(void)
+{
+    memory_board *board = fresh();
+    uint32_t identifier = 0;
+    uint8_t data[64];
+    int frames = 0;
+    asks_for_much(board);
+    CHECK(out(board, &identifier, data) == 8 && memcmp(data, "\x30\x10\x00\xcc", 4) == 0, "flow control");
+    CHECK(identifier == (0x18DAF100u | OWN), "its identifier %08x", (unsigned)identifier);
+    rest_of_question(board);
+    CHECK(out(board, &identifier, data) == 8 && data[0] == 0x10 && data[1] == 1 + 3 + 4 + 237, "first frame");
+    CHECK(silent(board), "nothing leaves before a flow control");
+    in(board, TO_NODE, "\x31\x00\x00\xcc\xcc\xcc\xcc\xcc", 8, false);
+    now += 900 * MS;
+    CHECK(silent(board), "WAIT makes it wait on");
+    in(board, TO_NODE, "\x30\x02\x05\xcc\xcc\xcc\xcc\xcc", 8, false);
+    CHECK(out(board, &identifier, data) == 8 && data[0] == 0x21, "consecutive frame");
+    CHECK(silent(board), "5 ms have not passed");
+    now += 5 * MS;
+    CHECK(out(board, &identifier, data) == 8 && data[0] == 0x22, "the second of the block");
+    now += 5 * MS;
+    CHECK(silent(board), "a block of two is over");
+    in(board, TO_NODE, "\x30\x00\xf9\xcc\xcc\xcc\xcc\xcc", 8, false);
+    while (out(board, &identifier, data) == 8 && frames < 100) {
+        frames++;
+        now += MS;
+    }
+    CHECK(frames == (245 - 6 + 6) / 7 - 2, "%d frames", frames);
+    memory_free(board);
+}
+
+static void what_nobody_takes_up_is_given_up(void)
+{
+    memory_board *board = fresh();
+    uint32_t identifier;
+    uint8_t data[64];
+    asks_for_much(board);
+    (void)out(board, &identifier, data);
+    rest_of_question(board);
+    CHECK(out(board, &identifier, data) == 8, "first frame");
+    now += 1001 * MS;
+    CHECK(silent(board), "given up");
+    in(board, TO_NODE, "\x30\x00\x00\xcc\xcc\xcc\xcc\xcc", 8, false);
+    CHECK(silent(board), "a flow control that is late is nobody's");
+    for (int i = 0; i < 12; i++) {
+        asks_for_much(board);
+        (void)out(board, &identifier, data);
+        rest_of_question(board);
+        CHECK(out(board, &identifier, data) == 8 && data[0] == 0x10, "asked anew it answers");
+    }
+    for (int i = 0; i < 11; i++) {
+        in(board, TO_NODE, "\x31\x00\x00", 3, false);
+    }
+    CHECK(silent(board), "eleven WAITs end it");
+    in(board, TO_NODE, "\x30\x00\x00", 3, false);
+    CHECK(silent(board), "ended");
+    memory_free(board);
+}
+
+static void a_broken_question_is_dropped(void)
+{
+    memory_board *board = fresh();
+    uint32_t identifier;
+    uint8_t data[64];
+    asks_for_much(board);
+    (void)out(board, &identifier, data);
+    in(board, TO_NODE, "\x22\x05\x80\x00\x00\x00\x00\xcc", 8, false);
+    CHECK(silent(board), "a number is missing");
+    rest_of_question(board);
+    CHECK(silent(board), "and the rest is nobody's");
+    asks_for_much(board);
+    (void)out(board, &identifier, data);
+    now += 1001 * MS;
+    rest_of_question(board);
+    CHECK(silent(board), "too late");
+    in(board, TO_NODE, "\x10\x06\x05\x00\x00\x01\x02\x00", 8, false);
+    CHECK(silent(board), "a first frame of what fits one frame");
+    in(board, TO_NODE, "\x08\x01\x02\x03\x04\x05\x06\x07", 8, false);
+    in(board, TO_NODE, "\x00\x00", 2, false);
+    in(board, TO_NODE, "\x05", 1, false);
+    in(board, TO_NODE, "\x40\x01\x02", 3, false);
+    CHECK(silent(board), "frames that say nothing");
+    memory_free(board);
+}
+
+static void what_cannot_be_taken_is_refused_by_one_frame(void)
+{
+    memory_board *board = fresh();
+    uint32_t identifier;
+    uint8_t data[64];
+    in(board, TO_NODE, "\x1f\xff\x77\x00\x00\x01\x03\x00", 8, false);
+    CHECK(out(board, &identifier, data) == 8 && memcmp(data, "\x05\x77\x00\x00\x01\x0a", 6) == 0, "10");
+    in(board, TO_NODE, "\x10\x00\x00\x01\x00\x00\x78\x00", 8, false);
+    CHECK(out(board, &identifier, data) == 8 && memcmp(data, "\x05\x78\x00\x00\x01\x0a", 6) == 0, "10, by 32 bits");
+    asks_for_much(board);
+    CHECK(out(board, &identifier, data) == 8 && data[0] == 0x30, "one long question is taken");
+    in(board, TO_NODE + 1, "\x10\x0c\x79\x00\x00\x01\x02\x00", 8, false);
+    CHECK(out(board, &identifier, data) == 8 && identifier == (0x18DAF200u | OWN) &&
+              memcmp(data, "\x05\x79\x00\x00\x01\x11", 6) == 0,
+          "17 to another station");
+    rest_of_question(board);
+    CHECK(out(board, &identifier, data) == 8 && data[0] == 0x10, "the first one is answered");
+    in(board, TO_NODE + 1, "\x10\x0c\x79\x00\x00\x01\x02\x00", 8, false);
+    CHECK(out(board, &identifier, data) == 8 && data[0] == 0x30, "and now the other one is heard");
+    memory_free(board);
+}
+
+static void frames_may_come_twice(void)
+{
+    memory_board *board = fresh();
+    uint32_t identifier;
+    uint8_t data[64];
+    in(board, TO_NODE, "\x10\x14\x05\x00\x00\x01\x02\x00", 8, false);
+    (void)out(board, &identifier, data);
+    in(board, TO_NODE, "\x21\x0d\x80\x00\x00\x00\x00\x01", 8, false);
+    in(board, TO_NODE, "\x21\x0d\x80\x00\x00\x00\x00\x01", 8, false);
+    in(board, TO_NODE, "\x22\x01\x02\x03\x04\x05\x06\x07", 8, false);
+    CHECK(out(board, &identifier, data) == 8 && memcmp(data, "\x05\x05\x00\x00\x01\x04", 6) == 0,
+          "a Read of 13 octets: 4");
+    memory_free(board);
+}
+
+static void everyone_is_answered_after_a_wait(void)
+{
+    memory_board *board = fresh();
+    uint32_t identifier;
+    uint8_t data[64];
+    in(board, 0x18DBFFF3u, "\x07\x2a\x00\x00\x80\x07\x00\x00", 8, false);
+    in(board, 0x18DBFFF3u, "\x07\x2b\x00\x00\x80\x08\x00\x00", 8, false);
+    now += 50 * MS;
+    CHECK(out(board, &identifier, data) == 8 && identifier == (0x18DAF300u | OWN) &&
+              memcmp(data, "\x10\x1b\x2a\x01\x00\x17\x01\x01", 8) == 0,
+          "Identify, and nothing else");
+    memory_free(board);
+}
+
+static void nodes_that_meet_sort_themselves_out(void)
+{
+    memory_board *board = fresh();
+    uint32_t identifier;
+    uint8_t data[64];
+    uint8_t own[4];
+    int told = 0;
+    teds_put32(own, teds_crc32(0, (const uint8_t *)"\x01\x02\x03\x04\x05\x06\x07\x08\x09\x0a", 10));
+    memory_at(board, now);
+    teds_can_start(&board->node, now);
+    now += 500 * MS;
+    CHECK(out(board, &identifier, data) == 8 && identifier == (0x1CFF0000u | OWN) && data[0] == 1 && data[1] == 0 &&
+              memcmp(data + 2, own, 4) == 0 && data[6] == 0 && data[7] == 0,
+          "Announce");
+    in(board, 0x1CFF0000u | (OWN + 1), "\x01\x00\x00\x00\x00\x00\x00\x00", 8, false);
+    in(board, 0x1CFF0000u | OWN, "\x01\x00\xff\xff\xff\xff\x00\x00", 8, false);
+    now += 50 * MS;
+    CHECK(out(board, &identifier, data) == 8 && identifier == (0x1CFF0000u | OWN), "the smaller CRC stays");
+    in(board, 0x1CFF0000u | OWN, "\x01\x00\x00\x00\x00\x01\x00\x00", 8, false);
+    now += 50 * MS;
+    CHECK(out(board, &identifier, data) == 8 && identifier == (0x1CFF0000u | (OWN + 2)),
+          "the greater one takes the next address of which nothing was heard");
+    for (int i = 0; i < 60; i++) {
+        in(board, 0x1CFF0000u | (OWN + 2), "\x01\x00\xff\xff\xff\xff\x00\x00", 8, false);
+        now += 60 * MS;
+        told += out(board, &identifier, data) == 8;
+    }
+    CHECK(told == 17, "%d more Announces in this minute", told);
+    now += 61000 * MS;
+    in(board, 0x1CFF0000u | (OWN + 2), "\x01\x00\xff\xff\xff\xff\x00\x00", 8, false);
+    now += 60 * MS;
+    CHECK(out(board, &identifier, data) == 8, "and again in the next");
+    memory_free(board);
+}
+
+int main(void)
+{
+    a_long_answer_waits_for_flow_control();
+    what_nobody_takes_up_is_given_up();
+    a_broken_question_is_dropped();
+    what_cannot_be_taken_is_refused_by_one_frame();
+    frames_may_come_twice();
+    everyone_is_answered_after_a_wait();
+    nodes_that_meet_sort_themselves_out();
+    return ENDED("isotp");
+}

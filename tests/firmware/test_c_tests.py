@@ -1,0 +1,53 @@
+"""The C tests: published vectors, ISO-TP, Announce and Claim, the fuzzers' corpus, under ASan and UBSan."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+
+import pytest
+
+from tests.firmware import builds
+from tests.vectors import c_arrays
+
+pytestmark = pytest.mark.system
+
+
+def test_the_c_tests_find_nothing_wrong() -> None:
+    builds.need("make", "gcc")
+    c_arrays.main([str(builds.BUILD / "vectors-c")])
+    done = subprocess.run(
+        ["make", "-C", str(builds.FIRMWARE), "check", f"VECTORS={builds.BUILD / 'vectors-c'}"],
+        capture_output=True,
+        text=True,
+        check=False,
+        env={**os.environ, "ASAN_OPTIONS": "detect_leaks=1"},
+    )
+    assert done.returncode == 0, done.stdout + done.stderr
+    for name in ("isotp", "vectors"):
+        assert f"{name}: " in done.stdout
+    assert " 0 wrong" in done.stdout
+
+
+def test_it_compiles_without_a_warning_for_clang_too() -> None:
+    builds.need("make", "gcc")
+    compiler = next((name for name in ("clang", "clang-14") if not builds.missing(name, headers=())), None)
+    if compiler is None:
+        pytest.skip("no clang here: scripts/install-firmware-packages installs it")
+    done = subprocess.run(
+        ["make", "-C", str(builds.FIRMWARE), "host", f"CC={compiler}", f"BUILD=build/{compiler}"],
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr
+
+
+@pytest.mark.parametrize("left_out", ["-DTEDS_OPERATION=0", "-DTEDS_CAN_FD=0", "-DTEDS_NFC=1"])
+def test_it_compiles_with_parts_left_out(left_out: str) -> None:
+    builds.need("make", "gcc")
+    words = ["gcc", "-std=c99", "-Wall", "-Wextra", "-Wconversion", "-Wshadow", "-pedantic", "-Werror", "-fsyntax-only"]
+    for source in sorted((builds.FIRMWARE / "src").glob("*.c")):
+        where = [f"-I{builds.FIRMWARE}/include", f"-I{builds.FIRMWARE}/src"]
+        done = subprocess.run([*words, left_out, *where, str(source)], capture_output=True, text=True, check=False)
+        assert done.returncode == 0, done.stderr
