@@ -4,7 +4,10 @@ from __future__ import annotations
 
 import contextlib
 import errno
+import functools
+import importlib
 import logging
+import re
 import select
 import socket
 import sys
@@ -12,6 +15,7 @@ import time
 from typing import TYPE_CHECKING, Any, Final, NoReturn
 
 from teds_provision.errors import LinkFailure, NoReader, UsageFailure
+from teds_provision.lazy import late
 from teds_provision.links.can.frame import Frame
 from teds_provision.links.can.spec import CanSpec
 from teds_provision.links.can.wire.echoes import Echoes
@@ -20,7 +24,11 @@ from teds_provision.links.can.wire.pacing import Pacer
 from teds_provision.links.ports import Trace
 
 if TYPE_CHECKING:
+    import inspect
+
     import can
+else:
+    inspect = late("inspect")  # for a bus with keys of its own
 
 _SEND_SECONDS: Final = 1.0
 _OPENINGS: Final = 5
@@ -34,7 +42,13 @@ _BUS_OFF: Final = 0x40
 """Error class of a SocketCAN error frame (linux/can/error.h, CAN_ERR_BUSOFF)."""
 
 
-__all__ = ["Bus", "Frame"]
+_PICKED: Final = re.compile(r"""kwargs(?:\.get\(|\.pop\(|\[)\s*["'](\w+)["']|:param [^:\n]*?(\w+):""")
+"""A key that an interface picks out of what it is given, or that its documentation names."""
+_ANYWHERE: Final = frozenset({"bitrate", "data_bitrate", "receive_own_messages", "timing"})
+_NOT_KEYS: Final = frozenset({"self", "args", "kwargs", "channel", "can_filters", "interface", "fd", ""})
+
+
+__all__ = ["Bus", "Frame", "known_keys"]
 
 
 class Bus:
@@ -216,6 +230,7 @@ def _open(spec: CanSpec) -> can.BusABC:
 
     for name in ("can", "isotp"):
         logging.getLogger(name).setLevel(logging.CRITICAL)
+    _require_known(spec)
     options = _options(spec)
     try:
         bus = _opened(spec, options)
@@ -232,6 +247,39 @@ def _open(spec: CanSpec) -> can.BusABC:
     if spec.interface == "socketcan":
         bus.set_filters([{"can_id": value, "can_mask": mask, "extended": True} for value, mask in _OURS])
     return bus
+
+
+def _require_known(spec: CanSpec) -> None:
+    """Raise UsageFailure for a key that the interface does not have: python-can takes any, and says nothing."""
+    if not spec.options:
+        return
+    known = known_keys(spec.interface)
+    for key, _ in spec.options:
+        if known and key not in known:
+            own = ", ".join(sorted(known | {"node", "source", "pace", "fd"}))
+            raise UsageFailure(f"--can {spec.interface} has no key {key!r}.", hint=f"It has: {own}.")
+
+
+@functools.cache
+def known_keys(interface: str) -> frozenset[str]:
+    """The keys of a python-can interface: arguments of its class and of those above it, and what it picks by name.
+
+    Empty where nobody can say: an interface whose driver is not installed, or of another package.
+    """
+    from can.interfaces import BACKENDS
+
+    try:
+        module, name = BACKENDS[interface]
+        if not module.startswith("can."):
+            return frozenset()
+        kinds = [kind for kind in getattr(importlib.import_module(module), name).__mro__ if kind is not object]
+        makers = [kind.__init__ for kind in kinds if "__init__" in vars(kind)]
+        source = "".join(map(inspect.getsource, makers))
+    except Exception:  # noqa: BLE001  a driver's library that is missing raises anything
+        return frozenset()
+    named = {key for make in makers for key in inspect.signature(make).parameters}
+    picked = {key for found in _PICKED.findall(source) for key in found}
+    return frozenset(named | picked | _ANYWHERE) - _NOT_KEYS
 
 
 def _multicast(bus: can.BusABC, spec: CanSpec) -> Multicast | None:

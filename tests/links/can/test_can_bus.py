@@ -8,7 +8,7 @@ import can
 import pytest
 
 from teds_provision.errors import LinkFailure, UsageFailure
-from teds_provision.links.can.bus import Bus, Frame
+from teds_provision.links.can.bus import Bus, Frame, known_keys
 from teds_provision.links.can.spec import parse_spec
 from tests.pace import PATIENCE
 
@@ -117,3 +117,27 @@ def test_on_socketcan_programs_of_one_machine_hear_each_other(
     kernel.frames.append(can.Message(arbitration_id=0x18DAF121, data=b"other", is_rx=False))
     assert (bus.receive(0) is not None) == heard
     bus.close()
+
+
+@pytest.mark.parametrize(
+    ("place", "key", "known"),
+    [
+        ("udp_multicast:239.74.163.2?prot=4000", "prot", "port"),
+        ("socketcan:can0?bit_rate=250000", "bit_rate", "bitrate"),
+        ("slcan:/dev/ttyACM0?speed=9600", "speed", "tty_baudrate"),
+        ("virtual:x?nodes=3", "nodes", "node"),
+    ],
+)
+def test_a_key_that_no_interface_has_is_refused_with_those_that_it_has(place: str, key: str, known: str) -> None:
+    """python-can takes any and says nothing: a bit rate with a slip was the default one."""
+    with pytest.raises(UsageFailure) as refusal:
+        Bus(parse_spec(place))
+    assert repr(key) in refusal.value.message
+    assert known in refusal.value.hint.split(": ")[1].rstrip(".").split(", ")
+
+
+def test_keys_that_an_interface_picks_out_of_what_it_is_given_are_known() -> None:
+    assert {"accept_virtual", "driver_mode", "tseg1", "bitrate"} <= known_keys("kvaser")
+    assert {"port", "hop_limit", "receive_own_messages"} <= known_keys("udp_multicast")
+    assert {"host", "port"} <= known_keys("socketcand")
+    assert known_keys("no such interface") == frozenset()
