@@ -55,6 +55,8 @@ class ChannelFacts:
     quantity: str = ""  # what the profile or the name calls it, e.g. "relative humidity"; empty where nobody said
     vector: tuple[int, ...] = ()  # channels of the vector group that it is in, axis by axis; empty where in none
 
+    siblings: tuple[tuple[int, str], ...] = ()  # number and name of every channel of the datasheet, for topics
+
     @property
     def key(self) -> tuple[str, int]:
         """Node and channel: what tells channels apart in a whole station."""
@@ -153,7 +155,7 @@ class StationFacts:
 
     ``names`` maps (uuid, channel) to the topic that the user chose, channel 0 to the node's part of it;
     ``frame_ids`` maps a uuid to a frame. ``scalar_rate`` limits topics of one value (Hz), 0 leaves them out.
-    ``nodes`` maps a uuid to the node's name as this station knows it, before the node itself was asked.
+    ``nodes`` maps a uuid to the node's name, of every node that this station knows: topics are unique among them all.
     ``instance`` tells the measurements of one station apart, which may run side by side; "" where there is one alone.
     """
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import math
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from teds_provision.errors import BadData, PolicyRefused
 from teds_provision.links.ports import Timed
@@ -54,10 +54,13 @@ class Trusted:
 
     def facts(self, channel: Channel, period: float | None) -> ChannelFacts:
         """What goes with every value of a channel that gives one every ``period`` seconds."""
+        siblings = tuple((one.number, one.name) for one in self.sheet.channels)
         if self.unsigned:  # a name to tell channels apart; nothing else that the node says of itself is repeated
             kind = facts_of(self.sheet, channel, name=self.name, fingerprint="", period=period).kind
-            return ChannelFacts(self.uuid, self.name, channel.number, channel.name, kind, period=period, unsigned=True)
-        return facts_of(self.sheet, channel, name=self.name, fingerprint=self.fingerprint, period=period)
+            bare = ChannelFacts(self.uuid, self.name, channel.number, channel.name, kind, period=period, unsigned=True)
+            return replace(bare, siblings=siblings)
+        known = facts_of(self.sheet, channel, name=self.name, fingerprint=self.fingerprint, period=period)
+        return replace(known, siblings=siblings)
 
     def channel(self, number: int) -> Channel:
         """A channel of the datasheet; raises BadData where there is none."""

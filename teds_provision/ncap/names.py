@@ -53,6 +53,8 @@ class Names:
                 f"{name!r} cannot be the name of a topic.",
                 hint="Use letters, digits and single _, beginning with a letter; / between parts.",
             )
+        if name is not None:
+            self._now().require_free(uuid, channel, name)
         raw = bytes.fromhex(uuid)
         if self._is_measured(uuid) or self._station.measurements.is_running(raw):
             raise Frozen(f"Node {uuid} is being measured: its names stay.", hint="End that measurement first.")

@@ -57,6 +57,10 @@ def set_name(app: App, node: str, channel: int, name: str, *, dry_run: bool) -> 
             hint="Use letters, digits and single _, beginning with a letter; / between parts of a channel's.",
         )
     _require_channel(station, uuid, channel)
+    if uuid != STATION:
+        topics = measure.sinks.names.Topics(measure.running.job.station_facts(station))
+        topics.learn(one for _, _, one in _channels(station))
+        topics.require_free(uuid.hex(), channel, chosen)
     if not dry_run:
         _change(app, station, uuid, channel, chosen)
     _tell(app, station)

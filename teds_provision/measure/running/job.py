@@ -157,8 +157,6 @@ class Job:
 
     def _facts(self) -> StationFacts:
         first = next((uuid.hex()[:8] for uuid in self.kept.uuids), "")
-        uuids = self.station.measurements.nodes_of(self.kept)
-        records = filter(None, (self.station.nodes.get(uuid) for uuid in uuids))
         return replace(
             station_facts(self.station),
             group=self.kept.group or "",
@@ -166,7 +164,6 @@ class Job:
             started=time.time(),
             scalar_rate=self.kept.scalar_rate,
             test_pattern=self.wish.test_pattern,
-            nodes={record.uuid.hex(): record.name or "" for record in records},
         )
 
     def _new_sinks(self) -> list[Sink]:
@@ -196,6 +193,7 @@ def wish_of(kept: Kept, more: Wish) -> Wish:
 
 
 def station_facts(station: Station) -> StationFacts:
-    """What the sinks are told of the station: its name, and the names that somebody chose."""
+    """What the sinks are told of the station: its name, those of its nodes, and the names that somebody chose."""
     names = {(uuid.hex(), channel): name for (uuid, channel), name in station.measurements.names.items()}
-    return StationFacts(names.pop((STATION.hex(), 0), station.name), names=names)
+    nodes = {record.uuid.hex(): record.name or "" for record in station.nodes.all()}
+    return StationFacts(names.pop((STATION.hex(), 0), station.name), names=names, nodes=nodes)

@@ -29,9 +29,14 @@ def plain(value: Any) -> Any:
     return value
 
 
+_WITHIN = ("units", "siblings")  # fields of facts that are of use in this process alone
+
+
 def facts_as_json(facts: ChannelFacts) -> dict[str, Any]:
     """Facts of a channel for a header or a metadata message: what is not known is left out."""
-    fields = {field.name: getattr(facts, field.name) for field in dataclasses.fields(facts) if field.name != "units"}
+    fields = {
+        field.name: getattr(facts, field.name) for field in dataclasses.fields(facts) if field.name not in _WITHIN
+    }
     fields["vector"] = list(facts.vector) or None
     return {
         name: plain(value) for name, value in fields.items() if value is not None and value is not False and value != ""

@@ -10,7 +10,9 @@ from __future__ import annotations
 import re
 import unicodedata
 from collections import Counter
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping, Set
+from itertools import chain
+from typing import Final, TypeVar
 
 from teds_provision.errors import UsageFailure
 from teds_provision.measure.blocks import ChannelFacts, StationFacts
@@ -32,7 +34,12 @@ def is_topic(text: str) -> bool:
 
 
 class Topics:
-    """Names of the nodes and channels of one measurement; chosen names go before made ones."""
+    """Names of all nodes and channels of one station: no two topics are equal, whatever names there are.
+
+    Chosen names go before made ones; a made one that is taken, or stands for something else (``teds``, ``imu``), gets
+    its number or the digits of its UUID behind it. What is made follows from ``station`` and from each node's own
+    datasheet alone (:attr:`ChannelFacts.siblings`), so that every measurement and ``/names`` make the same.
+    """
 
     def __init__(self, station: StationFacts) -> None:
         self.station = slug(station.name) or "station"
@@ -43,19 +50,39 @@ class Topics:
                     f"{name!r} for {key[0]} cannot be the name of a topic.",
                     hint="Use letters, digits and single _, beginning with a letter; / between parts.",
                 )
-        self._facts: dict[tuple[str, int], ChannelFacts] = {}
-        self._own = {uuid: slug(name) for uuid, name in station.nodes.items()}  # what each node is called itself
-        self._nodes = _names_of_nodes(self._own)
-        self._channels: dict[tuple[str, int], str] = {}
+        self._whole = {f"/{name}": key for key, name in self._chosen.items() if key[1]}
+        self._channels: dict[str, dict[int, str]] = {}  # of each node: name of each channel as it calls itself
+        self._known = {uuid: slug(name) for uuid, name in station.nodes.items()}  # what each node is called itself
+        self._strangers: dict[str, str] = {}
+        self._nodes: dict[str, str] = {}
+        self._made: dict[str, dict[int, str]] = {}
+        self._name_nodes()
 
     def learn(self, facts: Iterable[ChannelFacts]) -> None:
-        """Facts of channels; names of those that were known stay unless a namesake came."""
-        self._facts.update((one.key, one) for one in facts)
-        self._own.update((one.uuid, slug(one.node)) for one in self._facts.values())
-        self._nodes = _names_of_nodes(self._own)
-        self._channels = _names_of_channels(
-            {key: slug(one.name) or f"ch{one.number}" for key, one in self._facts.items()}
-        )
+        """Facts of channels; a node that the station does not know gives way to those that it does."""
+        strangers = len(self._strangers)
+        for one in facts:
+            if one.uuid not in self._known:
+                self._strangers[one.uuid] = slug(one.node)
+            channels = self._channels.setdefault(one.uuid, {})
+            channels.update({one.number: one.name, **dict(one.siblings)})
+            self._made.pop(one.uuid, None)
+        if len(self._strangers) != strangers:
+            self._name_nodes()
+
+    def _name_nodes(self) -> None:
+        taken = {name for (_, channel), name in self._chosen.items() if not channel} | _NOT_NODES
+        self._nodes = {}
+        for own in (self._known, self._strangers):
+            alike = Counter(uuid[:8] for uuid in own)
+            wishes = {uuid: (name or f"n{uuid[:8]}",) for uuid, name in own.items()}
+            more = {
+                uuid: (f"{name or 'n'}_{uuid[:8]}" if name and alike[uuid[:8]] == 1 else "", f"{name or 'n'}_{uuid}")
+                for uuid, name in own.items()
+            }
+            self._nodes |= _apart(wishes, more, taken)
+            taken |= set(self._nodes.values())
+        self._made = {}
 
     def node(self, uuid: str) -> str:
         """Part of the node: ``arm``, ``n8d4d9da6``."""
@@ -65,7 +92,20 @@ class Topics:
         """Whole topic of a channel: ``/bench/arm/angle``."""
         if (uuid, number) in self._chosen:
             return f"/{self._chosen[uuid, number]}"
-        return f"/{self.station}/{self.node(uuid)}/{self._channels.get((uuid, number), f'ch{number}')}"
+        if uuid not in self._made:
+            self._made[uuid] = self._make(uuid)
+        return f"/{self.station}/{self.node(uuid)}/{self._made[uuid].get(number, f'ch{number}')}"
+
+    def _make(self, uuid: str) -> dict[int, str]:
+        """Names of a node's channels that nobody chose one for."""
+        prefix = f"/{self.station}/{self.node(uuid)}/"
+        channels = self._channels.get(uuid, {})
+        own = {number: name for number, name in channels.items() if (uuid, number) not in self._chosen}
+        mine = [topic.removeprefix(prefix) for topic in self._whole if topic.startswith(prefix)]
+        taken = {*mine, *(topic.removesuffix("/cmd") for topic in mine)}
+        wishes = {number: (slug(name) or f"ch{number}",) for number, name in own.items()}
+        more = {number: (f"{wish}_{number}", f"{wish}_ch{number}") for number, (wish,) in wishes.items()}
+        return _apart(wishes, more, taken, _NOT_CHANNELS)
 
     def of_node(self, uuid: str, what: str) -> str:
         """A topic beside the channels of a node: ``/bench/arm/teds``."""
@@ -75,18 +115,66 @@ class Topics:
         """The array of a group: ``/bench/hand``; of a measurement without one ``/bench/all``."""
         return f"/{self.station}/{slug(group) or 'all'}"
 
+    def require_free(self, uuid: str, channel: int, name: str) -> None:
+        """Raise UsageFailure where a name that is to be chosen is, or would be taken for, another one's."""
+        name = name.strip("/")
+        if not channel:
+            other = next(
+                (one for one in {**self._known, **self._strangers} if one != uuid and self.node(one) == name), ""
+            )
+            if other or name in _NOT_NODES:
+                raise _taken(name, f"node {other}" if other else "something else")
+            return
+        topic = f"/{name}"
+        if name.partition("/")[0] in _NOT_TOPICS or self._stands_for_else(topic):
+            raise _taken(name, "something else")
+        for other, channels in self._channels.items():
+            for number in channels:
+                theirs = self.channel(other, number)
+                if (other, number) != (uuid, channel) and topic in (theirs, f"{theirs}/cmd"):
+                    raise _taken(name, f"channel {number} of node {other}")
 
-def _names_of_nodes(own: dict[str, str]) -> dict[str, str]:
-    """Names by UUID, of what each node is called itself: two of one name get the digits of their UUID behind it."""
-    namesakes, alike = Counter(own.values()), Counter(uuid[:8] for uuid in own)
-    names = {}
-    for uuid, name in own.items():
-        short = uuid[:8] if alike[uuid[:8]] == 1 else uuid
-        names[uuid] = f"n{short}" if not name else name if namesakes[name] == 1 else f"{name}_{short}"
-    return names
+    def _stands_for_else(self, topic: str) -> bool:
+        """Whether a topic is that of a node as a whole, of a group, or of what goes with them."""
+        _, _, rest = topic.partition(f"/{self.station}/")
+        if not topic.startswith(f"/{self.station}/") or not rest:
+            return False
+        parts = rest.split("/")
+        return len(parts) == 1 or bool(_NOT_CHANNELS.fullmatch(parts[-1])) or parts[-1] == "cmd"
 
 
-def _names_of_channels(own: dict[tuple[str, int], str]) -> dict[tuple[str, int], str]:
-    """Names by node and number: two of one name in one node get their number behind it."""
-    taken = Counter((uuid, name) for (uuid, _), name in own.items())
-    return {key: f"{name}_{key[1]}" if taken[key[0], name] > 1 else name for key, name in own.items()}
+_NOT_NODES: Final = frozenset({"all", "reports", "status", "unverified"})
+"""Parts of topics of the station itself: no node is called so."""
+_NOT_CHANNELS: Final = re.compile(r"(teds|state|status|age|cmd|(stream|imu|magnetic_field|wrench)(_[0-9]+)?)")
+"""Parts of topics that stand beside the channels of a node (live.py, vectors.py, mcap/recording.py, mqtt.py)."""
+_NOT_TOPICS: Final = frozenset(
+    {"diagnostics", "diagnostics_agg", "rosout", "rosout_agg", "parameter_events", "tf", "tf_static", "clock"}
+)
+"""Topics of ROS itself."""
+_Key = TypeVar("_Key", str, int)
+
+
+def _taken(name: str, by: str) -> UsageFailure:
+    return UsageFailure(f"{name!r} is the topic of {by} already.", hint="Choose another name.")
+
+
+def _apart(
+    wishes: Mapping[_Key, tuple[str, ...]],
+    more: Mapping[_Key, tuple[str, ...]],
+    taken: Set[str],
+    forbidden: re.Pattern[str] | None = None,
+) -> dict[_Key, str]:
+    """Each its wish where nobody else has it, else the first of ``more`` that is free, else that with a number."""
+
+    def may(name: str) -> bool:
+        return bool(name) and name not in taken and not (forbidden and forbidden.fullmatch(name))
+
+    count = Counter(name for (name,) in wishes.values())
+    found = {key: name for key, (name,) in wishes.items() if count[name] == 1 and may(name)}
+    used = set(found.values())
+    for key in sorted(wishes.keys() - found.keys()):
+        last = more[key][-1]
+        tries = chain(more[key], (f"{last}_{number}" for number in range(2, 1 << 30)))
+        found[key] = next(name for name in tries if may(name) and name not in used and name not in count)
+        used.add(found[key])
+    return found

@@ -6,12 +6,13 @@ import json
 import re
 import time
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from teds_provision.errors import UsageFailure
@@ -61,6 +62,67 @@ def test_a_chosen_name_goes_before_a_made_one_and_must_be_one() -> None:
     for wrong in ("two words", "a__b", "9lives", "end_", ""):
         with pytest.raises(UsageFailure):
             Topics(replace(STATION, names={(ARM, 1): wrong}))
+
+
+WORDS = st.sampled_from(
+    ["arm", "Arm", "arm_8d4d9da6", "n8d4d9da6", "hand", "all", "reports", "status", "", "angle", "angle_2", "angle_ch2",
+     "ch1", "ch2", "teds", "imu", "imu_2", "stream_0", "state", "cmd", "age", "bench", "wrench_1", "unverified"]
+)  # fmt: skip
+UUIDS = ["8d4d9da65281f7000001", "8d4d9da65281f7000002", "8d4d9da75281f7000003", "0123456789abcdef0000"]
+CHOSEN = st.sampled_from(
+    ["arm", "hand", "bench/arm/angle", "bench/arm/angle_2", "bench/hand/ch2", "bench/arm/imu", "bench/hand",
+     "bench/all", "crane/boom", "bench/arm/angle/cmd", "diagnostics", "angle", "n8d4d9da6", "arm_8d4d9da6",
+     "bench/reports", "status", "bench/arm_8d4d9da6/angle", "bench/hand/age", "bench/all/age"]
+)  # fmt: skip
+NODES = st.dictionaries(st.sampled_from(UUIDS), WORDS, min_size=2)
+CHANNELS = st.dictionaries(
+    st.tuples(st.sampled_from(UUIDS), st.sampled_from([1, 2, 3, 12])), WORDS, min_size=2, max_size=10
+)
+WISHES = st.lists(st.tuples(st.sampled_from(UUIDS), st.sampled_from([0, 1, 2, 3]), CHOSEN), max_size=6)
+
+
+@settings(max_examples=300, deadline=None)
+@given(nodes=NODES, channels=CHANNELS, wishes=WISHES, measured=st.sets(st.sampled_from(UUIDS), min_size=1))
+def test_no_two_topics_are_equal_whatever_was_chosen_and_made(
+    nodes: dict[str, str], channels: dict[tuple[str, int], str], wishes: list[tuple[str, int, str]], measured: set[str]
+) -> None:
+    """Also: a measurement of some nodes, of some of their channels, makes the very names that /names shows."""
+    facts = []
+    for (uuid, number), name in channels.items():
+        if uuid in nodes:
+            siblings = tuple((other, text) for (whose, other), text in channels.items() if whose == uuid)
+            facts.append(ChannelFacts(uuid, nodes[uuid], number, name, siblings=siblings))
+    station = StationFacts("bench", nodes=nodes)
+    for uuid, number, name in wishes:
+        there = uuid in nodes and (not number or (uuid, number) in channels)
+        if not there or name in station.names.values() or (not number and "/" in name):
+            continue  # as store and command refuse it
+        now = Topics(station)
+        now.learn(facts)
+        with suppress(UsageFailure):
+            now.require_free(uuid, number, name)
+            station = replace(station, names={**station.names, (uuid, number): name})
+    topics = Topics(station)
+    topics.learn(facts)
+    every = [topics.channel(*one.key) for one in facts]
+    every += [f"{topic}/cmd" for topic in every]
+    of_nodes = ("teds", "state", "imu", "imu_2", "magnetic_field", "wrench", "wrench_1", "stream_0")
+    every += [topics.of_node(uuid, what) for uuid in nodes for what in of_nodes]
+    every += [f"/bench/{topics.node(uuid)}" for uuid in nodes]
+    every += ["/bench/reports", "/bench/status", "/bench/all", "/bench/all/age", "/diagnostics"]
+    assert sorted(every) == sorted(set(every))
+    some = Topics(station)
+    some.learn([one for one in facts if one.uuid in measured and one.number != 2])
+    mine = [one for one in facts if one.uuid in measured and one.number != 2]
+    assert [some.channel(*one.key) for one in mine] == [topics.channel(*one.key) for one in mine]
+    assert all(some.node(uuid) == topics.node(uuid) for uuid in measured & nodes.keys())
+
+
+def test_a_stranger_takes_no_name_of_a_node_that_is_known() -> None:
+    topics = Topics(replace(STATION, nodes={ARM: "arm"}))
+    topics.learn([ANGLE, replace(FORCE, node="arm")])
+    assert topics.node(ARM) == "arm"
+    assert topics.node(HAND) != "arm"
 
 
 def test_words_become_plain_letters() -> None:
