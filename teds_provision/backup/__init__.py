@@ -5,6 +5,6 @@ from typing import TYPE_CHECKING
 from teds_provision.lazy import lazy
 
 if TYPE_CHECKING:
-    from teds_provision.backup import backup, chunks, content, merge, restore, sealed_file, version_1
+    from teds_provision.backup import backup, chunks, content, merge, restore, sealed_file
 else:
     __getattr__ = lazy(__name__)

@@ -7,7 +7,7 @@ Then chunks (:mod:`.chunks`), each bound to the SHA-256 of that line. Inside: a 
 the store as rows (:mod:`teds_provision.store.dump`), and the station's signature, 64 octets: SIG(station,
 "TEDS1 backup" ‖ 00 ‖ SHA-256 of the first line ‖ SHA-256 of all that stands before the signature).
 
-Files of version 1 (:mod:`.version_1`) still open.
+Files of version 1, of the time before KeyAgreement 2, are refused by name.
 """
 
 from __future__ import annotations
@@ -18,7 +18,6 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Any, BinaryIO, Final
 
-from teds_provision.backup import version_1
 from teds_provision.backup.chunks import KEY_OCTETS, ChunkReader, ChunkWriter
 from teds_provision.backup.content import MAX_HEAD_OCTETS, Content, Head, check_digest, context_of, digest_of
 from teds_provision.errors import BadData, NotAuthentic, NotFound, PolicyRefused
@@ -27,7 +26,7 @@ from teds_provision.protocol.handover import jose
 from teds_provision.protocol.handover.strict_json import dump, load_object
 from teds_provision.protocol.keys import SIGNATURE_OCTETS, PrivateKey, fingerprint, verify
 from teds_provision.store.dump import load as load_rows
-from teds_provision.store.snapshot import load as load_database
+from teds_provision.store.failures import too_old
 from teds_provision.vault import passphrase as sealing
 
 FORMAT: Final = "teds-backup/2"
@@ -90,27 +89,25 @@ class SealedFile:
         if self.octets > MAX_OCTETS:
             raise BadData(f"The file is larger than {MAX_OCTETS} octets; no backup is.")
         self._line = line
-        self._head: dict[str, Any] | None = None
-        if line.startswith(b'{"format":"teds-backup/2"'):
-            self._head = load_object(line, "The head of the backup") if line.endswith(b"\n") else None
-            if self._head is None or not isinstance(self._head.get("key"), dict):
-                raise BadData("The backup was cut off in its head, or it is damaged.", hint="Take another copy.")
-            self.is_for_key = "protected" in self._head["key"]
-        else:
-            self.is_for_key = version_1.is_for_key(version_1.read(path))
+        if not line.startswith(b'{"format":"teds-backup/2"'):
+            if b"teds-backup/1" in line or b'"protected"' in line:
+                raise too_old("The store in the backup", 1)
+            raise BadData("This is not a backup of this version of teds-provision.")
+        if not line.endswith(b"\n") or not isinstance(
+            (head := load_object(line, "The head of the backup")).get("key"), dict
+        ):
+            raise BadData("The backup was cut off in its head, or it is damaged.", hint="Take another copy.")
+        self._head = head
+        self.is_for_key = "protected" in head["key"]
 
     def open_with_passphrase(self, passphrase: str) -> Content:
         """Open it; raises BadData, NotAuthentic (damaged or changed), WrongPassphrase, VaultFailure."""
-        if self._head is None:
-            return _of_version_1(version_1.open_with_passphrase(version_1.read(self.path), passphrase))
         clear = self._checked_head()
         key, _ = sealing.unseal(passphrase, self._head["key"], context=context_of(clear, FORMAT))
         return self.open_with_content_key(key)
 
     def open_with_key(self, key: PrivateKey) -> Content:
         """Open it with the recovery key; raises PolicyRefused (another key), NotAuthentic, BadData."""
-        if self._head is None:
-            return _of_version_1(version_1.open_with_key(version_1.read(self.path), key))
         self._checked_head()
         sealed = dump(self._head["key"])
         recipients = jose.read_header(sealed, max_octets=_MAX_LINE_OCTETS).recipients
@@ -134,7 +131,6 @@ class SealedFile:
 
     def _checked_head(self) -> dict[str, Any]:
         """The members in the clear, held against their digest."""
-        assert self._head is not None
         check_digest(self._head)
         return {name: self._head.get(name) for name in _CLEAR}
 
@@ -153,8 +149,3 @@ def _content(chunks: ChunkReader, bound: bytes, clear: dict[str, Any]) -> Conten
     except BaseException:
         copy.close()
         raise
-
-
-def _of_version_1(old: version_1.Content) -> Content:
-    head = {name: value for name, value in vars(old).items() if name != "database"}
-    return Content(**head, copy=load_database(old.database))

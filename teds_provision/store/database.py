@@ -8,18 +8,17 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterator, Sequence, Sized
-from contextlib import nullcontext, suppress
+from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
 from teds_provision.errors import StoreFailure, StoreLocked
 from teds_provision.lazy import late
 from teds_provision.store.connection import QUIET_SECONDS, WAITING, Connection
-from teds_provision.store.failures import BUSY_SECONDS, as_store_failure, is_no_place_to_write
+from teds_provision.store.failures import BUSY_SECONDS, as_store_failure, is_no_place_to_write, too_old
 from teds_provision.store.frozen import open_copy
 from teds_provision.store.home import FILE_NAME, prepare_file, prepare_home
-from teds_provision.store.migration import carry
-from teds_provision.store.schema import APPLICATION_ID, SCHEMA_VERSION, STEPS_TO
+from teds_provision.store.schema import APPLICATION_ID, OLDEST_SCHEMA, SCHEMA_VERSION, STEPS_TO
 
 if TYPE_CHECKING:
     import sqlite3
@@ -184,9 +183,8 @@ class Database(Connection):
         with self.transaction(), self._translated():
             before = self._version()  # another process may have been first
             for step in range(before + 1, SCHEMA_VERSION + 1):
-                with carry(self._connection, step) if before else nullcontext():
-                    for statement in STEPS_TO[step]:
-                        self.execute(statement)
+                for statement in STEPS_TO[step]:
+                    self.execute(statement)
             self.execute(f"PRAGMA application_id={APPLICATION_ID}")
             self.execute(f"PRAGMA user_version={SCHEMA_VERSION}")
 
@@ -208,6 +206,8 @@ class Database(Connection):
         tables = self.execute("SELECT count(*) FROM sqlite_schema")[0][0]
         if (version or tables) and mark != APPLICATION_ID:
             raise StoreFailure(f"{self.path} is a database of another program.", hint="Choose another --home.")
+        if 0 < version < OLDEST_SCHEMA:
+            raise too_old(f"The store {self.path}", version)
         if version > SCHEMA_VERSION:
             raise StoreFailure(
                 f"The store {self.path} has schema {version}; this version of the tool knows up to {SCHEMA_VERSION}.",

@@ -17,7 +17,8 @@ from typing import TYPE_CHECKING, Any, Final, Protocol
 from teds_provision.errors import BadData, StoreFailure
 from teds_provision.lazy import late
 from teds_provision.store.database import PAGE, places
-from teds_provision.store.schema import APPLICATION_ID, SCHEMA_VERSION, STEPS_TO
+from teds_provision.store.failures import too_old
+from teds_provision.store.schema import APPLICATION_ID, OLDEST_SCHEMA, SCHEMA_VERSION, STEPS_TO
 from teds_provision.store.store import Store
 
 if TYPE_CHECKING:
@@ -133,6 +134,8 @@ def _head(source: RowSource) -> tuple[int, dict[str, list[str]]]:
         raise BadData("The backup holds no store.") from None
     if not whole or version < 1 or len(tables) >= _END:
         raise BadData("The backup holds no store.")
+    if version < OLDEST_SCHEMA:
+        raise too_old("The store in the backup", version)
     if version > SCHEMA_VERSION:
         raise StoreFailure(
             f"The store in the backup has schema {version}; this version of the tool knows up to {SCHEMA_VERSION}.",

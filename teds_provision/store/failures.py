@@ -75,3 +75,11 @@ def is_no_place_to_write(failure: StoreFailure) -> bool:
         return cause.errno in _OS_CAUSES
     refused = (sqlite3.SQLITE_READONLY, sqlite3.SQLITE_CANTOPEN, sqlite3.SQLITE_IOERR, sqlite3.SQLITE_FULL)
     return isinstance(cause, sqlite3.Error) and getattr(cause, "sqlite_errorcode", 0) & 0xFF in refused
+
+
+def too_old(what: str, version: int) -> StoreFailure:
+    """The error for a store, or the store in a backup (``what``), of a schema before KeyAgreement 2."""
+    return StoreFailure(
+        f"{what} is of schema {version}, from before KeyAgreement 2; no node agrees that way any more.",
+        hint="Nothing of it was released. Choose another --home, run init there, and provision the nodes anew.",
+    )

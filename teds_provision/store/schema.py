@@ -10,6 +10,8 @@ from typing import Final
 
 APPLICATION_ID: Final = 0x54454453  # "TEDS"
 SCHEMA_VERSION: Final = 7
+OLDEST_SCHEMA: Final = 7
+"""The first of KeyAgreement 2. Link keys of older stores were agreed as no node does any more."""
 
 _VERSION_1: Final = (
     "CREATE TABLE meta(name TEXT PRIMARY KEY, value TEXT NOT NULL) STRICT, WITHOUT ROWID",
@@ -70,7 +72,7 @@ _VERSION_1: Final = (
 )
 
 # What came with version 2: the settings by name became tables, images lie as octets and once, rows that decide whom the
-# station believes carry a MAC. ``migration.carry`` moves what SQL alone cannot read.
+# station believes carry a MAC.
 _VERSION_2: Final = (
     "DROP TABLE steps",
     "DROP TABLE node_images",

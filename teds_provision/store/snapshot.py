@@ -8,7 +8,7 @@ from enum import Enum
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
-from teds_provision.errors import BadData, StoreFailure
+from teds_provision.errors import StoreFailure
 from teds_provision.files import whole_draft
 from teds_provision.lazy import late
 from teds_provision.store.failures import as_store_failure
@@ -21,8 +21,6 @@ else:  # loaded with the first store: --help does not wait for it
     sqlite3 = late("sqlite3")
 
 
-_MAGIC: Final = b"SQLite format 3\0"
-_FORMAT_VERSIONS: Final = slice(18, 20)  # of the file header: 1 for a rollback journal, 2 for a write-ahead log
 _COUNTED: Final = ("whitelist", "nodes", "keys", "trust")
 _DAMAGE: Final = (sqlite3.SQLITE_CORRUPT, sqlite3.SQLITE_NOTADB)
 
@@ -34,26 +32,6 @@ class Relation(Enum):
     OLDER = "an older state"
     NEWER = "a newer state"
     DIVERGED = "a state that went another way"
-
-
-def load(octets: bytes) -> Store:
-    """Open a whole database file (backups of version 1 hold one) in memory; an older schema is brought forward.
-
-    Raises BadData, StoreFailure.
-    """
-    if not octets.startswith(_MAGIC) or octets[_FORMAT_VERSIONS] != b"\1\1":
-        raise BadData("The backup holds no store.")
-    connection = sqlite3.connect(":memory:", isolation_level=None, check_same_thread=False)
-    try:
-        connection.deserialize(octets)
-        store = Store.of_backup(connection)
-    except sqlite3.Error as error:
-        connection.close()
-        raise BadData("The backup holds no store that can be read.") from error
-    except BaseException:
-        connection.close()
-        raise
-    return store
 
 
 def place(copy: Store, home: Path) -> None:

@@ -12,18 +12,14 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from teds_provision.backup.chunks import CHUNK_OCTETS, ChunkReader, ChunkWriter
-from teds_provision.backup.restore import merge_sealed, rebuild
 from teds_provision.backup.sealed_file import SealedFile
-from teds_provision.errors import BadData, NotAuthentic, StoreFailure, WrongPassphrase
-from teds_provision.protocol.keys import SoftwareKey
+from teds_provision.errors import BadData, NotAuthentic, StoreFailure
 from teds_provision.station.station import Station
-from teds_provision.store import Draft, WhitelistEntry
+from teds_provision.store import Draft
 from teds_provision.store import dump as rows
 from teds_provision.store.schema import SCHEMA_VERSION
 from teds_provision.teds.image import Image
-from teds_provision.vault import forget_vaults
-from teds_provision.vault.passphrase import THROWAWAY
-from tests.backup.backups import FIXTURES, SEALED, TWO, ask, back_up, keys_of, opened, opened_octets
+from tests.backup.backups import back_up, opened, opened_octets
 
 
 def test_a_store_of_several_chunks_goes_out_and_comes_back(station: Station, tmp_path: Path) -> None:
@@ -77,41 +73,14 @@ def test_any_length_goes_through_the_chunks(length: int) -> None:
         ChunkReader(io.BytesIO(out.getvalue()), key, b"other").require_end()
 
 
-def test_backups_of_version_1_still_open(tmp_path: Path) -> None:
-    """Made by version 1's own code: a station named "version one" with two nodes and their keys."""
-    with SealedFile(FIXTURES / "version-1.backup").open_with_passphrase(SEALED) as content:
-        assert (content.name, len(content.copy.nodes())) == ("version one", 2)
-        done = rebuild(tmp_path / "home", content, ask, costs=THROWAWAY)
-    assert (done.back["nodes"], done.rotations_due) == (2, 2)
-    again = Station.open(tmp_path / "home", ask=ask)
-    assert keys_of(again, TWO) == [(1, "active", bytes([2]) * 16)]
-    again.close()
-    recovery = SoftwareKey.from_secret(bytes(31) + b"\x07")
-    with SealedFile(FIXTURES / "version-1-recovery.backup").open_with_key(recovery) as content:
-        assert len(content.copy.nodes()) == 2
-    with pytest.raises(WrongPassphrase):
-        SealedFile(FIXTURES / "version-1.backup").open_with_passphrase("other words here")
-
-
-def test_what_a_backup_of_version_1_brings_into_a_sealed_store_is_sealed(tmp_path: Path) -> None:
-    with SealedFile(FIXTURES / "version-1.backup").open_with_passphrase(SEALED) as content:
-        rebuild(tmp_path / "home", content, ask, costs=THROWAWAY)
-        forget_vaults()
-        station = Station.open(tmp_path / "home", ask=ask)
-        station.unlock()  # takes it over
-        lost = station.pins.whitelist()[0].uuid
-        station.pins.remove(lost)
-    with SealedFile(FIXTURES / "version-1.backup").open_with_passphrase(SEALED) as content:
-        done = merge_sealed(station._store, content, station.vault, ask)
-    assert done.back["whitelist"] == 1
-    assert list(station.seals.all_broken()) == []
-    assert station.pins.entry(lost) is not None
-    station._store.put_whitelist(WhitelistEntry(b"\xee" * 10))  # by another program
-    station.pins.remove(lost)
-    with SealedFile(FIXTURES / "version-1.backup").open_with_passphrase(SEALED) as content:
-        merge_sealed(station._store, content, station.vault, ask)
-    assert f"the whitelist entry of {'ee' * 10}" in list(station.seals.all_broken())
-    station.close()
+@pytest.mark.parametrize(
+    "line", ['{"format":"teds-backup/1","store":"…"}', '{"protected":"e30","recipients":[],"ciphertext":"","tag":""}']
+)
+def test_backups_of_version_1_are_refused_by_name(tmp_path: Path, line: str) -> None:
+    file = tmp_path / "old.backup"
+    file.write_text(line)
+    with pytest.raises(StoreFailure, match="before KeyAgreement 2"):
+        SealedFile(file)
 
 
 class Octets:

@@ -375,23 +375,17 @@ def receipt_seeds() -> Iterable[bytes]:
 
 def check_backup(data: bytes) -> None:
     """A backup: its sealed chunks, its head, and the dump of rows behind right seals."""
-    from teds_provision.backup import chunks, content, sealed_file, version_1
+    from teds_provision.backup import chunks, content, sealed_file
     from teds_provision.store.dump import load
 
     if not data:
         return
-    kind, body = data[0] % 4, data[1:]
+    kind, body = data[0] % 3, data[1:]
     if kind == 0:
         reader = chunks.ChunkReader(BytesIO(body), bytes(32), b"")
         reads(lambda: reader.read(len(body)), reader.require_end)
     elif kind == 1:
         reads(lambda: content.Head.read(body, sealed_file.FORMAT))
-    elif kind == 2:
-        reads(
-            lambda: version_1._parsed(body),
-            lambda: version_1._verified(body),
-            lambda: version_1.is_for_key(body),
-        )
     else:
         out = BytesIO()
         writer = chunks.ChunkWriter(out, bytes(32), b"")

@@ -2,15 +2,10 @@
 
 from __future__ import annotations
 
-import sqlite3
-from contextlib import closing
-from pathlib import Path
-
 import pytest
 
 from teds_provision.errors import BadData, StoreFailure, TedsProvisionError
 from teds_provision.store import Group, Measurement, Store
-from teds_provision.store.schema import APPLICATION_ID, STEPS_TO
 
 ONE, TWO = bytes(range(10)), bytes(range(1, 11))
 
@@ -78,23 +73,3 @@ def test_how_nodes_are_detected_is_kept(store: Store) -> None:
     for mode in ("transparent", "whitelist"):
         store.put_detection(mode)
         assert store.detection() == mode
-
-
-def test_a_store_of_schema_2_keeps_its_measurements(tmp_path: Path) -> None:
-    home = tmp_path / "home"
-    home.mkdir(mode=0o700)
-    with closing(sqlite3.connect(home / "store.sqlite3")) as database, database:
-        for step in (1, 2):
-            for statement in STEPS_TO[step]:
-                database.execute(statement)
-        database.execute("INSERT INTO meta VALUES('id', ?)", ("0" * 32,))
-        database.execute("INSERT INTO groups VALUES('hand', 'then')")
-        database.execute("INSERT INTO measurements VALUES('m1', 'hand', '[]', 50, 'periodic', 1, '[\"ros1\"]', 'then')")
-        database.execute(f"PRAGMA application_id={APPLICATION_ID}")
-        database.execute("PRAGMA user_version=2")
-    with Store.open(home) as store:
-        wanted = Measurement("m1", "hand", rate=50.0, kind="periodic", trigger=True, sinks=("ros1",), created="then")
-        assert store.measurements() == [wanted]
-        assert store.damage() is None
-        assert store.remove_group("hand")
-        assert store.measurements() == []

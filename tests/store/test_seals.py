@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 import hmac
-import shutil
 import sqlite3
 from collections.abc import Callable, Iterator
 from contextlib import closing
@@ -20,11 +19,12 @@ from teds_provision.station.station import Station, initialise
 from teds_provision.store import Revocation, TrustRecord, WhitelistEntry
 from teds_provision.vault import forget_vaults, passphrase
 
-from .test_migration import MADE, PASSPHRASE
-
 NODE = bytes(range(10))
 POINT = SoftwareKey.generate().point
 OTHER = SoftwareKey.generate().point
+
+
+PASSPHRASE = "correct horse battery"
 
 
 def ask(prompt: str, confirm: bool) -> str:
@@ -254,33 +254,6 @@ def test_a_new_master_key_leaves_the_seals_whole(opened: Open) -> None:
     station = opened()
     station.unlock()
     assert list(station.seals.all_broken()) == []
-
-
-def test_a_store_of_version_1_is_taken_over_once_and_listed(tmp_path: Path) -> None:
-    home = tmp_path / "home"
-    home.mkdir(mode=0o700)
-    for name in ("store.sqlite3", "vault.json"):
-        shutil.copy(MADE / name, home / name)
-    for round_ in range(2):
-        forget_vaults()
-        said: list[str] = []
-        station = Station.open(home, ask=ask, tell=said.append)
-        station.unlock()
-        assert list(station.seals.all_broken()) == []
-        acts = [entry.act for entry in station.audit_log.entries()]
-        assert acts.count("seal") == 1
-        assert len(said) == (1 if round_ == 0 else 0)
-        if round_ == 0:
-            assert "6 whitelist entries" in said[0]
-            assert "east, owner, south" in said[0]
-        station.close()
-    behind_its_back(home, "UPDATE whitelist SET mac = NULL")
-    forget_vaults()
-    station = Station.open(home, ask=ask)
-    station.unlock()
-    with pytest.raises(StoreChanged):  # a row without a seal is taken over once, not a second time
-        station.pins.whitelist()
-    station.close()
 
 
 def test_a_changed_identity_key_is_not_handed_over(home: Path, opened: Open) -> None:

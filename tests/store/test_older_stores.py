@@ -1,0 +1,42 @@
+"""Stores of before KeyAgreement 2 are refused by name, and nothing of them is read."""
+
+from __future__ import annotations
+
+import sqlite3
+from contextlib import closing
+from pathlib import Path
+
+import pytest
+
+from teds_provision.errors import StoreFailure
+from teds_provision.store import Store
+from teds_provision.store.schema import OLDEST_SCHEMA, SCHEMA_VERSION
+from tests.bench import make_station
+
+
+def stamped(home: Path, version: int) -> bytes:
+    """The station's store says that it is of another schema; its octets."""
+    with closing(sqlite3.connect(home / "store.sqlite3")) as connection:
+        connection.execute(f"PRAGMA user_version={version}")
+        connection.execute("PRAGMA wal_checkpoint(TRUNCATE)")
+    return (home / "store.sqlite3").read_bytes()
+
+
+@pytest.mark.parametrize("version", range(1, OLDEST_SCHEMA))
+def test_a_store_of_before_key_agreement_2_is_refused_and_left_as_it_is(tmp_path: Path, version: int) -> None:
+    home = tmp_path / "home"
+    make_station(home).close()
+    before = stamped(home, version)
+    with pytest.raises(StoreFailure, match="from before KeyAgreement 2") as error:
+        Store.open(home)
+    assert error.value.exit_code == 7
+    assert "init" in error.value.hint
+    assert (home / "store.sqlite3").read_bytes() == before
+
+
+def test_a_store_of_a_later_schema_is_refused(tmp_path: Path) -> None:
+    home = tmp_path / "home"
+    make_station(home).close()
+    stamped(home, SCHEMA_VERSION + 1)
+    with pytest.raises(StoreFailure, match="knows up to"):
+        Store.open(home)
