@@ -13,10 +13,11 @@ from teds_provision.measure.blocks import ChannelFacts
 from teds_provision.measure.clock import ClockMap, Exchange
 from teds_provision.measure.facts import facts_of
 from teds_provision.protocol.operation import commands
-from teds_provision.protocol.operation.commands import Operate, Operation
+from teds_provision.protocol.operation.commands import Operation
 from teds_provision.protocol.operation.stream_commands import CLOCK, Clock
 from teds_provision.station.station import Station
 from teds_provision.steps.agree import require_session
+from teds_provision.steps.board_type import operate
 from teds_provision.steps.verify import require_authentic
 from teds_provision.steps.verify_node import look_in_session
 from teds_provision.talk.conversation import Conversation
@@ -151,8 +152,7 @@ def ask_clock(node: Conversation) -> tuple[Clock, Exchange]:
 
 def claim(trusted: Trusted, channel: int, *, lease: int, dead_man: int | None = None) -> None:
     """Operate: claim a channel, 0 for every sensor; ``lease`` in s, ``dead_man`` in ms for an actuator."""
-    command = Operate(channel, trusted.digest, lease, dead_man).command()
-    trusted.node.send(command, f"to measure with channel {channel}" if channel else "to measure")
+    operate(trusted.node, channel, trusted.digest, lease=lease, dead_man=dead_man)
 
 
 def operation(node: Conversation) -> Operation:

@@ -8,6 +8,7 @@ if TYPE_CHECKING:
     from teds_provision.steps import (
         address,
         agree,
+        board_type,
         build,
         build_order,
         identify,

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING
 from teds_provision.errors import BadData, NotFound, PolicyRefused
 from teds_provision.protocol import datasheet
 from teds_provision.station.station import Station
+from teds_provision.steps.board_type import Retype, differences, is_remembered, refuse
 from teds_provision.steps.build_order import BuildOrder, Prepared, compose, guard, merged, named_for, own_name, prepare
 from teds_provision.steps.read import Survey
 from teds_provision.steps.sign import known_image, known_node_keys, unsigned_security
@@ -73,17 +74,22 @@ def build(
     has: Image | None = None,
     edition: int = 2007,
     keep_draft: bool = True,
+    retype: Retype = refuse,
 ) -> Built:
     """Build a node's datasheet as a draft: a trial, which only ``sign``, ``write`` or a "yes" bring onto the node.
 
     Where the order brings no calibration, that of an earlier run that never came to write is taken, else the one that
     the node was last read to have (``has``: another one's). ``keep_draft`` False changes nothing (dry run).
 
-    Raises NotFound (profile, file), BadData (profile or calibration with errors), PolicyRefused (a calibration that
-    the guard refuses).
+    ``retype`` is asked where the board, as it was last read, is of another type. Raises NotFound (profile, file),
+    BadData (profile or calibration with errors), WrongBoard, PolicyRefused (a calibration that the guard refuses).
     """
     prepared = named_for(station, uuid, prepare(station, order, uuid))
     has = has or known_image(station, uuid)
+    if has is not None and prepared.profile is not None and not order.retype:
+        told = differences(has.blocks, prepared.profile, prepared.calibrations or ())
+        if told and not is_remembered(station, uuid, order.profile, factory=False):
+            retype(uuid, told)
     plan = compose(station, uuid, prepared, pending_image(station, uuid, has) or has, edition=edition)
     image = Image(uuid, dict(plan.blocks))
     warnings = plan.warnings + guard(

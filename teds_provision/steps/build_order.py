@@ -45,6 +45,7 @@ class BuildOrder:
     name: str | None = None
     drop_calibration: bool = False
     accept_calibration: str | None = None
+    retype: bool = False  # whether the board may become one of another type than it says it is
 
     @property
     def names_nothing(self) -> bool:

@@ -9,14 +9,25 @@ from __future__ import annotations
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass
+from typing import Any
 
 from teds_provision.errors import PolicyRefused, StoreFailure, TedsProvisionError
 from teds_provision.protocol.datasheet import NodeKeys
 from teds_provision.protocol.messages.identity import NodeState
 from teds_provision.station.station import Station
 from teds_provision.steps.agree import Agreed, TakeOver, agree
+from teds_provision.steps.board_type import (
+    Borne,
+    Retype,
+    bears,
+    differences,
+    further,
+    is_remembered,
+    refuse,
+    shown_by,
+)
 from teds_provision.steps.build import BuildOrder, Confirm, Proposal, nobody, propose
-from teds_provision.steps.build_order import Prepared, named_for, no_profile, prepare
+from teds_provision.steps.build_order import Prepared, merged, named_for, no_profile, prepare
 from teds_provision.steps.identify import Identified, identify
 from teds_provision.steps.read import Survey, survey
 from teds_provision.steps.sign import Signed, sign
@@ -26,7 +37,7 @@ from teds_provision.steps.write import Low, Written, wait_for_charge, write
 from teds_provision.store import Draft, WhitelistEntry
 from teds_provision.store.records import Assurance
 from teds_provision.talk.conversation import Conversation
-from teds_provision.talk.progress import DONE, NOTHING, Reporter, StepResult, Steps
+from teds_provision.talk.progress import DONE, NOTHING, SKIPPED, Reporter, StepResult, Steps
 from teds_provision.teds.calibration.describe import sentence
 from teds_provision.teds.image import SECURITY, Image
 
@@ -47,6 +58,8 @@ class Provisioned:
     image: Image
     verified: Verified
     warnings: tuple[str, ...]
+    samples: tuple[dict[str, Any], ...] = ()
+    """One reading of each sensor at the end: channel, name, value and unit (SI), valid."""
 
 
 def provision(
@@ -60,15 +73,17 @@ def provision(
     onward: Onward | None = None,
     low: Low = wait_for_charge,
     take_over: TakeOver | None = None,
+    retype: Retype = refuse,
 ) -> Provisioned:
     """Bring one node from wherever it stands to a verified datasheet; raises at the first step that fails.
 
     ``accept`` is asked before an unknown node is whitelisted, ``confirm`` before a datasheet changes in what the order
     does not name, ``low`` before a node with a low battery is written, ``take_over`` before a node with another
-    station's key gets one of ours (None: that is refused). ``onward`` takes the conversation to another
+    station's key gets one of ours (None: that is refused), ``retype`` before a board becomes one of another type than
+    it says it is. ``onward`` takes the conversation to another
     link once the key is agreed on. A failure stands in the audit log with the step that it happened in.
     """
-    run = _Run(station, node, order, accept, confirm, reporter, onward, low, take_over)
+    run = _Run(station, node, order, accept, confirm, reporter, onward, low, take_over, retype)
     try:
         with station.turn(node.uuid), station.run():
             return run.run()
@@ -90,24 +105,42 @@ class _Run:
         onward: Onward | None,
         low: Low,
         take_over: TakeOver | None,
+        retype: Retype,
     ) -> None:
         self.station, self.node, self.order = station, node, order
         self.accept, self.confirm, self.reporter = accept, confirm, reporter
         self.steps, self.onward, self.low, self.take_over = Steps(reporter), onward, low, take_over
+        self.retype, self._retyped = retype, False
 
     def run(self) -> Provisioned:
         who = self._identify()
         prepared = self._prepared(who)
+        if who.state == NodeState.FACTORY and prepared.profile is not None:  # before it becomes ours
+            shown = shown_by(self.node, {one.number for one in prepared.profile.channels})
+            told = differences(shown, prepared.profile, prepared.calibrations or ())
+            self._require_its_board(who, prepared, told)
         entry = self._whitelist(who)
         self._agree(who, entry)
         if self.onward is not None:
             self.onward(self.node)
         present = survey(self.node, initial=who.security_teds)
-        proposal = self._build(prepared, present)
+        proposal = self._build(who, prepared, present)
         signed = self._sign(who, proposal, present)
         written = self._write(signed, proposal, present)
         verified = self._verify(who, written)
-        return Provisioned(who, tuple(self.steps.done), written.on_node, verified, proposal.warnings)
+        borne = self._check(written, verified)
+        warnings = merged((*proposal.warnings, *further(present.image.blocks, proposal.image), *borne.warnings))
+        return Provisioned(who, tuple(self.steps.done), written.on_node, verified, warnings, borne.samples)
+
+    def _require_its_board(self, who: Identified, prepared: Prepared, told: tuple[str, ...]) -> None:
+        """Ask, or refuse, where the board says that it is of another type; once, whoever of the two looks first."""
+        wanted = prepared.order.profile
+        if not told or prepared.order.retype or self._retyped:
+            return
+        if is_remembered(self.station, who.uuid, wanted, factory=who.state == NodeState.FACTORY):
+            return
+        self.retype(who.uuid, told)
+        self._retyped = True
 
     def _identify(self) -> Identified:
         with self.steps.step("identify") as step:
@@ -149,9 +182,13 @@ class _Run:
             step.detail = f"key epoch {agreed.epoch}, key {agreed.key_id}"
         return agreed
 
-    def _build(self, prepared: Prepared, present: Survey) -> Proposal:
+    def _build(self, who: Identified, prepared: Prepared, present: Survey) -> Proposal:
         with self.steps.step("build") as step:
+            if prepared.profile is not None:  # before a calibration is held against a channel that it is not of
+                told = differences(present.image.blocks, prepared.profile, prepared.calibrations or ())
+                self._require_its_board(who, prepared, told)
             proposal = propose(self.station, prepared, present)
+            self._require_its_board(who, prepared, differences(present.image.blocks, proposal.image))
             proposal.require_a_yes(self.confirm)
             if not proposal.changes:
                 step.result = NOTHING
@@ -196,6 +233,18 @@ class _Run:
             step.result = DONE if written.octets else NOTHING
             step.detail = f"{written.octets} octets" if written.octets else ""
         return written
+
+    def _check(self, written: Written, verified: Verified) -> Borne:
+        """Ask the hardware whether it bears the datasheet, and for one reading; nothing where it is not authentic."""
+        with self.steps.step("check") as step:
+            if verified.verdict != "authentic":
+                step.result = SKIPPED
+                return Borne({})
+            borne = bears(self.node, written.on_node)
+            step.result = DONE if borne.asked else SKIPPED
+            good = sum(bool(one) for one in borne.channels.values())
+            step.detail = f"{good} of {len(borne.channels)} channels bear it" if borne.asked else "it does not measure"
+        return borne
 
     def _verify(self, who: Identified, written: Written) -> Verified:
         with self.steps.step("verify") as step:

@@ -12,11 +12,12 @@ from teds_provision.links import Notice
 
 NOTHING = "nothing to do"
 DONE = "done"
+SKIPPED = "skipped"
 
 
 @dataclass
 class StepResult:
-    """One step: ``result`` is "done" or "nothing to do"; ``detail`` one short sentence for people."""
+    """One step: ``result`` is "done", "nothing to do" or "skipped"; ``detail`` one short sentence for people."""
 
     name: str
     result: str = DONE

@@ -36,7 +36,7 @@ def test_a_dry_run_on_a_new_node_changes_nothing(station: Station, node: Node, t
     before = everything(station, node)
     plan = station.ask("provision", "--profile", ANGLE, "--dry-run", *links.over("nfc"))
     assert plan["uuid"] == node.uuid
-    assert plan["plan"] == ["identify", "whitelist", "agree", "build", "sign", "write", "verify"]
+    assert plan["plan"] == ["identify", "whitelist", "agree", "build", "sign", "write", "verify", "check"]
     assert everything(station, node) == before
     told = station.run("provision", "--profile", ANGLE, "--dry-run", *links.over("nfc"))
     assert (told.code, node.uuid in told.out) == (0, True)

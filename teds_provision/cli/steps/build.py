@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Iterable
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import click
 
@@ -15,19 +15,21 @@ from teds_provision.cli.context import App, pass_app
 from teds_provision.cli.options import FileToRead, Function, command, dry_run_option, yes_option
 from teds_provision.files import SHARED, read_limited, write_whole
 
+if TYPE_CHECKING:
+    from teds_provision.steps.board_type import Retype
+
 MAX_INPUT_OCTETS = 32 << 20
 
 
 def order_options(function: Function) -> Function:
-    """Add --profile, --calibration, --no-calibration, --name, --accept-calibration; given as one ``order``."""
+    """Add --profile, --calibration, --no-calibration, --name, --accept-calibration, --retype: one ``order``."""
     from functools import wraps
 
     @wraps(function)
     def with_order(*args: Any, profile: Any, calibration: Any, no_calibration: bool, name: Any, **rest: Any) -> Any:
-        accepted = rest.pop("accept_calibration")
-        return function(
-            *args, order=steps.build_order.BuildOrder(profile, calibration, name, no_calibration, accepted), **rest
-        )
+        accepted, retype = rest.pop("accept_calibration"), rest.pop("retype")
+        order = steps.build_order.BuildOrder(profile, calibration, name, no_calibration, accepted, retype)
+        return function(*args, order=order, **rest)
 
     options = [
         click.option(
@@ -45,11 +47,25 @@ def order_options(function: Function) -> Function:
         click.option(
             "--accept-calibration", metavar='"WHY"', help="Take a calibration that the guard refuses; logged."
         ),
+        click.option("--retype", is_flag=True, help="The board may become one of another type than it says it is."),
     ]
     wrapped: Any = with_order
     for option in reversed(options):
         wrapped = option(wrapped)
     return wrapped  # type: ignore[no-any-return]
+
+
+def asks_retype(app: App, *, yes: bool) -> Retype:
+    """Who is asked before a board becomes one of another type: a person at a terminal who gave no answer beforehand."""
+
+    def ask(uuid: bytes, told: tuple[str, ...]) -> None:
+        app.note(f"Board {uuid.hex()} says that it is of another type than it would be given:")
+        for text in told:
+            app.note(f"  {text}")
+        if not app.ask("Make it one of the new type?"):
+            raise steps.many.board.Declined(f"You said no: board {uuid.hex()} keeps its type, nothing was written.")
+
+    return ask if app.interactive and not yes else steps.board_type.refuse
 
 
 @command("teds-provision build 8d4d --profile magnetic-angular-position-sensor --output angle.json")
@@ -64,10 +80,11 @@ def order_options(function: Function) -> Function:
 @pass_app
 def build(app: App, uuid: str, order: Any, output: Path | None, edition: str, yes: bool, dry_run: bool) -> None:
     """Build the TEDS of the node's type, plus calibration, plus the Security TEDS, still unsigned."""
-    del yes  # a build can always be made again
     station = app.station()
     octets = station.nodes.resolve(uuid)
-    built = steps.build.build(station, octets, order, edition=int(edition), keep_draft=not dry_run)
+    built = steps.build.build(
+        station, octets, order, edition=int(edition), keep_draft=not dry_run, retype=asks_retype(app, yes=yes)
+    )
     if output is not None and not dry_run:
         write_file(output, built.image.to_json())
     for warning in built.warnings:

@@ -13,7 +13,7 @@ from teds_provision import steps as steps_room
 from teds_provision.cli.context import App, pass_app
 from teds_provision.cli.options import FileToRead, command, dry_run_option, link_options, yes_option
 from teds_provision.cli.rendering import print_table, reporter_for
-from teds_provision.cli.steps.build import order_options
+from teds_provision.cli.steps.build import asks_retype, order_options
 from teds_provision.cli.steps.screen import Watched, screen_for
 from teds_provision.errors import NotWhitelisted, TedsProvisionError
 from teds_provision.links import LinkSettings
@@ -89,7 +89,7 @@ def provision(
         boards.unlock()  # asked for before the screen says what to do
         begun = None if several else reporter  # with several readers one board may be begun while another one ends
         with screen_for(app, boards, begun) as screen:
-            questions = _questions(app, yes, strangers=not everything)
+            questions = _questions(app, yes, strangers=not everything, several=True)
             _many(app, boards, questions, screen, totals=everything or batch is not None)
     else:
         _one(app, boards, _questions(app, yes))
@@ -125,7 +125,7 @@ def _many(app: App, boards: Boards, questions: Questions, screen: Screen, *, tot
 # -- questions ---------------------------------------------------------------------------------------------------------
 
 
-def _questions(app: App, yes: bool, *, strangers: bool = True) -> Questions:
+def _questions(app: App, yes: bool, *, strangers: bool = True, several: bool = False) -> Questions:
     """Whom to ask; ``strangers`` False: a yes on the command line does not add nodes that nobody named."""
     import threading
 
@@ -169,7 +169,8 @@ def _questions(app: App, yes: bool, *, strangers: bool = True) -> Questions:
                 raise many.board.Declined("You said no: the node keeps its key, nothing was changed.")
 
     asked = app.interactive
-    return many.boards.Questions(accept, confirm if asked else None, low, take_over if asked else None)
+    retype = asks_retype(app, yes=yes or several)
+    return many.boards.Questions(accept, confirm if asked else None, low, take_over if asked else None, retype)
 
 
 # -- telling -----------------------------------------------------------------------------------------------------------
@@ -211,6 +212,7 @@ def _tell(app: App, done: Provisioned, *, error: TedsProvisionError | None = Non
         "name": summary.name,
         "channels": [vars(channel) for channel in summary.channels],
         "steps": [{"name": s.name, "result": s.result, "seconds": s.seconds} for s in done.steps],
+        "sample": [{key: one[key] for key in ("channel", "value", "unit", "valid")} for one in done.samples],
         "verdict": done.verified.verdict,
         "warnings": list(done.warnings),
         **{name: value for name, value in more.items() if value is not None},

@@ -11,6 +11,7 @@ import click
 from teds_provision.cli.context import App, pass_app
 from teds_provision.cli.options import FileToRead, WholeNumber, command, dry_run_option, link_options, yes_option
 from teds_provision.cli.rendering import reporter_for
+from teds_provision.cli.steps.build import asks_retype
 from teds_provision.errors import UsageFailure
 from teds_provision.links import LinkSettings
 from teds_provision.steps import visits
@@ -33,6 +34,7 @@ if TYPE_CHECKING:
     metavar="SEQUENCE",
     help="Bring back what it had; see history.",
 )
+@click.option("--retype", is_flag=True, help="The board may become one of another type than it says it is.")
 @click.option("--sequence-jump", is_flag=True, help="Write although its sequence is far ahead of the node's.")
 @yes_option
 @dry_run_option
@@ -43,6 +45,7 @@ def write(
     uuid: str,
     image: Path | None,
     sequence: int | None,
+    retype: bool,
     sequence_jump: bool,
     yes: bool,
     dry_run: bool,
@@ -67,6 +70,7 @@ def write(
         dry_run=dry_run,
         jump=confirm if sequence_jump else None,
         low=confirm,
+        retype=None if retype else asks_retype(app, yes=yes),
     )
     node, written = done.image.uuid.hex(), done.written
     if written is None:

@@ -15,8 +15,9 @@ from teds_provision.links import Contact, LinkSettings, Port, open_port
 from teds_provision.protocol.messages.identity import NodeState
 from teds_provision.station.station import Station
 from teds_provision.steps.agree import TakeOver
+from teds_provision.steps.board_type import Retype, WrongBoard, differences, refuse
 from teds_provision.steps.build import Confirm, nobody, propose
-from teds_provision.steps.build_order import BuildOrder, Prepared, for_several, named_for, prepare
+from teds_provision.steps.build_order import BuildOrder, Prepared, for_several, merged, named_for, prepare
 from teds_provision.steps.identify import Identified, examine
 from teds_provision.steps.many.board import Board, Totals, worse
 from teds_provision.steps.many.progress import Progress, mean_steps
@@ -62,13 +63,14 @@ class Questions:
     """Who is asked: before an unknown node is whitelisted, and before what nobody named is written (None: nobody).
 
     ``low``: before a node with a low battery is written. ``take_over``: before a node with another station's key gets
-    one of ours (None: nobody).
+    one of ours (None: nobody). ``retype``: before a board becomes one of another type.
     """
 
     accept: Accept
     confirm: Confirm | None
     low: Low = wait_for_charge
     take_over: TakeOver | None = None
+    retype: Retype = refuse
 
 
 @dataclass(frozen=True)
@@ -133,8 +135,9 @@ class Boards:
             named = named_for(self._station, who.uuid, self._for(who))
             proposal = propose(self._station, named, found, record=False)
             changes = tuple(change.text for change in proposal.changes)
-            steps += ["build", "sign", "write", "verify"]
-            return Plan(who.uuid, who.state, tuple(steps), changes, proposal.warnings)
+            other = () if named.order.retype else differences(found.image.blocks, proposal.image)
+            steps += ["build", "sign", "write", "verify", "check"]
+            return Plan(who.uuid, who.state, tuple(steps), changes, merged((*proposal.warnings, *other)))
 
     # -- many ------------------------------------------------------------------------------------------------------
 
@@ -293,6 +296,7 @@ class Boards:
             onward=onward(self._links, self._reporter.notice),
             low=questions.low,
             take_over=questions.take_over,
+            retype=questions.retype,
         )
 
     def _for(self, who: Identified) -> Prepared:
@@ -325,7 +329,11 @@ class Boards:
     def _note(self, board: Board) -> None:
         self._boards.append(board)
         if self.progress is not None and board.row is not None:
-            self.progress.note(self.row(board.row), board)
+            row = self.row(board.row)
+            if isinstance(board.error, WrongBoard) and row.by_order:
+                self.progress.not_this_board(row, board)
+            else:
+                self.progress.note(row, board)
 
 
 def _progress(station: Station, request: Request, order: BuildOrder) -> Progress | None:

@@ -119,6 +119,14 @@ class Progress:
         """Note that this board was not given what the row says; the row stays free, and is tried again with it."""
         self._turned_away[row.number] = uuid.hex()
 
+    def not_this_board(self, row: Row, board: Board) -> None:
+        """Note that another type of board was tapped for this row: nothing was written, the row waits for its own."""
+        attempted = self.rows[row.number]
+        attempted.uuid, attempted.time = None, board.time
+        attempted.message = board.failure.message if board.failure is not None else ""
+        self.worst = worse(self.worst, board.failure)
+        self.save()
+
     def note(self, row: Row, board: Board) -> None:
         """Note how a board ended."""
         attempted = self.rows[row.number]

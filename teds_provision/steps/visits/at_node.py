@@ -11,6 +11,7 @@ from teds_provision.links import LINKS, LinkSettings
 from teds_provision.station.station import Station
 from teds_provision.steps.address import set_address
 from teds_provision.steps.agree import Agreed, agree
+from teds_provision.steps.board_type import Retype, differences, is_remembered, refuse, shown_by
 from teds_provision.steps.build_order import guard, own_name
 from teds_provision.steps.read import read_identity, read_image
 from teds_provision.steps.reading import keep
@@ -192,11 +193,13 @@ def write_at(
     dry_run: bool = False,
     jump: Callable[[str], object] | None = None,
     low: Low = wait_for_charge,
+    retype: Retype | None = refuse,
 ) -> WriteDone:
     """Write a signed image to the node that ``node`` names: of a file, else the draft, else what it was read to have.
 
     ``jump`` is asked before a sequence far ahead of the node's is written, and raises for a no; None: it is refused;
-    ``low`` before a node with a low battery is written.
+    ``low`` before a node with a low battery is written; ``retype`` before a board becomes one of another type than it
+    says it is (None: it may).
     Raises NotFound (nothing built), BadData (not signed), PolicyRefused (another node's image), as ``write`` does.
     """
     uuid = station.nodes.resolve(node)
@@ -208,6 +211,13 @@ def write_at(
         jump("The sequence of this node is then used up that far, for good. Write it?")
     with at_node(station, links.after_agreeing(), uuid, reporter) as visit:
         visit.session()
+        if retype is not None:
+            channels = {channel for channel, _ in wanted}
+            told = differences(shown_by(visit.node, channels), wanted)
+            profile = facts.get("profile")
+            known = isinstance(profile, str) and is_remembered(station, uuid, profile, factory=False)
+            if told and not known:
+                retype(uuid, told)
         far = jump is not None
         written = write(station, visit.node, wanted, progress=reporter.written, facts=facts, jump=far, low=low)
         return WriteDone(wanted, written)

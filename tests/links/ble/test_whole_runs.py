@@ -80,7 +80,7 @@ def test_a_cut_in_the_middle_of_every_step_does_no_harm(station: OpenStation, ai
         reporter = CutsAt(radio, step, pieces)
         done = over_the_air(station, reporter, BuildOrder(profile=ANGLE, name=f"angle-{number}"))
         assert done.verified.verdict == "authentic", step
-        assert reporter.done == ["identify", "whitelist", "agree", "build", "sign", "write", "verify"]
+        assert reporter.done == ["identify", "whitelist", "agree", "build", "sign", "write", "verify", "check"]
         if reporter.notices:
             cut.add(step)
     assert cut == {"identify", "agree", "build", "write", "verify"}

@@ -1,0 +1,308 @@
+"""Is this the board that the profile is of: what it says of its own type, and whether its hardware bears the datasheet.
+
+Before anything is written, every channel of the wanted datasheet is held against what the board says of it, signed or
+not: kind, form of a value, dimension of the unit. What nobody signed may refuse here, it permits nothing. At the end
+the firmware itself is asked, which no TEDS commands (operation.md section 1): Operate with lease 0 gets 19 where the
+channel bears its datasheet, 6 where it does not, and claims nothing.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import math
+from collections.abc import Callable, Collection, Iterator, Mapping
+from dataclasses import dataclass, replace
+from typing import Any, Final, NamedTuple
+
+from teds_provision.errors import BadData, NodeRefused, PolicyRefused
+from teds_provision.protocol.messages.frames import Reason
+from teds_provision.protocol.operation.commands import (
+    DIGEST_OCTETS,
+    FIRST_DEAD_MAN,
+    MOST_SAMPLE_CHANNELS,
+    OPERATION,
+    ChannelState,
+    Operate,
+    Operation,
+    Sampled,
+    idle,
+    sample,
+)
+from teds_provision.station.station import Station
+from teds_provision.steps.read import list_blocks, read_block
+from teds_provision.talk.conversation import Conversation
+from teds_provision.teds.calibration.interpreter import ChannelInterpreter
+from teds_provision.teds.calibration.samples import SampleForm
+from teds_provision.teds.channel import Kind
+from teds_provision.teds.codec.codes import AccessCode
+from teds_provision.teds.codec.model import Units
+from teds_provision.teds.image import BlockId, Image
+from teds_provision.teds.profile.model import ChannelProfile, Profile
+from teds_provision.teds.sheet import Channel, Sheet
+from teds_provision.teds.units import PRODUCT, name_of_units, units_of
+
+_LEASE: Final = 5
+_ROOM: Final = 180  # octets of data sets in one reply, so that it fits any node's maxMessage
+
+
+class WrongBoard(PolicyRefused):
+    """The board is of another type than what it would be given; ``differences`` says in what, a sentence each."""
+
+    code = "wrong-board"
+
+    def __init__(self, message: str, differences: tuple[str, ...] = (), *, hint: str = "") -> None:
+        super().__init__(message, hint=hint)
+        self.differences = differences
+
+
+Retype = Callable[[bytes, tuple[str, ...]], None]
+"""Asked before a board becomes one of another type: its UUID and the differences; raises where the answer is no."""
+
+
+def refuse(uuid: bytes, differences: tuple[str, ...]) -> None:
+    """The answer where nobody can be asked: no. Raises WrongBoard."""
+    more = f" (and {len(differences) - 1} more)" if len(differences) > 1 else ""
+    raise WrongBoard(
+        f"Board {uuid.hex()} is of another type: {differences[0].rstrip('.')}{more}. Nothing was written.",
+        differences,
+        hint="Take the right board, or the right profile; if it shall become another type: --retype",
+    )
+
+
+class _Says(NamedTuple):
+    """What is said of one channel; None: nothing."""
+
+    kind: int | None
+    form: tuple[int, int] | None
+    units: Units | None
+    calibrated: bool
+
+    @classmethod
+    def of(cls, channel: Channel, blocks: Mapping[BlockId, bytes]) -> _Says:
+        form = None if channel.sample is None else (channel.sample.model, channel.sample.octets)
+        units = channel.units if channel.units_stated else None
+        return cls(channel.kind, form, units, (channel.number, AccessCode.CALIBRATION) in blocks)
+
+    @classmethod
+    def wanted(cls, channel: ChannelProfile) -> _Says:
+        taken = channel.fields.get("Sample")
+        form: tuple[int, int] | None = None
+        if isinstance(taken, Mapping) and isinstance(taken.get("DatModel"), int):
+            form = (taken["DatModel"], taken["ModLenth"])
+        return cls(channel.type, form, channel.units, channel.calibration.required)
+
+
+def differences(
+    has: Mapping[BlockId, bytes], wanted: Image | Profile, calibrated: Collection[int] = ()
+) -> tuple[str, ...]:
+    """In what the type of a board differs from what it would be given, a sentence for each; empty where it does not.
+
+    ``has`` are TEDS of the board. A board without a TransducerChannel TEDS says nothing; more channels than are wanted
+    are no difference. A unit of counts, a ratio, a digital one, V or A says nothing where a calibration is wanted;
+    ``calibrated`` are channels that get one, whatever the type says.
+    """
+    own = {channel.number: _Says.of(channel, has) for channel in Sheet.of_blocks(has).channels}
+    if not own:
+        return ()
+    if isinstance(wanted, Image):
+        meant = {one.number: _Says.of(one, wanted.blocks) for one in Sheet.of(wanted).channels}
+    else:
+        meant = {one.number: _Says.wanted(one) for one in wanted.channels}
+    meant |= {number: meant[number]._replace(calibrated=True) for number in calibrated if number in meant}
+    return tuple(text for number in sorted(meant) for text in _between(number, own.get(number), meant[number]))
+
+
+def further(has: Mapping[BlockId, bytes], wanted: Image) -> tuple[str, ...]:
+    """A warning for the channels that the board describes and nobody wants, if there are any."""
+    channels = {one.number for one in Sheet.of_blocks(has).channels} - {one.number for one in Sheet.of(wanted).channels}
+    named = ", ".join(map(str, sorted(channels)))
+    return (f"The board has more channels than the profile: {named}.",) if channels else ()
+
+
+def _between(number: int, own: _Says | None, wanted: _Says) -> Iterator[str]:
+    if own is None:
+        yield f"Channel {number} is not there."
+        return
+    if None not in (own.kind, wanted.kind) and own.kind != wanted.kind:
+        yield f"Channel {number} is {_kind(own.kind)}, not {_kind(wanted.kind)}."
+    if own.units is not None and wanted.units is not None and not (wanted.calibrated and _says_nothing(own.units)):
+        mine, meant = replace(own.units, extension=0), replace(wanted.units, extension=0)
+        if mine != meant:
+            yield f"Channel {number} is in {name_of_units(mine)}, not in {name_of_units(meant)}."
+    if own.form is not None and wanted.form is not None and own.form != wanted.form:
+        yield f"Channel {number} gives {_form(own.form)}, not {_form(wanted.form)}."
+
+
+def _says_nothing(units: Units) -> bool:
+    """Counts, digital, a ratio, V, A: what a raw value may be of anything."""
+    bare = replace(units, extension=0)
+    return units.interpretation != PRODUCT or bare in (Units(), _VOLT, _AMPERE)
+
+
+_VOLT: Final = units_of(meters=2, kilograms=1, seconds=-3, amperes=-1)
+_AMPERE: Final = units_of(amperes=1)
+
+
+def _kind(kind: int | None) -> str:
+    return f"an {Kind(kind).word}" if kind in (Kind.ACTUATOR, Kind.EVENT_SENSOR) else "a sensor"
+
+
+def _form(form: tuple[int, int]) -> str:
+    return f"values of {SampleForm(*form).name}"
+
+
+def is_remembered(station: Station, uuid: bytes, wanted: str | None, *, factory: bool) -> bool:
+    """Whether this station knows the board as one of that profile, or as its own that was reset: that is no retype.
+
+    ``wanted`` None: of the profile that it was given before.
+
+    What was merely built for it counts for nothing; what was written, or came in a bundle, does.
+    """
+    history = station.nodes.history(uuid)
+    if factory and history:
+        return True
+    written = next((record.profile for record in history if record.profile is not None), None)
+    record = station.nodes.get(uuid)
+    known = record.profile if record is not None else None
+    wanted = wanted or known
+    brought = written is None and known == wanted and station.nodes.draft(uuid) is None
+    return wanted is not None and (written == wanted or brought)
+
+
+def shown_by(node: Conversation, channels: Collection[int]) -> dict[BlockId, bytes]:
+    """The TransducerChannel TEDS that a board shows for these channels; in a session, or plainly."""
+    wanted = [block for block in list_blocks(node) if block[1] == AccessCode.CHANNEL and block[0] in channels]
+    return {block: read_block(node, block) for block in wanted}
+
+
+# -- what the hardware bears -----------------------------------------------------------------------------------------
+
+
+def operate(node: Conversation, channel: int, digest: bytes, *, lease: int, dead_man: int | None = None) -> None:
+    """Claim a channel (0: every sensor); ``digest`` is that of the Security TEDS, ``lease`` in s, ``dead_man`` in ms.
+
+    Raises NodeRefused; what 6 and 23 mean here is said in words of their own.
+    """
+    named = f"channel {channel}" if channel else "any sensor"
+    try:
+        node.send(
+            Operate(channel, digest[:DIGEST_OCTETS], lease, dead_man).command(),
+            f"to measure with {named}" if channel else "to measure",
+        )
+    except NodeRefused as refusal:
+        said = next((said for reason, said in _OF_OPERATE.items() if reason == refusal.reason), None)
+        if said is None:
+            raise
+        words = f"{said[0].format(named)} (reason {refusal.reason})."
+        raise NodeRefused(words, reason=refusal.reason, hint=said[1]) from None
+
+
+_OF_OPERATE: Final = {
+    Reason.DIGEST_MISMATCH: (
+        "The board's hardware does not bear its datasheet on {}: kind, form or length of a value is another one there",
+        "It is of another type than its datasheet, or that was written meanwhile: verify UUID, then provision it anew.",
+    ),
+    Reason.FAULT: (
+        "The node cannot measure with {} now: its hardware reports a fault, or it has too little power",
+        "Look at its self-test and its battery: mode UUID.",
+    ),
+}
+
+
+@dataclass(frozen=True)
+class Borne:
+    """What the firmware said of each channel: True bears its datasheet, None does not measure; and one reading."""
+
+    channels: dict[int, bool | None]
+    samples: tuple[dict[str, Any], ...] = ()
+    warnings: tuple[str, ...] = ()
+
+    @property
+    def asked(self) -> bool:
+        """Whether the node measures at all."""
+        return any(self.channels.values())
+
+
+def bears(node: Conversation, image: Image) -> Borne:
+    """Ask a node, in its session, whether each channel bears the datasheet ``image``, and its sensors for one reading.
+
+    Nothing stays claimed. Sensors that another session claims are left alone. Raises WrongBoard with the channel that
+    does not bear it, LinkFailure.
+    """
+    sheet, digest = Sheet.of(image), hashlib.sha256(image.security or b"").digest()
+    found = {one.number: _bears(node, one, digest) for one in sheet.channels}
+    sensors = [one for one in sheet.channels if not one.actuator and found[one.number]]
+    if not sensors:
+        return Borne(found)
+    try:
+        samples = tuple(_read(node, sheet, sensors, digest))
+    except (NodeRefused, BadData) as error:  # busy, a fault: the datasheet stands, and a person is told
+        return Borne(found, warnings=(f"No reading was taken: {error.message}",))
+    bad = [str(one["channel"]) for one in samples if not one["valid"]]
+    warnings = (f"The reading of channel {', '.join(bad)} is not valid.",) if bad else ()
+    return Borne(found, samples, warnings)
+
+
+def _bears(node: Conversation, channel: Channel, digest: bytes) -> bool | None:
+    try:
+        operate(node, channel.number, digest, lease=0, dead_man=FIRST_DEAD_MAN if channel.actuator else None)
+    except NodeRefused as refusal:
+        if refusal.reason == Reason.OUT_OF_RANGE:
+            return True
+        if refusal.reason in (Reason.DIGEST_MISMATCH, Reason.BAD_FORM):  # 4: a sensor there where an actuator is meant
+            raise WrongBoard(
+                f"Channel {channel.number} ({channel.name or 'no name'}) of the board does not bear this datasheet: "
+                "its hardware is of another kind, or gives values of another form.",
+                hint="The board is of another type. Provision it by the profile of its own type.",
+            ) from refusal
+        return None
+    return None  # it claimed something for no time at all: no firmware of this profile
+
+
+def _read(node: Conversation, sheet: Sheet, sensors: list[Channel], digest: bytes) -> Iterator[dict[str, Any]]:
+    told = Operation.decode(node.send(OPERATION, "to tell its mode")).channels
+    taken = {number for number, (state, _) in told.items() if state & ChannelState.CLAIMED_BY_OTHER}
+    free = [one for one in sensors if one.number not in taken]
+    readers = {one.number: ChannelInterpreter(sheet, one.number) for one in free}
+    try:
+        for number in readers:
+            operate(node, number, digest, lease=_LEASE)
+        for part in _parts(readers):
+            width = sum(readers[number].octets for number in part)
+            reply = Sampled.decode(node.send(sample(part), "to sample"), width)
+            at, raws = 0, {}
+            for number in part:
+                one = readers[number]
+                raws[number] = one.reader.raw(reply.data[at : at + one.octets])
+                at += one.octets
+            for number in part:
+                yield _told(readers[number], raws, valid=reply.valid)
+    finally:
+        node.send(idle(0), "to let go")
+
+
+def _parts(readers: dict[int, ChannelInterpreter]) -> list[list[int]]:
+    parts: list[list[int]] = [[]]
+    for number, one in readers.items():
+        if parts[-1] and (
+            sum(readers[other].octets for other in parts[-1]) + one.octets > _ROOM
+            or len(parts[-1]) == MOST_SAMPLE_CHANNELS
+        ):
+            parts.append([])
+        parts[-1].append(number)
+    return [part for part in parts if part]
+
+
+def _told(one: ChannelInterpreter, raws: dict[int, Any], *, valid: bool) -> dict[str, Any]:
+    channel, value = one.channel, math.nan
+    if not one.problem and all(other in raws for other in one.others):
+        found = one.values(raws[channel.number], {other: raws[other] for other in one.others})
+        value, valid = one.unit.to_si(float(found.value[0])), valid and bool(found.valid[0])
+    valid = valid and math.isfinite(value)
+    return {
+        "channel": channel.number,
+        "name": channel.name,
+        "value": value if valid else None,
+        "unit": channel.si_unit,
+        "valid": valid,
+    }
