@@ -90,6 +90,18 @@ def keep_shown(station: Station, uuid: bytes, security_teds: bytes, *, by: str) 
     station.nodes.keep_reading(Reading(uuid, utc_now(), by, None, False, _packed(image), *signers))
 
 
+def is_known(station: Station, node: Conversation, image: Image) -> bool:
+    """Whether the row says this of the node already: the same TEDS, all of them read since it last started."""
+    row = station.nodes.reading(image.uuid)
+    return (
+        row is not None
+        and row.whole
+        and node.c is not None
+        and row.is_of_this_start(node.c)
+        and row.digests == _packed(image)
+    )
+
+
 def stands(station: Station, node: Conversation, security_teds: bytes, known: Known) -> Image | None:
     """The datasheet that was read of this node before, if its Security TEDS is the same and nothing spoke against it.
 

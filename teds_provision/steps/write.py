@@ -20,7 +20,7 @@ from teds_provision.protocol.messages.identity import Identity, NodeState
 from teds_provision.protocol.operation.commands import POWER, Power, PowerFlag
 from teds_provision.station.station import Station
 from teds_provision.steps.read import Survey, read_block, read_identity, read_image
-from teds_provision.steps.reading import keep
+from teds_provision.steps.reading import is_known, keep
 from teds_provision.steps.sign import known_image, node_keys_of, sign
 from teds_provision.steps.verify import known_of
 from teds_provision.talk.conversation import Conversation, SessionLost
@@ -83,9 +83,10 @@ def write(
     if (has.security if has is not None else read_block(node, SECURITY)) == image.security:
         has = has or read_image(node)
         if all(has.blocks.get(block) == image.blocks[block] for block in image):
-            known = known_of(station, image.uuid, node.proven or read_identity(node))
-            with station.durable("write", more_follows=True):
-                keep(station, node, has, by="write", known=known)
+            if not is_known(station, node, has):
+                known = known_of(station, image.uuid, node.proven or read_identity(node))
+                with station.durable("write", more_follows=True):
+                    keep(station, node, has, by="write", known=known)
             return Written(0, time.monotonic() - started, has)
     identity = node.proven or read_identity(node)
     _require_newer(signed, identity, jump=jump)
