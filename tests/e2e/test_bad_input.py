@@ -367,7 +367,7 @@ def test_a_full_disk_is_7_and_the_same_command_carries_on(station: Station, node
 
 def test_results_that_cannot_be_written_are_an_error(station: Station, finished: Node, tmp_path: Path) -> None:
     links = station.desk.links.over("nfc")
-    with unchanged(station, finished, without=("nodes", "datasheets")):
+    with unchanged(station, finished, without=("nodes", "datasheets", "readings")):
         said = station.refuses("read", finished.uuid, "--output", tmp_path / "no" / "image.json", *links, code=3)
         assert str(tmp_path / "no") in said["message"]
         outcome = station.run(

@@ -12,7 +12,7 @@ from .desk import ANGLE, FINGER, Desk, Node, Station, results
 pytestmark = pytest.mark.link
 
 SECURITY = 128
-CHANGING = ("audit", "nodes", "datasheets", "drafts")
+CHANGING = ("audit", "nodes", "datasheets", "drafts", "readings")
 STEPS = ["identify", "whitelist", "agree", "build", "sign", "write", "verify", "check"]
 NODE_KEYS = {"uuid", "fingerprint", "tag_uid", "state", "whitelisted", "channels", "name"}
 CALIBRATION = """raw,value [degree]
