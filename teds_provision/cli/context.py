@@ -181,6 +181,18 @@ class App:
         self.live_line()
         return click.confirm(_asked(question), err=True)
 
+    def asks_retype(self, *, yes: bool) -> Callable[[bytes, tuple[str, ...]], None] | None:
+        """Who is asked before a board becomes one of another type: a person at a terminal who answered nothing yet."""
+
+        def ask(uuid: bytes, differences: tuple[str, ...]) -> None:
+            self.note(f"Board {uuid.hex()} says that it is of another type than it would be given:")
+            for text in differences:
+                self.note(f"  {text}")
+            if not self.ask("Make it one of the new type?"):
+                raise PolicyRefused(f"You said no: board {uuid.hex()} keeps its type, nothing was written.")
+
+        return ask if self.interactive and not yes else None
+
     def ask_for_key(self, question: str, fingerprint: str) -> bool:
         """Ask a person whether a key counts: yes, no, or its digits (32 to 64, or a scanned label), held against it."""
         self.live_line()

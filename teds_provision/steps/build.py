@@ -74,7 +74,7 @@ def build(
     has: Image | None = None,
     edition: int = 2007,
     keep_draft: bool = True,
-    retype: Retype = refuse,
+    retype: Retype | None = None,
 ) -> Built:
     """Build a node's datasheet as a draft: a trial, which only ``sign``, ``write`` or a "yes" bring onto the node.
 
@@ -89,7 +89,7 @@ def build(
     if has is not None and prepared.profile is not None and not order.retype:
         told = differences(has.blocks, prepared.profile, prepared.calibrations or ())
         if told and not is_remembered(station, uuid, order.profile, factory=False):
-            retype(uuid, told)
+            (retype or refuse)(uuid, told)
     plan = compose(station, uuid, prepared, pending_image(station, uuid, has) or has, edition=edition)
     image = Image(uuid, dict(plan.blocks))
     warnings = plan.warnings + guard(

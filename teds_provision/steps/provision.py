@@ -73,7 +73,7 @@ def provision(
     onward: Onward | None = None,
     low: Low = wait_for_charge,
     take_over: TakeOver | None = None,
-    retype: Retype = refuse,
+    retype: Retype | None = None,
 ) -> Provisioned:
     """Bring one node from wherever it stands to a verified datasheet; raises at the first step that fails.
 
@@ -105,12 +105,12 @@ class _Run:
         onward: Onward | None,
         low: Low,
         take_over: TakeOver | None,
-        retype: Retype,
+        retype: Retype | None,
     ) -> None:
         self.station, self.node, self.order = station, node, order
         self.accept, self.confirm, self.reporter = accept, confirm, reporter
         self.steps, self.onward, self.low, self.take_over = Steps(reporter), onward, low, take_over
-        self.retype, self._retyped = retype, False
+        self.retype, self._retyped = retype or refuse, False
 
     def run(self) -> Provisioned:
         who = self._identify()

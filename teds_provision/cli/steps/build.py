@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Iterable
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import click
 
@@ -14,9 +14,6 @@ from teds_provision import teds as teds_room
 from teds_provision.cli.context import App, pass_app
 from teds_provision.cli.options import FileToRead, Function, command, dry_run_option, yes_option
 from teds_provision.files import SHARED, read_limited, write_whole
-
-if TYPE_CHECKING:
-    from teds_provision.steps.board_type import Retype
 
 MAX_INPUT_OCTETS = 32 << 20
 
@@ -55,19 +52,6 @@ def order_options(function: Function) -> Function:
     return wrapped  # type: ignore[no-any-return]
 
 
-def asks_retype(app: App, *, yes: bool) -> Retype:
-    """Who is asked before a board becomes one of another type: a person at a terminal who gave no answer beforehand."""
-
-    def ask(uuid: bytes, told: tuple[str, ...]) -> None:
-        app.note(f"Board {uuid.hex()} says that it is of another type than it would be given:")
-        for text in told:
-            app.note(f"  {text}")
-        if not app.ask("Make it one of the new type?"):
-            raise steps.many.board.Declined(f"You said no: board {uuid.hex()} keeps its type, nothing was written.")
-
-    return ask if app.interactive and not yes else steps.board_type.refuse
-
-
 @command("teds-provision build 8d4d --profile magnetic-angular-position-sensor --output angle.json")
 @click.argument("uuid")
 @order_options
@@ -83,7 +67,7 @@ def build(app: App, uuid: str, order: Any, output: Path | None, edition: str, ye
     station = app.station()
     octets = station.nodes.resolve(uuid)
     built = steps.build.build(
-        station, octets, order, edition=int(edition), keep_draft=not dry_run, retype=asks_retype(app, yes=yes)
+        station, octets, order, edition=int(edition), keep_draft=not dry_run, retype=app.asks_retype(yes=yes)
     )
     if output is not None and not dry_run:
         write_file(output, built.image.to_json())

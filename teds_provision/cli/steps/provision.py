@@ -13,7 +13,7 @@ from teds_provision import steps as steps_room
 from teds_provision.cli.context import App, pass_app
 from teds_provision.cli.options import FileToRead, command, dry_run_option, link_options, yes_option
 from teds_provision.cli.rendering import print_table, reporter_for
-from teds_provision.cli.steps.build import asks_retype, order_options
+from teds_provision.cli.steps.build import order_options
 from teds_provision.cli.steps.screen import Watched, screen_for
 from teds_provision.errors import NotWhitelisted, TedsProvisionError
 from teds_provision.links import LinkSettings
@@ -169,7 +169,7 @@ def _questions(app: App, yes: bool, *, strangers: bool = True, several: bool = F
                 raise many.board.Declined("You said no: the node keeps its key, nothing was changed.")
 
     asked = app.interactive
-    retype = asks_retype(app, yes=yes or several)
+    retype = app.asks_retype(yes=yes or several)
     return many.boards.Questions(accept, confirm if asked else None, low, take_over if asked else None, retype)
 
 

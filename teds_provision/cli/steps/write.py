@@ -11,7 +11,6 @@ import click
 from teds_provision.cli.context import App, pass_app
 from teds_provision.cli.options import FileToRead, WholeNumber, command, dry_run_option, link_options, yes_option
 from teds_provision.cli.rendering import reporter_for
-from teds_provision.cli.steps.build import asks_retype
 from teds_provision.errors import UsageFailure
 from teds_provision.links import LinkSettings
 from teds_provision.steps import visits
@@ -70,7 +69,8 @@ def write(
         dry_run=dry_run,
         jump=confirm if sequence_jump else None,
         low=confirm,
-        retype=None if retype else asks_retype(app, yes=yes),
+        retype=app.asks_retype(yes=yes),
+        retyped=retype,
     )
     node, written = done.image.uuid.hex(), done.written
     if written is None:

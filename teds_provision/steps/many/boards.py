@@ -15,7 +15,7 @@ from teds_provision.links import Contact, LinkSettings, Port, open_port
 from teds_provision.protocol.messages.identity import NodeState
 from teds_provision.station.station import Station
 from teds_provision.steps.agree import TakeOver
-from teds_provision.steps.board_type import Retype, WrongBoard, differences, refuse
+from teds_provision.steps.board_type import Retype, WrongBoard, differences
 from teds_provision.steps.build import Confirm, nobody, propose
 from teds_provision.steps.build_order import BuildOrder, Prepared, for_several, merged, named_for, prepare
 from teds_provision.steps.identify import Identified, examine
@@ -70,7 +70,7 @@ class Questions:
     confirm: Confirm | None
     low: Low = wait_for_charge
     take_over: TakeOver | None = None
-    retype: Retype = refuse
+    retype: Retype | None = None
 
 
 @dataclass(frozen=True)

@@ -193,13 +193,14 @@ def write_at(
     dry_run: bool = False,
     jump: Callable[[str], object] | None = None,
     low: Low = wait_for_charge,
-    retype: Retype | None = refuse,
+    retype: Retype | None = None,
+    retyped: bool = False,
 ) -> WriteDone:
     """Write a signed image to the node that ``node`` names: of a file, else the draft, else what it was read to have.
 
     ``jump`` is asked before a sequence far ahead of the node's is written, and raises for a no; None: it is refused;
     ``low`` before a node with a low battery is written; ``retype`` before a board becomes one of another type than it
-    says it is (None: it may).
+    says it is (None: that is refused), unless it was ``retyped`` by a word.
     Raises NotFound (nothing built), BadData (not signed), PolicyRefused (another node's image), as ``write`` does.
     """
     uuid = station.nodes.resolve(node)
@@ -211,13 +212,13 @@ def write_at(
         jump("The sequence of this node is then used up that far, for good. Write it?")
     with at_node(station, links.after_agreeing(), uuid, reporter) as visit:
         visit.session()
-        if retype is not None:
+        if not retyped:
             channels = {channel for channel, _ in wanted}
             told = differences(shown_by(visit.node, channels), wanted)
             profile = facts.get("profile")
             known = isinstance(profile, str) and is_remembered(station, uuid, profile, factory=False)
             if told and not known:
-                retype(uuid, told)
+                (retype or refuse)(uuid, told)
         far = jump is not None
         written = write(station, visit.node, wanted, progress=reporter.written, facts=facts, jump=far, low=low)
         return WriteDone(wanted, written)
