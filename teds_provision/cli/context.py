@@ -6,13 +6,12 @@ import os
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
-from typing import TYPE_CHECKING, Any, ClassVar, TextIO
+from typing import TYPE_CHECKING, Any, ClassVar, Final, TextIO
 
 import click
 
 from teds_provision import protocol, vault
 from teds_provision import station as station_room
-from teds_provision.cli import terminal
 from teds_provision.cli.configuration import home_of
 from teds_provision.errors import PolicyRefused, StoreFailure, TedsProvisionError, UsageFailure, WrongPassphrase
 from teds_provision.harmless import harmless, harmless_json
@@ -24,9 +23,11 @@ if TYPE_CHECKING:
 
     from rich.console import Console, RenderableType
 
+    from teds_provision.cli import console
     from teds_provision.station.station import Station
 else:
     json = late("json")
+    console = late("teds_provision.cli.console")  # rich
 
 _BEHIND = " [y/N]: "
 
@@ -121,7 +122,7 @@ class App:
     def console(self, *, stderr: bool = False) -> Console:
         """Return a rich console; colour yields to NO_COLOR and to a pipe, long lines are not broken in a pipe."""
         stream = sys.stderr if stderr else sys.stdout
-        return terminal.console.CleanConsole(stderr=stderr, highlight=False, soft_wrap=not stream.isatty())
+        return console.CleanConsole(stderr=stderr, highlight=False, soft_wrap=not stream.isatty())
 
     def note(self, text: str, *, level: int = 0) -> None:
         """Say something on stderr, unless --quiet (or fewer ``-v`` than ``level``); not with --json."""
@@ -261,12 +262,12 @@ class App:
 
 def say(text: str) -> None:
     """Say something on stderr; what others wrote steers no terminal, and no word is broken at its edge."""
-    print(terminal.folding.folded(harmless(text), sys.stderr), file=sys.stderr, flush=True)
+    print(folded(harmless(text), sys.stderr), file=sys.stderr, flush=True)
 
 
 def _asked(question: str) -> str:
     """A question as it is shown, with room for what click puts behind it."""
-    return terminal.folding.folded(harmless(question), sys.stderr, spare=len(_BEHIND))
+    return folded(harmless(question), sys.stderr, spare=len(_BEHIND))
 
 
 def nowhere(stream: TextIO) -> None:
@@ -308,3 +309,46 @@ def _log_to_stderr(*, logging_level: int, libraries: bool) -> None:
 
 
 pass_app = click.make_pass_decorator(App)
+
+
+# Plain lines on a terminal: broken between words, never inside one. A pipe gets them as they are.
+
+_NARROWEST: Final = 20
+_COMMAND: Final = ": teds-provision "
+_HINT: Final = "→ "
+
+
+def folded(text: str, stream: TextIO, *, spare: int = 0) -> str:
+    """The text with no line longer than the terminal behind ``stream`` is wide, less ``spare`` columns.
+
+    A word that is longer than that stays whole (the terminal breaks it), and so does a command line at the end of a
+    sentence, which begins a line of its own: what is copied from there is what is to be run.
+    """
+    width = _columns(stream) - spare
+    if width < _NARROWEST:
+        return text
+    return "\n".join(line if len(line) <= width else _fold(line, width) for line in text.split("\n"))
+
+
+def _columns(stream: TextIO) -> int:
+    """Columns of the terminal, 0 where there is none, or none that says."""
+    try:
+        return os.get_terminal_size(stream.fileno()).columns if stream.isatty() else 0
+    except (OSError, ValueError):
+        return 0
+
+
+def _fold(line: str, width: int) -> str:
+    lead = " " * (len(line) - len(line.lstrip(" ")))
+    said = line[len(lead) :]
+    later = lead + " " * len(_HINT) if said.startswith(_HINT) else lead
+    at = said.find(_COMMAND)
+    words = said.split(" ") if at < 0 else [*said[: at + 1].split(" "), said[at + 2 :]]
+    lines, current = [], lead + words[0]
+    for word in words[1:]:
+        if len(current) + 1 + len(word) <= width:
+            current += f" {word}"
+        else:
+            lines.append(current.rstrip(" "))
+            current = later + word
+    return "\n".join([*lines, current])

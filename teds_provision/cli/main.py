@@ -13,7 +13,6 @@ from typing import TYPE_CHECKING, Any, ClassVar, Final
 import click
 
 from teds_provision import __version__
-from teds_provision.cli import terminal
 from teds_provision.cli.configuration import PARAMETERS, Defaults, as_parameters, config_path, read_config
 from teds_provision.cli.context import App, nowhere, say
 from teds_provision.cli.globals import in_front
@@ -26,7 +25,10 @@ if TYPE_CHECKING:
     import json
     import pathlib
     from pathlib import Path
+
+    from teds_provision.cli import completing
 else:
+    completing = late("teds_provision.cli.completing")
     difflib, json, pathlib = late("difflib"), late("json"), late("pathlib")  # --help needs none of them
 
 ENVIRONMENT_PREFIX = "TEDS_PROVISION"
@@ -242,7 +244,7 @@ def _complete(instruction: str) -> int:
     """Answer a shell that completes a command line (``bash_source``, ``bash_complete``, zsh, fish alike)."""
     from click.shell_completion import shell_complete
 
-    LazyGroup.teachers.append(terminal.completing.teach)
+    LazyGroup.teachers.append(completing.teach)
     return shell_complete(cli, {}, "teds-provision", COMPLETE, instruction)
 
 

@@ -12,8 +12,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 import click
 
 from teds_provision.cli.context import App
-from teds_provision.cli.tracing import tracing
-from teds_provision.errors import NotFound
+from teds_provision.errors import NotFound, StoreFailure
 from teds_provision.files import require_no_pipe
 from teds_provision.lazy import late
 from teds_provision.links import LINKS, LinkSettings
@@ -24,6 +23,12 @@ if TYPE_CHECKING:
     from teds_provision import client
 else:  # HTTP: only where a base station runs
     client = late("teds_provision.client")
+
+if TYPE_CHECKING:
+    from teds_provision.links import Trace
+    from teds_provision.trace import recorder
+else:  # most runs have no trace
+    recorder = late("teds_provision.trace.recorder")
 
 Function = TypeVar("Function", bound=Callable[..., Any])
 
@@ -234,3 +239,25 @@ def yes_option(function: Function) -> Function:
 def dry_run_option(function: Function) -> Function:
     """Add --dry-run: print the plan, change nothing."""
     return click.option("--dry-run", is_flag=True, help="Print the plan and change nothing.")(function)
+
+
+# ``--trace FILE``: the file is made before anything is waited for, and ended with the command.
+
+
+@contextmanager
+def tracing(path: Path | None) -> Iterator[Trace | None]:
+    """Give the trace that ``path`` names, None for none. A command whose trace is not whole, and all else well, is 7.
+
+    Raises UsageFailure where the file is there already, NotFound without its folder, StoreFailure.
+    """
+    if path is None:
+        yield None
+        return
+    app = App.current
+    trace = recorder.open_trace(path, app.warn if app is not None else print)
+    try:
+        yield trace
+    finally:
+        trace.close()
+    if trace.failure:  # it was told when it happened, and the result stands on stdout already
+        raise click.exceptions.Exit(StoreFailure.exit_code)

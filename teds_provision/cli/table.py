@@ -20,7 +20,7 @@ SECTIONS: Final[dict[str, dict[str, Entry]]] = {
     "Set up": {
         "init": Entry("station.init", "init", "Make this base station's identity and CA key, or show them."),
         "trust": Entry("handover.trust", "trust", "Public keys of other stations and CAs that count here."),
-        "profile": Entry("datasheet.profile", "profile", "Datasheets by transducer type: list, show, check, new."),
+        "profile": Entry("profile", "profile", "Datasheets by transducer type: list, show, check, new."),
         "config": Entry("station.config", "config", "What is set in config.toml and the environment: show, path."),
         "completion": Entry("station.config", "completion", "What a shell needs to complete command lines."),
         "doctor": Entry("station.doctor", "doctor", "Look at reader, CAN, keyring, clock and store: cause and fix."),
@@ -44,10 +44,10 @@ SECTIONS: Final[dict[str, dict[str, Entry]]] = {
         "reset": Entry("steps.reset", "reset", "Take a node back to factory state, with its signed receipt."),
         "address": Entry("steps.address", "address", "Give a node another CAN address."),
         "nodes": Entry("station.nodes", "nodes", "What this station knows of its nodes."),
-        "label": Entry("station.label", "label", "A label for a board: QR code and text of UUID and fingerprint."),
+        "label": Entry("station.nodes", "label", "A label for a board: QR code and text of UUID and fingerprint."),
         "log": Entry("station.log", "log", "The audit log, and whether its hash chain holds."),
-        "trace": Entry("datasheet.trace", "trace", "What --trace wrote, in words: show."),
-        "show": Entry("datasheet.show", "show", "Decode TEDS, images, profiles, bundles and messages."),
+        "trace": Entry("trace", "trace", "What --trace wrote, in words: show."),
+        "show": Entry("show", "show", "Decode TEDS, images, profiles, bundles and messages."),
     },
     "Measure": {
         "measure": Entry("measure.measure", "measure", "Stream nodes or a group into files and topics, calibrated."),

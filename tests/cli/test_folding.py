@@ -15,7 +15,7 @@ from typing import TextIO
 from hypothesis import given
 from hypothesis import strategies as st
 
-from teds_provision.cli.terminal.folding import folded
+from teds_provision.cli.context import folded
 from tests.terminal import on_terminal
 
 COLUMNS = 80

@@ -19,7 +19,6 @@ OURS = {
     "teds_provision.cli.option_names",
     "teds_provision.cli.stdout",
     "teds_provision.cli.table",
-    "teds_provision.cli.terminal",
     "teds_provision.errors",
     "teds_provision.harmless",
     "teds_provision.lazy",

@@ -17,8 +17,7 @@ import click
 
 from teds_provision.cli.configuration import brokers_of, config_path
 from teds_provision.cli.context import App, pass_app, to_json
-from teds_provision.cli.options import FileToRead, WholeNumber, command
-from teds_provision.cli.tracing import tracing
+from teds_provision.cli.options import FileToRead, WholeNumber, command, tracing
 from teds_provision.errors import UsageFailure
 from teds_provision.lazy import how_to_install, late
 

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from teds_provision.cli import terminal
+from teds_provision.cli import completing
 from teds_provision.cli.configuration import as_parameters, config_path, read_config
 from teds_provision.cli.context import App, pass_app
 from teds_provision.cli.main import COMPLETE
@@ -127,5 +127,5 @@ def completion(app: App, shell: str) -> None:
     In bash: eval "$(teds-provision completion bash)"
     """
     root = click.get_current_context().find_root().command
-    script = terminal.completing.SHELLS[shell](root, {}, "teds-provision", COMPLETE).source()
+    script = completing.SHELLS[shell](root, {}, "teds-provision", COMPLETE).source()
     app.emit({"shell": shell, "script": script}, lambda console: print(script))

@@ -12,8 +12,8 @@ from teds_provision import doctor as doctor_room
 from teds_provision.cli.configuration import config_path
 from teds_provision.cli.context import App, pass_app
 from teds_provision.cli.options import command
-from teds_provision.cli.settings import known_settings
 from teds_provision.cli.station.config import check_values
+from teds_provision.cli.table import COMMANDS
 from teds_provision.errors import BadData
 
 if TYPE_CHECKING:
@@ -73,3 +73,30 @@ def _print(console: Console, findings: list[Finding]) -> None:
         console.print(line)
         if one.fix and one.result != "ok":
             console.print(Padding(Text(f"→ {one.fix}"), (0, 0, 0, 9)) if console.is_terminal else f"  → {one.fix}")
+
+
+# Which keys config.toml may have: the options of every command, by the names that the command line gives them.
+
+
+def known_settings(group: click.Group) -> dict[str, frozenset[str]]:
+    """Names that may stand in config.toml: under "" outside of a table, under a command's name in its table.
+
+    A name is that of an option without its dashes, written with ``-`` or ``_``. Loads every command.
+    """
+    context = click.Context(group)
+    of = {name: _names(group.get_command(context, name)) for name in COMMANDS}
+    everywhere = frozenset[str]().union(_own(group), *of.values())
+    return {"": everywhere, **of}
+
+
+def _names(command: click.Command | None) -> frozenset[str]:
+    if command is None:
+        return frozenset()
+    inner = command.commands.values() if isinstance(command, click.Group) else ()
+    names = frozenset(part.name for part in inner if part.name)
+    return _own(command).union(names, *map(_names, inner))
+
+
+def _own(command: click.Command) -> frozenset[str]:
+    options = (option for option in command.params if isinstance(option, click.Option))
+    return frozenset(word.lstrip("-") for option in options for word in (*option.opts, *option.secondary_opts))

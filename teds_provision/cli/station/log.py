@@ -16,9 +16,8 @@ import click
 
 from teds_provision import store
 from teds_provision.cli.context import App, pass_app
-from teds_provision.cli.moments import moment
 from teds_provision.cli.options import WholeNumber, command
-from teds_provision.cli.rendering import local_time, shown
+from teds_provision.cli.rendering import local_time, moment, shown
 from teds_provision.errors import StoreFailure, UsageFailure
 
 if TYPE_CHECKING:

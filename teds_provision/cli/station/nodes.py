@@ -8,18 +8,25 @@ import sys
 from collections.abc import Callable, Iterable, Iterator
 from datetime import UTC, datetime, timedelta
 from itertools import chain, islice
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
 
+from teds_provision import steps, teds
 from teds_provision.cli.context import App, pass_app
-from teds_provision.cli.moments import moment
 from teds_provision.cli.options import WholeNumber, command
-from teds_provision.cli.rendering import local_time, print_json_list, shown
-from teds_provision.cli.station.fits import show_fits
+from teds_provision.cli.rendering import local_time, moment, print_json_list, print_table, shown
+from teds_provision.errors import BadData, UsageFailure
+from teds_provision.station.label import label_of, write_label
 from teds_provision.steps.inventory import STATES, inventory, search
 
 if TYPE_CHECKING:
+    from teds_provision.station.station import Station
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
     from teds_provision.station.station import Station
 
 _FIRST = 200  # the rows that decide how wide each column is
@@ -222,3 +229,55 @@ def _one(node: dict[str, Any]) -> None:
         for text in [found] if isinstance(found, str) else found:
             if text:
                 print(f"{title:<12} {shown(text)}")
+
+
+# ``label``: QR code and text for a board.
+
+
+@command("teds-provision label 8d4d --output finger-1.svg", "teds-provision label 8d4d --output finger-1.png")
+@click.argument("uuid")
+@click.option(
+    "--output",
+    required=True,
+    type=click.Path(path_type=Path, dir_okay=False),
+    metavar="FILE.svg|png",
+    help="Where it goes; the ending says which kind.",
+)
+@pass_app
+def label(app: App, uuid: str, output: Path) -> None:
+    """Write a label: a QR code with UUID and the whole fingerprint of the node's key, and the same as text.
+
+    What a scanner reads of it is taken by whitelist add, and pins the key before the first tap.
+    """
+    station = app.station()
+    made = label_of(station, station.nodes.resolve(uuid))
+    write_label(made, output)
+    told = {"label": {"text": made.text, "uuid": made.uuid.hex(), "fingerprint": made.fingerprint, "file": str(output)}}
+    app.emit(told, f"{output}: {made.text}")
+
+
+# ``nodes --fits``: whether datasheets suffice for a task.
+
+
+def show_fits(app: App, station: Station, expression: str, uuids: list[bytes]) -> None:
+    """Tell for every channel of these nodes whether it meets ``expression``, and why not."""
+    try:
+        requirement = teds.fits.parse_fits(expression)
+    except BadData as error:
+        raise UsageFailure(f"--fits: {error.message}", hint=error.hint) from error
+    found = [fit.to_json() for fit in steps.many.fits.fits_of(station, [requirement], uuids, datetime.now(UTC))]
+    app.emit({"fits": found}, lambda console: _fits_table(console, found))
+
+
+def _fits_table(console: Console, found: list[dict[str, Any]]) -> None:
+    from rich.table import Table
+    from rich.text import Text
+
+    table = Table("UUID", "channel", "result", "why", box=None, pad_edge=False)
+    style = {"passed": "green", "failed": "red", "skipped": "dim"}
+    for fit in found:
+        channel = "" if fit["channel"] is None else f"{fit['channel']} {fit['name']}".strip()
+        table.add_row(
+            fit["uuid"], Text(shown(channel)), Text(fit["result"], style[fit["result"]]), Text(shown(fit["why"]))
+        )
+    print_table(console, table)

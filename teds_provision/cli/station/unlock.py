@@ -7,9 +7,8 @@ from datetime import UTC, datetime, timedelta
 import click
 
 from teds_provision.cli.context import App, pass_app
-from teds_provision.cli.moments import duration
 from teds_provision.cli.options import command
-from teds_provision.cli.rendering import local_time
+from teds_provision.cli.rendering import duration, local_time
 from teds_provision.errors import UsageFailure
 from teds_provision.vault.agent import asking
 

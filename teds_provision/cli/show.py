@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, cast
 import click
 
 from teds_provision import teds
-from teds_provision.cli import datasheet
+from teds_provision.cli import show_files, show_table
 from teds_provision.cli.context import App, pass_app
 from teds_provision.cli.context import to_json as dumps
 from teds_provision.cli.options import command
@@ -20,7 +20,7 @@ from teds_provision.errors import BadData, UsageFailure
 from teds_provision.harmless import harmless
 
 if TYPE_CHECKING:
-    from teds_provision.cli.datasheet.show_files import ShownFile
+    from teds_provision.cli.show_files import ShownFile
     from teds_provision.teds.codec.model import Edition
     from teds_provision.teds.formats import Block, Format
 
@@ -68,7 +68,7 @@ def show(
     if app.json and not plain:
         raise UsageFailure("--json and --format ask for different outputs.", hint="Leave one of them out.")
     wanted = cast("Edition", int(edition)) if edition else None
-    shown = [datasheet.show_files.load(name, wanted) for name in files]
+    shown = [show_files.load(name, wanted) for name in files]
     if plot is not None:
         _plot(app, shown, plot)
     _tell(app, shown, form)
@@ -85,10 +85,10 @@ def _tell(app: App, files: Sequence[ShownFile], form: str) -> None:
         for note in file.notes:
             app.note(f"{file.name}: {note}")
     if app.json or form == "json":
-        result = datasheet.show_json.to_json(files)
+        result = show_files.to_json(files)
         print(dumps(result, indent=None if app.json else 1), flush=True)
     elif form == "table":
-        datasheet.show_table.print_files(app.console(), files)
+        show_table.print_files(app.console(), files)
     else:
         _convert(app, files, cast("Format", form))
 
@@ -131,12 +131,12 @@ def _has_errors(file: ShownFile) -> bool:
 
 
 def _diff(app: App, before: str, after: str, *, as_json: bool) -> None:
-    old, new = (datasheet.show_files.placed(datasheet.show_files.load(name).blocks) for name in (before, after))
+    old, new = (show_files.placed(show_files.load(name).blocks) for name in (before, after))
     changes = teds.diff.diff_blocks(old, new)
     judged = teds.guard.check_calibration(new, old)
     result = {
         "changes": [asdict(change) for change in changes],
-        "guard": [datasheet.show_files.guard_to_json(finding) for finding in judged],
+        "guard": [show_files.guard_to_json(finding) for finding in judged],
     }
     if as_json and not app.json:
         print(dumps(result, indent=1), flush=True)
@@ -149,5 +149,5 @@ def _diff(app: App, before: str, after: str, *, as_json: bool) -> None:
 def _plot(app: App, files: Sequence[ShownFile], path: Path) -> None:
     if len(files) != 1:
         raise UsageFailure("A plot shows the calibrations of one file.", hint="Call show once for each.")
-    channels = teds.plot.plot_blocks(datasheet.show_files.placed(files[0].blocks), path)
+    channels = teds.plot.plot_blocks(show_files.placed(files[0].blocks), path)
     app.note(f"Drawn in {path}: channel {', '.join(map(str, channels))}.")

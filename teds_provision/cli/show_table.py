@@ -6,7 +6,7 @@ import re
 from collections.abc import Iterable, Iterator
 from typing import TYPE_CHECKING
 
-from teds_provision.cli.datasheet.show_files import ShownFile
+from teds_provision.cli.show_files import ShownFile
 from teds_provision.lazy import late
 from teds_provision.protocol.messages.message import Argument, Message
 from teds_provision.teds.codec.model import Finding, TimeInstance, Verdict
