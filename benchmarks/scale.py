@@ -98,7 +98,6 @@ def _node(number: int, points: list[bytes]) -> NodeRecord:
         2,
         1,
         3,
-        verdict="authentic",
         last_seen=utc_now(),
         channels=1,
         teds_sha256="ab" * 32,

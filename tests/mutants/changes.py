@@ -10,7 +10,7 @@ from __future__ import annotations
 import ast
 import re
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -38,6 +38,7 @@ class Mutant:
     line: int
     told: str
     words: frozenset[str] = frozenset()
+    test: str = ""
 
     def __str__(self) -> str:
         return f"{self.path}:{self.line} {self.function}: {self.told}"
@@ -49,12 +50,16 @@ class Mutant:
 
 @dataclass(frozen=True)
 class Pattern:
-    """A rule, and what holds it: in ``function`` (``name``, ``Class.name``) the expression ``was`` becomes ``now``."""
+    """A rule, and what holds it: in ``function`` (``name``, ``Class.name``) the expression ``was`` becomes ``now``.
+
+    ``test`` is the file that holds it, where others seem nearer.
+    """
 
     rule: str
     function: str
     was: str
     now: str
+    test: str = ""
 
 
 class Module:
@@ -124,7 +129,7 @@ def found(pattern: Pattern, where: list[Module]) -> list[Mutant]:
     """The places of a pattern: an expression, or a statement that is one expression; one, where all is well."""
     wanted, told = ast.unparse(ast.parse(pattern.was, mode="eval")), f"{pattern.rule}: {pattern.was}  ->  {pattern.now}"
     return [
-        module.mutant(node, pattern.now, function, told, _words(module, tree))
+        replace(module.mutant(node, pattern.now, function, told, _words(module, tree)), test=pattern.test)
         for module in where
         for function, tree in module.functions()
         if function == pattern.function

@@ -46,7 +46,8 @@ class Suite:
             near -= 1.0 * (f"tests/{room}/" in path) + 2.0 * (module.rpartition(".")[2] in name.rpartition(".")[2])
             near += 6.0 * path.startswith(_AFTER_THE_REST)
             ranks.append((near, path))
-        return [path for near, path in sorted(ranks)[:most] if near < FAR]
+        found = [path for near, path in sorted(ranks)[:most] if near < FAR]
+        return [mutant.test, *(path for path in found if path != mutant.test)] if mutant.test else found
 
     @cached_property
     def _words(self) -> dict[str, frozenset[str]]:

@@ -71,6 +71,19 @@ def test_rotation_gives_a_new_key_over_any_link(station: Station, board: Board) 
     assert held(station, board) == [("active", 2)]
 
 
+def test_a_board_that_replaces_another_begins_at_its_own_epoch(station: Station, board: Board) -> None:
+    """The operator let the old pin go: epoch 2 was the old board's, the new one offers 1."""
+    whitelist(station, board)
+    run(station, board)
+    run(station, board, rotate=True)
+    station.pins.let_go(board.uuid)
+    station.pins.remove(board.uuid)
+    new = Board()
+    whitelist(station, new)
+    assert run(station, new).epoch == 1
+    assert held(station, new) == [("active", 1)]
+
+
 def test_an_unknown_node_is_refused_before_any_key(station: Station, board: Board) -> None:
     with pytest.raises(NotWhitelisted):
         run(station, board)
