@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -107,6 +108,20 @@ def test_each_fault_is_told_in_its_line_and_the_worst_one_ends_the_command(home:
     assert call(home, "verify", folder / "a-good.json", folder / "b-harmful.json").code == 6
     assert call(home, "verify", folder / "a-good.json", folder / "gone.json").code == 3
     assert call(home, "verify", folder / "a-good.json", folder / "d-broken.json").code == 8
+
+
+def test_an_image_of_key_agreement_1_is_refused_by_name_alone_and_among_others(home: Path, tmp_path: Path) -> None:
+    image = signed(1)
+    shown = security.decode(image.blocks[0, 128])
+    older = replace(shown, values={**shown.values, 110: 1})
+    teds = older.with_signature(STATION.sign(security.tbs(image.uuid, older.encode()))).encode()
+    old = write(tmp_path / "images", "old.json", image.with_block((0, 128), teds))
+    write(tmp_path / "images", "new.json", signed(2))
+    for words in ([old], [old.parent]):
+        done = spawn("--home", home, "--json", "verify", *words)
+        assert done.code == 8
+        assert "KeyAgreement 1; 2 is spoken here" in done.out
+    assert spawn("--home", home, "verify", old.parent / "new.json").code == 0
 
 
 def test_people_see_a_line_each_and_a_sum(home: Path, tmp_path: Path) -> None:

@@ -19,6 +19,7 @@ from teds_provision.limits import LIMITS
 from teds_provision.station.station import Station
 from teds_provision.steps.judging import Judging, remember
 from teds_provision.steps.verify import Check, Verified, require_authentic, verify_images
+from teds_provision.teds.codec import security
 from teds_provision.teds.codec.codes import AccessCode
 from teds_provision.teds.image import Image
 
@@ -197,7 +198,7 @@ def _some(paths: Sequence[Path]) -> Iterator[list[_Read]]:
         try:
             text = read_limited(path, LIMITS.teds_file, "image", failure=BadData)
             octets += len(text)
-            some.append((path, Image.from_json(text)))
+            some.append((path, security.require_our_wire(Image.from_json(text))))
         except TedsProvisionError as error:
             some.append((path, error))
         if octets > _TOGETHER:

@@ -17,6 +17,7 @@ from teds_provision.steps.identify import Identified, identify
 from teds_provision.talk.conversation import Conversation
 from teds_provision.talk.meeting import meet
 from teds_provision.talk.progress import Reporter
+from teds_provision.teds.codec import security
 from teds_provision.teds.image import Image
 
 MAX_IMAGE_OCTETS: Final = 16 << 20
@@ -73,10 +74,11 @@ def node_or_image(station: Station, text: str) -> bytes | Image:
 
 
 def read_image_file(path: Path) -> Image:
-    """Read an image file; raises NotFound, BadData."""
+    """Read an image file; raises NotFound, BadData (of KeyAgreement 1 too, by name)."""
     try:
-        return Image.from_json(read_limited(path, MAX_IMAGE_OCTETS, "image"))
+        image = Image.from_json(read_limited(path, MAX_IMAGE_OCTETS, "image"))
     except BadData as error:
         raise BadData(
             f"{path} is no TEDS image: {error.message}", hint=error.hint or "Images come from build, sign and read."
         ) from error
+    return security.require_our_wire(image)

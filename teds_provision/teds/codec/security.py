@@ -14,7 +14,7 @@ from typing import Final
 
 from teds_provision.errors import BadData
 from teds_provision.teds.codec.frame import frame, raw_tuple, unframe
-from teds_provision.teds.image import BlockId
+from teds_provision.teds.image import BlockId, Image
 
 TEDSID_TUPLE: Final = bytes.fromhex("030400800101")
 
@@ -106,6 +106,24 @@ def other_wire(shown: SecurityTeds) -> str:
         if shown.values[number] != OUR_VALUES[number]:
             return f"{name} {shown.values[number]}; {OUR_VALUES[number]} is spoken here"
     return ""
+
+
+def require_our_wire(image: Image) -> Image:
+    """Give an image back; raises BadData, by name, for one whose Security TEDS is of a wire that is not spoken here.
+
+    One without, or with another owner's kind of Security TEDS, is left to whoever judges it.
+    """
+    octets = image.security
+    try:
+        other = other_wire(decode(octets)) if octets is not None else ""
+    except NotCanonical:
+        other = ""
+    if other:
+        raise BadData(
+            f"The image names {other}.",
+            hint="It is of a time before this wire; nothing of it was released. Read or build the datasheet anew.",
+        )
+    return image
 
 
 def ca_hint(name: str, ca_fingerprint: str) -> str:
