@@ -13,6 +13,9 @@ from typing import Final, Literal
 from teds_provision.errors import BadData, UsageFailure
 from teds_provision.files import read_limited
 from teds_provision.links import Trace
+from teds_provision.links.ble import spec as ble
+from teds_provision.links.can import spec as can
+from teds_provision.links.can.bus import require_known
 from teds_provision.measure.trusting import DEAD_MAN
 
 Detection = Literal["transparent", "whitelist"]
@@ -96,6 +99,16 @@ def _require_pair(certificate: Path, key: Path) -> None:
             f"{certificate} and {key} are no certificate with its key: {getattr(error, 'reason', None) or error}.",
             hint="Both are PEM; the certificate comes first in its file.",
         ) from error
+
+
+def require_places(settings: Settings) -> None:
+    """Raise UsageFailure for a link whose words are wrong: that does not mend itself, as a missing one may."""
+    for place in settings.places:
+        link, _, where = place.partition(":")
+        if link == "can":
+            require_known(can.parse_spec(where))
+        elif link == "ble":
+            ble.parse_spec(where)
 
 
 def require_safe(settings: Settings) -> None:

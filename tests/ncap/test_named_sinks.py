@@ -88,6 +88,19 @@ def test_readers_see_names_of_files_and_no_users() -> None:
     }
 
 
+@pytest.mark.parametrize(
+    ("words", "told"),
+    [
+        (("--can", "udp_multicast:239.74.163.2?prot=1"), "'prot'"),
+        (("--ble", "hci0?adress=x"), "'adress'"),
+        (("--mqtt", "mqtts://host?cafile=/x"), "'cafile'"),
+    ],
+)
+def test_words_of_a_link_or_sink_that_nobody_knows_end_the_start(desk: Desk, words: tuple[str, str], told: str) -> None:
+    done = desk.station().start("--json", "ncap", "run", *words).end()
+    assert (done.code, told in done.out) == (2, True), done
+
+
 @pytest.mark.link
 def test_a_running_daemon_takes_the_names_of_its_owner(desk: Desk) -> None:
     station = desk.station()

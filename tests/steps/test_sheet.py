@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from teds_provision.errors import BadData, NodeSilent, NoNode
+from teds_provision.errors import BadData, NodeBusy, NodeSilent, NoNode
 from teds_provision.station.station import Station
 from teds_provision.steps.build_order import BuildOrder
 from teds_provision.steps.many.board import Board, Declined
@@ -94,6 +94,26 @@ def test_rows_go_to_boards_in_the_order_of_the_taps_and_to_a_spare_at_last(stati
         assert row is not None
         assert row.number == 2
     assert again.row_for(board_of(9), "", busy={2}) is None, "another reader is at work on it"
+
+
+def test_two_runs_of_one_sheet_lose_each_other_no_board_and_share_no_row(station: Station, tmp_path: Path) -> None:
+    """Each wrote the whole sheet as it knew it: what the other had done was open again."""
+    sheet = read(station, tmp_path, "name\na\nb\nc\n")
+    one, other = Progress(station.home, sheet), Progress(station.home, sheet)
+    first, second, third = sheet.rows
+    one.take(first, board_of(1))
+    assert other.row_for(board_of(2), "") is first, "it does not know yet"
+    with pytest.raises(NodeBusy, match="by another run of this sheet"):
+        other.take(first, board_of(2))
+    assert other.row_for(board_of(2), "") is second
+    other.take(second, board_of(2))
+    other.note(second, Board(board_of(2), 1.0, error=NodeSilent("It was pulled."), row=2))
+    one.note(first, Board(board_of(1), 1.0, error=NodeSilent("It was pulled."), row=1))
+    one.take(third, board_of(3))
+    again = Progress(station.home, sheet)
+    assert [again.board_of(row) for row in sheet.rows] == [board_of(number).hex() for number in (1, 2, 3)]
+    assert [again.rows[number].result for number in (1, 2)] == ["failed", "failed"]
+    assert one.rows[2].result == "failed"
 
 
 def test_a_spare_gets_no_row_before_those_that_had_no_board(station: Station, tmp_path: Path) -> None:

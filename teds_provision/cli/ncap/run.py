@@ -90,6 +90,7 @@ def run(
         **wished,
     )
     settings.require_safe(wanted)
+    settings.require_places(wanted)
     station = app.station()
     station.unlock()  # nobody is asked for a passphrase later
     lines = Lines(app)

@@ -48,7 +48,7 @@ _ANYWHERE: Final = frozenset({"bitrate", "data_bitrate", "receive_own_messages",
 _NOT_KEYS: Final = frozenset({"self", "args", "kwargs", "channel", "can_filters", "interface", "fd", ""})
 
 
-__all__ = ["Bus", "Frame", "known_keys"]
+__all__ = ["Bus", "Frame", "known_keys", "require_known"]
 
 
 class Bus:
@@ -230,7 +230,7 @@ def _open(spec: CanSpec) -> can.BusABC:
 
     for name in ("can", "isotp"):
         logging.getLogger(name).setLevel(logging.CRITICAL)
-    _require_known(spec)
+    require_known(spec)
     options = _options(spec)
     try:
         bus = _opened(spec, options)
@@ -249,7 +249,7 @@ def _open(spec: CanSpec) -> can.BusABC:
     return bus
 
 
-def _require_known(spec: CanSpec) -> None:
+def require_known(spec: CanSpec) -> None:
     """Raise UsageFailure for a key that the interface does not have: python-can takes any, and says nothing."""
     if not spec.options:
         return

@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+import fcntl
 import hashlib
 import json
+import os
 from collections import Counter
-from collections.abc import Collection
+from collections.abc import Collection, Iterator
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any, Final
 
-from teds_provision.errors import NoNode, NotFound, TedsProvisionError
+from teds_provision.errors import NodeBusy, NoNode, NotFound, TedsProvisionError
 from teds_provision.files import private_folder, read_limited, write_whole
 from teds_provision.steps.many.board import Board, Totals, worse
 from teds_provision.steps.many.sheet import Row, Sheet
@@ -44,7 +47,7 @@ class Progress:
         self.sheet = sheet
         name = hashlib.sha256(str(sheet.path.resolve()).encode()).hexdigest()[:32]
         self._path = home / FOLDER / f"{name}.json"
-        kept = self._kept()
+        self._there = kept = self._kept()
         self.rows = {row.number: self._of(row, kept.get(str(row.number))) for row in sheet.rows}
         self.worst: TedsProvisionError | None = None
         self._tried: frozenset[int] = frozenset()
@@ -67,10 +70,39 @@ class Progress:
         except TypeError:  # of another version of this tool
             return Attempted(row.digest)
 
-    def save(self) -> None:
-        """Put it onto the disk; raises StoreFailure."""
+    def save(self, *changed: Row) -> None:
+        """Put these rows (all, where none is named) onto the disk, beside what another run of this sheet put there.
+
+        Raises StoreFailure.
+        """
+        with self._alone():
+            self._read_again(but={row.number for row in changed or self.sheet.rows})
+            self._write()
+
+    @contextmanager
+    def _alone(self) -> Iterator[None]:
+        """What is written is made from what lies there: two runs of one sheet (two desks) lose each other no board."""
         private_folder(self._path.parent)
-        told = {"sheet": str(self.sheet.path.resolve()), "rows": {n: asdict(row) for n, row in self.rows.items()}}
+        place = self._path.with_suffix(".lock")
+        descriptor = os.open(place, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_CLOEXEC, 0o600)
+        try:
+            fcntl.flock(descriptor, fcntl.LOCK_EX)  # held for one small file
+            yield
+        finally:
+            os.close(descriptor)
+
+    def _read_again(self, but: Collection[int] = ()) -> None:
+        """Take in the rows that another run has changed since this one looked."""
+        before, self._there = self._there, self._kept()
+        self.rows |= {
+            row.number: self._of(row, self._there[key])
+            for row in self.sheet.rows
+            if row.number not in but and (key := str(row.number)) in self._there and self._there[key] != before.get(key)
+        }
+
+    def _write(self) -> None:
+        self._there = {str(number): asdict(row) for number, row in self.rows.items()}
+        told = {"sheet": str(self.sheet.path.resolve()), "rows": self._there}
         write_whole(self._path, json.dumps(told, indent=1).encode())
 
     @property
@@ -109,11 +141,23 @@ class Progress:
         return self.rows[row.number].uuid or self._turned_away.get(row.number)
 
     def take(self, row: Row, uuid: bytes) -> None:
-        """Note that this board is the row's, before anything is done with it."""
-        attempted = self.rows[row.number]
-        if attempted.uuid != uuid.hex():
+        """Note that this board is the row's, before anything is done with it.
+
+        Raises NodeBusy where another run of this sheet has given the row to another board meanwhile.
+        """
+        before = self.rows[row.number].uuid
+        if before == uuid.hex():
+            return
+        with self._alone():
+            self._read_again()
+            attempted = self.rows[row.number]
+            if row.by_order and attempted.uuid not in (before, uuid.hex()):
+                raise NodeBusy(
+                    f"Row {row.number} was given to board {attempted.uuid} by another run of this sheet.",
+                    hint="Tap this board again: it gets the next row.",
+                )
             attempted.uuid = uuid.hex()
-            self.save()
+            self._write()
 
     def turn_away(self, row: Row, uuid: bytes) -> None:
         """Note that this board was not given what the row says; the row stays free, and is tried again with it."""
@@ -140,7 +184,7 @@ class Progress:
             attempted.steps = {step.name: step.seconds for step in board.done.steps}
         self._tried = self._tried | {row.number}
         self.worst = worse(self.worst, board.failure)
-        self.save()
+        self.save(row)
 
     def ran_out(self, seconds: float) -> None:
         """Note that no board came in time for the rows that nobody tried, if there are any."""
