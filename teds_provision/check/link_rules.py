@@ -5,16 +5,18 @@ from __future__ import annotations
 from collections.abc import Iterator
 from typing import Final
 
-from teds_provision.check.heard import HeardFrame
-from teds_provision.check.outcome import NotApplicable
-from teds_provision.check.probe import Probe, holds
+from teds_provision.check.probe import HeardFrame, NotApplicable, Probe, holds
 from teds_provision.check.rule import Stage, rule
-from teds_provision.links.can.isotp import BLOCK_SIZE, PADDING, addresses, padded
-from teds_provision.links.ports import Announces
-from teds_provision.protocol.messages.frames import write_teds
+from teds_provision.links.can.isotp import addresses, read_single
+from teds_provision.links.can.transfer import OVERFLOW, gap_seconds
+from teds_provision.links.ports import Announces, OnABus
+from teds_provision.protocol.messages.frames import Reason, refusal, write_teds
 from teds_provision.teds.image import SECURITY
 
 _SINGLE, _FIRST, _CONSECUTIVE, _FLOW = range(4)
+_OVERFLOW: Final = OVERFLOW & 0xF
+_HALF_SENT: Final = 200
+_GIVEN_UP: Final = 1.2
 _WTX: Final = 0xF2
 _MOST_WTX: Final = 59
 
@@ -63,25 +65,41 @@ def _used(frames: list[HeardFrame]) -> Iterator[tuple[HeardFrame, int]]:
             left = 0
 
 
-@rule("can-padding", "CAN", Stage.PLAIN)
-def can_padding(probe: Probe) -> str:
-    """Padding CC, to 8 octets, in FD to the next length that FD knows."""
-    _, frames = _of_the_node(probe)
-    for one, used in _used(frames):
-        due = padded(one.octets[:used], fd=one.fd)
-        holds(one.octets == due, f"A frame of {used} octets came as {one.octets.hex()}; {due.hex()} is due.")
-    return f"{len(frames)} frames, padded with {PADDING:02X}"
-
-
 @rule("can-flow-control", "CAN", Stage.PLAIN)
 def can_flow_control(probe: Probe) -> str:
-    """Flow control asks for blocks of 16 frames without a gap."""
+    """Flow control is well formed; block size, STmin and padding are the node's choice and are told.
+
+    A reserved STmin counts as 127 ms (ISO 15765-2, table of STmin).
+    """
     _, frames = _of_the_node(probe)
-    controls = {one.octets[:3] for one in frames if one.octets[0] >> 4 == _FLOW}
-    due = bytes([_FLOW << 4, BLOCK_SIZE, 0])
-    wrong = " ".join(sorted(control.hex() for control in controls - {due}))
-    holds(not wrong, f"Flow control {wrong}: {due.hex()} is due (block size {BLOCK_SIZE}, STmin 0).")
-    return f"block size {BLOCK_SIZE}, STmin 0"
+    controls = {one.octets for one in frames if one.octets[0] >> 4 == _FLOW}
+    wrong = " ".join(sorted(one.hex() for one in controls if len(one) < 3 or one[0] & 0xF > _OVERFLOW))
+    holds(not wrong, f"Flow control {wrong}: 30 to 32, block size and STmin are due.")
+    asked = {f"block size {one[1]}, STmin {gap_seconds(one[2]) * 1000:g} ms" for one in controls if one[0] & 0xF == 0}
+    padding = {octet for one, used in _used(frames) for octet in one.octets[used:]}
+    return f"{', '.join(sorted(asked))}; padding {' '.join(f'{one:02X}' for one in sorted(padding)) or 'none'}"
+
+
+@rule("can-busy", "CAN", Stage.PLAIN)
+def can_busy(probe: Probe) -> str:
+    """Beside another station's long request a first frame gets a flow control, or a single frame with refusal 17."""
+    other = probe.beside(1).line
+    assert isinstance(other, OnABus)
+    first = probe.bus.begin(_HALF_SENT)
+    holds(
+        first[:1] == b"\x30",
+        f"The first frame of {_HALF_SENT} octets: {first.hex() or 'nothing'} came, not a flow control.",
+    )
+    second = other.begin(_HALF_SENT)
+    refused = read_single(second) if second else None
+    fine = second[:1] in (b"\x30", b"\x31") or (refused is not None and refused[1:] == refusal(Reason.BUSY).encode())
+    came = second.hex() or "nothing"
+    due = "a flow control, or a single frame with refusal 17, is due"
+    holds(fine, f"A second station's first frame beside another's long request: {came} came; {due}.")
+    probe.pause(_GIVEN_UP)  # N_Cr: the node gives both up
+    return probe.refused(_LONG, Reason.NOT_PERMITTED, "a long request after it") + (
+        "; 17 for the second" if refused is not None else "; both taken up"
+    )
 
 
 @rule("can-form", "CAN", Stage.PLAIN)

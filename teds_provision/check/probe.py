@@ -3,13 +3,18 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
 from typing import Final
 
-from teds_provision.check.heard import Heard
-from teds_provision.check.outcome import NotApplicable, RuleBroken
-from teds_provision.errors import BadData, Garbled, NodeSilent, NotAuthentic
+from teds_provision.check import slips
+from teds_provision.check.slips import Slip
+from teds_provision.errors import BadData, Garbled, NodeSilent, NotAuthentic, TooLongForNode
 from teds_provision.links import Contact
-from teds_provision.protocol.agreement import Credentials
+from teds_provision.links.ports import Direction, Link, OnABus, Trace
+from teds_provision.protocol.agreement import AgreedKey, Credentials
+from teds_provision.protocol.datasheet import NodeKeys
+from teds_provision.protocol.keys import SoftwareKey
 from teds_provision.protocol.messages.frames import (
     IDENTIFY,
     Command,
@@ -31,21 +36,100 @@ from teds_provision.teds.image import SECURITY as SECURITY_TEDS
 from teds_provision.teds.image import BlockId
 
 _LARGEST_TEDS: Final = 1 << 20
+_STATIONS: Final = range(0xF7, 0xF0, -1)
+"""Addresses of base stations, those first that a real one has least often."""
+
+
+class RuleBroken(Exception):
+    """The node did not keep to the rule; the text says what was sent, what was due and what came.
+
+    ``slip`` is the known slip that would explain it, where one does.
+    """
+
+    def __init__(self, text: str, slip: Slip | None = None) -> None:
+        super().__init__(text if slip is None else f"{text} {slip.sentence}")
+        self.slip = slip
+
+
+class NotApplicable(Exception):
+    """The rule cannot be tried on this node, link or state, by no fault of the node; the text says why."""
+
+
+@dataclass(frozen=True)
+class HeardFrame:
+    """One frame: a CAN frame with its ``identifier``, or a block of the NFC link."""
+
+    link: str
+    direction: Direction
+    octets: bytes
+    identifier: int | None
+    fd: bool
+
+
+@dataclass
+class Heard:
+    """A trace that remembers the frames and hands everything on to ``further``; see ``links.ports.Trace``."""
+
+    further: Trace | None = None
+    frames: list[HeardFrame] = field(default_factory=list)
+
+    def frame(
+        self,
+        link: str,
+        direction: Direction,
+        octets: bytes,
+        *,
+        identifier: int | None = None,
+        fd: bool = False,
+        at: float | None = None,
+    ) -> None:
+        """Remember a frame."""
+        self.frames.append(HeardFrame(link, direction, bytes(octets), identifier, fd))
+        if self.further is not None:
+            self.further.frame(link, direction, octets, identifier=identifier, fd=fd, at=at)
+
+    def message(
+        self,
+        link: str,
+        direction: Direction,
+        octets: bytes,
+        words: str,
+        *,
+        uuid: bytes,
+        sealed: bool = False,
+        opened: bytes | None = None,
+    ) -> None:
+        """Hand a message on."""
+        if self.further is not None:
+            self.further.message(link, direction, octets, words, uuid=uuid, sealed=sealed, opened=opened)
 
 
 class Probe:
     """One node under test. ``credentials`` is this station's, ``key`` the link key where one is held.
 
-    ``heard`` are the frames of its link, None where nobody listened.
+    ``heard`` are the frames of its link, None where nobody listened. ``keep`` makes a new key durable here before its
+    Confirm leaves; None where no key may change. ``okm`` is that of the agreement that gave ``key``, where it was made
+    in this run. ``line`` is the line that is asked now, as a rule this station's own.
     """
 
     def __init__(self, contact: Contact, heard: Heard | None = None) -> None:
         self.contact, self.heard = contact, heard
+        self.line: Link = contact.link
         self.uuid = contact.identity.uuid
         self.max_message = contact.identity.max_message
         self.credentials: Credentials | None = None
+        self.keep: Callable[[AgreedKey], None] | None = None
         self.key: bytes | None = None
+        self.okm = b""
         self.session: StationSession | None = None
+        self.no_session = ""
+        """Why no session opened; empty where none was tried, or the last one did."""
+        self.no_agreement = ""
+        """Why a good Request came to nothing; empty where none was tried, or one did."""
+        self._sealed_once = False
+        self._shown: SecurityTeds | None = None
+        self.home_address, self.moved_at = 0, 0.0
+        """The CAN address that the node had before a rule moved it, 0 where none did; when it was moved."""
         self.asked = ""
         """The last command that was sent, in words."""
 
@@ -58,14 +142,21 @@ class Probe:
         """
         opened = None if inside is None else inside.encode()
         self.asked = what
-        until = time.monotonic() + BUSY_SECONDS
+        until = self.now() + BUSY_SECONDS
         while True:
             self.contact.note("out", frame, what, sealed=inside is not None, opened=opened)
             try:
-                raw = self.contact.link.exchange(frame)
+                raw = self.line.exchange(frame)
             except NodeSilent:
                 self.listen()
                 raise RuleBroken(f"{what}: no reply, and every command gets one.") from None
+            except TooLongForNode as refused:
+                if len(frame) > self.max_message:
+                    raise
+                raise RuleBroken(
+                    f"{what}: {len(frame)} octets are refused on the link; maxMessage is {self.max_message}."
+                    f" {refused.message}"
+                ) from None
             try:
                 reply = decode_reply(raw)
             except Garbled as error:
@@ -76,13 +167,50 @@ class Probe:
                 self.contact.note("in", raw, f"reply to {what}: {told(reply)}")
             if reply.reason != Reason.BUSY:
                 return reply
-            if time.monotonic() >= until:
-                raise NotApplicable(f"{what}: the node is busy (17).")
-            time.sleep(BUSY_PAUSE)
+            if self.now() >= until:
+                raise RuleBroken(f"{what}: busy (17) for {BUSY_SECONDS:g} s, and nothing here keeps the node busy.")
+            self.pause(BUSY_PAUSE)
 
     def listen(self) -> None:
         """Ask Identify, whatever it says; raises LinkFailure where nothing comes."""
-        self.contact.link.exchange(IDENTIFY.encode())
+        self.line.exchange(IDENTIFY.encode())
+
+    def pause(self, seconds: float) -> None:
+        """Let time pass."""
+        time.sleep(seconds)
+
+    @property
+    def bus(self) -> OnABus:
+        """The node's line where it is one of a bus; raises NotApplicable elsewhere."""
+        link = self.contact.link
+        if not isinstance(link, OnABus):
+            raise NotApplicable("Needs a bus, where a second station can ask: try it over CAN.")
+        return link
+
+    def beside(self, number: int) -> Probe:
+        """The same node as another base station has it, ``number`` 1 or 2: its own line, and so its own session."""
+        bus = self.bus
+        frames = self.heard.frames if self.heard is not None else []
+        out = [one.identifier & 0xFF for one in frames if one.identifier is not None and one.direction == "out"]
+        taken = {one.identifier & 0xFF for one in frames if one.identifier is not None and one.direction == "in"}
+        free = [source for source in _STATIONS if source not in taken | set(out[:1])]
+        if number > len(free):
+            raise NotApplicable("All addresses of base stations are in use on this bus.")
+        other = Probe(self.contact, self.heard)
+        other.line, other.key, other.okm = bus.beside(free[number - 1]), self.key, self.okm
+        other.credentials = self.credentials
+        return other
+
+    def now(self) -> float:
+        """Monotonic seconds."""
+        return time.monotonic()
+
+    def move(self, address: int) -> None:
+        """Ask the node at another CAN address from now on."""
+        self.moved_at = self.now()
+        if isinstance(self.contact.link, OnABus):
+            self.contact.link.address = address
+            self.contact = replace(self.contact, address=address)
 
     def plain(self, command: Command) -> Reply:
         """Send a plain command."""
@@ -116,31 +244,88 @@ class Probe:
         return self.credentials
 
     def open(self) -> StationSession:
-        """Open a session; raises RuleBroken where the node's reply or tag is wrong."""
-        session = StationSession(self.link_key, self.uuid)
+        """Open a session; raises RuleBroken where the node's reply or tag is wrong, NotApplicable the next time."""
+        if self.no_session:
+            raise NotApplicable(f"Needs a session, and none opens: {self.no_session}")
         try:
-            session.accept(self.good(session.open(self.good(session.ask()))))
+            self.session = self._opened()
+        except RuleBroken as broken:
+            self.no_session = str(broken)
+            raise
+        return self.session
+
+    def _opened(self) -> StationSession:
+        key, one_time = self.link_key, SoftwareKey.generate()
+        session = StationSession(key, self.uuid, one_time=one_time)
+        command = session.open(self.opening_counter())
+        reply = self.plain(command)
+        if reply.reason == Reason.BAD_TAG:  # another station may have been faster
+            command = session.open(self.opening_counter())
+            reply = self.plain(command)
+        if not reply.ok:
+            raise RuleBroken(
+                f"{named(command)}: success is due, {told(reply)} came.", self._slip_of_open(reply, one_time)
+            )
+        try:
+            session.accept(reply.payload)
         except (Garbled, NotAuthentic) as error:
-            raise RuleBroken(f"Open (128.3): {error.message}") from None
-        self.session = session
+            slip = slips.of_session(key, self.uuid, one_time, reply.payload)
+            raise RuleBroken(f"Open (128.3): {error.message}", slip) from None
         return session
+
+    def opening_counter(self) -> bytes:
+        """C of Open, 8 octets; raises RuleBroken."""
+        counter = self.good(security_command(Function.OPEN))
+        holds(len(counter) == 8, f"Open (128.3) without payload: c has {len(counter)} octets, 8 are due.")
+        return counter
+
+    def _slip_of_open(self, reply: Reply, one_time: SoftwareKey) -> Slip | None:
+        """What the node made otherwise of keyId (it said 16) or mac (12): each slip is tried until it takes one."""
+        if reply.reason not in (Reason.UNKNOWN_KEY, Reason.BAD_TAG):
+            return None
+        about_key = reply.reason == Reason.UNKNOWN_KEY
+        tries = slips.opens(self.link_key, self.okm, self.uuid, one_time.point, about_key=about_key)
+        for slip, payload in tries:
+            if self.plain(security_command(Function.OPEN, payload(self.opening_counter()))).ok:
+                return slip
+        return None
 
     def sealed(self, command: Command) -> Reply:
         """Send a command in the session, which is opened where none is; the inner reply."""
         session = self.session or self.open()
+        try:
+            reply = self._sealed(session, command)
+        except RuleBroken as broken:
+            if not self._sealed_once:
+                self.no_session = str(broken)
+            raise
+        self._sealed_once = True
+        return reply
+
+    def _sealed(self, session: StationSession, command: Command) -> Reply:
         sealed = session.seal(command)
         outer = self.octets(sealed.encode(), named(command), inside=command)
         if not outer.ok:
             self.session = None
-            raise RuleBroken(f"{named(command)}, sealed: a sealed reply is due, {told(outer)} came.")
+            slip = self._slip_of_sealed(session) if outer.reason == Reason.BAD_TAG else None
+            raise RuleBroken(f"{named(command)}, sealed: a sealed reply is due, {told(outer)} came.", slip)
         try:
             inner = session.unseal(outer.payload)
         except (Garbled, NotAuthentic) as error:
             self.contact.note("in", outer.encode(), answered(command, outer), sealed=True)
             self.session = None
-            raise RuleBroken(f"{named(command)}, sealed: {error.message}") from None
+            slip = slips.of_sealed_reply(session.keys, outer.payload, int.from_bytes(sealed.payload[:4], "big"))
+            raise RuleBroken(f"{named(command)}, sealed: {error.message}", slip) from None
         self.contact.note("in", outer.encode(), answered(command, inner), sealed=True, opened=inner.encode())
         return inner
+
+    def _slip_of_sealed(self, session: StationSession) -> Slip | None:
+        """How the node would take a Sealed frame: each slip is tried, under counters of their own."""
+        for counter, (slip, seal) in enumerate(slips.SEALED, 1000):
+            payload = seal(session.keys, counter, IDENTIFY.encode())
+            if self.plain(security_command(Function.SEALED, payload)).ok:
+                return slip
+        return None
 
     def sealed_good(self, command: Command) -> bytes:
         """A sealed command that must succeed; the inner payload."""
@@ -169,7 +354,7 @@ class Probe:
     @property
     def tapped(self) -> bool:
         """Whether commands of this link count as tapped whatever the node's state."""
-        return self.contact.link.capabilities.tapped
+        return self.line.capabilities.tapped
 
     def identity(self) -> Identity:
         """Identify, asked now."""
@@ -209,11 +394,24 @@ class Probe:
         raise RuleBroken(f"Read (1.2) of {block}: no end after {len(octets)} octets.")
 
     def security(self) -> SecurityTeds:
-        """The Security TEDS, decoded; raises RuleBroken where it is not canonical."""
+        """The Security TEDS as it is now, decoded; raises RuleBroken where it is not canonical."""
         try:
-            return security.decode(self.teds(SECURITY_TEDS))
+            shown = security.decode(self.teds(SECURITY_TEDS))
         except BadData as error:
             raise RuleBroken(f"Security TEDS: {error.message}") from None
+        self._shown = self._shown or shown
+        return shown
+
+    @property
+    def node_keys(self) -> NodeKeys:
+        """Fields 101 and 102, as the first Security TEDS that could be read had them: they never change."""
+        shown = self._shown or self.security()
+        return NodeKeys(self.uuid, shown.node_key, shown.node_key_signature)
+
+    @property
+    def node_key(self) -> bytes:
+        """P(node), field 101."""
+        return self.node_keys.key
 
 
 def demand(reply: Reply, reason: int, what: str) -> str:

@@ -1,24 +1,27 @@
-"""What a rule is, when it can be run, and the register of all rules."""
+"""What a rule is, when it can be run, the register of all rules, and how one ends."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
 from enum import Enum
-from typing import Final
+from typing import Final, Literal
 
 from teds_provision.check.probe import Probe
 
+Result = Literal["passed", "failed", "skipped"]
+
 
 class Stage(Enum):
-    """When a rule is run, in this order. From AGREEMENT on the node's key changes, but for SESSION with a held key."""
+    """When a rule is run, in this order. From AGREEMENT on the key changes, but in KEYED and SESSION with one held."""
 
     PLAIN = "in any state, changes nothing"
     FACTORY = "in factory state, changes nothing"
     AGREEMENT = "a factory node is given a key"
-    KEYED = "a node with a key of this station, plainly"
+    KEYED = "a node with a key of this station"
     SESSION = "in sessions; what is staged is dropped"
     COMMIT = "a datasheet is committed"
+    ROTATION = "the node is given another key"
     RESET = "the node goes back to factory state"
 
 
@@ -38,6 +41,20 @@ class Rule:
     def clause(self) -> str:
         """Page and section."""
         return f"profile.md, {self.section}"
+
+
+@dataclass(frozen=True)
+class Checked:
+    """How one rule ended; ``detail`` is what was sent and seen, or why it was skipped. Never holds a key.
+
+    ``slip`` is the name of the known slip that would explain it, None where none does.
+    """
+
+    rule: str
+    clause: str
+    result: Result
+    detail: str
+    slip: str | None = None
 
 
 RULES: Final[list[Rule]] = []

@@ -4,15 +4,17 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
-from teds_provision.check import link_rules, owning, plain, sessions, teds_rules, writing
-from teds_provision.check.heard import Heard
-from teds_provision.check.outcome import Checked, NotApplicable, RuleBroken
-from teds_provision.check.probe import Probe
-from teds_provision.check.rule import RULES, Rule, Stage
-from teds_provision.errors import BadData, Garbled, LinkFailure, NodeRefused, NotAuthentic, PolicyRefused
+from teds_provision.check import agreement, link_rules, plain, sessions, writing
+from teds_provision.check.agreement import Explained, explain
+from teds_provision.check.probe import Heard, NotApplicable, Probe, RuleBroken
+from teds_provision.check.rule import RULES, Checked, Rule, Stage
+from teds_provision.errors import BadData, Garbled, LinkFailure, NotAuthentic, PolicyRefused
 from teds_provision.links import LinkSettings
+from teds_provision.protocol.agreement import AgreedKey, key_id
+from teds_provision.protocol.keys import SoftwareKey
+from teds_provision.protocol.messages.frames import Function, Reason, security_command
 from teds_provision.protocol.messages.identity import NodeState
-from teds_provision.station.station import Station
+from teds_provision.station.station import NodeKey, Station
 from teds_provision.steps.agree import open_session
 from teds_provision.steps.identify import examine
 from teds_provision.steps.reset import reset_node
@@ -20,7 +22,7 @@ from teds_provision.talk.conversation import Conversation
 from teds_provision.talk.meeting import meet
 from teds_provision.talk.progress import Reporter
 
-_REGISTERS = (plain, teds_rules, link_rules, owning, sessions, writing)
+_REGISTERS = (plain, link_rules, agreement, sessions, writing)
 """The modules whose rules are registered by being imported."""
 _ONLY_FACTORY = "The node has a key. Ask with --factory to have it reset and keyed anew."
 _NEEDS_FACTORY = "Changes the node's key. Ask with --factory."
@@ -29,7 +31,7 @@ _NEEDS_KEY = "The node has no key. Ask with --factory to give it one."
 
 _GONE = "The node does not answer any more."
 _TORN_TRIES = 3
-"""So often a rule is tried whose replies come torn, at a reader; nothing but the node makes them so each time there."""
+"""So often a rule is tried whose replies come torn; on a bus each try has repetitions of its own below it."""
 
 
 @dataclass(frozen=True)
@@ -37,49 +39,70 @@ class Report:
     """Every rule, in order, and how often each result came.
 
     ``lost`` is why the rest could not be tried: the node fell silent, or the reader went away; None where all was.
+    ``explained`` is the test agreement that was asked for, or why there is none; None where none was asked for.
     """
 
     uuid: bytes
     checks: tuple[Checked, ...]
     lost: LinkFailure | None = None
+    explained: Explained | str | None = None
 
     def count(self, result: str) -> int:
         """How many rules ended so."""
         return sum(check.result == result for check in self.checks)
 
 
-def check_at(station: Station, links: LinkSettings, reporter: Reporter, *, factory: bool) -> Report:
+def check_at(
+    station: Station, links: LinkSettings, reporter: Reporter, *, factory: bool, explained: bool = False
+) -> Report:
     """Run the rules against the node that is met first; see :func:`check_node`. Raises NoNode, NoReader as well."""
     heard = Heard(links.trace)
     with meet(station, replace(links, trace=heard), None, reporter, before=station.unlock) as node:
-        return check_node(station, node, factory=factory, heard=heard)
+        return check_node(station, node, factory=factory, heard=heard, explained=explained)
 
 
-def check_node(station: Station, node: Conversation, *, factory: bool = False, heard: Heard | None = None) -> Report:
+def check_node(
+    station: Station,
+    node: Conversation,
+    *,
+    factory: bool = False,
+    heard: Heard | None = None,
+    explained: bool = False,
+) -> Report:
     """Run the rules against a node, most of which change nothing; ``heard`` has the frames of its link.
 
     Without ``factory`` no key changes: a factory node is tried in factory state, one of ours in sessions too. With it a
     node of ours is reset, then keyed, written and reset again, so that it ends in factory state.
+    ``explained``: make a test agreement that is never confirmed, and say what it comes to.
     A node that falls silent ends it, with what was found until then. Raises PolicyRefused for a node with another
     owner, before anything but Identify was asked; LinkFailure before the first rule.
     """
-    return _Run(station, node, factory, heard).all()
+    return _Run(station, node, factory, heard, explained=explained).all()
 
 
 class _Run:
-    def __init__(self, station: Station, node: Conversation, factory: bool, heard: Heard | None) -> None:
+    def __init__(
+        self, station: Station, node: Conversation, factory: bool, heard: Heard | None, *, explained: bool
+    ) -> None:
         self._station, self._node, self._factory = station, node, factory
         self._probe = Probe(node.contact, heard)
         self._checks: dict[str, Checked] = {}
+        self._explaining, self._explained = explained, None  # type: bool, Explained | str | None
         self._lost: LinkFailure | None = None
 
     def all(self) -> Report:
-        ours = self._probe.identity().state != NodeState.FACTORY
+        try:
+            ours = self._probe.identity().state != NodeState.FACTORY
+        except RuleBroken:  # the rules say what is wrong with it
+            ours = self._node.identity.state != NodeState.FACTORY
         if ours:
             self._take_up()
         elif self._factory:
             self._station.policy.require_not_given_away(self._node.uuid)
+        ca = self._station.keys.ca_of(self._node.uuid) if ours else None
+        self._probe.credentials = self._station.identity.credentials(ca) if ca else self._station.credentials()
         try:
+            self._explain()
             self._stage(Stage.PLAIN)
             if ours:
                 self._stage(Stage.KEYED)
@@ -93,7 +116,16 @@ class _Run:
             held = stage in (Stage.KEYED, Stage.SESSION) and not self._factory
             self._skip(stage, _NEEDS_KEY if held else _NEEDS_FACTORY)
         checks = tuple(self._checks[each.name] for each in _ordered())
-        return Report(self._node.uuid, checks, self._lost)
+        return Report(self._node.uuid, checks, self._lost, self._explained)
+
+    def _explain(self) -> None:
+        """Before any rule: a node that cannot agree gets the figures that lead to why."""
+        if not self._explaining:
+            return
+        try:
+            self._explained = explain(self._probe)
+        except (RuleBroken, NotApplicable) as no:
+            self._explained = str(no)
 
     def _in_factory_state(self, ours: bool) -> None:
         """Rules of factory state, and of the way from there to a key and back; a node of ours is reset for them."""
@@ -124,19 +156,21 @@ class _Run:
                 return self._tried(each)
             except Garbled as torn:  # of the link, after its own repetitions
                 why, self._probe.session = torn.message, None
-                if self._probe.noisy:  # not the node's fault for certain
-                    return Checked(each.name, each.clause, "skipped", f"The link failed: {why}")
                 if left:
                     self._probe.listen()  # a node that answers nothing else either is lost, not wrong in this
-        return Checked(each.name, each.clause, "failed", f"{self._probe.asked}: no reply that can be read. {why}")
+        also = " Identify was answered meanwhile: it is the node, or a very bad bus." if self._probe.noisy else ""
+        text = f"{self._probe.asked}: no reply that can be read, {_TORN_TRIES} times.{also} {why}"
+        return Checked(each.name, each.clause, "failed", text)
 
     def _tried(self, each: Rule) -> Checked:
+        slip = None
         try:
             return Checked(each.name, each.clause, "passed", each.run(self._probe))
         except NotApplicable as skip:
+            self._probe.session = None
             return Checked(each.name, each.clause, "skipped", str(skip))
         except RuleBroken as broken:
-            detail = str(broken)
+            detail, slip = str(broken), broken.slip
         except Garbled:
             raise
         except LinkFailure as lost:
@@ -146,64 +180,73 @@ class _Run:
         except (BadData, NotAuthentic, PolicyRefused) as wrong:
             detail = wrong.message
         self._probe.session = None
-        return Checked(each.name, each.clause, "failed", detail)
+        return Checked(each.name, each.clause, "failed", detail, slip.name if slip is not None else None)
 
     # -- keys ------------------------------------------------------------------------------------------------------
 
     def _take_up(self) -> None:
-        """The link key of a node of ours; raises PolicyRefused where another owner, or nobody here, has it."""
-        held = open_session(self._station, self._node) if self._station.keys.held(self._node.uuid) else None
+        """The link key of a node of ours; raises PolicyRefused where another owner, or nobody here, has it.
+
+        A node that knows the key and opens no session all the same has its rules tried: they say why.
+        """
+        node, held = self._node, None
+        if self._station.keys.held(node.uuid):
+            held = open_session(self._station, node) or self._known_there()
         if held is None:
             raise PolicyRefused(
-                f"Node {self._node.uuid.hex()} has a key that this station does not hold: nothing was tried.",
+                f"Node {node.uuid.hex()} has a key that this station does not hold: nothing was tried.",
                 hint="Check it from its owner's station, or reset it by hand (button held 5 s).",
             )
         self._probe.key = held.key
-        self._node.leave()
+        node.leave()
+
+    def _known_there(self) -> NodeKey | None:
+        """The newest key of ours whose keyId the node knows: to a wrong mac under it, it says 12 and not 16."""
+        for held in self._station.keys.unwrapped(self._node.uuid):
+            wrong = key_id(held.key) + SoftwareKey.generate().point + bytes(16)
+            if self._probe.plain(security_command(Function.OPEN, wrong)).reason == Reason.BAD_TAG:
+                return held
+        return None
 
     def _reset(self) -> str:
         """Reset a node of ours as ``reset`` does: its keys go here when the proof was good. Why not, "" where it is."""
         try:
             reset_node(self._station, self._node, examine(self._station, self._node))
         except (BadData, NotAuthentic, PolicyRefused) as no:
+            (rule,) = [each for each in RULES if each.name == "reset"]
+            self._checks["reset"] = Checked("reset", rule.clause, "failed", no.message)
             return f"The node could not be reset. {no.message}"
         self._probe.key = self._probe.session = None
+        self._probe.no_session = self._probe.no_agreement = ""
         return ""
 
     def _key_and_back(self, *, sessions_too: bool) -> None:
-        self._probe.credentials = self._station.credentials()
+        probe = self._probe
+        probe.credentials, probe.keep = self._station.credentials(), self._keep
         self._stage(Stage.AGREEMENT)
-        why = self._agree()
-        if why:
-            for stage in (Stage.KEYED, Stage.SESSION, Stage.COMMIT, Stage.RESET):
+        if probe.key is None:
+            ended = self._checks["agreement"]
+            why = f"No key was agreed (rule agreement, {ended.result}): {ended.detail}"
+            for stage in (Stage.KEYED, Stage.SESSION, Stage.COMMIT, Stage.ROTATION, Stage.RESET):
                 self._skip(stage, why)
             return
         if sessions_too:
             self._stage(Stage.KEYED)
             self._stage(Stage.SESSION)
-        self._stage(Stage.COMMIT)
-        self._stage(Stage.RESET)
+        for stage in (Stage.COMMIT, Stage.ROTATION, Stage.RESET):
+            self._stage(stage)
         if self._checks["reset"].result == "passed":
             with self._station.durable("node check"):
                 self._station.keys.remove(self._node.uuid)
                 self._station.audit("reset", self._node.uuid, "done", by="node check")
 
-    def _agree(self) -> str:
-        """Give the node a key that is durable here before its Confirm leaves; why not, "" where it has one."""
-        uuid, station, probe = self._node.uuid, self._station, self._probe
-        try:
-            agreed = owning.agree(probe, station.credentials(), epoch=0)
-            with station.durable("node check"):
-                station.keys.add_pending(uuid, key=agreed.key, key_id=agreed.key_id, epoch=agreed.epoch)
-                station.keys.set_ca_of(uuid, station.identity.ca)
-                station.audit("agree", uuid, "pending", key_id=agreed.key_id.hex(), by="node check")
-            probe.good(agreed.confirm)
-        except (RuleBroken, NotApplicable) as no:
-            return f"No key was agreed. {no}"
-        except (BadData, NotAuthentic, PolicyRefused, NodeRefused) as no:
-            return f"No key was agreed. {no.message}"
-        probe.key = agreed.key
-        return ""
+    def _keep(self, agreed: AgreedKey) -> None:
+        """Make a key durable here, before its Confirm leaves."""
+        uuid, station = self._node.uuid, self._station
+        with station.durable("node check"):
+            station.keys.add_pending(uuid, key=agreed.key, key_id=agreed.key_id, epoch=agreed.epoch)
+            station.keys.set_ca_of(uuid, station.identity.ca)
+            station.audit("agree", uuid, "pending", key_id=agreed.key_id.hex(), by="node check")
 
 
 def _ordered() -> list[Rule]:

@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
+import base64
+import hashlib
 import os
 from collections.abc import Callable
 from dataclasses import replace
 
-from teds_provision.check.outcome import NotApplicable
-from teds_provision.check.owning import Strangers, request, require_reset_proof, tapped_or_bus
-from teds_provision.check.probe import Probe, holds
+from teds_provision.check import slips
+from teds_provision.check.agreement import Strangers, request, require_reset_proof, tapped_or_bus
+from teds_provision.check.plain import absent, security_state
+from teds_provision.check.probe import NotApplicable, Probe, RuleBroken, holds
 from teds_provision.check.rule import Stage, rule
-from teds_provision.check.teds_rules import absent, security_state
-from teds_provision.protocol.datasheet import NodeKeys, digests, sign_datasheet, unsigned_datasheet
+from teds_provision.check.slips import Slip
+from teds_provision.protocol.datasheet import digests, sign_datasheet, unsigned_datasheet
 from teds_provision.protocol.keys import (
     CHALLENGE_OCTETS,
     GROUP_ORDER,
@@ -32,6 +35,7 @@ from teds_provision.protocol.messages.frames import (
     write_teds,
 )
 from teds_provision.protocol.messages.identity import NodeState
+from teds_provision.protocol.messages.words import named, told
 from teds_provision.teds.codec import security
 from teds_provision.teds.codec.frame import frame
 from teds_provision.teds.codec.security import OUR_VALUES, SecurityTeds
@@ -39,6 +43,7 @@ from teds_provision.teds.image import SECURITY, BlockId
 
 _MOST_WRITTEN = 32768
 """MaxTEDSSize up to which a TEDS of that size is staged for trying."""
+_ALPHABET = b"ABCDEFGHIJKLMNOPQRSTUVWXYZabcdefghijklmnopqrstuvwxyz0123456789+/"
 _HEAD = 53
 """Octets of a Write that are not TEDS: of maxMessage so many less may be written at once."""
 
@@ -121,6 +126,30 @@ def staging_ends(probe: Probe) -> str:
     return "a new session begins with nothing staged"
 
 
+@rule("staging-shared", "Writing to flash", Stage.SESSION)
+def staging_shared(probe: Probe) -> str:
+    """There is one staging area: while a session has something in it, Write and Update in another get 17.
+
+    17 comes after 4 and 18, and what is staged stays; it goes when its session ends.
+    """
+    other, block = probe.beside(1), absent(probe)
+    good = _example(block)
+    probe.sealed_good(write_teds(*block, 0, good))
+    other.sealed_refused(write_teds(*block, 1, b"\0"), Reason.BAD_FORM, "another session, offset 1 with nothing staged")
+    other.sealed_refused(write_teds(0, 99, 0, b"\0"), Reason.NO_SUCH_TEDS, "another session, access code 99")
+    other.sealed_refused(write_teds(*block, 0, good), Reason.BUSY, "something staged in another session")
+    seen = other.sealed_refused(update_teds(*block), Reason.BUSY, "something staged in another session")
+    staged = TedsStatus.decode(probe.sealed_good(update_teds(*block)))
+    holds(
+        staged.size == len(good),
+        f"What was staged has {staged.size} octets after another session's Write; {len(good)} are due.",
+    )
+    probe.close()
+    other.sealed_good(write_teds(*block, 0, good))
+    other.close()
+    return seen
+
+
 # -- the commit --------------------------------------------------------------------------------------------------------
 
 
@@ -130,9 +159,9 @@ def _stored(probe: Probe) -> dict[BlockId, bytes]:
 
 def _sheet(probe: Probe, listed: dict[BlockId, bytes]) -> SecurityTeds:
     """What the next good Security TEDS over these blocks says, unsigned."""
-    identity, shown, station = probe.identity(), probe.security(), probe.station
+    identity, station = probe.identity(), probe.station
     return unsigned_datasheet(
-        NodeKeys(probe.uuid, shown.node_key, shown.node_key_signature),
+        probe.node_keys,
         station.key.point,
         station.station_signature,
         digests(listed),
@@ -165,7 +194,14 @@ def _refused_over(probe: Probe, reason: Reason, why: str, octets: bytes) -> str:
     """Commit this Security TEDS with what is staged; what came, when the node is as it was before."""
     before = probe.identity(), probe.teds(SECURITY), probe.listed()
     _write(probe, SECURITY, octets)
-    seen = probe.sealed_refused(update_teds(*SECURITY), reason, why)
+    try:
+        seen = probe.sealed_refused(update_teds(*SECURITY), reason, why)
+    except RuleBroken:
+        if probe.teds(SECURITY) == octets:  # it took what is wrong: a good one in its place, so that the rest can go on
+            _write(probe, SECURITY, _signed(probe, _sheet(probe, _stored(probe))))
+            probe.sealed(update_teds(*SECURITY))
+            probe.close()
+        raise
     probe.close()
     after = probe.identity(), probe.teds(SECURITY), probe.listed()
     holds(after == before, f"Update (1.4) of 128 was refused ({why}), and changed the node.")
@@ -208,6 +244,73 @@ def commit_form(probe: Probe) -> str:
         seen = probe.sealed_refused(update_teds(*SECURITY), Reason.BAD_FORM, why)
         probe.close()
     return seen
+
+
+@rule("commit-utf8", "The Security TEDS", Stage.COMMIT)
+def commit_utf8(probe: Probe) -> str:
+    """A field 5 that is not UTF-8 gets 4, signed as it may be: a lone octet, a surrogate, more octets than needed."""
+    for wrong in (b"bench\xff:", b"\xed\xa0\x80:", b"\xc0\xaf:"):
+        block = _unsigned_block(probe)
+        at = _place(block, 5)
+        changed = block[: at - 2] + bytes([5, len(wrong)]) + wrong + block[at + block[at - 1] :]
+        seen = _refused_over(probe, Reason.BAD_FORM, f"field 5 {wrong.hex()}", _signed_block(probe, changed))
+    return seen
+
+
+@rule("commit-base64", "The Security TEDS", Stage.COMMIT)
+def commit_base64(probe: Probe) -> str:
+    """Fields 100 to 104 are base64 with spare bits zero and no other letters: else 4, signed as they may be."""
+    for field in (100, 101, 103, 104):
+        block = _unsigned_block(probe)
+        if field == 100:
+            whole = _signed_block(probe, block)
+            block = whole[4:-2]
+        at = _place(block, field)
+        text = block[at : at + 88]
+        last = 85 if text.endswith(b"==") else 86
+        spare = _ALPHABET[_ALPHABET.index(text[last]) + 1]
+        for octet, where, why in ((spare, last, "spare bits not zero"), (0x0A, 40, "a line feed in it")):
+            wrong = text[:where] + bytes([octet]) + text[where + 1 :]
+            changed = block[:at] + wrong + block[at + 88 :]
+            octets = frame(changed) if field == 100 else _signed_block(probe, changed)
+            seen = _refused_over(probe, Reason.BAD_FORM, f"field {field}, {why}", octets)
+    return seen
+
+
+@rule("commit-extra", "The Security TEDS", Stage.COMMIT)
+def commit_extra(probe: Probe) -> str:
+    """Fields 111 to 255 are skipped, and covered by the signature: one changed after signing gets 5."""
+    extra = {111: b"\x01", 200: b"of a later profile", 255: b""}
+    good = _signed(probe, replace(_sheet(probe, _stored(probe)), extra=extra))
+    at = good.index(b"of a later profile")
+    changed = frame(good[4:at] + b"OF" + good[at + 2 : -2])
+    _refused_over(probe, Reason.BAD_SIGNATURE, "field 200 changed after signing", changed)
+    _write(probe, SECURITY, good)
+    probe.sealed_good(update_teds(*SECURITY))
+    holds(probe.teds(SECURITY) == good, "After the commit of fields 111, 200 and 255 Read gives another Security TEDS.")
+    probe.close()
+    return "fields 111, 200 and 255 taken, read back, and covered"
+
+
+def _unsigned_block(probe: Probe) -> bytes:
+    """The data block of the next good Security TEDS, without field 100."""
+    return _sheet(probe, _stored(probe)).block()
+
+
+def _signed_block(probe: Probe, block: bytes, message: bytes = b"") -> bytes:
+    """The framed TEDS of a data block whose field 100 signs it as it is, or signs ``message``."""
+    message = message or b"TEDS1 datasheet\0" + probe.uuid + block
+    signature = base64.b64encode(probe.station.key.sign(message))
+    at = _place(block, 101) - 2
+    return frame(block[:at] + bytes([100, 88]) + signature + block[at:])
+
+
+def _place(block: bytes, field: int) -> int:
+    """Where the value of a field begins in a data block."""
+    at = 0
+    while block[at] != field or at == 0:  # the TEDSID is first by position, whatever its type
+        at += 2 + block[at + 1]
+    return at + 2
 
 
 def security_of_the_node(probe: Probe) -> bytes:
@@ -300,7 +403,10 @@ def commit(probe: Probe) -> str:
         for each in set(blocks) - set(stored):
             _write(probe, each, blocks[each])
         _write(probe, SECURITY, octets)
-        probe.sealed_good(update_teds(*SECURITY))
+        reply = probe.sealed(update_teds(*SECURITY))
+        if not reply.ok:
+            slip = _slip_of_commit(probe, reply.reason, blocks)
+            raise RuleBroken(f"{named(update_teds(*SECURITY))}, sealed: success is due, {told(reply)} came.", slip)
         holds(probe.teds(SECURITY) == octets, "After the commit Read gives another Security TEDS.")
         holds(_stored(probe) == blocks, "After the commit the node holds other TEDS than were signed.")
     after = probe.require(NodeState.PROVISIONED)
@@ -310,6 +416,35 @@ def commit(probe: Probe) -> str:
     )
     probe.close()
     return f"two commits, sequence {after.sequence}, read back"
+
+
+def _slip_of_commit(probe: Probe, reason: int | None, blocks: dict[BlockId, bytes]) -> Slip | None:
+    """What a node that refuses a good datasheet with 5 or 6 may be looking for: each is tried until it takes one."""
+    probe.close()
+    tries: list[tuple[Slip, bytes]] = []
+    if reason == Reason.BAD_SIGNATURE:
+        block = _sheet(probe, blocks).block()
+        tries = [(slip, _signed_block(probe, block, message)) for slip, message in slips.datasheets(probe.uuid, block)]
+    if reason == Reason.DIGEST_MISMATCH:
+        cuts = {
+            "digest-of-data-block": (slice(4, -2), "the digests of field 108 are over data blocks only"),
+            "digest-without-length": (slice(4, None), "the digests of field 108 leave out Length"),
+            "digest-without-checksum": (slice(0, -2), "the digests of field 108 leave out Checksum"),
+        }
+        for name, (cut, words) in cuts.items():
+            listed = {block: hashlib.sha256(teds[cut]).digest() for block, teds in blocks.items()}
+            sheet = replace(_sheet(probe, blocks), signed_blocks=dict(sorted(listed.items())))
+            tries.append((Slip(name, words + "; they are from Length to Checksum"), _signed(probe, sheet)))
+    stored = _stored(probe)
+    for slip, octets in tries:
+        for each in set(blocks) - set(stored):
+            _write(probe, each, blocks[each])
+        _write(probe, SECURITY, octets)
+        taken = probe.sealed(update_teds(*SECURITY)).ok
+        probe.close()
+        if taken:
+            return slip
+    return None
 
 
 # -- the way back ------------------------------------------------------------------------------------------------------

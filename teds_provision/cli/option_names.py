@@ -60,7 +60,7 @@ OPTIONS: Final[dict[str, frozenset[str]]] = {
     "unlock": frozenset({"for"}),
     "restore": frozenset({"recovery-key", "keystore", "backup-passphrase-fd", "yes", "dry-run"}),
     "demo": frozenset({"page", "http"}),
-    "node check": frozenset({"factory", "yes", "dry-run", "via", "nfc", "can", "ble", "timeout", "trace"}),
+    "node check": frozenset({"factory", "explain", "yes", "dry-run", "via", "nfc", "can", "ble", "timeout", "trace"}),
     "node create": frozenset({"uuid", "name", "teds", "profile", "max-message"}),
     "node run": frozenset({"nfc", "tag", "can", "ble", "source", "crypto-delay", "flash-delay", "wait-time", "battery", "pace"}),
 }

@@ -131,6 +131,12 @@ class StationSession:
         self._keys, self._one_time = keys, None
 
     @property
+    def keys(self) -> SessionKeys:
+        """What Open gave, for trying a node out."""
+        assert self._keys is not None, "keys before a good accept()"
+        return self._keys
+
+    @property
     def message_key(self) -> bytes:
         """k_m, 32 octets: the root of the keys of streams and of Drive (operation.md section 3)."""
         assert self._keys is not None, "message_key before a good accept()"

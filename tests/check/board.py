@@ -24,13 +24,15 @@ from teds_provision.node.nfc.server import NfcServer
 from teds_provision.protocol.messages.frames import IDENTIFY
 from teds_provision.protocol.messages.identity import NodeState
 from teds_provision.protocol.repetition import Repetition
+from teds_provision.protocol.tim import node
 from tests.bench import Board
+from tests.check.faults import FAULTS
 from tests.check.faulty import Fault
-from tests.check.test_node_check import FAULTS
-from tests.check.test_wrong_inside import INSIDE
 from tests.protocol.desk import META, NAME
 
 Bend = Callable[[pytest.MonkeyPatch], None]
+ADDRESS_SECONDS = 3.0
+"""Between two writes of the address, of the 10 s that the profile has: nobody waits for them here."""
 
 
 def _runs_again(patch: pytest.MonkeyPatch) -> None:
@@ -153,14 +155,16 @@ def main() -> None:
     words.add_argument("--wait-time", type=int, default=4)
     said = words.parse_args()
     patch = pytest.MonkeyPatch()
-    if said.fault in INSIDE:
-        INSIDE[said.fault][0](patch)
+    patch.setattr(node, "_ADDRESS_SECONDS", ADDRESS_SECONDS)
+    one = FAULTS.get(said.fault)
+    if one is not None and one.bend is not None:
+        one.bend(patch)
     if said.fault in LINK_FAULTS:
         LINK_FAULTS[said.fault](patch)
     board = Board()
     board.flash.state = replace(board.state, blocks={(0, 1): META, (1, 12): NAME}, epoch=4)
     board.power_on()
-    handler = OnLinks(board, FAULTS[said.fault][0] if said.fault in FAULTS else None)
+    handler = OnLinks(board, one.fault if one is not None else None)
     handler.mute = said.fault == "mute"
     servers: list[NfcServer | CanServer] = []
     if said.nfc:

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 
-from teds_provision.protocol.agreement import key_id
+from teds_provision.errors import NodeSilent
 from teds_provision.protocol.keys import GROUP_ORDER, SoftwareKey
 from teds_provision.protocol.messages.frames import (
     COMMON,
+    IDENTIFY,
     SECURITY,
     Attribute,
     Function,
@@ -20,7 +21,8 @@ from teds_provision.protocol.messages.frames import (
     decode_reply,
     refusal,
 )
-from teds_provision.protocol.messages.identity import NodeState
+from teds_provision.protocol.messages.identity import Identity, NodeState
+from teds_provision.protocol.repetition import Repetition
 from teds_provision.protocol.session import OPEN_OCTETS, open_mac
 from teds_provision.teds.codec.frame import frame
 
@@ -39,26 +41,92 @@ class FaultyLink(MemoryLink):
     tapped_when_keyed: bool = False
     runs_again: bool = False
     """Whether the node runs a repeated request instead of giving the stored reply."""
+    repetition: Repetition = field(default_factory=Repetition)
+
+    @property
+    def name(self) -> str:
+        """The link as sessions hang on it."""
+        return self.via
+
+    def reference(self, octets: bytes) -> bytes:
+        """What the reference node answers here."""
+        factory = self.board.state.state == NodeState.FACTORY
+        tapped = self.via == "nfc" or factory or self.tapped_when_keyed
+        return self.board.tim.handle(octets, link=self.name, tapped=tapped)
 
     def exchange(self, frame: bytes) -> bytes:
-        def reference(octets: bytes) -> bytes:
-            factory = self.board.state.state == NodeState.FACTORY
-            tapped = self.via == "nfc" or factory or self.tapped_when_keyed
-            return self.board.tim.handle(octets, link=self.via, tapped=tapped)
-
         self.frames.append(frame)
         self.count += 1
-        return self.answer(frame, reference)
+        return self.answer(frame)
 
     def again(self, frame: bytes) -> bytes:
         self.count += self.runs_again
-        return self.answer(frame, lambda octets: self.board.tim.handle(octets, link=self.via, tapped=self.via == "nfc"))
+        return self.answer(frame)
 
-    def answer(self, frame: bytes, reference: Next) -> bytes:
+    def answer(self, frame: bytes) -> bytes:
         def run(octets: bytes) -> bytes:
-            return reference(octets) if self.fault is None else self.fault(self.board, octets, reference)
+            return self.reference(octets) if self.fault is None else self.fault(self.board, octets, self.reference)
 
-        return self.board.repetition.answer(self.count, frame, run, now=self.board.seconds)
+        return self.repetition.answer(self.count, frame, run, now=self.board.seconds)
+
+
+@dataclass
+class FaultyBus(FaultyLink):
+    """A line of a bus: the node is heard at its address alone, other stations have lines of their own."""
+
+    via: str = "can"
+    address: int = 0
+    source: int = 0xF1
+    moves_too_soon: bool = False
+    """Whether the node's reply to Set CAN address waits for its flow control at the new address."""
+    stays_at_the_old: bool = False
+    everyone_counts: bool = False
+    """Whether a functional Identify takes the place of the stored reply."""
+    one_buffer: bytes = b"\x30\x10\0"
+    """What answers a second station's first frame beside the one of the first."""
+    half_sent: int = 0
+    lines: dict[int, FaultyBus] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        self.address = self.address or self.board.tim.can_address
+        self.lines[self.source] = self
+        self._pair = self._first = self.address
+
+    @property
+    def name(self) -> str:
+        return f"can:{self.source:02x}"
+
+    def exchange(self, frame: bytes) -> bytes:
+        now = self.board.tim.can_address
+        if self.address != now and not self.stays_at_the_old:
+            raise NodeSilent("Nobody answers at this address.")
+        if self._pair != now and self.address == now:
+            self._pair = now
+            self.board.tim.link_lost(self.name)
+            self.repetition.forget()
+        reply = super().exchange(frame)
+        if self.moves_too_soon and self.board.tim.can_address != now:
+            raise NodeSilent("The reply begins and does not end.")
+        return reply
+
+    def beside(self, source: int) -> FaultyBus:
+        if source not in self.lines:
+            replace(self, source=source, repetition=Repetition(), frames=[], lines=self.lines)
+        return self.lines[source]
+
+    def everyone(self) -> bytes:
+        if self.everyone_counts:
+            self.count += 1
+            return self.answer(IDENTIFY.encode())
+        return self.reference(IDENTIFY.encode())
+
+    def there(self, address: int) -> Identity | None:
+        here = address == self.board.tim.can_address or (self.stays_at_the_old and address == self._first)
+        return self.board.tim.identity() if here else None
+
+    def begin(self, octets: int) -> bytes:
+        self.lines[0xF1].half_sent += 1
+        return b"\x30\x10\0" if self.lines[0xF1].half_sent == 1 else self.one_buffer
 
 
 def _is(octets: bytes, function: int, command_class: int = SECURITY) -> bool:
@@ -102,7 +170,7 @@ def proof_of_another(_board: Board, octets: bytes, reference: Next) -> bytes:
 
 def list_twice(_board: Board, octets: bytes, reference: Next) -> bytes:
     reply = decode_reply(reference(octets))
-    return Reply(True, reply.payload * 2).encode() if _is(octets, Function.LIST) else reply.encode()
+    return Reply(True, reply.payload * 2).encode() if _is(octets, Function.LIST) and reply.ok else reply.encode()
 
 
 def absent_is_available(_board: Board, octets: bytes, reference: Next) -> bytes:
@@ -147,7 +215,7 @@ def any_mac(board: Board, octets: bytes, reference: Next) -> bytes:
         return reference(octets)
     counter = decode_reply(reference(octets[:4] + b"\0\0")).payload
     point = octets[14:79]
-    return reference(octets[:6] + key_id(key) + point + open_mac(key, board.uuid, counter, point))
+    return reference(octets[:14] + point + open_mac(key, board.uuid, counter, point))
 
 
 def any_counter(board: Board, octets: bytes, reference: Next) -> bytes:
@@ -198,3 +266,47 @@ def reset_forgets_epoch(board: Board, octets: bytes, reference: Next) -> bytes:
     if keyed and board.state.key is None:
         board.flash.state = board.tim._flash = replace(board.state, epoch=0)
     return reply
+
+
+def high_s_in_reset(_board: Board, octets: bytes, reference: Next) -> bytes:
+    reply = decode_reply(reference(octets))
+    if not _is(octets, Function.RESET) or not reply.ok:
+        return reply.encode()
+    s = GROUP_ORDER - int.from_bytes(reply.payload[32:], "big")
+    return Reply(True, reply.payload[:32] + s.to_bytes(32, "big")).encode()
+
+
+def half_of_max_message(board: Board, octets: bytes, reference: Next) -> bytes:
+    return refusal(Reason.TOO_LARGE).encode() if len(octets) > board.max_message // 2 else reference(octets)
+
+
+def announces(octets: int) -> Fault:
+    """Identify announces another maxMessage than the one that is kept."""
+
+    def fault(board: Board, frame: bytes, reference: Next) -> bytes:
+        if _is(frame, Function.IDENTIFY) and len(frame) == 6:
+            return Reply(True, replace(board.tim.identity(), max_message=octets).encode()).encode()
+        return reference(frame)
+
+    return fault
+
+
+def identify_any_payload(_board: Board, octets: bytes, reference: Next) -> bytes:
+    return reference(octets[:4] + b"\0\0" if _is(octets, Function.IDENTIFY) else octets)
+
+
+def list_long(_board: Board, octets: bytes, reference: Next) -> bytes:
+    return Reply(True, bytes(2046)).encode() if _is(octets, Function.LIST) else reference(octets)
+
+
+def all_text(_board: Board, octets: bytes, reference: Next) -> bytes:
+    answer = reference(octets)
+    query = _is(octets, TedsFunction.QUERY, COMMON) and answer[:1] == b"\1"
+    return answer[:3] + bytes([answer[3] | 0x10]) + answer[4:] if query else answer
+
+
+def stale_initial(board: Board, octets: bytes, reference: Next) -> bytes:
+    if board.state.key is None or board.state.provisioned:
+        return reference(octets)
+    older = replace(board.state, epoch=board.state.epoch - 1).security_teds()
+    return _reads(lambda _: older)(board, octets, reference)

@@ -8,49 +8,67 @@ from pathlib import Path
 
 import pytest
 
+from teds_provision.check.agreement import Explained
 from teds_provision.check.rule import RULES, Stage
 from teds_provision.check.run import Report, check_node
-from teds_provision.errors import Garbled, NodeSilent, PolicyRefused
-from teds_provision.protocol.commit import verified_commit
+from teds_provision.errors import Garbled, NodeSilent, PolicyRefused, TooLongForNode
+from teds_provision.protocol.messages.frames import Function, Reason, decode_reply, refusal, security_command
 from teds_provision.protocol.messages.identity import NodeState
-from teds_provision.protocol.tim import teds_access
 from teds_provision.station.station import Station
 from teds_provision.steps.identify import identify
 from teds_provision.steps.reset import reset_node
 
 from ..bench import Board, make_station, talk
-from ..protocol.desk import META, NAME
-from . import faulty
-from .faulty import Fault, FaultyLink
+from . import faulty, nodes
+from .bends import agreeing_so, opening_so
+from .faulty import FaultyLink
+from .nodes import names
 
 PAGE = Path(__file__).parents[2] / "docs" / "profile.md"
 
 
+@pytest.fixture
+def patch(monkeypatch: pytest.MonkeyPatch) -> pytest.MonkeyPatch:
+    return monkeypatch
+
+
 def checked(station: Station, board: Board, *, factory: bool = True, **link: object) -> Report:
-    return check_node(station, talk(board, FaultyLink(board, **link)), factory=factory)  # type: ignore[arg-type]
+    with pytest.MonkeyPatch.context() as patch:
+        return nodes.checked(station, patch, board, factory=factory, **link)
 
 
-OF_LINKS = {"can-padding", "can-flow-control", "can-form", "nfc-wait-time", "nfc-wtx"}
+OF_FRAMES = {"can-flow-control", "can-form", "nfc-wait-time", "nfc-wtx"}
 """Rules that hear frames: a link in memory has none. ``test_link_rules`` tries them."""
-
-
-def names(report: Report, result: str) -> set[str]:
-    return {check.rule for check in report.checks if check.result == result}
+OF_STATIONS = {
+    "can-busy", "confirm-other-link", "confirm-beside", "two-sessions", "stranger-ends-nothing", "repetition-everyone",
+    "repetition-two", "staging-shared",
+}  # fmt: skip
+"""Rules that need a second station."""
 
 
 # -- a good node -------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(("via", "skipped"), [("nfc", {"keyed-untapped"}), ("can", {"confirm-elsewhere"})])
-def test_the_reference_node_keeps_every_rule(station: Station, via: str, skipped: set[str]) -> None:
-    board = Board()
-    board.flash.state = replace(board.state, blocks={(0, 1): META, (1, 12): NAME})
-    board.power_on()
-    report = checked(station, board, via=via)
-    assert not [check for check in report.checks if check.result == "failed"]
-    assert names(report, "skipped") == skipped | OF_LINKS
+@pytest.mark.parametrize(
+    ("over", "skipped"),
+    [
+        ("nfc", {"keyed-untapped", "operate-lease", *OF_STATIONS}),
+        ("can", {"confirm-elsewhere", "operate-lease"}),
+        ("measuring", {"keyed-untapped", *OF_STATIONS}),
+    ],
+)
+def test_the_reference_node_keeps_every_rule(
+    station: Station, patch: pytest.MonkeyPatch, over: str, skipped: set[str]
+) -> None:
+    board = nodes.made(over)
+    own, home = dict(board.state.blocks), board.tim.can_address
+    report = nodes.checked(station, patch, board, over=over)
+    assert not nodes.failed(report)
+    assert names(report, "skipped") == skipped | OF_FRAMES
     assert board.state.state == NodeState.FACTORY
-    assert board.state.blocks == {(0, 1): META, (1, 12): NAME}, "the TEDS of the test is gone, its own are there"
+    assert board.state.blocks == own, "the TEDS of the test is gone, its own are there"
+    assert (board.state.epoch, board.state.sequence) == (6, 3)
+    assert board.tim.can_address == home
     assert not station.keys.held(board.uuid)
 
 
@@ -61,7 +79,7 @@ def test_without_factory_a_factory_node_is_left_as_it_was(station: Station) -> N
     assert board.state == before
     assert not names(report, "failed")
     tried = {each.name for each in RULES if each.stage in (Stage.PLAIN, Stage.FACTORY)}
-    assert names(report, "passed") == tried - OF_LINKS
+    assert names(report, "passed") == tried - OF_FRAMES - OF_STATIONS
 
 
 def agreed(station: Station, board: Board) -> None:
@@ -85,7 +103,8 @@ def test_a_run_that_was_cut_leaves_a_node_of_ours(station: Station) -> None:
     report = checked(station, board, factory=False)
     assert board.state.key == held
     assert not names(report, "failed")
-    assert {each.name for each in RULES if each.stage == Stage.SESSION} <= names(report, "passed")
+    in_sessions = {each.name for each in RULES if each.stage in (Stage.KEYED, Stage.SESSION)}
+    assert in_sessions - OF_STATIONS - {"keyed-untapped", "operate-lease"} <= names(report, "passed")
     again = checked(station, board)
     assert not names(again, "failed")
     assert board.state.state == NodeState.FACTORY
@@ -105,8 +124,8 @@ def test_a_node_of_ours_that_cannot_be_reset_loses_no_report(station: Station) -
     board.flash.state = replace(board.state, node_key_signature=board.key.sign(b"for another UUID"))
     board.power_on()
     report = checked(station, board)
-    assert names(report, "failed") == {"node-key"}
-    assert {"factory-open", "commit", "reset"} <= names(report, "skipped")
+    assert names(report, "failed") == {"node-key", "reset"}
+    assert {"factory-open", "commit"} <= names(report, "skipped")
     assert station.keys.held(board.uuid)
 
 
@@ -122,69 +141,12 @@ def test_a_node_of_another_owner_is_left_alone(station: Station, tmp_path: Path,
     rival.close()
 
 
-# -- faults ------------------------------------------------------------------------------------------------------------
-
-FAULTS: dict[str, tuple[Fault, str]] = {
-    "an unknown command is answered by 0 octets": (faulty.unknown_is_silent, "unknown-command"),
-    "a refusal of two octets": (faulty.long_refusal, "refusal-form"),
-    "lengths before state": (faulty.length_before_state, "state-before-length"),
-    "the length in the header is ignored": (faulty.header_length_ignored, "frame-length"),
-    "a high s in Prove": (faulty.high_s, "prove-low-s"),
-    "a challenge of any length": (faulty.any_challenge, "prove-length"),
-    "Prove under another key": (faulty.proof_of_another, "prove"),
-    "List does not ascend": (faulty.list_twice, "list-ascending"),
-    "Query of an absent TEDS without NotAvail": (faulty.absent_is_available, "query-absent"),
-    "the checksum of a TEDS": (faulty.wrong_checksum, "teds-checksum"),
-    "a Security TEDS that is not canonical": (faulty.not_canonical, "security-canonical"),
-    "the suite of the draft": (faulty.other_suite, "security-canonical"),
-    "Read past the end is refused": (faulty.end_refused, "read-end"),
-    "Write outside a session": (faulty.write_anywhere, "write-needs-session"),
-    "Open with a wrong mac": (faulty.any_mac, "open-checks"),
-    "a second sealed reply for a counter": (faulty.any_counter, "sealed-counter"),
-    "Close ends nothing": (faulty.close_is_ignored, "close"),
-    "what pends survives a wrong tagS": (faulty.keeps_pending, "confirm-checks"),
-    "the CA of another owner": (faulty.any_ca, "first-owner-wins"),
-    "an epoch that stands still": (faulty.epoch_stands_still, "agreement-epoch"),
-    "an epoch that goes back with Reset": (faulty.reset_forgets_epoch, "reset"),
-}
+# -- a node that keeps rules from being tried --------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("what", FAULTS)
-def test_a_fault_is_found_by_its_rule(station: Station, what: str) -> None:
-    fault, rule = FAULTS[what]
-    board = Board()
-    board.flash.state = replace(board.state, epoch=4)
-    board.power_on()
-    report = checked(station, board, fault=fault)
-    assert rule in names(report, "failed"), [check for check in report.checks if check.result != "passed"]
-
-
-def test_a_wrong_field_102_is_found(station: Station) -> None:
-    board = Board()
-    board.flash.state = replace(board.state, node_key_signature=board.key.sign(b"for another UUID"))
-    board.power_on()
-    assert "node-key" in names(checked(station, board), "failed")
-
-
-def test_a_request_without_a_tap_is_found(station: Station) -> None:
-    assert names(checked(station, Board(), via="can", tapped_when_keyed=True), "failed") == {"keyed-untapped"}
-
-
-def test_a_repetition_that_is_run_again_is_found(station: Station) -> None:
-    assert names(checked(station, Board(), runs_again=True), "failed") == {"repetition"}
-
-
-def test_a_commit_that_takes_an_old_sequence_is_found(station: Station, monkeypatch: pytest.MonkeyPatch) -> None:
-    def forgetful(flash, staged, verify):  # type: ignore[no-untyped-def]
-        return verified_commit(replace(flash, sequence=flash.sequence - 1), staged, verify)
-
-    monkeypatch.setattr(teds_access, "verified_commit", forgetful)
-    assert names(checked(station, Board()), "failed") == {"commit-sequence"}
-
-
-@pytest.mark.parametrize(("via", "result"), [("nfc", "failed"), ("can", "skipped")])
-def test_a_reply_that_is_torn_each_time_is_the_nodes_fault_at_a_reader(station: Station, via: str, result: str) -> None:
-    """It was skipped, and a board that answered 0 octets over NFC passed; on a bus single frames are lost."""
+@pytest.mark.parametrize("via", ["nfc", "can"])
+def test_a_reply_that_is_torn_each_time_is_the_nodes_fault(station: Station, via: str) -> None:
+    """It was skipped, and a board that answered 0 octets over NFC passed; so did it on a bus, with exit code 0."""
 
     class Torn(FaultyLink):
         def exchange(self, frame: bytes) -> bytes:
@@ -194,9 +156,106 @@ def test_a_reply_that_is_torn_each_time_is_the_nodes_fault_at_a_reader(station: 
 
     report = check_node(station, talk(board := Board(), Torn(board, via=via)))
     torn = {check.rule: check for check in report.checks if check.rule in ("unknown-command", "refusal-form")}
-    assert {check.result for check in torn.values()} == {result}
+    assert {check.result for check in torn.values()} == {"failed"}
     assert len(torn) == 2
-    assert names(report, "failed") <= set(torn)
+    assert names(report, "failed") <= {*torn, "max-message"}
+    assert all(("very bad bus" in check.detail) == (via == "can") for check in torn.values())
+
+
+def test_a_board_that_refuses_what_it_announces_fails_and_is_not_skipped(
+    station: Station, patch: pytest.MonkeyPatch
+) -> None:
+    """It announced 1024, refused more than 512 on the link, and 15 rules were skipped with exit code 0."""
+
+    class Short(FaultyLink):
+        def exchange(self, frame: bytes) -> bytes:
+            if len(frame) > 512:
+                raise TooLongForNode("The node refuses it (flow control: overflow).")
+            return super().exchange(frame)
+
+    board = Board(max_message=1024)
+    report = nodes.checked(station, patch, board, line=Short(board))
+    assert {"max-message", "commit", "write-drops"} <= names(report, "failed")
+    (said,) = [check.detail for check in report.checks if check.rule == "max-message"]
+    assert "1024 octets are refused on the link; maxMessage is 1024" in said
+    assert not [check for check in report.checks if check.result == "skipped" and "refuse" in check.detail]
+
+
+def test_a_board_that_is_busy_for_ever_fails_and_is_not_skipped(station: Station) -> None:
+    def busy(_board: Board, octets: bytes, reference: faulty.Next) -> bytes:
+        return refusal(Reason.BUSY).encode() if octets[2:4] == b"\x80\x0b" else reference(octets)
+
+    report = checked(station, Board(), fault=busy)
+    assert "list-ascending" in names(report, "failed")
+
+
+@pytest.mark.parametrize("bend", [opening_so(tag_label=b"node open\0"), opening_so(swapped=True)])
+def test_what_needs_a_session_is_skipped_where_none_opens(
+    station: Station, patch: pytest.MonkeyPatch, bend: object
+) -> None:
+    """One slip failed 29 rules, each of which accused the key."""
+    bend(patch)  # type: ignore[operator]
+    report = nodes.checked(station, patch)
+    assert names(report, "failed") == {"open"}
+    needed = [check for check in report.checks if check.detail.startswith("Needs a session, and none opens: ")]
+    assert len(needed) > 30
+    assert {check.result for check in needed} == {"skipped"}
+
+
+def test_a_node_of_ours_that_opens_no_session_is_not_taken_for_another_owners(
+    station: Station, patch: pytest.MonkeyPatch
+) -> None:
+    board = Board()
+    agreed(station, board)
+    opening_so(tag_label=b"node open\0")(patch)
+    report = nodes.checked(station, patch, board, factory=False)
+    assert names(report, "failed") == {"open"}
+    assert board.state.state == NodeState.KEYED
+
+
+# -- the test agreement in the open ------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("over", ["nfc", "can"])
+def test_explain_tells_an_agreement_that_is_never_confirmed(
+    station: Station, patch: pytest.MonkeyPatch, over: str
+) -> None:
+    board = nodes.made(over)
+    before = board.state
+    told = nodes.checked(station, patch, board, over=over, factory=False, explained=True).explained
+    assert isinstance(told, Explained)
+    assert (len(told.transcript), len(told.okm), len(told.confirmation_key)) == (32, 48, 32)
+    assert told.tag_due == told.reply[85:101]
+    assert not told.problem
+    assert board.state == before
+    assert station.identity.point not in told.request, "a stranger asks, whose keys are for this one question"
+
+
+def test_explain_shows_what_is_due_beside_what_came(station: Station, patch: pytest.MonkeyPatch) -> None:
+    agreeing_so(label=b"TEDS1 transcript")(patch)
+    told = nodes.checked(station, patch, factory=False, explained=True).explained
+    assert isinstance(told, Explained)
+    assert told.slip == "transcript-label-without-00"
+    assert told.tag_due != told.reply[85:101]
+    assert "tagN is wrong" in told.problem
+
+
+@pytest.mark.parametrize("over", ["nfc", "can"])
+def test_explain_of_a_node_of_ours_never_tells_its_key(station: Station, patch: pytest.MonkeyPatch, over: str) -> None:
+    board = Board()
+    agreed(station, board)
+    held = board.state.key
+    told = nodes.checked(station, patch, board, over=over, factory=False, explained=True).explained
+    assert isinstance(told, Explained)
+    assert board.state.key == held
+    assert held is not None
+    assert told.okm[:16] != held
+    confirmed = security_command(Function.CONFIRM, told.station_tag).encode()
+    reply = decode_reply(board.tim.handle(confirmed, link="nfc", tapped=True))
+    assert reply.reason == Reason.WRONG_STATE, "what is printed can be confirmed by nobody"
+
+
+# -- what runs twice, and stops ----------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("via", ["nfc", "can"])
@@ -204,7 +263,7 @@ def test_a_node_that_falls_silent_loses_no_report(station: Station, via: str) ->
     """Nothing was said of the rules before it, nor which command it was."""
 
     def hangs(board: Board, octets: bytes, reference: faulty.Next) -> bytes:
-        if board.max_message == 0 or octets[2:4] == bytes([1, 1]):
+        if board.max_message == 0 or octets[2:] == bytes([1, 1, 0, 1, 128]):
             board.max_message = 0
             raise NodeSilent("The node does not answer any more.")
         return reference(octets)

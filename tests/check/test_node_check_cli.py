@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from teds_provision.check import link_rules, owning, plain, sessions, teds_rules, writing
+from teds_provision.check import agreement, link_rules, plain, sessions, writing
 from teds_provision.check.rule import RULES
 from tests.bench import PASSPHRASE, make_station
 from tests.cli.shell import Outcome, spawn
@@ -25,7 +25,7 @@ def desk(tmp_path: Path) -> Iterator[Desk]:
     made.clear()
 
 
-ROOMS = (link_rules, owning, plain, sessions, teds_rules, writing)
+ROOMS = (agreement, link_rules, plain, sessions, writing)
 """Rules are registered when these are imported."""
 
 
@@ -41,8 +41,26 @@ def test_a_virtual_node_on_a_bus_keeps_every_rule(desk: Desk) -> None:
     assert outcome.code == 0, outcome
     told = outcome.json
     assert told["uuid"] == node.uuid
-    assert (told["passed"], told["failed"], told["skipped"]) == (len(RULES) - 3, 0, 3)
-    assert set(told["checks"][0]) == {"rule", "clause", "result", "detail"}
+    assert (told["passed"], told["failed"], told["skipped"]) == (len(RULES) - 4, 0, 4), "NFC, a tap, and channels"
+    assert set(told["checks"][0]) == {"rule", "clause", "result", "detail", "slip"}
+    assert {each["slip"] for each in told["checks"]} == {None}
+    assert "explain" not in told
+
+
+def test_explain_prints_a_test_agreement_and_no_key_of_anybody(desk: Desk) -> None:
+    desk.node().start(nfc=False, can=True)
+    outcome = check(desk, "bench", "check", "--explain")
+    assert outcome.code == 0, outcome
+    told = outcome.json["explain"]
+    assert {key: len(told[key]) // 2 for key in ("t", "okm", "m", "tag_n", "tag_s")} == {
+        "t": 32, "okm": 48, "m": 32, "tag_n": 16, "tag_s": 16
+    }  # fmt: skip
+    assert told["tag_n"] == told["tag_n_received"]
+    assert (told["problem"], told["slip"]) == (None, None)
+    where = ("--via", "can", "--can", desk.links.can)
+    words = spawn("--home", desk.folder / "bench", "node", "check", "--explain", *where, passphrase=PASSPHRASE)
+    assert "never confirmed" in words.out
+    assert "tagN, due" in words.out
 
 
 def test_without_a_word_nothing_is_keyed(desk: Desk) -> None:

@@ -25,7 +25,7 @@ def test_it_keeps_every_rule_of_the_profile(desk: Desk, station: Station, node: 
     wrong = [rule for rule in checked["checks"] if rule["result"] == "failed"]
     assert not wrong
     skipped = {rule["rule"] for rule in checked["checks"] if rule["result"] == "skipped"}
-    assert skipped == {"nfc-wait-time", "nfc-wtx", "confirm-elsewhere"}
+    assert skipped == {"nfc-wait-time", "nfc-wtx", "confirm-elsewhere", "operate-lease"}
 
 
 def test_it_is_provisioned_verified_rotated_and_reset(desk: Desk, station: Station, node: CNode) -> None:

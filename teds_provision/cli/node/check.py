@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Final
 
 import click
 
@@ -16,11 +16,13 @@ from teds_provision.links import LinkSettings
 if TYPE_CHECKING:
     from rich.console import Console
 
+    from teds_provision.check.agreement import Explained
     from teds_provision.check.run import Report
 
 
 @command(
     "teds-provision node check --nfc udp:localhost:54321",
+    "teds-provision node check --explain --nfc udp:localhost:54321",
     "teds-provision node check --factory --yes --via can --can udp_multicast:239.74.163.2",
 )
 @click.option(
@@ -28,14 +30,21 @@ if TYPE_CHECKING:
     is_flag=True,
     help="Key, write and reset the node too; it ends in factory state. One of ours loses its key.",
 )
+@click.option(
+    "--explain",
+    is_flag=True,
+    help="Show T, OKM, M and tags of a test agreement that is never confirmed, to compare a firmware's own with.",
+)
 @yes_option
 @dry_run_option
 @link_options
 @pass_app
-def check(app: App, factory: bool, yes: bool, dry_run: bool, links: LinkSettings) -> None:
+def check(app: App, factory: bool, explain: bool, yes: bool, dry_run: bool, links: LinkSettings) -> None:
     """Run the rules of the profile against a board.
 
     Each ends as passed, failed or skipped, with its clause and what was seen.
+
+    Where a known slip explains what failed (a label without its 00, swapped halves of Z …) it is named.
 
     A node of another owner is left alone (6). Keys change only with --factory: a factory node, or one of this
     station's, is then keyed, written and reset.
@@ -50,20 +59,68 @@ def check(app: App, factory: bool, yes: bool, dry_run: bool, links: LinkSettings
         app.confirm(
             "Key, write and reset the node that is met? If it is one of yours its key and datasheet go.", yes=yes
         )
-    report = check_room.run.check_at(station, links, reporter_for(app), factory=factory)
+    report = check_room.run.check_at(station, links, reporter_for(app), factory=factory, explained=explain)
     counts = {result: report.count(result) for result in ("passed", "failed", "skipped")}
     checks = [
-        {"rule": each.rule, "clause": each.clause, "result": each.result, "detail": each.detail}
+        {
+            "rule": each.rule,
+            "clause": each.clause,
+            "result": each.result,
+            "detail": each.detail,
+            "slip": each.slip,
+        }
         for each in report.checks
     ]
+    explained = {"explain": _explained(report.explained)} if report.explained is not None else {}
     broken = [each.rule for each in report.checks if each.result == "failed"]
     error: TedsProvisionError | None = report.lost
     if broken:
         count = "a rule" if len(broken) == 1 else f"{len(broken)} rules"
         error = NotAuthentic(f"The node breaks {count}: {', '.join(broken)}.", hint=_silent(report))
     app.conclude(
-        {"uuid": report.uuid.hex(), "checks": checks, **counts}, lambda console: _table(console, report), error
+        {"uuid": report.uuid.hex(), "checks": checks, **counts, **explained},
+        lambda console: _table(console, report),
+        error,
     )
+
+
+def _explained(told: Explained | str) -> dict[str, str | None]:
+    """The test agreement in hex; where none came about only ``problem``."""
+    if isinstance(told, str):
+        return {"problem": told}
+    reply = told.reply
+    return {
+        "request": told.request.hex(),
+        "security_teds": told.security_teds.hex(),
+        "nonce": reply[:16].hex(),
+        "epoch": reply[16:20].hex(),
+        "en": reply[20:85].hex(),
+        "t": told.transcript.hex(),
+        "okm": told.okm.hex(),
+        "m": told.confirmation_key.hex(),
+        "tag_n": told.tag_due.hex(),
+        "tag_n_received": reply[85:101].hex(),
+        "sig_n_received": reply[101:].hex(),
+        "tag_s": told.station_tag.hex(),
+        "problem": told.problem or None,
+        "slip": told.slip,
+    }
+
+
+_EXPLAINED: Final = {
+    "request": "Request, payload",
+    "security_teds": "Security TEDS",
+    "nonce": "nonceN",
+    "epoch": "epoch",
+    "en": "En",
+    "t": "T",
+    "okm": "OKM (48 octets)",
+    "m": "M",
+    "tag_n": "tagN, due",
+    "tag_n_received": "tagN, received",
+    "sig_n_received": "sigN, received",
+    "tag_s": "tagS",
+}
 
 
 def _silent(report: Report) -> str:
@@ -81,3 +138,12 @@ def _table(console: Console, report: Report) -> None:
     print_table(console, table)
     counts = ", ".join(f"{report.count(result)} {result}" for result in style)
     console.print(f"{report.uuid.hex()}: {counts}")
+    if report.explained is None:
+        return
+    told = _explained(report.explained)
+    console.print("A test agreement, never confirmed and ended on the node; none of it is anybody's key:")
+    for key, name in _EXPLAINED.items():
+        if (value := told.get(key)) is not None:
+            console.print(f"{name:<18} {value}", markup=False, highlight=False, soft_wrap=True)
+    if told["problem"]:
+        console.print(told["problem"], markup=False, highlight=False, soft_wrap=True)

@@ -138,7 +138,8 @@ class CanLink:
             until = time.monotonic() + _HELLO_SECONDS
             while time.monotonic() < until:
                 with suppress(Empty):
-                    return bus.next_of(line.flows, 0.01)
+                    if flow := bus.next_of(line.flows, 0.01):  # an empty one only says that a reply has come
+                        return flow
                 with suppress(Empty):
                     event = bus.next_of(line.events, 0.01)
                     return single(event.body, fd=bus.spec.fd) if event.kind == "whole" else b"\x10"

@@ -1,0 +1,65 @@
+"""Nodes on a desk in memory for ``node check``: on a reader, or on a bus with several stations; no real time."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import pytest
+
+from teds_provision.check.probe import Probe
+from teds_provision.check.rule import Checked
+from teds_provision.check.run import Report, check_node
+from teds_provision.protocol.tim import Tim
+from teds_provision.station.station import Station
+from tests.protocol.operation.bench import FakeHardware, channel_teds
+
+from ..bench import Board, talk
+from ..protocol.desk import META, NAME
+from .faulty import FaultyBus, FaultyLink
+
+
+class Measuring(Board):
+    """A node with channels, which a session may claim; their TEDS fit."""
+
+    def power_on(self) -> None:
+        self.hardware = FakeHardware()
+        super().power_on()
+        self.tim = Tim(self.key, self.flash, lambda: self.seconds, max_message=self.max_message, hardware=self.hardware)
+
+
+def made(over: str = "nfc", *, epoch: int = 4) -> Board:
+    """A node in factory state that was keyed before, with a Meta-TEDS and a name of its own."""
+    board = Measuring() if over == "measuring" else Board()
+    blocks = {(0, 1): META, (1, 12): NAME}
+    if isinstance(board, Measuring):
+        blocks |= {(number, 3): channel_teds(facts) for number, facts in board.hardware.channels.items()}
+    board.flash.state = replace(board.state, blocks=blocks, epoch=epoch)
+    board.power_on()
+    return board
+
+
+def checked(
+    station: Station, patch: pytest.MonkeyPatch, board: Board | None = None, *, over: str = "nfc", factory: bool = True,
+    explained: bool = False, line: FaultyLink | None = None, **link: Any,
+) -> Report:  # fmt: skip
+    """Run the rules; waits of theirs pass at once, for the node as well."""
+    board = made(over) if board is None else board
+
+    def pause(self: Probe, seconds: float) -> None:
+        board.seconds += seconds
+
+    patch.setattr(Probe, "pause", pause)
+    patch.setattr(Probe, "now", lambda self: board.seconds)
+    line = line or (FaultyBus(board, **link) if over == "can" else FaultyLink(board, **link))
+    return check_node(station, talk(board, line), factory=factory, explained=explained)
+
+
+def failed(report: Report) -> dict[str, Checked]:
+    """The rules that the node breaks."""
+    return {check.rule: check for check in report.checks if check.result == "failed"}
+
+
+def names(report: Report, result: str) -> set[str]:
+    """The rules that ended so."""
+    return {check.rule for check in report.checks if check.result == result}

@@ -1,0 +1,49 @@
+"""``node check`` finds each faulty node of the table by the rule that is meant, with words that name the fault."""
+
+from __future__ import annotations
+
+import pytest
+
+from teds_provision.check.rule import RULES
+from teds_provision.check.run import Report
+from teds_provision.station.station import Station
+
+from .faults import FAULTS, Faulty
+from .nodes import checked, failed
+
+OF_FRAMES = {"can-flow-control", "can-form", "nfc-wait-time", "nfc-wtx", "identify-found"}
+"""Rules that hear frames, which a link in memory has none of: ``test_link_rules`` finds faults by them."""
+
+
+def run(station: Station, patch: pytest.MonkeyPatch, one: Faulty) -> Report:
+    if one.bend is not None:
+        one.bend(patch)
+    return checked(station, patch, over=one.over, fault=one.fault, **one.link)
+
+
+@pytest.mark.parametrize("name", FAULTS)
+def test_a_faulty_node_is_found_by_its_rule(station: Station, monkeypatch: pytest.MonkeyPatch, name: str) -> None:
+    one = FAULTS[name]
+    report = run(station, monkeypatch, one)
+    found = failed(report)
+    assert one.rule in found, (found, [each for each in report.checks if each.result == "skipped"])
+    assert one.words in found[one.rule].detail
+    assert found[one.rule].slip == one.slip
+    if "*" not in one.also:
+        assert set(found) <= {one.rule, *one.also}, {rule: check.detail for rule, check in found.items()}
+
+
+def test_the_table_leaves_out_only_rules_that_another_fault_breaks_first() -> None:
+    found, every = {one.rule for one in FAULTS.values()}, {each.name for each in RULES}
+    assert len(FAULTS) >= 40
+    assert found <= every
+    assert every - found == OF_FRAMES | SISTERS
+
+
+SISTERS = {
+    "identify", "close-needs-session", "operation-needs-session", "never-held", "query-length", "read-absent",
+    "security-state", "factory-open", "confirm-without-request", "keyed-reset", "sealed-tag", "sealed-only-sealed",
+    "sealed-command-residues", "repetition-two", "address-back", "write-checks", "update-checks", "commit-form",
+    "commit-digests", "commit-epoch",
+}  # fmt: skip
+"""Rules whose fault is that of a rule in the table, looked at from another side."""
