@@ -17,7 +17,7 @@ from cryptography.hazmat.primitives.ciphers.aead import AESCCM
 from cryptography.hazmat.primitives.kdf.hkdf import HKDF
 
 from teds_provision.errors import Garbled, NotAuthentic
-from teds_provision.protocol.agreement import good_point, key_id
+from teds_provision.protocol.agreement import good_one_time, key_id
 from teds_provision.protocol.keys import POINT_OCTETS, PrivateKey, SoftwareKey
 from teds_provision.protocol.messages.frames import Command, Function, Reply, decode_reply, security_command
 
@@ -94,10 +94,13 @@ class StationSession:
     """The station's half: :meth:`ask` for c, :meth:`open` once, then sealed commands with rising counters.
 
     One object is one Open; after a refusal with reason 12 a new one asks for c again (another station was faster).
+    ``statics`` are the static points at hand, P(station) and P(node): En is due to be none of them.
     """
 
-    def __init__(self, key: bytes, uuid: bytes, *, one_time: PrivateKey | None = None) -> None:
-        self._key, self._uuid = key, uuid
+    def __init__(
+        self, key: bytes, uuid: bytes, *, one_time: PrivateKey | None = None, statics: tuple[bytes, ...] = ()
+    ) -> None:
+        self._key, self._uuid, self._statics = key, uuid, statics
         self._one_time: PrivateKey | None = one_time or SoftwareKey.generate()
         self._keys: SessionKeys | None = None
         self._counter = 0
@@ -123,8 +126,10 @@ class StationSession:
         if len(payload) != OPEN_REPLY_OCTETS:
             raise Garbled(f"The reply to Open has {len(payload)} octets, not {OPEN_REPLY_OCTETS}.")
         node, station = payload[:POINT_OCTETS], self._one_time.point
-        if not good_point(node, station):
-            raise NotAuthentic("The node's one-time key in its reply to Open is not a valid point, or is our own.")
+        if not good_one_time(node, station, *self._statics):
+            raise NotAuthentic(
+                "The node's one-time key in its reply to Open is not a valid point, or is no one-time key."
+            )
         keys = SessionKeys.derive(self._key, self._uuid, self._one_time.ecdh(node), station, node)
         if not hmac.compare_digest(keys.node_tag, payload[POINT_OCTETS:]):
             raise NotAuthentic("The node's tag on Open is wrong: it does not hold the key.")

@@ -48,9 +48,11 @@ def open_session(station: Station, node: Conversation, *, word: bool = False) ->
     station.policy.require_not_given_away(node.uuid)
     if not (node.tapped or word):
         station.policy.require_not_restored(node.uuid)
+    known = station.nodes.get(node.uuid)
+    statics = (station.point, *([known.point] if known is not None and known.point is not None else []))
     for held in station.keys.unwrapped(node.uuid):
         try:
-            node.open(held.key)
+            node.open(held.key, statics=statics)
         except NodeRefused as refusal:
             if refusal.reason in (Reason.UNKNOWN_KEY, Reason.WRONG_STATE):
                 continue
@@ -376,7 +378,7 @@ def _agree_anew(
         station.audit("agree", uuid, "pending", key_id=key_id, epoch=agreed.epoch, via=node.contact.link.via)
     node.send(agreed.confirm, "the key confirmation")
     node.forget()
-    node.open(agreed.key)
+    node.open(agreed.key, statics=(station.point, agreed.node))
     identity = read_identity(node)
     if identity.epoch != agreed.epoch:  # a datasheet for the one would never fit the other
         raise NotAuthentic(

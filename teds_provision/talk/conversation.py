@@ -123,6 +123,7 @@ class Conversation:
         self._notice, self._busy_seconds = notice, busy_seconds
         self._key: bytes | None = None
         self._session: StationSession | None = None
+        self._statics: tuple[bytes, ...] = ()
         self.c: bytes | None = None
         """c of the Open of this session, 8 octets: it tells whether the node has started anew since another one."""
         self._release: Callable[[], object] = _nothing
@@ -161,8 +162,12 @@ class Conversation:
 
     # -- sessions --------------------------------------------------------------------------------------------------
 
-    def open(self, key: bytes) -> None:
-        """Open a session under a link key; raises NodeRefused (16: unknown key) or NotAuthentic (wrong node tag)."""
+    def open(self, key: bytes, *, statics: tuple[bytes, ...] = ()) -> None:
+        """Open a session under a link key; raises NodeRefused (16: unknown key) or NotAuthentic (wrong node tag).
+
+        ``statics``: P(station) and P(node), where they are at hand; the node's one-time key is neither.
+        """
+        self._statics = statics or self._statics
         session, reply = self._open(key)
         # another station's Open was faster, its counter is used up; or, on a bus, a frame was disturbed
         if reply.reason == Reason.BAD_TAG or (self._is_noisy and reply.reason in _DISTURBED):
@@ -174,7 +179,7 @@ class Conversation:
 
     def _open(self, key: bytes) -> tuple[StationSession, Reply]:
         """Ask for c and send one Open; each has a one-time key of its own."""
-        session = StationSession(key, self.uuid)
+        session = StationSession(key, self.uuid, statics=self._statics)
         return session, self._exchange(session.open(self.plain(session.ask(), _OPENING)))
 
     def reopen(self) -> None:

@@ -112,6 +112,34 @@ def test_an_equal_repetition_is_not_run_again_even_after_a_functional_identify(
     assert node.seen[0] == ("can:f1", True)
 
 
+def test_a_repetition_that_comes_while_the_first_is_still_being_run_gets_the_same_reply_once_more(
+    station: Stranger, node: EchoNode
+) -> None:
+    node.free.clear()
+    pair = Pair(station.source, 0x21, station.bus.send)
+    pair.send(b"\x09" + COUNT)
+    assert wait_for(lambda: node.runs == 1)
+    threading.Timer(0.3, node.free.set).start()
+    assert station.ask(0x21, b"\x09" + COUNT) == [b"\x09\x01\x00\x01", b"\x09\x01\x00\x01"]
+    assert node.runs == 1
+
+
+def test_a_strangers_questions_end_no_session_and_take_no_stored_reply(
+    hub: Hub, station: Stranger, node: EchoNode
+) -> None:
+    assert station.ask(0x21, b"\x09" + COUNT) == [b"\x09\x01\x00\x01"]
+    for source in range(0xF2, 0xF8):
+        other = Stranger(hub.spec, source)
+        try:
+            assert other.ask(0x21, b"\x01" + IDENTIFY) == [b"\x01\x01\x00\x17" + node.identify()]
+            other.everyone("0742000080070000")
+        finally:
+            other.bus.close()
+    assert node.links_lost == []
+    assert station.ask(0x21, b"\x09" + COUNT) == [b"\x09\x01\x00\x01"]
+    assert node.runs == 1
+
+
 def test_lines_do_not_share_a_stored_reply(hub: Hub, station: Stranger, node: EchoNode) -> None:
     other = Stranger(hub.spec, 0xF7)
     try:

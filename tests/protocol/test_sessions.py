@@ -10,7 +10,7 @@ from teds_provision.protocol.keys import SoftwareKey
 from teds_provision.protocol.messages.frames import Command, Function, Reason, Reply, refusal, security_command
 from teds_provision.protocol.session import NodeSession, SessionKeys, StationSession, _decrypt, _seal_padded, open_mac
 
-from .desk import UUID, Desk
+from .desk import NODE, STATION, UUID, Desk
 
 IDENTIFY = security_command(Function.IDENTIFY)
 OFF_CURVE = b"\x04" + bytes(63) + b"\x01"
@@ -34,8 +34,20 @@ def test_the_station_checks_the_nodes_one_time_point(point: bytes | str) -> None
     session = StationSession(bytes(16), UUID, one_time=own)
     session.open(bytes(8))
     shown = own.point if isinstance(point, str) else point
-    with pytest.raises(NotAuthentic, match="not a valid point, or is our own"):
+    with pytest.raises(NotAuthentic, match="is no one-time key"):
         session.accept(shown + bytes(16))
+
+
+def test_a_static_key_at_hand_is_no_one_time_key_of_an_open() -> None:
+    desk = Desk().agree()
+    for static in (STATION, NODE):
+        session = StationSession(desk.key, UUID, statics=(STATION.point, NODE.point))
+        session.open(bytes(8))
+        with pytest.raises(NotAuthentic, match="is no one-time key"):
+            session.accept(static.point + bytes(16))
+        counter = desk.plain(session.ask()).payload
+        wrong = StationSession(desk.key, UUID, one_time=static).open(counter)
+        assert desk.plain(wrong).reason == Reason.BAD_POINT
 
 
 @pytest.mark.parametrize("size", [0, 32, 80, 82])
