@@ -55,6 +55,19 @@ def test_an_empty_home_says_what_to_do_next_and_a_tap_opens_the_node(browser: Br
         page.get_by_role("link", name="provision it first").wait_for()
 
 
+def test_measuring_is_said_of_a_node_that_is_measured_and_of_no_other(browser: Browser, lab: Lab) -> None:
+    """A node that was refused had the word for as long as the measurement was kept."""
+    with opened(browser, lab) as page:
+        told = page.evaluate(
+            """async () => {
+                const { node } = await import("/js/shapes.js");
+                const of = (state) => node({ uuid: "00", measurement: "m", measuring: state && { state } }).mode;
+                return ["running", "refused", "lost", undefined].map(of).concat(node({ uuid: "00" }).mode);
+            }"""
+        )
+    assert told == ["measuring", "refused, not measured", "lost, not measured", "waits to be measured", None]
+
+
 def test_a_node_that_leaves_is_shown_as_away(browser: Browser, fresh: Lab) -> None:
     fresh.run("--detection", "transparent")
     fresh.create("oven", "temperature-sensor")

@@ -115,6 +115,46 @@ def test_a_forbidden_backend_is_named_in_the_reason(monkeypatch: pytest.MonkeyPa
     assert "keyring.backends.null.Keyring" in why
 
 
+class InMemory:
+    """A keyring of two processes at once: each opens it, and both write."""
+
+    def __init__(self) -> None:
+        self.entries: dict[tuple[str, str], str] = {}
+
+    def get_password(self, service: str, entry: str) -> str | None:
+        return self.entries.get((service, entry))
+
+    def set_password(self, service: str, entry: str, line: str) -> None:
+        self.entries[service, entry] = line
+
+    def delete_password(self, service: str, entry: str) -> None:
+        del self.entries[service, entry]
+
+
+def test_what_is_written_is_made_from_what_lies_in_the_keyring_now(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The CA key was dropped by writing back what was read before another process changed the master key."""
+    name = f"{InMemory.__module__}.{InMemory.__qualname__}"
+    backend = InMemory()
+    monkeypatch.setitem(keyring_vault.ALLOWED, name, "a keyring in memory")
+    monkeypatch.setattr(keyring_vault, "_viable", lambda: iter([(name, backend)]))
+    one = KeyringVault.create(STORE)
+    other = KeyringVault.open(STORE)
+    wrapped = one.wrap(bytes(16), context=b"x")
+    other.add_master()
+    assert one.drop_ca()
+    one.add_master()
+    now = KeyringVault.open(STORE)
+    assert (now.masters(), now.ca()) == ((1, 2, 3), None)
+    assert now.unwrap(wrapped, context=b"x") == bytes(16)
+    assert other.refresh()
+    assert not other.refresh()
+    assert not other.drop_ca(), "it is gone already"
+    backend.entries.clear()
+    with pytest.raises(VaultFailure, match="any more"):
+        other.add_master()
+    assert backend.entries == {}
+
+
 # From here on a real Secret Service.
 
 
