@@ -5,11 +5,15 @@ from __future__ import annotations
 import csv
 import json
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 from mcap.reader import make_reader
 
+from teds_provision.node.flash_file import FlashFile
+from teds_provision.teds.codec.codes import AccessCode
+from teds_provision.teds.codec.frame import frame, unframe
 from tests.e2e.desk import ANGLE
 from tests.measure.hall import Hall, of, states
 
@@ -79,3 +83,33 @@ def test_raw_values_of_an_unsigned_datasheet_come_only_where_asked_for_and_are_m
     assert [one["unsigned"] for one in channels] == ["true"]
     signed = of(hall.measure(hall.nodes["a"].uuid, "--rate", 20, "--duration", 1, "--unsigned"))
     assert all("unsigned" not in line and None not in line["value"] for line in signed)
+
+
+def test_a_teds_that_was_changed_in_flash_ends_the_measurement_that_began_by_the_kept_copy(
+    hall: Hall, tmp_path: Path
+) -> None:
+    """It had been "authentic" for ever: the kept copy stood in for octets that nobody read."""
+    node, file = hall.nodes["g"], tmp_path / "run.csv"
+    node.kill()
+    flash = FlashFile(hall.folder / "g")
+    state = flash.load()
+    block = (1, AccessCode.CALIBRATION)
+    body = bytearray(unframe(state.blocks[block]))
+    body[-1] ^= 1
+    flash.commit(replace(state, blocks={**state.blocks, block: frame(bytes(body))}))
+    flash.release()
+    node.start()
+    try:
+        lines = hall.measure(node.uuid, "--rate", 10, "--duration", 30, "--to", file, code=4)
+        assert "data" in {line["event"] for line in lines}, "it was measured at once, by the signed copy"
+        assert "refused" in states(lines)
+        assert "do not count" in lines[-1]["error"]["message"]
+        assert any("refused" in line and "do not count" in line for line in file.read_text().splitlines())
+        (listed,) = hall.station.ask("nodes", node.uuid)["nodes"]
+        assert (listed["verdict"], listed["reading"]["by"]) == ("not authentic", "measure")
+        refused = hall.station.refuses("sample", node.uuid, "--can", node.bus, code=4)
+        assert "TEDS 5 of channel 1 is absent or changed" in refused["message"]
+    finally:
+        flash = FlashFile(hall.folder / "g")
+        flash.commit(replace(flash.load(), blocks=state.blocks))
+        flash.release()
