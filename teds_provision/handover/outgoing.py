@@ -106,8 +106,20 @@ class Selection:
         """Every node of which a key is held, with what keeps it here; where all stay, those of a move that was cut."""
         why = {uuid: self._obstacle(uuid) for uuid in sorted(self.keys.keys() | self.pending)}
         if all(why.values()):
-            return dict.fromkeys(self._cut_move(), "") or why
+            return self._cut_again() or why
         return why
+
+    def _cut_again(self) -> dict[bytes, str]:
+        """The nodes of a move that was cut; PolicyRefused where one of them has been revoked or forgotten since."""
+        resting = self._cut_move()
+        for uuid in resting:
+            if uuid in self.revoked or uuid not in self.keys:
+                why = "it is revoked" if uuid in self.revoked else "no key of it is held here"
+                raise PolicyRefused(
+                    f"The move under way cannot be sealed again, as node {uuid.hex()} is in it: {why}.",
+                    hint="Take the move back (handover list, handover undo ID), then hand over the others.",
+                )
+        return dict.fromkeys(resting, "")
 
     def _obstacle(self, uuid: bytes) -> str:
         return self._key_stays(uuid) or self.stays.get(uuid, _UNKNOWN)

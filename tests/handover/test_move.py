@@ -16,6 +16,7 @@ from teds_provision.steps.agree import agree
 from teds_provision.steps.identify import identify
 from teds_provision.steps.read import read_image
 from teds_provision.steps.verify_node import verify_node
+from teds_provision.store import Revocation
 from tests.bench import MemoryLink, make_station, talk
 from tests.handover.desk import Pair, held, node_key_id, provisioned, session, trust
 
@@ -159,3 +160,17 @@ def test_a_node_goes_there_and_back(pair: Pair) -> None:
     assert pair.north.policy.tombstone(pair.board.uuid) is None
     with pytest.raises(PolicyRefused, match="was moved to station"):
         session(pair.south, pair.board)
+
+
+@pytest.mark.parametrize("revoked", [True, False])
+def test_a_move_under_way_is_not_sealed_again_with_a_node_that_was_revoked_or_forgotten(
+    pair: Pair, revoked: bool
+) -> None:
+    """Found by two commands at once: revoke deletes the key while a move of the node is open."""
+    pair.export("move")
+    if revoked:
+        pair.north.policy.deny(Revocation(pair.board.uuid, None, "lost", "a statement"))
+    pair.north.keys.remove(pair.board.uuid)
+    with pytest.raises(PolicyRefused, match="is revoked" if revoked else "no key of it is held here") as refused:
+        plan_export(pair.north, ExportOrder((pair.south.name,), None, "move"))
+    assert "handover undo" in (refused.value.hint or "")

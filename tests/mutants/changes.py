@@ -39,6 +39,7 @@ class Mutant:
     told: str
     words: frozenset[str] = frozenset()
     test: str = ""
+    rule: str = ""
 
     def __str__(self) -> str:
         return f"{self.path}:{self.line} {self.function}: {self.told}"
@@ -129,7 +130,9 @@ def found(pattern: Pattern, where: list[Module]) -> list[Mutant]:
     """The places of a pattern: an expression, or a statement that is one expression; one, where all is well."""
     wanted, told = ast.unparse(ast.parse(pattern.was, mode="eval")), f"{pattern.rule}: {pattern.was}  ->  {pattern.now}"
     return [
-        replace(module.mutant(node, pattern.now, function, told, _words(module, tree)), test=pattern.test)
+        replace(
+            module.mutant(node, pattern.now, function, told, _words(module, tree)), test=pattern.test, rule=pattern.rule
+        )
         for module in where
         for function, tree in module.functions()
         if function == pattern.function

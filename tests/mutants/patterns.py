@@ -79,18 +79,26 @@ PATTERNS = (
         "False",
     ),
     Pattern("no epoch goes back by a bundle", "_Judge._stale_key", "node.epoch < latest", "False"),
-    Pattern("no second key of one epoch", "_Judge._stale_key", "node.epoch == active", "False"),
+    Pattern(
+        "no second key of one epoch",
+        "_Judge._stale_key",
+        "node.epoch == active",
+        "False",
+        "tests/handover/test_importing.py",
+    ),
     Pattern(
         "a known UUID keeps its key",
         "_Judge._obstacle",
         "pin is not None and (not same_key(pin, fingerprint(node.node_key)))",
         "False",
+        "tests/handover/test_importing.py",
     ),
     Pattern(
         "a receipt closes its own move",
         "_delete_what_left",
         "tombstone is None or tombstone.handover_id != row.id",
         "tombstone is None",
+        "tests/handover/test_hostile_stations.py",
     ),
     Pattern("a receipt deletes the key of its bundle", "_delete_what_left", "key.key_id == in_bundle", "True"),
     Pattern("a receipt is for this bundle", "_check_receipt", "receipt.bundle_sha256 not in notes.files", "False"),
@@ -103,10 +111,18 @@ PATTERNS = (
     Pattern("a reset forgets the pending agreement's key", "Agreeing.forget", "self._pending.link == link", "False"),
     # the node
     Pattern("a Request dies after 60 s", "Agreeing.confirm", "self._clock() - pending.at >= PENDING_SECONDS", "False"),
-    Pattern("Confirm comes by its link", "Agreeing.confirm", "pending.link != origin.link", "False"),
+    Pattern(
+        "Confirm comes by its link",
+        "Agreeing.confirm",
+        "pending.link != origin.link",
+        "False",
+        "tests/protocol/test_tim_agreement.py",
+    ),
     Pattern("Confirm comes in its session", "Agreeing.confirm", "pending.session is not origin.session", "False"),
     Pattern("the node keeps one CA", "Agreeing.request", "flash.ca is not None and request.ca != flash.ca", "False"),
-    Pattern("the first CA stays", "Agreeing.confirm", "flash.ca is None", "True"),
+    Pattern(
+        "the first CA stays", "Agreeing.confirm", "flash.ca is None", "True", "tests/protocol/test_tim_agreement.py"
+    ),
     Pattern(
         "a sequence grows",
         "verified_commit",
@@ -124,7 +140,13 @@ PATTERNS = (
     Pattern("an epoch of the future", "_epoch", "shown.key_epoch > known.identity.epoch", "False"),
     Pattern("only good signatures are floors", "known_of", "datasheet.signature_good(shown, octets, uuid)", "True"),
     Pattern("no session, no verdict", "Verified.verdict", "_SESSION in failed", "False"),
-    Pattern("write refuses another epoch", "_require_newer", "signed.key_epoch != identity.epoch", "False"),
+    Pattern(
+        "write refuses another epoch",
+        "_require_newer",
+        "signed.key_epoch != identity.epoch",
+        "False",
+        "tests/steps/test_by_hand.py",
+    ),
     Pattern(
         "write asks before a jump",
         "_require_newer",
@@ -136,14 +158,22 @@ PATTERNS = (
         "_last_known",
         "highest and brought.sequence > highest + SEQUENCE_WINDOW",
         "False",
+        "tests/handover/test_fleet.py",
     ),
-    Pattern("a signature is used again for a newer number only", "sign", "number > node_sequence", "True"),
+    Pattern(
+        "a signature is used again for a newer number only",
+        "sign",
+        "number > node_sequence",
+        "True",
+        "tests/steps/test_provision.py",
+    ),
     # measuring and the service
     Pattern(
         "a node that was moved is measured no more",
         "Standing.require",
         "policy.require_not_given_away(self._uuid)",
         "None",
+        "tests/measure/test_standing.py",
     ),
     Pattern(
         "off the whitelist nothing moves", "Standing.require", "require_whitelisted(self._station, self._uuid)", "None"
