@@ -169,7 +169,7 @@ class Progress:
         attempted.uuid, attempted.time = None, board.time
         attempted.message = board.failure.message if board.failure is not None else ""
         self.worst = worse(self.worst, board.failure)
-        self.save()
+        self.save(row)
 
     def note(self, row: Row, board: Board) -> None:
         """Note how a board ended."""
