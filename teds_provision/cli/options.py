@@ -257,7 +257,9 @@ def tracing(path: Path | None) -> Iterator[Trace | None]:
     trace = recorder.open_trace(path, app.warn if app is not None else print)
     try:
         yield trace
-    finally:
-        trace.close()
+    except BaseException:  # a command that failed before the first frame can be run again as it stands
+        trace.close(keep_empty=False)
+        raise
+    trace.close()
     if trace.failure:  # it was told when it happened, and the result stands on stdout already
         raise click.exceptions.Exit(StoreFailure.exit_code)

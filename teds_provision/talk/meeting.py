@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 
-from teds_provision.errors import AddressConflict, StoreLocked, UsageFailure
+from teds_provision.errors import AddressConflict, NoReader, StoreLocked, UsageFailure
 from teds_provision.links import Contact, LinkSettings, Notice, open_port
 from teds_provision.links.ports import NoticeSink, Port
 from teds_provision.protocol.announce import default_can_address
@@ -36,7 +36,12 @@ def meet(
     def wanted(identity: Identity) -> bool:
         return uuid is None or identity.uuid == uuid
 
-    port = open_port(links)
+    try:
+        port = open_port(links)
+    except NoReader as error:
+        if uuid is None or links.via != "nfc" or links.nfc is not None:
+            raise
+        raise _no_link(station, uuid, error) from error
     try:
         if uuid is not None:
             _require_no_measurement(station, port, uuid)
@@ -50,6 +55,17 @@ def meet(
             yield node
     finally:
         port.close()
+
+
+def _no_link(station: Station, uuid: bytes, error: NoReader) -> NoReader:
+    """The error where no link is named, so that a reader is looked for, and there is none."""
+    known = station.nodes.get(uuid)
+    met = known is not None and known.can_address
+    last = f" It was last met on a CAN bus, at address 0x{known.can_address:02X}." if known and met else ""
+    return NoReader(
+        f"No link to node {uuid.hex()} is named, and no NFC reader can be used: {error.message}",
+        hint=f"Name where it is: --can socketcan:can0, --ble hci0 or --nfc usb; or once, in config.toml.{last}",
+    )
 
 
 def likely_address(station: Station, uuid: bytes) -> int:

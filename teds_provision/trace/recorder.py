@@ -6,6 +6,7 @@ import os
 import threading
 import time
 from collections.abc import Callable, Iterator
+from contextlib import suppress
 from pathlib import Path
 from typing import Final
 
@@ -48,6 +49,8 @@ class Recorder:
         form = pcapng if path.suffix == PCAPNG else line_form
         self._encode = pcapng.block if form is pcapng else line_form.line
         self._write(form.head())
+        self.is_empty = True
+        """No frame was written down yet."""
 
     def frame(
         self,
@@ -82,15 +85,19 @@ class Recorder:
             Record(time.time(), direction, link, "message", octets, told, opened=opened, sealed=sealed, uuid=uuid.hex())
         )
 
-    def close(self) -> None:
-        """End the trace; never raises."""
+    def close(self, *, keep_empty: bool = True) -> None:
+        """End the trace; never raises. Without ``keep_empty`` a file in which no frame stands is taken away."""
         with self._lock:
             if self._descriptor >= 0:
+                if self.is_empty and not keep_empty:
+                    with suppress(OSError):
+                        self.path.unlink()
                 os.close(self._descriptor)
                 self._descriptor = -1
 
     def _put(self, record: Record) -> None:
         if not self.failure:
+            self.is_empty = False
             self._write(self._encode(record))
 
     def _write(self, octets: bytes) -> None:

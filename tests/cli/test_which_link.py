@@ -14,8 +14,12 @@ from teds_provision.cli.measure.values import over_the_bus
 from teds_provision.cli.options import link_options
 from teds_provision.errors import TedsProvisionError
 from teds_provision.links import LinkSettings
+from teds_provision.links.nfc import reader
 from teds_provision.links.ports import LISTEN_SECONDS
+from teds_provision.station.station import Station
 from teds_provision.steps import sign
+from tests.bench import PASSPHRASE
+from tests.places import free_bus
 
 from .shell import call
 
@@ -77,6 +81,72 @@ def test_measure_takes_the_bus_that_is_kept_beside_a_reader(home: Path, monkeypa
     told = call(home, "--json", "measure", "8d4d9da65281f7000000", "--timeout", "1")
     assert "Streams need a bus" not in told.out
     assert told.code == 5
+
+
+def remember(home: Path, uuid: str, **facts: object) -> None:
+    station = Station.open(home, ask=lambda _prompt, _confirm: PASSPHRASE)
+    try:
+        with station.durable("test"):
+            station.nodes.remember(bytes.fromhex(uuid), **facts)
+    finally:
+        station.close()
+
+
+def test_a_node_without_a_link_is_told_what_to_name(home: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """`sample NODE` spoke of USB readers that nfcpy knows."""
+    uuid = "8d4d9da65281f7000000"
+    call(home, "whitelist", "add", uuid, "--fingerprint", "ab" * 32)
+    remember(home, uuid, can_address=0x21)
+    monkeypatch.setattr(reader, "_usb_readers", lambda _path: [])
+    monkeypatch.setattr(reader, "names_if_any", list)
+    for command in ("sample", "mode", "verify", "read"):
+        said = call(home, "--json", command, uuid)
+        assert said.code == 5, said
+        error = said.json["error"]
+        assert f"No link to node {uuid} is named" in error["message"]
+        assert all(word in error["hint"] for word in ("--can", "--ble", "--nfc", "config.toml", "CAN bus", "0x21"))
+
+
+def test_a_link_that_is_named_means_a_node_and_not_a_folder_of_its_name(
+    home: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "hand").mkdir()
+    call(home, "whitelist", "add", "8d4d9da65281f7000000", "--fingerprint", "ab" * 32)
+    remember(home, "8d4d9da65281f7000000", name="hand")
+    said = call(home, "--json", "verify", "hand", "--via", "can", "--can", free_bus(), "--timeout", "0.5")
+    assert (said.code, "no-node" in said.json["error"]["code"] or "answered" in said.json["error"]["message"]) == (
+        5,
+        True,
+    )
+    assert call(home, "--json", "verify", "hand").code == 3, "without one it is the folder, which holds no image"
+
+
+def test_a_trace_without_a_frame_does_not_make_the_repetition_fail(home: Path, tmp_path: Path) -> None:
+    for name in ("one.jsonl", "one.pcapng"):
+        for _ in range(2):
+            said = call(home, "--json", "identify", "--nfc", "tty:NONE7:pn532", "--trace", tmp_path / name)
+            assert said.code == 5, said.out
+        assert not (tmp_path / name).exists()
+
+
+@pytest.mark.parametrize(
+    ("bus", "code", "words"),
+    [
+        ("gs_usb:0", 5, "-m pip install 'python-can[gs-usb]'"),
+        ("kvaser:0", 5, "CANlib"),
+        ("pcan:PCAN_USBBUS1", 5, "PCAN-Basic"),
+        ("socketcan:can0?bitrat=250000", 2, "bitrate"),
+        ("udp_multicast:239.74.163.2?prot=9", 2, "port"),
+        ("slcan:/dev/ttyNONE?speed=9", 2, "tty_baudrate"),
+        ("socketcand:can0?hots=127.0.0.1", 2, "host"),
+    ],
+)
+def test_a_bus_that_cannot_be_opened_says_what_to_install_or_which_keys_there_are(
+    home: Path, bus: str, code: int, words: str
+) -> None:
+    said = call(home, "--json", "identify", "--via", "can", "--can", bus, "--timeout", "0.5")
+    assert (said.code, words in said.json["error"]["hint"]) == (code, True), said.out
 
 
 def test_several_readers_for_a_command_of_one_are_listed(home: Path) -> None:

@@ -8,7 +8,7 @@ import click
 
 from teds_provision.cli import steps as steps_cli
 from teds_provision.cli.context import App, pass_app
-from teds_provision.cli.options import command, link_options
+from teds_provision.cli.options import command, link_options, said_here
 from teds_provision.cli.rendering import print_table, reporter_for
 from teds_provision.errors import UsageFailure
 from teds_provision.links import LinkSettings
@@ -32,18 +32,20 @@ if TYPE_CHECKING:
 def verify(app: App, what: tuple[str, ...], links: LinkSettings, accept_calibration: str | None) -> None:
     """Read a node (or an image file) and check its datasheet; a node must also sign a fresh challenge.
 
-    A file is judged alone. A node whose key is held here must open a session, else nothing is proven.
+    A file is judged alone; with --can, --nfc or --ble here a node's name goes before that of a file or folder.
+    A node whose key is held here must open a session, else nothing is proven.
     Several files, or a folder, give a line each and at last the totals; on every core.
     Exits 0 for "authentic", 4 for "unsigned" and "not authentic", 5 for "unproven", 6 for a harmful calibration;
     of several the worst.
     """
-    if steps_cli.verify_files.are_files(what):
+    node = len(what) == 1 and bool(said_here("via", "nfc", "can", "ble"))
+    if not node and steps_cli.verify_files.are_files(what):
         if accept_calibration is not None:
             raise UsageFailure("--accept-calibration is for one image.", hint="Verify that one by itself.")
         steps_cli.verify_files.verify_many(app, what)
         return
     done = visits.at_node.verify_at(
-        app.station(), links, what[0], reporter_for(app), accept_calibration=accept_calibration
+        app.station(), links, what[0], reporter_for(app), accept_calibration=accept_calibration, node=node
     )
     verified = done.verified
     result = {

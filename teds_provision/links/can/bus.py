@@ -15,7 +15,7 @@ import time
 from typing import TYPE_CHECKING, Any, Final, NoReturn
 
 from teds_provision.errors import LinkFailure, NoReader, UsageFailure
-from teds_provision.lazy import late
+from teds_provision.lazy import install_command, late
 from teds_provision.links.can.frame import Frame
 from teds_provision.links.can.spec import CanSpec
 from teds_provision.links.can.wire.echoes import Echoes
@@ -46,6 +46,33 @@ _PICKED: Final = re.compile(r"""kwargs(?:\.get\(|\.pop\(|\[)\s*["'](\w+)["']|:pa
 """A key that an interface picks out of what it is given, or that its documentation names."""
 _ANYWHERE: Final = frozenset({"bitrate", "data_bitrate", "receive_own_messages", "timing"})
 _NOT_KEYS: Final = frozenset({"self", "args", "kwargs", "channel", "can_filters", "interface", "fd", ""})
+
+
+_PACKAGES: Final = {
+    "gs_usb": "python-can[gs-usb]",
+    "canalystii": "python-can[canalystii]",
+    "cantact": "python-can[cantact]",
+    "neovi": "python-can[neovi]",
+    "nixnet": "python-can[nixnet]",
+    "seeedstudio": "python-can[seeedstudio]",
+    "candle": "python-can[candle]",
+    "canine": "python-can[canine]",
+    "sontheim": "python-can[sontheim]",
+    "zlgcan": "python-can[zlgcan]",
+}
+"""Packages that python-can itself needs for an interface (its pyproject.toml)."""
+_LIBRARIES: Final = {
+    "kvaser": "Kvaser's CANlib (linuxcan, from kvaser.com)",
+    "pcan": "PEAK's PCAN-Basic (libpcanbasic.so, from peak-system.com), or the kernel's own driver: socketcan:can0",
+    "ixxat": "HMS's VCI driver, of Windows; on Linux take the kernel's driver: socketcan:can0",
+    "vector": "Vector's XL driver, of Windows",
+    "usb2can": "8devices' library, of Windows; on Linux take the kernel's driver: socketcan:can0",
+    "systec": "SYS TEC's library, of Windows; on Linux take the kernel's driver: socketcan:can0",
+    "nican": "NI-CAN, of Windows",
+    "iscan": "Thorsis' isCAN library",
+    "etas": "ETAS BOA, of Windows",
+}
+"""Libraries that come from the maker of the adapter."""
 
 
 __all__ = ["Bus", "Frame", "known_keys", "require_known"]
@@ -235,10 +262,13 @@ def _open(spec: CanSpec) -> can.BusABC:
     try:
         bus = _opened(spec, options)
     except can.CanInterfaceNotImplementedError as error:
+        known = f"python-can knows {', '.join(sorted(can.VALID_INTERFACES))}."
         raise NoReader(
             f"The CAN interface {spec.interface!r} is not usable here: {_reason(error)}.",
-            hint=f"python-can knows {', '.join(sorted(can.VALID_INTERFACES))}.",
+            hint=_driver(spec.interface) or known,
         ) from error
+    except TypeError as error:  # python-can's own word about a key that the interface does not take
+        raise _unknown_key(spec, error) from error
     except Exception as error:  # back ends raise what their driver, serial port or library raises
         raise _not_opened(spec, error) from error
     if spec.interface == "udp_multicast":
@@ -387,7 +417,28 @@ def _cure(spec: CanSpec) -> str:
         return "It needs a multicast address, and a route to it: sudo ip route add 239.0.0.0/8 dev lo."
     if spec.interface == "socketcand":
         return "Start socketcand there, or name it: socketcand:can0?host=127.0.0.1&port=29536."
-    return "Check the channel's name, that the adapter is plugged in, and that its driver is installed."
+    driver = _driver(spec.interface)
+    return f"Check the channel's name and that the adapter is plugged in. {driver or 'Is its driver installed?'}"
+
+
+def _driver(interface: str) -> str:
+    """How the driver of an interface is installed, "" where it needs none or nothing is known."""
+    package, library = _PACKAGES.get(interface), _LIBRARIES.get(interface)
+    return f"Install it: {install_command(package)}" if package else f"It needs {library}." if library else ""
+
+
+def _unknown_key(spec: CanSpec, error: TypeError) -> UsageFailure:
+    """Why an interface does not take what stands behind the ``?``."""
+    found = re.search(r"unexpected keyword argument '(\w+)'", str(error))
+    missing = re.search(r"missing \d+ required [^:]*: (.+)", str(error))
+    if found is not None:
+        why = f"takes no {found[1]}="
+    else:
+        why = f"also needs {missing[1]}" if missing is not None else f"does not take these options: {_reason(error)}"
+    return UsageFailure(
+        f"The CAN interface {spec.interface} {why}.",
+        hint="Ours are bitrate, data_bitrate, fd, node, source and pace; any other key is the interface's own.",
+    )
 
 
 def _number(error: BaseException) -> int | None:
@@ -401,6 +452,8 @@ def _reason(error: BaseException) -> str:
     """The innermost cause in one line: python-can hides it behind its own."""
     while error.__cause__ is not None:
         error = error.__cause__
+    if isinstance(error, NameError):  # what python-can would have loaded from the driver's library
+        return "the library of its driver is not installed"
     text = str(error).strip().splitlines()
     return (text[0] if text else type(error).__name__).rstrip(".")
 

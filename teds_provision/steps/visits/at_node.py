@@ -120,13 +120,19 @@ class VerifyDone:
 
 
 def verify_at(
-    station: Station, links: LinkSettings, what: str, reporter: Reporter, *, accept_calibration: str | None = None
+    station: Station,
+    links: LinkSettings,
+    what: str,
+    reporter: Reporter,
+    *,
+    accept_calibration: str | None = None,
+    node: bool = False,
 ) -> VerifyDone:
-    """Check the image file, or the node, that ``what`` names.
+    """Check the image file, or the node, that ``what`` names; with ``node`` a node's name goes first.
 
     ``error``: NotAuthentic (4), Unproven (5), or PolicyRefused (6) for a calibration that would hurt.
     """
-    found = node_or_image(station, what)
+    found = node_or_image(station, what, node=node)
     if isinstance(found, Image):
         image, verified = found, Verified(found.uuid, tuple(verify_image(station, found)), scope="image")
     else:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Final, Literal
@@ -56,9 +56,15 @@ def at_node(
         yield Visit(station, node, identify(station, node))
 
 
-def node_or_image(station: Station, text: str) -> bytes | Image:
-    """The image of a file, or the UUID that ``text`` names; raises NotFound which says what of the two it is not."""
+def node_or_image(station: Station, text: str, *, node: bool = False) -> bytes | Image:
+    """The image of a file, or the UUID that ``text`` names; raises NotFound which says what of the two it is not.
+
+    Of both the file, but with ``node`` the node.
+    """
     path = Path(text)
+    if node:
+        with suppress(NotFound):
+            return station.nodes.resolve(text)
     if path.is_file():
         return read_image_file(path)
     try:
