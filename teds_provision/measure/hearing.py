@@ -148,6 +148,8 @@ class Hearing:
         self._lock = threading.Lock()
         self._stop = threading.Event()
         self.lost_frames = 0
+        self.failure: LinkFailure | None = None
+        """Why the bus itself cannot be heard now; None where it can."""
         self._thread = threading.Thread(target=self._run, name=f"hearing {place}", daemon=True)
         self._thread.start()
 
@@ -175,8 +177,9 @@ class Hearing:
         while not self._stop.is_set():
             try:
                 self._hear()
-            except LinkFailure:
+            except LinkFailure as failure:
                 # The nodes' own threads meet the same failure, tell it, and open the bus again.
+                self.failure = failure
                 self._stop.wait(0.5)
 
     def _hear(self) -> None:
@@ -207,6 +210,7 @@ class CanHearing(Hearing):
 
     def _hear(self) -> None:
         with self._port.bus().listen(self._wanted, most=MOST_HELD) as ear:
+            self.failure = None
             looked = time.monotonic()
             while not self._stop.is_set():
                 # All that wait first: a thread that fell behind calibrates more at once, and catches up.

@@ -304,12 +304,12 @@ class NodeKeeper:
         """Clock every lease / 3 until the end, or until the node is lost, or may not be measured any more."""
         rest = Rest(self._station, trusted, bus, by=self._wish.by) if trusted.kept else None
         try:
-            self._watch(trusted, standing, rest)
+            self._watch(bus, trusted, standing, rest)
         finally:
             if rest is not None:
                 rest.close()
 
-    def _watch(self, trusted: Trusted, standing: Standing, rest: Rest | None) -> None:
+    def _watch(self, bus: Bus, trusted: Trusted, standing: Standing, rest: Rest | None) -> None:
         told = time.monotonic()
         every = self._wish.lease / 3
         lied = False
@@ -328,6 +328,8 @@ class NodeKeeper:
                 lied = True
                 self._say("running", why=f"its clock lies: {self.streams.clock.lie}")
             silent = self.streams.silent(now)
+            if silent and (failure := bus.hearing.failure) is not None:  # the adapter was pulled: it is not the node
+                raise failure
             if silent:
                 raise LinkFailure(
                     f"No message of the node came for {silent:.1f} s.", hint="Check its power and the bus."

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import pty
+import signal
 import threading
 import tty
 from collections.abc import Iterator
@@ -77,12 +78,12 @@ def test_a_pulled_adapter_is_told_as_itself(hall: Hall) -> None:
     adapter = Adapter(hall.can)
     try:
         running = hall.begin("a", "--rate", 10, can=f"slcan:{adapter.name}?sleep_after_open=0")
-        running.wait_for('"event": "data"', 60)
+        running.wait_for('"event":"data"', 60)
         adapter.pull()
         running.wait_for("The CAN bus slcan:", 60)
     finally:
         adapter.pull()
-    running.interrupt() if hasattr(running, "interrupt") else running.process.send_signal(2)
+    running.signal(signal.SIGINT)
     told = [one.get("why") or "" for one in events(running.end().out) if one["event"] == "status"]
     assert any("The CAN bus slcan:" in why for why in told), told
     assert not any("No message of the node" in why for why in told), told
