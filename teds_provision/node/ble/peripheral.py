@@ -17,7 +17,6 @@ from teds_provision.node.ble.address import StaticAddress
 from teds_provision.node.can.workers import Crew
 from teds_provision.node.handler import InTheAir
 from teds_provision.protocol.messages import ble
-from teds_provision.protocol.messages.identity import Identity
 from teds_provision.protocol.repetition import Repetition
 
 BUS: Final = "ble"
@@ -27,6 +26,8 @@ STRANGER_SECONDS: Final = 10.0
 """After so long a connection without a session is dropped."""
 TAPPED_SECONDS: Final = 60.0
 """A node without key advertises for so long after a tap."""
+_LONGEST: Final = 0xFFFF
+"""Octets of a request that are put together: what is longer than maxMessage gets 10, and not silence."""
 _FIRST_SOURCE: Final = 2
 _MOST_WAITING: Final = 4
 _LOOK_SECONDS: Final = 0.5
@@ -39,11 +40,11 @@ _LOG: Final = logging.getLogger(__name__)
 class Line:
     """One connection: its session (by name), its stored reply, what it has enabled. Used in the loop alone."""
 
-    def __init__(self, number: int, connection: Any, crew: Crew, most: int) -> None:
+    def __init__(self, number: int, connection: Any, crew: Crew) -> None:
         self.number, self.connection = number, connection
         self.name = f"{BUS}:{number:x}"
         self.turns = crew.turns()
-        self.assembly = ble.Assembly(most)
+        self.assembly = ble.Assembly(_LONGEST)
         self.repetition = Repetition()
         self.waiting = 0
         self.hears = False
@@ -61,7 +62,6 @@ class Peripheral:
 
     def __init__(self, node: InTheAir, address: StaticAddress, *, stranger_seconds: float = STRANGER_SECONDS) -> None:
         self._node, self._address, self._stranger_seconds = node, address, stranger_seconds
-        self._most = Identity.decode(node.identify()).max_message
         self._crew = Crew()
         self._lines: dict[int, Line] = {}
         self._tapped_until = 0.0
@@ -194,7 +194,7 @@ class Peripheral:
 
     def _connected(self, connection: Any) -> None:
         number = next(free for free in range(_FIRST_SOURCE, 256) if free not in self._lines)
-        line = self._lines[number] = Line(number, connection, self._crew, self._most)
+        line = self._lines[number] = Line(number, connection, self._crew)
         connection.on("disconnection", lambda _reason: self._disconnected(line))
         self._advertising = False  # a controller stops when somebody connects
         self._news.set()
