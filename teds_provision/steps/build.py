@@ -105,7 +105,7 @@ def build(
     with station.durable("build"):
         facts = {} if plan.name is None else {"name": plan.name}
         if has is None or not has.unsigned_blocks():  # of a node with a datasheet the store keeps what is on it
-            facts["profile"] = plan.wanted
+            facts |= {"profile": plan.wanted, "profile_digest": plan.digest}
         station.nodes.remember(uuid, **facts)
         station.nodes.keep_draft(Draft(uuid, image, "built", plan.wanted))
         station.audit("build", uuid, "done", profile=built.profile, teds=image.digest())
@@ -127,6 +127,7 @@ class Proposal:
     profile: str | None = None
     name: str | None = None
     calibrations: Mapping[int, Calibration] = field(default_factory=dict)
+    profile_digest: str | None = None
 
     def require_a_yes(self, confirm: Confirm) -> None:
         """Ask where something changes that was not named."""
@@ -159,6 +160,7 @@ def propose(station: Station, prepared: Prepared, present: Survey, *, record: bo
         proposal.profile,
         proposal.name,
         proposal.calibrations,
+        proposal.profile_digest,
     )
 
 
@@ -220,7 +222,8 @@ def _composed(
     name = own_name(station, pending or has, record.profile if record is not None else None)
     plan = compose(station, uuid, prepared, pending or has, name=name, as_known=resume)
     image = Image(uuid, {**keep, **plan.blocks})
-    return Proposal(image, (), named, plan.warnings, plan.wanted, plan.name, plan.calibrations)
+    named = named and not plan.changed
+    return Proposal(image, (), named, plan.warnings, plan.wanted, plan.name, plan.calibrations, plan.digest)
 
 
 def _as_it_is(station: Station, present: Survey, keep: Mapping[BlockId, bytes]) -> Proposal:
@@ -255,6 +258,7 @@ def _only_what_is_named(
             blocks[block] = wanted
     if prepared.order.name is not None:  # also where the profile says the same and the node does not
         blocks[0, AccessCode.NAME] = asked.blocks[0, AccessCode.NAME]
+    # What else the profile says now stays unwritten, so what is remembered of it is what it said then.
     return Proposal(Image(uuid, blocks), (), True, asked.warnings, asked.wanted, asked.name, asked.calibrations)
 
 

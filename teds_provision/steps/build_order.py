@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import hashlib
+import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -14,7 +16,7 @@ from teds_provision.lazy import late
 from teds_provision.station.station import Station
 from teds_provision.teds.codec.codes import AccessCode
 from teds_provision.teds.image import Image
-from teds_provision.teds.profile.load import default_folders, load_profile, passed_over
+from teds_provision.teds.profile.load import default_folders, is_profile_name, load_profile, passed_over
 from teds_provision.teds.profile.reader import NAME_OCTETS
 from teds_provision.teds.sheet import Sheet, described
 
@@ -83,6 +85,9 @@ class Composed:
     calibrations: Mapping[int, Calibration]
     blocks: Mapping[BlockId, bytes]
     warnings: tuple[str, ...]
+    digest: str = ""
+    changed: bool = False
+    """Whether the profile that the node had says something else than when its datasheet was made."""
 
 
 def for_several(order: BuildOrder) -> BuildOrder:
@@ -106,7 +111,7 @@ def prepare(station: Station, order: BuildOrder, uuid: bytes | None = None) -> P
     Changes nothing. Raises UsageFailure (no profile known), NotFound, BadData, PolicyRefused (the guard).
     """
     check_name(order.name)
-    wanted = order.profile or (_known_profile(station, uuid) if uuid is not None else None)
+    wanted = _whole(order.profile) or (_known_profile(station, uuid) if uuid is not None else None)
     if order.calibration is not None and not order.calibration.is_file():
         raise NotFound(f"There is no calibration file {order.calibration}.")
     if wanted is None:
@@ -188,7 +193,7 @@ def compose(
     Raises UsageFailure (no profile known), BadData.
     """
     order = prepared.order
-    wanted = order.profile or _known_profile(station, uuid)
+    wanted = _whole(order.profile) or _known_profile(station, uuid)
     if wanted is None:
         raise no_profile(uuid)
     profile = prepared.profile or _load(station, wanted)
@@ -199,7 +204,26 @@ def compose(
         calibrations, warnings = _kept_calibrations(order, has, profile)
     kept = order.name or name or (_known_name(station, uuid) if as_known else None)
     made = _made(profile, uuid, calibrations, kept, edition)
-    return Composed(profile, wanted, kept, calibrations, made.blocks, merged((*passed, *warnings, *made.warnings)))
+    digest, record = digest_of(profile), station.nodes.get(uuid)
+    before = record.profile_digest if record is not None and record.profile == wanted else None
+    changed = order.profile is None and before is not None and before != digest
+    if changed:
+        warnings += (f"The profile {wanted} is not what it was when this node's datasheet was made.",)
+    told = merged((*passed, *warnings, *made.warnings))
+    return Composed(profile, wanted, kept, calibrations, made.blocks, told, digest, changed)
+
+
+def digest_of(profile: Profile) -> str:
+    """SHA-256 (hex) of what a profile says, with all that it extends: of the TEDS that it gives, and its demands."""
+    blocks = _made(profile, _NOBODY, {}, None, 2007).blocks
+    said = [[*block, octets.hex()] for block, octets in sorted(blocks.items())]
+    demands = [repr(one.calibration) for one in profile.channels]
+    return hashlib.sha256(json.dumps([said, demands]).encode()).hexdigest()
+
+
+def _whole(profile: str | None) -> str | None:
+    """A name as it is, a path from the root on: the next command may stand in another folder."""
+    return profile if profile is None or is_profile_name(profile) else str(Path(profile).absolute())
 
 
 def _known_name(station: Station, uuid: bytes) -> str | None:

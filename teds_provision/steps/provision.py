@@ -220,7 +220,7 @@ class _Run:
 
     def _write(self, signed: Signed, proposal: Proposal, present: Survey) -> Written:
         with self.steps.step("write") as step:
-            facts = {"profile": proposal.profile, "name": proposal.name}
+            facts = {"profile": proposal.profile, "name": proposal.name, "profile_digest": proposal.profile_digest}
             written = write(
                 self.station,
                 self.node,

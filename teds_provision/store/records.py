@@ -63,7 +63,8 @@ class NodeRecord:
     ``teds_sha256`` is the digest (hex) of the Security TEDS last committed; ``channels`` counts TransducerChannels;
     ``retired`` is a person's word that it is out of service;
     ``due`` is the day (ISO 8601) on which the first calibration of its datasheet ends; ``charging`` what it last said
-    of its charge, JSON with the time ``at``, which nobody authenticated.
+    of its charge, JSON with the time ``at``, which nobody authenticated. ``profile`` is a name or the whole path of a
+    file, ``profile_digest`` (hex) what it said when the node's datasheet was made.
     """
 
     uuid: bytes
@@ -82,6 +83,7 @@ class NodeRecord:
     point_mac: bytes | None = field(default=None, repr=False, compare=False)
     due: str | None = None
     charging: str | None = None
+    profile_digest: str | None = None
 
 
 @dataclass(frozen=True, slots=True)

@@ -9,7 +9,7 @@ from __future__ import annotations
 from typing import Final
 
 APPLICATION_ID: Final = 0x54454453  # "TEDS"
-SCHEMA_VERSION: Final = 7
+SCHEMA_VERSION: Final = 8
 OLDEST_SCHEMA: Final = 7
 """The first of KeyAgreement 2. Link keys of older stores were agreed as no node does any more."""
 
@@ -183,6 +183,9 @@ _VERSION_7: Final = (
     "UPDATE nodes SET retired = NULL WHERE NOT (retired GLOB 'decommissioned*' OR retired GLOB 'replaced by*')",
 )
 
+# What came with version 8: what the profile said that a node's datasheet was made of.
+_VERSION_8: Final = ("ALTER TABLE nodes ADD COLUMN profile_digest TEXT",)
+
 # STEPS_TO[n] are the statements that bring a store of version n - 1 to version n.
 STEPS_TO: Final[dict[int, tuple[str, ...]]] = {
     1: _VERSION_1,
@@ -192,4 +195,5 @@ STEPS_TO: Final[dict[int, tuple[str, ...]]] = {
     5: _VERSION_5,
     6: _VERSION_6,
     7: _VERSION_7,
+    8: _VERSION_8,
 }

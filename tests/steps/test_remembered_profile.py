@@ -1,0 +1,72 @@
+"""The profile of a node is the file that it was made of, wherever the next command stands and whatever lies there."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from teds_provision.station.station import Station
+from teds_provision.steps.build import NotNamed, build, nobody
+from teds_provision.steps.build_order import BuildOrder
+from teds_provision.steps.identify import identify
+from teds_provision.steps.provision import Provisioned, provision
+from teds_provision.steps.reset import reset_node
+from teds_provision.talk.progress import Silent
+from teds_provision.teds.profile.load import shipped_profiles
+from tests.bench import Board, talk
+
+CELL = (shipped_profiles() / "load-cell.toml").read_text()
+OVEN = (shipped_profiles() / "temperature-sensor.toml").read_text()
+
+
+def provisioned(station: Station, board: Board, order: BuildOrder) -> Provisioned:
+    with talk(board) as node:
+        return provision(station, node, order, accept=lambda _who: None, reporter=Silent(), confirm=nobody)
+
+
+@pytest.fixture
+def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    (tmp_path / "here").mkdir()
+    (tmp_path / "there").mkdir()
+    (tmp_path / "here/own.toml").write_text(CELL)
+    monkeypatch.chdir(tmp_path / "here")
+    return tmp_path / "here"
+
+
+def test_a_relative_path_is_remembered_whole(
+    station: Station, board: Board, here: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    provisioned(station, board, BuildOrder("./own.toml"))
+    record = station.nodes.get(board.uuid)
+    assert record is not None
+    assert record.profile == str(here / "own.toml")
+    before = build(station, board.uuid, BuildOrder(name="a")).image
+    monkeypatch.chdir(here.parent / "there")
+    assert build(station, board.uuid, BuildOrder(name="a")).image.unsigned_blocks() == before.unsigned_blocks()
+    Path("own.toml").write_text(OVEN)
+    assert build(station, board.uuid, BuildOrder(name="a")).image.unsigned_blocks() == before.unsigned_blocks()
+
+
+def test_a_profile_that_changed_since_is_told_and_asked(station: Station, board: Board, here: Path) -> None:
+    provisioned(station, board, BuildOrder("./own.toml"))
+    assert not any("is not what it was" in text for text in build(station, board.uuid, BuildOrder(name="a")).warnings)
+    (here / "own.toml").write_text(CELL.replace("\n", "\n# a comment changes nothing\n", 1))
+    assert not any("is not what it was" in text for text in build(station, board.uuid, BuildOrder(name="a")).warnings)
+    (here / "own.toml").write_text(OVEN)
+    told = build(station, board.uuid, BuildOrder(name="a")).warnings
+    assert any("is not what it was when this node's datasheet was made" in text for text in told)
+    station.nodes.drop_draft(board.uuid)
+    reset(station, board)
+    with pytest.raises(NotNamed):
+        provisioned(station, board, BuildOrder())
+    assert provisioned(station, board, BuildOrder("./own.toml")).verified.verdict == "authentic"
+    reset(station, board)
+    again = provisioned(station, board, BuildOrder())
+    assert again.verified.verdict == "authentic", "it is remembered anew"
+
+
+def reset(station: Station, board: Board) -> None:
+    """To factory state: its datasheet is judged by the profile that is remembered."""
+    with talk(board) as node:
+        reset_node(station, node, identify(station, node))
