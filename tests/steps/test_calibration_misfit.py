@@ -50,16 +50,16 @@ def test_degrees_are_never_published_as_something_else(
 ) -> None:
     before = board.state
     with pytest.raises(CalibrationMisfit, match="channel 1") as refused:
-        provisioned(station, board, BuildOrder(profile))
+        provisioned(station, board, BuildOrder(profile, retype=True))
     assert (refused.value.exit_code, refused.value.code) == (6, "calibration-misfit")
     assert "--no-calibration" in refused.value.hint
     with pytest.raises(CalibrationMisfit):
-        build(station, board.uuid, BuildOrder(profile))
+        build(station, board.uuid, BuildOrder(profile, retype=True))
     assert board.state == before, "nothing is written"
 
 
 def test_without_the_calibration_the_new_type_is_built(station: Station, board: Board, calibrated: Path) -> None:
-    built = build(station, board.uuid, BuildOrder("load-cell", drop_calibration=True))
+    built = build(station, board.uuid, BuildOrder("load-cell", drop_calibration=True, retype=True))
     assert (1, AccessCode.CALIBRATION) not in built.image.blocks
 
 
@@ -74,7 +74,7 @@ def test_a_draft_that_was_never_written_is_kept_for_its_own_type_alone(
 ) -> None:
     build(station, board.uuid, BuildOrder(ANGLE, calibrated))
     with pytest.raises(CalibrationMisfit):
-        build(station, board.uuid, BuildOrder("load-cell"))
+        build(station, board.uuid, BuildOrder("load-cell", retype=True))
 
 
 def test_a_spare_of_the_same_type_takes_the_calibration_with_its_unit(

@@ -53,7 +53,7 @@ def test_a_profile_that_changed_since_is_told_and_asked(station: Station, board:
     assert not any("is not what it was" in text for text in build(station, board.uuid, BuildOrder(name="a")).warnings)
     (here / "own.toml").write_text(CELL.replace("\n", "\n# a comment changes nothing\n", 1))
     assert not any("is not what it was" in text for text in build(station, board.uuid, BuildOrder(name="a")).warnings)
-    (here / "own.toml").write_text(OVEN)
+    (here / "own.toml").write_text(CELL.replace("high-limit = 500.0", "high-limit = 400.0"))
     told = build(station, board.uuid, BuildOrder(name="a")).warnings
     assert any("is not what it was when this node's datasheet was made" in text for text in told)
     station.nodes.drop_draft(board.uuid)
