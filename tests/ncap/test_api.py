@@ -308,6 +308,7 @@ def test_detection_decides_who_is_shown(service: Service, asked: Client) -> None
         "sign",
         "write",
         "verify",
+        "check",
     ]
     assert asked.node("angle")["whitelisted"] is True
     asked.request("PUT", "/detection", {"mode": "whitelist"})
