@@ -97,7 +97,7 @@ fuzz: .venv-fuzz/.ready
 	  echo "== $$target"; .venv-fuzz/bin/python tests/fuzz/run.py $$target -runs=$(RUNS); done
 
 # Cuts at every durable write and message of every changing command, failing disks, power loss, two commands at once,
-# backups of 100,000 nodes; an hour, or all (FULL=1).
+# backups of 100,000 nodes; an hour and a half, or all (FULL=1).
 faults: $(VENV)/.dev
 	$(BIN)/python -m tests.faults.bench $(if $(FULL),--full,--minutes 60)
 

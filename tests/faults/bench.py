@@ -30,7 +30,7 @@ from tests.faults.trials import Bench, Fault, Trial
 ERRORS = ("ENOSPC", "EIO", "EROFS", "EDQUOT")
 SHARE = 8  # one of so many failing calls is tried, unless all are
 PAIRS = 80  # of 276, unless all are
-FEW = 6
+FEW = 4
 WAITING = 24  # trials of a cut node that wait for a time-out beside those that work
 
 
@@ -110,13 +110,14 @@ def main(arguments: list[str]) -> int:
             work += (
                 quick_trials_of(bench, act, share) if chosen.quick else trials_of(bench, act, share, full=chosen.full)
             )
-        lost = run_all(bench, work, chosen.jobs, until)
+        lost = 0
+        if chosen.pairs or not chosen.quick:
+            count = 0 if chosen.full or chosen.pairs else PAIRS
+            lost += pairs(bench, share, count=count, jobs=chosen.jobs, until=None)
+        lost += run_all(bench, work, chosen.jobs, until)
         complaint = crowd(bench)
         print(f"8 processes on one store: {complaint or 'all done, nothing lost'}")
         lost += bool(complaint)
-        if chosen.pairs or not chosen.quick:
-            count = 0 if chosen.full or chosen.pairs else PAIRS
-            lost += pairs(bench, share, count=count, jobs=chosen.jobs, until=until)
         if chosen.large or not chosen.quick:
             large = [trial for act in LARGE for trial in few_trials_of(bench, act, share)]
             lost += run_all(bench, large, 1, None)
