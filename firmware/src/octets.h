@@ -7,72 +7,20 @@
 #include <stdint.h>
 #include <string.h>
 
-static inline void teds_put16(uint8_t *at, uint16_t value)
-{
-    at[0] = (uint8_t)(value >> 8);
-    at[1] = (uint8_t)value;
-}
-
-static inline void teds_put32(uint8_t *at, uint32_t value)
-{
-    teds_put16(at, (uint16_t)(value >> 16));
-    teds_put16(at + 2, (uint16_t)value);
-}
-
-static inline void teds_put64(uint8_t *at, uint64_t value)
-{
-    teds_put32(at, (uint32_t)(value >> 32));
-    teds_put32(at + 4, (uint32_t)value);
-}
-
-static inline uint16_t teds_get16(const uint8_t *at)
-{
-    return (uint16_t)((uint32_t)at[0] << 8 | at[1]);
-}
-
-static inline uint32_t teds_get32(const uint8_t *at)
-{
-    return (uint32_t)teds_get16(at) << 16 | teds_get16(at + 2);
-}
-
-static inline uint64_t teds_get64(const uint8_t *at)
-{
-    return (uint64_t)teds_get32(at) << 32 | teds_get32(at + 4);
-}
+void teds_put16(uint8_t *at, uint16_t value);
+void teds_put32(uint8_t *at, uint32_t value);
+void teds_put64(uint8_t *at, uint64_t value);
+uint16_t teds_get16(const uint8_t *at);
+uint32_t teds_get32(const uint8_t *at);
+uint64_t teds_get64(const uint8_t *at);
 
 /* In a time that does not depend on where they differ. */
-static inline bool teds_equal(const uint8_t *a, const uint8_t *b, size_t length)
-{
-    uint8_t differ = 0;
-    for (size_t i = 0; i < length; i++) {
-        differ |= (uint8_t)(a[i] ^ b[i]);
-    }
-    return differ == 0;
-}
+bool teds_equal(const uint8_t *a, const uint8_t *b, size_t length);
 
 /* Not left out by a compiler that sees no later use. */
-static inline void teds_wipe(void *octets, size_t length)
-{
-    volatile uint8_t *at = octets;
-    for (size_t i = 0; i < length; i++) {
-        at[i] = 0;
-    }
-}
+void teds_wipe(void *octets, size_t length);
 
 /* CRC-32 of IEEE 802.3, continued: begin with 0. By nibbles: no table of 1 KiB, and quick enough for 8 KiB at a start. */
-static inline uint32_t teds_crc32(uint32_t crc, const uint8_t *octets, size_t length)
-{
-    static const uint32_t nibble[16] = {
-        0x00000000, 0x1DB71064, 0x3B6E20C8, 0x26D930AC, 0x76DC4190, 0x6B6B51F4, 0x4DB26158, 0x5005713C,
-        0xEDB88320, 0xF00F9344, 0xD6D6A3E8, 0xCB61B38C, 0x9B64C2B0, 0x86D3D2D4, 0xA00AE278, 0xBDBDF21C,
-    };
-    crc = ~crc;
-    for (size_t i = 0; i < length; i++) {
-        crc ^= octets[i];
-        crc = crc >> 4 ^ nibble[crc & 15];
-        crc = crc >> 4 ^ nibble[crc & 15];
-    }
-    return ~crc;
-}
+uint32_t teds_crc32(uint32_t crc, const uint8_t *octets, size_t length);
 
 #endif

@@ -167,47 +167,54 @@ typedef struct teds_can {
     uint8_t rx_number, rx_block;
     uint16_t rx_length, rx_at;
     uint64_t rx_until;
-    uint8_t rx[1 + TEDS_MAX_MESSAGE];
-    teds_line lines[TEDS_CAN_LINES];
 #if TEDS_OPERATION
     /* the one data message that is being sent */
     int8_t data_stream;
     uint8_t data_segment;
     uint16_t data_at, data_length;
     uint64_t data_free_at;
+#endif
+    teds_line lines[TEDS_CAN_LINES];
+    uint8_t rx[1 + TEDS_MAX_MESSAGE];
+#if TEDS_OPERATION
     uint8_t data[TEDS_MESSAGE];
 #endif
 } teds_can;
 
+/* What is small and asked for often stands first: an offset that fits into an instruction costs nothing. */
 typedef struct teds_node {
     const teds_port *port;
     const teds_config *config;
-    uint8_t uuid[10];
-    teds_key_ref key;
-    uint8_t point[65], signature[64]; /* field 102 */
-    teds_state state;
-    uint8_t slot;          /* the one that counts */
+    uint8_t slot; /* the one that counts */
     bool free_slot_dirty, old_slot_due;
-    uint32_t slot_counter, records_at, records_end;
-    uint64_t opens;        /* c */
-    uint64_t address_written_at, stranger_at;
     bool address_written, stranger_seen;
+    uint16_t staging_end;
+    uint32_t slot_counter, records_at, records_end;
+    uint64_t opens; /* c */
+    uint64_t address_written_at, stranger_at;
+#if TEDS_OPERATION
+    uint32_t safe, stopped; /* bits by place */
+    uint64_t missed;
+#endif
+    teds_state state;
+    uint8_t uuid[10];
+    uint8_t point[65], signature[64]; /* field 102 */
+    teds_key_ref key;
+    teds_pending pending;
+    teds_one_time one_time;
     teds_session sessions[TEDS_SESSIONS];
     teds_half_open half_open[TEDS_SESSIONS];
-    teds_stored_reply replies[TEDS_REPLIES];
-    teds_one_time one_time;
-    teds_pending pending;
-    uint16_t staging_end;
-    uint8_t staging[TEDS_STAGING];
 #if TEDS_OPERATION
-    uint32_t safe, stopped;         /* bits by place */
     uint64_t deadline[TEDS_CHANNELS];
     uint16_t dead_man[TEDS_CHANNELS];
     int8_t actuator_of[TEDS_CHANNELS]; /* session that claims an actuator */
-    teds_stream streams[TEDS_STREAMS];
-    uint64_t missed;
 #endif
     teds_can can;
+#if TEDS_OPERATION
+    teds_stream streams[TEDS_STREAMS];
+#endif
+    teds_stored_reply replies[TEDS_REPLIES];
+    uint8_t staging[TEDS_STAGING];
 } teds_node;
 
 /* -- public functions --------------------------------------------------------------------------------------------- */

@@ -1,0 +1,54 @@
+# Cross builds for Cortex-M0+ and M4: sizes of the library, stack of each function, images for qemu. Included by Makefile.
+
+ARM := arm-none-eabi-
+ARM_FLAGS := -mthumb -Os -ffunction-sections -fdata-sections -fstack-usage -fcallgraph-info=su
+BEARSSL ?= $(BUILD)/bearssl
+BEARSSL_SOURCES := $(addprefix $(BEARSSL)/src/, \
+  aead/ccm.c codec/ccopy.c codec/dec32be.c codec/enc32be.c codec/dec32le.c codec/enc32le.c codec/dec64be.c \
+  codec/enc64be.c hash/sha2small.c hash/dig_size.c mac/hmac.c rand/hmac_drbg.c \
+  symcipher/aes_ct.c symcipher/aes_ct_enc.c symcipher/aes_ct_ctrcbc.c int/i32_div32.c \
+  ec/ec_p256_m15.c ec/ec_p256_m31.c ec/ec_secp256r1.c ec/ec_secp384r1.c ec/ec_secp521r1.c ec/ecdsa_i15_bits.c ec/ecdsa_i15_sign_raw.c \
+  ec/ecdsa_i15_vrfy_raw.c ec/ecdsa_i31_bits.c ec/ecdsa_i31_sign_raw.c ec/ecdsa_i31_vrfy_raw.c) \
+  $(wildcard $(BEARSSL)/src/int/i15_*.c $(BEARSSL)/src/int/i31_*.c)
+
+CPU_m0 := -mcpu=cortex-m0plus -DTEDS_BEARSSL_M15
+CPU_m4 := -mcpu=cortex-m4
+# What a sensor on a classic bus needs; and security alone.
+LIBRARY_full :=
+LIBRARY_security := -DTEDS_OPERATION=0 -DTEDS_CAN_FD=0
+
+.PHONY: arm
+arm: $(foreach cpu,m0 m4,$(BUILD)/arm/$(cpu)-full.a $(BUILD)/arm/$(cpu)-security.a $(BUILD)/arm/$(cpu)-measure.elf) \
+  $(BUILD)/arm/m4-node.elf
+
+define LIBRARY_RULE
+$(BUILD)/arm/$(1)-$(2).a: $(SOURCES) $(HEADERS)
+	@mkdir -p $(BUILD)/arm/$(1)-$(2)
+	cd $(BUILD)/arm/$(1)-$(2) && $(ARM)gcc $(filter-out -Wmissing-prototypes,$(WARNINGS)) $(ARM_FLAGS) $(CPU_$(1)) \
+	  $(LIBRARY_$(2)) -I$(CURDIR)/include -I$(CURDIR)/src -c $(addprefix $(CURDIR)/,$(SOURCES))
+	@rm -f $$@
+	$(ARM)ar rcs $$@ $(BUILD)/arm/$(1)-$(2)/*.o
+endef
+$(foreach cpu,m0 m4,$(foreach size,full security,$(eval $(call LIBRARY_RULE,$(cpu),$(size)))))
+
+define BEARSSL_RULE
+$(BUILD)/arm/$(1)-bearssl.a: port/bearssl/teds_bearssl.c $(HEADERS) arm.mk
+	@test -f $(BEARSSL)/inc/bearssl.h || { echo "BearSSL's source is missing: run scripts/install-firmware-packages"; exit 1; }
+	@mkdir -p $(BUILD)/arm/$(1)-bearssl
+	cd $(BUILD)/arm/$(1)-bearssl && $(ARM)gcc -std=c99 $(ARM_FLAGS) $(CPU_$(1)) -DBR_USE_UNIX_TIME=0 -DBR_USE_URANDOM=0 \
+	  -I$(abspath $(BEARSSL))/inc -I$(abspath $(BEARSSL))/src -I$(CURDIR)/include \
+	  -c $(abspath $(BEARSSL_SOURCES)) $(CURDIR)/port/bearssl/teds_bearssl.c
+	@rm -f $$@
+	$(ARM)ar rcs $$@ $(BUILD)/arm/$(1)-bearssl/*.o
+endef
+$(foreach cpu,m0 m4,$(eval $(call BEARSSL_RULE,$(cpu))))
+
+MACHINE_m0 := -DTEDS_MICROBIT -Wl,--defsym=ROM_LENGTH=0x40000 -Wl,--defsym=RAM_LENGTH=0x4000
+MACHINE_m4 := -Wl,--defsym=ROM_LENGTH=0x400000 -Wl,--defsym=RAM_LENGTH=0x400000
+define IMAGE_RULE
+$(BUILD)/arm/$(1)-$(2).elf: port/qemu/start.c port/qemu/$(2).c port/qemu/image.ld $(BUILD)/arm/$(1)-full.a $(BUILD)/arm/$(1)-bearssl.a
+	$(ARM)gcc -std=gnu99 -Wall -Wextra -mthumb -Os $(CPU_$(1)) -ffunction-sections -fdata-sections -Iinclude -Isrc -Iport/bearssl \
+	  -I$(BEARSSL)/inc $(MACHINE_$(1)) -nostartfiles --specs=nano.specs -Wl,--gc-sections -T port/qemu/image.ld \
+	  port/qemu/start.c port/qemu/$(2).c $(BUILD)/arm/$(1)-full.a $(BUILD)/arm/$(1)-bearssl.a -lc -lgcc -o $$@
+endef
+$(foreach cpu,m0 m4,$(foreach image,measure node,$(eval $(call IMAGE_RULE,$(cpu),$(image)))))
