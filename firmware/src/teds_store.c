@@ -547,7 +547,7 @@ static int status(uint16_t id, bool read_only, bool there, uint32_t size, uint16
 {
     static const uint32_t text = 1u << 2 | 1u << 4 | 1u << 6 | 1u << 10 | 1u << 11 | 1u << 14 | 1u << 15;
     uint8_t code = (uint8_t)id;
-    uint32_t attributes = code >= 128 ? 0x40u : (text >> code & 1u) != 0 ? 0x10u : 0;
+    uint32_t attributes = code >= 128 ? 0x40u : (text >> (code & 31u) & 1u) != 0 ? 0x10u : 0;
     attributes |= (read_only ? 1u : 0u) | (there ? 0u : 2u);
     out[0] = (uint8_t)attributes;
     out[1] = 0;

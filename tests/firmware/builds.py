@@ -48,6 +48,13 @@ def host() -> Path:
     return BUILD / "host" / "teds-node"
 
 
+def host_psa() -> Path:
+    """The host port over the PSA Crypto API, built."""
+    need("make", "gcc", headers=("psa/crypto.h",))
+    make("psa")
+    return BUILD / "host" / "teds-node-psa"
+
+
 def library(max_message: int = 1024, staging: int = 4096) -> Path:
     """The node over flash in memory, built for these sizes."""
     need("make", "gcc")

@@ -11,6 +11,8 @@ from tests.bench import make_station
 from tests.e2e.desk import Desk, Running, Station
 from tests.firmware import builds
 
+ANGLE_CHANNELS = "1 sensor 0 2 100000\n"
+
 
 @dataclass
 class CNode:
@@ -20,18 +22,20 @@ class CNode:
     program: Path
     flash: Path
     uuid: str
-    channels: str = ""
+    channels: str = ANGLE_CHANNELS
     ready: dict[str, Any] = field(default_factory=dict)
     process: Running | None = None
 
-    def start(self, *options: object, can: str | None = None) -> CNode:
+    def start(self, *options: object, can: str | None = None, cwd: Path | None = None) -> CNode:
         """Power on, and wait until it is on the bus."""
         words: list[object] = ["--flash", self.flash, "--can", can or self.desk.links.can, "--uuid", self.uuid]
         if self.channels:
             table = self.flash.with_suffix(".channels")
             table.write_text(self.channels)
             words += ["--channels", table]
-        self.process = self.desk.start(*words, *options, program=(str(self.program),), fork=False)
+        self.process = self.desk.start(
+            *words, *options, program=(str(self.program),), fork=False, cwd=cwd or self.desk.folder
+        )
         (self.ready,) = self.process.wait_for_lines(1)
         assert self.ready["ready"] is True
         assert self.ready["uuid"] == self.uuid

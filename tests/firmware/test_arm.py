@@ -68,9 +68,9 @@ def test_no_function_of_the_library_calls_itself_or_has_an_array_of_variable_len
     for report in (arm / "m4-full").glob("*.ci"):
         for source, target in re.findall(r'sourcename: "([^"]+)" targetname: "([^"]+)"', report.read_text()):
             calls.setdefault(source.split(":")[-1], set()).add(target.split(":")[-1])
-    for name in calls:
+    for name, called in calls.items():
         seen: set[str] = set()
-        ahead = set(calls[name])
+        ahead = set(called)
         while ahead:
             each = ahead.pop()
             seen.add(each)

@@ -9,12 +9,14 @@ import pytest
 
 from teds_provision.protocol.announce import default_can_address
 from tests.e2e.desk import ANGLE, Desk, Station, results
+from tests.firmware import builds
 from tests.firmware.conftest import CNode
 from tests.handover.desk import Pair
 
 pytestmark = pytest.mark.system
 
-ANGLE_CHANNELS = "1 sensor 0 2 100000\n"
+OF_OTHER_LINKS = {"nfc-wait-time", "nfc-wtx", "confirm-elsewhere", "operate-lease"}
+"""What a node with a bus alone cannot show; Operate wants a Channel TEDS that fits, which a factory node has not."""
 
 
 @pytest.mark.parametrize("fd", [False, True], ids=["classic", "fd"])
@@ -36,7 +38,7 @@ def test_it_is_provisioned_verified_rotated_and_reset(desk: Desk, station: Stati
     assert (done["uuid"], done["verdict"]) == (node.uuid, "authentic")
     assert station.ask("agree", node.uuid, "--rotate", *links)["epoch"] == 2
     assert station.ask("verify", node.uuid, *links)["verdict"] == "authentic"
-    assert station.ask("reset", node.uuid, "--yes", *links)["receipt"]
+    assert station.ask("reset", node.uuid, "--yes", *links)["uuid"] == node.uuid
     assert station.provision("can", "--profile", ANGLE)["verdict"] == "authentic"
 
 
@@ -56,9 +58,9 @@ def test_what_it_holds_outlives_its_power(desk: Desk, station: Station, node: CN
     assert again["state"] == "factory"
 
 
+@pytest.mark.realtime
 @pytest.mark.parametrize("kind", ["periodic", "free"])
 def test_its_stream_loses_nothing(desk: Desk, station: Station, node: CNode, kind: str) -> None:
-    node.channels = ANGLE_CHANNELS
     node.start("--source", "sine:2")
     links = desk.links.over("can")
     assert station.provision("can", "--profile", ANGLE)["verdict"] == "authentic"
@@ -71,6 +73,21 @@ def test_its_stream_loses_nothing(desk: Desk, station: Station, node: CNode, kin
     assert values >= 900
     assert messages >= 20
     assert (lost, late, bad) == (0, 0, 0)
+
+
+def test_its_identity_key_may_lie_in_psa_and_never_leave_it(desk: Desk, station: Station, node: CNode) -> None:
+    """By Mbed TLS: a key of one use each, agreed with one-time keys; what it signs is known again after a restart."""
+    node.program = builds.host_psa()
+    node.start(cwd=desk.folder)
+    links = desk.links.over("can")
+    checked = station.ask("node", "check", "--factory", "--yes", *links)
+    assert (checked["failed"], checked["skipped"]) == (0, len(OF_OTHER_LINKS))
+    assert station.provision("can", "--profile", ANGLE)["verdict"] == "authentic"
+    fingerprint = node.ready["fingerprint"]
+    node.kill()
+    node.start(cwd=desk.folder)
+    assert node.ready["fingerprint"] == fingerprint
+    assert station.ask("verify", node.uuid, *links)["verdict"] == "authentic"
 
 
 @pytest.mark.parametrize("mode", ["copy", "move"])

@@ -1,7 +1,11 @@
 /* teds-node: a node of the profile as a program, for benches and tests. */
 #define _GNU_SOURCE
 #include "host.h"
+#ifdef TEDS_HOST_PSA
+#include "teds_psa.h"
+#else
 #include "teds_bearssl.h"
+#endif
 
 #include <errno.h>
 #include <poll.h>
@@ -13,7 +17,9 @@
 #include <time.h>
 
 typedef struct board {
+#ifndef TEDS_HOST_PSA
     teds_bearssl crypto; /* first: the port of BearSSL looks here */
+#endif
     host_flash flash;
     host_channels channels;
     host_bus bus;
@@ -128,7 +134,10 @@ static void fill_port(teds_port *port, board *own)
     port->now = port_now;
     port->step = 1;
     port->drift = 50;
+#ifndef TEDS_HOST_PSA
     teds_bearssl_fill(port);
+    own->crypto.random = port_random;
+#endif
     port->channels = own->channels.table;
     port->channel_count = own->channels.count;
     port->sample = port_sample;
@@ -136,7 +145,6 @@ static void fill_port(teds_port *port, board *own)
     port->set = port_set;
     port->set_point = port_set_point;
     port->safe = port_safe;
-    own->crypto.random = port_random;
 }
 
 /* -- options --------------------------------------------------------------------------------------------------------------- */
@@ -293,6 +301,12 @@ int main(int count, char **words)
         return 2;
     }
     fill_port(&port, &own);
+#ifdef TEDS_HOST_PSA
+    if (teds_psa_fill(&port, true) != 0) {
+        (void)fprintf(stderr, "PSA Crypto does not start.\n");
+        return 1;
+    }
+#endif
     config.quick_points = true;
     if (given.uuid != NULL ? read_uuid(given.uuid, config.uuid) != 0 : port_random(&own, config.uuid, 10) != 0) {
         return usage();
