@@ -61,6 +61,15 @@ def test_an_id_that_came_before_with_other_content(pair: Pair) -> None:
     assert everything(pair.south) == before
 
 
+def test_another_key_of_the_epoch_in_use_is_refused(pair: Pair) -> None:
+    """Two keys of one epoch cannot both be the node's: one of the two stations was told a lie."""
+    bundle, _ = pair.export("copy")
+    pair.south.keys.add_pending(pair.board.uuid, key=bytes(16), key_id=b"another!", epoch=1)
+    pair.south.keys.promote(pair.board.uuid, b"another!".hex())
+    with pytest.raises(PolicyRefused, match="another key of epoch 1 is in use here"):
+        pair.take(bundle)
+
+
 def test_an_older_epoch_than_the_stores_is_refused(pair: Pair) -> None:
     old, _ = pair.export("copy")
     with talk(pair.board) as node:

@@ -12,7 +12,8 @@ from teds_provision.errors import BadData, NotAuthentic, PolicyRefused, UsageFai
 from teds_provision.handover.incoming import ImportPlan, plan_import, prove_node, proven_of
 from teds_provision.handover.outgoing import ExportOrder, export_bundle, plan_export
 from teds_provision.handover.pending import content_digest
-from teds_provision.steps.agree import agree
+from teds_provision.steps.address import set_address
+from teds_provision.steps.agree import agree, open_session
 from teds_provision.steps.identify import identify
 from teds_provision.steps.read import read_image
 from teds_provision.steps.verify_node import verify_node
@@ -174,3 +175,12 @@ def test_a_move_under_way_is_not_sealed_again_with_a_node_that_was_revoked_or_fo
     with pytest.raises(PolicyRefused, match="is revoked" if revoked else "no key of it is held here") as refused:
         plan_export(pair.north, ExportOrder((pair.south.name,), None, "move"))
     assert "handover undo" in (refused.value.hint or "")
+
+
+def test_no_command_opens_a_session_under_a_key_that_rests(pair: Pair) -> None:
+    """``address`` asks for nothing but a session; every other command is refused before."""
+    pair.export("move")
+    with talk(pair.board) as node, pytest.raises(PolicyRefused, match="was moved to station"):
+        open_session(pair.north, node)
+    with talk(pair.board) as node, pytest.raises(PolicyRefused, match="was moved to station"):
+        set_address(pair.north, node, 33)

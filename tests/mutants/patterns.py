@@ -49,13 +49,13 @@ PATTERNS = (
         "station.keys.rotation_due(node.uuid) is not None",
         "False",
     ),
-    Pattern("only a tap pins", "_pin_for", "node.tapped", "True", "tests/steps/test_pinning.py"),
+    Pattern("only a tap pins", "_pin_for", "node.tapped", "True", "tests/steps/test_agree.py"),
     Pattern(
         "only a new node's bus pins",
         "_pin_for",
         "who.state == NodeState.FACTORY and node.wired",
         "node.wired",
-        "tests/steps/test_pinning.py",
+        "tests/steps/test_agree.py",
     ),
     Pattern("a held-back Confirm finds its key", "NodeKeys.outdated", "other.created >= late", "False"),
     Pattern("eight pending keys", "NodeKeys.add_pending", "pending[MAX_PENDING - 1:]", "[]"),
@@ -97,7 +97,7 @@ PATTERNS = (
         "a receipt closes its own move",
         "_delete_what_left",
         "tombstone is None or tombstone.handover_id != row.id",
-        "tombstone is None",
+        "False",
         "tests/handover/test_hostile_stations.py",
     ),
     Pattern("a receipt deletes the key of its bundle", "_delete_what_left", "key.key_id == in_bundle", "True"),
@@ -121,9 +121,6 @@ PATTERNS = (
     Pattern("Confirm comes in its session", "Agreeing.confirm", "pending.session is not origin.session", "False"),
     Pattern("the node keeps one CA", "Agreeing.request", "flash.ca is not None and request.ca != flash.ca", "False"),
     Pattern(
-        "the first CA stays", "Agreeing.confirm", "flash.ca is None", "True", "tests/protocol/test_tim_agreement.py"
-    ),
-    Pattern(
         "a sequence grows",
         "verified_commit",
         "0 < ahead <= datasheet.SEQUENCE_WINDOW",
@@ -145,7 +142,7 @@ PATTERNS = (
         "_require_newer",
         "signed.key_epoch != identity.epoch",
         "False",
-        "tests/steps/test_by_hand.py",
+        "tests/steps/test_verify.py",
     ),
     Pattern(
         "write asks before a jump",
@@ -165,7 +162,7 @@ PATTERNS = (
         "sign",
         "number > node_sequence",
         "True",
-        "tests/steps/test_provision.py",
+        "tests/steps/test_verify.py",
     ),
     # measuring and the service
     Pattern(

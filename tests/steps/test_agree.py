@@ -71,6 +71,19 @@ def test_rotation_gives_a_new_key_over_any_link(station: Station, board: Board) 
     assert held(station, board) == [("active", 2)]
 
 
+def test_over_a_bus_a_node_that_has_a_key_is_never_pinned(station: Station, board: Board) -> None:
+    """Its entry knows the UUID alone, which anyone on a bus can show."""
+    whitelist(station, board)
+    run(station, board)
+    whitelist(station, board)
+    with pytest.raises(PolicyRefused, match="only a tap can pin its key"):
+        run(station, board, MemoryLink(board, via="can", tapped=False), rotate=True)
+    entry = station.pins.entry(board.uuid)
+    assert entry is not None
+    assert entry.fingerprint is None
+    assert run(station, board, rotate=True).epoch == 2
+
+
 def test_a_board_that_replaces_another_begins_at_its_own_epoch(station: Station, board: Board) -> None:
     """The operator let the old pin go: epoch 2 was the old board's, the new one offers 1."""
     whitelist(station, board)

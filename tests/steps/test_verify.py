@@ -7,23 +7,27 @@ from pathlib import Path
 
 import pytest
 
-from teds_provision.errors import NotWhitelisted
+from teds_provision.errors import NotWhitelisted, PolicyRefused
 from teds_provision.protocol.datasheet import sign_datasheet
 from teds_provision.protocol.keys import SoftwareKey, fingerprint, station_key_message
 from teds_provision.protocol.messages.identity import Identity
 from teds_provision.station.station import Station
 from teds_provision.steps.agree import agree, require_session
+from teds_provision.steps.build import build
 from teds_provision.steps.identify import identify
 from teds_provision.steps.read import read_image
+from teds_provision.steps.sign import known_node_keys, sign
 from teds_provision.steps.verify import Known, Verified, known_of, verify_image
 from teds_provision.steps.verify_node import verify_node
+from teds_provision.steps.visits.sign_command import SignOrder, sign_image
+from teds_provision.steps.write import write
 from teds_provision.store import TrustRecord
 from teds_provision.teds.codec import security
 from teds_provision.teds.codec.frame import frame
 from teds_provision.teds.image import SECURITY, Image
 from tests.bench import Board, make_station, talk
 
-from .test_provision import run
+from .test_provision import ANGLE, run
 
 
 @pytest.fixture
@@ -152,8 +156,6 @@ def test_a_key_that_its_node_did_not_sign_for_this_uuid_is_not_authentic(station
 
 def test_a_file_is_judged_alone(station: Station, board: Board, image: Image) -> None:
     """An older datasheet from an archive is as authentic as on its first day; what does not apply does no harm."""
-    from .test_provision import ANGLE
-
     run(station, board, order=replace(ANGLE, name="renamed"))
     assert verdict(station, image) == "authentic"
     skipped = {check.name for check in verify_image(station, image) if check.result == "skipped"}
@@ -232,19 +234,13 @@ def test_what_a_stranger_signed_is_no_floor_for_sequence_and_epoch(
 
 
 def test_what_is_not_whitelisted_cannot_be_signed(station: Station, board: Board, image: Image) -> None:
-    from teds_provision.steps.visits.sign_command import SignOrder, sign_image
-
     station.pins.remove(board.uuid)
     with pytest.raises(NotWhitelisted):
         sign_image(station, SignOrder(board.uuid, image), None)
 
 
 def test_the_same_build_signed_as_draft_and_as_file_has_one_signature(station: Station, board: Board) -> None:
-    from teds_provision.steps.build import build
-    from teds_provision.steps.visits.sign_command import SignOrder, sign_image
-
     from .test_agree import whitelist
-    from .test_provision import ANGLE
 
     whitelist(station, board)
     with talk(board) as node:
@@ -255,3 +251,29 @@ def test_the_same_build_signed_as_draft_and_as_file_has_one_signature(station: S
     assert (second.signature, second.sequence, second.reused) == (first.signature, 1, True)
     again = sign_image(station, SignOrder(board.uuid), None).signed
     assert (again.signature, again.reused) == (first.signature, True)
+
+
+def test_a_draft_that_is_not_above_the_nodes_sequence_is_signed_anew(station: Station, board: Board) -> None:
+    """Another station has written meanwhile: the signature says the same, and the node would not take it."""
+    run(station, board)
+    built = build(station, board.uuid, replace(ANGLE, name="renamed")).image
+    draft = sign_image(station, SignOrder(board.uuid), None).signed
+    keys = known_node_keys(station, board.uuid, draft.image)
+    earlier = [draft.image.blocks[SECURITY]]
+    above = sign(station, keys, built, epoch=1, node_sequence=draft.sequence - 1, earlier=earlier)
+    assert (above.sequence, above.reused) == (draft.sequence, True)
+    anew = sign(station, keys, built, epoch=1, node_sequence=draft.sequence, earlier=earlier)
+    assert (anew.sequence, anew.reused) == (draft.sequence + 1, False)
+
+
+def test_a_datasheet_signed_before_a_rotation_is_refused_before_anything_is_staged(
+    station: Station, board: Board
+) -> None:
+    run(station, board)
+    build(station, board.uuid, replace(ANGLE, name="renamed"))
+    draft = sign_image(station, SignOrder(board.uuid), None).signed
+    with talk(board) as node:
+        agree(station, node, identify(station, node), rotate=True)
+        with pytest.raises(PolicyRefused, match="epoch") as refused:
+            write(station, node, draft.image)
+    assert refused.type is PolicyRefused, "said here, not by the node after its flash was written"
