@@ -18,7 +18,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 MODEL = Path(__file__).with_name("keys_life.pml")
-SECONDS = 1500
+SECONDS = 3000
+SAMPLE_MINUTES = 10
 
 
 @dataclass(frozen=True)
@@ -109,7 +110,8 @@ def check(run: Run, folder: Path) -> Outcome:
     memory = ["-DHC4"] if run.whole else ["-DBITSTATE"]
     _call(["cc", "-O0" if run.small else "-O2", "-DSAFETY", *memory, "-DMEMLIM=8000", "-o", "pan", "pan.c"], folder)
     table = 31 if not run.whole else 20 if run.small else 25
-    said = _call(["./pan", "-m100000", f"-w{table}"], folder)
+    limit = [] if run.whole else [f"-Q{SAMPLE_MINUTES}"]
+    said = _call(["./pan", "-m100000", f"-w{table}", *limit], folder)
     if "max search depth too small" in said or "out of memory" in said:
         raise RuntimeError("the search was cut short:\n" + said)
     errors = re.search(r"errors: (\d+)", said)
