@@ -21,14 +21,11 @@ from teds_provision.protocol.fingerprints import read_fingerprint
 
 if TYPE_CHECKING:
     from teds_provision import client
-else:  # HTTP: only where a base station runs
-    client = late("teds_provision.client")
-
-if TYPE_CHECKING:
     from teds_provision.links import Trace
     from teds_provision.trace import recorder
-else:  # most runs have no trace
-    recorder = late("teds_provision.trace.recorder")
+else:
+    client = late("teds_provision.client")  # HTTP: only where a base station runs
+    recorder = late("teds_provision.trace.recorder")  # most runs have no trace
 
 Function = TypeVar("Function", bound=Callable[..., Any])
 

@@ -17,69 +17,69 @@ class Entry(NamedTuple):
 
 
 SECTIONS: Final[dict[str, dict[str, Entry]]] = {
+    "Start here": {
+        "init": Entry("init", "init", "Create this station's identity and CA key, or show them."),
+        "provision": Entry(
+            "provision", "provision", "Identify, whitelist, key, sign, write and verify a node in one go."
+        ),
+        "verify": Entry("verify", "verify", "Check a node or image against everything the profile demands."),
+        "nodes": Entry("nodes", "nodes", "Show what this station knows about its nodes."),
+        "measure": Entry("measure", "measure", "Stream calibrated values from nodes to files and topics."),
+        "ncap run": Entry("ncap", "ncap", "Run the base station as a service, with API and web page."),
+    },
     "Set up": {
-        "init": Entry("station.init", "init", "Make this base station's identity and CA key, or show them."),
-        "trust": Entry("handover.trust", "trust", "Public keys of other stations and CAs that count here."),
-        "profile": Entry("profile", "profile", "Datasheets by transducer type: list, show, check, new."),
-        "config": Entry("station.config", "config", "What is set in config.toml and the environment: show, path."),
-        "completion": Entry("station.config", "completion", "What a shell needs to complete command lines."),
-        "doctor": Entry("station.doctor", "doctor", "Look at reader, CAN, keyring, clock and store: cause and fix."),
+        "trust": Entry("trust", "trust", "Manage trusted public keys of other stations and CAs."),
+        "profile": Entry("profile", "profile", "List, show, check and create transducer types."),
+        "config": Entry("config", "config", "Show the settings in config.toml and the environment."),
+        "completion": Entry("config", "completion", "Print the script that completes commands in your shell."),
+        "doctor": Entry("doctor", "doctor", "Check reader, CAN, keyring, clock and store; suggest fixes."),
     },
     "Nodes": {
-        "provision": Entry(
-            "steps.provision", "provision", "All of it in one: identify, whitelist, agree, build, sign, write, verify."
-        ),
-        "identify": Entry(
-            "steps.identify", "identify", "Wait for a tap; read UUID and key, and have the node prove it."
-        ),
-        "whitelist": Entry("steps.whitelist", "whitelist", "The nodes that may be keyed and written."),
-        "agree": Entry("steps.agree", "agree", "Agree on a key with a node, or rotate it."),
-        "build": Entry("steps.build", "build", "Build a node's datasheet from its profile and calibration."),
-        "sign": Entry("steps.sign", "sign", "Sign a built datasheet; say what changes on the node."),
-        "write": Entry("steps.write", "write", "Write a signed datasheet to the node's flash, commit, read back."),
-        "draft": Entry("steps.history", "draft", "What was built and not written: list, drop."),
-        "history": Entry("steps.history", "history", "The datasheets that a node had; write --from brings one back."),
-        "verify": Entry("steps.verify", "verify", "Check a node or an image against everything the profile demands."),
-        "read": Entry("steps.read", "read", "Read every TEDS of a node."),
-        "reset": Entry("steps.reset", "reset", "Take a node back to factory state, with its signed receipt."),
-        "address": Entry("steps.address", "address", "Give a node another CAN address."),
-        "nodes": Entry("station.nodes", "nodes", "What this station knows of its nodes."),
-        "label": Entry("station.nodes", "label", "A label for a board: QR code and text of UUID and fingerprint."),
-        "log": Entry("station.log", "log", "The audit log, and whether its hash chain holds."),
-        "trace": Entry("trace", "trace", "What --trace wrote, in words: show."),
+        "identify": Entry("identify", "identify", "Wait for a tap, read UUID and key, and have the node prove it."),
+        "whitelist": Entry("whitelist", "whitelist", "Manage the nodes that may be keyed and written."),
+        "agree": Entry("agree", "agree", "Agree on a key with a node, or rotate it."),
+        "build": Entry("build", "build", "Build a node's datasheet from its profile and calibration."),
+        "sign": Entry("build", "sign", "Sign a built datasheet and show what changes on the node."),
+        "write": Entry("build", "write", "Write a signed datasheet to a node's flash and read it back."),
+        "draft": Entry("build", "draft", "List and drop datasheets that were built but not written."),
+        "history": Entry("build", "history", "List a node's earlier datasheets; write --from restores one."),
+        "read": Entry("build", "read", "Read every TEDS of a node."),
+        "reset": Entry("agree", "reset", "Reset a node to factory state and keep its signed receipt."),
+        "address": Entry("agree", "address", "Change a node's CAN address."),
+        "label": Entry("nodes", "label", "Make a label with QR code, UUID and fingerprint."),
+        "log": Entry("log", "log", "Show the audit log and check its hash chain."),
+        "trace": Entry("trace", "trace", "Show what --trace recorded."),
         "show": Entry("show", "show", "Decode TEDS, images, profiles, bundles and messages."),
     },
-    "Measure": {
-        "measure": Entry("measure.measure", "measure", "Stream nodes or a group into files and topics, calibrated."),
-        "sample": Entry("measure.values", "sample", "One reading now, verified and calibrated."),
-        "set": Entry("measure.values", "set_value", "Operate an actuator within its limits; let go: safe state."),
-        "mode": Entry("measure.values", "mode", "What a node claims and does."),
-        "ncap": Entry("ncap.group", "ncap", "The base station as a service, with a page: run, status, open, token."),
-        "group": Entry("measure.group", "group", "Measurement groups: create, add, remove, delete, list."),
-        "names": Entry("measure.names", "names", "Topics under which channels are published: list, set, reset."),
+    "Measure and actuate": {
+        "sample": Entry("sample", "sample", "Take one verified, calibrated reading."),
+        "set": Entry("sample", "set_value", "Drive an actuator within its limits; it returns to its safe state."),
+        "mode": Entry("sample", "mode", "Show or change a node's operating mode."),
+        "ncap": Entry("ncap", "ncap", "Run and control the base station service."),
+        "group": Entry("group", "group", "Manage groups of nodes that are measured together."),
+        "names": Entry("names", "names", "Choose the topics under which channels are published."),
     },
-    "A key's life": {
-        "export-keys": Entry(
-            "handover.export_keys", "export_keys", "Hand node keys to another base station in a sealed bundle."
-        ),
-        "import-keys": Entry("handover.import_keys", "import_keys", "Take node keys over from another base station."),
-        "handover": Entry("handover.pending", "handover", "Handovers under way: list, receipt, undo."),
-        "revoke": Entry("handover.life", "revoke", "Ban a node's key, here and where bundles from here go."),
-        "decommission": Entry("handover.life", "decommission", "Reset a node and take it out of service."),
-        "replace": Entry("handover.life", "replace", "Put a spare in the place of a broken node."),
-        "backup": Entry("station.backup", "backup", "Write the whole store to a sealed file."),
-        "vault": Entry("station.vault", "vault", "A new passphrase or PIN; a new master key over every node key."),
-        "unlock": Entry("station.unlock", "unlock", "Hold the vault open for a while, in memory alone."),
-        "lock": Entry("station.unlock", "lock", "Close the vault that unlock holds open."),
-        "restore": Entry("station.backup", "restore", "Bring a sealed store back; no epoch or sequence goes back."),
+    "Keys and backup": {
+        "export-keys": Entry("export_keys", "export_keys", "Hand node keys to another station in a sealed bundle."),
+        "import-keys": Entry("import_keys", "import_keys", "Take over node keys from another station."),
+        "handover": Entry("handover", "handover", "List, confirm and undo key handovers."),
+        "revoke": Entry("life", "revoke", "Ban a node's key on this station and those it hands keys to."),
+        "decommission": Entry("life", "decommission", "Reset a node and take it out of service."),
+        "replace": Entry("life", "replace", "Replace a broken node with a spare."),
+        "backup": Entry("backup", "backup", "Back up the whole store to a sealed file."),
+        "restore": Entry("backup", "restore", "Restore a backup; no epoch or sequence ever goes back."),
+        "vault": Entry("vault", "vault", "Change the passphrase or PIN, or rewrap every node key."),
+        "unlock": Entry("vault", "unlock", "Keep the vault unlocked in memory for a while."),
+        "lock": Entry("vault", "lock", "Lock the vault again."),
     },
-    "Try it": {
-        "demo": Entry("station.demo", "demo", "Two stations and a virtual node on this machine, start to end."),
-        "node": Entry("node.group", "node", "A virtual transducer: create, run; check a board."),
+    "Try it out": {
+        "demo": Entry("demo", "demo", "Run two stations and a virtual node on this machine, start to finish."),
+        "node": Entry("node", "node", "Create and run virtual nodes; check a real board's firmware."),
     },
 }
+"""What ``--help`` lists; a name of two words is a line of help only: its first word stands below as a command."""
 
-COMMANDS: Final = {name: entry for section in SECTIONS.values() for name, entry in section.items()}
+COMMANDS: Final = {name: entry for section in SECTIONS.values() for name, entry in section.items() if " " not in name}
 GROUPS: Final = frozenset(
     {"draft", "vault", "group", "trace", "trust", "config", "profile", "whitelist", "handover", "node", "ncap", "names"}
 )

@@ -135,7 +135,7 @@ def test_a_command_that_is_missing_shows_the_help(words: list[str], path: str) -
 
 @pytest.mark.parametrize(
     ("typed", "offered"),
-    [("teds-provision pro", ["profile", "provision"]), ("teds-provision provision --via c", ["can"])],
+    [("teds-provision pro", ["provision", "profile"]), ("teds-provision provision --via c", ["can"])],
 )
 def test_a_shell_is_told_how_a_line_goes_on(typed: str, offered: list[str]) -> None:
     asked = {"_TEDS_PROVISION_COMPLETE": "bash_complete", "COMP_WORDS": typed}

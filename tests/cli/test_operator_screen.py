@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import pytest
 from rich.console import Console
 
-from teds_provision.cli.steps.screen import OperatorScreen, Watched
+from teds_provision.cli.provision import OperatorScreen, Watched
 from teds_provision.errors import NodeSilent, TedsProvisionError
 from teds_provision.steps.build_order import BuildOrder, Prepared
 from teds_provision.steps.many.board import Board, Declined

@@ -10,8 +10,8 @@ import pytest
 from rich.spinner import Spinner
 
 from teds_provision.cli.context import App
+from teds_provision.cli.provision import _questions
 from teds_provision.cli.rendering import LiveReporter, tidy
-from teds_provision.cli.steps.provision import _questions
 from teds_provision.errors import NotAuthentic
 from teds_provision.links import Notice
 from teds_provision.links.nfc.message import Record

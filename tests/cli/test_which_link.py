@@ -10,8 +10,8 @@ import click
 import pytest
 
 from teds_provision.cli.configuration import Defaults
-from teds_provision.cli.measure.values import over_the_bus
 from teds_provision.cli.options import link_options
+from teds_provision.cli.sample import over_the_bus
 from teds_provision.errors import TedsProvisionError
 from teds_provision.links import LinkSettings
 from teds_provision.links.nfc import reader

@@ -1,4 +1,4 @@
-"""``ncap run``: the daemon in the foreground, for a terminal or for systemd."""
+"""``ncap``: the base station as a service: run it, query it through the socket in its home, manage API tokens."""
 
 from __future__ import annotations
 
@@ -10,21 +10,30 @@ from collections import deque
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import replace
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 import click
 
+from teds_provision import client
 from teds_provision.cli.configuration import brokers_of, config_path
 from teds_provision.cli.context import App, pass_app, to_json
-from teds_provision.cli.options import FileToRead, WholeNumber, command, tracing
+from teds_provision.cli.options import COMMAND_SETTINGS, FileToRead, WholeNumber, command, examples, tracing
+from teds_provision.cli.rendering import shown
 from teds_provision.errors import UsageFailure
 from teds_provision.lazy import how_to_install, late
+from teds_provision.store.records import iso
 
 if TYPE_CHECKING:
+    from rich.console import Console
+
     from teds_provision.ncap import running, settings
+    from teds_provision.ncap.web import tokens
 else:
     running, settings = late("teds_provision.ncap.running"), late("teds_provision.ncap.settings")
+    tokens = late("teds_provision.ncap.web.tokens")
+
 
 MOST: Final = 1000  # lines that may wait for somebody to read them
 LEAVING: Final = 2.0  # seconds for them to leave at the end
@@ -173,3 +182,136 @@ def _sentence(event: dict[str, Any]) -> str:
 
 def _text(value: Any) -> str:
     return str(value.get("message", value)) if isinstance(value, dict) else str(value)
+
+
+@click.group(
+    context_settings=COMMAND_SETTINGS,
+    epilog=examples(
+        "teds-provision ncap run --http 127.0.0.1:8351 --can socketcan:can0",
+        "teds-provision ncap open",
+        "teds-provision ncap status",
+    ),
+)
+def ncap() -> None:
+    """The base station as a service: finds nodes, measures what it shall, serves a page and an API."""
+
+
+@command("teds-provision ncap status", name="status")
+@pass_app
+def status(app: App) -> None:
+    """Show what the running base station does."""
+    with client.connect(home=app.home) as station:
+        found = {**station.status(), "nodes": station.nodes()}
+    app.emit(found, lambda console: _status(console, found))
+
+
+def _status(console: Console, found: dict[str, Any]) -> None:
+    served = found["url"] or "no page; start it with --http"
+    console.print(f"{found['station']['name']}: {found['detection']} mode, {served}", markup=False)
+    for link in found["links"]:
+        console.print(_link(link), markup=False)
+    for node in found["nodes"]:
+        there = "there" if node["present"] else "away"
+        name = shown(node["name"]) or "no name"
+        console.print(f"{node['uuid']}  {name}  {there}  {_verdict(node)}", markup=False)
+    for one in found.get("measurements", ()):
+        console.print(f"measurement {one['id']}: {one['state']}", markup=False)
+    for one in found.get("sinks", ()):
+        console.print(f"{shown(one['name'])}: {one['state']}, {one['dropped']} dropped", markup=False)
+
+
+def _verdict(node: dict[str, Any]) -> str:
+    if node["verdict"] is None:
+        return "not looked at yet"
+    kept = " (all but its Security TEDS as last read)" if node["verdict"]["from"] == "kept" else ""
+    return f"{node['verdict']['verdict']}{kept}"
+
+
+def _link(link: dict[str, Any]) -> str:
+    problem = f": {link['problem']['message']}" if link["problem"] else ""
+    others = f", {link['strangers']} not on the whitelist" if link["strangers"] else ""
+    return f"{link['place']}: {link['state']}, {link['nodes']} nodes{others}{problem}"
+
+
+@command("teds-provision ncap detection transparent", name="detection")
+@click.argument("mode", type=click.Choice(["transparent", "whitelist"]))
+@pass_app
+def detection(app: App, mode: str) -> None:
+    """Set which nodes are taken up: all, or those on the whitelist."""
+    with client.connect(home=app.home) as station:
+        now = station.set_detection(mode)
+    app.emit({"detection": now}, f"Detection: {now}.")
+
+
+@command("teds-provision ncap open", "teds-provision ncap open --read-only", name="open")
+@click.option("--read-only", is_flag=True, help="For somebody who shall see and change nothing.")
+@pass_app
+def open_page(app: App, *, read_only: bool) -> None:
+    """Print the page's address, with a token that works once.
+
+    It is good for five minutes.
+    """
+    with client.connect(home=app.home) as station:
+        url = station.login_url(read_only=read_only)
+    app.emit({"url": url}, url)
+
+
+@click.group(
+    context_settings=COMMAND_SETTINGS,
+    epilog=examples("teds-provision ncap token add plotter --read-only", "teds-provision ncap token list"),
+)
+def token() -> None:
+    """Tokens for scripts: add, list, remove. Only their digests are kept."""
+
+
+@command("teds-provision ncap token add plotter --read-only", name="add")
+@click.argument("name")
+@click.option("--read-only", is_flag=True, help="It may read and change nothing.")
+@pass_app
+def add(app: App, name: str, *, read_only: bool) -> None:
+    """Make a token and print it, once.
+
+    Send it as `Authorization: Bearer TOKEN`.
+    """
+    app.station()
+    made = tokens.Tokens(app.home).add(name, read_only=read_only)
+    app.emit({"name": name, "token": made, "read_only": read_only}, made)
+
+
+@command("teds-provision ncap token list", name="list")
+@pass_app
+def list_tokens(app: App) -> None:
+    """List every token that is good now, those of browsers too."""
+    app.station()
+    found = [
+        {
+            "name": one.name,
+            "kind": one.kind,
+            "read_only": one.read_only,
+            "created": iso(datetime.fromtimestamp(one.created, UTC)),
+            "until": iso(datetime.fromtimestamp(one.until, UTC)) if one.until else None,
+        }
+        for one in tokens.Tokens(app.home).all()
+    ]
+    lines = [f"{one['name']}  {one['kind']}{'  read-only' if one['read_only'] else ''}" for one in found]
+    app.emit({"tokens": found}, "\n".join(lines) or "There is no token. Make one: teds-provision ncap token add NAME")
+
+
+@command("teds-provision ncap token remove plotter", name="remove")
+@click.argument("name")
+@pass_app
+def remove(app: App, name: str) -> None:
+    """Take a token away.
+
+    Who uses it is refused from now on; the name `browser` logs every browser out.
+    """
+    app.station()
+    gone = tokens.Tokens(app.home).remove(name)
+    app.emit({"removed": name, "count": gone}, f"Removed: {name}.")
+
+
+for one in (add, list_tokens, remove):
+    token.add_command(one)
+
+for one in (run, status, detection, open_page, token):
+    ncap.add_command(one)

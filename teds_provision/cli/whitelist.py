@@ -10,10 +10,10 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from teds_provision import steps
+from teds_provision.cli.build import write_file
 from teds_provision.cli.context import App, pass_app
 from teds_provision.cli.options import COMMAND_SETTINGS, dry_run_option, examples, fingerprint_option, yes_option
 from teds_provision.cli.rendering import local_time, print_json_list, shown
-from teds_provision.cli.steps.build import write_file
 from teds_provision.protocol.fingerprints import same_key
 from teds_provision.station.label import read_label
 

@@ -12,9 +12,9 @@ from teds_provision import backup as backup_room
 from teds_provision import handover, protocol
 from teds_provision import store as store_room
 from teds_provision import vault as vault_room
+from teds_provision.cli.build import read_file
 from teds_provision.cli.context import App, pass_app, read_line
 from teds_provision.cli.options import FileToRead, command, dry_run_option, yes_option
-from teds_provision.cli.steps.build import read_file
 from teds_provision.errors import NotFound, UsageFailure, VaultChanged, VaultFailure, WrongPassphrase
 
 if TYPE_CHECKING:

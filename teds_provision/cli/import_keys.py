@@ -15,7 +15,7 @@ import click
 from teds_provision import handover, protocol
 from teds_provision.cli import options
 from teds_provision.cli.context import App
-from teds_provision.cli.handover.export_keys import require_same
+from teds_provision.cli.export_keys import require_same
 from teds_provision.cli.options import command, dry_run_option, link_options, links_given, yes_option
 from teds_provision.cli.rendering import count_of, first_lines, reporter_for
 from teds_provision.errors import BadData, LinkFailure

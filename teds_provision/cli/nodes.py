@@ -22,9 +22,6 @@ from teds_provision.station.label import label_of, write_label
 from teds_provision.steps.inventory import STATES, inventory, search
 
 if TYPE_CHECKING:
-    from teds_provision.station.station import Station
-
-if TYPE_CHECKING:
     from rich.console import Console
 
     from teds_provision.station.station import Station

@@ -9,7 +9,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from typing import TYPE_CHECKING, Any
 
-from teds_provision import measure
+from teds_provision import measure as measure_room
 from teds_provision.cli.context import App
 from teds_provision.cli.rendering import shown, tidy
 from teds_provision.measure.blocks import Block, ChannelFacts, NodeReport, why_invalid
@@ -48,7 +48,7 @@ def watcher_for(app: App, station: Station, sinks: Sequence[Sink], stop: threadi
 
 
 def _no_station(name: str) -> StationFacts:
-    return measure.blocks.StationFacts(name)
+    return measure_room.blocks.StationFacts(name)
 
 
 class JsonLines(ThreadedSink):

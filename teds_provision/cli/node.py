@@ -1,4 +1,4 @@
-"""``node run``: virtual transducers on their links, until SIGTERM or Ctrl-C."""
+"""``node``: a virtual transducer for trying things out, for tests, and as the other side for firmware authors."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import functools
 import signal
 import threading
 from collections.abc import Callable, Sequence
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -13,9 +14,10 @@ import click
 
 from teds_provision import node as node_room
 from teds_provision import protocol, teds
+from teds_provision import teds as teds_room
+from teds_provision.cli.check import check
 from teds_provision.cli.context import App, pass_app
-from teds_provision.cli.node.actuators import ActuatorLines
-from teds_provision.cli.options import Number, WholeNumber, command
+from teds_provision.cli.options import COMMAND_SETTINGS, FileToRead, Number, WholeNumber, command, examples
 from teds_provision.errors import UsageFailure
 from teds_provision.node import ble as ble_room
 from teds_provision.node import can as can_room
@@ -23,14 +25,137 @@ from teds_provision.node import hardware as hardware_room
 from teds_provision.node import nfc as nfc_room
 
 if TYPE_CHECKING:
-    from teds_provision.cli.node.actuators import ActuatorLines
     from teds_provision.node.ble.server import BleServer
     from teds_provision.node.can.server import CanServer
     from teds_provision.node.flash_file import FlashFile
-    from teds_provision.node.hardware.board import Board
+    from teds_provision.node.hardware.board import Board, Shown
     from teds_provision.node.nfc.charging import Extras
     from teds_provision.node.virtual import LinkServer, VirtualNode
     from teds_provision.protocol.operation.streams import DataFrame
+
+
+@click.group(
+    context_settings=COMMAND_SETTINGS,
+    epilog=examples(
+        "teds-provision node create bench/finger",
+        "teds-provision node run bench/finger --nfc udp:localhost:54321 --can udp_multicast:239.74.163.2",
+    ),
+)
+def node() -> None:
+    """A virtual transducer: the whole node half of the profile, its flash in a file."""
+
+
+_NAME_OCTETS = 120
+
+
+def _uuid(_ctx: click.Context, _parameter: click.Parameter, text: str | None) -> bytes | None:
+    if text is None:
+        return None
+    try:
+        octets = bytes.fromhex(text.removeprefix("0x").removeprefix("0X"))
+    except ValueError:
+        octets = b""
+    if len(octets) != 10:
+        raise click.BadParameter("a UUID is 20 hex digits.")
+    return octets
+
+
+def _name(_ctx: click.Context, _parameter: click.Parameter, text: str) -> str:
+    try:
+        octets = len(text.encode())
+    except UnicodeEncodeError:
+        raise click.BadParameter("it is not valid text in this terminal's encoding.") from None
+    if octets > _NAME_OCTETS or not (text.isprintable() or not text):
+        raise click.BadParameter(f"a name has at most {_NAME_OCTETS} octets of printable text; this one has {octets}.")
+    return text
+
+
+@command(
+    "teds-provision node create bench/finger",
+    "teds-provision node create bench/angle --profile magnetic-angular-position-sensor --name angle",
+    "teds-provision node create bench/copy --teds angle.json",
+)
+@click.argument("folder", metavar="DIR", type=click.Path(path_type=Path, file_okay=False))
+@click.option("--uuid", callback=_uuid, metavar="HEX", help="Its UUID, 20 hex digits (default: the file's, or random).")
+@click.option("--name", default="", callback=_name, help="What its maker calls it, at most 120 octets.")
+@click.option(
+    "--teds",
+    type=FileToRead(),
+    metavar="FILE",
+    help="Its datasheet and hardware: an image, XML, JSON, hex or binary file.",
+)
+@click.option("--profile", metavar="P", help="Its datasheet and hardware: those of a transducer type.")
+@click.option(
+    "--max-message",
+    type=WholeNumber(512, 4094),
+    default=2048,
+    show_default=True,
+    metavar="OCTETS",
+    help="Length of its longest frame.",
+)
+@pass_app
+def create(
+    app: App,
+    folder: Path,
+    uuid: bytes | None,
+    name: str,
+    teds: Path | None,
+    profile: str | None,
+    max_message: int,
+) -> None:
+    """Make a virtual node in DIR, in factory state, with its own key.
+
+    With --teds or --profile the channels of that datasheet are its hardware; the TEDS lie on it unsigned.
+    """
+    if teds is not None and profile is not None:
+        raise UsageFailure("A node has one datasheet.", hint="Give --teds or --profile, not both.")
+    made = node_room.described.create(
+        folder,
+        uuid=uuid,
+        name=name,
+        max_message=max_message,
+        teds=teds,
+        profile=profile,
+        folders=teds_room.profile.default_folders(app.home),
+    )
+    flash = made.load()
+    print_of_key = protocol.keys.fingerprint(flash.node_key)
+    channels = [
+        {
+            "channel": channel.number,
+            "name": channel.name,
+            "kind": channel.kind.word if channel.kind is not None else None,
+            "unit": channel.unit.text,
+        }
+        for channel in teds_room.sheet.Sheet.of_blocks(made.hardware).channels
+    ]
+    app.emit(
+        {
+            "uuid": flash.uuid.hex(),
+            "fingerprint": print_of_key,
+            "name": made.name,
+            "can_address": flash.can_address,
+            "channels": channels,
+        },
+        f"Node {flash.uuid.hex()} in {folder}, key {print_of_key[:16]}, CAN address 0x{flash.can_address:02x}"
+        + (f", {len(channels)} channel{'' if len(channels) == 1 else 's'}." if channels else "."),
+    )
+
+
+@node.command(
+    context_settings=COMMAND_SETTINGS,
+    short_help="Reset the node in DIR by hand.",
+    epilog=examples("teds-provision node reset bench/finger"),
+)
+@click.argument("folder", metavar="DIR", type=click.Path(path_type=Path, file_okay=False))
+@pass_app
+def reset(app: App, folder: Path) -> None:
+    """Reset the node in DIR by hand (button held 5 s) while it is not running."""
+    node = node_room.virtual.VirtualNode(folder, exclusive=True)
+    node.reset_by_hand()
+    uuid = node.tim.flash.uuid.hex()
+    app.emit({"uuid": uuid, "state": "factory"}, f"Node {uuid} is back in factory state.")
+
 
 _DEFAULT_SOURCE = "noise"
 
@@ -227,3 +352,89 @@ def _extras(node: VirtualNode, air: BleServer | None) -> Extras:
         after=lambda: (charging.out_of_band_record(air.address.octets, random=True),) if air is not None else (),
         field=field,
     )
+
+
+# Virtual actuators report on stdout: at most twenty lines a second each, and always the last state.
+#
+# ``time`` is when the state began, not when the line was printed, so it shows how long a dead-man took.
+
+_EVERY_SECONDS = 0.05
+
+
+class ActuatorLines:
+    """Prints states in a thread of its own, from :meth:`start` on; the first line says where each one stands."""
+
+    def __init__(self, app: App) -> None:
+        self._app = app
+        self._news: dict[tuple[str, int], Shown] = {}
+        self._told: dict[tuple[str, int], Shown] = {}
+        self._condition = threading.Condition()
+        self._stop = threading.Event()
+        self._thread = threading.Thread(target=self._run, name="actuators", daemon=True)
+
+    def of(self, uuid: str) -> Callable[[Shown], None]:
+        """Where the board of a node tells its states."""
+
+        def shown(state: Shown) -> None:
+            with self._condition:
+                self._news[uuid, state.channel] = state
+                self._condition.notify()
+
+        return shown
+
+    def start(self) -> None:
+        """Begin to print."""
+        self._thread.start()
+
+    def stop(self) -> None:
+        """Print what is left, and end."""
+        self._stop.set()
+        with self._condition:
+            self._condition.notify()
+        if self._thread.is_alive():
+            self._thread.join(timeout=2)
+
+    def _run(self) -> None:
+        while not self._stop.is_set():
+            with self._condition:
+                while not self._news and not self._stop.is_set():
+                    self._condition.wait()
+            self._tell_news()
+            self._stop.wait(_EVERY_SECONDS)
+        self._tell_news()
+
+    def _tell_news(self) -> None:
+        with self._condition:
+            news, self._news = self._news, {}
+        for (uuid, channel), state in news.items():
+            if self._told.get((uuid, channel)) != state:
+                self._told[uuid, channel] = state
+                try:
+                    self._tell(uuid, state)
+                except OSError:  # nobody reads, or the disk is full: the node runs on
+                    self._stop.set()
+                    return
+
+    def _tell(self, uuid: str, state: Shown) -> None:
+        name = state.name or f"channel {state.channel}"
+        value = f"{state.value:g} {state.unit}".rstrip() if state.value is not None else f"raw {state.raw:g}"
+        self._app.emit(
+            {
+                "event": "actuator",
+                "uuid": uuid,
+                "channel": state.channel,
+                "name": state.name,
+                "value": state.value,
+                "unit": state.unit,
+                "raw": state.raw if state.raw == state.raw else None,
+                "safe": state.safe,
+                "time": datetime.fromtimestamp(state.time, UTC)
+                .isoformat(timespec="milliseconds")
+                .replace("+00:00", "Z"),
+            },
+            f"{uuid} {name}: {'safe state, ' if state.safe else ''}{value}",
+        )
+
+
+for one in (check, create, run):
+    node.add_command(one)

@@ -9,10 +9,10 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from teds_provision import doctor as doctor_room
+from teds_provision.cli.config import check_values
 from teds_provision.cli.configuration import config_path
 from teds_provision.cli.context import App, pass_app
 from teds_provision.cli.options import command
-from teds_provision.cli.station.config import check_values
 from teds_provision.cli.table import COMMANDS
 from teds_provision.errors import BadData
 

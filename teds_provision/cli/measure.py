@@ -15,21 +15,24 @@ from click.core import ParameterSource
 from teds_provision import links as links_room
 from teds_provision import measure as measure_room
 from teds_provision import teds
-from teds_provision.cli import measure as measure_cli
+from teds_provision.cli.build import read_file
 from teds_provision.cli.context import App, pass_app
-from teds_provision.cli.measure.values import ending, over_the_bus
 from teds_provision.cli.options import Channel, FileToRead, Number, WholeNumber, command, link_options
-from teds_provision.cli.steps.build import read_file
+from teds_provision.cli.sample import ending, over_the_bus
 from teds_provision.errors import BadData, UsageFailure
+from teds_provision.lazy import late
 from teds_provision.links import LINKS, LinkSettings, ble, can
 from teds_provision.store import Measurement
 
 if TYPE_CHECKING:
+    from teds_provision.cli import measure_view
     from teds_provision.measure.runner import Ended
     from teds_provision.measure.running.job import Job
     from teds_provision.measure.running.requirements import Requirements
     from teds_provision.measure.sinks.mcap.recover import Recovered
     from teds_provision.station.station import Station
+else:  # loads the sinks and numpy
+    measure_view = late("teds_provision.cli.measure_view")
 
 MOST_NAMED = 3
 KINDS = ("periodic", "event", "free")
@@ -174,7 +177,7 @@ def _run(app: App, job: Job, links: LinkSettings, uuids: Sequence[bytes], durati
             stack.enter_context(
                 measure_room.finding.sources.sole_user(station, buses_alone, f"measure {group or ', '.join(nodes)}")
             )
-            watcher = stack.enter_context(measure_cli.showing.watcher_for(app, station, job.sinks, stop))
+            watcher = stack.enter_context(measure_view.watcher_for(app, station, job.sinks, stop))
             stack.enter_context(ending(stop))
             buses = stack.enter_context(measure_room.finding.buses.Buses(ports, note=app.warn))
             station.audit("measure", None, "begun", nodes=nodes, group=group)

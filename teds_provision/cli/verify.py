@@ -2,21 +2,24 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 import click
 
-from teds_provision.cli import steps as steps_cli
-from teds_provision.cli.context import App, pass_app
+from teds_provision.cli.context import App, pass_app, to_json
 from teds_provision.cli.options import command, link_options, said_here
 from teds_provision.cli.rendering import print_table, reporter_for
 from teds_provision.errors import UsageFailure
+from teds_provision.harmless import printable
 from teds_provision.links import LinkSettings
-from teds_provision.steps import visits
+from teds_provision.steps import many, visits
 
 if TYPE_CHECKING:
     from rich.console import Console
 
+    from teds_provision.steps.many.verify_files import FileVerdict
     from teds_provision.steps.verify import Verified
 
 
@@ -39,10 +42,10 @@ def verify(app: App, what: tuple[str, ...], links: LinkSettings, accept_calibrat
     of several the worst.
     """
     node = len(what) == 1 and bool(said_here("via", "nfc", "can", "ble"))
-    if not node and steps_cli.verify_files.are_files(what):
+    if not node and are_files(what):
         if accept_calibration is not None:
             raise UsageFailure("--accept-calibration is for one image.", hint="Verify that one by itself.")
-        steps_cli.verify_files.verify_many(app, what)
+        verify_many(app, what)
         return
     done = visits.at_node.verify_at(
         app.station(), links, what[0], reporter_for(app), accept_calibration=accept_calibration, node=node
@@ -71,3 +74,37 @@ def _table(console: Console, verified: Verified) -> None:
     print_table(console, table)
     colour = "bold green" if verified.verdict == "authentic" else "bold red"
     console.print(f"[{colour}]{verified.uuid.hex()}: {verified.verdict}[/]")
+
+
+# ``verify FILES…|DIR``: one line per image, then the totals; exits with the worst image's code.
+
+
+def are_files(what: Sequence[str]) -> bool:
+    """Whether these words name many images rather than one image or a node."""
+    return len(what) > 1 or (len(what) == 1 and Path(what[0]).is_dir())
+
+
+def verify_many(app: App, what: Sequence[str]) -> None:
+    """Judge every file by itself; one that fails stops no other."""
+    files = many.verify_files.image_files([Path(word) for word in what])
+    totals = many.verify_files.Totals()
+    for lines, counted in many.verify_files.verify_files(app.station(), files, _json if app.json else _line):
+        totals.join(counted)
+        app.lines(lines)
+    if app.json:
+        app.emit(totals.to_json())
+    else:
+        words = ", ".join(f"{count} {word}" for word, count in sorted(totals.verdicts.items()))
+        app.lines([f"{totals.files} image{'' if totals.files == 1 else 's'}: {words}."])
+    if totals.exit_code:
+        raise click.exceptions.Exit(totals.exit_code)
+
+
+def _line(found: FileVerdict) -> str:
+    why = found.error or ("; ".join(found.warnings) if found.warnings else "")
+    text = f"{found.verdict or 'unreadable':<13}  {found.uuid or '-':<20}  {found.path}"
+    return printable(f"{text}: {why}" if why else text)
+
+
+def _json(found: FileVerdict) -> str:
+    return to_json(found.to_json())

@@ -1,0 +1,111 @@
+"""``agree``, ``reset``, ``address``: a node's key, its way back to factory state, its CAN address."""
+
+from __future__ import annotations
+
+import click
+
+from teds_provision.cli.context import App, pass_app
+from teds_provision.cli.options import command, dry_run_option, link_options, yes_option
+from teds_provision.cli.rendering import reporter_for
+from teds_provision.links import LinkSettings
+from teds_provision.protocol.announce import LAST_ADDRESS
+from teds_provision.steps import visits
+
+
+@command(
+    "teds-provision agree 8d4d --nfc udp:localhost:54321",
+    "teds-provision agree 8d4d --rotate --via can --can udp_multicast:239.74.163.2",
+)
+@click.argument("uuid")
+@click.option("--rotate", is_flag=True, help="Make a new key although there is one.")
+@yes_option
+@dry_run_option
+@link_options
+@pass_app
+def agree(app: App, uuid: str, links: LinkSettings, rotate: bool, yes: bool, dry_run: bool) -> None:
+    """Agree on a key with a whitelisted node; on a node that has one, do nothing, or --rotate it.
+
+    The first agreement needs a tap (or the bus of a node built without NFC); a rotation goes over any link. A node that
+    has a key of another station is taken over by tap, after a question, or with --rotate --yes: that one is locked out.
+    """
+
+    def confirm(question: str) -> None:
+        app.confirm(question, yes=yes and rotate, named="--rotate")
+
+    done = visits.at_node.agree_at(
+        app.station(), links, uuid, reporter_for(app), rotate=rotate, dry_run=dry_run, confirm=confirm
+    )
+    node, agreed = done.uuid.hex(), done.agreed
+    if agreed is None:
+        told = f"Plan: {done.plan} ({', '.join(done.held) or 'no key held'})."
+        app.emit({"uuid": node, "plan": done.plan, "held": list(done.held)}, told)
+        return
+    again = "." if agreed.fresh else " (nothing to do)."
+    app.emit(
+        {"uuid": node, "epoch": agreed.epoch, "key_id": agreed.key_id, "fresh": agreed.fresh},
+        f"Node {node}: key {agreed.key_id}, epoch {agreed.epoch}{again}",
+    )
+
+
+@command("teds-provision reset 8d4d --yes --nfc udp:localhost:54321")
+@click.argument("uuid")
+@yes_option
+@dry_run_option
+@link_options
+@pass_app
+def reset(app: App, uuid: str, yes: bool, dry_run: bool, links: LinkSettings) -> None:
+    """Erase a node's key and trust in a session; its identity, epoch and sequence stay.
+
+    The node signs the statement; in factory state it signs it again, so a lost receipt can be fetched.
+    """
+    station = app.station()
+    octets = station.nodes.resolve(uuid)
+    if dry_run:
+        app.emit({"uuid": octets.hex(), "plan": "reset"}, f"Plan: reset {octets.hex()} to factory state.")
+        return
+    app.confirm(f"Reset node {octets.hex()}? Its key is erased and its datasheet counts as unsigned.", yes=yes)
+    receipt = visits.at_node.reset_at(station, links, octets, reporter_for(app))
+    app.emit(
+        {
+            "uuid": octets.hex(),
+            "state": "factory",
+            "epoch": receipt.epoch,
+            "challenge": receipt.challenge.hex(),
+            "proof": receipt.proof.hex(),
+        },
+        f"Node {octets.hex()} is back in factory state; it signed that at epoch {receipt.epoch}.",
+    )
+
+
+def _address(_ctx: click.Context, _parameter: click.Parameter, text: str) -> int:
+    """Read 1 to 239, decimal or with 0x."""
+    try:
+        number = int(text, 0)
+    except ValueError:
+        number = 0
+    if not 1 <= number <= LAST_ADDRESS:
+        raise click.BadParameter("a CAN address is 1 to 239 (0x01 to 0xEF).")
+    return number
+
+
+@command("teds-provision address 8d4d 0x21 --nfc udp:localhost:54321")
+@click.argument("uuid")
+@click.argument("address", callback=_address)
+@yes_option
+@dry_run_option
+@link_options
+@pass_app
+def address(app: App, uuid: str, address: int, yes: bool, dry_run: bool, links: LinkSettings) -> None:
+    """Give a node another CAN address, 1 to 239, for good: by tap, or in a session where its key is held."""
+    del yes  # the old address can be given back the same way
+    done = visits.at_node.set_address_at(app.station(), links, uuid, address, reporter_for(app), dry_run=dry_run)
+    node = done.uuid.hex()
+    if done.changed is None:
+        plan = f"Plan: node {node} gets CAN address 0x{address:02x}."
+        app.emit({"uuid": node, "plan": "address", "can_address": address}, plan)
+        return
+    told = "has" if done.changed else "has already"
+    app.emit(
+        {"uuid": node, "can_address": address, "changed": done.changed},
+        f"Node {node} {told} CAN address 0x{address:02x}.",
+    )

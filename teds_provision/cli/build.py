@@ -1,0 +1,364 @@
+"""``build``, ``sign``, ``write``, ``read``, ``draft``, ``history``: a datasheet, from its profile to the flash."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Iterable
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from teds_provision import steps
+from teds_provision import teds as teds_room
+from teds_provision.cli.context import App, pass_app
+from teds_provision.cli.options import (
+    FileToRead,
+    Function,
+    WholeNumber,
+    command,
+    dry_run_option,
+    examples,
+    link_options,
+    yes_option,
+)
+from teds_provision.cli.rendering import local_time, reporter_for
+from teds_provision.errors import UsageFailure
+from teds_provision.files import SHARED, read_limited, write_whole
+from teds_provision.links import LinkSettings
+from teds_provision.steps import visits
+
+if TYPE_CHECKING:
+    from teds_provision.steps.write import Written
+
+MAX_INPUT_OCTETS = 32 << 20
+
+
+def order_options(function: Function) -> Function:
+    """Add --profile, --calibration, --no-calibration, --name, --accept-calibration, --retype: one ``order``."""
+    from functools import wraps
+
+    @wraps(function)
+    def with_order(*args: Any, profile: Any, calibration: Any, no_calibration: bool, name: Any, **rest: Any) -> Any:
+        accepted, retype = rest.pop("accept_calibration"), rest.pop("retype")
+        order = steps.build_order.BuildOrder(profile, calibration, name, no_calibration, accepted, retype)
+        return function(*args, order=order, **rest)
+
+    options = [
+        click.option(
+            "--profile", "-p", metavar="P", help="Transducer type, or a TOML file (default: the node's last)."
+        ),
+        click.option(
+            "--calibration",
+            "-c",
+            type=FileToRead(),
+            metavar="FILE",
+            help="CSV of raw, value pairs, or coefficients.",
+        ),
+        click.option("--no-calibration", is_flag=True, help="Drop the calibration that the node has."),
+        click.option("--name", help="Name of this node, written into its XdcrName TEDS."),
+        click.option(
+            "--accept-calibration", metavar='"WHY"', help="Take a calibration that the guard refuses; logged."
+        ),
+        click.option("--retype", is_flag=True, help="The board may become one of another type than it says it is."),
+    ]
+    wrapped: Any = with_order
+    for option in reversed(options):
+        wrapped = option(wrapped)
+    return wrapped  # type: ignore[no-any-return]
+
+
+@command("teds-provision build 8d4d --profile magnetic-angular-position-sensor --output angle.json")
+@click.argument("uuid")
+@order_options
+@click.option(
+    "--output", "-o", type=click.Path(path_type=Path, dir_okay=False), metavar="IMAGE", help="Also write it here."
+)
+@click.option("--edition", type=click.Choice(["2007", "2024"]), default="2007", show_default=True, help="TEDS form.")
+@yes_option
+@dry_run_option
+@pass_app
+def build(app: App, uuid: str, order: Any, output: Path | None, edition: str, yes: bool, dry_run: bool) -> None:
+    """Build the TEDS of the node's type, plus calibration, plus the Security TEDS, still unsigned."""
+    station = app.station()
+    octets = station.nodes.resolve(uuid)
+    built = steps.build.build(
+        station, octets, order, edition=int(edition), keep_draft=not dry_run, retype=app.asks_retype(yes=yes)
+    )
+    if output is not None and not dry_run:
+        write_file(output, built.image.to_json())
+    for warning in built.warnings:
+        app.warn(warning)
+    blocks = [
+        {"access_code": code, "channel": channel, "octets": len(teds), "sha256": hashlib.sha256(teds).hexdigest()}
+        for (channel, code), teds in sorted(built.image.blocks.items())
+    ]
+
+    calibrations = [
+        teds_room.calibration.describe_calibration(calibration) for calibration in built.calibrations.values()
+    ]
+    fits = "".join(f"\n  {teds_room.calibration.sentence(calibration)}" for calibration in built.calibrations.values())
+    lines = [f"{b['access_code']:>4}  channel {b['channel']:<3} {b['octets']:>5} octets" for b in blocks]
+    app.emit(
+        {
+            "uuid": octets.hex(),
+            "profile": built.profile,
+            "blocks": blocks,
+            "warnings": list(built.warnings),
+            "calibrations": calibrations,
+        },
+        f"Built {octets.hex()} as {built.profile}:\n" + "\n".join(lines) + fits,
+    )
+
+
+def write_file(path: Path, text: str | Iterable[str]) -> None:
+    """Write a result file whole or not at all; its parts as they come."""
+    parts = (text,) if isinstance(text, str) else text
+    write_whole(path, (part.encode("utf-8") for part in parts), mode=SHARED)
+
+
+def read_file(path: Path) -> bytes:
+    """Read an input file; raises NotFound, BadData (too large)."""
+    return read_limited(path, MAX_INPUT_OCTETS, "image")
+
+
+@command("teds-provision sign 8d4d", "teds-provision sign angle.json --output signed.json")
+@click.argument("what", metavar="UUID|IMAGE")
+@click.option("--output", "-o", type=click.Path(path_type=Path, dir_okay=False), metavar="IMAGE", help="Signed image.")
+@click.option("--read-node", is_flag=True, help="Meet the node: take its epoch, sequence and TEDS, not the store's.")
+@click.option("--accept-calibration", metavar='"WHY"', help="Take a calibration that the guard refuses; logged.")
+@yes_option
+@dry_run_option
+@link_options
+@pass_app
+def sign(
+    app: App,
+    what: str,
+    output: Path | None,
+    read_node: bool,
+    accept_calibration: str | None,
+    yes: bool,
+    dry_run: bool,
+    links: LinkSettings,
+) -> None:
+    """Sign the datasheet that was built for a node, or an image file (needs --output).
+
+    Unchanged content, key epoch and signer give back the existing signature.
+    """
+    del yes  # a signature uses up a sequence number, nothing else
+    station = app.station()
+    done = visits.sign_command.sign_at(
+        station,
+        links,
+        what,
+        reporter_for(app),
+        read_node=read_node,
+        accept_calibration=accept_calibration,
+        dry_run=dry_run,
+        output=output,
+    )
+    uuid = done.signed.image.uuid
+    if dry_run:
+        app.emit({"uuid": uuid.hex(), "changes": list(done.changes)}, _changes(done.changes))
+        return
+    if output is not None:
+        write_file(output, done.signed.image.to_json())
+    result: dict[str, Any] = {
+        "uuid": uuid.hex(),
+        "sequence": done.signed.sequence,
+        "signature": done.signed.signature.hex(),
+        "signed_by": station.fingerprint,
+        "reused": done.signed.reused,
+        "changes": list(done.changes),
+    }
+    again = " (the signature that was there still holds)" if done.signed.reused else ""
+    app.emit(result, f"{_changes(done.changes)}\nSigned {uuid.hex()}, sequence {done.signed.sequence}{again}.")
+
+
+def _changes(changes: tuple[str, ...]) -> str:
+    return "\n".join(f"  {change}" for change in changes) or "  no change against what the node has"
+
+
+@command(
+    "teds-provision write 8d4d --nfc udp:localhost:54321",
+    "teds-provision write 8d4d --image signed.json --via can --can udp_multicast:239.74.163.2",
+    "teds-provision write 8d4d --from 3 --nfc udp:localhost:54321",
+)
+@click.argument("uuid")
+@click.option("--image", type=FileToRead(), metavar="IMAGE", help="Write this file's image.")
+@click.option(
+    "--from",
+    "sequence",
+    type=WholeNumber(0, 2**32 - 1),
+    metavar="SEQUENCE",
+    help="Bring back what it had; see history.",
+)
+@click.option("--retype", is_flag=True, help="The board may become one of another type than it says it is.")
+@click.option("--sequence-jump", is_flag=True, help="Write although its sequence is far ahead of the node's.")
+@yes_option
+@dry_run_option
+@link_options
+@pass_app
+def write(
+    app: App,
+    uuid: str,
+    image: Path | None,
+    sequence: int | None,
+    retype: bool,
+    sequence_jump: bool,
+    yes: bool,
+    dry_run: bool,
+    links: LinkSettings,
+) -> None:
+    """Write a signed datasheet over a session, commit it, read it back and compare.
+
+    --from brings an older datasheet of the node back, signed anew.
+    """
+    if sequence is not None:
+        if image is not None:
+            raise UsageFailure("--from and --image name two datasheets.", hint="Give one of them.")
+        _bring_back(app, uuid, sequence, links, dry_run=dry_run)
+        return
+    confirm = partial(app.confirm, yes=yes)
+    done = visits.at_node.write_at(
+        app.station(),
+        links,
+        uuid,
+        reporter_for(app),
+        file=image,
+        dry_run=dry_run,
+        jump=confirm if sequence_jump else None,
+        low=confirm,
+        retype=app.asks_retype(yes=yes),
+        retyped=retype,
+    )
+    node, written = done.image.uuid.hex(), done.written
+    if written is None:
+        blocks, octets = len(done.image.blocks), sum(map(len, done.image.blocks.values()))
+        plan = {"uuid": node, "plan": "write", "blocks": blocks, "octets": octets}
+        app.emit(plan, f"Plan: write {blocks} TEDS, {octets} octets, to {node}.")
+        return
+    app.emit(_told(node, written), f"Node {node}: {_said(written)}.")
+
+
+def _bring_back(app: App, uuid: str, sequence: int, links: LinkSettings, *, dry_run: bool) -> None:
+    done = visits.history.bring_back(app.station(), links, uuid, sequence, reporter_for(app), dry_run=dry_run)
+    node, changes = done.uuid.hex(), [change.text for change in done.changes]
+    lines = "".join(f"\n  {text}" for text in changes) or "\n  no change of what it has"
+    if done.written is None:
+        plan = {"uuid": node, "plan": "write", "from": sequence, "changes": changes}
+        app.emit(plan, f"Plan: bring the datasheet of sequence {sequence} back to {node}.{lines}")
+        return
+    result = _told(node, done.written) | {"from": sequence, "sequence": done.sequence, "changes": changes}
+    told = f"the datasheet of sequence {sequence} is back, as sequence {done.sequence}"
+    app.emit(result, f"Node {node}: {told}; {_said(done.written)}.{lines}")
+
+
+def _told(node: str, written: Written) -> dict[str, Any]:
+    return {
+        "uuid": node,
+        "octets_written": written.octets,
+        "verified": True,
+        "seconds": round(written.seconds, 3),
+    }
+
+
+def _said(written: Written) -> str:
+    told = f"{written.octets} octets written and read back" if written.octets else "nothing to do, it is there already"
+    return f"{told} ({written.seconds:.2f} s)"
+
+
+@command("teds-provision read 8d4d --nfc udp:localhost:54321 --output node.json")
+@click.argument("uuid")
+@click.option(
+    "--output", "-o", type=click.Path(path_type=Path, dir_okay=False), metavar="IMAGE", help="Write the image here."
+)
+@link_options
+@pass_app
+def read(app: App, uuid: str, output: Path | None, links: LinkSettings) -> None:
+    """Read every TEDS of a node, over a session where this station holds its key; look at it with show.
+
+    Where a key is held and no session came about, nothing is proven: what was heard is shown, no file is written,
+    and the exit code is 5.
+    """
+    done = visits.at_node.read_at(app.station(), links, uuid, reporter_for(app))
+    text = done.image.to_json()
+    if done.error is not None:
+        app.conclude({**json.loads(text), "verdict": "unproven"}, text.rstrip("\n"), done.error)
+        return
+    if output is not None:
+        write_file(output, text)
+    total = sum(map(len, done.image.blocks.values()))
+    into = f" into {output}." if output else "."
+    told = f"{len(done.image.blocks)} TEDS, {total} octets read from {done.image.uuid.hex()}{into}"
+    app.emit(json.loads(text), told if output is not None else text.rstrip("\n"))
+
+
+@click.group(epilog=examples("teds-provision draft list", "teds-provision draft drop 8d4d"))
+def draft() -> None:
+    """What was built and not written: a trial, or a run that was cut."""
+
+
+@command("teds-provision draft list")
+@pass_app
+def list_(app: App) -> None:
+    """List every draft: the node, its profile, and how far it came."""
+    drafts = [
+        {"uuid": one.uuid.hex(), "profile": one.profile, "stage": one.stage, "created": one.created}
+        for one in app.station().nodes.drafts()
+    ]
+    lines = [
+        f"{one['uuid']}  {one['stage']:<6}  {local_time(str(one['created']))}  {one['profile'] or ''}".rstrip()
+        for one in drafts
+    ]
+    app.emit({"drafts": drafts}, "\n".join(lines) or "Nothing lies ready.")
+
+
+@command("teds-provision draft drop 8d4d")
+@click.argument("uuid")
+@yes_option
+@dry_run_option
+@pass_app
+def drop(app: App, uuid: str, yes: bool, dry_run: bool) -> None:
+    """Drop the draft of a node: its datasheet stays as it is."""
+    del yes  # what was built can be built again
+    done = visits.history.drop_draft(app.station(), uuid, dry_run=dry_run)
+    node = done.uuid.hex()
+    if done.draft is None:
+        app.emit({"uuid": node, "dropped": False}, f"Nothing lies ready for node {node}.")
+        return
+    told = f"{'Plan: drop' if dry_run else 'Dropped'} the {done.draft.stage} draft of node {node}."
+    app.emit({"uuid": node, "dropped": not dry_run}, told)
+
+
+draft.add_command(list_, "list")
+draft.add_command(drop, "drop")
+
+
+@command("teds-provision history 8d4d")
+@click.argument("uuid")
+@pass_app
+def history(app: App, uuid: str) -> None:
+    """The datasheets that a node had, newest first; write UUID --from SEQUENCE brings one back, signed anew."""
+    node, records = visits.history.history_of(app.station(), uuid)
+    told = [
+        {
+            "sequence": record.sequence,
+            "epoch": record.epoch,
+            "signed": record.signed,
+            "profile": record.profile,
+            "sha256": record.digest,
+            "seen": record.seen,
+        }
+        for record in records
+    ]
+    lines = [
+        f"{one.sequence:>6}  epoch {one.epoch}  {local_time(one.signed or 'not signed'):<25}  {one.profile or ''}"
+        for one in records
+    ]
+    app.emit(
+        {"uuid": node.hex(), "history": told},
+        "\n".join(map(str.rstrip, lines)) or f"No datasheet of node {node.hex()} is known.",
+    )

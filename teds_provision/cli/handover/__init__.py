@@ -1,1 +1,0 @@
-"""Commands that move keys and trust between base stations."""

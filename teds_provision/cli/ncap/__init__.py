@@ -1,1 +1,0 @@
-"""``ncap …``: the base station as a service."""
