@@ -529,6 +529,22 @@ static int stage(teds_node *node, uint16_t id, uint32_t offset, const uint8_t *o
     return 0;
 }
 
+/* Whether List could name one more, sealed; `own`: what is staged is this session's. */
+static bool can_list(const teds_node *node, uint16_t id, bool own)
+{
+    teds_source source;
+    int32_t after = -1;
+    uint16_t each;
+    size_t staged = 0, count = teds_find(node, id, &source) || (own && teds_staged(node, id, &staged) != NULL) ? 0 : 1;
+    for (; teds_next_id(node, after, &each); after = each) {
+        count++;
+    }
+    for (after = -1; own && teds_next_staged(node, after, &each); after = each) {
+        count += teds_find(node, each, &source) ? 0u : 1u;
+    }
+    return 3 * count <= TEDS_ROOM;
+}
+
 /* -- commands -------------------------------------------------------------------------------------------------------- */
 
 /* The TEDS that a command names: its id, or a reason negated. */
@@ -621,8 +637,11 @@ int teds_write(teds_node *node, const teds_command *command, teds_origin *origin
     if (other >= 0 && now - node->sessions[other].staged_at < STAGED_NS) {
         return -TEDS_BUSY;
     }
-    if (other >= 0 && 4 + command->length - 5 > TEDS_STAGING) {
+    if (!can_list(node, (uint16_t)id, other < 0) || (other >= 0 && 4 + command->length - 5 > TEDS_STAGING)) {
         return -TEDS_TOO_LARGE; /* which changes no staging */
+    }
+    if (teds_make_blank(node) != 0) {
+        return -TEDS_FAILURE;
     }
     if (other >= 0) {
         teds_staging_drop(node);
@@ -633,9 +652,6 @@ int teds_write(teds_node *node, const teds_command *command, teds_origin *origin
     }
     session->staged = true;
     session->staged_at = now;
-    if (teds_make_blank(node) != 0) {
-        return -TEDS_FAILURE;
-    }
 #if TEDS_OPERATION
     if (origin->arrival->kind == TEDS_AT_NFC) {
         teds_yield_sensors(node, origin->session);

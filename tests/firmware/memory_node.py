@@ -168,10 +168,19 @@ class MemoryNode:
         """What Identify says."""
         return Identity.decode(self.handle(bytes.fromhex("000080070000"), link="can:f7", tapped=False)[3:])
 
+    @property
+    def can_address(self) -> int:
+        """The present CAN address."""
+        return self.identity().can_address
+
     def link_lost(self, link: str) -> None:
         """Loss of the field or link."""
         self._now()
         self._library.memory_lost(self._board, ctypes.c_uint8(link_number(link)[0]))
+
+    def take_can_address(self, address: int) -> None:
+        """Move because another node claimed this address."""
+        self._library.memory_move(self._board, ctypes.c_uint8(address))
 
     def reset_by_hand(self) -> None:
         """Button, pad or magnet."""

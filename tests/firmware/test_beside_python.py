@@ -185,7 +185,6 @@ class Station:
         self.twins, self.dice = twins, random.Random(seed)
         self.key = b""
         self.sessions: dict[str, StationSession] = {}
-        self.writer = ""
         self.desk = Desk.__new__(Desk)
         self.desk.memory = twins.memory
 
@@ -277,23 +276,13 @@ class Station:
             function = 7
         channel = self.dice.choice([0, 0, 0, 1, 2, 7, 9, 256])
         group = self.dice.choice([1, 128, 128, 3, 4, 5])
-        if (group, function) in ((1, 3), (1, 4)):
-            self.become_writer(link)
         self.sealed(Command(channel, group, function, payload), link)
 
-    def become_writer(self, link: str) -> None:
-        """A node has one staging area: whoever staged before lets go of it."""
-        if self.writer in self.sessions and self.writer != link:
-            self.sealed(security_command(Function.CLOSE), self.writer)
-            del self.sessions[self.writer]
-        self.writer = link
-
     def write(self) -> None:
-        """A datasheet, good or with one thing wrong; by one session at a time."""
+        """A datasheet, good or with one thing wrong."""
         link = self.opened()
         if link is None:
             return
-        self.become_writer(link)
         blocks = dict(SHEET)
         if self.dice.random() < 0.3:
             blocks.pop(self.dice.choice(list(blocks)))

@@ -317,6 +317,11 @@ void memory_lost(memory_board *board, uint8_t link)
     teds_node_link_lost(&board->node, link);
 }
 
+void memory_move(memory_board *board, uint8_t address)
+{
+    teds_can_move(&board->node, address);
+}
+
 int memory_by_hand(memory_board *board)
 {
     return teds_node_reset_by_hand(&board->node);

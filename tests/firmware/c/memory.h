@@ -54,6 +54,7 @@ int memory_put(memory_board *board, uint8_t flags, uint8_t address, uint32_t epo
 /* A TEDS of the firmware, from the next start on; `octets` stay where they are. */
 void memory_fixed(memory_board *board, uint8_t channel, uint8_t code, const uint8_t *octets, uint16_t length);
 void memory_lost(memory_board *board, uint8_t link);
+void memory_move(memory_board *board, uint8_t address);
 int memory_by_hand(memory_board *board);
 void memory_can_rx(memory_board *board, uint32_t identifier, const uint8_t *data, uint8_t length, bool fd);
 /* Length of the frame, -1: none. */
