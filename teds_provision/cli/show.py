@@ -2,27 +2,46 @@
 
 from __future__ import annotations
 
+import os
+import re
 import sys
-from collections.abc import Sequence
-from dataclasses import asdict
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass, field, replace
 from itertools import chain
 from pathlib import Path
-from typing import TYPE_CHECKING, cast
+from typing import TYPE_CHECKING, Any, Final, cast
 
 import click
 
 from teds_provision import teds
-from teds_provision.cli import show_files, show_table
 from teds_provision.cli.context import App, pass_app
 from teds_provision.cli.context import to_json as dumps
 from teds_provision.cli.options import command
 from teds_provision.errors import BadData, UsageFailure
+from teds_provision.files import open_to_read
 from teds_provision.harmless import harmless
+from teds_provision.lazy import late
+from teds_provision.limits import LIMITS
+from teds_provision.protocol import handover
+from teds_provision.protocol.messages.message import Argument, Message, decode_message, looks_like_message
+from teds_provision.teds import convert, decode
+from teds_provision.teds.codec.codes import AccessCode
+from teds_provision.teds.codec.model import Decoded, Edition, Finding, TimeInstance, Verdict
+from teds_provision.teds.formats import Block, Kind, class_of, detect, read_blocks, with_class
+from teds_provision.teds.formats.jsonform import FORMAT, value_to_json
+from teds_provision.teds.guard import check_calibration
+from teds_provision.teds.show import Shown, ShownField, describe, finding_to_json, hexadecimal, instant, shown_to_json
 
 if TYPE_CHECKING:
-    from teds_provision.cli.show_files import ShownFile
-    from teds_provision.teds.codec.model import Edition
-    from teds_provision.teds.formats import Block, Format
+    from rich import markup
+    from rich import table as rich_table
+    from rich.console import Console
+
+    from teds_provision.protocol.handover.bundle import BundleHeader
+    from teds_provision.teds.formats import Format
+    from teds_provision.teds.guard import GuardFinding
+else:
+    markup, rich_table = late("rich.markup"), late("rich.table")
 
 CHOICES = ["table", "json", "xml", "hex", "ihex", "toml", "binary", "image"]
 _BAD_DATA = BadData.exit_code
@@ -68,7 +87,7 @@ def show(
     if app.json and not plain:
         raise UsageFailure("--json and --format ask for different outputs.", hint="Leave one of them out.")
     wanted = cast("Edition", int(edition)) if edition else None
-    shown = [show_files.load(name, wanted) for name in files]
+    shown = [load(name, wanted) for name in files]
     if plot is not None:
         _plot(app, shown, plot)
     _tell(app, shown, form)
@@ -85,10 +104,10 @@ def _tell(app: App, files: Sequence[ShownFile], form: str) -> None:
         for note in file.notes:
             app.note(f"{file.name}: {note}")
     if app.json or form == "json":
-        result = show_files.to_json(files)
+        result = to_json(files)
         print(dumps(result, indent=None if app.json else 1), flush=True)
     elif form == "table":
-        show_table.print_files(app.console(), files)
+        print_files(app.console(), files)
     else:
         _convert(app, files, cast("Format", form))
 
@@ -131,12 +150,12 @@ def _has_errors(file: ShownFile) -> bool:
 
 
 def _diff(app: App, before: str, after: str, *, as_json: bool) -> None:
-    old, new = (show_files.placed(show_files.load(name).blocks) for name in (before, after))
+    old, new = (placed(load(name).blocks) for name in (before, after))
     changes = teds.diff.diff_blocks(old, new)
     judged = teds.guard.check_calibration(new, old)
     result = {
         "changes": [asdict(change) for change in changes],
-        "guard": [show_files.guard_to_json(finding) for finding in judged],
+        "guard": [guard_to_json(finding) for finding in judged],
     }
     if as_json and not app.json:
         print(dumps(result, indent=1), flush=True)
@@ -149,5 +168,352 @@ def _diff(app: App, before: str, after: str, *, as_json: bool) -> None:
 def _plot(app: App, files: Sequence[ShownFile], path: Path) -> None:
     if len(files) != 1:
         raise UsageFailure("A plot shows the calibrations of one file.", hint="Call show once for each.")
-    channels = teds.plot.plot_blocks(show_files.placed(files[0].blocks), path)
+    channels = teds.plot.plot_blocks(placed(files[0].blocks), path)
     app.note(f"Drawn in {path}: channel {', '.join(map(str, channels))}.")
+
+
+# For people: rich tables of fields, findings and what they mean.
+
+_COLOURS = {"error": "bold red", "warning": "yellow", "note": "dim"}
+_PIPE_WIDTH = 200
+_UNSAFE = re.compile("[\x00-\x08\x0b-\x1f\x7f-\x9f\u200e\u200f\u202a-\u202e\u2066-\u2069]")
+_GOOD = {Verdict.CLEAN, Verdict.BLOCK_CLEAN, Verdict.MESSAGE}
+
+
+def escape(text: str) -> str:
+    """Text of a file that is to reach the terminal as text: no markup, no control or direction characters."""
+    return markup.escape(_UNSAFE.sub(lambda found: f"\\x{ord(found.group()):02x}", text))
+
+
+def print_files(console: Console, files: Iterable[ShownFile]) -> None:
+    """Print every file, one TEDS after the other."""
+    many = list(files)
+    if not console.is_terminal:
+        console.width = _PIPE_WIDTH
+    for file in many:
+        if len(many) > 1:
+            console.rule(escape(file.name), align="left")
+        if file.message is not None:
+            _print_message(console, file.message)
+        if file.bundle is not None:
+            _print_bundle(console, file.bundle)
+        for number, shown in enumerate(file.teds):
+            if number:
+                console.print()
+            print_teds(console, shown)
+            _print_findings(console, file.conversions.get(number, ()), "conversion: ")
+        for guarded in file.guard:
+            colour = _COLOURS[guarded.severity]
+            where = f"guard, channel {guarded.channel}, {guarded.code}: "
+            console.print(f"[{colour}]{guarded.severity}[/]  {escape(where + guarded.message)}")
+
+
+def print_teds(console: Console, shown: Shown) -> None:
+    """Print one TEDS: title, meaning, fields, findings."""
+    decoded = shown.decoded
+    colour = "green" if decoded.verdict in _GOOD else "red"
+    edition = f"{decoded.edition} edition" if decoded.edition else "edition unknown"
+    frame = "" if decoded.framed else " · bare data block"
+    head = f"[bold]{escape(shown.title)}[/] · {edition} · {len(decoded.octets)} octets{frame}"
+    console.print(f"{head} · [{colour}]{decoded.verdict}[/]")
+    for label, text in shown.summary:
+        console.print(f"  [cyan]{label}[/]: {escape(text)}")
+    table = rich_table.Table(
+        "offset", "type", "field", "value", "meaning", box=None, pad_edge=False, header_style="dim"
+    )
+    table.columns[0].justify = table.columns[1].justify = "right"
+    for row in _rows(shown.fields, 0):
+        table.add_row(*row)
+    for octets in decoded.text:
+        table.add_row("", "", "text", escape(octets.decode(errors="replace")), "")
+    console.print(table)
+    _print_findings(console, decoded.findings, "")
+
+
+def _rows(fields: Iterable[ShownField], depth: int) -> Iterator[tuple[str, ...]]:
+    for one in fields:
+        meaning = escape(one.meaning)
+        if one.weak:
+            meaning = f"[bold red]{meaning}: weak, refused wherever a TEDS is built or trusted[/]"
+        yield str(one.offset), str(one.type), "  " * depth + escape(one.name), escape(one.text), meaning
+        yield from _rows(one.children, depth + 1)
+
+
+def _print_findings(console: Console, findings: Iterable[Finding], prefix: str) -> None:
+    for finding in findings:
+        where = "" if finding.offset is None else f"octet {finding.offset}, "
+        text = f"{prefix}{where}{finding.code}: {finding.message}"
+        console.print(f"[{_COLOURS[finding.severity]}]{finding.severity}[/]  {escape(text)}")
+
+
+def _print_message(console: Console, message: Message) -> None:
+    where = "" if message.channel is None else f" · channel {message.channel}"
+    group = f"{message.group_name}: " if message.group_name else ""
+    name = message.name or "no message that is known here"
+    school = " · tagged arguments" if message.school == "tagged" else ""
+    failed = " · [red]failed[/]" if message.ok is False else ""
+    console.print(f"[bold]{escape(group + name)}[/] · {message.kind}, {message.edition} edition{where}{school}{failed}")
+    table = rich_table.Table("offset", "argument", "value", "meaning", box=None, pad_edge=False, header_style="dim")
+    for argument in message.arguments:
+        table.add_row(str(argument.offset), argument.name, escape(_value(argument)), escape(argument.meaning))
+    if message.arguments:
+        console.print(table)
+    _print_findings(console, message.findings, "")
+    for offset, octets in message.teds:
+        console.print(f"\nTEDS at octet {offset}:")
+        print_teds(console, describe(with_class(octets)))
+
+
+def _value(argument: Argument) -> str:
+    value = argument.value
+    if isinstance(value, bytes):
+        return ".".join(map(str, value)) if argument.name == "address" and len(value) == 4 else hexadecimal(value)
+    if isinstance(value, TimeInstance):
+        return instant(value)
+    if argument.type == "duration":
+        return f"{value} s"
+    return ", ".join(map(str, value_to_json(value))) if isinstance(value, tuple) else str(value)
+
+
+def _print_bundle(console: Console, bundle: BundleHeader) -> None:
+    console.print(f"[bold]sealed handover bundle[/] · {bundle.octets} octets · sha256 {bundle.sha256[:16]}…")
+    console.print(f"  {bundle.algorithm}, {bundle.encryption}, holds {bundle.content_type or 'unknown'}; not opened")
+    for recipient in bundle.recipients:
+        console.print(f"  for the station with fingerprint {recipient[:16] or '(not named)'}")
+
+
+# Files are read, recognized and described before anything is printed.
+
+STDIN = "-"
+_HEAD_OCTETS: Final = 64
+_OTHERS: Final = {
+    b'{"format":"teds-backup/': ("a backup of a station", "teds-provision restore {}"),
+    b"\x89MCAP0\r\n": ("a recording (MCAP)", "mcap info {}"),
+    b"# teds-provision measurement, text": (
+        "a recording (text)",
+        "less {}",
+    ),
+    b"\n\r\r\n": ("a trace (pcapng)", "teds-provision trace show {}"),
+    b'{"format": "teds-trace/': ("a trace", "teds-provision trace show {}"),
+}
+"""What other files of this program begin with, what they are, and the command that reads them."""
+
+
+@dataclass(frozen=True)
+class ShownFile:
+    """One file: its TEDS, or the message or the bundle's header that it holds; ``notes`` are said on stderr."""
+
+    name: str
+    kind: Kind
+    teds: tuple[Shown, ...] = ()
+    message: Message | None = None
+    bundle: BundleHeader | None = None
+    guard: tuple[GuardFinding, ...] = ()
+    notes: tuple[str, ...] = ()
+    conversions: Mapping[int, tuple[Finding, ...]] = field(default_factory=dict)
+
+    @property
+    def blocks(self) -> list[Block]:
+        """The blocks of its TEDS; a message is one block without a place."""
+        if self.message is not None:
+            return [Block(None, None, self.message.octets)]
+        return [shown.block for shown in self.teds]
+
+    @property
+    def malformed(self) -> bool:
+        """Whether the tuples of a TEDS do not even close, or a message is none."""
+        unreadable = self.message is not None and self.message.kind == "unknown"
+        return unreadable or any(shown.decoded.verdict is Verdict.MALFORMED for shown in self.teds)
+
+
+def read_file(name: str) -> bytes:
+    """Octets of a file or, for ``-``, of standard input; raises NotFound and, for more than 32 MiB, BadData."""
+    if name != STDIN:
+        with open_to_read(Path(name)) as file:
+            octets = file.read(LIMITS.teds_file + 1)
+        if len(octets) <= LIMITS.teds_file:
+            return octets
+        raise _no_teds(name, octets, f"it has more than {LIMITS.teds_file >> 20} MiB")
+    octets = sys.stdin.buffer.read(LIMITS.teds_file + 1)
+    if len(octets) > LIMITS.teds_file:
+        raise BadData(f"Standard input gives more than {LIMITS.teds_file >> 20} MiB; no file of TEDS has.")
+    return octets
+
+
+def load(name: str, edition: Edition | None = None) -> ShownFile:
+    """Read one file and put it into words, converted to ``edition`` where one is asked."""
+    bundle = _long_bundle(name)
+    if bundle is not None:
+        return ShownFile(name, "bundle", bundle=bundle)
+    octets = read_file(name)
+    kind: Kind | None = None
+    if octets.startswith(tuple(_OTHERS)):
+        raise _no_teds(name, octets, "")
+    try:
+        kind = detect(octets)
+        if kind == "bundle":
+            return ShownFile(name, kind, bundle=handover.bundle.peek_bundle(octets))
+        blocks = read_blocks(octets, kind, path=Path(name) if name != STDIN else None)
+    except BadData as error:
+        raise _of_file(name, kind, error) from error
+    if not blocks:
+        raise BadData(f"{name} holds no TEDS.")
+    if len(blocks) == 1 and is_message(blocks[0].octets):
+        return ShownFile(name, kind, message=decode_message(blocks[0].octets))
+    return _described(name, kind, blocks, edition)
+
+
+def _long_bundle(name: str) -> BundleHeader | None:
+    """The header of a bundle that is longer than any file of TEDS, read piece by piece; None for everything else."""
+    try:
+        if name == STDIN or os.stat(name).st_size <= LIMITS.teds_file:  # a pipe has none, and is opened once
+            return None
+    except (OSError, ValueError):
+        return None
+    with open_to_read(Path(name)) as file:
+        if not file.read(_HEAD_OCTETS).lstrip().startswith(b"{"):
+            return None
+        try:
+            return handover.bundle.peek_bundle(file)
+        except BadData:
+            return None
+
+
+def _no_teds(name: str, octets: bytes, why: str) -> BadData:
+    """The error for a file of another kind: what it is, and which command reads it, where its first octets tell."""
+    for head, (what, reader) in _OTHERS.items():
+        if octets.startswith(head):
+            return BadData(f"{name} holds no TEDS: it is {what}.", hint=f"Read it with: {reader.format(name)}")
+    return BadData(f"{name} holds no TEDS: {why}.")
+
+
+def _of_file(name: str, kind: Kind | None, error: BadData) -> BadData:
+    """What is wrong with a file, with its name before it."""
+    if kind == "hex" and "Line 1 holds" in error.message:  # whatever is text and nothing else is taken for hex
+        return BadData(
+            f"{name} holds no TEDS: it is neither binary nor hex (read as hex: {error.message[:1].lower()}"
+            f"{error.message[1:].rstrip('.')}).",
+            hint="TEDS come as binary, hex, Intel HEX, JSON, XML, an image, a profile or a bundle.",
+        )
+    named = error.message.startswith((f"{name}:", f"{name} "))
+    return BadData(error.message if named else f"{name}: {error.message}", hint=error.hint)
+
+
+def _described(name: str, kind: Kind, blocks: Sequence[Block], edition: Edition | None) -> ShownFile:
+    notes = ("The UUID is all zeros: a profile has none.",) if kind == "toml" else ()
+    file = ShownFile(name, kind, notes=notes)
+    if edition is not None:
+        blocks, conversions = _converted(blocks, edition)
+        file = replace(file, conversions=conversions)
+    beside = placed(blocks)
+    shown = tuple(describe(block, beside) for block in blocks)
+    return replace(file, teds=shown, guard=_guard(beside))
+
+
+def is_message(octets: bytes) -> bool:
+    """Whether octets are a message rather than a TEDS."""
+    if looks_like_message(octets):
+        return True
+
+    return class_of(octets) is None and decode(octets).verdict is Verdict.MESSAGE
+
+
+def placed(blocks: Sequence[Block]) -> dict[tuple[int, int], bytes]:
+    """TEDS by (channel, access code); lone channel TEDS and calibrations without a channel count as channel 1."""
+    out: dict[tuple[int, int], bytes] = {}
+    for channel, code, octets in blocks:
+        if code is not None:
+            out.setdefault((_usual_channel(code) if channel is None else channel, code), octets)
+    return out
+
+
+def _usual_channel(code: int) -> int:
+    return 1 if code in {AccessCode.CHANNEL, AccessCode.CALIBRATION} else 0
+
+
+def _guard(beside: dict[tuple[int, int], bytes]) -> tuple[GuardFinding, ...]:
+    if not any(code == AccessCode.CALIBRATION for _, code in beside):
+        return ()
+    from datetime import UTC, datetime
+
+    return tuple(check_calibration(beside, now=datetime.now(UTC)))
+
+
+def _converted(blocks: Sequence[Block], edition: Edition) -> tuple[list[Block], dict[int, tuple[Finding, ...]]]:
+    out: list[Block] = []
+    said: dict[int, tuple[Finding, ...]] = {}
+    for number, block in enumerate(blocks):
+        decoded: Decoded = decode(block.octets)
+        try:
+            octets, findings = convert(decoded, edition)
+        except BadData as error:
+            octets, findings = block.octets, [Finding("error", "not-converted", error.message)]
+        out.append(block._replace(octets=octets))
+        said[number] = tuple(findings)
+    return out, said
+
+
+def guard_to_json(finding: GuardFinding) -> dict[str, Any]:
+    """One finding of the guard as a JSON object."""
+    return {
+        "severity": finding.severity,
+        "channel": finding.channel,
+        "code": finding.code,
+        "message": finding.message,
+    }
+
+
+# With --json: one object with every TEDS of every file.
+
+
+def to_json(files: Sequence[ShownFile]) -> dict[str, Any]:
+    """Return ``{"format": "teds/1", "teds": […]}``; the keys of a lone TEDS (or message) stand on top as well."""
+    entries = [entry for file in files for entry in _entries(file)]
+    bundles = [{"file": file.name, **asdict(file.bundle)} for file in files if file.bundle is not None]
+    out: dict[str, Any] = dict(entries[0]) if len(entries) == 1 else {}
+    out |= {"format": FORMAT, "teds": entries}
+    guard = [guard_to_json(finding) for file in files for finding in file.guard]
+    return out | ({"guard": guard} if guard else {}) | ({"bundles": bundles} if bundles else {})
+
+
+def _entries(file: ShownFile) -> list[dict[str, Any]]:
+    if file.message is not None:
+        return [{"file": file.name, **_message(file.message)}]
+    entries = []
+    for number, shown in enumerate(file.teds):
+        entry = {"file": file.name, **shown_to_json(shown)}
+        said = file.conversions.get(number)
+        if said is not None:
+            entry["conversion"] = [finding_to_json(finding) for finding in said]
+        entries.append(entry)
+    return entries
+
+
+def _message(message: Message) -> dict[str, Any]:
+    inside = [describe(with_class(octets)) for _, octets in message.teds]
+    code = message.get("access_code")
+    out: dict[str, Any] = {
+        "edition": message.edition,
+        "access_code": code if isinstance(code, int) else None,
+        "verdict": "message",
+        "findings": [finding_to_json(finding) for finding in message.findings],
+        "fields": [_argument(argument) for argument in message.arguments],
+        "octets": message.octets.hex(),
+        "message": {
+            "kind": message.kind,
+            "name": message.name,
+            "group": message.group,
+            "group_name": message.group_name,
+            "function": message.function,
+            "channel": message.channel,
+            "ok": message.ok,
+            "school": message.school,
+        },
+    }
+    return out | ({"inside": [shown_to_json(shown) for shown in inside]} if inside else {})
+
+
+def _argument(argument: Argument) -> dict[str, Any]:
+    out = {"name": argument.name, "type": argument.type, "value": value_to_json(argument.value)}
+    out["offset"] = argument.offset
+    return out | ({"meaning": argument.meaning} if argument.meaning else {})

@@ -52,7 +52,14 @@ def test_help_names_every_command_once() -> None:
     shown = spawn("--help")
     assert shown.code == 0
     for name in COMMANDS:
-        assert len(re.findall(rf"^  {name} ", shown.out, re.MULTILINE)) == 1, name
+        assert len(re.findall(rf"^  {name} +[A-Z]", shown.out, re.MULTILINE)) == 1, name
+
+
+def test_help_begins_with_the_commands_that_people_use_first() -> None:
+    listed = re.findall(
+        r"^  ([a-z]+(?: [a-z]+)?) +[A-Z]", spawn("--help").out.partition("Start here:")[2], re.MULTILINE
+    )
+    assert listed[:6] == ["init", "provision", "verify", "nodes", "measure", "ncap run"]
 
 
 @pytest.mark.parametrize("name", PRESENT)

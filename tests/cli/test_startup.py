@@ -14,7 +14,6 @@ OURS = {
     "teds_provision.cli",
     "teds_provision.cli.configuration",
     "teds_provision.cli.context",
-    "teds_provision.cli.globals",
     "teds_provision.cli.main",
     "teds_provision.cli.option_names",
     "teds_provision.cli.stdout",
