@@ -5,6 +5,7 @@ from __future__ import annotations
 import ctypes
 import functools
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any, Final
 
 from teds_provision.protocol.flash import Flash
@@ -21,8 +22,8 @@ Draw = Callable[[str, int], bytes]
 
 
 @functools.cache
-def _library(max_message: int, staging: int) -> Any:
-    library = ctypes.CDLL(str(builds.library(max_message, staging)))
+def _library(path: Path) -> Any:
+    library = ctypes.CDLL(str(path))
     library.memory_new.restype = ctypes.c_void_p
     library.memory_handle.restype = library.memory_flash.restype = ctypes.c_size_t
     library.memory_steps.restype = ctypes.c_long
@@ -53,8 +54,10 @@ class MemoryNode:
         max_teds: int = 4092,
         unit: int = 8,
         erased: int = 0xFF,
+        library: Path | None = None,
     ) -> None:
-        self._library, self._clock, self.max_message = _library(max_message, max_teds + 4), clock, max_message
+        self._library = _library(library or builds.library(max_message, max_teds + 4))
+        self._clock, self.max_message = clock, max_message
         self._draw = draw
         self._callback = _RANDOM(self._random)  # kept: the library calls it as long as the node is there
         self._fixed: list[Any] = []
@@ -115,14 +118,14 @@ class MemoryNode:
         assert failed == 0
 
     @property
-    def flash(self) -> bytes:
+    def image(self) -> bytes:
         """Every octet of its flash; may be put back before a start."""
         octets = ctypes.create_string_buffer(self._library.memory_flash(self._board, None))
         self._library.memory_flash(self._board, octets)
         return octets.raw
 
-    @flash.setter
-    def flash(self, octets: bytes) -> None:
+    @image.setter
+    def image(self, octets: bytes) -> None:
         self._library.memory_put_flash(self._board, octets)
 
     def cut(self, step: int, *, torn: bool) -> None:

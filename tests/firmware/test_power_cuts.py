@@ -97,13 +97,13 @@ def test_there_is_the_old_state_or_the_new_one(what: str, torn: bool, unit: int,
     BEFORE[what](desk)
     desk.node.poll()
     desk.restart()
-    image, key, old, old_key = desk.node.flash, desk.key, desk.shown(), desk.key
+    image, key, old, old_key = desk.node.image, desk.key, desk.shown(), desk.key
     ACTS[what](desk)
     new, new_key = desk.shown(), desk.key
     desk.node.poll()
     outcomes = []
     for step in range(1, 400):
-        desk.node.flash, desk.key = image, key
+        desk.node.image, desk.key = image, key
         desk.restart()
         desk.node.cut(step, torn=torn)
         try:
@@ -120,7 +120,7 @@ def test_there_is_the_old_state_or_the_new_one(what: str, torn: bool, unit: int,
         is_new = now != old
         assert is_new or not done.ok, f"step {step}: a good reply, and the old state"
         if old_key and is_new and what in ("a rotation", "a reset", "a reset by hand"):
-            assert old_key not in desk.node.flash, f"step {step}: the old key lies in flash"
+            assert old_key not in desk.node.image, f"step {step}: the old key lies in flash"
         assert not desk.node.misused
         outcomes.append(is_new)
         if not cut:
@@ -138,10 +138,10 @@ def test_there_is_the_old_state_or_the_new_one(what: str, torn: bool, unit: int,
 def test_at_the_very_first_start_there_is_one_identity_or_none(torn: bool) -> None:
     """A torn identity is told, never replaced by a second key; a blank one is made."""
     desk = CDesk()
-    blank = bytes([0xFF]) * len(desk.node.flash)
+    blank = bytes([0xFF]) * len(desk.node.image)
     seen = []
     for step in range(1, 60):
-        desk.node.flash = blank
+        desk.node.image = blank
         desk.node.start_cut(step, torn=torn)
         cut = desk.node.dead
         again = desk.node.start()
