@@ -16,15 +16,29 @@ import json
 import os
 import socket
 import ssl
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from types import TracebackType
-from typing import Any, Final
+from typing import TYPE_CHECKING, Any, Final
 from urllib.parse import quote, urlsplit
 
 from teds_provision.errors import LinkFailure, TedsProvisionError, UsageFailure
 from teds_provision.files import short_path
+
+if TYPE_CHECKING:
+    from teds_provision.api.answers import (
+        Applied,
+        Entry,
+        Group,
+        Measurement,
+        Node,
+        Provisioning,
+        Sheet,
+        SheetPlan,
+        Status,
+    )
+    from teds_provision.api.bodies import Kind, Mode
 
 API: Final = "/api/v1"
 SOCKET: Final = "ncap.sock"
@@ -44,6 +58,7 @@ _EXIT: Final = {
     "usage": 2, "not-found": 3, "not-authentic": 4, "link": 5, "no-reader": 5, "no-node": 5, "node-silent": 5,
     "garbled": 5, "address-conflict": 5, "unproven": 5, "store": 7, "store-changed": 7, "store-locked": 7,
     "vault-changed": 7, "node-busy": 7, "vault": 7, "no-keyring": 7, "wrong-passphrase": 7, "bad-data": 8, "bug": 1,
+    "bad-request": 2,
 }  # fmt: skip
 _EXIT_BY_STATUS: Final = {401: 6, 403: 6, 404: 3, 409: 6, 413: 8, 415: 8, 421: 6, 422: 6, 423: 6, 429: 6, 503: 5}
 
@@ -102,7 +117,7 @@ class Client:
         try:
             value = json.loads(octets) if kind.startswith("application/json") else octets.decode()
         except ValueError as error:
-            raise LinkFailure("The answer of the base station is no JSON.") from error
+            raise LinkFailure("The base station's answer is not valid JSON.") from error
         if status < 400:
             return value
         told = value.get("error", {}) if isinstance(value, dict) else {}
@@ -138,7 +153,10 @@ class Client:
             return _UnixConnection(self._home / SOCKET, self._timeout)
         parts = urlsplit(self.url)
         if parts.scheme not in ("http", "https") or not parts.hostname:
-            raise UsageFailure(f"{self.url!r} is no address of a base station.", hint="Write http://127.0.0.1:8351")
+            raise UsageFailure(
+                f"{self.url!r} is not the address of a base station.",
+                hint="Use an address such as http://127.0.0.1:8351.",
+            )
         if parts.scheme == "https":
             context = ssl.create_default_context()
             return http.client.HTTPSConnection(parts.hostname, parts.port, timeout=self._timeout, context=context)
@@ -146,21 +164,23 @@ class Client:
 
     # -- resources ---------------------------------------------------------------------------------------------------
 
-    def status(self) -> dict[str, Any]:
+    def status(self) -> Status:
         """Version, links, detection, sinks, clock, budget."""
-        return dict(self.request("GET", "/status"))
+        found: Status = self.request("GET", "/status")
+        return found
 
-    def set_detection(self, mode: str) -> str:
+    def set_detection(self, mode: Mode) -> Mode:
         """``transparent`` or ``whitelist``."""
-        return str(self.request("PUT", "/detection", {"mode": mode})["mode"])
+        found: Mode = self.request("PUT", "/detection", {"mode": mode})["mode"]
+        return found
 
-    def discover(self) -> list[dict[str, Any]]:
+    def discover(self) -> list[Node]:
         """Ask every link now."""
         return list(self.request("POST", "/discover", {})["nodes"])
 
-    def nodes(self) -> list[dict[str, Any]]:
+    def nodes(self) -> list[Node]:
         """Every node, asked for a thousand at a time."""
-        found: dict[str, dict[str, Any]] = {}
+        found: dict[str, Node] = {}
         offset = 0
         while True:
             answer = self.request("GET", f"/nodes?offset={offset}")
@@ -169,34 +189,85 @@ class Client:
             if not answer["nodes"] or offset >= answer["total"]:
                 return list(found.values())
 
-    def node(self, node: str) -> dict[str, Any]:
+    def node(self, node: str) -> Node:
         """One node, by UUID, prefix or name."""
-        return dict(self.request("GET", f"/nodes/{quote(node, safe='')}"))
+        found: Node = self.request("GET", f"/nodes/{quote(node, safe='')}")
+        return found
 
-    def teds(self, node: str) -> dict[str, Any]:
+    def teds(self, node: str) -> Sheet:
         """A node's datasheet, decoded and checked."""
-        return dict(self.request("GET", f"/nodes/{quote(node, safe='')}/teds"))
+        found: Sheet = self.request("GET", f"/nodes/{quote(node, safe='')}/teds")
+        return found
 
-    def write_teds(self, node: str, document: str, *, dry_run: bool = False) -> dict[str, Any]:
-        """Write what a document (XML, JSON, hex) says; ``dry_run``: only what that would change."""
+    def write_teds(
+        self, node: str, content: str, *, accept_calibration: str | None = None, dry_run: bool = False
+    ) -> SheetPlan:
+        """Write a datasheet (XML, JSON, hex); ``dry_run``: only show what that would change.
+
+        ``accept_calibration``: why a calibration that the guard refuses is right.
+        """
         query = "?dry_run=1" if dry_run else ""
-        return dict(self.request("PUT", f"/nodes/{quote(node, safe='')}/teds{query}", {"content": document}))
+        body = {"content": content, "accept_calibration": accept_calibration}
+        found: SheetPlan = self.request("PUT", f"/nodes/{quote(node, safe='')}/teds{query}", body)
+        return found
 
-    def provision(self, node: str = "next", **order: str | None) -> dict[str, Any]:
-        """Provision a node, or the next that is tapped; ``order``: profile, name, calibration, calibration_name."""
-        return dict(self.request("POST", f"/nodes/{quote(node, safe='')}/provision", order))
+    def provision(
+        self,
+        node: str = "next",
+        *,
+        profile: str | None = None,
+        name: str | None = None,
+        calibration: str | None = None,
+        calibration_name: str | None = None,
+        cancel: bool = False,
+    ) -> Provisioning:
+        """Provision a node, or the next that is tapped; ``calibration`` is the content of a file of that name."""
+        body = {
+            "profile": profile,
+            "name": name,
+            "calibration": calibration,
+            "calibration_name": calibration_name,
+            "cancel": cancel,
+        }
+        found: Provisioning = self.request("POST", f"/nodes/{quote(node, safe='')}/provision", body)
+        return found
 
-    def groups(self) -> list[dict[str, Any]]:
+    def groups(self) -> list[Group]:
         """The measurement groups."""
         return list(self.request("GET", "/groups")["groups"])
 
-    def measurements(self) -> list[dict[str, Any]]:
+    def measurements(self) -> list[Measurement]:
         """What is measured."""
         return list(self.request("GET", "/measurements")["measurements"])
 
-    def measure(self, *nodes: str, **asked: Any) -> dict[str, Any]:
-        """Measure nodes from now on; ``asked``: group (in place of nodes), rate, kind, trigger, channels, sinks."""
-        return dict(self.request("POST", "/measurements", {**({"uuids": list(nodes)} if nodes else {}), **asked}))
+    def measure(
+        self,
+        *uuids: str,
+        group: str | None = None,
+        channels: Sequence[int] = (),
+        rate: float | None = None,
+        kind: Kind | None = None,
+        trigger: bool = False,
+        sinks: Sequence[str] = (),
+        actuators: bool = True,
+        dead_man: int | None = None,
+        scalar_rate: float | None = None,
+    ) -> Measurement:
+        """Measure nodes, or a ``group``, from now on; ``rate`` and ``scalar_rate`` in Hz, ``dead_man`` in ms."""
+        body = {
+            "uuids": uuids,
+            "group": group,
+            "channels": channels,
+            "rate": rate,
+            "kind": kind,
+            "trigger": trigger,
+            "sinks": sinks,
+            "actuators": actuators,
+            "dead_man": dead_man,
+            "scalar_rate": scalar_rate,
+        }
+        found: Measurement = self.request("POST", "/measurements", body)
+        return found
 
     def end_measurement(self, measurement_id: str) -> None:
         """End one and forget it."""
@@ -204,22 +275,23 @@ class Client:
 
     def set(
         self, node: str, channel: int, value: float, *, unit: str | None = None, hold: float | None = None
-    ) -> dict[str, Any]:
-        """Set an actuator and hold it for ``hold`` seconds (1 where none are said); set it again to hold it on."""
+    ) -> Applied:
+        """Set an actuator and hold it for ``hold`` seconds (1 by default); set it again in time to keep holding it."""
         body = {"value": value, "unit": unit, "hold": hold}
-        return dict(self.request("PUT", f"/nodes/{quote(node, safe='')}/channels/{channel}", body))
+        found: Applied = self.request("PUT", f"/nodes/{quote(node, safe='')}/channels/{channel}", body)
+        return found
 
     def let_go(self, node: str, channel: int) -> bool | None:
-        """Let an actuator go; whether the node said that it is safe, None where it did not say."""
-        safe = self.request("PUT", f"/nodes/{quote(node, safe='')}/channels/{channel}", {"hold": 0})["safe"]
-        return None if safe is None else bool(safe)
+        """Let an actuator go; whether the node reports that it is safe, None where it did not say."""
+        found: Applied = self.request("PUT", f"/nodes/{quote(node, safe='')}/channels/{channel}", {"hold": 0})
+        return found["safe"]
 
-    def log(self, last: int = 200) -> list[dict[str, Any]]:
+    def log(self, last: int = 200) -> list[Entry]:
         """The newest entries of the audit log."""
         return list(self.request("GET", f"/log?limit={last}")["entries"])
 
     def login_url(self, *, read_only: bool = False) -> str:
-        """The page's address with a token that works once; over the Unix socket alone."""
+        """The page's address with a token that works once; over the Unix socket only."""
         return str(self.request("POST", "/login-link", {"read_only": read_only})["url"])
 
     @contextmanager
@@ -274,5 +346,5 @@ class _UnixConnection(http.client.HTTPConnection):
         except OSError as error:
             self.sock.close()
             raise LinkFailure(
-                f"No base station runs in {self._path.parent}.", hint="Start it: teds-provision ncap run"
+                f"No base station is running in {self._path.parent}.", hint="Start it: teds-provision ncap run"
             ) from error

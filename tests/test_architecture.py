@@ -19,6 +19,7 @@ MODULES = sorted(PACKAGE.rglob("*.py"))
 WITHOUT_FILES = {"errors", "harmless", "lazy", "limits", "protocol"}
 _BELOW_TALK = {"station", "links", "vault", "store", "protocol", "teds"}
 ARROWS = {
+    "api": set(),
     "errors": set(),
     "files": set(),
     "harmless": set(),
@@ -36,14 +37,14 @@ ARROWS = {
     "steps": _BELOW_TALK | {"talk"},
     "handover": _BELOW_TALK | {"talk", "steps"},
     "measure": _BELOW_TALK | {"talk", "steps", "handover"},
-    "client": set(),
-    "ncap": _BELOW_TALK | {"talk", "steps", "handover", "measure", "node", "client"},
+    "client": {"api"},
+    "ncap": _BELOW_TALK | {"talk", "steps", "handover", "measure", "node", "client", "api"},
     "check": _BELOW_TALK | {"talk", "steps"},
     "backup": {"station", "vault", "store", "protocol", "teds"},
     "doctor": {"station", "links", "vault", "store", "protocol", "teds"},
     "demo": _BELOW_TALK | {"talk", "steps", "handover", "measure", "client"},
     "cli": _BELOW_TALK
-    | {"talk", "steps", "handover", "backup", "doctor", "demo", "node", "measure", "check", "ncap", "client"}
+    | {"talk", "steps", "handover", "backup", "doctor", "demo", "node", "measure", "check", "ncap", "client", "api"}
     | {"trace"},
     "__main__": {"cli"},
 }

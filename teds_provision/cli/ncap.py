@@ -28,6 +28,7 @@ from teds_provision.store.records import iso
 if TYPE_CHECKING:
     from rich.console import Console
 
+    from teds_provision.api.bodies import Mode
     from teds_provision.ncap import running, settings
     from teds_provision.ncap.web import tokens
 else:
@@ -236,7 +237,7 @@ def _link(link: dict[str, Any]) -> str:
 @command("teds-provision ncap detection transparent", name="detection")
 @click.argument("mode", type=click.Choice(["transparent", "whitelist"]))
 @pass_app
-def detection(app: App, mode: str) -> None:
+def detection(app: App, mode: Mode) -> None:
     """Set which nodes are taken up: all, or those on the whitelist."""
     with client.connect(home=app.home) as station:
         now = station.set_detection(mode)

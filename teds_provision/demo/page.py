@@ -75,12 +75,17 @@ def _measured(api: client.Client) -> None:
         made = api.request("POST", "/virtual", {"profile": profile, "name": name, "source": source})
         uuids.append(made["uuid"])
     until = time.monotonic() + _READY
-    while any((api.node(uuid)["verdict"] or {}).get("verdict") != "authentic" for uuid in uuids):
+
+    def authentic(uuid: str) -> bool:
+        verdict = api.node(uuid)["verdict"]
+        return verdict is not None and verdict["verdict"] == "authentic"
+
+    while not all(map(authentic, uuids)):
         if time.monotonic() > until:
             raise LinkFailure(f"The virtual transducers were not ready within {_READY:.0f} s.", hint="Try again.")
         time.sleep(0.2)
     api.request("POST", "/groups", {"name": GROUP, "uuids": uuids})
-    api.request("POST", "/measurements", {"group": GROUP, "rate": RATE})
+    api.measure(group=GROUP, rate=RATE)
 
 
 @contextmanager

@@ -100,8 +100,8 @@ class Measuring:
     def add(
         self,
         *,
-        group: str | None,
-        uuids: Sequence[str],
+        group: str | None = None,
+        uuids: Sequence[str] = (),
         channels: Sequence[int] = (),
         rate: float | None = None,
         kind: Any = None,

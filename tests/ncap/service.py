@@ -13,7 +13,7 @@ from urllib.parse import urlsplit
 import jsonschema
 
 from teds_provision import client
-from teds_provision.ncap.web.openapi import document
+from teds_provision.api.operations import document
 from tests.e2e.desk import Desk, Running, Station
 from tests.pace import PATIENCE, until
 

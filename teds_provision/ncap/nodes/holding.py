@@ -15,6 +15,7 @@ from contextlib import AbstractContextManager, ExitStack, contextmanager, suppre
 from dataclasses import dataclass, field
 from typing import Any, Final
 
+from teds_provision.api.bodies import LONGEST_HOLD
 from teds_provision.errors import LinkFailure, NodeBusy, NodeRefused, NoNode, StoreFailure, TedsProvisionError
 from teds_provision.links.ports import Notice
 from teds_provision.measure.blocks import Command
@@ -28,7 +29,6 @@ from teds_provision.station.station import Station
 from teds_provision.talk.conversation import Conversation, SessionLost
 
 HOLD: Final = 1.0  # seconds, where a request does not say
-LONGEST: Final = 60.0
 _STARTING: Final = 15.0
 _OPENING, _LOOK = 5.0, 0.05  # seconds for a session that is being opened, and between looks at it
 Measured = Callable[[str], AbstractContextManager[Trusted | None]]
@@ -125,7 +125,7 @@ class Holding:
                 facts = {"channel": channel, "value": value, "unit": unit or "", "why": error.message}
                 self._station.audit("set", bytes.fromhex(uuid), error.code, **facts)
             raise
-        seconds = HOLD if hold is None else min(hold, LONGEST)
+        seconds = HOLD if hold is None else min(hold, LONGEST_HOLD)
         held, fresh = self._held_for(uuid, channel, value, unit)
         with held.news:
             held.until = time.monotonic() + seconds + (_STARTING if fresh else 0.0)

@@ -14,6 +14,7 @@ from dataclasses import dataclass
 from datetime import UTC, datetime
 from typing import Any, Final
 
+from teds_provision.api.operations import MOST_NODES
 from teds_provision.ncap.live import Live
 from teds_provision.station.station import Station
 from teds_provision.steps.inventory import with_verdicts
@@ -23,7 +24,6 @@ from teds_provision.store.records import iso
 from teds_provision.teds.sheet import Channel, Sheet
 
 _READ_NOW: Final = "read now"
-MOST_SHOWN: Final = 1000
 MOST_GONE: Final = 200
 """Nodes that left and that the store does not know, kept to be shown: in transparent mode anybody can make up more."""
 
@@ -182,11 +182,11 @@ class Roster:
         with self._lock:
             return uuid in self._rows or uuid in self._seen
 
-    def nodes(self, most: int = MOST_SHOWN) -> list[dict[str, Any]]:
+    def nodes(self, most: int = MOST_NODES) -> list[dict[str, Any]]:
         """The first ``most`` of them; those that are there come first."""
         return [self.node(uuid) for uuid in self.uuids()[:most]]
 
-    def nodes_text(self, most: int = MOST_SHOWN, offset: int = 0) -> str:
+    def nodes_text(self, most: int = MOST_NODES, offset: int = 0) -> str:
         """The answer of GET /nodes as JSON; what did not change since is not put together again."""
         uuids = self.uuids()
         shown = ",".join(map(self._text, uuids[offset : offset + most]))

@@ -16,7 +16,7 @@ from starlette.staticfiles import StaticFiles
 from starlette.types import Scope
 from starlette.websockets import WebSocket, WebSocketDisconnect
 
-from teds_provision.client import API
+from teds_provision.api.operations import API
 from teds_provision.errors import NotFound, StoreFailure, TedsProvisionError
 from teds_provision.ncap.daemon import Daemon
 from teds_provision.ncap.live import Listener

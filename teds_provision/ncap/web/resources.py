@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import re
-from collections.abc import AsyncIterator, Awaitable, Callable
+from collections.abc import AsyncIterator, Awaitable, Callable, Sequence
 from dataclasses import replace
 from datetime import UTC, datetime
 from typing import Any, Final
@@ -13,29 +13,20 @@ from starlette.requests import Request
 from starlette.responses import JSONResponse, Response, StreamingResponse
 from starlette.routing import Route
 
+from teds_provision.api import bodies
+from teds_provision.api.operations import FURTHEST, LONGEST_TEXT, MOST_ENTRIES, MOST_NODES, document
 from teds_provision.errors import NotFound, PolicyRefused, UsageFailure
 from teds_provision.ncap.daemon import Daemon
-from teds_provision.ncap.nodes.holding import LONGEST
-from teds_provision.ncap.nodes.roster import MOST_SHOWN
 from teds_provision.ncap.sinks import for_readers
-from teds_provision.ncap.web.answers import Body
+from teds_provision.ncap.web.answers import body_of, changing, moving, reading
 from teds_provision.ncap.web.guard import CALLER, Caller
-from teds_provision.ncap.web.openapi import document
-from teds_provision.ncap.web.threads import changing, moving, reading
 from teds_provision.store import Choice, is_failure
 from teds_provision.store.records import iso
-from teds_provision.teds.profile import default_folders, is_profile_name, list_profiles, listed
+from teds_provision.teds.profile import default_folders, list_profiles, listed
 
 Handler = Callable[[Request], Awaitable[Response]]
-_KINDS: Final = ("periodic", "event", "free")
-_MOST_ENTRIES: Final = 10_000
-_FASTEST: Final = 1e6
-_FASTEST_SCALAR: Final = 1000
-_LARGEST: Final = 1e300
 _LENT_LOOK: Final = 0.5
 _DIGITS: Final = 9  # of a number in a query; Python gives up on four thousand
-_FURTHEST: Final = 10_000_000
-_LONGEST_TEXT: Final = 200
 _UNIX: Final = re.compile(r"[0-9]{1,12}(\.[0-9]{1,9})?")
 
 
@@ -73,7 +64,7 @@ class Resources:
     async def _node_of(self, request: Request) -> str:
         return await asyncio.to_thread(self._daemon.known, request.path_params["uuid"])
 
-    async def _nodes_of(self, texts: tuple[str, ...]) -> list[str]:
+    async def _nodes_of(self, texts: Sequence[str]) -> list[str]:
         return [await asyncio.to_thread(self._daemon.resolve, text) for text in texts]
 
     # -- the station -------------------------------------------------------------------------------------------------
@@ -87,15 +78,13 @@ class Resources:
     async def detection(self, request: Request) -> Response:
         """GET, PUT /detection."""
         if request.method == "PUT":
-            body = await Body.of(request)
-            mode = body.need("mode", str)
-            body.done()
-            await changing(self._daemon.set_detection, mode)
+            body = await body_of(request, bodies.Detection)
+            await changing(self._daemon.set_detection, body.mode)
         return JSONResponse({"mode": await asyncio.to_thread(lambda: self._daemon.detection)})
 
     async def discover(self, request: Request) -> Response:
         """POST /discover."""
-        (await Body.of(request)).done()
+        await body_of(request, bodies.Nothing)
         return JSONResponse({"nodes": await changing(self._daemon.discover)})
 
     async def profiles(self, _request: Request) -> Response:
@@ -110,11 +99,11 @@ class Resources:
     async def log(self, request: Request) -> Response:
         """GET /log: the newest entries that are meant, before ``before`` where it is given, and whether they hold."""
         words = request.query_params
-        limit = _integer(request, "limit", 200, _MOST_ENTRIES)
-        before = _integer(request, "before", 0, _FURTHEST, least=1) or None
+        limit = _integer(request, "limit", 200, MOST_ENTRIES)
+        before = _integer(request, "before", 0, FURTHEST, least=1) or None
         text = words.get("text")
-        if text is not None and len(text) > _LONGEST_TEXT:
-            raise UsageFailure(f"text has {_LONGEST_TEXT} characters at most.")
+        if text is not None and len(text) > LONGEST_TEXT:
+            raise UsageFailure(f"text may have at most {LONGEST_TEXT} characters.")
         failed = words.get("failed", "0") not in ("0", "", "false")
         choice = Choice(act=words.get("act") or None, failed=failed, text=text or None, before=before)
         since = _moment(words["since"]) if words.get("since") else None
@@ -151,18 +140,18 @@ class Resources:
     async def login_link(self, request: Request) -> Response:
         """POST /login-link: the page's address with a token that works once; over the Unix socket alone."""
         caller: Caller = request.scope[CALLER]
-        body = await Body.of(request)
-        read_only = body.take("read_only", bool, False)
-        body.done()
+        body = await body_of(request, bodies.LoginLink)
         if caller.kind != "socket":
-            raise PolicyRefused("A link to log in is given on the machine alone.", hint="teds-provision ncap open")
-        return JSONResponse({"url": self._daemon.login_url(read_only=read_only)})
+            raise PolicyRefused(
+                "Login links are only issued on the station's own machine.", hint="Run there: teds-provision ncap open"
+            )
+        return JSONResponse({"url": self._daemon.login_url(read_only=bool(body.read_only))})
 
     async def lend(self, request: Request) -> Response:
         """GET /lend: the readers are the caller's for as long as this answer is not ended; over the socket alone."""
         caller: Caller = request.scope[CALLER]
         if caller.kind != "socket":
-            raise PolicyRefused("Readers are lent on this machine alone.")
+            raise PolicyRefused("Readers can only be borrowed on the station's own machine.")
         watches = list(self._daemon.watches)
 
         async def lent() -> AsyncIterator[str]:
@@ -183,8 +172,8 @@ class Resources:
 
     async def nodes(self, request: Request) -> Response:
         """GET /nodes: ``limit`` of them from ``offset`` on, and ``total``."""
-        limit = _integer(request, "limit", MOST_SHOWN, MOST_SHOWN)
-        offset = _integer(request, "offset", 0, _FURTHEST, least=0)
+        limit = _integer(request, "limit", MOST_NODES, MOST_NODES)
+        offset = _integer(request, "offset", 0, FURTHEST, least=0)
         text = await asyncio.to_thread(self._daemon.roster.nodes_text, limit, offset)
         return Response(text, media_type="application/json")
 
@@ -195,43 +184,37 @@ class Resources:
 
     async def teds(self, request: Request) -> Response:
         """GET, PUT /nodes/UUID/teds."""
-        uuid, sheets = await self._node_of(request), self._daemon.sheets
-        if request.method == "GET":
+        sheets = self._daemon.sheets
+        body = await body_of(request, bodies.SheetText) if request.method == "PUT" else None
+        uuid = await self._node_of(request)
+        if body is None:
             form = request.query_params.get("format")
             if form is None:
                 return JSONResponse(await reading(sheets.as_json, uuid))
             text, kind = await reading(sheets.document, uuid, form)
             disposition = f'attachment; filename="{uuid}.{form}"'
             return Response(text, media_type=kind, headers={"content-disposition": disposition})
-        body = await Body.of(request)
-        content, accept = body.need("content", str), body.take("accept_calibration", str)
-        body.take("format", str)  # what it is shows in itself
-        body.done()
         dry = request.query_params.get("dry_run", "0") not in ("0", "", "false")
         step = sheets.plan if dry else sheets.write
-        return JSONResponse(await changing(lambda: step(uuid, content, accept=accept)))
+        return JSONResponse(await changing(lambda: step(uuid, body.content, accept=body.accept_calibration)))
 
     async def provision(self, request: Request) -> Response:
         """GET, POST /nodes/UUID/provision; UUID ``next``: whichever node is tapped next."""
+        body = await body_of(request, bodies.Order) if request.method == "POST" else None
         word = request.path_params["uuid"]
         uuid = word if word == "next" else await self._uuid_of_a_label(word)
         runs = self._daemon.provisioning
-        if request.method == "GET":
+        if body is None:
             return JSONResponse(await asyncio.to_thread(runs.of, uuid))
-        body = await Body.of(request)
-        if body.take("cancel", bool, False):
-            body.done()
+        if body.cancel:
             return JSONResponse(await changing(runs.cancel, uuid))
-        profile, name = _type_name(body), body.take("name", str)
-        calibration, calibration_name = body.take("calibration", str), body.take("calibration_name", str)
-        body.done()
-
-        def begin() -> dict[str, Any]:
-            return runs.begin(
-                uuid, profile=profile, name=name, calibration=calibration, calibration_name=calibration_name
-            )
-
-        return JSONResponse(await changing(begin), 202)
+        order = {
+            "profile": body.profile,
+            "name": body.name,
+            "calibration": body.calibration,
+            "calibration_name": body.calibration_name,
+        }
+        return JSONResponse(await changing(lambda: runs.begin(uuid, **order)), 202)
 
     async def _uuid_of_a_label(self, word: str) -> str:
         """A node that nobody has seen yet is named by its whole UUID, as its label says it."""
@@ -242,27 +225,19 @@ class Resources:
 
     async def channel(self, request: Request) -> Response:
         """PUT /nodes/UUID/channels/N: an actuator."""
+        body = await body_of(request, bodies.SetPoint)
         uuid, number = await self._node_of(request), request.path_params["number"]
-        body = await Body.of(request)
-        value = body.number("value", -_LARGEST, _LARGEST)
-        unit, hold = body.take("unit", str), body.number("hold", 0, LONGEST)
-        body.done()
-        if value is None and hold != 0:
-            raise UsageFailure("A set point is missing.", hint='Send {"value": …}, or {"hold": 0} to let go.')
-        if value is None or hold == 0:
+        if body.value is None or body.hold == 0:
             return JSONResponse(await moving(self._daemon.holding.let_go, uuid, number))
-        found = value
-        return JSONResponse(await moving(self._daemon.holding.put, uuid, number, found, unit, hold))
+        return JSONResponse(await moving(self._daemon.holding.put, uuid, number, body.value, body.unit, body.hold))
 
     # -- groups and measurements -------------------------------------------------------------------------------------
 
     async def groups(self, request: Request) -> Response:
         """GET, POST /groups."""
         if request.method == "POST":
-            body = await Body.of(request)
-            name, uuids = body.need("name", str), await self._nodes_of(body.texts("uuids"))
-            body.done()
-            await changing(self._daemon.make_group, name, uuids)
+            body = await body_of(request, bodies.NewGroup)
+            await changing(self._daemon.make_group, body.name, await self._nodes_of(body.uuids or ()))
         found = {"groups": await asyncio.to_thread(self._daemon.groups)}
         return JSONResponse(found, 201 if request.method == "POST" else 200)
 
@@ -272,10 +247,8 @@ class Resources:
         if request.method == "DELETE":
             await changing(self._daemon.drop_group, name)
         else:
-            body = await Body.of(request)
-            uuids = await self._nodes_of(body.texts("uuids", needed=True))
-            body.done()
-            await changing(self._daemon.change_group, name, uuids)
+            body = await body_of(request, bodies.GroupMembers)
+            await changing(self._daemon.change_group, name, await self._nodes_of(body.uuids))
         return JSONResponse({"groups": await asyncio.to_thread(self._daemon.groups)})
 
     async def measurements(self, request: Request) -> Response:
@@ -283,24 +256,10 @@ class Resources:
         measuring = self._daemon.measuring
         if request.method == "GET":
             return _shown(request, {"measurements": await asyncio.to_thread(measuring.all)})
-        body = await Body.of(request)
-        asked: dict[str, Any] = {
-            "group": body.take("group", str),
-            "uuids": await self._nodes_of(body.texts("uuids")),
-            "rate": body.number("rate", 0.001, _FASTEST),
-            "kind": body.take("kind", str),
-            "trigger": body.take("trigger", bool, False),
-            "sinks": body.texts("sinks"),
-            "channels": _numbers(body.take("channels", list, [])),
-            "actuators": body.take("actuators", bool, True),
-        }
-        dead_man, scalar_rate = body.take("dead_man", int), body.number("scalar_rate", 0, _FASTEST_SCALAR)
-        asked |= {} if dead_man is None else {"dead_man": _dead_man(dead_man)}
-        asked |= {} if scalar_rate is None else {"scalar_rate": scalar_rate}
-        body.done()
-        if asked["kind"] not in (None, *_KINDS):
-            raise UsageFailure(f"{asked['kind']!r} is no kind.", hint=f"Use {', '.join(_KINDS)}.")
-        return JSONResponse(await changing(lambda: measuring.add(**asked)), 201)
+        body = await body_of(request, bodies.NewMeasurement)
+        said = {name: value for name, value in vars(body).items() if value is not None}  # else as the daemon has it
+        said["uuids"] = await self._nodes_of(body.uuids)
+        return JSONResponse(await changing(lambda: measuring.add(**said)), 201)
 
     async def measurement(self, request: Request) -> Response:
         """DELETE /measurements/ID."""
@@ -313,43 +272,35 @@ class Resources:
         """GET, PUT /names."""
         names = self._daemon.names
         if request.method == "PUT":
-            body = await Body.of(request)
-            [uuid] = await self._nodes_of((body.need("uuid", str),))
-            channel, name = body.take("channel", int, 0), body.take("name", str)
-            body.take("topic", str)  # the row of GET, sent back
-            body.done()
-            if not 0 <= channel <= 255:
-                raise UsageFailure(f"{channel} is no channel.")
-            await changing(names.rename, uuid, channel, name or None)
+            body = await body_of(request, bodies.NewName)
+            [uuid] = await self._nodes_of([body.uuid])
+            await changing(names.rename, uuid, body.channel or 0, body.name or None)
         return JSONResponse({"names": await asyncio.to_thread(names.all)})
 
     async def virtual(self, request: Request) -> Response:
         """GET, POST /virtual."""
         if request.method == "GET":
             return JSONResponse({"virtual": self._daemon.virtuals.all()})
-        body = await Body.of(request)
-        asked: dict[str, Any] = {
-            "name": body.take("name", str),
-            "source": body.take("source", str, "noise"),
-            "content": body.take("content", str),
-            "profile": _type_name(body),
-        }
-        body.take("format", str)
-        body.done()
+        body = await body_of(request, bodies.NewVirtual)
+        source = body.source or "noise"
         caller: Caller = request.scope[CALLER]
-        if caller.kind != "socket" and asked["source"].startswith(("file:", "unix:")):
-            # What is wrong with a file is told with a piece of it: no token reads this user's files.
+        if caller.kind != "socket" and source.startswith(("file:", "unix:")):
+            # An error about a file quotes a piece of it: no token reads this user's files.
             raise PolicyRefused(
-                "A source that is a file or a socket is named on this machine alone.",
+                "A file or socket can only be named as a source on the station's own machine.",
                 hint="Use noise, sine:S or ramp:S.",
             )
-        return JSONResponse(await changing(lambda: self._daemon.make_virtual(**asked)), 201)
+
+        def make() -> dict[str, Any]:
+            return self._daemon.make_virtual(name=body.name, source=source, content=body.content, profile=body.profile)
+
+        return JSONResponse(await changing(make), 201)
 
     async def one_virtual(self, request: Request) -> Response:
         """DELETE /virtual/UUID."""
         uuid = request.path_params["uuid"].lower()
         if uuid not in self._daemon.virtuals:
-            raise NotFound(f"{uuid} is no virtual transducer of this station.")
+            raise NotFound(f"{uuid} is not a virtual transducer of this station.")
         await changing(self._daemon.drop_virtual, uuid)
         return JSONResponse({"virtual": self._daemon.virtuals.all()})
 
@@ -365,7 +316,7 @@ def _integer(request: Request, name: str, default: int, most: int, least: int = 
     if text is None:
         return default
     if not (text.isascii() and text.isdecimal() and len(text) <= _DIGITS and least <= int(text) <= most):
-        raise UsageFailure(f"{name} has to be a whole number from {least} to {most}.")
+        raise UsageFailure(f"{name} must be a whole number from {least} to {most}.")
     return int(text)
 
 
@@ -374,28 +325,8 @@ def _moment(text: str) -> str:
     try:
         at = datetime.fromtimestamp(float(text), UTC) if _UNIX.fullmatch(text) else datetime.fromisoformat(text)
     except (ValueError, OverflowError, OSError):
-        raise UsageFailure("since has to be a moment: 2026-11-22T10:00:00Z, or unix seconds.") from None
+        raise UsageFailure("since must be a time such as 2026-11-22T10:00:00Z, or unix seconds.") from None
     return iso(at if at.tzinfo is not None else at.replace(tzinfo=UTC))
-
-
-def _type_name(body: Body) -> str | None:
-    """The name of a transducer type, never a path: what is wrong with a file is told with a piece of it."""
-    name: str | None = body.take("profile", str)
-    if name is not None and not is_profile_name(name):
-        raise UsageFailure(f"{name!r} is no name of a profile.", hint="GET /profiles lists them.")
-    return name
-
-
-def _numbers(values: list[Any]) -> tuple[int, ...]:
-    if not all(isinstance(one, int) and not isinstance(one, bool) and 1 <= one <= 255 for one in values):
-        raise UsageFailure("Channels are numbers from 1 to 255.")
-    return tuple(values)
-
-
-def _dead_man(milliseconds: int) -> int:
-    if not 20 <= milliseconds <= 10_000:
-        raise UsageFailure(f"'dead_man' has to be from 20 to 10000 ms, not {milliseconds}.")
-    return milliseconds
 
 
 def _sentence(outcome: str, detail: dict[str, Any]) -> str:

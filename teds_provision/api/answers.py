@@ -1,0 +1,466 @@
+"""What answers hold: each class is a schema of the description, under its own name.
+
+Values are in the SI unit of the datasheet, times in unix seconds unless they are texts. More members may come.
+"""
+
+from __future__ import annotations
+
+from typing import Annotated, Any, Literal, NotRequired, TypedDict
+
+from teds_provision.api.bodies import Mode
+from teds_provision.api.schema import Meta
+
+Uuid = Annotated[str, Meta(pattern="^[0-9a-f]{20}$", description="20 hex digits")]
+Time = Annotated[float, Meta(description="unix seconds")]
+_Origin = TypedDict("_Origin", {"from": Literal["session", "kept", "plain"]})  # a keyword of Python
+
+
+class Problem(TypedDict):
+    """What is wrong, and what to do about it."""
+
+    code: str
+    message: str
+    hint: str
+
+
+class Error(TypedDict):
+    """A refusal."""
+
+    error: Problem
+
+
+class Check(TypedDict):
+    """One check of a verdict."""
+
+    name: str
+    result: Literal["passed", "failed", "skipped"]
+    why: str
+
+
+class Shown(TypedDict):
+    """The unit for people: SI value × factor + offset."""
+
+    unit: str
+    factor: float | None
+    offset: float | None
+
+
+class Last(TypedDict):
+    """The newest value of a channel."""
+
+    value: float | None
+    valid: bool
+    time: Time
+    age: float
+    raw: NotRequired[Any]
+
+
+class ActuatorState(TypedDict):
+    """The last set point of an actuator."""
+
+    value: float | None
+    unit: str | None
+    safe: bool | None
+
+
+class Channel(TypedDict):
+    """A TransducerChannel."""
+
+    number: int
+    name: str
+    kind: Literal["sensor", "actuator", "event sensor"] | None
+    unit: Annotated[str, Meta(description="SI unit of every number here")]
+    shown: Shown
+    low: float | None
+    high: float | None
+    uncertainty: float | None
+    rate: Annotated[float, Meta(description="samples a second that the datasheet allows")] | None
+    calibrated: str | None
+    due: str | None
+    overdue: bool
+    problem: Annotated[str, Meta(description="why it gives no values")] | None
+    topic: str | None
+    last: Last | None
+    actuator: ActuatorState | None
+
+
+class Invalid(TypedDict):
+    """Samples of a channel that are not valid, by reason."""
+
+    channel: int
+    why: str
+    count: int
+
+
+class Report(TypedDict):
+    """How a node does in a measurement."""
+
+    uuid: Uuid
+    state: Literal["waiting", "running", "lost", "refused", "ended"]
+    why: str
+    samples: NotRequired[int]
+    lost: NotRequired[int]
+    late: NotRequired[int]
+    bad: NotRequired[int]
+    invalid: NotRequired[int]
+    invalid_why: NotRequired[list[Invalid]]
+    clock_error: NotRequired[Annotated[float, Meta(description="seconds")] | None]
+
+
+class Verdict(_Origin):
+    """Whether a datasheet is authentic, and how that is known."""
+
+    verdict: Literal["authentic", "unsigned", "unverified", "not authentic", "unproven"]
+    checks: list[Check]
+    at: str
+    by: str
+
+
+class Node(TypedDict):
+    """A node, as far as it is known."""
+
+    uuid: Uuid
+    name: str | None
+    profile: NotRequired[str | None]
+    link: str | None
+    via: str | None
+    address: NotRequired[int | None]
+    present: bool
+    last_seen: NotRequired[str | None]
+    tapped: NotRequired[float | None]
+    state: str | None
+    mode: NotRequired[Literal["idle", "measuring"] | None]
+    whitelisted: bool
+    virtual: bool
+    fingerprint: NotRequired[str | None]
+    epoch: NotRequired[int]
+    sequence: NotRequired[int]
+    due: NotRequired[str | None]
+    verdict: Verdict | None
+    heard: Verdict | None
+    verified: NotRequired[str | None]
+    retired: NotRequired[str | None]
+    problem: Problem | None
+    busy: NotRequired[str | None]
+    group: NotRequired[str | None]
+    groups: list[str]
+    measurement: str | None
+    measuring: NotRequired[Report | None]
+    power: dict[str, Any] | None
+    channels: list[Channel]
+
+
+class Group(TypedDict):
+    """A measurement group."""
+
+    name: str
+    uuids: list[Uuid]
+    measuring: bool
+
+
+class Measurement(TypedDict):
+    """A measurement, kept until it is deleted."""
+
+    id: str
+    group: str | None
+    uuids: list[Uuid]
+    channels: NotRequired[list[int]]
+    rate: float | None
+    kind: str | None
+    trigger: bool
+    sinks: list[str]
+    actuators: Annotated[bool, Meta(description="whether set points arrive by topics")]
+    dead_man: NotRequired[Annotated[int, Meta(description="ms after which an actuator without set points is safe")]]
+    created: NotRequired[str]
+    state: Literal["starting", "waiting", "running", "failed", "ended"]
+    why: str
+    nodes: list[Report]
+    files: list[str]
+
+
+class Sink(TypedDict):
+    """Where values go, and what became of them."""
+
+    measurement: str
+    name: str
+    state: str
+    detail: NotRequired[str]
+    error: str
+    hint: str
+    written: int
+    dropped: int
+    octets: NotRequired[int]
+    messages: NotRequired[int]
+    recorder: NotRequired[bool]
+    files: NotRequired[list[str]]
+
+
+class Link(TypedDict):
+    """A link of the station."""
+
+    place: str
+    via: str
+    virtual: NotRequired[bool]
+    state: Literal["opening", "up", "down", "lent"]
+    problem: Problem | None
+    waiting: NotRequired[str | None]
+    notice: NotRequired[
+        Annotated[str, Meta(description="the newest: another station under our address, an address used twice")] | None
+    ]
+    since: NotRequired[Time]
+    nodes: int
+    strangers: int
+
+
+class StationName(TypedDict):
+    """Which station this is."""
+
+    name: str
+    fingerprint: str
+
+
+class Budget(TypedDict):
+    """Messages a second to ROS and MQTT."""
+
+    used: float
+    limit: float
+
+
+class Status(TypedDict):
+    """The station, its links, measurements and sinks."""
+
+    version: str
+    station: StationName
+    started: NotRequired[Time]
+    time: Time
+    url: str | None
+    detection: Mode
+    adopt: NotRequired[bool]
+    actuators: NotRequired[
+        Annotated[bool, Meta(description="whether set points arrive by topics where a measurement lets them")]
+    ]
+    dead_man: NotRequired[Annotated[int, Meta(description="ms, unless a measurement sets its own; also for requests")]]
+    links: list[Link]
+    nodes: NotRequired[int]
+    strangers: NotRequired[int]
+    clients: NotRequired[int]
+    measurements: list[Measurement]
+    sinks: list[Sink]
+    clock_error: float | None
+    budget: Budget
+    write: Annotated[bool, Meta(description="whether this token may change anything")]
+
+
+class Change(TypedDict):
+    """One field that writing a datasheet changes, in physical units."""
+
+    channel: int
+    access_code: NotRequired[int]
+    field: str
+    before: str
+    after: str
+    text: str
+
+
+class Finding(TypedDict):
+    """What the guard says of a datasheet."""
+
+    severity: str
+    message: str
+    hint: str
+
+
+class Curve(TypedDict):
+    """The calibration of a channel, to be drawn."""
+
+    channel: int
+    name: str
+    x_unit: str
+    y_unit: str
+    points: list[list[float]]
+
+
+class Sheet(_Origin):
+    """A node's datasheet, decoded and checked."""
+
+    uuid: Uuid
+    read_now: bool
+    verdict: str
+    at: str
+    by: str
+    checks: list[Check]
+    teds: list[dict[str, Any]]
+    guard: list[Finding]
+    curves: list[Curve]
+
+
+class DocumentBlock(TypedDict):
+    """One TEDS of a document."""
+
+    channel: int
+    access_code: int
+    octets: NotRequired[str]
+
+
+class Document(TypedDict):
+    """A datasheet as a JSON document."""
+
+    format: Literal["teds/1"]
+    teds: list[DocumentBlock]
+
+
+class Step(TypedDict):
+    """A step of work with a node."""
+
+    name: str
+    result: str
+    detail: str
+    seconds: NotRequired[float]
+
+
+class SheetPlan(TypedDict):
+    """What writing a datasheet changes, or changed."""
+
+    uuid: Uuid
+    dry_run: bool
+    changes: list[Change]
+    guard: list[Finding]
+    steps: list[Step]
+    verdict: str | None
+
+
+class Provisioning(TypedDict):
+    """A provisioning that waits, runs, or is over."""
+
+    uuid: str
+    state: Literal["waiting", "running", "done", "failed", "cancelled"]
+    waits_for: Literal["tap"] | None
+    until: float | None
+    steps: list[Step]
+    error: Problem | None
+    verdict: str | None
+
+
+class AppliedValue(TypedDict):
+    """What an actuator was set to."""
+
+    channel: int
+    value: float
+    unit: str
+    raw: Any
+
+
+class Applied(TypedDict):
+    """What became of a set point."""
+
+    applied: AppliedValue | None
+    until: float | None
+    safe: Annotated[bool, Meta(description="what the node itself said after it was let go")] | None
+
+
+class Name(TypedDict):
+    """The name and topic of a node or channel."""
+
+    uuid: Uuid
+    channel: int
+    name: str | None
+    topic: str
+
+
+class Virtual(TypedDict):
+    """A virtual transducer of this station."""
+
+    uuid: Uuid
+    name: str
+    source: str
+    state: Literal["starting", "running", "ended"]
+    why: NotRequired[str]
+    channels: int
+
+
+class Profile(TypedDict):
+    """A transducer type that can be built."""
+
+    name: str
+    title: str
+
+
+class Entry(TypedDict):
+    """An entry of the audit log."""
+
+    seq: int
+    time: Time
+    who: str
+    actor: Annotated[str, Meta(description="the user, the name of a token, or page")]
+    act: str
+    uuid: Uuid | None
+    subject: NotRequired[str]
+    outcome: str
+    detail: str
+    facts: NotRequired[dict[str, Any]]
+    failed: bool
+
+
+# -- what holds a list of them, or one thing ---------------------------------------------------------------------------
+
+
+class DetectionMode(TypedDict):
+    """Which nodes the station looks at."""
+
+    mode: Mode
+
+
+class Found(TypedDict):
+    """The nodes that answered."""
+
+    nodes: list[Node]
+
+
+class Nodes(Found):
+    """A page of nodes, and how many there are in all."""
+
+    total: int
+
+
+class Groups(TypedDict):
+    """Every measurement group."""
+
+    groups: list[Group]
+
+
+class Measurements(TypedDict):
+    """Every measurement."""
+
+    measurements: list[Measurement]
+
+
+class Names(TypedDict):
+    """Every name and topic."""
+
+    names: list[Name]
+
+
+class Virtuals(TypedDict):
+    """Every virtual transducer."""
+
+    virtual: list[Virtual]
+
+
+class Profiles(TypedDict):
+    """Every profile."""
+
+    profiles: list[Profile]
+
+
+class Log(TypedDict):
+    """Entries of the audit log, and whether the log is intact."""
+
+    entries: list[Entry]
+    intact: bool
+    why: NotRequired[str]
+
+
+class Url(TypedDict):
+    """An address."""
+
+    url: str

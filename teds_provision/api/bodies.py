@@ -1,0 +1,153 @@
+"""What a request may say: each class is the body of one operation, in the order of ``operations``.
+
+A member that may be left out may be null too. What only the state of the station decides (is there such a node, may
+this name be taken) is not here: it has error codes of its own.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Annotated, ClassVar, Final, Literal
+
+from teds_provision.api.schema import Meta
+
+LONGEST_HOLD: Final = 60.0
+"""Seconds for which one request holds an actuator, at most."""
+_LARGEST: Final = 1e300
+
+Mode = Literal["transparent", "whitelist"]
+Kind = Literal["periodic", "event", "free"]
+Number = Annotated[int, Meta(minimum=1, maximum=255)]
+ProfileName = Annotated[
+    str,
+    Meta(
+        pattern=r"^(?!.*\.toml$)[a-z0-9][a-z0-9._-]{0,63}$",
+        description="a name that GET /profiles lists, never a path",
+    ),
+]
+
+
+@dataclass(frozen=True)
+class Detection:
+    """PUT /detection."""
+
+    mode: Mode
+
+
+@dataclass(frozen=True)
+class Nothing:
+    """POST /discover."""
+
+
+@dataclass(frozen=True)
+class SheetText:
+    """PUT /nodes/{uuid}/teds."""
+
+    content: Annotated[str, Meta(description="XML, JSON or hex")]
+    format: Annotated[str, Meta(description="ignored: the content shows what it is")] | None = None
+    accept_calibration: Annotated[str, Meta(description="why a calibration that the guard refuses is right")] | None = (
+        None
+    )
+
+
+@dataclass(frozen=True)
+class Order:
+    """POST /nodes/{uuid}/provision."""
+
+    profile: ProfileName | None = None
+    name: str | None = None
+    calibration: Annotated[str, Meta(description="the content of a calibration file")] | None = None
+    calibration_name: Annotated[str, Meta(description="the name of that file")] | None = None
+    cancel: Annotated[bool, Meta(description="stop waiting for a tap")] | None = None
+
+
+@dataclass(frozen=True)
+class SetPoint:
+    """PUT /nodes/{uuid}/channels/{number}."""
+
+    value: Annotated[float, Meta(minimum=-_LARGEST, maximum=_LARGEST)] | None = None
+    unit: Annotated[str, Meta(description="of the value; else the SI unit of the datasheet")] | None = None
+    hold: Annotated[float, Meta(minimum=0, maximum=LONGEST_HOLD, description="seconds; 0 lets go")] | None = None
+
+    RULE: ClassVar = Meta(
+        anyOf=[
+            {"required": ["value"], "properties": {"value": {"type": "number"}}},
+            {"required": ["hold"], "properties": {"hold": {"type": "number", "maximum": 0}}},
+        ],
+        description='Send {"value": …} to set the actuator, or {"hold": 0} to let it go.',
+    )
+
+
+@dataclass(frozen=True)
+class NewGroup:
+    """POST /groups."""
+
+    name: str
+    uuids: list[str] | None = None
+
+
+@dataclass(frozen=True)
+class GroupMembers:
+    """PUT /groups/{name}."""
+
+    uuids: list[str]
+
+
+@dataclass(frozen=True)
+class NewMeasurement:
+    """POST /measurements."""
+
+    group: str | None = None
+    uuids: list[str] = field(default_factory=list)
+    channels: list[Number] | None = None
+    rate: Annotated[float, Meta(minimum=0.001, maximum=1e6, description="Hz, else the datasheet's")] | None = None
+    kind: Kind | None = None
+    trigger: bool | None = None
+    sinks: list[Annotated[str, Meta(description="ros1, ros2, the name of a broker, or of a file")]] | None = None
+    actuators: Annotated[bool, Meta(description="may set points arrive by ROS topics; true by default")] | None = None
+    dead_man: Annotated[int, Meta(minimum=20, maximum=10_000, description="ms, else the station's")] | None = None
+    scalar_rate: Annotated[float, Meta(minimum=0, maximum=1000, description="Hz, 10 by default")] | None = None
+
+    RULE: ClassVar = Meta(
+        oneOf=[
+            {"required": ["group"], "properties": {"group": {"type": "string"}}},
+            {"required": ["uuids"], "properties": {"uuids": {"type": "array", "minItems": 1}}},
+        ],
+        description='A measurement needs either "group" or "uuids".',
+    )
+
+
+@dataclass(frozen=True)
+class NewName:
+    """PUT /names; a row of GET /names may be sent back as it is."""
+
+    uuid: str
+    channel: Annotated[int, Meta(minimum=0, maximum=255, description="0: the node itself")] | None = None
+    name: Annotated[str, Meta(description="null restores the default")] | None = None
+    topic: Annotated[str, Meta(description="ignored")] | None = None
+
+
+@dataclass(frozen=True)
+class NewVirtual:
+    """POST /virtual."""
+
+    name: str | None = None
+    source: Annotated[str, Meta(description="noise (default), sine:S, ramp:S, file:/P or unix:/P")] | None = None
+    content: Annotated[str, Meta(description="a datasheet in XML or JSON")] | None = None
+    format: Annotated[str, Meta(description="ignored: the content shows what it is")] | None = None
+    profile: ProfileName | None = None
+
+    RULE: ClassVar = Meta(
+        oneOf=[
+            {"required": ["content"], "properties": {"content": {"type": "string"}}},
+            {"required": ["profile"], "properties": {"profile": {"type": "string"}}},
+        ],
+        description='A virtual transducer needs either "content" or "profile".',
+    )
+
+
+@dataclass(frozen=True)
+class LoginLink:
+    """POST /login-link."""
+
+    read_only: bool | None = None

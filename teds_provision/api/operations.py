@@ -1,0 +1,174 @@
+"""Every operation of the API, and its description as OpenAPI 3.1; tested against the routes and the answers."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any, Final
+
+from teds_provision import __version__
+from teds_provision.api import answers, bodies
+from teds_provision.api.schema import Schema, schema_of
+
+API: Final = "/api/v1"
+MOST_NODES: Final = 1000
+"""Nodes in one answer."""
+MOST_ENTRIES: Final = 10_000
+"""Entries of the log in one answer."""
+FURTHEST: Final = 10_000_000
+LONGEST_TEXT: Final = 200
+
+_TEXT: Final[Schema] = {"type": "string"}
+
+
+@dataclass(frozen=True)
+class Operation:
+    """One method of one path: what it does, what it takes, what it answers.
+
+    ``answer`` is a type of ``answers``, several of which one is given, ``str`` for text, None for any object.
+    """
+
+    method: str
+    path: str
+    does: str
+    answer: Any
+    body: type[Any] | None = None
+    status: int = 200
+    query: dict[str, Schema] = field(default_factory=dict)
+    document: bool = False  # whether it may answer a document that is no JSON
+
+
+def _integer(least: int, most: int) -> Schema:
+    return {"type": "integer", "minimum": least, "maximum": most}
+
+
+OPERATIONS: Final = (
+    Operation("GET", "/status", "Version, station, links, detection, sinks, clock quality, budget.", answers.Status),
+    Operation("GET", "/detection", "Get the detection mode.", answers.DetectionMode),
+    Operation("PUT", "/detection", "Set the detection mode, and look at every link again.", answers.DetectionMode,
+              bodies.Detection),
+    Operation("POST", "/discover", "Ask every link now.", answers.Found, bodies.Nothing),
+    Operation("GET", "/nodes", "List nodes, those that are present first.", answers.Nodes,
+              query={"limit": _integer(1, MOST_NODES), "offset": _integer(0, FURTHEST)}),
+    Operation("GET", "/nodes/{uuid}", "Get a node, by UUID, prefix or name.", answers.Node),
+    Operation("GET", "/nodes/{uuid}/teds", "Read a node's datasheet: decoded and checked, or as a document.",
+              (answers.Sheet, answers.Document),
+              query={"format": {"type": "string", "enum": ["json", "xml", "hex"]}}, document=True),
+    Operation("PUT", "/nodes/{uuid}/teds", "Write a datasheet, or show what that would change.", answers.SheetPlan,
+              bodies.SheetText, query={"dry_run": _TEXT}),
+    Operation("GET", "/nodes/{uuid}/provision", "Follow a node's provisioning.", answers.Provisioning),
+    Operation("POST", "/nodes/{uuid}/provision",
+              "Provision a node (next: whichever is tapped next), or stop waiting for it.", answers.Provisioning,
+              bodies.Order, status=202),
+    Operation("PUT", "/nodes/{uuid}/channels/{number}", "Set an actuator and hold it, or let it go.", answers.Applied,
+              bodies.SetPoint),
+    Operation("GET", "/groups", "List the measurement groups.", answers.Groups),
+    Operation("POST", "/groups", "Create a group.", answers.Groups, bodies.NewGroup, status=201),
+    Operation("PUT", "/groups/{name}", "Replace the members of a group.", answers.Groups, bodies.GroupMembers),
+    Operation("DELETE", "/groups/{name}", "Delete a group.", answers.Groups),
+    Operation("GET", "/measurements", "List the measurements.", answers.Measurements),
+    Operation("POST", "/measurements", "Measure until deleted, across restarts of the station and of nodes.",
+              answers.Measurement, bodies.NewMeasurement, status=201),
+    Operation("DELETE", "/measurements/{id}", "End a measurement and forget it.", answers.Measurements),
+    Operation("GET", "/names", "List the name and topic of every channel.", answers.Names),
+    Operation("PUT", "/names", "Rename a node or a channel.", answers.Names, bodies.NewName),
+    Operation("GET", "/virtual", "List the virtual transducers of this station.", answers.Virtuals),
+    Operation("POST", "/virtual", "Create a virtual transducer from a datasheet or a profile.", answers.Virtual,
+              bodies.NewVirtual, status=201),
+    Operation("DELETE", "/virtual/{uuid}", "Delete a virtual transducer and its key.", answers.Virtuals),
+    Operation("GET", "/profiles", "List the transducer types that can be built.", answers.Profiles),
+    Operation(
+        "GET", "/log", "Search the audit log: the newest entries, or the newest before entry ``before``.", answers.Log,
+        query={
+            "limit": _integer(1, MOST_ENTRIES),
+            "before": _integer(1, FURTHEST),
+            "uuid": _TEXT,
+            "text": {"type": "string", "maxLength": LONGEST_TEXT},
+            "act": _TEXT,
+            "failed": _TEXT,
+            "since": {"type": "string", "description": "ISO 8601, or unix seconds"},
+        },
+    ),
+    Operation("POST", "/login-link", "Get the page's address with a token that works once (Unix socket only).",
+              answers.Url, bodies.LoginLink),
+    Operation("GET", "/lend", "Borrow the readers until this answer is closed (Unix socket only).", str,
+              document=True),
+    Operation("GET", "/openapi.json", "Get this description.", None),
+)  # fmt: skip
+
+REFUSALS: Final = {
+    "400": "malformed HTTP",
+    "401": "no token, or one that is invalid or has expired",
+    "403": "a foreign Origin, or a read-only token used to change something",
+    "404": "not found",
+    "405": "method not allowed",
+    "409": "frozen: being measured",
+    "413": "body over 1 MiB",
+    "415": "a request that changes something must be JSON",
+    "421": "a foreign Host",
+    "422": "bad-request: the body does not match its schema; other codes: guard, limits, policy, bad data",
+    "423": "claimed by another station, or busy",
+    "429": "too many wrong tokens",
+    "500": "a bug",
+    "503": "the link or the store failed",
+}
+
+
+def document() -> dict[str, Any]:
+    """The whole description."""
+    named: dict[str, Schema] = {}
+    paths: dict[str, dict[str, Any]] = {}
+    for one in OPERATIONS:
+        paths.setdefault(one.path, {})[one.method.lower()] = _operation(one, named)
+    error = schema_of(answers.Error, named)
+    return {
+        "openapi": "3.1.0",
+        "info": {
+            "title": "teds-provision: a base station",
+            "version": __version__,
+            "description": "Values are in the SI unit of the datasheet, times in unix seconds unless they are texts.",
+        },
+        "servers": [{"url": API}],
+        "security": [{"token": []}, {"browser": []}],
+        "paths": paths,
+        "components": {
+            "schemas": named,
+            "securitySchemes": {
+                "token": {"type": "http", "scheme": "bearer"},
+                "browser": {"type": "apiKey", "in": "cookie", "name": "ncap-PORT"},
+            },
+            "responses": {
+                key: {"description": why, "content": {"application/json": {"schema": error}}}
+                for key, why in REFUSALS.items()
+            },
+        },
+    }
+
+
+def _operation(one: Operation, named: dict[str, Schema]) -> dict[str, Any]:
+    names = [part[1:-1] for part in one.path.split("/") if part.startswith("{")]
+    path = [
+        {"name": name, "in": "path", "required": True, "schema": {"type": "integer"} if name == "number" else _TEXT}
+        for name in names
+    ]
+    if isinstance(one.answer, tuple):
+        schema: Schema = {"anyOf": [schema_of(kind, named) for kind in one.answer]}
+    else:
+        schema = {"type": "object"} if one.answer is None else schema_of(one.answer, named)
+    content: dict[str, Any] = {"application/json": {"schema": schema}}
+    if one.document:
+        content |= {"application/xml": {"schema": _TEXT}, "text/plain": {"schema": _TEXT}}
+    responses: dict[str, Any] = {str(one.status): {"description": one.does, "content": content}}
+    if one.status == 202:
+        responses["200"] = responses["202"]  # a waiting that was cancelled
+    responses |= {key: {"$ref": f"#/components/responses/{key}"} for key in REFUSALS}
+    words = "".join(part.strip("{}").title().replace("-", "") for part in one.path.split("/"))
+    found: dict[str, Any] = {
+        "operationId": f"{one.method.lower()}{words}",
+        "summary": one.does,
+        "parameters": [*path, *({"name": name, "in": "query", "schema": kind} for name, kind in one.query.items())],
+        "responses": responses,
+    }
+    if one.body is not None:
+        schema = schema_of(one.body, named)
+        found["requestBody"] = {"required": "required" in schema, "content": {"application/json": {"schema": schema}}}
+    return found

@@ -1,0 +1,198 @@
+"""From a type to its JSON schema (2020-12, as OpenAPI 3.1 takes it), and from JSON to a value of that type.
+
+A value is checked against the schema itself, so that a body is refused exactly where the published description forbids
+it. The subset is what the types of this room need: type, enum, const, pattern, minimum, maximum, minItems, items,
+properties, required, additionalProperties, anyOf, oneOf.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import re
+import types
+from dataclasses import MISSING, fields, is_dataclass
+from typing import (
+    Annotated,
+    Any,
+    Final,
+    Literal,
+    NotRequired,
+    TypeVar,
+    Union,
+    get_args,
+    get_origin,
+    get_type_hints,
+    is_typeddict,
+)
+
+Schema = dict[str, Any]
+Shape = TypeVar("Shape")
+"""A dataclass of ``bodies``."""
+
+
+class Meta:
+    """What a schema says beside the type: ``Annotated[float, Meta(minimum=0)]``."""
+
+    def __init__(self, **facts: Any) -> None:
+        self.facts = facts
+
+
+class BadRequest(ValueError):
+    """A body that the description forbids: what is wrong, and what to do."""
+
+    def __init__(self, message: str, hint: str = "See /api/v1/openapi.json.") -> None:
+        super().__init__(message)
+        self.message, self.hint = message, hint
+
+
+_PLAIN: Final = {str: "string", int: "integer", float: "number", bool: "boolean", dict: "object", Any: None}
+
+
+def schema_of(shape: Any, named: dict[str, Schema]) -> Schema:
+    """The schema of a type. Typed dictionaries become references; their own schemas are put into ``named``."""
+    if is_typeddict(shape):
+        if shape.__name__ not in named:
+            named[shape.__name__] = {}  # here already, should it hold itself
+            hints = get_type_hints(shape, include_extras=True)
+            named[shape.__name__] = {
+                "type": "object",
+                "properties": {name: schema_of(hint, named) for name, hint in hints.items()},
+                "required": [name for name, hint in hints.items() if get_origin(hint) is not NotRequired],
+            }
+        return {"$ref": f"#/components/schemas/{shape.__name__}"}
+    if is_dataclass(shape):
+        hints = get_type_hints(shape, include_extras=True)
+        required = [one.name for one in fields(shape) if one.default is MISSING and one.default_factory is MISSING]
+        found: Schema = {
+            "type": "object",
+            "properties": {one.name: schema_of(hints[one.name], named) for one in fields(shape)},
+            "additionalProperties": False,
+        }
+        rule: Meta = getattr(shape, "RULE", Meta())
+        return found | ({"required": required} if required else {}) | rule.facts
+    origin, inner = get_origin(shape), get_args(shape)
+    if origin is Annotated:
+        meta: Meta = inner[1]
+        return schema_of(inner[0], named) | meta.facts
+    if origin is NotRequired:
+        return schema_of(inner[0], named)
+    if origin is Literal:
+        return {"type": "string", "enum": list(inner)}
+    if origin in (Union, types.UnionType):
+        [kind] = [one for one in inner if one is not type(None)]
+        found = schema_of(kind, named)
+        if "type" not in found:
+            return {"anyOf": [found, {"type": "null"}]}
+        either: Schema = {**found, "type": [found["type"], "null"]}
+        return either | ({"enum": [*found["enum"], None]} if "enum" in found else {})
+    if origin is list:
+        return {"type": "array", "items": schema_of(inner[0], named)}
+    kind = _PLAIN[origin or shape]
+    return {} if kind is None else {"type": kind}
+
+
+def read(shape: type[Shape], octets: bytes) -> Shape:
+    """A body of that shape; nothing at all counts as ``{}``. A member that is null is as one that is not there.
+
+    Raises BadRequest for what is not JSON (RFC 8259: no NaN, no half of a surrogate pair), for two members of one name
+    (section 4: each reader takes another of them, so what was checked in front of us is not what we would do), and for
+    what the schema forbids.
+    """
+    try:
+        value = json.loads(octets, object_pairs_hook=_unique, parse_constant=_no_constant) if octets else {}
+        json.dumps(value, ensure_ascii=False).encode()
+    except BadRequest:
+        raise
+    except (ValueError, RecursionError) as error:
+        raise BadRequest("The request body is not valid JSON.", "") from error
+    if not isinstance(value, dict):
+        raise BadRequest("The request body must be a JSON object.", "")
+    found = fit(schema_of(shape, {}), value)
+    return shape(**{name: member for name, member in found.items() if member is not None})
+
+
+def _unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    members = dict(pairs)
+    if len(members) < len(pairs):
+        names = [name for name, _ in pairs]
+        twice = next(name for name in names if names.count(name) > 1)
+        raise BadRequest(f"Member {twice[:64]!r} appears twice.", "Send each member once.")
+    return members
+
+
+def _no_constant(name: str) -> Any:
+    raise ValueError(name)
+
+
+def fit(schema: Schema, value: Any, where: str = "") -> Any:
+    """The value as its schema has it (1.0 is the integer 1, 1 the number 1.0); raises BadRequest where it forbids it.
+
+    ``where`` names the value in what is said: ``uuids[2]``.
+    """
+    kinds = schema.get("type", [])
+    kind = _kind_of(value, kinds if isinstance(kinds, list) else [kinds])
+    if "enum" in schema and value not in schema["enum"]:
+        known = ", ".join(str(one) for one in schema["enum"] if one is not None)
+        raise BadRequest(f"{where!r} must be one of {known}, not {_shown(value)}.")
+    if kind == "object":
+        return _object(schema, value, where)
+    if kind == "array":
+        if len(value) < schema.get("minItems", 0):
+            raise BadRequest(f"{where!r} must have at least {schema['minItems']} items.")
+        return [fit(schema.get("items", {}), one, f"{where}[{number}]") for number, one in enumerate(value)]
+    if kind in ("integer", "number"):
+        least, most = schema.get("minimum", -math.inf), schema.get("maximum", math.inf)
+        if not least <= value <= most:
+            raise BadRequest(f"{where!r} must be between {least:g} and {most:g}, not {_shown(value)}.")
+        return int(value) if kind == "integer" else float(value)
+    if kind == "string" and not re.search(schema.get("pattern", "").replace("$", r"\Z"), value):
+        raise BadRequest(f"{where!r} must match {schema['pattern']}, unlike {_shown(value)}.")
+    if kind is None and kinds:
+        wanted = " or ".join(kinds) if isinstance(kinds, list) else kinds
+        raise BadRequest(f"{where!r} must be of type {wanted}, not {_shown(value)}.")
+    return value
+
+
+def _kind_of(value: Any, kinds: list[str]) -> str | None:
+    """Which of these types a value has; JSON Schema counts 1.0 as an integer, and true as no number."""
+    whole = isinstance(value, int) or (isinstance(value, float) and value.is_integer())
+    there = {
+        "null": value is None,
+        "boolean": isinstance(value, bool),
+        "string": isinstance(value, str),
+        "array": isinstance(value, list),
+        "object": isinstance(value, dict),
+        "integer": whole and not isinstance(value, bool),
+        "number": isinstance(value, int | float) and not isinstance(value, bool),
+    }
+    return next((kind for kind in kinds if there[kind]), None)
+
+
+def _object(schema: Schema, value: dict[str, Any], where: str) -> dict[str, Any]:
+    properties = schema.get("properties", {})
+    if schema.get("additionalProperties") is False:
+        for name in value:
+            if name not in properties:
+                raise BadRequest(f"Unknown member {name[:64]!r}.")
+    for name in schema.get("required", ()):
+        if name not in value:
+            raise BadRequest(f"Member {name!r} is missing.")
+    found = {name: fit(properties.get(name, {}), member, name) for name, member in value.items()}
+    for choice in ("anyOf", "oneOf"):
+        fitting = sum(_fits(one, value) for one in schema.get(choice, ()))
+        if choice in schema and (not fitting or (choice == "oneOf" and fitting > 1)):
+            raise BadRequest(schema["description"])
+    return found
+
+
+def _fits(schema: Schema, value: Any) -> bool:
+    try:
+        fit({"type": "object", **schema}, value)
+    except BadRequest:
+        return False
+    return True
+
+
+def _shown(value: Any) -> str:
+    return json.dumps(value)[:40]

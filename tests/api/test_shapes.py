@@ -1,0 +1,162 @@
+"""The shapes of the API: what a type says is what is published, and exactly that is let in."""
+
+from __future__ import annotations
+
+import dataclasses
+import inspect
+import json
+import re
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
+
+import jsonschema
+import pytest
+from hypothesis import example, given
+from hypothesis import strategies as st
+
+from teds_provision import client, ncap
+from teds_provision.api import bodies
+from teds_provision.api.operations import OPERATIONS, document
+from teds_provision.api.schema import BadRequest, read, schema_of
+
+BODIES = [one.body for one in OPERATIONS if one.body is not None]
+SCHEMAS = document()["components"]["schemas"]
+TEXTS = st.sampled_from(["", "transparent", "free", "gripper", "x.toml", "../x", "noise", "ab" * 10])
+NUMBERS = st.sampled_from(
+    [0, 1, -1, 1.0, 0.5, 20, 61, 255, 256, 1e6, 1000.0, 10_001, 10**30, 1e300, 1e301, -0.0]
+) | st.integers(-5, 300)
+VALUES = st.recursive(st.none() | st.booleans() | NUMBERS | TEXTS, lambda one: st.lists(one, max_size=3), max_leaves=4)
+
+
+@pytest.mark.parametrize("body", BODIES, ids=lambda body: str(body.__name__))
+@given(data=st.data())
+def test_a_body_is_refused_exactly_where_its_published_schema_forbids_it(body: type[Any], data: st.DataObject) -> None:
+    names = st.sampled_from([one.name for one in dataclasses.fields(body)] + ["x"])
+    members = data.draw(st.dictionaries(names, VALUES, max_size=4))
+    published = jsonschema.Draft202012Validator(schema_of(body, {})).is_valid(members)
+    try:
+        read(body, json.dumps(members).encode())
+        taken = True
+    except BadRequest:
+        taken = False
+    assert taken == published
+
+
+def test_the_end_of_a_pattern_is_the_end_of_the_text() -> None:
+    """ECMA 262, which JSON Schema means, lets no line end pass before ``$``; Python does."""
+    with pytest.raises(BadRequest, match="'profile' must match"):
+        read(bodies.Order, b'{"profile": "gripper\\n"}')
+
+
+@given(st.text(max_size=40) | st.binary(max_size=40).map(lambda octets: octets.decode("latin-1")))
+@example('{"mode": NaN}')
+@example('{"mode": "\\ud83d"}')
+@example("[" * 100_000)
+@example("1" * 5000)
+def test_what_is_no_json_object_is_refused_and_nothing_worse(text: str) -> None:
+    with suppress(BadRequest):
+        assert read(bodies.Nothing, text.encode()) == bodies.Nothing()
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        '{"mode": "whitelist", "mode": "whitelist"}',
+        '{"mode": "whitelist", "m\\u006fde": "transparent"}',
+        '{"mode": {"a": 1, "a": 1}}',
+    ],
+)
+def test_equal_keys_are_refused_at_every_depth(text: str) -> None:
+    with pytest.raises(BadRequest, match="appears twice"):
+        read(bodies.Detection, text.encode())
+
+
+def test_a_member_that_is_null_is_as_one_that_is_not_there() -> None:
+    assert read(bodies.NewVirtual, b'{"profile": "gripper", "name": null}') == bodies.NewVirtual(profile="gripper")
+    with pytest.raises(BadRequest, match="'mode' must be"):
+        read(bodies.Detection, b'{"mode": null}')
+
+
+def test_whole_numbers_and_numbers_come_as_what_they_are() -> None:
+    found = read(bodies.NewMeasurement, b'{"group": "g", "channels": [1.0], "rate": 5}')
+    assert (found.channels, found.rate) == ([1], 5.0)
+    assert (type((found.channels or [])[0]), type(found.rate)) == (int, float)
+
+
+@pytest.mark.parametrize(
+    ("body", "members", "said"),
+    [
+        (bodies.NewGroup, {}, "Member 'name' is missing."),
+        (bodies.NewGroup, {"name": "g", "colour": 1}, "Unknown member 'colour'."),
+        (bodies.NewGroup, {"name": "g", "uuids": ["a", 2]}, "'uuids[1]' must be of type string, not 2."),
+        (bodies.NewMeasurement, {"group": "g", "rate": 0}, "'rate' must be between 0.001 and 1e+06, not 0."),
+        (bodies.NewMeasurement, {"group": "g", "kind": "x"}, "'kind' must be one of periodic, event, free, not"),
+        (bodies.NewMeasurement, {}, 'A measurement needs either "group" or "uuids".'),
+        (bodies.SetPoint, {"hold": 1}, "to let it go."),
+    ],
+)
+def test_a_refusal_names_the_member_and_what_it_may_be(body: type[Any], members: dict[str, Any], said: str) -> None:
+    with pytest.raises(BadRequest) as refused:
+        read(body, json.dumps(members).encode())
+    assert said in refused.value.message
+
+
+@pytest.mark.parametrize(
+    ("method", "body", "besides"),
+    [
+        (client.Client.measure, bodies.NewMeasurement, set()),
+        (client.Client.provision, bodies.Order, {"node"}),
+        (client.Client.set, bodies.SetPoint, {"node", "channel"}),
+        (client.Client.write_teds, bodies.SheetText, {"node", "dry_run"}),
+        (client.Client.login_url, bodies.LoginLink, set()),
+        (client.Client.set_detection, bodies.Detection, set()),
+    ],
+)
+def test_the_client_takes_what_the_body_takes(method: Any, body: type[Any], besides: set[str]) -> None:
+    members = {one.name for one in dataclasses.fields(body)} - {"format"}  # the content shows what it is
+    assert set(inspect.signature(method).parameters) - {"self"} == members | besides
+
+
+# -- the page ----------------------------------------------------------------------------------------------------------
+
+SHAPES = Path(ncap.__file__).parent / "page" / "js" / "shapes.js"
+READ_AS = {"scaleOf": "Channel", "channel": "Channel", "node": "Node", "status": "Status"}
+"""Which schema the argument ``wire`` of a function has; ``link`` of status is a Link."""
+FREE = {"power", "live", "moment", "modeOf"}  # what has no schema: flags of a battery, messages of /live, one value
+
+
+def member(schema: dict[str, Any], name: str) -> dict[str, Any] | None:
+    for one in schema.get("anyOf", [schema]):
+        whole = SCHEMAS[one["$ref"].rpartition("/")[2]] if "$ref" in one else one
+        if name in whole.get("properties", {}):
+            return dict(whole["properties"][name])
+    return None
+
+
+def test_the_page_reads_only_members_that_the_description_has() -> None:
+    text = SHAPES.read_text(encoding="utf-8")
+    functions = dict(re.findall(r"^(?:export )?function (\w+)\([^)]*\) \{\n(.*?)^\}", text, re.MULTILINE | re.DOTALL))
+    assert set(functions) == {*READ_AS, *FREE}
+    wrong, walked = [], 0
+    for function, schema in READ_AS.items():
+        starts = {"wire": SCHEMAS[schema], "link": SCHEMAS["Link"], "shown": SCHEMAS["Shown"]}
+        for variable, path in re.findall(r"\b(wire|link|shown)((?:\??\.\w+)+)", functions[function]):
+            at = starts[variable]
+            for name in re.findall(r"\w+", path):
+                if name in ("map", "replace"):
+                    break  # what JavaScript does with it
+                found = member(at, name)
+                walked += 1
+                if found is None:
+                    wrong.append(f"{function}: {variable}{path}: no {name}")
+                    break
+                at = found
+    assert not wrong
+    assert walked > 30
+
+
+def test_the_page_knows_the_states_that_a_node_has_in_a_measurement() -> None:
+    states = re.search(r"return \{ (.*) \}\[state\]", SHAPES.read_text(encoding="utf-8"))
+    assert states is not None
+    assert set(re.findall(r"(\w+): \"", states[1])) <= set(SCHEMAS["Report"]["properties"]["state"]["enum"])
