@@ -9,9 +9,9 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 
-from teds_provision.links.can.wire.pacing import classic_bits, fd_seconds
+from teds_provision.links.can.pacing import classic_bits, fd_seconds
 from teds_provision.links.nfc import message, tnep
-from teds_provision.node.nfc.air import answer_seconds, command_seconds
+from teds_provision.node.nfc.server import answer_seconds, command_seconds
 
 Sizes = Sequence[tuple[int, int]]
 

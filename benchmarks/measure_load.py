@@ -26,9 +26,9 @@ from pathlib import Path
 import numpy as np
 
 from teds_provision.links.can.bus import Bus, Frame
+from teds_provision.links.can.pacing import sharp_timers
 from teds_provision.links.can.port import CanPort
 from teds_provision.links.can.spec import parse_spec
-from teds_provision.links.can.wire.pacing import sharp_timers
 from teds_provision.links.ports import free_port
 from teds_provision.measure.blocks import Block, StationFacts
 from teds_provision.measure.clock import ClockMap, Exchange, Monotone, Wall

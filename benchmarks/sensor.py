@@ -23,7 +23,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from benchmarks.provisioning import PROFILE
-from teds_provision.links.can.wire.pacing import classic_bits, fd_seconds
+from teds_provision.links.can.pacing import classic_bits, fd_seconds
 from teds_provision.links.ports import free_port
 from teds_provision.protocol.operation.can_frames import cut
 

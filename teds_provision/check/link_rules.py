@@ -7,8 +7,7 @@ from typing import Final
 
 from teds_provision.check.probe import HeardFrame, NotApplicable, Probe, holds
 from teds_provision.check.rule import Stage, rule
-from teds_provision.links.can.isotp import addresses, read_single
-from teds_provision.links.can.transfer import OVERFLOW, gap_seconds
+from teds_provision.links.can.isotp import OVERFLOW, addresses, gap_seconds, read_single
 from teds_provision.links.ports import Announces, OnABus
 from teds_provision.protocol.messages.frames import Reason, refusal, write_teds
 from teds_provision.teds.image import SECURITY

@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from teds_provision.node.can.server import CanServer
     from teds_provision.node.flash_file import FlashFile
     from teds_provision.node.hardware.board import Board, Shown
-    from teds_provision.node.nfc.charging import Extras
+    from teds_provision.node.nfc.tnep import Extras
     from teds_provision.node.virtual import LinkServer, VirtualNode
     from teds_provision.protocol.operation.streams import DataFrame
 
@@ -271,7 +271,7 @@ def _boards(app: App, lines: ActuatorLines, source: str, percent: float | None) 
         return hardware_room.board.Board(
             teds.sheet.Sheet.of(teds.image.Image(uuid, hardware)),
             source=source,
-            battery=None if percent is None else hardware_room.battery.Battery(percent),
+            battery=None if percent is None else hardware_room.board.Battery(percent),
             shown=lines.of(uuid.hex()),
             tell=app.warn,
         )
@@ -339,7 +339,7 @@ def _send(bus: CanServer, node: VirtualNode, frame: DataFrame) -> None:
 def _extras(node: VirtualNode, air: BleServer | None) -> Extras:
     """What the initial message says beside: charge, and the address in the air; and what a reader's field does."""
     battery = node.board.battery if node.board is not None else None
-    charging = nfc_room.charging
+    charging = nfc_room.tnep
 
     def field(present: bool) -> None:
         if battery is not None:

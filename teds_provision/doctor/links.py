@@ -270,7 +270,7 @@ def can(place: Place) -> Iterator[Finding]:
     except (LinkFailure, UsageFailure) as failure:
         yield Finding("can", "failed", failure.message, failure.hint)
         return
-    rivals = can_room.rivals.Rivals(bus.spec.source)
+    rivals = can_room.shared.Rivals(bus.spec.source)
     until = time.monotonic() + _LISTEN_SECONDS
     try:
         while (left := until - time.monotonic()) > 0:

@@ -13,7 +13,7 @@ import time
 from typing import Protocol
 
 from teds_provision.errors import LinkFailure
-from teds_provision.links.can.wire.pacing import sharp_timers
+from teds_provision.links.can.pacing import sharp_timers
 
 
 class Beating(Protocol):

@@ -44,7 +44,7 @@ from teds_provision.teds.image import SECURITY, Image
 Order = BuildOrder | Prepared | Callable[["Identified"], Prepared]
 """What a node gets: as it was asked for, read already, or by who it is (which raises where it gets nothing)."""
 Onward = Callable[[Conversation], None]
-"""Takes the conversation to another link; see ``talk/onward.py``."""
+"""Takes the conversation to another link; see ``talk/meeting.py``."""
 Accept = Callable[[Identified], None]
 """Asked before an unknown node is whitelisted; raises where the answer is no."""
 

@@ -5,6 +5,6 @@ from typing import TYPE_CHECKING
 from teds_provision.lazy import lazy
 
 if TYPE_CHECKING:
-    from teds_provision.talk import conversation, meeting, onward, progress, watching
+    from teds_provision.talk import conversation, meeting, progress, watching
 else:
     __getattr__ = lazy(__name__)

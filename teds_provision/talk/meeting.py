@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 
 from teds_provision.errors import AddressConflict, NoReader, StoreLocked, UsageFailure
-from teds_provision.links import Contact, LinkSettings, Notice, open_port
+from teds_provision.links import Contact, LinkSettings, Notice, open_place, open_port
 from teds_provision.links.ports import NoticeSink, Port
 from teds_provision.protocol.announce import default_can_address
 from teds_provision.protocol.messages.identity import Identity, NodeState
@@ -148,3 +148,36 @@ def the_one(station: Station, contacts: list[Contact]) -> Contact:
 
 def _finished(station: Station, identity: Identity) -> bool:
     return identity.state == NodeState.PROVISIONED and station.nodes.reads_well(identity.uuid)
+
+
+# Tap first, air after: a node that was agreed with at the reader is gone on with over BLE (profile.md, "BLE").
+#
+# It may lie there or be carried away meanwhile. The tap has named its address; its key says that it is the one.
+
+
+def onward(links: LinkSettings, notice: NoticeSink) -> Callable[[Conversation], None] | None:
+    """How to go on once a key is agreed on: where both ``--nfc`` and ``--ble`` are named, over BLE; None where not.
+
+    What is returned raises NoReader, NoNode (it does not advertise, or is out of reach), LinkFailure.
+    """
+    place = links.onward
+    if place is None:
+        return None
+
+    def go_on(node: Conversation) -> None:
+        if not node.tapped:
+            return
+        named = node.contact.ble
+        at = f"{'&' if '?' in place else '?'}address={named.text}" if named and "address=" not in place else ""
+        port = open_place(place + at, links.trace)
+
+        def wanted(identity: Identity) -> bool:
+            return identity.uuid == node.uuid
+
+        try:
+            node.move_to(lambda: port.find(wanted, seconds=links.timeout, notice=notice), port.close)
+        except BaseException:
+            port.close()
+            raise
+
+    return go_on

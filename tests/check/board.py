@@ -18,8 +18,8 @@ from teds_provision.errors import LinkFailure
 from teds_provision.links.can import isotp
 from teds_provision.node.can import seat
 from teds_provision.node.can.server import CanServer
+from teds_provision.node.nfc import tags
 from teds_provision.node.nfc import tnep as tnep_of_node
-from teds_provision.node.nfc import type4
 from teds_provision.node.nfc.server import NfcServer
 from teds_provision.protocol.messages.frames import IDENTIFY
 from teds_provision.protocol.messages.identity import NodeState
@@ -75,15 +75,15 @@ def _wtx(octets: bytes) -> Bend:
     """Each APDU is answered after an S(WTX) with this multiplier."""
 
     def bend(patch: pytest.MonkeyPatch) -> None:
-        run = type4.IsoDepTag._run
+        run = tags.IsoDepTag._run
 
-        def asks_first(self: type4.IsoDepTag, apdu: bytes) -> bytes:
+        def asks_first(self: tags.IsoDepTag, apdu: bytes) -> bytes:
             if self._pending is None:
                 self._pending = apdu
                 return self._kept(octets)
             return run(self, apdu)
 
-        patch.setattr(type4.IsoDepTag, "_run", asks_first)
+        patch.setattr(tags.IsoDepTag, "_run", asks_first)
 
     return bend
 

@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import IO, Final
 
 from teds_provision.links.can.bus import Bus
-from teds_provision.links.can.frame import Frame
+from teds_provision.links.can.isotp import Frame
 from teds_provision.links.can.spec import parse_spec
 
 _END, _ESCAPE = 0xC0, 0xDB

@@ -261,7 +261,7 @@ def check_can(data: bytes) -> None:
     """ISO-TP as a stranger drives it: pieces ``kind u8 ‖ length u8 ‖ data``, to a gathering and to a pair."""
     from teds_provision.links.can import isotp
     from teds_provision.links.can.bus import Frame
-    from teds_provision.links.can.gathering import Gathering
+    from teds_provision.links.can.shared import Gathering
 
     logging.getLogger("isotp").setLevel(logging.CRITICAL)
     gathering, sent = Gathering(0xF1, 7), []

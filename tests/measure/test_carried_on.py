@@ -12,7 +12,7 @@ from typing import Any
 
 import pytest
 
-from teds_provision.links.can.frame import Frame
+from teds_provision.links.can.isotp import Frame
 from teds_provision.links.can.port import CanPort
 from teds_provision.measure.sinks.mcap.recover import recover
 from tests.e2e.desk import ANGLE, Station

@@ -14,7 +14,7 @@ from typing import Any
 import pytest
 
 from teds_provision.errors import AddressConflict, LinkFailure
-from teds_provision.links.can.frame import Frame
+from teds_provision.links.can.isotp import Frame
 from teds_provision.links.can.port import CanPort
 from teds_provision.measure.finding.asking import LEAST, Pace
 from teds_provision.measure.finding.lookout import BELIEVED, SOON, Lookout

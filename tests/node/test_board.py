@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from teds_provision.node.hardware.battery import Battery
-from teds_provision.node.hardware.board import Board, Shown
+from teds_provision.node.hardware.board import Battery, Board, Shown
 from teds_provision.node.hardware.clock import NodeClock
 from teds_provision.protocol.operation.commands import PowerFlag
 from teds_provision.teds.image import Image

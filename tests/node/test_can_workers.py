@@ -8,7 +8,7 @@ from collections.abc import Callable
 
 import pytest
 
-from teds_provision.node.can.workers import Crew
+from teds_provision.node.handler import Crew
 
 _SECONDS = 30.0
 

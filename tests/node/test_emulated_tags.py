@@ -9,9 +9,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from teds_provision.errors import UsageFailure
-from teds_provision.node.nfc.air import ETU, Air, answer_seconds, command_seconds
-from teds_provision.node.nfc.type2 import Type2Memory
-from teds_provision.node.nfc.type4 import IsoDepTag, NdefApplication, Type4Memory
+from teds_provision.node.nfc.server import ETU, Air, answer_seconds, command_seconds
+from teds_provision.node.nfc.tags import IsoDepTag, NdefApplication, Type2Memory, Type4Memory
 from tests.node.tag_talk import Handler
 from tests.pace import best_of
 

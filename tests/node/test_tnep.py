@@ -12,9 +12,9 @@ from hypothesis import strategies as st
 from teds_provision.links.nfc import message, tnep
 from teds_provision.links.nfc.pieces import Piece
 from teds_provision.links.nfc.poller import Poller
-from teds_provision.node.nfc import charging
+from teds_provision.node.nfc import tnep as charging
+from teds_provision.node.nfc.tags import Type4Memory
 from teds_provision.node.nfc.tnep import TnepTag
-from teds_provision.node.nfc.type4 import Type4Memory
 from teds_provision.protocol.operation.commands import Power, PowerFlag
 from tests.node.tag_talk import Handler, request, select
 

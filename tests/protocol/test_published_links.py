@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from teds_provision.links.can.bus import Frame
-from teds_provision.links.can.gathering import Gathering
 from teds_provision.links.can.isotp import Pair
+from teds_provision.links.can.shared import Gathering
 from teds_provision.links.nfc import message, tnep
 from teds_provision.links.nfc.pieces import Piece, Requester, room
 from tests.vectors.recipes_links import Mailbox, TagHandler, node

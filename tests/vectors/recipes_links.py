@@ -9,8 +9,8 @@ from dataclasses import replace
 from typing import Any
 
 from teds_provision.links.can.bus import Frame
-from teds_provision.links.can.gathering import Gathering
 from teds_provision.links.can.isotp import FUNCTIONAL, Pair, single
+from teds_provision.links.can.shared import Gathering
 from teds_provision.links.nfc import message, tnep
 from teds_provision.links.nfc.pieces import Piece, Requester, room
 from teds_provision.node.nfc.tnep import TnepTag

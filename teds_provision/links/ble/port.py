@@ -5,6 +5,7 @@ Nodes are connected one after the other; a connection ends when its link is clos
 
 from __future__ import annotations
 
+import json
 import queue
 import secrets
 import threading
@@ -12,18 +13,68 @@ import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Final
 
-from teds_provision.errors import LinkFailure, NodeRefused, NoNode, NoReader
+from teds_provision.errors import LinkFailure, NodeRefused, NoNode, NoReader, TedsProvisionError
+from teds_provision.files import read_limited, whole_file
 from teds_provision.links.ble.adapter import Adapter
 from teds_provision.links.ble.connection import Connection
-from teds_provision.links.ble.link import BleLink
-from teds_provision.links.ble.loop import Loop
-from teds_provision.links.ble.remembered import Remembered, cache_file
+from teds_provision.links.ble.link import BleLink, Loop
 from teds_provision.links.ble.spec import parse_spec
 from teds_provision.links.ports import BLE, LISTEN_SECONDS, Capabilities, Contact, Notice, NoticeSink, Trace
 from teds_provision.protocol.messages.frames import IDENTIFY, decode_reply
 from teds_provision.protocol.messages.identity import Identity, NodeState
+
+# Which node was met at which Bluetooth address, kept from command to command (operation.md section 7). A hint.
+#
+# A node keeps its address until it is reset, so a node that is named is looked for there first, and twenty others are
+# not asked. The file lies in the user's cache folder; a cache that cannot be read or written harms nothing.
+
+FILE: Final = "ble-addresses.json"
+MOST: Final = 10_000
+_MOST_OCTETS: Final = 4 << 20
+
+
+def cache_file() -> Path:
+    """Where it lies: ``~/.cache/teds-provision/ble-addresses.json`` unless XDG_CACHE_HOME says otherwise."""
+    from platformdirs import user_cache_path
+
+    return user_cache_path("teds-provision") / FILE
+
+
+class Remembered:
+    """Identify of nodes by address, the newest last; :meth:`save` keeps what was learnt."""
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+        self._known: dict[str, Identity] = {}
+        self._changed = False
+        with suppress(OSError, ValueError, TypeError, AttributeError, TedsProvisionError):
+            said = json.loads(read_limited(path, _MOST_OCTETS, "cache"))
+            self._known = {address: Identity.decode(bytes.fromhex(octets)) for address, octets in said.items()}
+
+    def items(self) -> list[tuple[str, Identity]]:
+        """Every address and who was there, the newest first."""
+        return list(reversed(self._known.items()))
+
+    def learn(self, address: str, identity: Identity) -> None:
+        """A node was met; an address at which it was before is forgotten."""
+        others = {at: one for at, one in self._known.items() if at != address and one.uuid != identity.uuid}
+        self._changed = self._changed or self._known.get(address) is None or len(others) + 1 != len(self._known)
+        self._known = {**others, address: identity}
+
+    def save(self) -> None:
+        """Write it, where something is new; never raises."""
+        if not self._changed:
+            return
+        kept = list(self._known.items())[-MOST:]
+        with suppress(OSError):
+            self._path.parent.mkdir(parents=True, exist_ok=True, mode=0o700)
+            with whole_file(self._path, replace=True) as file:
+                file.write(json.dumps({address: identity.encode().hex() for address, identity in kept}).encode())
+            self._changed = False
+
 
 _ROUND_SECONDS: Final = 2.0
 _SILENCE_SECONDS: Final = 1.5

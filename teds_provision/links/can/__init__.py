@@ -5,21 +5,6 @@ from typing import TYPE_CHECKING
 from teds_provision.lazy import lazy
 
 if TYPE_CHECKING:
-    from teds_provision.links.can import (
-        arrivals,
-        bus,
-        finding,
-        frame,
-        gathering,
-        isotp,
-        link,
-        port,
-        reading,
-        rivals,
-        shared,
-        spec,
-        transfer,
-        wire,
-    )
+    from teds_provision.links.can import arrivals, bus, finding, isotp, link, port, shared, spec
 else:
     __getattr__ = lazy(__name__)

@@ -16,7 +16,7 @@ from teds_provision.protocol.announce import Announce, is_announce, uuid_crc
 from teds_provision.protocol.messages.identity import Identity, NodeState
 
 if TYPE_CHECKING:
-    from teds_provision.links.can.frame import Frame
+    from teds_provision.links.can.isotp import Frame
     from teds_provision.links.can.shared import Ear, SharedBus
 
 _GONE_SECONDS: Final = 3.0

@@ -11,16 +11,17 @@ import re
 import select
 import socket
 import sys
+import threading
 import time
+from collections import OrderedDict
 from typing import TYPE_CHECKING, Any, Final, NoReturn
 
 from teds_provision.errors import LinkFailure, NoReader, UsageFailure
 from teds_provision.lazy import install_command, late
-from teds_provision.links.can.frame import Frame
+from teds_provision.links.can.isotp import Frame
+from teds_provision.links.can.multicast import Multicast, of_bus
+from teds_provision.links.can.pacing import Pacer
 from teds_provision.links.can.spec import CanSpec
-from teds_provision.links.can.wire.echoes import Echoes
-from teds_provision.links.can.wire.multicast import Multicast, of_bus
-from teds_provision.links.can.wire.pacing import Pacer
 from teds_provision.links.ports import Trace
 
 if TYPE_CHECKING:
@@ -29,6 +30,49 @@ if TYPE_CHECKING:
     import can
 else:
     inspect = late("inspect")  # for a bus with keys of its own
+
+
+# Our own frames, given back by an interface that cannot tell them from those of others: udp_multicast, SocketCAN.
+#
+# A frame is taken for our own once for each time that it was sent, within three seconds.
+
+_SECONDS: Final = 3.0
+_KEPT: Final = 4096
+
+
+class Echoes:
+    """What was sent and has not come back yet. Thread-safe."""
+
+    def __init__(self) -> None:
+        self._sent: OrderedDict[tuple[int, bytes], list[float]] = OrderedDict()
+        self._lock = threading.Lock()
+
+    def sent(self, frame: Frame) -> None:
+        """Note a frame before it leaves."""
+        key = (frame.identifier, frame.data)
+        with self._lock:
+            self._sent.setdefault(key, []).append(time.monotonic())
+            self._sent.move_to_end(key)
+            if len(self._sent) > _KEPT:  # some were lost on their way back
+                self._sent.popitem(last=False)
+
+    def take(self, frame: Frame) -> bool:
+        """Whether this is one of them; it will not be another time."""
+        key = (frame.identifier, frame.data)
+        with self._lock:
+            times = self._sent.get(key)
+            if times is None:
+                return False
+            oldest = time.monotonic() - _SECONDS
+            while times and times[0] < oldest:
+                times.pop(0)
+            known = bool(times)
+            if known:
+                times.pop(0)
+            if not times:
+                del self._sent[key]
+            return known
+
 
 _SEND_SECONDS: Final = 1.0
 _OPENINGS: Final = 5

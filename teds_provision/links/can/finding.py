@@ -8,11 +8,9 @@ from dataclasses import dataclass, field
 from typing import Final
 
 from teds_provision.errors import AddressConflict, BadData, Garbled, NodeSilent, TedsProvisionError
-from teds_provision.links.can.frame import Frame
-from teds_provision.links.can.gathering import Gathering
-from teds_provision.links.can.isotp import FUNCTIONAL, single
+from teds_provision.links.can.isotp import FUNCTIONAL, Frame, single
 from teds_provision.links.can.link import conflict
-from teds_provision.links.can.shared import Asked, SharedBus
+from teds_provision.links.can.shared import Asked, Gathering, SharedBus
 from teds_provision.protocol.messages.frames import IDENTIFY, decode_reply
 from teds_provision.protocol.messages.identity import Identity
 

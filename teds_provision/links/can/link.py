@@ -9,10 +9,18 @@ from queue import Empty
 from typing import Final
 
 from teds_provision.errors import AddressConflict, BadData, Garbled, LinkFailure, NodeSilent, TooLongForNode
-from teds_provision.links.can.frame import Frame
-from teds_provision.links.can.isotp import FUNCTIONAL, physical_id, single
+from teds_provision.links.can.isotp import (
+    FUNCTIONAL,
+    OVERFLOW,
+    WAIT,
+    Frame,
+    consecutive_frames,
+    first_frame,
+    gap_seconds,
+    physical_id,
+    single,
+)
 from teds_provision.links.can.shared import Line, SharedBus
-from teds_provision.links.can.transfer import OVERFLOW, WAIT, consecutive_frames, first_frame, gap_seconds
 from teds_provision.links.ports import CAN, Capabilities
 from teds_provision.protocol.messages.frames import IDENTIFY, Reason, decode_reply, refusal
 from teds_provision.protocol.messages.identity import Identity

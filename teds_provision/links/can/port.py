@@ -22,7 +22,7 @@ from teds_provision.links.can.finding import (
     twice_text,
     unfinished_text,
 )
-from teds_provision.links.can.frame import Frame
+from teds_provision.links.can.isotp import Frame
 from teds_provision.links.can.link import CanLink, conflict
 from teds_provision.links.can.shared import Ear, SharedBus
 from teds_provision.links.can.spec import LAST_NODE, parse_spec

@@ -1,4 +1,4 @@
-"""One CAN bus for many threads: whoever reads it (``reading.py``) hands each frame to those who wait for it.
+"""One CAN bus for many threads: whoever reads it (:class:`Reading`) hands each frame to those who wait for it.
 
 What nodes send to this station is put together here, whoever asked; the flow control leaves at once from the thread
 that reads, so that a busy one holds nobody up. Data frames, announcements and triggers go to those who listen
@@ -14,20 +14,277 @@ import threading
 import time
 from collections import deque
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from queue import Empty, SimpleQueue
 from types import TracebackType
-from typing import Final
+from typing import Final, TypeVar
 
 from teds_provision.errors import LinkFailure
 from teds_provision.links.can.bus import Bus
-from teds_provision.links.can.frame import Frame
-from teds_provision.links.can.gathering import Gathering
-from teds_provision.links.can.isotp import addresses, read_single
-from teds_provision.links.can.reading import Reading, Thing
-from teds_provision.links.can.rivals import Rivals
-from teds_provision.links.can.transfer import CONTINUE, OVERFLOW, Reassembly, flow
+from teds_provision.links.can.isotp import (
+    CONTINUE,
+    FUNCTIONAL,
+    OVERFLOW,
+    Frame,
+    Reassembly,
+    addresses,
+    flow,
+    read_single,
+)
+
+# Who reads a bus: a loop of its own, or the thread that waits for a reply and so need not be woken by another.
+#
+# A reply that one thread reads and another one wants costs two wakings and a turn at the interpreter's lock, with every
+# flow control again. So the thread that waits reads by itself where it is the only one that waits. Where several do,
+# and when nobody has waited for a moment, the loop reads.
+
+_ALIVE_SECONDS: Final = 0.25
+_SHORT_SLICE: Final = 0.02
+"""How long one receive waits on an interface that cannot be woken."""
+_LINGER_SECONDS: Final = 0.005
+"""How long after a reply the loop leaves the bus to the thread that got it: most ask on at once."""
+_NAP_SECONDS: Final = 0.002
+
+Thing = TypeVar("Thing")
+
+
+class Reading:
+    """Reads ``bus`` until :meth:`stop`; each frame goes to ``take``, the end of the bus to ``failed``.
+
+    ``take`` runs in one thread at a time. ``woken`` can be read once the bus is to be closed.
+    """
+
+    def __init__(
+        self, bus: Bus, take: Callable[[Frame], None], failed: Callable[[LinkFailure], None], woken: socket.socket
+    ) -> None:
+        self._bus, self._take, self._failed, self._woken = bus, take, failed, woken
+        self._turn = threading.Lock()
+        self._counting = threading.Lock()
+        self._leaning = 0
+        self._helped_until = 0.0
+        self._over = False
+
+    def run(self) -> None:
+        """The loop; returns after :meth:`stop`, or when the bus has failed."""
+        while not self._over:
+            if not self._bus.can_be_waited_for:
+                self._read(_SHORT_SLICE)
+            elif self._is_helped():
+                time.sleep(_NAP_SECONDS)
+            else:
+                self._bus.wait(_ALIVE_SECONDS, self._woken)
+                self._read_all()
+
+    def stop(self) -> None:
+        """Let nobody read any more; returns when nobody does."""
+        self._over = True
+        if self._turn.acquire(timeout=2):
+            self._turn.release()
+
+    def wait_for(self, queue: SimpleQueue[Thing], seconds: float) -> Thing:
+        """The next of a queue that ``take`` or ``failed`` fills; raises Empty after ``seconds``."""
+        until = time.monotonic() + seconds
+        while True:
+            with suppress(Empty):
+                return queue.get_nowait()
+            left = until - time.monotonic()
+            if left <= 0:
+                raise Empty
+            if self._over or self._leaning or not self._bus.can_be_waited_for or not self._turn.acquire(blocking=False):
+                return self._lean(queue, left)
+            try:
+                self._read_or_wait(min(left, _ALIVE_SECONDS))
+            finally:
+                self._helped_until = time.monotonic() + _LINGER_SECONDS
+                self._turn.release()
+
+    def _lean(self, queue: SimpleQueue[Thing], seconds: float) -> Thing:
+        """Have another thread read: the loop, or the one that reads already."""
+        with self._counting:
+            self._leaning += 1
+        try:
+            return queue.get(timeout=seconds)
+        finally:
+            with self._counting:
+                self._leaning -= 1
+
+    def _is_helped(self) -> bool:
+        return self._turn.locked() or (not self._leaning and time.monotonic() < self._helped_until)
+
+    def _read_or_wait(self, seconds: float) -> None:
+        """A frame where there is one, else the wait for it."""
+        if not self._read(0.0) and not self._over:
+            self._bus.wait(seconds, self._woken)
+
+    def _read_all(self) -> None:
+        """The loop's turn: every frame that is there, unless another thread has come to read them."""
+        while not self._is_helped() and self._turn.acquire(blocking=False):
+            try:
+                if not self._read(0.0):
+                    return
+            finally:
+                self._turn.release()
+
+    def _read(self, seconds: float) -> bool:
+        """Whether there was a frame."""
+        try:
+            frame = self._bus.receive(seconds)
+        except LinkFailure as failure:
+            self._over = True
+            self._failed(failure)
+            return False
+        if frame is None:
+            return False
+        self._take(frame)
+        return True
+
+
+# Another base station under our own source address: noticed by the frames that nobody here sent or asked for.
+#
+# Two stations of one address get each other's replies, so that commands fail in ways that look like noise. Seen are
+# frames *from* our address that we did not send, and replies to us that we did not ask for.
+
+_KEPT: Final = 64
+_FRAMES_NEEDED: Final = 2
+_REPLIES_NEEDED: Final = 4
+
+
+class Rivals:
+    """What speaks for another station at our address ``own``. Thread-safe."""
+
+    def __init__(self, own: int) -> None:
+        self._own = own
+        self._frames: list[float] = []
+        self._replies: list[float] = []
+        self._lock = threading.Lock()
+
+    def heard(self, frame: Frame) -> None:
+        """Look at a frame of the bus that we did not send."""
+        if frame.identifier & 0xFF == self._own and _of_a_station(frame.identifier):
+            with self._lock:
+                self._frames.append(time.monotonic())
+                del self._frames[:-_KEPT]
+
+    def unasked(self, node: int) -> None:
+        """Note the beginning of a reply of ``node`` to us that nobody here asked for."""
+        del node
+        with self._lock:
+            self._replies.append(time.monotonic())
+            del self._replies[:-_KEPT]
+
+    def seen(self, *, within: float = 10.0) -> bool:
+        """Whether another station used our address within these seconds."""
+        since = time.monotonic() - within
+        with self._lock:
+            frames = sum(at >= since for at in self._frames)
+            replies = sum(at >= since for at in self._replies)
+        return frames >= _FRAMES_NEEDED or replies >= _REPLIES_NEEDED
+
+    @property
+    def text(self) -> str:
+        """One sentence that names the address."""
+        return f"Another base station on this bus uses our source address 0x{self._own:02X}."
+
+    @property
+    def hint(self) -> str:
+        """The cure."""
+        free = 0xF2 if self._own == 0xF1 else 0xF1
+        return f"Give each station an address of its own, 0xF1 to 0xF7: add source=0x{free:02X} to --can of one."
+
+
+def _of_a_station(identifier: int) -> bool:
+    return identifier & 0x1FFFFF00 == FUNCTIONAL or addresses(identifier) is not None
+
+
+# The answers of all nodes to one functional Identify, put together from raw frames.
+#
+# Many nodes answer at once, each with its own first frame, flow control and consecutive frames. Pure: frames in, frames
+# out.
+
+
+@dataclass
+class Gathering:
+    """One functional Identify of station ``own``: ``answers`` by node address, without the transaction octet.
+
+    ``conflicts`` are addresses under which two nodes answered: two first frames within this Identify, two different
+    whole answers, or consecutive frames out of sequence (profile.md, "CAN"). A frame that was lost looks the same,
+    so whoever asks looks again before it says so. ``clashes`` are those where it is sure: two different beginnings.
+    """
+
+    own: int
+    transaction: int
+    answers: dict[int, bytes] = field(default_factory=dict)
+    conflicts: set[int] = field(default_factory=set)
+    clashes: set[int] = field(default_factory=set)
+    _partial: dict[int, Reassembly] = field(default_factory=dict)
+    _began: dict[int, bytes] = field(default_factory=dict)
+
+    @property
+    def busy(self) -> bool:
+        """Whether an answer has begun and not ended."""
+        return bool(self._partial)
+
+    @property
+    def unfinished(self) -> set[int]:
+        """Addresses of which an answer began and did not end."""
+        return set(self._partial)
+
+    def take(self, frame: Frame) -> Frame | None:
+        """Take any frame of the bus; returns the flow control that it asks for, if any. Never raises."""
+        ends = addresses(frame.identifier)
+        if ends is None or ends[0] != self.own or len(frame.data) < 2:
+            return None
+        node, kind = ends[1], frame.data[0] >> 4
+        if kind == 0:
+            self._single(node, frame.data)
+        elif kind == 1:
+            return self._first(node, frame)
+        elif kind == 2:
+            return self._consecutive(node, frame)
+        return None
+
+    def _single(self, node: int, data: bytes) -> None:
+        body = read_single(data)
+        if body and body[0] == self.transaction:
+            self._begin(node, data)
+            self._whole(node, body)
+
+    def _first(self, node: int, frame: Frame) -> Frame | None:
+        partial = Reassembly.begin(node, frame)
+        if partial is None:
+            return None
+        if partial.too_long or partial.octets[0] != self.transaction:  # or late: of an Identify before this one
+            return flow(node, self.own, OVERFLOW, fd=frame.fd)
+        self._begin(node, frame.data)
+        self._partial[node] = partial
+        return flow(node, self.own, CONTINUE, fd=frame.fd)
+
+    def _consecutive(self, node: int, frame: Frame) -> Frame | None:
+        partial = self._partial.get(node)
+        if partial is None:
+            return None
+        match partial.take(frame.data):
+            case "again" | "torn":
+                self.conflicts.add(node)
+                del self._partial[node]
+            case "whole":
+                del self._partial[node]
+                self._whole(node, bytes(partial.octets))
+            case "block":
+                return flow(node, self.own, CONTINUE, fd=partial.fd)
+        return None
+
+    def _begin(self, node: int, data: bytes) -> None:
+        if node in self._began:
+            self.conflicts.add(node)
+            if self._began[node] != data:
+                self.clashes.add(node)
+        self._began[node] = data
+
+    def _whole(self, node: int, body: bytes) -> None:
+        self.answers[node] = body[1:]
+
 
 _REMEMBERED: Final = 16
 """Transactions of one node whose late replies are known as such."""

@@ -15,7 +15,7 @@ from collections import deque
 
 from teds_provision.errors import AddressConflict, LinkFailure
 from teds_provision.links.can.finding import LONGEST_SECONDS, SILENCE_SECONDS, Found, ask_all, settle, twice_text
-from teds_provision.links.can.frame import Frame
+from teds_provision.links.can.isotp import Frame
 from teds_provision.links.can.port import CanPort
 from teds_provision.measure.finding.asking import LEAST, Asking, Pace
 from teds_provision.measure.finding.sightings import Sighting, Sightings

@@ -12,7 +12,7 @@ from contextlib import ExitStack, contextmanager
 
 from teds_provision.errors import AddressConflict, StoreLocked
 from teds_provision.links import LinkSettings
-from teds_provision.links.can.frame import Frame
+from teds_provision.links.can.isotp import Frame
 from teds_provision.links.can.port import CanPort
 from teds_provision.links.can.spec import CanSpec, parse_spec
 from teds_provision.protocol.operation.can_frames import DATA

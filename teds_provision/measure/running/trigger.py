@@ -9,7 +9,7 @@ import time
 from collections.abc import Callable, Sequence
 
 from teds_provision.errors import TedsProvisionError
-from teds_provision.links.can.frame import Frame
+from teds_provision.links.can.isotp import Frame
 from teds_provision.links.can.port import CanPort
 from teds_provision.measure.keeper import NodeKeeper
 from teds_provision.measure.running.common_start import CommonStart

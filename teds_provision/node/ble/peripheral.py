@@ -14,8 +14,7 @@ from typing import Any, Final
 
 from teds_provision.errors import TedsProvisionError
 from teds_provision.node.ble.address import StaticAddress
-from teds_provision.node.can.workers import Crew
-from teds_provision.node.handler import InTheAir
+from teds_provision.node.handler import Crew, InTheAir
 from teds_provision.protocol.messages import ble
 from teds_provision.protocol.repetition import Repetition
 

@@ -12,8 +12,7 @@ from typing import Final, NamedTuple
 
 from teds_provision.links.can.bus import Frame
 from teds_provision.links.can.isotp import Pair
-from teds_provision.node.can.workers import Crew, Turns
-from teds_provision.node.handler import Measuring, NodeHandler
+from teds_provision.node.handler import Crew, Measuring, NodeHandler, Turns
 from teds_provision.protocol.announce import Announce, Claim, uuid_crc
 from teds_provision.protocol.messages.identity import Identity
 from teds_provision.protocol.repetition import Repetition

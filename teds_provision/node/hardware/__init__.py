@@ -5,6 +5,6 @@ from typing import TYPE_CHECKING
 from teds_provision.lazy import lazy
 
 if TYPE_CHECKING:
-    from teds_provision.node.hardware import battery, board, clock, converter
+    from teds_provision.node.hardware import board, clock, converter
 else:
     __getattr__ = lazy(__name__)

@@ -5,6 +5,6 @@ from typing import TYPE_CHECKING
 from teds_provision.lazy import lazy
 
 if TYPE_CHECKING:
-    from teds_provision.node.nfc import air, charging, server, tnep, type2, type4
+    from teds_provision.node.nfc import server, tags, tnep
 else:
     __getattr__ = lazy(__name__)

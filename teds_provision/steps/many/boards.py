@@ -28,8 +28,7 @@ from teds_provision.steps.read import survey
 from teds_provision.steps.reading import verdict_of
 from teds_provision.steps.write import Low, wait_for_charge
 from teds_provision.talk.conversation import Conversation, SessionLost
-from teds_provision.talk.meeting import meet, refuse_twins, without_twins
-from teds_provision.talk.onward import onward
+from teds_provision.talk.meeting import meet, onward, refuse_twins, without_twins
 from teds_provision.talk.progress import Reporter
 from teds_provision.talk.watching import Patience, watch_nodes
 

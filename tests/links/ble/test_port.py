@@ -11,8 +11,7 @@ from pathlib import Path
 import pytest
 
 from teds_provision.errors import LinkFailure, NoNode, NoReader, UsageFailure
-from teds_provision.links.ble.port import BlePort
-from teds_provision.links.ble.remembered import cache_file
+from teds_provision.links.ble.port import BlePort, cache_file
 from teds_provision.links.ble.spec import parse_spec
 from teds_provision.links.ports import LISTEN_SECONDS, Contact, Notice, Prompt
 from teds_provision.node import described

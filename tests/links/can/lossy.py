@@ -19,8 +19,8 @@ import can
 import can.interfaces
 import can.util
 
-from teds_provision.links.can.frame import Frame
-from teds_provision.links.can.wire.echoes import Echoes
+from teds_provision.links.can.bus import Echoes
+from teds_provision.links.can.isotp import Frame
 
 KINDS = ("loss", "double", "swap", "delay", "corrupt")
 

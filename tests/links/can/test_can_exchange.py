@@ -15,8 +15,7 @@ import pytest
 from teds_provision.errors import AddressConflict, LinkFailure, NodeSilent, NoNode, NoReader
 from teds_provision.links.can import link as link_module
 from teds_provision.links.can.arrivals import Arrivals
-from teds_provision.links.can.frame import Frame
-from teds_provision.links.can.isotp import FUNCTIONAL
+from teds_provision.links.can.isotp import FUNCTIONAL, Frame
 from teds_provision.links.can.port import CanPort
 from teds_provision.links.can.spec import parse_spec
 from teds_provision.links.ports import Contact, Notice

@@ -11,12 +11,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from teds_provision.links.can import pacing
 from teds_provision.links.can.bus import Bus, Frame
-from teds_provision.links.can.gathering import Gathering
 from teds_provision.links.can.isotp import Pair, addresses, padded, physical_id, read_single, single
+from teds_provision.links.can.pacing import Pacer, classic_bits, fd_seconds
+from teds_provision.links.can.shared import Gathering
 from teds_provision.links.can.spec import parse_spec
-from teds_provision.links.can.wire import pacing
-from teds_provision.links.can.wire.pacing import Pacer, classic_bits, fd_seconds
 from tests.pace import PATIENCE
 
 STATION, NODE = 0xF1, 0x21

@@ -14,9 +14,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from teds_provision.errors import LinkFailure
+from teds_provision.links.can import multicast
 from teds_provision.links.can.bus import Bus, Frame
 from teds_provision.links.can.spec import parse_spec
-from teds_provision.links.can.wire import multicast
 from tests.pace import PATIENCE
 
 pytestmark = pytest.mark.link

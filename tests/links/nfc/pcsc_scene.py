@@ -24,9 +24,8 @@ from collections.abc import Callable
 from pathlib import Path
 
 from teds_provision.node.flash_file import FlashFile
+from teds_provision.node.nfc.tags import NdefApplication, Type2Memory, Type4Memory
 from teds_provision.node.nfc.tnep import TnepTag
-from teds_provision.node.nfc.type2 import Type2Memory
-from teds_provision.node.nfc.type4 import NdefApplication, Type4Memory
 from teds_provision.node.virtual import VirtualNode
 
 DRIVER = "/usr/lib/pcsc/drivers/serial/libifdvpcd.so"

@@ -8,7 +8,7 @@ import pytest
 
 from teds_provision.links.nfc.nfcpy import Type4TagCommandError
 from teds_provision.links.nfc.tag import Type4Ndef
-from teds_provision.node.nfc.type4 import NdefApplication, Type4Memory
+from teds_provision.node.nfc.tags import NdefApplication, Type4Memory
 
 
 class Tag:

@@ -13,9 +13,8 @@ from teds_provision.errors import NoNode, NoReader, UsageFailure
 from teds_provision.links import LinkSettings, Notice, open_port
 from teds_provision.links.nfc import reader
 from teds_provision.links.nfc.port import NfcPort
+from teds_provision.node.nfc.tags import ATS, IsoDepTag, NdefApplication, Type2Memory, Type4Memory
 from teds_provision.node.nfc.tnep import TnepTag
-from teds_provision.node.nfc.type2 import Type2Memory
-from teds_provision.node.nfc.type4 import ATS, IsoDepTag, NdefApplication, Type4Memory
 from tests.pace import until
 
 from .conftest import UUID

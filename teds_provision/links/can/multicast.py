@@ -18,7 +18,7 @@ import time
 from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 from teds_provision.lazy import late
-from teds_provision.links.can.frame import Frame
+from teds_provision.links.can.isotp import Frame
 
 if TYPE_CHECKING:
     import msgpack
