@@ -187,9 +187,9 @@ class IsoDepTag:
 
 # A Type 2 tag as a state machine, in the layout of the NHS31xx family: 512 octets of SRAM behind 16 of header.
 #
-# The data area begins with a lock control TLV ``01 03 E8 0E 46`` and a proprietary TLV ``FD 01 00``; the NDEF TLV stands
-# on RF page 6, and a length other than 0 written there completes a message (facts from NXP's public SDK headers; the
-# octets of the capability container are an inference). What lies behind the SRAM is not there.
+# The data area begins with a lock control TLV ``01 03 E8 0E 46`` and a proprietary TLV ``FD 01 00``; the NDEF TLV
+# stands on RF page 6, and a length other than 0 written there completes a message (facts from NXP's public SDK
+# headers; the octets of the capability container are an inference). What lies behind the SRAM is not there.
 
 MAX_NDEF = 499  # 512 - 8 (the two TLVs) - 4 (TLV type and length) - 1 (terminator)
 TYPE_2_SAK: Final = 0x00
