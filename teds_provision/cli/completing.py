@@ -24,7 +24,7 @@ from teds_provision import station as station_room
 from teds_provision import teds
 from teds_provision.cli.configuration import home_of
 from teds_provision.errors import TedsProvisionError
-from teds_provision.harmless import printable
+from teds_provision.sanitize import printable
 
 _NODES: Final = frozenset({"uuid", "uuids", "what", "old", "new", "node", "nodes", "text", "names"})
 _MOST: Final = 50

@@ -14,8 +14,8 @@ from teds_provision import protocol, vault
 from teds_provision import station as station_room
 from teds_provision.cli.configuration import home_of
 from teds_provision.errors import PolicyRefused, StoreFailure, TedsProvisionError, UsageFailure, WrongPassphrase
-from teds_provision.harmless import harmless, harmless_json
 from teds_provision.lazy import late
+from teds_provision.sanitize import sanitize, sanitize_json
 
 if TYPE_CHECKING:
     import json
@@ -99,7 +99,7 @@ class App:
         if callable(human):
             human(console)
         elif isinstance(human, str):
-            console.print(harmless(human), markup=False)
+            console.print(sanitize(human), markup=False)
         else:
             console.print(human)
 
@@ -262,12 +262,12 @@ class App:
 
 def say(text: str) -> None:
     """Say something on stderr; what others wrote steers no terminal, and no word is broken at its edge."""
-    print(folded(harmless(text), sys.stderr), file=sys.stderr, flush=True)
+    print(folded(sanitize(text), sys.stderr), file=sys.stderr, flush=True)
 
 
 def _asked(question: str) -> str:
     """A question as it is shown, with room for what click puts behind it."""
-    return folded(harmless(question), sys.stderr, spare=len(_BEHIND))
+    return folded(sanitize(question), sys.stderr, spare=len(_BEHIND))
 
 
 def nowhere(stream: TextIO) -> None:
@@ -281,7 +281,7 @@ def nowhere(stream: TextIO) -> None:
 def to_json(value: object, *, indent: int | None = None) -> str:
     """JSON for stdout: characters as they are where it takes UTF-8, escaped where it does not."""
     wide = (sys.stdout.encoding or "utf-8").lower().replace("-", "") == "utf8"
-    return harmless_json(json.dumps(value, ensure_ascii=not wide, indent=indent))
+    return sanitize_json(json.dumps(value, ensure_ascii=not wide, indent=indent))
 
 
 def read_line(descriptor: int) -> str:

@@ -20,8 +20,8 @@ from teds_provision.cli.context import App, pass_app
 from teds_provision.cli.options import FileToRead, command, dry_run_option, link_options, yes_option
 from teds_provision.cli.rendering import print_table, reporter_for
 from teds_provision.errors import NotWhitelisted, TedsProvisionError
-from teds_provision.harmless import harmless
 from teds_provision.links import LinkSettings
+from teds_provision.sanitize import sanitize
 from teds_provision.steps import many
 from teds_provision.talk.progress import Reporter, StepResult
 
@@ -444,7 +444,7 @@ class OperatorScreen:
         self._line(f"{board.seconds:.1f} s  {board.uuid.hex()}{row}  {self._name(board)}", style="bold")
         if board.failure is not None:
             hint = f" → {board.failure.hint}" if board.failure.hint else ""
-            why = Text(harmless(f"{board.failure.message}{hint}"), style="bold red")
+            why = Text(sanitize(f"{board.failure.message}{hint}"), style="bold red")
             for line in why.wrap(self._console, self._console.width)[:_WHY_LINES]:
                 self._console.print(line)
         elif board.done is not None and board.done.warnings:
@@ -454,7 +454,7 @@ class OperatorScreen:
         """One line, cut with an ellipsis where the terminal ends."""
         from rich.text import Text
 
-        self._console.print(Text(harmless(text).rstrip()), style=style, no_wrap=True, overflow="ellipsis")
+        self._console.print(Text(sanitize(text).rstrip()), style=style, no_wrap=True, overflow="ellipsis")
 
     def _name(self, board: Board) -> str:
         return self._boards.row(board.row).prepared.order.name or "" if board.row is not None else ""
@@ -467,9 +467,9 @@ class OperatorScreen:
         if row.by_order:
             had = self._boards.board_of(row)
             board = "THE BOARD" if had is None else f"BOARD {had} AGAIN"
-            return harmless(f"TAP {board} FOR ROW {row.number}  {name}".rstrip())
+            return sanitize(f"TAP {board} FOR ROW {row.number}  {name}".rstrip())
         which = row.uuid.hex() if row.uuid is not None else f"key {(row.fingerprint or '')[:16]}"
-        return harmless(f"TAP ANY BOARD OF THE SHEET, e.g. {which}  {name}".rstrip())
+        return sanitize(f"TAP ANY BOARD OF THE SHEET, e.g. {which}  {name}".rstrip())
 
 
 def _clock(moment: str) -> str:

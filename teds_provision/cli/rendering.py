@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from teds_provision.errors import TedsProvisionError, UsageFailure
-from teds_provision.harmless import harmless
+from teds_provision.sanitize import sanitize
 from teds_provision.talk.progress import NOTHING, Reporter, Silent, StepResult
 
 if TYPE_CHECKING:
@@ -168,7 +168,7 @@ class LiveReporter:
             self._stop()
             if notice.kind == "node-left":  # whatever step ran ended with it
                 self._step = ""
-            self._console.print(harmless(f"… {notice.text}"), style="yellow", markup=False)
+            self._console.print(sanitize(f"… {notice.text}"), style="yellow", markup=False)
 
     def written(self, octets: int, total: int) -> None:
         """Show how far the transfer is."""
@@ -195,7 +195,7 @@ class LiveReporter:
         left = "" if self._until is None else f" ({max(0.0, self._until - time.monotonic()):.0f} s left)"
         what = f"  {self._what}{left}" if self._what else ""
         return Spinner(
-            "dots", text=Text(harmless(f"{self._step}{what}".lstrip()))
+            "dots", text=Text(sanitize(f"{self._step}{what}".lstrip()))
         )  # a bare text would be read as markup
 
     def close(self) -> None:

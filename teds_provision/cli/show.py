@@ -19,14 +19,13 @@ from teds_provision.cli.context import to_json as dumps
 from teds_provision.cli.options import command
 from teds_provision.errors import BadData, UsageFailure
 from teds_provision.files import open_to_read
-from teds_provision.harmless import harmless
 from teds_provision.lazy import late
 from teds_provision.limits import LIMITS
 from teds_provision.protocol import handover
 from teds_provision.protocol.messages.message import Argument, Message, decode_message, looks_like_message
+from teds_provision.sanitize import sanitize
 from teds_provision.teds import convert, decode
-from teds_provision.teds.codec.codes import AccessCode
-from teds_provision.teds.codec.model import Decoded, Edition, Finding, TimeInstance, Verdict
+from teds_provision.teds.codec.model import AccessCode, Decoded, Edition, Finding, TimeInstance, Verdict
 from teds_provision.teds.formats import Block, Kind, class_of, detect, read_blocks, with_class
 from teds_provision.teds.formats.jsonform import FORMAT, value_to_json
 from teds_provision.teds.guard import check_calibration
@@ -129,7 +128,7 @@ def _write(app: App, blocks: Sequence[Block], form: Format) -> None:
     for sentence in teds.formats.lost(blocks, form):
         app.warn(f"{form} cannot hold {sentence}")
     if isinstance(written, str) and sys.stdout.isatty():
-        written = harmless(written)
+        written = sanitize(written)
     octets = written if isinstance(written, bytes) else written.encode()
     sys.stdout.buffer.write(octets)
     sys.stdout.flush()

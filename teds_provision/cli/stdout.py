@@ -43,7 +43,7 @@ class CleanText(io.TextIOWrapper):
     """Text for stdout, with escapes in the place of what would steer a terminal or turn what people read.
 
     In JSON such an escape says the same. ESC itself stays, as colours need it: whoever prints names takes it out
-    (:mod:`teds_provision.harmless`), and JSON never holds it.
+    (:mod:`teds_provision.sanitize`), and JSON never holds it.
     """
 
     def write(self, text: str, /) -> int:

@@ -12,8 +12,8 @@ import click
 from teds_provision.cli.context import App, pass_app
 from teds_provision.cli.options import COMMAND_SETTINGS, examples
 from teds_provision.cli.rendering import print_json_list
-from teds_provision.harmless import harmless
 from teds_provision.lazy import late
+from teds_provision.sanitize import sanitize
 
 if TYPE_CHECKING:
     from teds_provision.trace import recorder
@@ -65,4 +65,4 @@ def _lines(records: Iterator[Record], *, whole: bool) -> Iterator[str]:
         mark = "  " if record.layer == "frame" else ""
         octets = shown.hex() if whole or len(shown) <= _SHOWN else f"{shown[:_SHOWN].hex()}…"
         head = f"{moment} {record.link:4} {_ARROWS[record.direction]} {mark}"
-        yield harmless(f"{head}{record.command}{seal}  {where}{octets}".rstrip())
+        yield sanitize(f"{head}{record.command}{seal}  {where}{octets}".rstrip())

@@ -12,8 +12,8 @@ from teds_provision.cli.context import App, pass_app, to_json
 from teds_provision.cli.options import command, link_options, said_here
 from teds_provision.cli.rendering import print_table, reporter_for
 from teds_provision.errors import UsageFailure
-from teds_provision.harmless import printable
 from teds_provision.links import LinkSettings
+from teds_provision.sanitize import printable
 from teds_provision.steps import many, visits
 
 if TYPE_CHECKING:

@@ -15,7 +15,7 @@ from teds_provision.station.station import Station
 from teds_provision.steps.build import BuildOrder, build
 from teds_provision.steps.sign import known_image
 from teds_provision.store import NodeRecord, Revocation
-from teds_provision.teds.codec.codes import AccessCode
+from teds_provision.teds.codec.model import AccessCode
 from teds_provision.teds.image import BlockId, Image
 
 if TYPE_CHECKING:

@@ -11,7 +11,7 @@ from teds_provision.protocol.flash import Flash
 from teds_provision.protocol.keys import Verify, verify
 from teds_provision.protocol.messages.frames import Reason, Refused
 from teds_provision.teds.codec import security
-from teds_provision.teds.codec.codes import AccessCode
+from teds_provision.teds.codec.model import AccessCode
 from teds_provision.teds.codec.security import NotCanonical, SecurityTeds
 from teds_provision.teds.image import SECURITY, BlockId
 

@@ -11,7 +11,7 @@ from teds_provision.errors import BadData
 from teds_provision.protocol.agreement import Credentials
 from teds_provision.protocol.keys import Verify, is_point, station_key_message, verify
 from teds_provision.teds.codec import frame, security
-from teds_provision.teds.codec.codes import AccessCode
+from teds_provision.teds.codec.model import AccessCode
 from teds_provision.teds.codec.security import SecurityTeds
 from teds_provision.teds.image import BlockId
 

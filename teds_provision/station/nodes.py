@@ -10,7 +10,7 @@ from teds_provision.errors import BadData
 from teds_provision.lazy import late
 from teds_provision.station.seals import Seals
 from teds_provision.store import DatasheetRecord, Draft, Handed, Known, NodeRecord, Reading, Search, Shown, Store
-from teds_provision.teds.codec.codes import AccessCode
+from teds_provision.teds.codec.model import AccessCode
 from teds_provision.teds.image import Image
 
 if TYPE_CHECKING:

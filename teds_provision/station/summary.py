@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from teds_provision import teds
-from teds_provision.harmless import printable
-from teds_provision.teds.codec.codes import AccessCode
+from teds_provision.sanitize import printable
+from teds_provision.teds.codec.model import AccessCode
 from teds_provision.teds.image import Image
 from teds_provision.teds.sheet import described
 

@@ -34,8 +34,7 @@ from teds_provision.talk.conversation import Conversation
 from teds_provision.teds.calibration.interpreter import ChannelInterpreter
 from teds_provision.teds.calibration.samples import SampleForm
 from teds_provision.teds.channel import Kind
-from teds_provision.teds.codec.codes import AccessCode
-from teds_provision.teds.codec.model import Units
+from teds_provision.teds.codec.model import AccessCode, Units
 from teds_provision.teds.image import BlockId, Image
 from teds_provision.teds.profile.model import ChannelProfile, Profile
 from teds_provision.teds.sheet import Channel, Sheet

@@ -21,7 +21,7 @@ from teds_provision.steps.sign import known_image, known_node_keys, unsigned_sec
 from teds_provision.steps.verify import Known, Verified, verify_image
 from teds_provision.store import Draft
 from teds_provision.teds.codec import security
-from teds_provision.teds.codec.codes import AccessCode
+from teds_provision.teds.codec.model import AccessCode
 from teds_provision.teds.diff import Change, diff_blocks
 from teds_provision.teds.image import SECURITY, BlockId, Image
 

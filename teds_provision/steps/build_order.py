@@ -11,10 +11,10 @@ from typing import TYPE_CHECKING, Final
 
 from teds_provision import teds
 from teds_provision.errors import BadData, CalibrationMisfit, NotFound, PolicyRefused, UsageFailure
-from teds_provision.harmless import printable
 from teds_provision.lazy import late
+from teds_provision.sanitize import printable
 from teds_provision.station.station import Station
-from teds_provision.teds.codec.codes import AccessCode
+from teds_provision.teds.codec.model import AccessCode
 from teds_provision.teds.image import Image
 from teds_provision.teds.profile.load import default_folders, is_profile_name, load_profile, passed_over
 from teds_provision.teds.profile.reader import NAME_OCTETS

@@ -10,18 +10,18 @@ from dataclasses import dataclass, replace
 
 from teds_provision import teds
 from teds_provision.errors import NodeRefused, NoKeyring, NotAuthentic, WrongPassphrase
-from teds_provision.harmless import printable
 from teds_provision.protocol.fingerprints import is_whole
 from teds_provision.protocol.keys import CHALLENGE_OCTETS, fingerprint, node_key_good, prove_message, verify
 from teds_provision.protocol.messages.frames import Function, security_command
 from teds_provision.protocol.messages.identity import NodeState
+from teds_provision.sanitize import printable
 from teds_provision.station.station import Station
 from teds_provision.steps.read import read_block
 from teds_provision.steps.reading import keep_shown
 from teds_provision.store import WhitelistEntry, utc_now
 from teds_provision.talk.conversation import Conversation
 from teds_provision.teds.codec import security
-from teds_provision.teds.codec.codes import AccessCode
+from teds_provision.teds.codec.model import AccessCode
 from teds_provision.teds.image import SECURITY
 
 

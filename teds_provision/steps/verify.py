@@ -14,7 +14,7 @@ from teds_provision.station.station import Station
 from teds_provision.steps.judging import Judging
 from teds_provision.steps.sign import known_image
 from teds_provision.teds.codec import security
-from teds_provision.teds.codec.codes import AccessCode
+from teds_provision.teds.codec.model import AccessCode
 from teds_provision.teds.codec.security import NotCanonical, SecurityTeds
 from teds_provision.teds.image import SECURITY, Image
 

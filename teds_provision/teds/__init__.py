@@ -26,11 +26,11 @@ if TYPE_CHECKING:
         show,
         units,
     )
-    from teds_provision.teds.codec.codes import AccessCode
     from teds_provision.teds.codec.composer import compose, convert, encode, recompose
     from teds_provision.teds.codec.decode import decode
     from teds_provision.teds.codec.keyforms import ReadKey, read_key
     from teds_provision.teds.codec.model import (
+        AccessCode,
         Decoded,
         Edition,
         Field,

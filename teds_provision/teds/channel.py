@@ -13,9 +13,8 @@ from typing import TYPE_CHECKING, Final
 from teds_provision.lazy import late
 from teds_provision.teds.calibration.model import Calibration
 from teds_provision.teds.calibration.samples import DataModel, SampleForm
-from teds_provision.teds.codec.codes import AccessCode
 from teds_provision.teds.codec.decode import decode
-from teds_provision.teds.codec.model import Decoded, Units
+from teds_provision.teds.codec.model import AccessCode, Decoded, Units
 from teds_provision.teds.image import BlockId
 from teds_provision.teds.units import (
     ARBITRARY,

@@ -11,9 +11,8 @@ from teds_provision.lazy import late
 from teds_provision.teds.calibration.decoded import from_decoded, is_sound
 from teds_provision.teds.calibration.describe import kind_of
 from teds_provision.teds.calibration.model import Calibration
-from teds_provision.teds.codec.codes import AccessCode
 from teds_provision.teds.codec.decode import decode
-from teds_provision.teds.codec.model import Decoded, Field, Units
+from teds_provision.teds.codec.model import AccessCode, Decoded, Field, Units
 from teds_provision.teds.codec.tables import FieldSpec, name_of, table
 from teds_provision.teds.curve import channel_of, curve_of
 from teds_provision.teds.image import BlockId

@@ -22,9 +22,8 @@ from teds_provision.teds.calibration.model import Calibration
 from teds_provision.teds.calibration.samples import Range
 from teds_provision.teds.channel import TURN
 from teds_provision.teds.channel import Channel as SheetChannel
-from teds_provision.teds.codec.codes import AccessCode
 from teds_provision.teds.codec.decode import decode
-from teds_provision.teds.codec.model import Decoded
+from teds_provision.teds.codec.model import AccessCode, Decoded
 from teds_provision.teds.curve import FLOAT32_STEP, Curve, channel_of, curve_of
 from teds_provision.teds.image import BlockId
 

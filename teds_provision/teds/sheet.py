@@ -26,9 +26,8 @@ from teds_provision.teds.channel import (
     number_of,
     read_channel,
 )
-from teds_provision.teds.codec.codes import AccessCode
 from teds_provision.teds.codec.decode import decode
-from teds_provision.teds.codec.model import Decoded, Finding, Severity, Verdict
+from teds_provision.teds.codec.model import AccessCode, Decoded, Finding, Severity, Verdict
 from teds_provision.teds.codec.tables import name_of
 from teds_provision.teds.image import BlockId, Image
 

@@ -13,10 +13,9 @@ from typing import Any, Final
 from teds_provision.errors import BadData
 from teds_provision.teds.calibration.decoded import calibrated_unit, from_decoded
 from teds_provision.teds.codec import security
-from teds_provision.teds.codec.codes import AccessCode
 from teds_provision.teds.codec.decode import decode
 from teds_provision.teds.codec.keyforms import read_key
-from teds_provision.teds.codec.model import Decoded, Field, Finding, TimeInstance, Units
+from teds_provision.teds.codec.model import AccessCode, Decoded, Field, Finding, TimeInstance, Units
 from teds_provision.teds.codec.tables import FieldSpec, Table, name_of, table
 from teds_provision.teds.codec.uuid import unpack_uuid
 from teds_provision.teds.formats import Block

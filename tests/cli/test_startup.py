@@ -19,7 +19,7 @@ OURS = {
     "teds_provision.cli.stdout",
     "teds_provision.cli.table",
     "teds_provision.errors",
-    "teds_provision.harmless",
+    "teds_provision.sanitize",
     "teds_provision.lazy",
     "teds_provision.protocol",
     "teds_provision.station",

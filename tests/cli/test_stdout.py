@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from teds_provision.harmless import harmless, harmless_json, printable
+from teds_provision.sanitize import printable, sanitize, sanitize_json
 from teds_provision.store import NodeRecord, Store
 from tests.bench import PASSPHRASE
 from tests.cli.shell import call, clean_environment
@@ -80,13 +80,13 @@ STEERING = "\x1b[31mred\x9b2J\u202etxt\x07"
 
 
 def test_cleaned_text_steers_nothing_and_json_still_says_the_same() -> None:
-    for clean in (printable(STEERING), harmless(STEERING)):
+    for clean in (printable(STEERING), sanitize(STEERING)):
         assert clean.isprintable()
-    told = harmless_json(json.dumps({"name": STEERING}, ensure_ascii=False))
+    told = sanitize_json(json.dumps({"name": STEERING}, ensure_ascii=False))
     assert told.isprintable()
     assert json.loads(told) == {"name": STEERING}
-    assert harmless_json('{"ä": "ö"}') == '{"ä": "ö"}'
-    assert harmless("two\n\tlines") == "two\n\tlines"
+    assert sanitize_json('{"ä": "ö"}') == '{"ä": "ö"}'
+    assert sanitize("two\n\tlines") == "two\n\tlines"
 
 
 @pytest.mark.parametrize(

@@ -10,7 +10,7 @@ from teds_provision.errors import BadData, NotFound, UsageFailure
 from teds_provision.node import described
 from teds_provision.node.flash_file import FlashFile
 from teds_provision.teds import compose
-from teds_provision.teds.codec.codes import AccessCode
+from teds_provision.teds.codec.model import AccessCode
 from teds_provision.teds.formats import Block, write_blocks
 from teds_provision.teds.image import SECURITY, Image
 from teds_provision.teds.profile import load_profile

@@ -19,7 +19,7 @@ from teds_provision.talk.progress import Silent
 from teds_provision.teds.calibration import Calibration, read_calibrations
 from teds_provision.teds.calibration.samples import SampleForm
 from teds_provision.teds.channel import Channel, Kind
-from teds_provision.teds.codec.codes import AccessCode
+from teds_provision.teds.codec.model import AccessCode
 from teds_provision.teds.guard import misfit
 from teds_provision.teds.profile import load_profile
 from teds_provision.teds.sheet import Sheet

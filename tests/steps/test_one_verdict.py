@@ -29,8 +29,8 @@ from teds_provision.steps.sign import known_node_keys
 from teds_provision.steps.verify import possession
 from teds_provision.steps.verify_node import Looked, look_at_node, look_in_session, verify_node
 from teds_provision.store import Reading, Revocation, utc_now
-from teds_provision.teds.codec.codes import AccessCode
 from teds_provision.teds.codec.frame import frame, unframe
+from teds_provision.teds.codec.model import AccessCode
 from teds_provision.teds.image import SECURITY
 from tests.bench import Board, MemoryLink, talk
 from tests.handover.desk import Pair, provisioned

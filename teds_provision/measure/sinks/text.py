@@ -17,11 +17,11 @@ from itertools import count
 from pathlib import Path
 from typing import Any
 
-from teds_provision.harmless import printable
 from teds_provision.measure.blocks import Block, ChannelFacts, NodeReport, why_invalid
 from teds_provision.measure.sinks.base import Item
 from teds_provision.measure.sinks.files import FileSink
 from teds_provision.measure.sinks.lines import facts_as_json, iso
+from teds_provision.sanitize import printable
 
 FORMULA = ("=", "+", "-", "@")  # a cell that begins so would be computed by a spreadsheet
 

@@ -19,9 +19,9 @@ from starlette.responses import JSONResponse, Response
 from starlette.routing import Route
 
 from teds_provision.errors import NotFound, TedsProvisionError, UsageFailure
-from teds_provision.harmless import printable
 from teds_provision.ncap.daemon import Daemon
 from teds_provision.ncap.web.answers import reading
+from teds_provision.sanitize import printable
 
 NO_ERROR, NO_SUCH, NO_VALUE, BAD_ARGUMENT, FAILED = 0, 1, 2, 3, 4
 Fields = dict[str, Any]

@@ -21,7 +21,7 @@ from teds_provision.protocol.messages.frames import (
     TedsStatus,
 )
 from teds_provision.protocol.session import NodeSession
-from teds_provision.teds.codec.codes import MANUFACTURER, TEXT_BASED
+from teds_provision.teds.codec.model import MANUFACTURER, TEXT_BASED
 from teds_provision.teds.image import SECURITY, BlockId
 
 STAGED_SECONDS: Final = 60.0

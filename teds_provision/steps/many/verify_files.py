@@ -20,7 +20,7 @@ from teds_provision.station.station import Station
 from teds_provision.steps.judging import Judging, remember
 from teds_provision.steps.verify import Check, Verified, require_authentic, verify_images
 from teds_provision.teds.codec import security
-from teds_provision.teds.codec.codes import AccessCode
+from teds_provision.teds.codec.model import AccessCode
 from teds_provision.teds.image import Image
 
 ENDING: Final = ".json"

@@ -21,7 +21,7 @@ from teds_provision.steps.verify_node import verify_node
 from teds_provision.steps.write import write
 from teds_provision.talk.conversation import Conversation
 from teds_provision.talk.progress import DONE, NOTHING, Reporter, StepResult, Steps
-from teds_provision.teds.codec.codes import AccessCode
+from teds_provision.teds.codec.model import AccessCode
 from teds_provision.teds.diff import Change, diff_blocks
 from teds_provision.teds.formats import stated_uuid, under
 from teds_provision.teds.image import BlockId, Image

@@ -9,9 +9,8 @@ from typing import Final
 
 from teds_provision.errors import BadData
 from teds_provision.teds.codec import values
-from teds_provision.teds.codec.codes import AccessCode
 from teds_provision.teds.codec.frame import TEDSID, frame, raw_tuple
-from teds_provision.teds.codec.model import Decoded, Edition, Field, Finding, Severity, TimeInstance, Units
+from teds_provision.teds.codec.model import AccessCode, Decoded, Edition, Field, Finding, Severity, TimeInstance, Units
 from teds_provision.teds.codec.tables import ONLY_2024, TEXT_BASED, FieldSpec, Table, table
 from teds_provision.teds.codec.values import compose_text, pairs_of
 

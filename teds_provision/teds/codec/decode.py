@@ -11,9 +11,18 @@ from functools import partial
 from typing import Final
 
 from teds_provision.errors import BadData
-from teds_provision.teds.codec.codes import AccessCode
 from teds_provision.teds.codec.frame import MINIMUM_OCTETS, TEDSID, checksum, shape_of
-from teds_provision.teds.codec.model import MALFORMED_CODES, Decoded, Edition, Field, Finding, Severity, Value, Verdict
+from teds_provision.teds.codec.model import (
+    MALFORMED_CODES,
+    AccessCode,
+    Decoded,
+    Edition,
+    Field,
+    Finding,
+    Severity,
+    Value,
+    Verdict,
+)
 from teds_provision.teds.codec.plausibility import check
 from teds_provision.teds.codec.tables import MANUFACTURER, ONLY_2024, TEXT_BASED, FieldSpec, Table, name_of, table
 from teds_provision.teds.codec.values import READERS, is_packed_units, split_text, units_of

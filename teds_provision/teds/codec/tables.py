@@ -13,7 +13,7 @@ from functools import cache
 from pathlib import Path
 from typing import Any, Final, Literal
 
-from teds_provision.teds.codec.codes import MANUFACTURER, ONLY_2024, TEXT_BASED, AccessCode
+from teds_provision.teds.codec.model import MANUFACTURER, ONLY_2024, TEXT_BASED, AccessCode
 
 # Rows of the Meta-TEDS, the TransducerChannel TEDS and the transducer name TEDS (teds.md, "Access codes").
 

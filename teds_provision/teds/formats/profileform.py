@@ -13,9 +13,8 @@ from typing import Final
 
 from teds_provision.errors import BadData
 from teds_provision.teds.channel import channel_from
-from teds_provision.teds.codec.codes import AccessCode
 from teds_provision.teds.codec.decode import decode
-from teds_provision.teds.codec.model import UNIT_PARTS, Decoded, Edition, Field, Units
+from teds_provision.teds.codec.model import UNIT_PARTS, AccessCode, Decoded, Edition, Field, Units
 from teds_provision.teds.codec.tables import name_of
 from teds_provision.teds.formats.tree import shortest
 from teds_provision.teds.image import Block

@@ -7,8 +7,7 @@ from typing import Final, cast
 
 from teds_provision.errors import BadData
 from teds_provision.teds.calibration.model import METHODS, Monotone
-from teds_provision.teds.codec.codes import AccessCode
-from teds_provision.teds.codec.model import Units
+from teds_provision.teds.codec.model import AccessCode, Units
 from teds_provision.teds.profile.keys import (
     CALIBRATION_KEYS,
     CHANNEL_KEYS,

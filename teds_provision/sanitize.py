@@ -1,4 +1,4 @@
-"""Text that others wrote, made harmless for a terminal: names from nodes, tags and files steer nothing."""
+"""Text that others wrote, sanitized for a terminal: names from nodes, tags and files cannot control it."""
 
 from __future__ import annotations
 
@@ -13,23 +13,23 @@ else:
 
 
 def printable(text: str) -> str:
-    """A name as a node gives it, without the characters that steer a terminal or turn the direction of writing."""
+    """A name as a node gives it, without the characters that control a terminal or reverse the direction of text."""
     if text.isprintable():
         return text
     return "".join(character if character.isprintable() else "\N{REPLACEMENT CHARACTER}" for character in text)
 
 
-def harmless(text: str) -> str:
-    """Lines for a terminal: nothing in them that a node, a tag or a file brought can steer it; breaks and tabs stay."""
+def sanitize(text: str) -> str:
+    """Lines for a terminal, without control characters that a node, a tag or a file brought; line breaks and tabs stay."""
     if text.isprintable():
         return text
     return "".join(character if character.isprintable() or character in "\n\t" else "?" for character in text)
 
 
-def harmless_json(text: str) -> str:
-    """JSON with every character that is not printable escaped: it says the same, and steers no terminal.
+def sanitize_json(text: str) -> str:
+    """JSON with every character that is not printable escaped: same meaning, and no control of the terminal.
 
-    JSON itself escapes only what lies below U+0020; a terminal also obeys U+009B, and U+202E turns what people read.
+    JSON itself escapes only what lies below U+0020; a terminal also obeys U+009B, and U+202E reverses what people read.
     """
     if text.isprintable():
         return text
