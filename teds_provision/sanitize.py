@@ -20,7 +20,7 @@ def printable(text: str) -> str:
 
 
 def sanitize(text: str) -> str:
-    """Lines for a terminal, without control characters that a node, a tag or a file brought; line breaks and tabs stay."""
+    """Lines for a terminal, without the control characters that others put in; line breaks and tabs stay."""
     if text.isprintable():
         return text
     return "".join(character if character.isprintable() or character in "\n\t" else "?" for character in text)

@@ -17,7 +17,7 @@ from teds_provision.measure.clock import ClockMap, Monotone, Wall
 from teds_provision.protocol.operation.stream_commands import Kind
 from teds_provision.protocol.operation.subscription import Message, Plan
 from teds_provision.teds.calibration.interpreter import ChannelInterpreter
-from teds_provision.teds.calibration.many_channels import ManyChannels
+from teds_provision.teds.calibration.vectorized import ManyChannels
 from teds_provision.teds.sheet import Sheet
 
 NODE_SAYS_SO = "the node marks them as not valid"

@@ -38,7 +38,7 @@ from teds_provision.store import Draft, WhitelistEntry
 from teds_provision.store.records import Assurance
 from teds_provision.talk.conversation import Conversation
 from teds_provision.talk.progress import DONE, NOTHING, SKIPPED, Reporter, StepResult, Steps
-from teds_provision.teds.calibration.describe import sentence
+from teds_provision.teds.calibration.formula import sentence
 from teds_provision.teds.image import SECURITY, Image
 
 Order = BuildOrder | Prepared | Callable[["Identified"], Prepared]

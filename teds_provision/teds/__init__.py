@@ -77,11 +77,10 @@ if not TYPE_CHECKING:
     __getattr__ = lazy(
         __name__,
         {
-            "codec.codes": "AccessCode",
             "codec.composer": "compose convert encode recompose",
             "codec.decode": "decode",
             "codec.keyforms": "ReadKey read_key",
-            "codec.model": "Decoded Edition Field Finding Severity TimeInstance Units Value Verdict",
+            "codec.model": "AccessCode Decoded Edition Field Finding Severity TimeInstance Units Value Verdict",
             "codec.tables": "FieldSpec Table name_of table",
             "codec.uuid": "UuidParts pack_uuid unpack_uuid",
             "sheet": "Sheet",

@@ -8,9 +8,8 @@ from typing import TYPE_CHECKING, Final
 
 from teds_provision.errors import BadData
 from teds_provision.lazy import late
-from teds_provision.teds.calibration.decoded import from_decoded, is_sound
-from teds_provision.teds.calibration.describe import kind_of
-from teds_provision.teds.calibration.model import Calibration
+from teds_provision.teds.calibration.formula import kind_of
+from teds_provision.teds.calibration.model import Calibration, from_decoded, is_sound
 from teds_provision.teds.codec.decode import decode
 from teds_provision.teds.codec.model import AccessCode, Decoded, Field, Units
 from teds_provision.teds.codec.tables import FieldSpec, name_of, table

@@ -15,10 +15,8 @@ from typing import TYPE_CHECKING, Final, Literal
 
 from teds_provision.errors import BadData
 from teds_provision.lazy import late
-from teds_provision.teds.calibration.decoded import from_decoded
-from teds_provision.teds.calibration.fitting import residuals
-from teds_provision.teds.calibration.formula import evaluate
-from teds_provision.teds.calibration.model import Calibration
+from teds_provision.teds.calibration.formula import evaluate, residuals
+from teds_provision.teds.calibration.model import Calibration, from_decoded
 from teds_provision.teds.calibration.samples import Range
 from teds_provision.teds.channel import TURN
 from teds_provision.teds.channel import Channel as SheetChannel

@@ -15,10 +15,8 @@ from typing import TYPE_CHECKING, Any, Final
 from teds_provision.errors import BadData, TedsProvisionError, UsageFailure
 from teds_provision.files import SHARED, write_whole
 from teds_provision.lazy import how_to_install, late
-from teds_provision.teds.calibration.decoded import is_sound
-from teds_provision.teds.calibration.describe import kind_of
-from teds_provision.teds.calibration.fitting import residuals
-from teds_provision.teds.calibration.model import Calibration
+from teds_provision.teds.calibration.formula import kind_of, residuals
+from teds_provision.teds.calibration.model import Calibration, is_sound
 from teds_provision.teds.channel import TURN, wrapped
 from teds_provision.teds.curve import channel_of, curve_of
 from teds_provision.teds.image import BlockId

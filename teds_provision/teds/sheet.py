@@ -13,8 +13,7 @@ from dataclasses import dataclass, replace
 from typing import Final
 
 from teds_provision.errors import BadData
-from teds_provision.teds.calibration.decoded import from_decoded, is_finite
-from teds_provision.teds.calibration.model import Calibration
+from teds_provision.teds.calibration.model import Calibration, from_decoded, is_finite
 from teds_provision.teds.channel import (
     NOT_STATED,
     Channel,

@@ -11,7 +11,7 @@ from datetime import UTC, datetime, timedelta
 from typing import Any, Final
 
 from teds_provision.errors import BadData
-from teds_provision.teds.calibration.decoded import calibrated_unit, from_decoded
+from teds_provision.teds.calibration.model import calibrated_unit, from_decoded
 from teds_provision.teds.codec import security
 from teds_provision.teds.codec.decode import decode
 from teds_provision.teds.codec.keyforms import read_key

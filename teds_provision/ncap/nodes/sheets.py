@@ -22,7 +22,7 @@ from teds_provision.steps.visits.sheet_file import SheetPlan, plan_sheet, write_
 from teds_provision.store import utc_now
 from teds_provision.talk.conversation import Conversation
 from teds_provision.talk.progress import Silent, StepResult
-from teds_provision.teds.calibration.decoded import is_finite
+from teds_provision.teds.calibration.model import is_finite
 from teds_provision.teds.formats import Block, placed, write_blocks
 from teds_provision.teds.image import BlockId, Image
 from teds_provision.teds.sheet import Sheet

@@ -12,8 +12,7 @@ import numpy as np
 from teds_provision.errors import BadData
 from teds_provision.node.sources.base import Place, Reading
 from teds_provision.teds.calibration.interpreter import ChannelInterpreter
-from teds_provision.teds.calibration.reading import SampleReader
-from teds_provision.teds.calibration.samples import DataModel
+from teds_provision.teds.calibration.samples import DataModel, SampleReader
 from teds_provision.teds.sheet import Channel, Sheet
 
 _KNOTS: Final = 257

@@ -8,16 +8,24 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from teds_provision.lazy import lazy
-from teds_provision.teds.calibration.decoded import from_decoded
-from teds_provision.teds.calibration.model import METHODS, Calibration, CalibrationInput, Method
+from teds_provision.teds.calibration.model import METHODS, Calibration, CalibrationInput, Method, from_decoded
 
 if TYPE_CHECKING:
-    from teds_provision.teds.calibration.describe import describe_calibration, kind_of, sentence
     from teds_provision.teds.calibration.files import load_calibrations, read_calibrations
-    from teds_provision.teds.calibration.fitting import Residuals, fit, residuals
-    from teds_provision.teds.calibration.formula import Evaluation, PreparedCurve, PreparedInverse, evaluate
+    from teds_provision.teds.calibration.formula import (
+        Evaluation,
+        PreparedCurve,
+        PreparedInverse,
+        Residuals,
+        describe_calibration,
+        evaluate,
+        fit,
+        kind_of,
+        residuals,
+        sentence,
+    )
     from teds_provision.teds.calibration.interpreter import ChannelInterpreter, Values
-    from teds_provision.teds.calibration.reading import SampleReader
+    from teds_provision.teds.calibration.samples import SampleReader
 
 __all__ = [
     "METHODS",
@@ -45,11 +53,10 @@ __all__ = [
 __getattr__ = lazy(
     __name__,
     {
-        "describe": "describe_calibration kind_of sentence",
         "files": "load_calibrations read_calibrations",
-        "fitting": "Residuals fit residuals",
-        "formula": "Evaluation PreparedCurve PreparedInverse evaluate",
+        "formula": "Evaluation PreparedCurve PreparedInverse Residuals describe_calibration evaluate fit kind_of"
+        " residuals sentence",
         "interpreter": "ChannelInterpreter Values",
-        "reading": "SampleReader",
+        "samples": "SampleReader",
     },
 )

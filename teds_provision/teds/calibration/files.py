@@ -5,19 +5,237 @@ Metadata of a CSV stand in lines ``# key: value``; every error names file, line 
 
 from __future__ import annotations
 
+import csv
+import math
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from difflib import get_close_matches
+from itertools import count, takewhile
 from pathlib import Path
 from typing import Final
 
 from teds_provision.errors import BadData
-from teds_provision.limits import LIMITS, load_json
-from teds_provision.teds.calibration.csv_text import CsvTable, read_csv
+from teds_provision.limits import LIMITS, check_size, load_json
 from teds_provision.teds.calibration.model import Calibration
 from teds_provision.teds.calibration.order import Order, calibration_of
 from teds_provision.teds.profile.model import ChannelProfile, Profile
 from teds_provision.teds.profile.reader import Item, Table, Where, parse, read_text
+
+# The CSV reader takes delimiter, decimal comma, header, units and metadata as instruments and spreadsheets write them.
+
+MAXIMUM_ROWS: Final = 200_000
+_CHANNEL_DIGITS: Final = 5
+_LINE: Final = 20_000
+RAW: Final = {"raw", "count", "counts", "adc", "code", "digital", "x", "input"}
+CHANNEL: Final = {"channel", "ch"}
+SEGMENT: Final = ("from", "to", "offset")
+_METADATA: Final = re.compile(r"#\s*([A-Za-z][A-Za-z -]*?)\s*:\s*(.*?)\s*\Z")
+_UNIT: Final = re.compile(r"\s*(.*?)\s*(?:\[([^\]]*)\]|\(([^)]*)\))?\s*\Z")
+
+
+@dataclass(frozen=True)
+class Row:
+    """Numbers of one line."""
+
+    line: int
+    channel: int | None
+    values: tuple[float, ...]
+
+
+@dataclass
+class CsvTable:
+    """A calibration CSV: metadata and unit with their lines, rows of (raw, value), or of segments with coefficients."""
+
+    file: str
+    metadata: dict[str, tuple[object, int]] = field(default_factory=dict)
+    unit: tuple[object, int] | None = None
+    segments: bool = False
+    rows: list[Row] = field(default_factory=list)
+
+    def by_channel(self) -> dict[int | None, list[Row]]:
+        """Rows by the channel of their line; None where the file has no such column."""
+        groups: dict[int | None, list[Row]] = {}
+        for row in self.rows:
+            groups.setdefault(row.channel, []).append(row)
+        return groups
+
+
+@dataclass(frozen=True)
+class _Columns:
+    """Where the numbers stand in a line, and their names for errors."""
+
+    names: tuple[str, ...]
+    places: tuple[int, ...]
+    channel: int | None = None
+
+
+def read_csv(text: str, file: str, keys: Sequence[str]) -> CsvTable:
+    """Read a calibration CSV; raises BadData naming file, line and field."""
+    table = CsvTable(file)
+    data = _data_lines(table, text, keys)
+    delimiter = _delimiter(data[0][1])
+    lines = [(number, _cells(line, delimiter)) for number, line in data]
+    columns = _header(table, *lines[0])
+    lines = lines if columns is None else lines[1:]
+    known = columns or _unnamed(table, *lines[0])
+    table.rows = [_row(table, number, cells, known, delimiter != ",") for number, cells in lines]
+    if not table.rows:
+        raise BadData(f"{file}:{data[0][0]}: the file holds a header and no points.")
+    return table
+
+
+def _data_lines(table: CsvTable, text: str, keys: Sequence[str]) -> list[tuple[int, str]]:
+    """Lines that are neither empty nor comments, with their numbers; what comments say goes into the table."""
+    file = table.file
+    check_size(len(text), LIMITS.text_file, file)
+    data: list[tuple[int, str]] = []
+    for number, line in enumerate(text.splitlines(), 1):
+        stripped = line.strip()
+        if stripped.startswith("#"):
+            _metadata(table, stripped, number, keys)
+        elif stripped.strip(",;\t "):
+            data.append((number, line))
+    if not data:
+        raise BadData(
+            f"{file}:1: the file holds no points.", hint="It takes lines of raw value and value, like: 512, 10.5"
+        )
+    long = next((number for number, line in data if len(line) > _LINE), None)
+    if long is not None:
+        raise BadData(f"{file}:{long}: the line has more than {_LINE} characters.")
+    if len(data) > MAXIMUM_ROWS:
+        raise BadData(f"{file}:{data[MAXIMUM_ROWS][0]}: more than {MAXIMUM_ROWS} lines.")
+    return data
+
+
+def _unnamed(table: CsvTable, number: int, cells: list[str]) -> _Columns:
+    """Two columns without a header: raw value and value."""
+    if len(cells) != 2:
+        raise BadData(
+            f"{table.file}:{number}: {len(cells)} columns and no header.",
+            hint='Name them in the first line: "raw, value" or "channel, raw, value".',
+        )
+    return _Columns(("raw", "value"), (0, 1))
+
+
+def _metadata(table: CsvTable, line: str, number: int, keys: Sequence[str]) -> None:
+    match = _METADATA.match(line)
+    if match is None:
+        return
+    key = match[1].lower().replace(" ", "-")
+    if key in keys:
+        if key in table.metadata:
+            raise BadData(f"{table.file}:{number}: {key}: given twice.")
+        table.metadata[key] = (match[2], number)
+        return
+    near = get_close_matches(key[:64], keys, n=1, cutoff=0.8)
+    if near:
+        raise BadData(f'{table.file}:{number}: {key}: there is no such key. Did you mean "{near[0]}"?')
+
+
+def _delimiter(line: str) -> str:
+    for delimiter in (";", "\t", ","):
+        if delimiter in line:
+            return delimiter
+    return " "
+
+
+def _cells(line: str, delimiter: str) -> list[str]:
+    if delimiter == " ":
+        return line.split()
+    cells = [cell.strip() for cell in next(csv.reader([line], delimiter=delimiter, skipinitialspace=True))]
+    while len(cells) > 1 and not cells[-1]:
+        cells.pop()
+    return cells
+
+
+def _number(text: str, *, decimal_comma: bool) -> float:
+    plain = text.replace(",", ".") if decimal_comma and text.count(",") == 1 else text
+    value = float(int(plain, 16)) if plain.lower().startswith("0x") else float(plain)
+    if not math.isfinite(value) or "_" in plain:
+        raise ValueError(text)
+    return value
+
+
+def _header(table: CsvTable, number: int, cells: list[str]) -> _Columns | None:
+    """Columns that a header names; None where the first line is data."""
+    if all(map(_is_number, cells)):
+        return None
+    heads = [_name_and_unit(cell) for cell in cells]
+    names = [name for name, _ in heads]
+    channel = next((at for at, name in enumerate(names) if name in CHANNEL), None)
+    if {"from", "to"} <= set(names):
+        return _segment_columns(table, number, names, channel)
+    raw, value = _pair_columns(table, number, names, channel)
+    unit = heads[value][1]
+    if unit:
+        table.unit = (unit, number)
+    return _Columns(("raw", "value"), (raw, value), channel)
+
+
+def _name_and_unit(cell: str) -> tuple[str, str | None]:
+    """``Torque [N·m]`` or ``Torque (N·m)``: the name in small letters, and the unit."""
+    match = _UNIT.match(cell)
+    return (match[1].lower(), match[2] or match[3]) if match else ("", None)
+
+
+def _pair_columns(table: CsvTable, number: int, names: list[str], channel: int | None) -> tuple[int, int]:
+    """Places of raw value and value: the raw one by its name, else the first."""
+    rest = [at for at in range(len(names)) if at != channel]
+    if len(rest) != 2:
+        raise BadData(
+            f"{table.file}:{number}: the header names {len(rest)} columns besides the channel; "
+            "raw value and value are two."
+        )
+    raw = next((at for at in rest if names[at] in RAW), rest[0])
+    return raw, next(at for at in rest if at != raw)
+
+
+def _is_number(cell: str) -> bool:
+    try:
+        _number(cell, decimal_comma=True)
+    except (ValueError, OverflowError):
+        return False
+    return True
+
+
+def _segment_columns(table: CsvTable, number: int, names: list[str], channel: int | None) -> _Columns:
+    wanted = (*SEGMENT, *takewhile(names.__contains__, (f"c{power}" for power in count())))
+    twice = next((name for name in wanted if names.count(name) > 1), None)
+    if twice is not None:
+        raise BadData(f'{table.file}:{number}: the column "{twice}" is there twice.')
+    wrong = _wrong_columns(names if channel is None else names[:channel] + names[channel + 1 :], wanted)
+    if wrong:
+        raise BadData(f"{table.file}:{number}: {wrong}: a table of segments has from, to, offset, c0, c1 and so on.")
+    table.segments = True
+    return _Columns(wanted, tuple(names.index(name) for name in wanted), channel)
+
+
+def _wrong_columns(names: list[str], wanted: tuple[str, ...]) -> str:
+    for name in names:
+        if name not in wanted:
+            return f'"{name}" is no column'
+    return next((f'the column "{name}" is missing' for name in (*SEGMENT, "c0") if name not in names), "")
+
+
+def _row(table: CsvTable, number: int, cells: list[str], columns: _Columns, decimal_comma: bool) -> Row:
+    asked = len(columns.places) + (columns.channel is not None)
+    if len(cells) != asked:
+        raise BadData(f"{table.file}:{number}: {len(cells)} columns where {asked} are expected.")
+    values = []
+    for name, place in zip(columns.names, columns.places, strict=True):
+        try:
+            values.append(_number(cells[place], decimal_comma=decimal_comma))
+        except (ValueError, OverflowError) as error:
+            raise BadData(f'{table.file}:{number}: {name}: "{cells[place][:40]}" is not a number.') from error
+    channel = None
+    if columns.channel is not None:
+        text = cells[columns.channel]
+        if not (text.isascii() and text.isdecimal() and len(text) <= _CHANNEL_DIGITS):
+            raise BadData(f'{table.file}:{number}: channel: "{text[:40]}" is not the number of a channel.')
+        channel = int(text)
+    return Row(number, channel, tuple(values))
+
 
 KEYS: Final = (
     "channel",

@@ -15,8 +15,7 @@ from typing import TYPE_CHECKING
 from teds_provision.errors import BadData
 from teds_provision.lazy import late
 from teds_provision.teds.calibration.formula import PreparedCurve, PreparedInverse
-from teds_provision.teds.calibration.reading import SampleReader
-from teds_provision.teds.calibration.samples import Range, SampleForm
+from teds_provision.teds.calibration.samples import Range, SampleForm, SampleReader
 from teds_provision.teds.channel import ROUNDING, TURN, wrapped
 from teds_provision.teds.sheet import Channel, Sheet
 from teds_provision.teds.units import WrittenUnit
@@ -25,7 +24,7 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
-    from teds_provision.teds.calibration.reading import Octets
+    from teds_provision.teds.calibration.samples import Octets
 
     Floats = NDArray[np.float64]
 else:

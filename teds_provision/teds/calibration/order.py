@@ -9,7 +9,7 @@ from difflib import get_close_matches
 from itertools import pairwise
 
 from teds_provision.errors import BadData
-from teds_provision.teds.calibration.fitting import fit, residuals
+from teds_provision.teds.calibration.formula import fit, residuals
 from teds_provision.teds.calibration.model import METHODS, Calibration, CalibrationInput, Method
 from teds_provision.teds.profile.model import ChannelProfile
 from teds_provision.teds.profile.reader import FLOAT32_MAXIMUM, Table

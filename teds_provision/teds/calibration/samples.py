@@ -1,14 +1,28 @@
-"""What one sample of a channel is: its data model, octets and bits, and the raw numbers that they can give.
+"""Samples of a channel: data model, octets and bits, the raw numbers that they can give, and reading and writing them.
 
-DatModel, ModLenth and SigBits are fields 40 to 42 of the TransducerChannel TEDS (teds.md, "3 ChanTEDS"). Turning
-octets into numbers in blocks is :mod:`teds_provision.teds.calibration.reading`.
+DatModel, ModLenth and SigBits are fields 40 to 42 of the TransducerChannel TEDS (teds.md, "3 ChanTEDS"). Samples come
+in blocks (operation.md section 2): a number of samples of one channel, each ModLenth octets, most significant octet
+first. Integers stand right-justified, floats are IEEE 754, a fraction has its point before the first bit.
 """
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from enum import IntEnum
-from typing import Final
+from functools import cached_property
+from typing import TYPE_CHECKING, Any, Final
+
+from teds_provision.errors import BadData
+from teds_provision.lazy import late
+
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
+    Octets = bytes | bytearray | memoryview | NDArray[np.uint8]
+else:
+    np = late("numpy")
 
 Range = tuple[float, float]
 """Lowest and highest value, ends included."""
@@ -105,3 +119,140 @@ def raw_range(model: int, octets: int, bits: int) -> Range | None:
 def model_name(model: int) -> str:
     """Name of a DatModel."""
     return MODEL_NAMES[model] if 0 <= model < len(MODEL_NAMES) else f"model {model} (reserved)"
+
+
+WORD: Final = 8
+_NEGATIVE: Final = 1 << 31
+_FLOATS: Final = {DataModel.FLOAT32: ">f4", DataModel.FLOAT64: ">f8"}
+_INTEGERS: Final = (DataModel.UNSIGNED, DataModel.BITS, DataModel.LONG_INTEGER)
+_FRACTIONS: Final = (DataModel.FRACTION, DataModel.LONG_FRACTION)
+
+
+@dataclass(frozen=True)
+class SampleReader:
+    """Reads and writes samples of one form, prepared once. Raises BadData for a form that cannot be read."""
+
+    form: SampleForm
+
+    def __post_init__(self) -> None:
+        if self.form.problem:
+            raise BadData(f"The samples cannot be read: {self.form.problem}.")
+
+    @property
+    def octets(self) -> int:
+        """Octets of one sample."""
+        return self.form.octets
+
+    @cached_property
+    def _long(self) -> bool:
+        return self.form.octets > WORD
+
+    def raw(self, octets: Octets) -> NDArray[np.generic]:
+        """Raw values as the data model says: unsigned 64-bit integers, Float64 for floats, fractions and times.
+
+        Integers and bits of more than 8 octets come as Python integers in an object array. Takes octets one sample
+        after the other, or an array of shape (samples, ModLenth). Raises BadData where they do not divide evenly.
+        """
+        rows = self._rows(octets)
+        model = self.form.model
+        if model in _FLOATS:
+            return np.ascontiguousarray(rows).view(_FLOATS[DataModel(model)])[:, 0].astype(np.float64)
+        if model == DataModel.TIME_OF_DAY:
+            return _times(rows)
+        if model in _FRACTIONS:
+            return self._fractions(rows)
+        return _whole(rows) if self._long else _words(rows)
+
+    def numbers(self, raw: NDArray[np.generic]) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+        """Raw values as Float64, and which of them their data model and SigBits can give.
+
+        Of integers above 2^53 the nearest Float64 is taken; one that no Float64 can hold is infinite, and not possible.
+        """
+        if raw.dtype == object:
+            values = np.array([_float(number) for number in raw.tolist()], dtype=np.float64)
+        else:
+            values = raw.astype(np.float64)
+        possible = np.isfinite(values)
+        if self.form.integer and self.form.raw_range is not None:
+            possible &= values <= self.form.raw_range[1]
+        return values, possible
+
+    def write(self, numbers: NDArray[np.float64]) -> bytes:
+        """Octets of raw numbers, rounded to the nearest that the form can hold and kept within what it can give.
+
+        Raises BadData for a number that is not finite, and for bit sequences and times, which are not quantities.
+        """
+        if self.form.model in (DataModel.BITS, DataModel.TIME_OF_DAY):
+            raise BadData(f"A number cannot be written as {self.form.name}.")
+        numbers = np.atleast_1d(np.asarray(numbers, dtype=np.float64))
+        if not np.isfinite(numbers).all():
+            raise BadData("A value that is not finite cannot be written as a sample.")
+        if self.form.model in _FLOATS:
+            most = float(np.finfo(_FLOATS[DataModel(self.form.model)]).max)
+            return np.clip(numbers, -most, most).astype(_FLOATS[DataModel(self.form.model)]).tobytes()
+        return b"".join(self._integer(float(number)) for number in numbers)
+
+    def _integer(self, number: float) -> bytes:
+        whole, used = 8 * self.form.octets, self.form.bits
+        bits = used if 0 < used < whole else whole
+        if self.form.model in _FRACTIONS:  # the leading bits count, the others stay 0
+            steps = _scaled(min(max(number, 0.0), 1.0), bits)
+            return (min(steps, (1 << bits) - 1) << (whole - bits)).to_bytes(self.form.octets, "big")
+        return min(max(round(number), 0), (1 << bits) - 1).to_bytes(self.form.octets, "big")
+
+    def _rows(self, octets: Octets) -> NDArray[np.uint8]:
+        rows = octets if isinstance(octets, np.ndarray) else np.frombuffer(octets, dtype=np.uint8)
+        size = self.form.octets
+        if rows.ndim == 1:
+            if len(rows) % size:
+                raise BadData(f"{len(rows)} octets are no whole number of samples of {size} octets.")
+            rows = rows.reshape(-1, size)
+        elif rows.shape[1] != size:
+            raise BadData(f"A sample of {rows.shape[1]} octets was given; the data model has {size}.")
+        return rows
+
+    def _fractions(self, rows: NDArray[np.uint8]) -> NDArray[np.float64]:
+        whole = 8 * self.form.octets
+        if not self._long:
+            return _words(rows).astype(np.float64) * 2.0**-whole
+        return np.array([number / (1 << whole) for number in _whole(rows).tolist()], dtype=np.float64)
+
+
+def big_endian(rows: NDArray[np.uint8]) -> NDArray[Any]:
+    """Octets of the last axis (at most 8) as integers of 64 bits, high octet first."""
+    padded = np.zeros((*rows.shape[:-1], WORD), dtype=np.uint8)
+    padded[..., WORD - rows.shape[-1] :] = rows
+    return padded.view(">u8")[..., 0]
+
+
+def _words(rows: NDArray[np.uint8]) -> NDArray[np.uint64]:
+    """Up to 8 octets a row, as integers."""
+    return big_endian(rows).astype(np.uint64)
+
+
+def _whole(rows: NDArray[np.uint8]) -> NDArray[np.object_]:
+    """Any number of octets a row, as Python integers."""
+    out = np.empty(len(rows), dtype=object)
+    out[:] = [int.from_bytes(row.tobytes(), "big") for row in rows]
+    return out
+
+
+def _times(rows: NDArray[np.uint8]) -> NDArray[np.float64]:
+    """TimeInstance: seconds, and nanoseconds whose highest bit is the sign of the whole."""
+    seconds = _words(rows[:, :4]).astype(np.float64)
+    nanoseconds = _words(rows[:, 4:])
+    value = seconds + (nanoseconds & (_NEGATIVE - 1)).astype(np.float64) * 1e-9
+    return np.where(nanoseconds & _NEGATIVE, -value, value)
+
+
+def _float(number: int) -> float:
+    try:
+        return float(number)
+    except OverflowError:
+        return math.inf
+
+
+def _scaled(number: float, bits: int) -> int:
+    """``number`` × 2^bits to the nearest integer, exact however many bits there are."""
+    above, below = number.as_integer_ratio()
+    return ((above << (bits + 1)) + below) // (2 * below)

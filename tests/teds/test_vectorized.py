@@ -11,8 +11,8 @@ from hypothesis import strategies as st
 
 from teds_provision.teds import Sheet
 from teds_provision.teds.calibration import ChannelInterpreter, fit
-from teds_provision.teds.calibration.many_channels import ManyChannels
 from teds_provision.teds.calibration.samples import SampleForm
+from teds_provision.teds.calibration.vectorized import ManyChannels
 from teds_provision.teds.units import parse_unit
 from tests.teds.test_interpreter import sheet_of, turned
 

@@ -15,8 +15,7 @@ import numpy as np
 
 from teds_provision.teds.calibration.interpreter import ChannelInterpreter
 from teds_provision.teds.calibration.model import Calibration
-from teds_provision.teds.calibration.reading import WORD, big_endian
-from teds_provision.teds.calibration.samples import DataModel
+from teds_provision.teds.calibration.samples import WORD, DataModel, big_endian
 from teds_provision.teds.channel import wrapped
 
 if TYPE_CHECKING:
