@@ -18,13 +18,11 @@ from teds_provision.measure.finding.sightings import Sighting
 from teds_provision.ncap.live import Live
 from teds_provision.ncap.measuring import Measuring
 from teds_provision.ncap.names import Names
-from teds_provision.ncap.nodes.adopting import Adopting
-from teds_provision.ncap.nodes.desk import Desk
+from teds_provision.ncap.nodes.desk import Desk, Turns
 from teds_provision.ncap.nodes.holding import Holding
-from teds_provision.ncap.nodes.provisioning import Provisioning
+from teds_provision.ncap.nodes.provisioning import Adopting, Provisioning
 from teds_provision.ncap.nodes.roster import Roster
 from teds_provision.ncap.nodes.sheets import Sheets
-from teds_provision.ncap.nodes.turns import Turns
 from teds_provision.ncap.nodes.virtual import Virtuals
 from teds_provision.ncap.nodes.watching import Watch
 from teds_provision.ncap.settings import Detection, Settings, own_source, with_source

@@ -23,9 +23,9 @@ from teds_provision.measure.sinks import Sink
 from teds_provision.measure.trusting import DEAD_MAN, Trusted
 from teds_provision.measure.wish import Wish
 from teds_provision.ncap.live import Live
+from teds_provision.ncap.nodes.desk import Turns
 from teds_provision.ncap.nodes.looking import as_problem
 from teds_provision.ncap.nodes.roster import Roster
-from teds_provision.ncap.nodes.turns import Turns
 from teds_provision.ncap.sinks import DaemonSinks, sink_json
 from teds_provision.protocol.operation.stream_commands import Kind
 from teds_provision.station.station import Station

@@ -19,7 +19,7 @@ from teds_provision.links.can.port import CanPort
 from teds_provision.measure.finding.asking import LEAST, Pace
 from teds_provision.measure.finding.lookout import BELIEVED, SOON, Lookout
 from teds_provision.measure.finding.sightings import Sighting, Sightings
-from teds_provision.ncap.nodes.leaving import AT_ONCE, CHECK, StillThere
+from teds_provision.ncap.nodes.watching import CHECK, MAX_PARALLEL, StillThere
 from teds_provision.protocol.announce import Announce, uuid_crc
 from teds_provision.protocol.messages.identity import Identity, NodeState
 from tests.links.can.conftest import hub, nodes  # noqa: F401  fixtures
@@ -220,4 +220,4 @@ def test_who_is_held_is_not_asked_and_no_more_than_five_are_at_once() -> None:
     uuids = [bytes([number]) * 10 for number in range(1, 12)]
     known = {uuid.hex(): last_heard(uuid, number, 2 * CHECK + number) for number, uuid in enumerate(uuids, 1)}
     found = asks(Bus(), known, held=uuids[-1].hex())
-    assert list(found) == [uuid.hex() for uuid in reversed(uuids[-1 - AT_ONCE : -1])]
+    assert list(found) == [uuid.hex() for uuid in reversed(uuids[-1 - MAX_PARALLEL : -1])]

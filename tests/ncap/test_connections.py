@@ -7,7 +7,7 @@ from collections.abc import Awaitable, Callable
 
 import pytest
 
-from teds_provision.ncap.web import connections, server
+from teds_provision.ncap.web import server
 from teds_provision.ncap.web.guard import CALLER, Receive, Scope, Send
 from tests.pace import PATIENCE
 
@@ -62,8 +62,8 @@ def test_a_head_and_a_body_that_do_not_end_cost_the_connection(monkeypatch: pyte
     async def work(connect: Callable[[], Awaitable[Pair]]) -> None:
         second = await connect()
         await asyncio.sleep(0.05)  # the server has it
-        monkeypatch.setattr(connections, "HEAD", 0.2)  # for whoever comes, and whoever has been answered, from now on
-        monkeypatch.setattr(connections, "BODY", 0.2)
+        monkeypatch.setattr(server, "HEAD", 0.2)  # for whoever comes, and whoever has been answered, from now on
+        monkeypatch.setattr(server, "BODY", 0.2)
         mute, head, body = [await connect() for _ in range(3)]
         head[1].write(GET + b"X: ")
         body[1].write(PUT + b"ab")
@@ -77,7 +77,7 @@ def test_a_head_and_a_body_that_do_not_end_cost_the_connection(monkeypatch: pyte
 
 
 def test_the_time_of_a_head_is_not_the_time_of_a_body_nor_of_the_work(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(connections, "HEAD", 1.0)
+    monkeypatch.setattr(server, "HEAD", 1.0)
 
     async def work(connect: Callable[[], Awaitable[Pair]]) -> None:
         pair = await connect()
@@ -89,7 +89,7 @@ def test_the_time_of_a_head_is_not_the_time_of_a_body_nor_of_the_work(monkeypatc
 
 
 def test_silent_connections_make_room_for_the_next_one(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(connections, "MOST", 20)
+    monkeypatch.setattr(server, "MOST", 20)
     monkeypatch.setattr(server, "MOST", 20)
 
     async def work(connect: Callable[[], Awaitable[Pair]]) -> None:
@@ -107,7 +107,7 @@ def test_slow_bodies_without_a_token_keep_nobody_out_and_end_nobodys_connection(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """Five hundred of them, each with one octet of its body, were 503 for everybody else."""
-    monkeypatch.setattr(connections, "MOST", 20)
+    monkeypatch.setattr(server, "MOST", 20)
     monkeypatch.setattr(server, "MOST", 20)
 
     async def work(connect: Callable[[], Awaitable[Pair]]) -> None:

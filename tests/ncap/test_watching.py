@@ -10,8 +10,8 @@ from typing import Any
 import pytest
 
 from teds_provision.ncap.nodes import watching
+from teds_provision.ncap.nodes.desk import Turns
 from teds_provision.ncap.nodes.roster import MOST_GONE, Roster
-from teds_provision.ncap.nodes.turns import Turns
 from teds_provision.ncap.nodes.watching import MOST_KNOWN, Watch
 
 

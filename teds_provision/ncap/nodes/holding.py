@@ -22,8 +22,7 @@ from teds_provision.measure.blocks import Command
 from teds_provision.measure.held_actuator import HeldActuator
 from teds_provision.measure.trusting import DEAD_MAN, Trusted, open_trusted, require_whitelisted
 from teds_provision.ncap.live import Live
-from teds_provision.ncap.nodes.desk import Desk
-from teds_provision.ncap.nodes.turns import Turns
+from teds_provision.ncap.nodes.desk import Desk, Turns
 from teds_provision.protocol.messages.frames import Reason
 from teds_provision.station.station import Station
 from teds_provision.talk.conversation import Conversation, SessionLost

@@ -9,13 +9,13 @@ from __future__ import annotations
 import logging
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from dataclasses import dataclass, field
 from typing import Any, Final, Protocol
 
-from teds_provision.errors import Frozen, LinkFailure, NodeBusy, TedsProvisionError
+from teds_provision.errors import AddressConflict, Frozen, LinkFailure, NodeBusy, TedsProvisionError
 from teds_provision.links import Contact, Notice, Port, Trace
 from teds_provision.links.ble.port import BlePort
 from teds_provision.links.can.port import CanPort
@@ -25,12 +25,59 @@ from teds_provision.measure.finding.lookout import POLL
 from teds_provision.measure.finding.sightings import Sighting
 from teds_provision.measure.finding.sources import sole_user
 from teds_provision.ncap.live import Live
-from teds_provision.ncap.nodes.leaving import StillThere
+from teds_provision.ncap.nodes.desk import Turns
 from teds_provision.ncap.nodes.looking import Look, as_problem, is_listed, look, read_anew
 from teds_provision.ncap.nodes.roster import Roster
-from teds_provision.ncap.nodes.turns import Turns
 from teds_provision.station.station import Station
 from teds_provision.talk.conversation import Conversation, SessionLost
+
+# Whether a node that was seen on a bus is still there: it is asked itself, twice, before it is said to have left.
+#
+# Everybody is asked every 30 s only (operation.md section 7), and on a busy machine an answer to that may come too
+# late. So a node that was silent for CHECK seconds gets an Identify of its own: at most MAX_PARALLEL a second, once in
+# 10 s each, the bound that the contract sets for nodes that announce themselves.
+
+CHECK: Final = 10.0
+MAX_PARALLEL: Final = 5
+PATIENCE: Final = (1.0, 3.0)  # seconds for the answer to the first question, and to the second
+
+
+class StillThere:
+    """Asks the nodes of one bus. ``held`` says of whom others hear meanwhile: who is measured, or worked with."""
+
+    def __init__(self, port: CanPort, held: Callable[[str], bool]) -> None:
+        self._port, self._held = port, held
+        self._asked: dict[str, float] = {}
+        self._last = 0.0
+
+    def look(self, known: Mapping[str, Sighting]) -> Iterator[tuple[str, Sighting | None]]:
+        """Ask those whose turn has come: each with what it says now, None where it does not answer any more."""
+        now = time.monotonic()
+        if now - self._last < 1.0:
+            return
+        due = [uuid for uuid, last in known.items() if now - max(last.at, self._asked.get(uuid, 0.0)) >= CHECK]
+        due.sort(key=lambda uuid: known[uuid].at)
+        silent = [uuid for uuid in due if not self._held(uuid)][:MAX_PARALLEL]
+        self._asked = {uuid: at for uuid, at in self._asked.items() if uuid in known} | dict.fromkeys(silent, now)
+        if not silent:
+            return
+        self._last = now
+        with ThreadPoolExecutor(len(silent), thread_name_prefix="still there") as askers:
+            yield from zip(silent, askers.map(self._ask, [known[uuid] for uuid in silent]), strict=True)
+
+    def _ask(self, last: Sighting) -> Sighting | None:
+        for seconds in PATIENCE:
+            try:
+                identity = self._port.identify(last.address, seconds=seconds)
+            except AddressConflict:  # somebody is there, and that two are is told by whoever finds out
+                return Sighting(last.identity, last.address, last.port, time.monotonic())
+            except LinkFailure:
+                return None
+            if identity is not None:
+                same = identity.uuid == last.uuid
+                return Sighting(identity, last.address, last.port, time.monotonic()) if same else None
+        return None
+
 
 _log = logging.getLogger(__name__)
 WORKERS: Final = 4
