@@ -218,7 +218,9 @@ def _status(console: Console, found: dict[str, Any]) -> None:
     for one in found.get("measurements", ()):
         console.print(f"measurement {one['id']}: {one['state']}", markup=False)
     for one in found.get("sinks", ()):
-        console.print(f"{shown(one['name'])}: {one['state']}, {one['dropped']} dropped", markup=False)
+        why = one["error"] or one["detail"]
+        told = f"{one['state']}, {one['dropped']} dropped{f': {why}' if why else ''}"
+        console.print(f"{shown(one['name'])}: {told}", markup=False)
 
 
 def _verdict(node: dict[str, Any]) -> str:

@@ -88,7 +88,7 @@ class Block:
     stream: int
     channels: tuple[int, ...]
     index: int  # sample number of the first row in its run
-    time: NDArray[Any]  # (n) float64, unix seconds; never goes back within a stream
+    time: NDArray[Any]  # (n) float64, unix seconds; goes back within a stream only where the host's clock is set
     tick: NDArray[Any]  # (n) uint64, nanoseconds of the node's clock
     raw: NDArray[Any]  # (n, c)
     value: NDArray[Any]  # (n, c) float64
@@ -97,6 +97,7 @@ class Block:
     clock_error: float | None = None  # bound of the error of `time` in seconds; None: none is known, or the clock lies
     test_pattern: bool = False
     run: int = 0  # number of the run of the stream in its session
+    clock: int | None = None  # which setting of the host's clock `time` follows; None: the present one
 
 
 @dataclass(frozen=True)
@@ -172,6 +173,23 @@ class StationFacts:
 
 
 @dataclass(frozen=True)
+class ClockSet:
+    """The system's clock was put forward by so many seconds (back: negative), seen at ``time`` on the new clock.
+
+    What is dated before it was handed on follows the old clock, all that comes later the new one.
+    """
+
+    time: float
+    by: float
+
+    @property
+    def words(self) -> str:
+        """For people and the notes of a recording."""
+        way = "forward" if self.by > 0 else "back"
+        return f"The system's clock was put {way} by {abs(self.by):.3f} s: earlier times follow the old clock."
+
+
+@dataclass(frozen=True)
 class Command:
     """A set point for an actuator that came by a sink (a ROS topic), in the SI unit of the datasheet."""
 
@@ -189,7 +207,7 @@ class SinkStats:
     """
 
     written: int = 0  # samples (values) that went out
-    dropped: int = 0  # samples that a slow consumer cost; 0 for a recorder, always
+    dropped: int = 0  # samples that a slow consumer cost; of a recorder, those that a full disk did
     octets: int = 0
     messages: int = 0
     lag: float = 0.0  # seconds by which the last item waited in the queue

@@ -5,8 +5,8 @@ Two kinds of evidence. A Clock *exchange* says where the offset lies: within an 
 The estimate is a line through the exchanges (of the hull before there are enough of them), kept inside what the
 evidence allows. A refit never steps: the difference is let out over SLEW seconds, so time never goes back.
 
-Host time is CLOCK_MONOTONIC in nanoseconds; :class:`Wall` converts once, at the start of a measurement, so that a step
-of the wall clock does not tear a recording.
+Host time is CLOCK_MONOTONIC in nanoseconds. :class:`HostClock` converts it by one offset until the system's clock is
+set: then all stamps change at once, and every recorder begins a new part.
 """
 
 from __future__ import annotations
@@ -36,6 +36,7 @@ SLEW = 1_000_000_000  # ns over which a refit's difference is let out
 SPAN_OF_A_HULL = 2_000_000_000  # ns of arrivals before they say something about skew
 END_OF_TICKS = 1 << 63  # 292 years of ns since the node's start: no tick is so late
 ANY_TICK = TickBounds(-(1 << 64), 1 << 64)  # without evidence
+STEP = 1e-3  # seconds by which the system's clock must have been set to count; less belongs to the bound
 SPAN_OF_EXCHANGES = 60_000_000_000  # ns of exchanges before they say more about it than the arrivals
 
 
@@ -323,24 +324,66 @@ def _extend(hull: list[tuple[int, int]], point: tuple[int, int]) -> None:
 
 @dataclass(frozen=True)
 class Wall:
-    """Monotonic to unix seconds, read once."""
+    """Monotonic to unix seconds, read once, to ``error`` seconds."""
 
     offset: float
+    error: float = 0.0
 
     @classmethod
-    def now(cls) -> Wall:
+    def now(cls, readings: int = 9) -> Wall:
         """The narrowest of a few readings, so that an interruption between the two clocks does not count."""
-        readings = []
-        for _ in range(9):
+        found = []
+        for _ in range(readings):
             before = time.monotonic_ns()
             wall = time.time_ns()
             after = time.monotonic_ns()
-            readings.append((after - before, wall - (before + after) / 2))
-        return cls(min(readings)[1] / 1e9)
+            found.append((after - before, wall - (before + after) / 2))
+        width, offset = min(found)
+        return cls(offset / 1e9, width / 2e9)
 
     def unix(self, monotonic: NDArray[np.float64]) -> NDArray[np.float64]:
         """Unix seconds."""
         return monotonic + self.offset
+
+
+class HostClock:
+    """The wall clock of one measurement: steady, until the system's clock is set.
+
+    ``number`` counts how often that was; a block says by which one it is dated. ``apart`` are seconds by which the
+    system's clock differs from this one without being a step: they belong to the bound of a stamp's error. One thread
+    looks and sets; any thread reads :attr:`present`.
+    """
+
+    def __init__(self, wall: Wall | None = None) -> None:
+        self._walls = [wall or Wall.now()]
+        self.present: tuple[int, float] = 0, self._walls[0].offset
+        self.apart = 0.0
+
+    def was_set(self) -> bool:
+        """Whether the system's clock was set by more than STEP since; costs a microsecond where it was not."""
+        return self._differs(Wall.now(1)) and self._differs(Wall.now())
+
+    def _differs(self, wall: Wall) -> bool:
+        apart = max(0.0, abs(wall.offset - self.present[1]) - wall.error)
+        if apart > STEP:
+            return True
+        self.apart = apart
+        return False
+
+    def set_anew(self) -> float:
+        """Follow the system's clock; gives the seconds by which it was put forward."""
+        self._walls.append(Wall.now())
+        before, self.present = self.present, (len(self._walls) - 1, self._walls[-1].offset)
+        self.apart = 0.0
+        return self.present[1] - before[1]
+
+    def since(self, number: int) -> float:
+        """Seconds to add to a stamp that was made by an earlier setting."""
+        return self.present[1] - self._walls[number].offset
+
+    def now(self) -> float:
+        """Unix seconds by this clock."""
+        return time.monotonic() + self.present[1]
 
 
 class Monotone:

@@ -13,7 +13,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from teds_provision.measure.blocks import Block, Invalid
-from teds_provision.measure.clock import ClockMap, Monotone, Wall
+from teds_provision.measure.clock import ClockMap, HostClock, Monotone
 from teds_provision.protocol.operation.stream_commands import Kind
 from teds_provision.protocol.operation.subscription import Message, Plan
 from teds_provision.teds.calibration.interpreter import ChannelInterpreter
@@ -30,9 +30,17 @@ class StreamInterpreter:
     """
 
     def __init__(
-        self, sheet: Sheet, plan: Plan, run: int, clock: ClockMap, wall: Wall, monotone: Monotone, *, raw_only: str = ""
+        self,
+        sheet: Sheet,
+        plan: Plan,
+        run: int,
+        clock: ClockMap,
+        host: HostClock,
+        monotone: Monotone,
+        *,
+        raw_only: str = "",
     ) -> None:
-        self._plan, self._run, self._clock, self._wall = plan, run, clock, wall
+        self._plan, self._run, self._clock, self._host = plan, run, clock, host
         self._uuid = sheet.uuid.hex()
         self._monotone = monotone
         self._channels = [ChannelInterpreter(sheet, number) for number in plan.layout.channels]
@@ -98,21 +106,24 @@ class StreamInterpreter:
         # Whole nanoseconds first: a tick of months and an offset of years would lose microseconds as floats.
         host, rate, bound = self._clock.line(first.tick, first.tick + span)
         times = seconds * rate
-        times += host / 1e9 + self._wall.offset
+        times += host / 1e9
+        times = self._monotone.straight(times)
+        setting, offset = self._host.present
         return Block(
             uuid=self._uuid,
             stream=self._stream,
             channels=self._numbers,
             index=first.index,
-            time=self._monotone.straight(times),
+            time=times + offset,
             tick=steps + first.tick,
             raw=raws,
             value=value,
             valid=valid,
             age=time.monotonic() - (host + span * rate) / 1e9,
-            clock_error=bound if bound < math.inf and not self._clock.lie else None,
+            clock_error=bound + self._host.apart if bound < math.inf and not self._clock.lie else None,
             test_pattern=self._test_pattern,
             run=self._run,
+            clock=setting,
         )
 
     def _count_invalid(self, raws: np.ndarray, valid: np.ndarray, flagged: np.ndarray | None) -> None:

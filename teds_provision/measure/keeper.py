@@ -25,7 +25,7 @@ from teds_provision.errors import (
     TedsProvisionError,
 )
 from teds_provision.measure.blocks import Command, NodeReport, State
-from teds_provision.measure.clock import AT_FIRST, Wall
+from teds_provision.measure.clock import AT_FIRST, HostClock
 from teds_provision.measure.finding.buses import Bus, Buses
 from teds_provision.measure.finding.sightings import Sighting
 from teds_provision.measure.planning import BusTime, Plans, plan_node, sensors_of
@@ -63,7 +63,7 @@ class NodeKeeper:
         buses: Buses,
         uuid: bytes,
         wish: Wish,
-        wall: Wall,
+        host: HostClock,
         events: Events,
         common_start: CommonStart,
     ) -> None:
@@ -72,7 +72,7 @@ class NodeKeeper:
         self.state: State = "waiting"
         self.ever_ran = False
         self.trusted: Trusted | None = None
-        self.streams = NodeStreams(wall, events.block)
+        self.streams = NodeStreams(host, events.block)
         self.turn = threading.Lock()  # of the session: one exchange at a time
         self.ready = threading.Event()  # streams were asked for
         self.done = threading.Event()

@@ -12,12 +12,12 @@ import time
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from typing import Any
 
 from teds_provision.errors import LinkFailure, NoNode, StoreFailure, TedsProvisionError
-from teds_provision.measure.blocks import Block, ChannelFacts, Command, GroupRows, NodeReport, StationFacts
-from teds_provision.measure.clock import Wall
+from teds_provision.measure.blocks import Block, ChannelFacts, ClockSet, Command, GroupRows, NodeReport, StationFacts
+from teds_provision.measure.clock import HostClock
 from teds_provision.measure.finding.buses import Buses
 from teds_provision.measure.grid import Grid
 from teds_provision.measure.keeper import NodeKeeper
@@ -75,7 +75,8 @@ class Measurement:
 
         Raises what a sink's ``open`` raises; everything else stands in the result.
         """
-        self._wall, self._lock = Wall.now(), threading.Lock()
+        self._host, self._lock = HostClock(), threading.Lock()
+        self._setting = threading.Lock()  # of the clock: until it is free, no block goes on; taken after _lock
         self._known: dict[tuple[str, int], ChannelFacts] = {}
         self._grid: Grid | None = None
         self._for_grid: deque[Block] = deque()
@@ -96,7 +97,7 @@ class Measurement:
             self.wish.require.expect(self.uuids)
         events = Events(self._block, self._describe, self._report)
         self.keepers = [
-            NodeKeeper(self.station, self.buses, uuid, self.wish, self._wall, events, self._common_start)
+            NodeKeeper(self.station, self.buses, uuid, self.wish, self._host, events, self._common_start)
             for uuid in self.uuids
         ]
         for keeper in self.keepers:
@@ -117,6 +118,8 @@ class Measurement:
             if self._all_done():
                 return
             self._trigger()
+            if self._host.was_set():
+                self._follow_the_clock()
             if until == math.inf:
                 until = self._until(now, duration)
             if now >= until:
@@ -162,18 +165,19 @@ class Measurement:
                 self.watcher.sink(sink)
 
     def _is_news(self, sink: Sink) -> bool:
-        """Whether a sink failed, waits for its consumers for long, or has them again."""
-        stats, now = sink.stats, time.monotonic()
+        """Whether a sink failed, waits for its consumers for long or its disk for room, or goes on again."""
+        stats, now, recorder = sink.stats, time.monotonic(), bool(getattr(sink, "recorder", False))
         state = "failed" if stats.error else str(stats.state)
         since = self._waits.setdefault(sink.name, now)
         if state != "waiting":
             del self._waits[sink.name]
         before = self._shown.get(sink.name, "running")
-        if state == before or state not in ("failed", "running", "waiting"):
+        told = f"{state} {stats.detail}".strip() if recorder else state  # it may have waited and gone on between looks
+        if told == before or state not in ("failed", "running", "waiting"):
             return False
-        if state == "waiting" and now - since < WAITING:
+        if state == "waiting" and not recorder and now - since < WAITING:
             return False
-        self._shown[sink.name] = state
+        self._shown[sink.name] = told
         return True
 
     def _rows(self) -> None:
@@ -186,7 +190,23 @@ class Measurement:
     def _synchronized(self, grid: Grid) -> GroupRows | None:
         while self._for_grid:
             grid.take(self._for_grid.popleft())
-        return grid.rows(time.time())
+        return grid.rows(self._host.now())
+
+    def _follow_the_clock(self) -> None:
+        """The system's clock was set: what is measured until now is handed on by the old one, the rest by the new one.
+
+        Without it a clock that was wrong when the daemon began would be wrong in every stamp until its end.
+        """
+        with self._lock, self._setting:
+            rows = self._synchronized(self._grid) if self._grid is not None else None
+            news = ClockSet(by=self._host.set_anew(), time=self._host.now())
+            for sink in self.sinks:
+                if rows is not None:
+                    sink.write_group(rows)
+                sink.clock_set(news)
+            if self._grid is not None:
+                self._grid = self._new_grid()
+        self.watcher.note(news.words)
 
     @contextmanager
     def session(self, uuid: bytes) -> Iterator[Trusted | None]:
@@ -210,10 +230,14 @@ class Measurement:
     # -- from the threads of nodes and bus ---------------------------------------------------------------------------
 
     def _block(self, block: Block) -> None:
-        for sink in self.sinks:
-            sink.write(block)
-        if self._grid is not None:
-            self._for_grid.append(block)  # without the lock: the thread that hears must not wait while rows are made
+        with self._setting:
+            setting, _ = self._host.present
+            if block.clock is not None and block.clock != setting:  # dated just before the clock was set
+                block = replace(block, time=block.time + self._host.since(block.clock), clock=setting)
+            for sink in self.sinks:
+                sink.write(block)
+            if self._grid is not None:
+                self._for_grid.append(block)  # without _lock: the thread that hears must not wait while rows are made
         self.watcher.block(block)
 
     def _describe(self, facts: Sequence[ChannelFacts]) -> None:
@@ -280,11 +304,11 @@ def _summary(keeper: NodeKeeper) -> dict[str, Any]:
 
 def _as_error(sink: Sink) -> TedsProvisionError | None:
     """What ended a sink: of a recording it is the disk (7), of one that took nothing of what came the way to it (5)."""
-    stats = sink.stats
-    if stats.dropped and not stats.written and not sink.files:
+    stats, recorder = sink.stats, bool(getattr(sink, "recorder", False))
+    if stats.dropped and not stats.written and not recorder:
         why = stats.error or f"{sink.name} took nothing: all {stats.dropped} values were dropped."
         return LinkFailure(why, hint=stats.hint or "See whether it runs, and where it listens.")
-    kind = StoreFailure if sink.files else TedsProvisionError
+    kind = StoreFailure if recorder else TedsProvisionError
     return kind(stats.error, hint=stats.hint) if stats.error else None
 
 

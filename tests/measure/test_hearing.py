@@ -12,7 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from teds_provision.measure.blocks import Block
-from teds_provision.measure.clock import ClockMap, Exchange, Monotone, Wall
+from teds_provision.measure.clock import ClockMap, Exchange, HostClock, Monotone, Wall
 from teds_provision.measure.hearing import GATHER, HeardStream
 from teds_provision.measure.interpreter import StreamInterpreter
 from teds_provision.protocol.operation.can_frames import Assembly
@@ -29,6 +29,7 @@ CURVES = {
 }
 SHEET = sheet_of("tactile-finger-sensor", CURVES)
 WALL = Wall(1.8e9)
+HOST = HostClock(WALL)
 
 
 class Scene:
@@ -42,7 +43,7 @@ class Scene:
         clock.exchange(Exchange(self.base, self.base + 2000, SECOND + 500, SECOND + 1500, 1, 20))
         self.clock, self.blocks = clock, list[Block]()
         receiver = Receiver(self.plan, Subscribed(1, self.plan.length, SECOND), KEY)
-        interpreter = StreamInterpreter(SHEET, self.plan, 1, clock, WALL, Monotone())
+        interpreter = StreamInterpreter(SHEET, self.plan, 1, clock, HOST, Monotone())
         assembly = Assembly(self.plan.length, fd=True)
         self.heard = HeardStream(receiver, assembly, interpreter, clock, threading.Lock(), self.blocks.append)
         self._sealer = Sealer(stream_key(KEY, 1))

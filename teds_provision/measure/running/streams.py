@@ -12,7 +12,7 @@ from itertools import chain
 
 from teds_provision.errors import TedsProvisionError
 from teds_provision.measure.blocks import Block, Invalid
-from teds_provision.measure.clock import ClockMap, Monotone, Wall
+from teds_provision.measure.clock import ClockMap, HostClock, Monotone
 from teds_provision.measure.finding.buses import Bus
 from teds_provision.measure.hearing import HeardStream
 from teds_provision.measure.interpreter import StreamInterpreter
@@ -75,12 +75,12 @@ class NodeStreams:
     ``mapping`` guards the clock's map, which the hearing thread reads and feeds.
     """
 
-    def __init__(self, wall: Wall, deliver: Callable[[Block], None]) -> None:
+    def __init__(self, host: HostClock, deliver: Callable[[Block], None]) -> None:
         self.clock = ClockMap()
         self.mapping = threading.Lock()
         self.running: dict[int, HeardStream] = {}
         self.totals: dict[int, StreamTotals] = {}
-        self._wall, self._deliver = wall, deliver
+        self._host, self._deliver = host, deliver
         self._run = 0  # the session's last
         self._monotone: dict[int, Monotone] = {}
 
@@ -114,7 +114,7 @@ class NodeStreams:
             plan,
             reply.run,
             self.clock,
-            self._wall,
+            self._host,
             monotone,
             raw_only=UNSIGNED if trusted.unsigned else "",
         )

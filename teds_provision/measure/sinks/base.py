@@ -1,7 +1,8 @@
 """The interface of a sink, and its thread: the measuring loop never waits for a disk, a broker or a subscriber.
 
-A *recorder* drops nothing. If it cannot keep up, or the disk is full, the recording ends with an error that stays in
-its statistics, and what was written until then is whole. A *live* sink drops the oldest waiting block and counts it.
+A *recorder* drops nothing that the disk has room for. If it cannot keep up, the recording ends with an error that stays
+in its statistics, and what was written until then is whole; while the disk is full it waits for room, counts and tells
+what is lost (:mod:`files`). A *live* sink drops the oldest waiting block and counts it.
 """
 
 from __future__ import annotations
@@ -15,9 +16,18 @@ from dataclasses import replace
 from typing import Literal, Protocol
 
 from teds_provision.errors import NotFound, StoreFailure, TedsProvisionError
-from teds_provision.measure.blocks import Block, ChannelFacts, Command, GroupRows, NodeReport, SinkStats, StationFacts
+from teds_provision.measure.blocks import (
+    Block,
+    ChannelFacts,
+    ClockSet,
+    Command,
+    GroupRows,
+    NodeReport,
+    SinkStats,
+    StationFacts,
+)
 
-Item = Block | GroupRows | NodeReport | tuple[ChannelFacts, ...]
+Item = Block | GroupRows | NodeReport | ClockSet | tuple[ChannelFacts, ...]
 CommandTaker = Callable[[Command], None]
 
 RECORDER_WAITING = 2_000_000  # values that a recorder may owe: some 200 MB, 40 s at 50,000 values a second
@@ -65,6 +75,9 @@ class Sink(Protocol):
 
     def report(self, report: NodeReport) -> None:
         """Take the state of a node."""
+
+    def clock_set(self, news: ClockSet) -> None:
+        """The system's clock was set: what comes from now on follows the new one."""
 
     def close(self) -> None:
         """Write out what is owed, end, give back what was opened. A second call does nothing."""
@@ -123,6 +136,10 @@ class ThreadedSink(ABC):
         """State of a node."""
         self._put(report, 0)
 
+    def clock_set(self, news: ClockSet) -> None:
+        """The clock was set."""
+        self._put(news, 0)
+
     def close(self) -> None:
         """Let the thread write what it owes and end."""
         with self._lock:
@@ -144,6 +161,18 @@ class ThreadedSink(ABC):
     @abstractmethod
     def _take(self, item: Item) -> None:
         """One item."""
+
+    def _first(self) -> None:
+        """Call ``_begin``; a sink that can outlive its failure does so here, in ``_one`` and in ``_beat``."""
+        self._begin()
+
+    def _one(self, item: Item) -> None:
+        """Call ``_take``."""
+        self._take(item)
+
+    def _beat(self, now: float) -> None:
+        """Call ``_idle``."""
+        self._idle(now)
 
     def _idle(self, now: float) -> None:  # noqa: B027  may be left out
         """Something to do by the clock (time.monotonic); at least every TICK."""
@@ -221,7 +250,7 @@ class ThreadedSink(ABC):
 
     def _work(self) -> None:
         try:
-            self._begin()
+            self._first()
             if self.stats.state == "starting":  # a sink that waits for somebody has said so by now
                 self._say("running")
             self._run()
@@ -238,10 +267,10 @@ class ThreadedSink(ABC):
         while not done:
             items, done = self._next()
             for item in items:
-                self._take(item)
+                self._one(item)
             now = time.monotonic()
             if not items or now - looked >= TICK:
-                self._idle(now)
+                self._beat(now)
                 looked = now
 
     def _end(self) -> None:

@@ -1,27 +1,35 @@
 """Files of a recorder: never written over, each complete in itself, whole lines and records only.
 
 What stands in the file is at most FLUSH old, so a kill -9 costs no more than that; it goes to the disk itself once a
-second (power loss). If the disk fills up, the file is cut back to the last whole piece.
+second (power loss). If the disk fills up, the file is cut back to the last whole piece, values are counted as dropped,
+and the next part begins as soon as there is room; then it says what is missing. When the system's clock is set, the
+next part begins too, and both say so.
 """
 
 from __future__ import annotations
 
+import errno
 import fcntl
 import os
 import time
 from contextlib import suppress
+from dataclasses import replace
 from pathlib import Path
 
-from teds_provision.errors import TedsProvisionError
+from teds_provision.errors import StoreFailure, TedsProvisionError
 from teds_provision.files import sync_folder
-from teds_provision.measure.blocks import ChannelFacts, StationFacts
-from teds_provision.measure.sinks.base import ThreadedSink, as_sink_failure
+from teds_provision.measure.blocks import Block, ChannelFacts, ClockSet, StationFacts
+from teds_provision.measure.sinks.base import Item, ThreadedSink, as_sink_failure
+from teds_provision.measure.sinks.lines import iso
 
 FLUSH = 0.1  # seconds that a piece may wait in this process
 SYNC = 1.0  # seconds that it may wait in the system's cache
 PIECE = 1 << 18  # octets that are handed to the system at once, at most
 PARTS = 100_000
 LARGEST_PART = 1 << 30  # octets; then the next part begins
+FULL = frozenset({errno.ENOSPC, errno.EDQUOT})
+ROOM = 1 << 20  # octets that are free before a part is begun anew on a disk that was full
+AGAIN = 1.0  # seconds between looks whether there is room
 
 
 class Part:
@@ -32,15 +40,21 @@ class Part:
         self._file = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o644)
         with suppress(OSError):  # some network folders have no locks
             fcntl.flock(self._file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        sync_folder(path.parent)
+        try:
+            sync_folder(path.parent)
+        except OSError:
+            os.close(self._file)
+            path.unlink(missing_ok=True)
+            raise
         self.size = 0
-        self._waiting: list[bytes] = []
+        self.lost = 0  # values of pieces that are not in the file, after an error
+        self._waiting: list[tuple[bytes, int]] = []
         self.waiting_octets = 0
         self._synced = self._flushed = time.monotonic()
 
-    def add(self, piece: bytes) -> None:
-        """Take a whole piece (lines, a record); it is written with the next flush. Raises OSError."""
-        self._waiting.append(piece)
+    def add(self, piece: bytes, values: int = 0) -> None:
+        """Take a whole piece (lines, a record) of so many values; it is written with the next flush. Raises OSError."""
+        self._waiting.append((piece, values))
         self.waiting_octets += len(piece)
         if self.waiting_octets >= PIECE:
             self.flush()
@@ -59,15 +73,16 @@ class Part:
         if not self._waiting:
             return
         pieces, self._waiting, self.waiting_octets = self._waiting, [], 0
-        octets = b"".join(pieces)
+        octets = b"".join([piece for piece, _ in pieces])
         done = 0
         try:
             while done < len(octets):
                 done += os.write(self._file, octets[done:])
         except OSError:
             whole = 0
-            for piece in pieces:
+            for count, (piece, _) in enumerate(pieces):
                 if whole + len(piece) > done:
+                    self.lost += sum(values for _, values in pieces[count:])
                     break
                 whole += len(piece)
             with suppress(OSError):
@@ -84,6 +99,11 @@ class Part:
         finally:
             os.close(self._file)
 
+    def abandon(self) -> int:
+        """Close it as it is; values that were added and are not in it."""
+        os.close(self._file)
+        return self.lost + sum(values for _, values in self._waiting)
+
 
 class FileSink(ThreadedSink):
     """A recorder over parts: ``run.csv``, then ``run.2.csv`` where another one is needed or the first is there."""
@@ -97,6 +117,10 @@ class FileSink(ThreadedSink):
         self._part: Part | None = None
         self.station = StationFacts("")
         self.facts: dict[tuple[str, int], ChannelFacts] = {}
+        self._full: tuple[float, int, str] | None = None  # since when (unix), dropped until then, what is the matter
+        self._tried = 0.0
+        self._gaps: list[str] = []
+        self._unsaid: list[ClockSet] = []  # came while no part could be written
 
     @property
     def files(self) -> tuple[str, ...]:
@@ -134,6 +158,114 @@ class FileSink(ThreadedSink):
             return part
         raise TedsProvisionError(f"There are {PARTS} parts of {self._path} already.", hint="Name another file.")
 
+    # -- what a full disk and the system's clock do ------------------------------------------------------------------
+
+    def _note(self, at: float, text: str) -> None:
+        """Write words about the recording into the part, as its format has them."""
+
+    def _first(self) -> None:
+        try:
+            self._begin()
+        except OSError as error:
+            self._wait_for_room(error)
+
+    def _one(self, item: Item) -> None:
+        if self._full is not None:
+            self._miss(item)
+            return
+        try:
+            if isinstance(item, ClockSet):
+                self._follow(item)
+            else:
+                self._take(item)
+        except OSError as error:
+            self._wait_for_room(error)
+
+    def _beat(self, now: float) -> None:
+        if self._full is not None:
+            if now - self._tried >= AGAIN:
+                self._tried = now
+                self._try_again()
+            return
+        try:
+            self._idle(now)
+        except OSError as error:
+            self._wait_for_room(error)
+
+    def _follow(self, news: ClockSet) -> None:
+        """The clock was set: another part, which begins when this recording did by the new clock."""
+        self._note(news.time - news.by, news.words)
+        self.station = replace(self.station, started=self.station.started + news.by)
+        self._new_part()
+        self._note(news.time, news.words)
+
+    def _miss(self, item: Item) -> None:
+        """What comes while there is no room: counted, and known to the next part."""
+        if isinstance(item, Block):
+            self._count(dropped=int(item.value.size))
+        elif isinstance(item, tuple):
+            self._news(item)
+        elif isinstance(item, ClockSet):
+            self.station = replace(self.station, started=self.station.started + item.by)
+            self._unsaid.append(item)
+
+    def _wait_for_room(self, error: OSError) -> None:
+        """Give the part up and wait; raises the error where it is another one than a full disk."""
+        if error.errno not in FULL:
+            raise error
+        before = self.stats.dropped
+        self._tried = time.monotonic()
+        what = "quota of the disk is used up" if error.errno == errno.EDQUOT else "disk is full"
+        self._full = time.time(), before, what
+        lost = self._abandon()
+        self._count(written=-lost, dropped=lost)
+        self._say("waiting", f"The {what} since {iso(self._full[0])}: nothing is recorded until there is room.")
+
+    def _abandon(self) -> int:
+        """Let the part go, and one without a whole piece altogether; how many values are lost with it."""
+        part, self._part = self._part, None
+        if part is None:
+            return 0
+        lost = part.abandon()
+        if not part.size:
+            with suppress(OSError):
+                part.path.unlink()
+            self._parts.remove(part.path)
+        return lost
+
+    def _mend(self, path: Path) -> None:
+        """Make the part whole that a full disk cut off; raises OSError where the disk is full again."""
+
+    def _try_again(self) -> None:
+        """Begin the next part where there is room by now."""
+        assert self._full is not None
+        since, before, what = self._full
+        try:
+            room = os.statvfs(self._path.parent)
+            if room.f_bavail * room.f_frsize < ROOM:
+                return
+            if self._parts:
+                self._mend(self._parts[-1])
+            self._part = self._next_part()
+            self._begin()
+            now, missing = time.time(), self.stats.dropped - before
+            was = what.replace(" is ", " was ")
+            gap = f"The {was} from {iso(since)} to {iso(now)}: {missing} values are not recorded."
+            self._note(now, gap)
+            for news in self._unsaid:
+                self._note(news.time, news.words)
+            self.part.flush()
+        except OSError as error:
+            self._abandon()
+            if error.errno not in FULL:
+                raise
+            return
+        self._full, self._unsaid = None, []
+        self._gaps.append(gap)
+        self._say("running", gap)
+
+    # -- parts ---------------------------------------------------------------------------------------------------------
+
     def _new_part(self) -> None:
         """Close the part and begin the next one, with all that a reader needs."""
         self._close_part()
@@ -152,4 +284,20 @@ class FileSink(ThreadedSink):
             part.close()
 
     def _finish(self) -> None:
-        self._close_part()
+        try:
+            self._close_part()
+        except OSError as error:
+            self._wait_for_room(error)
+        if self._full is not None:
+            since, before, what = self._full
+            missing = self.stats.dropped - before
+            self._gaps.append(f"The {what} since {iso(since)}: {missing} values are not recorded.")
+            if self._parts:
+                with suppress(OSError):
+                    self._mend(self._parts[-1])
+        if self._gaps:
+            told = " ".join(self._gaps[-3:])
+            raise StoreFailure(
+                f"{self.name} has {len(self._gaps)} {'gap' if len(self._gaps) == 1 else 'gaps'}. {told}",
+                hint="Free some space before the next run; what was written is whole.",
+            )

@@ -33,14 +33,16 @@ class JsonLinesSink(FileSink):
 
     def _take(self, item: Item) -> None:
         if isinstance(item, Block):
-            for line in data_lines(item, self.facts):
-                self._add(as_line(line))
             self._count(written=item.value.size, messages=len(item.channels))
+            self._add(b"".join(as_line(line) for line in data_lines(item, self.facts)), item.value.size)
         elif isinstance(item, NodeReport):
             self._add(as_line(status_line(item)))
         else:
             self._channels(item)
 
-    def _add(self, line: bytes) -> None:
-        self.part.add(line)
-        self._count(octets=len(line))
+    def _note(self, at: float, text: str) -> None:
+        self._add(as_line({"event": "note", "time": at, "why": text}))
+
+    def _add(self, lines: bytes, values: int = 0) -> None:
+        self._count(octets=len(lines))
+        self.part.add(lines, values)

@@ -30,6 +30,7 @@ import numpy as np
 from teds_provision.measure.blocks import (
     Block,
     ChannelFacts,
+    ClockSet,
     Command,
     GroupRows,
     NodeReport,
@@ -151,8 +152,11 @@ class TopicSink(ThreadedSink):
         elif changed := self._learn(item):
             self._announce(changed)
 
-    def _learn(self, item: NodeReport | tuple[ChannelFacts, ...]) -> list[ChannelFacts]:
+    def _learn(self, item: NodeReport | ClockSet | tuple[ChannelFacts, ...]) -> list[ChannelFacts]:
         """Keep a report or facts; gives the facts that are new."""
+        if isinstance(item, ClockSet):
+            self._arrays.clear()  # else no row would go out until a clock that was put back had caught up
+            return []
         if isinstance(item, NodeReport):
             self._reports[item.uuid] = item
             return []

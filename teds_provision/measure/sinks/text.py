@@ -55,6 +55,10 @@ class TextSink(FileSink):
         self.part.add(octets)
         self._count(octets=len(octets))
 
+    def _note(self, at: float, text: str) -> None:
+        if self._columns:
+            self._line(f"# {iso(at)} {printable(text)}")
+
     def _header(self) -> None:
         known = [self.facts[key] for key in sorted(self.facts)]
         self._columns = {one.key: place for place, one in enumerate(known)}
@@ -91,8 +95,8 @@ class TextSink(FileSink):
             self._header()
         text = self._rows(block)
         octets = text.encode()
-        self.part.add(octets)
         self._count(written=block.value.size, octets=len(octets), messages=len(block.time))
+        self.part.add(octets, block.value.size)
 
     def _rows(self, block: Block) -> str:
         raw, values, kind = _raw_values(block), block.value.tolist(), block.raw.dtype.kind

@@ -11,6 +11,7 @@ from __future__ import annotations
 import json
 import struct
 import time
+from contextlib import suppress
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -18,10 +19,12 @@ from typing import Any
 import numpy as np
 
 from teds_provision import __version__
+from teds_provision.errors import TedsProvisionError
 from teds_provision.measure.blocks import Block, ChannelFacts, NodeReport
 from teds_provision.measure.sinks.base import Item
 from teds_provision.measure.sinks.files import FLUSH, FileSink
 from teds_provision.measure.sinks.lines import facts_as_json, iso
+from teds_provision.measure.sinks.mcap.recover import recover
 from teds_provision.measure.sinks.mcap.writer import MESSAGE, MESSAGE_HEAD, McapWriter
 from teds_provision.measure.sinks.names import Topics
 
@@ -57,6 +60,7 @@ class McapSink(FileSink):
         self._streams: dict[tuple[str, int, tuple[int, ...], str], tuple[int, np.ndarray]] = {}
         self._strings: dict[str, int] = {}
         self._topics: Topics | None = None
+        self._in_chunk = 0  # values that wait in the open chunk
 
     @property
     def _out(self) -> McapWriter:
@@ -92,7 +96,8 @@ class McapSink(FileSink):
         self._describe(tuple(self.facts.values()))
 
     def _octets(self, octets: bytes) -> None:
-        self.part.add(octets)
+        values, self._in_chunk = self._in_chunk, 0
+        self.part.add(octets, values)
         self.part.flush()
         self._count(octets=len(octets))
 
@@ -186,14 +191,26 @@ class McapSink(FileSink):
         rows["value"] = block.value
         rows["raw"] = raw.view(np.int64) if raw.dtype == np.uint64 else raw
         self._out.add_messages(channel, rows.tobytes(), nanoseconds.tolist())
+        self._in_chunk += block.value.size
         self._count(written=block.value.size, messages=n)
 
+    def _note(self, at: float, text: str) -> None:
+        self._out.metadata("note", {"time": iso(at), "note": text})
+
     def _close_part(self) -> None:
-        # After a full disk the summary does not fit either; `measure recover` makes the file whole later.
+        # After a failure the summary does not fit either; `measure recover` makes the file whole later.
         if self._writer is not None and self._part is not None and self.stats.state != "failed":
             writer, self._writer = self._writer, None
             writer.finish()
         super()._close_part()
+
+    def _abandon(self) -> int:
+        waiting, self._in_chunk, self._writer = self._in_chunk, 0, None
+        return waiting + super()._abandon()
+
+    def _mend(self, path: Path) -> None:
+        with suppress(TedsProvisionError):  # what cannot be mended stays as it is, for `measure recover`
+            recover(path)
 
 
 def _as_texts(facts: dict[str, Any]) -> dict[str, str]:

@@ -35,7 +35,7 @@ export function stationView(main) {
     if (!(status.links ?? []).length && !links.firstChild) fill(links, h("li", { class: "hint" }, "No link was given to ncap run: add --can or --nfc."));
     keyed(sinks, status.sinks ?? [], (one) => one.name, () => h("li", {}), (element, one) => {
       const bad = one.state === "failed";
-      again(element, one, () => [h("span", { class: "grow" }, h("strong", {}, one.name), h("span", { class: "hint" }, ` ${count(one.written ?? 0, "value")} written, ${one.dropped ?? 0} dropped`)), chip(bad ? "bad" : one.dropped ? "warn" : "good", bad || one.dropped ? "warn" : "good", one.state), one.error ? h("p", { class: "hint full" }, one.error, one.hint ? ` ${one.hint}` : "") : null]);
+      again(element, one, () => [h("span", { class: "grow" }, h("strong", {}, one.name), h("span", { class: "hint" }, ` ${count(one.written ?? 0, "value")} written, ${one.dropped ?? 0} dropped`)), chip(bad ? "bad" : one.dropped ? "warn" : "good", bad || one.dropped ? "warn" : "good", one.state), one.error || ((one.recorder || one.state === "waiting") && one.detail) ? h("p", { class: "hint full" }, one.error || one.detail, one.hint ? ` ${one.hint}` : "") : null]);
     });
     if ((status.sinks ?? []).length) noSink.replaceChildren();
     else if (!noSink.firstChild) fill(noSink, empty("Values go to this page alone.", h("p", {}, "Start ncap run with --record, --ros1, --ros2 or --mqtt, or name a file when you start a group.")));
