@@ -25,7 +25,7 @@ def main() -> int:
         page = browser.new_page(viewport={"width": WIDTH, "height": HEIGHT}, color_scheme="light")
         page.goto(shown.url)
         page.get_by_role("link", name="hand").click()
-        page.get_by_role("img", name="Course of opening").wait_for()
+        page.get_by_role("img", name="Plot of opening").wait_for()
         page.wait_for_timeout(SECONDS * 1000)
         page.mouse.move(0, 0)
         page.screenshot(path=sys.argv[1])

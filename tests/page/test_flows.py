@@ -41,29 +41,29 @@ def make_group(page: Page, name: str, *nodes: str) -> None:
     page.get_by_label("Name", exact=True).fill(name)
     for node in nodes:
         page.get_by_role("group", name="Nodes").get_by_role("checkbox", name=node).check()
-    page.get_by_role("button", name="Make the group").click()
+    page.get_by_role("button", name="Create group").click()
 
 
 def test_from_an_empty_home_to_a_moving_plot(browser: Browser, fresh: Lab) -> None:
     fresh.run()
     with opened(browser, fresh) as page:
-        page.get_by_role("link", name="Make a virtual transducer").click()
+        page.get_by_role("link", name="Create a virtual transducer").click()
         page.get_by_label("Transducer type").select_option("accelerometer")
         page.get_by_label("Name").fill("shaker")
-        page.get_by_role("button", name="Make it").click()
+        page.get_by_role("button", name="Create").click()
         page.get_by_role("link", name="Nodes").click()
         page.locator(".card", has_text="shaker").get_by_text("Authentic", exact=True).wait_for()
         page.get_by_role("link", name="Measure").click()
-        page.get_by_text("No group yet").wait_for()
+        page.get_by_text("No groups yet").wait_for()
         make_group(page, "table", "shaker")
         page.get_by_role("button", name="Start table").click()
-        page.get_by_role("img", name="Course of acceleration x, acceleration y, acceleration z").wait_for()
+        page.get_by_role("img", name="Plot of acceleration x, acceleration y, acceleration z").wait_for()
         until(lambda: received(page) > 50, "no points arrive")
         before = received(page)
         until(lambda: received(page) > before, "the plot stands still")
         in_group(page, "table").get_by_text(re.compile(r"running, \d+ samples, none lost")).wait_for()
         page.get_by_role("button", name="Pause").click()
-        page.get_by_role("button", name="Go on").wait_for()
+        page.get_by_role("button", name="Resume").wait_for()
         page.get_by_role("button", name="Stop table").click()
         page.get_by_role("button", name="Start table").wait_for()
         page.get_by_role("link", name="Nodes").click()
@@ -75,7 +75,7 @@ def test_a_rate_that_does_not_fit_is_refused_with_the_fastest(browser: Browser, 
     with opened(browser, lab, route=f"nodes/{lab.nodes['hand'].uuid}/live") as page:
         page.get_by_label("Rate, Hz").fill("5000")
         page.get_by_role("button", name="Measure").click()
-        page.get_by_role("alert").filter(has_text="gives at most 100 Hz").wait_for()
+        page.get_by_role("alert").filter(has_text="supports at most 100 Hz").wait_for()
         assert page.get_by_role("button", name="Idle", pressed=True).is_visible()
 
 
@@ -87,50 +87,50 @@ def test_who_measures_says_whether_topics_may_move_actuators_and_when_these_are_
         with opened(browser, fresh, route="virtual") as page:
             page.get_by_label("Transducer type").select_option("gripper")
             page.get_by_label("Name").fill("hand")
-            page.get_by_role("button", name="Make it").click()
+            page.get_by_role("button", name="Create").click()
             page.get_by_role("link", name="Nodes").click()
             page.locator(".card", has_text="hand").get_by_text("Authentic", exact=True).wait_for()
             page.get_by_role("link", name="Measure").click()
             make_group(page, "arm", "hand")
             card = in_group(page, "arm")
             card.get_by_text("More", exact=True).click()
-            may = card.get_by_label("Topics may move its actuators")
+            may = card.get_by_label("Allow topics to move actuators")
             assert may.is_checked()
             assert card.get_by_label("Dead-man, ms").get_attribute("placeholder") == "300"
             card.get_by_label("Dead-man, ms").fill("5")
             page.get_by_role("button", name="Start arm").click()
-            page.get_by_role("alert").filter(has_text="from 20 to 10000 ms").wait_for()
+            page.get_by_role("alert").filter(has_text="between 20 and 10000 ms").wait_for()
             card.get_by_label("Dead-man, ms").fill("")
             page.get_by_role("button", name="Start arm").click()
-            card.get_by_text("without one for 300 ms an actuator is safe").wait_for()
+            card.get_by_text("safe state 300 ms after the last one").wait_for()
             assert [(one["actuators"], one["dead_man"]) for one in fresh.measurements()] == [(True, 300)]
             page.get_by_role("button", name="Stop arm").click()
             page.get_by_role("button", name="Start arm").wait_for()
             may.uncheck()
             card.get_by_label("Dead-man, ms").fill("250")
             page.get_by_role("button", name="Start arm").click()
-            card.get_by_text("They are not taken").wait_for()
+            card.get_by_text("Not accepted in this measurement").wait_for()
             assert [(one["actuators"], one["dead_man"]) for one in fresh.measurements()] == [(False, 250)]
             page.get_by_role("button", name="Stop arm").click()
             page.get_by_role("button", name="Start arm").wait_for()
             # The same of one node by itself.
             page.get_by_role("link", name="Nodes").click()
             page.locator(".card", has_text="hand").click()
-            page.get_by_role("group", name="Set points by topics").get_by_label(
-                "Topics may move its actuators"
+            page.get_by_role("group", name="Set points from topics").get_by_label(
+                "Allow topics to move actuators"
             ).uncheck()
             page.get_by_role("button", name="Measure", exact=True).click()
-            page.get_by_text("They are not taken").wait_for()
+            page.get_by_text("Not accepted in this measurement").wait_for()
             assert [one["actuators"] for one in fresh.measurements()] == [False]
 
 
 def test_a_station_without_topics_says_that_it_takes_no_set_points(browser: Browser, lab: Lab) -> None:
     with opened(browser, lab, route=f"nodes/{lab.nodes['hand'].uuid}/live") as page:
-        page.get_by_text("This station takes no set points from topics").wait_for()
-        assert page.get_by_label("Topics may move its actuators").is_disabled()
+        page.get_by_text("This station does not accept set points from topics").wait_for()
+        assert page.get_by_label("Allow topics to move actuators").is_disabled()
     with opened(browser, lab, route=f"nodes/{lab.nodes['slew'].uuid}/live") as page:
         page.get_by_role("button", name="Measure", exact=True).wait_for()
-        assert not page.get_by_label("Topics may move its actuators").is_visible(), "it has none"
+        assert not page.get_by_label("Allow topics to move actuators").is_visible(), "it has none"
 
 
 @pytest.mark.realtime
@@ -142,14 +142,12 @@ def test_an_actuator_moves_while_it_is_held_and_the_node_says_that_it_is_safe(br
         hold.hover()
         page.mouse.down()
         page.get_by_text("Moving: 39.998 mm").wait_for()
-        until(
-            lambda: any(abs(one["value"] - 0.04) < 1e-4 and not one["safe"] for one in lab.moved("hand")), "not moved"
-        )
+        until(lambda: any(abs(one["value"] - 0.04) < 1e-4 and not one["safe"] for one in lab.moved("hand")), "not set")
         began = len(lab.moved("hand"))
         page.wait_for_timeout(1500)  # longer than what one word holds: the page goes on asking
         assert not any(one["safe"] for one in lab.moved("hand")[began:])
         page.mouse.up()
-        page.get_by_text("Safe: the node said so at").wait_for()
+        page.get_by_text("Safe: confirmed by the node at").wait_for()
         assert lab.moved("hand")[-1]["safe"]
         # By keyboard.
         page.get_by_role("slider").focus()
@@ -159,7 +157,7 @@ def test_an_actuator_moves_while_it_is_held_and_the_node_says_that_it_is_safe(br
         page.keyboard.down(" ")
         page.get_by_text("Moving: 110").wait_for()
         page.keyboard.up(" ")
-        page.get_by_text("Safe: the node said so at").wait_for()
+        page.get_by_text("Safe: confirmed by the node at").wait_for()
         # Beyond the limits of the datasheet.
         value.fill("500")
         hold.click()
@@ -182,7 +180,7 @@ def test_a_datasheet_is_read_and_written_from_a_file_with_the_changes_shown_firs
     slew = lab.nodes["slew"]
     with opened(browser, lab, route=f"nodes/{slew.uuid}/datasheet") as page:
         panel = page.get_by_role("region", name="Datasheet", exact=True)
-        panel.get_by_text("Signature, trust and key proof hold").wait_for()
+        panel.get_by_text("Signature, trust and key proof are valid").wait_for()
         panel.get_by_role("img", name="Calibration of angle").locator("canvas").wait_for()
         panel.get_by_text("Channel 1: TransducerChannel TEDS").click()
         assert "360 °" in panel.get_by_role("row", name="HiLimit").inner_text()
@@ -216,29 +214,29 @@ def test_provisioning_waits_for_the_tap_and_follows_it(browser: Browser, lab: La
     calibration = lab.desk.folder / "oven.csv"
     calibration.write_text("# date: 2026-11-01\nraw,value [degC]\n0,-40\n21120,125\n")
     with opened(browser, lab, route="nodes") as page:
-        page.get_by_role("link", name="Provision the next node that is tapped").click()
+        page.get_by_role("link", name="Provision the next tapped node").click()
         page.get_by_role("button", name="Provision").click()
-        page.get_by_role("alert").filter(has_text="No type is chosen").wait_for()
+        page.get_by_role("alert").filter(has_text="Choose a transducer type").wait_for()
         page.get_by_label("Transducer type").select_option("temperature-sensor")
         page.get_by_label("Name").fill("oven")
         page.get_by_label("Calibration").set_input_files(calibration)
         page.get_by_role("button", name="Provision").click()
-        page.locator(".waiting").get_by_text("Lay a node on the reader.").wait_for()
+        page.locator(".waiting").get_by_text("Place a node on the reader.").wait_for()
         page.reload()
-        page.locator(".waiting").get_by_text("Lay a node on the reader.").wait_for()
-        page.get_by_role("button", name="Do not wait any more").click()
-        page.get_by_text("Nobody waits for a tap any more").wait_for()
+        page.locator(".waiting").get_by_text("Place a node on the reader.").wait_for()
+        page.get_by_role("button", name="Cancel").click()
+        page.get_by_text("Provisioning was cancelled").wait_for()
         page.get_by_label("Transducer type").select_option("temperature-sensor")
         page.get_by_label("Name").fill("oven")
         page.get_by_label("Calibration").set_input_files(calibration)
         page.get_by_role("button", name="Provision").click()
-        page.locator(".waiting").get_by_text("Lay a node on the reader.").wait_for()
+        page.locator(".waiting").get_by_text("Place a node on the reader.").wait_for()
         running = lab.power("oven", nfc=True)
         page.get_by_text("This node is ready").wait_for()
         page.get_by_role("heading", name="oven", exact=True).wait_for()
         steps = page.locator(".steps li")
         assert steps.count() >= 6
-        assert {one.split("\n")[0] for one in steps.all_inner_texts()} <= {"done", "nothing to do"}
+        assert {one.split("\n")[0] for one in steps.all_inner_texts()} <= {"done", "not needed"}
         assert lab.nodes["oven"].uuid in page.url
         running.close()
 
@@ -251,14 +249,14 @@ def test_names_from_a_datasheet_are_text_and_nothing_else(browser: Browser, fres
     with opened(browser, fresh, route="virtual") as page:
         page.get_by_label("Transducer type").select_option("gripper")
         page.get_by_label("Name").fill(HOSTILE + TURNED)
-        page.get_by_role("button", name="Make it").click()
+        page.get_by_role("button", name="Create").click()
         page.get_by_role("alert").filter(has_text="one line of printable characters").wait_for()
         page.goto(f"{fresh.url}/#/nodes/{foreign}")
         page.get_by_role("heading", name="\ufffdgrab\ufffd", exact=True).wait_for()
         page.goto(f"{fresh.url}/#/virtual")
         page.get_by_label("Transducer type").select_option("gripper")
         page.get_by_label("Name").fill(HOSTILE)
-        page.get_by_role("button", name="Make it").click()
+        page.get_by_role("button", name="Create").click()
         page.get_by_role("link", name=HOSTILE).first.click()
         page.locator(".card").get_by_text("Authentic", exact=True).wait_for()
         title = page.title()
@@ -278,14 +276,45 @@ def test_two_browsers_see_the_same_and_one_that_may_only_read_changes_nothing(br
         page.get_by_role("button", name="Start both").click()
         until(lambda: received(other) > 20, "the second browser gets nothing")
         other.goto(f"{lab.url}/#/nodes/{lab.nodes['hand'].uuid}/datasheet")
-        other.get_by_text("This browser may only read").or_(other.get_by_text("It is being measured")).first.wait_for()
+        other.get_by_text("This browser has read-only access").or_(
+            other.get_by_text("is being measured")
+        ).first.wait_for()
         page.get_by_role("button", name="Stop both").click()
         page.get_by_text("More").first.click()
         members = page.get_by_role("group", name="Members")
         members.get_by_role("checkbox", name="slew").check()
-        page.get_by_role("button", name="Keep these members").click()
+        page.get_by_role("button", name="Save members").click()
         other.locator(".card", has_text="slew").get_by_text("both").wait_for()
         page.get_by_role("button", name="Delete group").click()
-        page.get_by_text("No group yet").wait_for()
+        page.get_by_text("No groups yet").wait_for()
         other.goto(f"{lab.url}/#/measure")
-        other.get_by_text("No group yet").wait_for()
+        other.get_by_text("No groups yet").wait_for()
+
+
+def test_the_station_searches_its_log_and_older_entries_come_when_they_are_asked_for(
+    browser: Browser, fresh: Lab
+) -> None:
+    fresh.run()
+    with closing(Station.open(fresh.station.home, ask=lambda _prompt, confirm: PASSPHRASE)) as station:
+        station.audit("group", None, "the first of many")
+        for number in range(230):
+            station.audit("detection", None, "set", number=number)
+    with opened(browser, fresh, route="log") as page:
+        rows = page.locator("table.log tbody tr")
+        page.get_by_text("Newest 200 entries").wait_for()
+        page.get_by_text("Chain intact").wait_for()
+        assert rows.count() == 200
+        page.get_by_role("button", name="Show older entries").click()
+        page.get_by_text("the first of many").wait_for()
+        assert rows.count() > 230
+        page.get_by_role("button", name="Show older entries").wait_for(state="hidden")
+        page.reload()
+        page.get_by_text("Newest 200 entries").wait_for()
+        page.get_by_label("Search the log").fill("first of MANY")
+        page.get_by_text("1 entry").wait_for()
+        assert "the first of many" in rows.first.inner_text(), "it is none of the newest 200"
+        page.get_by_label("Failures only").check()
+        page.get_by_text("No matching entries").wait_for()
+        page.get_by_label("Failures only").uncheck()
+        page.get_by_label("Search the log").fill("")
+        page.get_by_text("Newest 200 entries").wait_for()

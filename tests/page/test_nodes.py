@@ -29,7 +29,7 @@ def test_nodes_are_shown_with_verdict_link_and_channels(browser: Browser, lab: L
             assert re.search(r"(80|79) %", card.inner_text()), card.inner_text()
         nodes.get_by_role("link", name="hand").click()
         page.get_by_role("heading", name="hand", exact=True).wait_for()
-        rows = page.get_by_role("table", name="Channels and their last values")
+        rows = page.get_by_role("table", name="Channels and their latest values")
         row = rows.get_by_role("row", name="opening", exact=False).nth(1)
         for words in ("opening", "mm", "0 to 110 mm", "± 0.1 mm", "100 Hz", "2026-11-01"):
             assert words in row.inner_text(), row.inner_text()
@@ -43,8 +43,8 @@ def test_an_empty_home_says_what_to_do_next_and_a_tap_opens_the_node(browser: Br
     fresh.create("oven", "temperature-sensor")
     with opened(browser, fresh, route="log") as page:
         page.goto(f"{fresh.url}/#/nodes")
-        page.get_by_role("heading", name="No node yet").wait_for()
-        page.get_by_role("link", name="Make a virtual transducer").wait_for()
+        page.get_by_role("heading", name="No nodes yet").wait_for()
+        page.get_by_role("link", name="Create a virtual transducer").wait_for()
         page.goto(f"{fresh.url}/#/station")
         page.get_by_role("heading", name="Links").wait_for()
         fresh.power("oven", nfc=True)  # laid on the reader while the person looks at something else
@@ -65,7 +65,7 @@ def test_measuring_is_said_of_a_node_that_is_measured_and_of_no_other(browser: B
                 return ["running", "refused", "lost", undefined].map(of).concat(node({ uuid: "00" }).mode);
             }"""
         )
-    assert told == ["measuring", "refused, not measured", "lost, not measured", "waits to be measured", None]
+    assert told == ["measuring", "refused, not measured", "lost, not measured", "waiting to be measured", None]
 
 
 def test_a_node_that_leaves_is_shown_as_away(browser: Browser, fresh: Lab) -> None:
@@ -119,7 +119,7 @@ def test_a_lost_connection_is_seen_within_two_seconds_and_healed(
         fresh.daemon.signal(how)
         page.locator("#connection", has_text="Connection lost").wait_for()
         seen = time.monotonic() - began
-        page.get_by_role("alert").filter(has_text="What you see is old").wait_for()
+        page.get_by_role("alert").filter(has_text="These values are out of date").wait_for()
         assert page.get_by_role("button", name="Discover").is_disabled()
         if how == signal.SIGSTOP:
             fresh.daemon.signal(signal.SIGCONT)

@@ -28,7 +28,7 @@ async function ask(method, path, body, { signal, keepalive } = {}) {
     });
   } catch (error) {
     if (signal?.aborted) throw error;
-    throw new Refusal(0, "unreachable", "The base station does not answer.", "Is `teds-provision ncap run` still running?");
+    throw new Refusal(0, "unreachable", "The base station is not responding.", "Is `teds-provision ncap run` still running?");
   }
   const said = await answer.json().catch(() => null);
   if (answer.ok) return said ?? {};

@@ -94,17 +94,17 @@ export function grouped(hex) {
 }
 
 const VERDICTS = {
-  authentic: ["good", "good", "Authentic", "Signature, trust and key proof hold."],
+  authentic: ["good", "good", "Authentic", "Signature, trust and key proof are valid."],
   unproven: ["warn", "ask", "Unproven", "The node could not prove that it holds its key."],
-  unverified: ["warn", "warn", "Unverified", "It was keyed here as it came: nobody signed this datasheet."],
+  unverified: ["warn", "warn", "Unverified", "This station has a key for the node, but nobody signed its datasheet."],
   unsigned: ["warn", "warn", "Unsigned", "Nobody signed this datasheet."],
-  "not authentic": ["bad", "bad", "Not authentic", "A check failed: do not trust its values."],
+  "not authentic": ["bad", "bad", "Not authentic", "A security check failed. Do not trust its values."],
 };
 
 /** Tone, sign, word and meaning of the verdict on a node or a datasheet. */
 export function verdict(of) {
   const known = VERDICTS[of.verdict];
-  if (known && of.from === "kept") return [...known.slice(0, 3), `${known[3]} All but its Security TEDS is as it was last read.`];
+  if (known && of.from === "kept") return [...known.slice(0, 3), `${known[3]} Only the Security TEDS was read now; the rest is from the last reading.`];
   if (known) return known;
-  return ["plain", "ask", "Not checked", "Nobody has verified this node yet."];
+  return ["plain", "ask", "Not checked", "This node has not been verified yet."];
 }

@@ -48,8 +48,8 @@ function header() {
   const pill = h("span", { class: "pill", id: "connection" });
   const modes = h("div", { class: "switch", role: "group", "aria-label": "Detection" });
   const explained = {
-    whitelist: "Only nodes on the whitelist are opened; others are counted.",
-    transparent: "Every node that is found is read and shown.",
+    whitelist: "Open only nodes on the whitelist; count the others.",
+    transparent: "Read and show every node found.",
   };
   const choices = Object.entries(explained).map(([mode, why]) =>
     button(mode === "whitelist" ? "Whitelist" : "Transparent", {
@@ -59,7 +59,7 @@ function header() {
     }),
   );
   modes.append(...choices);
-  const discover = button("Discover", { id: "discover", title: "Ask every link now which nodes are there." }, "wave");
+  const discover = button("Discover", { id: "discover", title: "Look for nodes on every link now." }, "wave");
   discover.addEventListener("click", () => discover.busy(find));
   const nav = h("nav", { "aria-label": "Views" });
   const links = Object.entries(VIEWS).map(([name, [words]]) => h("a", { href: `#/${name}`, "data-view": name }, words));
@@ -93,10 +93,10 @@ function connection(pill) {
   document.body.classList.toggle("lost", state.connection !== "live");
   const banner = document.getElementById("banner");
   if (state.connection === "lost") {
-    text(banner, "Connection to the base station lost. What you see is old. Trying again …");
+    text(banner, "Connection to the base station lost. These values are out of date. Reconnecting …");
   } else if (state.connection === "signed out") {
     if (!banner.firstElementChild) {
-      fill(banner, "This browser is not signed in any more. Open the page anew with the address that this command prints: ", h("code", {}, "teds-provision ncap open"));
+      fill(banner, "This browser is no longer signed in. Open the address that this command prints: ", h("code", {}, "teds-provision ncap open"));
     }
   } else banner.replaceChildren();
 }
@@ -112,12 +112,12 @@ async function detect(mode, why) {
 }
 
 async function find() {
-  say("Asking every link which nodes are there.");
+  say("Looking for nodes on every link.");
   try {
     const { nodes } = await post("discover");
     await refresh("nodes", "status");
     const words = nodes?.length ? `${count(nodes.length, "node")} answered.` : "No node answered.";
-    toast("good", words, nodes?.length ? "" : "Is it powered and on the bus? A node with NFC is found when you lay it on the reader.");
+    toast("good", words, nodes?.length ? "" : "Is it powered and on the bus? A node with NFC is found when you place it on the reader.");
   } catch (error) {
     toast("bad", error.message, error.hint);
   }
@@ -125,10 +125,10 @@ async function find() {
 
 /** What a person is at that must not be taken from under the hands; "" where nothing is. */
 function occupied() {
-  if (document.querySelector("[data-held]")) return "you hold an actuator";
+  if (document.querySelector("[data-held]")) return "you are holding an actuator";
   const at = document.activeElement;
   const typing = at?.matches?.("main input:not([type=checkbox], [type=range], [type=file])") && at.value !== at.defaultValue;
-  return typing ? "you are writing" : "";
+  return typing ? "you are typing" : "";
 }
 
 /** A tap opens that very node and marks it, wherever the person was: no button is needed. */
@@ -139,7 +139,7 @@ function tapped() {
   const here = location.hash.startsWith(`#/nodes/${uuid}`);
   const busy = occupied();
   if (busy) {
-    toast("good", `Tapped: ${nameOf(node ?? { uuid })}.`, `Not opened, because ${busy}. It is marked under Nodes.`);
+    toast("good", `Tapped: ${nameOf(node ?? { uuid })}.`, `Not opened because ${busy}. It is marked under Nodes.`);
     return;
   }
   const run = state.runs.get(uuid) ?? state.runs.get("next");
@@ -177,4 +177,4 @@ window.addEventListener("unhandledrejection", (event) => {
 });
 
 if (window.uPlot) start();
-else fill(document.getElementById("main"), trouble({ message: "A file of this page is missing: vendor/uPlot.iife.min.js.", hint: "Install teds-provision anew." }));
+else fill(document.getElementById("main"), trouble({ message: "A file of this page could not be loaded: vendor/uPlot.iife.min.js.", hint: "Reinstall teds-provision." }));

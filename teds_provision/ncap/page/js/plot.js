@@ -71,7 +71,7 @@ export class LivePlot {
   }
 
   frame(unit, channels, colours) {
-    const title = unit || "without unit";
+    const title = unit || "no unit";
     const legend = h("ul", { class: "legend" });
     const values = channels.map((channel, index) => {
       const value = h("span", { class: "figure" }, "no value yet");
@@ -86,7 +86,7 @@ export class LivePlot {
       legend.append(h("li", {}, swatch, h("span", { class: "label" }, channel.label), value));
       return value;
     });
-    const canvas = h("div", { class: "canvas", role: "img", "aria-label": `Course of ${channels.map((one) => one.label).join(", ")} in ${title}` });
+    const canvas = h("div", { class: "canvas", role: "img", "aria-label": `Plot of ${channels.map((one) => one.label).join(", ")} in ${title}` });
     const element = h("figure", {}, h("figcaption", {}, h("span", { class: "unit" }, title), legend), canvas);
     const chart = new window.uPlot(options(channels, colours), [[], ...channels.map(() => [])], canvas);
     return { element, canvas, chart, channels, values, shown: 0 };
@@ -142,8 +142,8 @@ export class LivePlot {
     if (since < 1000) return;
     const rate = (each) => Math.round((each * 1000) / since);
     const parts = [count(this.channels.length, "channel"), `${rate(state.received - this.second.received)} points/s`];
-    parts.push(`drawn ${rate(this.second.frames)} times/s`, this.skipped ? `${this.skipped} drawings left out` : "no drawing left out");
-    parts.push(state.dropped ? `${count(state.dropped, "message")} of values left out: this page was too slow` : "none lost on the way here");
+    parts.push(`${rate(this.second.frames)} fps`);
+    parts.push(state.dropped ? `${count(state.dropped, "message")} dropped: this page is too slow` : "no data lost between station and browser");
     text(this.foot, parts.join(" · "));
     Object.assign(this.foot.dataset, { received: state.received, dropped: state.dropped, drawn: this.drawn, skipped: this.skipped });
     this.second = { at: performance.now(), frames: 0, received: state.received };

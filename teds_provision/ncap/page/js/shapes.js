@@ -56,7 +56,7 @@ function power(wire) {
 
 /** What a measurement does with a node: it measures only while the node runs. */
 function modeOf(state) {
-  return { running: "measuring", refused: "refused, not measured", lost: "lost, not measured", ended: "not measured" }[state] ?? "waits to be measured";
+  return { running: "measuring", refused: "refused, not measured", lost: "lost, not measured", ended: "not measured" }[state] ?? "waiting to be measured";
 }
 
 /** A node; its verdict is judged from the station's one row of reading, `heard` is what it said in no session. */
@@ -83,7 +83,7 @@ export function node(wire) {
 /** The station. */
 export function status(wire) {
   const links = (wire.links ?? []).map((link) => ({
-    name: link.virtual ? "bus of the virtual transducers" : (link.place ?? "").replace(/^(can|nfc|ble):/, ""),
+    name: link.virtual ? "virtual transducers" : (link.place ?? "").replace(/^(can|nfc|ble):/, ""),
     kind: link.virtual ? "virtual" : link.via,
     state: link.state,
     why: link.problem?.message ?? link.waiting ?? "",

@@ -20,7 +20,6 @@ export const state = {
   virtual: [],
   profiles: [],
   names: [],
-  log: { entries: [], intact: null },
   values: new Map(), // "uuid/channel" → {value, time, heard}
   rings: new Map(), // "uuid/channel" → Ring
   runs: new Map(), // UUID → what provisioning said so far
@@ -119,7 +118,6 @@ const LISTS = {
   virtual: async () => (state.virtual = (await get("virtual")).virtual ?? []),
   profiles: async () => (state.profiles = (await get("profiles")).profiles ?? []),
   names: async () => (state.names = (await get("names")).names ?? []),
-  log: async () => (state.log = await get("log?limit=300")),
 };
 
 const asking = new Map(); // list → whether it is to be asked once more after this answer

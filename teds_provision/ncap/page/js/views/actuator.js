@@ -89,7 +89,7 @@ export class ActuatorPanel {
     if (this.holding || this.button.disabled) return;
     const value = Number(this.entry.value);
     if (this.entry.value === "" || !Number.isFinite(value)) {
-      fill(this.error, trouble({ message: "The set point is no number.", hint: `Give one within ${range(this.channel)}.` }));
+      fill(this.error, trouble({ message: "Enter a number as the set point.", hint: `It must be within ${range(this.channel)}.` }));
       return;
     }
     this.error.replaceChildren();
@@ -97,7 +97,7 @@ export class ActuatorPanel {
     this.safeAt = null;
     this.button.dataset.held = "";
     this.button.setAttribute("aria-pressed", "true");
-    text(this.words, "Moving: let go to stop");
+    text(this.words, "Moving: release to stop");
     say(`Moving ${channelName(this.channel)}.`);
     this.paint();
     this.feed();
@@ -165,7 +165,7 @@ export class ActuatorPanel {
       }
     } catch (error) {
       this.stopping = false;
-      if (!refused) fill(this.error, trouble({ message: error.message, hint: `${error.hint ? `${error.hint} ` : ""}The node goes to its safe state by itself within a second without a word.` }));
+      if (!refused) fill(this.error, trouble({ message: error.message, hint: `${error.hint ? `${error.hint} ` : ""}Without further set points, the node goes to its safe state by itself within a second.` }));
     }
     this.paint();
   }
@@ -176,15 +176,15 @@ export class ActuatorPanel {
     const may = state.connection === "live" && state.status?.write !== false && state.nodes.get(this.uuid)?.whitelisted !== false;
     if (!may && this.holding) this.letGo();
     this.button.disabled = !may;
-    text(this.limits, `Limits ${range(channel)}. It moves only while the button (or Space) is held; let go, and the node brings it to its safe state. No safety function: keep an emergency stop.`);
+    text(this.limits, `Limits ${range(channel)}. It moves only while you hold the button (or Space). Release it, and the node returns to its safe state. This is not a safety function: keep an emergency stop within reach.`);
     const figure = (value) => `${number(value)}${channel.unit ? ` ${channel.unit}` : ""}`;
     let shown;
     if (this.holding) shown = chip("busy", "play", `Moving: ${figure(this.applied ?? Number(this.entry.value))}`);
     else if (this.stopping) shown = chip("warn", "clock", "Stopping …");
-    else if (told?.safe === false) shown = chip("busy", "play", `Moved by another: ${figure(told.value)}`);
-    else if (this.safeAt) shown = chip("good", "good", `Safe: the node said so at ${clock(this.safeAt)}`);
+    else if (told?.safe === false) shown = chip("busy", "play", `Controlled from elsewhere: ${figure(told.value)}`);
+    else if (this.safeAt) shown = chip("good", "good", `Safe: confirmed by the node at ${clock(this.safeAt)}`);
     else if (told?.safe === true) shown = chip("good", "good", "Safe state");
-    else shown = chip("plain", "ask", "Not moved from here");
+    else shown = chip("plain", "ask", "Not controlled from this page");
     if (this.state.textContent !== shown.textContent) fill(this.state, shown);
   }
 

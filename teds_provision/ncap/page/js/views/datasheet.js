@@ -12,7 +12,7 @@ export class DatasheetTab {
   constructor(parent, uuid) {
     this.uuid = uuid;
     this.leaving = new AbortController();
-    this.read = button("Read from the node", { class: "main" }, "list");
+    this.read = button("Read from node", { class: "main" }, "list");
     this.read.addEventListener("click", () => this.load());
     this.files = h("span", { class: "links" });
     this.body = h("div", { "aria-live": "off" });
@@ -24,7 +24,7 @@ export class DatasheetTab {
     this.off = on("connection nodes", () => this.paint());
     this.paint();
     if (state.connection === "live") this.load();
-    else fill(this.body, empty("Not read yet.", h("p", {}, "Press Read from the node.")));
+    else fill(this.body, empty("Not read yet.", h("p", {}, "Press Read from node.")));
   }
 
   paint() {
@@ -34,7 +34,7 @@ export class DatasheetTab {
 
   async load() {
     await this.read.busy(async () => {
-      if (!this.body.querySelector(".teds")) fill(this.body, h("p", { class: "empty busy-line" }, "Reading the datasheet from the node and checking it …"));
+      if (!this.body.querySelector(".teds")) fill(this.body, h("p", { class: "empty busy-line" }, "Reading and verifying the datasheet …"));
       try {
         const sheet = await get(paths.teds(this.uuid), { signal: this.leaving.signal });
         this.show(sheet);
@@ -56,7 +56,7 @@ export class DatasheetTab {
     const findings = [...(sheet.guard ?? []).map((one) => ({ ...one, where: "Plausibility" })), ...found];
     fill(
       this.body,
-      h("div", { class: "sheet-verdict" }, chip(tone, sign, words), h("span", {}, why), sheet.read_now === false ? chip("warn", "clock", "As it was last read: the node is not on a bus now") : null),
+      h("div", { class: "sheet-verdict" }, chip(tone, sign, words), h("span", {}, why), sheet.read_now === false ? chip("warn", "clock", "Last reading: the node is not connected now") : null),
       sheet.checks?.length ? h("details", { class: "checks", open: sheet.verdict !== "authentic" }, h("summary", {}, "Security check"), h("ul", {}, sheet.checks.map(checkLine))) : null,
       findings.length ? h("details", { class: "findings", open: findings.some((one) => one.severity === "error") }, h("summary", {}, `${count(findings.length, "finding")}`), h("ul", {}, findings.map(findingLine))) : null,
       teds.length ? null : empty("The node has no datasheet.", h("p", {}, "Write one from a file below, or ", h("a", { href: `#/nodes/${this.uuid}/provision` }, "provision it"), " from a type.")),

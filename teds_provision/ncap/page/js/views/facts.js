@@ -27,15 +27,15 @@ export function facts(node) {
 
 /** Battery and charging in words. */
 function power(told) {
-  const level = typeof told.percent === "number" ? `${told.percent} %` : "level not known";
-  const words = { charging: "charging", wanted: "wants charging", full: "full", error: "charging error" }[told.charging];
+  const level = typeof told.percent === "number" ? `${told.percent} %` : "level unknown";
+  const words = { charging: "charging", wanted: "needs charging", full: "full", error: "charging error" }[told.charging];
   const low = told.low || (typeof told.percent === "number" && told.percent < 10);
   return h("span", { class: low ? "warn" : "" }, icon(told.charging === "charging" ? "charge" : "battery"), [level, words, low ? "low" : null].filter(Boolean).join(", "));
 }
 
 /** One check of the security check, with its reason. */
 export function checkLine(check) {
-  if (check.print) return h("li", {}, h("span", { class: "check-name" }, "Fingerprint of its key"), h("code", { class: "print" }, grouped(check.print)));
+  if (check.print) return h("li", {}, h("span", { class: "check-name" }, "Key fingerprint"), h("code", { class: "print" }, grouped(check.print)));
   const [tone, sign, words] = RESULTS[check.result] ?? RESULTS.skipped;
   return h("li", {}, chip(tone, sign, words), h("span", { class: "check-name" }, check.name), check.why ? h("span", { class: "hint" }, check.why) : null);
 }

@@ -1,43 +1,84 @@
-// The audit log: what was done, by whom it was refused, and whether its chain holds.
+// The audit log: what was done, by whom, what was refused, and whether its chain is intact. The station searches it.
 
-import { chip, empty, fill, h, keyed, text } from "../dom.js";
+import { get } from "../api.js";
+import { button, chip, empty, fill, h, keyed, text, trouble } from "../dom.js";
 import { clock, count, nameOf } from "../format.js";
-import { on, refresh, state } from "../state.js";
+import { on, state } from "../state.js";
 
-const EVERY = 5000; // ms
+const EVERY = 5000; // ms between two looks for what is new
+const PAGE = 200; // entries in one answer
+const TYPING = 250; // ms after the last key before the station is asked
 
 export function logView(main) {
-  const search = h("input", { type: "search", placeholder: "Act, node, word", "aria-label": "Find in the log", oninput: () => paint() });
-  const failed = h("input", { type: "checkbox", onchange: () => paint() });
+  const search = h("input", { type: "search", placeholder: "Action, node or text", "aria-label": "Search the log", maxlength: "200" });
+  const failed = h("input", { type: "checkbox" });
   const intact = h("span", {});
   const rows = h("tbody", {});
   const none = h("div", {});
   const total = h("span", { class: "hint" });
-  const table = h("table", { class: "log" }, h("caption", { class: "unseen" }, "Audit log, newest first"), h("thead", {}, h("tr", {}, ["Time", "Act", "Node", "What", "Who"].map((words) => h("th", { scope: "col" }, words)))), rows);
-  main.append(h("div", { class: "panel-head view-head" }, h("h2", {}, "Log"), intact, search, h("label", { class: "tick" }, failed, h("span", {}, "Failures only")), total), h("section", { class: "panel", "aria-label": "Audit log" }, none, h("div", { class: "scroll", tabindex: "0", role: "group", "aria-label": "Audit log" }, table)));
+  const table = h("table", { class: "log" }, h("caption", { class: "unseen" }, "Audit log, newest first"), h("thead", {}, h("tr", {}, ["Time", "Action", "Node", "Details", "By"].map((words) => h("th", { scope: "col" }, words)))), rows);
+  const older = button("Show older entries", { onclick: () => older.busy(() => load(Math.min(...entries.keys()))) });
+  main.append(h("div", { class: "panel-head view-head" }, h("h2", {}, "Log"), intact, search, h("label", { class: "tick" }, failed, h("span", {}, "Failures only")), total), h("section", { class: "panel", "aria-label": "Audit log" }, none, h("div", { class: "scroll", tabindex: "0", role: "group", "aria-label": "Audit log" }, table), h("div", { class: "row" }, older)));
 
-  function paint() {
-    const entries = [...(state.log.entries ?? [])].sort((one, other) => other.seq - one.seq);
-    const words = search.value.trim().toLowerCase();
-    const found = entries.filter((one) => (!failed.checked || one.failed) && (!words || JSON.stringify(one).toLowerCase().includes(words)));
-    keyed(rows, found, (one) => one.seq, line);
-    const holds = state.log.intact;
-    const shown = holds === true ? ["good", "good", "Chain holds"] : holds === false ? ["bad", "bad", "Chain broken: the log was changed"] : ["plain", "ask", "Not checked"];
-    if (intact.textContent !== shown[2]) fill(intact, chip(...shown));
-    intact.title = state.log.why ?? "";
-    text(total, count(found.length, "entry", "entries"));
-    table.hidden = !found.length;
-    if (found.length) none.replaceChildren();
-    else fill(none, empty(entries.length ? "Nothing matches." : "Nothing was done yet.", h("p", {}, entries.length ? "Take another word, or show all." : "Every change and every refusal will stand here.")));
+  let entries = new Map(); // by sequence number: what was fetched under this search
+  let asked = null; // the search that they belong to
+  let more = false; // whether the station has older ones
+  let told = null; // the newest answer
+  let typing = null;
+
+  /** Fetch the newest entries, or those before a number; an answer to an earlier search counts for nothing. */
+  async function load(before = null) {
+    const words = new URLSearchParams({ limit: PAGE });
+    if (search.value.trim()) words.set("text", search.value.trim());
+    if (failed.checked) words.set("failed", "1");
+    const query = words.toString();
+    if (before !== null) words.set("before", before);
+    if (asked !== query) more = false;
+    asked = query;
+    try {
+      const answer = await get(`log?${words}`);
+      if (asked !== query) return;
+      if (entries.query !== query) {
+        entries = new Map();
+        entries.query = query;
+      }
+      if (before !== null || !entries.size) more = answer.entries.length === PAGE;
+      answer.entries.forEach((one) => entries.set(one.seq, one));
+      told = answer;
+      paint();
+    } catch (error) {
+      if (state.connection === "live") fill(none, trouble(error));
+    }
   }
 
-  const off = on("log", paint);
-  const ticking = setInterval(() => !document.hidden && state.connection === "live" && refresh("log"), EVERY);
-  refresh("log");
-  paint();
+  function paint() {
+    if (!told) return;
+    const found = [...entries.values()].sort((one, other) => other.seq - one.seq);
+    const all = !search.value.trim() && !failed.checked;
+    keyed(rows, found, (one) => one.seq, line, (element, one) => one.uuid && text(element.querySelector("a"), nameOf(state.nodes.get(one.uuid) ?? one)));
+    const shown = told.intact ? ["good", "good", "Chain intact"] : ["bad", "bad", "Chain broken: the log was altered"];
+    if (intact.textContent !== shown[2]) fill(intact, chip(...shown));
+    intact.title = told.why ?? "";
+    text(total, more ? `Newest ${count(found.length, "entry", "entries")}` : count(found.length, "entry", "entries"));
+    table.hidden = !found.length;
+    older.hidden = !more;
+    if (found.length) none.replaceChildren();
+    else fill(none, empty(all ? "The log is empty." : "No matching entries.", h("p", {}, all ? "Every change and every refusal is recorded here." : "Try another search, or clear the filter.")));
+  }
+
+  search.addEventListener("input", () => {
+    clearTimeout(typing);
+    typing = setTimeout(() => load(), TYPING);
+  });
+  failed.addEventListener("change", () => load());
+  older.hidden = table.hidden = true;
+  const offs = [on("log", () => load()), on("nodes", paint)];
+  const ticking = setInterval(() => !document.hidden && state.connection === "live" && load(), EVERY);
+  load();
   return {
     end() {
-      off();
+      offs.forEach((off) => off());
+      clearTimeout(typing);
       clearInterval(ticking);
     },
   };

@@ -23,9 +23,9 @@ class Groups {
     this.none = h("div", {});
     this.name = h("input", { type: "text", maxlength: "64", autocomplete: "off", required: true });
     this.members = h("fieldset", { class: "members" }, h("legend", {}, "Nodes"), h("div", { class: "ticks" }));
-    this.make = button("Make the group", { class: "main", onclick: () => this.make.busy(() => this.create()) }, "plus");
+    this.make = button("Create group", { class: "main", onclick: () => this.make.busy(() => this.create()) }, "plus");
     this.error = h("div", {});
-    this.fresh = h("details", { class: "panel new" }, h("summary", {}, icon("plus"), "New group"), h("div", { class: "stack" }, field("Name", this.name, "Letters, digits and _; it becomes the name of the topic."), this.members, h("div", { class: "row" }, this.make), this.error));
+    this.fresh = h("details", { class: "panel new" }, h("summary", {}, icon("plus"), "New group"), h("div", { class: "stack" }, field("Name", this.name, "Letters, digits and _; the topic gets this name."), this.members, h("div", { class: "row" }, this.make), this.error));
     this.others = h("ul", { class: "groups" });
     this.element = h("section", { class: "side-wide", "aria-label": "Groups" }, h("h3", {}, "Groups"), this.none, this.list, this.fresh, this.others);
     this.off = on("groups measurements nodes status connection", () => this.paint());
@@ -35,7 +35,7 @@ class Groups {
   paint() {
     const may = state.connection === "live" && state.status?.write !== false;
     if (state.groups.length) this.none.replaceChildren();
-    else if (!this.none.firstChild) fill(this.none, empty("No group yet.", h("p", {}, "A group is nodes that are measured together, on one time line. Open New group, name it, tick its nodes, then press Start.")));
+    else if (!this.none.firstChild) fill(this.none, empty("No groups yet.", h("p", {}, "A group is a set of nodes measured together on one time line. Open New group, enter a name, select its nodes, then press Start.")));
     keyed(this.list, state.groups, (group) => group.name, (group) => new GroupCard(group.name).element, (element, group) => element.card.paint(group, may));
     const lone = state.measurements.filter((one) => !one.group);
     keyed(this.others, lone, (one) => `${one.id}`, (one) => loneCard(one), (element, one) => element.paint(one, may));
@@ -52,7 +52,7 @@ class Groups {
     const name = this.name.value.trim();
     const uuids = [...this.members.querySelectorAll("input:checked")].map((box) => box.value);
     if (!name || !uuids.length) {
-      fill(this.error, trouble({ message: name ? "No node is ticked." : "The group has no name.", hint: name ? "Tick the nodes that are to be measured together." : "Give it a short name, such as hand." }));
+      fill(this.error, trouble({ message: name ? "Select at least one node." : "Enter a name for the group.", hint: name ? "A group is the nodes that you want to measure together." : "A short one will do, such as hand." }));
       return;
     }
     try {
@@ -60,7 +60,7 @@ class Groups {
       this.name.value = "";
       this.members.querySelectorAll("input:checked").forEach((box) => (box.checked = false));
       this.fresh.open = false;
-      say(`Group ${name} made. Press Start to measure it.`);
+      say(`Group ${name} created. Press Start to measure it.`);
       await refresh("groups", "nodes");
     } catch (error) {
       fill(this.error, trouble(error));
@@ -82,7 +82,7 @@ class GroupCard {
     this.name = name;
     this.state = h("span", {});
     this.members = h("ul", { class: "member-list" });
-    this.rate = h("input", { type: "number", min: "0.01", step: "any", inputmode: "decimal", placeholder: "datasheet's", class: "narrow" });
+    this.rate = h("input", { type: "number", min: "0.01", step: "any", inputmode: "decimal", placeholder: "default", class: "narrow" });
     this.kind = h("select", {}, h("option", { value: "periodic" }, "periodic"), h("option", { value: "event" }, "event"), h("option", { value: "free" }, "free"));
     this.trigger = h("input", { type: "checkbox" });
     this.setPoints = new SetPoints();
@@ -90,10 +90,10 @@ class GroupCard {
     this.start = button("Start", { class: "main", onclick: () => this.start.busy(() => this.go()) }, "play");
     this.stop = button("Stop", { onclick: () => this.stop.busy(() => this.halt()) }, "stop");
     this.others = h("fieldset", { class: "members" }, h("legend", {}, "Members"), h("div", { class: "ticks" }));
-    this.keep = button("Keep these members", { onclick: () => this.keep.busy(() => this.remember()) });
+    this.keep = button("Save members", { onclick: () => this.keep.busy(() => this.remember()) });
     this.drop = button("Delete group", { class: "quiet" });
     this.drop.addEventListener("click", () => this.drop.busy(() => this.away()));
-    this.more = h("details", { class: "more" }, h("summary", {}, "More"), h("div", { class: "row" }, field("Kind", this.kind), h("label", { class: "tick" }, this.trigger, h("span", {}, "Begin together, by trigger")), field("Record to", this.record, "A file in the station's record folder: .csv, .txt, .mcap, .jsonl.")), this.setPoints.element, this.others, h("div", { class: "row" }, this.keep, this.drop));
+    this.more = h("details", { class: "more" }, h("summary", {}, "More"), h("div", { class: "row" }, field("Kind", this.kind), h("label", { class: "tick" }, this.trigger, h("span", {}, "Start all nodes together (trigger)")), field("Record to", this.record, "A file name in the station's recording folder, ending in .csv, .txt, .mcap or .jsonl.")), this.setPoints.element, this.others, h("div", { class: "row" }, this.keep, this.drop));
     this.error = h("div", {});
     this.element = h("li", { class: "panel group" }, h("div", { class: "panel-head" }, h("h4", {}, name), this.state), this.members, h("div", { class: "row" }, field("Rate, Hz", this.rate), this.start, this.stop), this.more, this.error);
     this.element.card = this;
@@ -154,7 +154,7 @@ class GroupCard {
     await this.does(() => {
       requireRate(membersOf({ group: this.name }), rate);
       return post("measurements", { group: this.name, rate, kind: this.kind.value, trigger: this.trigger.checked, sinks: record ? [record] : [], ...this.setPoints.asked });
-    }, `Group ${this.name} is being measured.`);
+    }, `Group ${this.name} is now measuring.`);
   }
 
   async halt() {
@@ -162,7 +162,7 @@ class GroupCard {
   }
 
   async away() {
-    await this.does(() => remove(paths.group(this.name)), `Group ${this.name} deleted. Its nodes stay as they are.`);
+    await this.does(() => remove(paths.group(this.name)), `Group ${this.name} deleted. Its nodes are unchanged.`);
     toast("good", `Group ${this.name} deleted.`);
   }
 
@@ -235,7 +235,7 @@ class Course {
     this.plot.element.hidden = !shown.length;
     this.head.hidden = !shown.length;
     if (shown.length) this.none.replaceChildren();
-    else if (!this.none.firstChild) fill(this.none, empty("Nothing is measured.", h("p", {}, "Start a group, or press Measure at a node: the curves move here.")));
+    else if (!this.none.firstChild) fill(this.none, empty("No measurement is running.", h("p", {}, "Start a group, or open a node and press Measure, to see live values.")));
   }
 
   tick(one) {

@@ -19,7 +19,7 @@ export class NodePanel {
     this.checks = h("details", { class: "checks" }, h("summary", {}), h("ul", {}));
     this.tabs = h(
       "nav",
-      { class: "tabs", "aria-label": "Parts of this node" },
+      { class: "tabs", "aria-label": "Node views" },
       Object.entries(TABS).map(([name, [words]]) => h("a", { href: `#/nodes/${uuid}/${name}`, "data-tab": name }, words)),
     );
     this.body = h("div", { class: "tab" });
@@ -46,8 +46,8 @@ export class NodePanel {
     if (!node) return;
     text(this.title, nameOf(node));
     const [tone, sign, words, why] = verdict(node);
-    const heard = node.heard && node.heard.verdict !== node.verdict ? chip("warn", "ask", `Heard in no session: ${node.heard.verdict}`, "Anyone on the link could have said this: it changes nothing.") : null;
-    const kept = node.from === "kept" ? chip("plain", "clock", "Kept", "It has started since its datasheet was read: the rest is being read again.") : null;
+    const heard = node.heard && node.heard.verdict !== node.verdict ? chip("warn", "ask", `Not verified: ${node.heard.verdict}`, "The node sent this outside a session, where anyone on the link could have sent it. It changes nothing.") : null;
+    const kept = node.from === "kept" ? chip("plain", "clock", "Kept", "The node has restarted since its datasheet was read. The rest is being read again.") : null;
     fill(this.head, chip(tone, sign, words, why), kept, heard, node.whitelisted ? chip("plain", "list", "On the whitelist") : null, facts(node), node.why ? h("span", { class: "warn" }, icon("warn"), node.why, node.cure ? ` ${node.cure}` : "") : null);
     const checks = node.checks ?? [];
     this.checks.hidden = !checks.length && !node.fingerprint;

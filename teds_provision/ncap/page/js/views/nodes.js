@@ -13,12 +13,12 @@ const SEARCH_FROM = 7; // nodes
 const order = (one, other) => Number(other.present ?? false) - Number(one.present ?? false) || nameOf(one).localeCompare(nameOf(other));
 
 export function nodesView(main, rest) {
-  const search = h("input", { type: "search", placeholder: "Name or UUID", "aria-label": "Find a node", oninput: () => paint() });
+  const search = h("input", { type: "search", placeholder: "Name or UUID", "aria-label": "Search nodes", oninput: () => paint() });
   const total = h("p", { class: "total" });
   const list = h("ul", { class: "cards" });
   const none = h("div", {});
   const detail = h("div", { class: "detail" });
-  const side = h("section", { class: "side", "aria-label": "Nodes" }, h("div", { class: "side-head" }, h("h2", {}, "Nodes"), total), search, list, h("p", { class: "side-foot" }, h("a", { href: "#/nodes/next/provision" }, icon("nfc"), " Provision the next node that is tapped")));
+  const side = h("section", { class: "side", "aria-label": "Nodes" }, h("div", { class: "side-head" }, h("h2", {}, "Nodes"), total), search, list, h("p", { class: "side-foot" }, h("a", { href: "#/nodes/next/provision" }, icon("nfc"), " Provision the next tapped node")));
   main.append(side, none, detail);
   let panel = null;
   let next = null; // the form for whichever node is tapped next
@@ -46,7 +46,7 @@ export function nodesView(main, rest) {
     if (any || chosen[0]) none.replaceChildren();
     else if (!none.firstChild || none.dataset.loaded !== String(state.loaded)) {
       none.dataset.loaded = String(state.loaded);
-      fill(none, state.loaded ? firstSteps() : h("p", { class: "empty" }, "Asking the base station …"));
+      fill(none, state.loaded ? firstSteps() : h("p", { class: "empty" }, "Loading …"));
     }
     if (!any && state.loaded) {
       const hidden = none.querySelector("[data-strangers]");
@@ -72,7 +72,7 @@ export function nodesView(main, rest) {
     if (!node) {
       panel?.end();
       panel = null;
-      if (chosen[0] && state.loaded) fill(detail, empty("This node is not there.", h("p", {}, "Lay it on the reader, or connect it and press Discover."), h("p", {}, h("a", { href: "#/nodes" }, "All nodes"))));
+      if (chosen[0] && state.loaded) fill(detail, empty("Node not found.", h("p", {}, "Place it on the reader, or connect it and press Discover."), h("p", {}, h("a", { href: "#/nodes" }, "All nodes"))));
       else detail.replaceChildren();
       return;
     }
@@ -142,20 +142,20 @@ function card(node) {
   return h("li", { class: "card" }, h("a", { href: `#/nodes/${node.uuid}` }));
 }
 
-const strangersWords = (many) => `${count(many, "node")} answered, but not on the whitelist: lay one on the reader to take it in, or switch detection to Transparent to look at all.`;
+const strangersWords = (many) => `${count(many, "node")} answered but not on the whitelist. Place a node on the reader to add it, or switch detection to Transparent to see them all.`;
 
 function firstSteps() {
   return h(
     "section",
     { class: "first" },
-    h("h2", {}, "No node yet"),
+    h("h2", {}, "No nodes yet"),
     h("p", { class: "warn-line", "data-strangers": true, hidden: true }),
     h(
       "ol",
       {},
-      h("li", {}, icon("nfc"), h("div", {}, h("strong", {}, "Lay a node on the NFC reader."), h("p", {}, "It opens here by itself. Nothing is to be pressed. "), h("p", {}, h("a", { href: "#/nodes/next/provision" }, "Provision the next node that is tapped")))),
-      h("li", {}, icon("can"), h("div", {}, h("strong", {}, "Or connect one to the bus."), h("p", {}, "It announces itself; Discover, above, asks every link now."))),
-      h("li", {}, icon("virtual"), h("div", {}, h("strong", {}, "None at hand? "), h("a", { href: "#/virtual" }, "Make a virtual transducer"), h("p", {}, "It speaks like a board and needs no hardware."))),
+      h("li", {}, icon("nfc"), h("div", {}, h("strong", {}, "Place a node on the NFC reader."), h("p", {}, "It opens here automatically. "), h("p", {}, h("a", { href: "#/nodes/next/provision" }, "Provision the next tapped node")))),
+      h("li", {}, icon("can"), h("div", {}, h("strong", {}, "Or connect a node to the bus."), h("p", {}, "It announces itself. To look for it now, press Discover above."))),
+      h("li", {}, icon("virtual"), h("div", {}, h("strong", {}, "No node at hand? "), h("a", { href: "#/virtual" }, "Create a virtual transducer"), h("p", {}, "It behaves like a real node."))),
     ),
   );
 }

@@ -7,14 +7,14 @@ import { measuring, now, on, state } from "../state.js";
 
 const STEPS = {
   identify: "Identify",
-  whitelist: "Take in the whitelist",
+  whitelist: "Add to the whitelist",
   agree: "Agree on a key",
   build: "Build the datasheet",
   sign: "Sign",
   write: "Write",
   verify: "Read back and verify",
 };
-const RESULTS = { done: ["good", "good", "done"], skipped: ["plain", "good", "nothing to do"], running: ["busy", "clock", "at it"], failed: ["bad", "bad", "failed"] };
+const RESULTS = { done: ["good", "good", "done"], skipped: ["plain", "good", "not needed"], running: ["busy", "clock", "in progress"], failed: ["bad", "bad", "failed"] };
 
 export class ProvisionTab {
   constructor(parent, uuid) {
@@ -23,7 +23,7 @@ export class ProvisionTab {
     this.name = h("input", { type: "text", maxlength: "120", autocomplete: "off" });
     this.calibration = h("input", { type: "file", accept: ".csv,.toml,.json,.txt" });
     this.go = button("Provision", { class: "main", onclick: () => this.go.busy(() => this.start()) }, "good");
-    this.cancel = button("Do not wait any more", { onclick: () => this.cancel.busy(() => this.end_waiting()) });
+    this.cancel = button("Cancel", { onclick: () => this.cancel.busy(() => this.end_waiting()) });
     this.waiting = h("div", { class: "waiting", role: "status" });
     this.clock = h("span", { class: "figure", "aria-hidden": "true" });
     this.steps = h("ol", { class: "steps" });
@@ -35,9 +35,9 @@ export class ProvisionTab {
       h(
         "section",
         { class: "panel", "aria-label": "Provision" },
-        h(uuid === "next" ? "h2" : "h3", {}, uuid === "next" ? "Provision the next node that is tapped" : "Provision"),
-        h("p", { class: "hint" }, "Gives the node a key of this station and a signed datasheet. When a tap is needed, this page waits for it: just lay the node on the reader."),
-        h("div", { class: "row" }, field("Transducer type", this.profile), field("Name", this.name), field("Calibration (if it has one)", this.calibration)),
+        h(uuid === "next" ? "h2" : "h3", {}, uuid === "next" ? "Provision the next tapped node" : "Provision"),
+        h("p", { class: "hint" }, "Agrees on a key with the node and writes a signed datasheet. If a tap is needed, place the node on the reader when asked."),
+        h("div", { class: "row" }, field("Transducer type", this.profile), field("Name", this.name), field("Calibration file (optional)", this.calibration)),
         h("div", { class: "row" }, this.go, this.why),
         this.waiting,
         this.steps,
@@ -74,7 +74,7 @@ export class ProvisionTab {
     }
     const run = this.run;
     const busy = run?.state === "waiting" || run?.state === "running";
-    const blocked = measuring(this.uuid) ? "It is being measured: stop that first." : state.status?.write === false ? "This browser may only read." : "";
+    const blocked = measuring(this.uuid) ? "This node is being measured. Stop the measurement first." : state.status?.write === false ? "This browser has read-only access." : "";
     text(this.why, blocked);
     if (this.go.getAttribute("aria-busy") !== "true") this.go.disabled = busy || Boolean(blocked) || state.connection !== "live";
     this.follow(run);
@@ -83,8 +83,8 @@ export class ProvisionTab {
   follow(run) {
     const waits = run?.state === "waiting";
     if (waits && !this.waiting.firstChild) {
-      const words = this.uuid === "next" ? "Lay a node on the reader." : "Lay this node on the reader.";
-      fill(this.waiting, icon("nfc"), h("div", {}, h("p", { class: "lead" }, words), h("p", {}, "Waiting until ", clock(run.until), " ", this.clock)), this.cancel);
+      const words = this.uuid === "next" ? "Place a node on the reader." : "Place this node on the reader.";
+      fill(this.waiting, icon("nfc"), h("div", {}, h("p", { class: "lead" }, words), h("p", {}, "Waiting for a tap until ", clock(run.until), " ", this.clock)), this.cancel);
       say(words);
     } else if (!waits && this.waiting.firstChild) this.waiting.replaceChildren();
     keyed(this.steps, run?.steps ?? [], (step) => step.name, () => h("li", {}), (element, step) => {
@@ -98,8 +98,8 @@ export class ProvisionTab {
     if (run?.state === "done") {
       fill(this.outcome, h("p", { class: "done" }, chip("good", "good", "Provisioned"), " This node is ready. ", h("a", { href: `#/nodes/${this.uuid}/live` }, "See its values")));
       say("Provisioned.");
-    } else if (run?.state === "cancelled") fill(this.outcome, h("p", { class: "hint" }, "Nobody waits for a tap any more."));
-    else if (run?.state === "failed") fill(this.outcome, trouble(run.error ?? { message: "It failed." }));
+    } else if (run?.state === "cancelled") fill(this.outcome, h("p", { class: "hint" }, "Provisioning was cancelled."));
+    else if (run?.state === "failed") fill(this.outcome, trouble(run.error ?? { message: "Provisioning failed." }));
     else this.outcome.replaceChildren();
   }
 
@@ -112,7 +112,7 @@ export class ProvisionTab {
   async start() {
     this.outcome.replaceChildren();
     if (!this.profile.value) {
-      fill(this.outcome, trouble({ message: "No type is chosen.", hint: "Choose what this transducer is; the list comes from the profiles of this station." }));
+      fill(this.outcome, trouble({ message: "Choose a transducer type.", hint: "The list shows the profiles of this station." }));
       this.profile.focus();
       return;
     }

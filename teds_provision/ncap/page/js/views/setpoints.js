@@ -12,7 +12,7 @@ export class SetPoints {
     this.box = h("input", { type: "checkbox", checked: true });
     this.deadMan = h("input", { type: "number", min: LEAST, max: MOST, step: "1", inputmode: "numeric", class: "narrow" });
     this.hint = h("span", { class: "hint" });
-    this.element = h("div", { class: "row", role: "group", "aria-label": "Set points by topics" }, h("label", { class: "tick" }, this.box, h("span", {}, "Topics may move its actuators")), field("Dead-man, ms", this.deadMan), this.hint);
+    this.element = h("div", { class: "row", role: "group", "aria-label": "Set points from topics" }, h("label", { class: "tick" }, this.box, h("span", {}, "Allow topics to move actuators")), field("Dead-man, ms", this.deadMan), this.hint);
   }
 
   /** `one`: the measurement that runs, null where none does; `uuids`: the nodes that it is about. */
@@ -23,7 +23,7 @@ export class SetPoints {
     this.box.disabled = this.deadMan.disabled = Boolean(one) || !taken;
     if (one && taken) this.box.checked = one.actuators;
     this.deadMan.placeholder = `${one?.dead_man ?? state.status?.dead_man ?? ""}`;
-    text(this.hint, !taken ? "This station takes no set points from topics." : one ? (one.actuators ? `They are taken; without one for ${one.dead_man} ms an actuator is safe.` : "They are not taken.") : "");
+    text(this.hint, !taken ? "This station does not accept set points from topics." : one ? (one.actuators ? `Accepted. An actuator goes to its safe state ${one.dead_man} ms after the last one.` : "Not accepted in this measurement.") : "");
   }
 
   /** What POST /measurements is told; throws where the dead-man is none. */
@@ -31,7 +31,7 @@ export class SetPoints {
     const words = this.deadMan.value.trim();
     const deadMan = words === "" ? null : Number(words);
     if (!this.deadMan.validity.valid || (deadMan !== null && (!Number.isInteger(deadMan) || deadMan < LEAST || deadMan > MOST))) {
-      throw new Refusal(0, "usage", `The dead-man has to be from ${LEAST} to ${MOST} ms.`, `Leave it empty for the station's, ${state.status?.dead_man} ms.`);
+      throw new Refusal(0, "usage", `The dead-man must be between ${LEAST} and ${MOST} ms.`, `Leave it empty to use the station's default of ${state.status?.dead_man} ms.`);
     }
     return { actuators: this.box.checked, ...(deadMan === null ? {} : { dead_man: deadMan }) };
   }

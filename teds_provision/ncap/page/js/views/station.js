@@ -32,16 +32,16 @@ export function stationView(main) {
       const up = one.state === "up" || one.state === "running";
       again(element, [one.state, one.why], () => [icon(one.kind ?? "can"), h("span", { class: "grow" }, h("strong", {}, linkName(one.kind)), " ", one.name), chip(up ? "good" : "warn", up ? "good" : "warn", one.state), one.why ? h("p", { class: "hint full" }, one.why, one.hint ? ` ${one.hint}` : "") : null]);
     });
-    if (!(status.links ?? []).length && !links.firstChild) fill(links, h("li", { class: "hint" }, "No link was given to ncap run: add --can or --nfc."));
+    if (!(status.links ?? []).length && !links.firstChild) fill(links, h("li", { class: "hint" }, "No links. Start ncap run with --can, --nfc or --ble."));
     keyed(sinks, status.sinks ?? [], (one) => one.name, () => h("li", {}), (element, one) => {
       const bad = one.state === "failed";
       again(element, one, () => [h("span", { class: "grow" }, h("strong", {}, one.name), h("span", { class: "hint" }, ` ${count(one.written ?? 0, "value")} written, ${one.dropped ?? 0} dropped`)), chip(bad ? "bad" : one.dropped ? "warn" : "good", bad || one.dropped ? "warn" : "good", one.state), one.error || ((one.recorder || one.state === "waiting") && one.detail) ? h("p", { class: "hint full" }, one.error || one.detail, one.hint ? ` ${one.hint}` : "") : null]);
     });
     if ((status.sinks ?? []).length) noSink.replaceChildren();
-    else if (!noSink.firstChild) fill(noSink, empty("Values go to this page alone.", h("p", {}, "Start ncap run with --record, --ros1, --ros2 or --mqtt, or name a file when you start a group.")));
+    else if (!noSink.firstChild) fill(noSink, empty("Values are not recorded or published.", h("p", {}, "Start ncap run with --record, --ros1, --ros2 or --mqtt, or enter a file name when you start a group.")));
     about(status);
     if (state.names.length) noName.replaceChildren();
-    else if (!noName.firstChild) fill(noName, empty("No channel is published yet.", h("p", {}, "Names appear with the first node that has a datasheet.")));
+    else if (!noName.firstChild) fill(noName, empty("No channels are published yet.", h("p", {}, "Names appear once a node has a datasheet.")));
     table.hidden = !state.names.length;
     keyed(names, state.names, (one) => `${one.uuid}/${one.channel}`, nameRow, (element, one) => element.paint(one));
   }
@@ -53,9 +53,9 @@ export function stationView(main) {
       ["Fingerprint", status.station?.fingerprint ? h("code", { class: "print" }, grouped(status.station.fingerprint)) : null],
       ["Version", status.version],
       ["Running since", status.started ? clock(status.started) : null],
-      ["Clock bound", typeof status.clock_error === "number" ? `± ${short(status.clock_error * 1e6)} µs at worst` : "no node is measured"],
-      ["Messages", budget ? `${short(budget.used ?? 0)} of ${short(budget.limit ?? 0)} a second` : null],
-      ["This browser", status.write === false ? "may only read" : "may read and change"],
+      ["Clock error", typeof status.clock_error === "number" ? `± ${short(status.clock_error * 1e6)} µs at most` : "no measurement is running"],
+      ["Messages", budget ? `${short(budget.used ?? 0)} of ${short(budget.limit ?? 0)} per second` : null],
+      ["This browser", status.write === false ? "read-only" : "read and write"],
     ].filter(([, value]) => value !== null && value !== undefined);
     again(facts, rows.map(([name, value]) => [name, value?.textContent ?? value]), () => rows.map(([name, value]) => [h("dt", {}, name), h("dd", {}, value)]));
   }

@@ -17,14 +17,14 @@ export class LiveTab {
     this.table = h(
       "table",
       { class: "values" },
-      h("caption", { class: "unseen" }, "Channels and their last values"),
-      h("thead", {}, h("tr", {}, ["Channel", "Value", "", "Range", "Uncertainty", "Fastest", "Calibrated"].map((words, at) => (at === 2 ? h("td", {}) : h("th", { scope: "col", class: at === 1 ? "n" : "" }, words))))),
+      h("caption", { class: "unseen" }, "Channels and their latest values"),
+      h("thead", {}, h("tr", {}, ["Channel", "Value", "", "Range", "Uncertainty", "Max. rate", "Calibrated"].map((words, at) => (at === 2 ? h("td", {}) : h("th", { scope: "col", class: at === 1 ? "n" : "" }, words))))),
       this.rows,
     );
     this.none = h("div", {});
     this.mode = new ModePanel(uuid);
     this.actuators = h("div", { class: "actuators" });
-    this.plotBox = h("section", { class: "panel", "aria-label": "Course" });
+    this.plotBox = h("section", { class: "panel", "aria-label": "Plot" });
     this.plot = null;
     this.panels = new Map();
     parent.append(this.mode.element, h("section", { class: "panel", "aria-label": "Values" }, h("h3", {}, "Values"), h("div", { class: "scroll", tabindex: "0", role: "group", "aria-label": "Table of values" }, this.table), this.none), this.actuators, this.plotBox);
@@ -56,9 +56,9 @@ export class LiveTab {
     this.none.dataset.stranger = String(stranger);
     const [datasheet, provision] = ["datasheet", "provision"].map((tab) => `#/nodes/${this.uuid}/${tab}`);
     const words = stranger
-      ? [h("p", {}, "This station does not know this node: it is not on the whitelist, so nothing of it is opened."), h("p", {}, h("a", { class: "action", href: provision }, "Provision this node"))]
-      : [h("p", {}, "Its datasheet was not read yet, or it has none."), h("p", {}, h("a", { class: "action", href: datasheet }, "Read or write its datasheet")), h("p", {}, h("a", { href: provision }, "Provision it anew"))];
-    fill(this.none, empty(stranger ? "Not on the whitelist" : "No channels are known", words));
+      ? [h("p", {}, "This node is not on the station's whitelist, so the station does not open a session with it."), h("p", {}, h("a", { class: "action", href: provision }, "Provision this node"))]
+      : [h("p", {}, "The station has not read this node's datasheet yet, or the node has none."), h("p", {}, h("a", { class: "action", href: datasheet }, "Read or write the datasheet")), h("p", {}, h("a", { href: provision }, "Provision it again"))];
+    fill(this.none, empty(stranger ? "Not on the whitelist" : "No channels", words));
   }
 
   actuator(channel) {
@@ -73,7 +73,7 @@ export class LiveTab {
     if (!running) {
       this.plot?.end();
       this.plot = null;
-      fill(this.plotBox, h("h3", {}, "Course"), h("p", { class: "hint" }, "Press Measure above: the curves move here."));
+      fill(this.plotBox, h("h3", {}, "Plot"), h("p", { class: "hint" }, "Press Measure to see live values."));
       return;
     }
     const shown = channels.slice(0, MOVING).map((channel) => ({ uuid: this.uuid, number: channel.number, label: channelName(channel), unit: channel.unit ?? "", uncertainty: channel.uncertainty, problem: channel.problem }));
@@ -97,7 +97,7 @@ export class LiveTab {
       if (channel.kind === "actuator") {
         const told = channel.actuator;
         const set = told?.safe === false;
-        text(figure, set ? number(told.value, channel.uncertainty) : told?.safe === true ? "safe state" : "not moved");
+        text(figure, set ? number(told.value, channel.uncertainty) : told?.safe === true ? "safe state" : "not set");
         if (unit) unit.hidden = !set;
         element.classList.toggle("actuator-row", true);
         if (bar) bar.value = told?.safe === false ? told.value : channel.low;
@@ -147,7 +147,7 @@ function facts(element, channel) {
     h("td", { class: "within" }, bar, old),
     h("td", { "data-label": "Range" }, range(channel)),
     h("td", { "data-label": "Uncertainty" }, typeof channel.uncertainty === "number" ? `± ${short(channel.uncertainty)}${channel.unit ? ` ${channel.unit}` : ""}` : "not stated"),
-    h("td", { "data-label": "Fastest" }, channel.kind === "actuator" ? "by set point" : hertz(channel.rate)),
+    h("td", { "data-label": "Max. rate" }, channel.kind === "actuator" ? "by set point" : hertz(channel.rate)),
     h("td", { "data-label": "Calibrated" }, calibrated(channel)),
   );
 }
@@ -159,7 +159,7 @@ function calibrated(channel) {
 }
 
 /** Title of a plot with its window and a pause. */
-export function plotHead(plot, tag, title = "Course") {
+export function plotHead(plot, tag, title = "Plot") {
   const windows = h("div", { class: "switch", role: "group", "aria-label": "Time shown" });
   const show = (seconds) => {
     plot.window = seconds;
@@ -173,7 +173,7 @@ export function plotHead(plot, tag, title = "Course") {
       const yes = plot.paused === null;
       plot.pause(yes);
       pause.setAttribute("aria-pressed", String(yes));
-      text(pause.lastChild, yes ? "Go on" : "Pause");
+      text(pause.lastChild, yes ? "Resume" : "Pause");
     },
   });
   return h("div", { class: "panel-head" }, h(tag, {}, title), windows, pause);
@@ -183,13 +183,13 @@ export function plotHead(plot, tag, title = "Course") {
 class ModePanel {
   constructor(uuid) {
     this.uuid = uuid;
-    this.rate = h("input", { type: "number", min: "0.01", step: "any", inputmode: "decimal", placeholder: "datasheet's", class: "narrow" });
+    this.rate = h("input", { type: "number", min: "0.01", step: "any", inputmode: "decimal", placeholder: "default", class: "narrow" });
     this.idle = button("Idle", { onclick: () => this.idle.busy(() => this.stop()) }, "stop");
     this.run = button("Measure", { onclick: () => this.run.busy(() => this.start()) }, "play");
     this.state = h("p", { class: "state" });
     this.setPoints = new SetPoints();
     this.error = h("div", {});
-    const both = h("div", { class: "switch", role: "group", "aria-label": "What this node does" }, this.idle, this.run);
+    const both = h("div", { class: "switch", role: "group", "aria-label": "Mode" }, this.idle, this.run);
     this.element = h("section", { class: "panel mode", "aria-label": "Configure" }, h("div", { class: "row" }, h("h3", {}, "Configure"), both, field("Rate, Hz", this.rate), this.state), this.setPoints.element, this.error);
     this.off = on("status connection measurements", () => this.paint());
   }
@@ -213,8 +213,8 @@ class ModePanel {
     const stranger = node?.whitelisted === false;
     this.setPoints.paint([this.uuid], one);
     if (!one && stranger) fill(this.state, "Not on the whitelist: ", h("a", { href: `#/nodes/${this.uuid}/provision` }, "provision it first"), ".");
-    else if (!one) fill(this.state, sensors ? "Idle." : "No sensor to measure.");
-    else if (one.group) fill(this.state, "Measured with group ", h("a", { href: "#/measure" }, one.group), ": stop it there.");
+    else if (!one) fill(this.state, sensors ? "Idle." : "This node has no sensors to measure.");
+    else if (one.group) fill(this.state, "Measured as part of group ", h("a", { href: "#/measure" }, one.group), ". Stop it there.");
     else fill(this.state, told(one, this.uuid));
   }
 
@@ -250,18 +250,18 @@ class ModePanel {
 /** Raise where the datasheets say that a sensor is slower: it would only wait for ever. */
 export function requireRate(uuids, rate) {
   if (rate === null) return;
-  if (!(rate > 0)) throw new Refusal(0, "usage", "The rate is no number above 0.", "Give it in hertz, or leave it empty: then it is the datasheet's.");
+  if (!(rate > 0)) throw new Refusal(0, "usage", "Enter a rate above 0 Hz.", "Or leave it empty to use the rate in the datasheet.");
   for (const uuid of uuids) {
     const node = state.nodes.get(uuid);
     const slow = (node?.channels ?? []).find((channel) => channel.kind === "sensor" && channel.rate && channel.rate < rate * (1 - 1e-6));
-    if (slow) throw new Refusal(0, "refused", `${channelName(slow)} of ${nameOf(node)} gives at most ${hertz(slow.rate)}.`, "Take a lower rate, or leave it empty: then each has its datasheet's.");
+    if (slow) throw new Refusal(0, "refused", `${channelName(slow)} of ${nameOf(node)} supports at most ${hertz(slow.rate)}.`, "Enter a lower rate, or leave it empty to use the rate in each datasheet.");
   }
 }
 
 /** Why values are not valid, the most frequent reasons first. */
 function invalid(node) {
   const most = [...(node.invalid_why ?? [])].sort((one, other) => other.count - one.count).slice(0, 3);
-  return most.map((one) => `channel ${one.channel}: ${one.why}`).join("; ") || "the station does not say why";
+  return most.map((one) => `channel ${one.channel}: ${one.why}`).join("; ") || "no reason given";
 }
 
 /** How a node of a measurement fares, in words. */

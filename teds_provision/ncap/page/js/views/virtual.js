@@ -12,19 +12,19 @@ export function virtualView(main) {
   const file = h("input", { type: "file", accept: ".xml,.json,application/xml,application/json" });
   const name = h("input", { type: "text", maxlength: "120", autocomplete: "off" });
   const source = h("select", {}, h("option", { value: "sine:5" }, "Sine, 5 s"), h("option", { value: "ramp:5" }, "Ramp, 5 s"), h("option", { value: "noise" }, "Noise"));
-  const make = button("Make it", { class: "main", onclick: () => make.busy(create) }, "plus");
+  const make = button("Create", { class: "main", onclick: () => make.busy(create) }, "plus");
   const error = h("div", {});
   main.append(
     h("h2", { class: "view-title" }, "Virtual transducers"),
-    h("p", { class: "hint intro" }, "Nodes in software with a key and a UUID of their own. They speak like boards: same commands, same checks."),
+    h("p", { class: "hint intro" }, "Nodes in software with a key and a UUID of their own. They behave like real nodes: same commands, same checks."),
     h(
       "div",
       { class: "columns" },
       h(
         "section",
-        { class: "panel side-wide", "aria-label": "Make a virtual transducer" },
-        h("h3", {}, "Make one"),
-        h("div", { class: "stack" }, field("Transducer type", type), field("or a datasheet file, XML or JSON", file), field("Name", name), field("Where its values come from", source), h("div", { class: "row" }, make), error),
+        { class: "panel side-wide", "aria-label": "Create a virtual transducer" },
+        h("h3", {}, "Create one"),
+        h("div", { class: "stack" }, field("Transducer type", type), field("Or a datasheet file (XML or JSON)", file), field("Name", name), field("Value source", source), h("div", { class: "row" }, make), error),
       ),
       h("section", { class: "wide", "aria-label": "Virtual transducers" }, none, list),
     ),
@@ -42,14 +42,14 @@ export function virtualView(main) {
     if (make.getAttribute("aria-busy") !== "true") make.disabled = !may;
     keyed(list, state.virtual, (one) => one.uuid, card, (element, one) => element.paint(one, may));
     if (state.virtual.length) none.replaceChildren();
-    else if (!none.firstChild) fill(none, empty("No virtual transducer yet.", h("p", {}, "Choose a type on this page and press Make it: it shows up under Nodes like a board.")));
+    else if (!none.firstChild) fill(none, empty("No virtual transducers yet.", h("p", {}, "Choose a type on this page and press Create. It appears under Nodes like a real node.")));
   }
 
   async function create() {
     error.replaceChildren();
     const chosen = file.files[0];
     if (!chosen && !type.value) {
-      fill(error, trouble({ message: "It needs a datasheet.", hint: "Choose a transducer type, or a datasheet file." }));
+      fill(error, trouble({ message: "A virtual transducer needs a datasheet.", hint: "Choose a transducer type, or a datasheet file." }));
       return;
     }
     try {
@@ -60,8 +60,8 @@ export function virtualView(main) {
       } else body.profile = type.value;
       const made = await post("virtual", body);
       file.value = name.value = "";
-      say(`Virtual transducer ${made.name ?? ""} made.`);
-      fill(error, h("p", { class: "done" }, chip("good", "good", "Made"), " ", h("a", { href: `#/nodes/${made.uuid}` }, nameOf(made))));
+      say(`Virtual transducer ${made.name ?? ""} created.`);
+      fill(error, h("p", { class: "done" }, chip("good", "good", "Created"), " ", h("a", { href: `#/nodes/${made.uuid}` }, nameOf(made))));
       await refresh("virtual", "nodes");
     } catch (refusal) {
       fill(error, trouble(refusal));
@@ -84,7 +84,7 @@ function card(one) {
   drop.addEventListener("click", () => {
     if (!sure) {
       sure = true; // its key goes with it, so this is asked twice
-      text(drop.lastChild, "Remove it and its key?");
+      text(drop.lastChild, "Delete this transducer and its key?");
       setTimeout(() => {
         sure = false;
         text(drop.lastChild, "Remove");
@@ -104,7 +104,7 @@ function card(one) {
   element.paint = (now, may) => {
     text(open, nameOf(now));
     const channels = Array.isArray(now.channels) ? now.channels.length : now.channels;
-    text(facts, [`source ${now.source ?? "not known"}`, typeof channels === "number" ? count(channels, "channel") : null, now.state, now.uuid].filter(Boolean).join(" · "));
+    text(facts, [`source ${now.source ?? "unknown"}`, typeof channels === "number" ? count(channels, "channel") : null, now.state, now.uuid].filter(Boolean).join(" · "));
     if (drop.getAttribute("aria-busy") !== "true") drop.disabled = !may;
   };
   return element;

@@ -32,7 +32,7 @@ export class WritePanel {
       "section",
       { class: "panel", "aria-label": "Write a datasheet" },
       h("h3", {}, "Write a datasheet"),
-      h("p", { class: "hint" }, "Nothing is written before you saw what changes."),
+      h("p", { class: "hint" }, "You will see the changes before anything is written."),
       this.file,
       this.drop,
       this.frozen,
@@ -49,7 +49,7 @@ export class WritePanel {
 
   paint() {
     const one = measuring(this.uuid);
-    const blocked = one ? `It is being measured${one.group ? ` with group ${one.group}` : ""}: stop that first, its datasheet is frozen.` : state.status?.write === false ? "This browser may only read." : "";
+    const blocked = one ? `This node is being measured${one.group ? ` in group ${one.group}` : ""}. Stop the measurement first: until then its datasheet is frozen.` : state.status?.write === false ? "This browser has read-only access." : "";
     this.frozen.textContent = blocked;
     this.file.disabled = Boolean(blocked) || state.connection !== "live";
     this.drop.classList.toggle("off", this.file.disabled);
@@ -60,7 +60,7 @@ export class WritePanel {
     this.file.value = "";
     if (!file || this.file.disabled) return;
     if (file.size > LARGEST) {
-      fill(this.result, trouble({ message: `${file.name} has ${file.size} octets: too large for a datasheet.`, hint: "Choose the XML or JSON file of one node." }));
+      fill(this.result, trouble({ message: `${file.name} is too large for a datasheet (${file.size} bytes).`, hint: "Choose the XML or JSON datasheet of one node." }));
       return;
     }
     const content = await file.text();
@@ -68,7 +68,7 @@ export class WritePanel {
   }
 
   async compare(name, body) {
-    fill(this.result, h("p", { class: "busy-line" }, `Comparing ${name} with what the node has …`));
+    fill(this.result, h("p", { class: "busy-line" }, `Comparing ${name} with the node's datasheet …`));
     try {
       const plan = await change(`${paths.teds(this.uuid)}?dry_run=1`, body, { signal: this.leaving.signal });
       this.plan(name, body, plan);
@@ -82,9 +82,9 @@ export class WritePanel {
   /** A calibration that looks wrong is written only with a reason, which goes into the log. */
   unlikely(name, body, error) {
     const reason = h("input", { type: "text", maxlength: "200", autocomplete: "off" });
-    const again = button("It is right: compare again", {}, "ask");
+    const again = button("Accept and compare again", {}, "ask");
     again.addEventListener("click", () => reason.value.trim() && this.compare(name, { ...body, accept_calibration: reason.value.trim() }));
-    fill(this.result, trouble({ message: error.message, hint: "Mend the file. Or, if it is right, say why: that goes into the log." }), h("div", { class: "row" }, field("Why it is right", reason), again));
+    fill(this.result, trouble({ message: error.message, hint: "Fix the file, or give a reason to accept it. The reason goes into the log." }), h("div", { class: "row" }, field("Reason to accept it", reason), again));
   }
 
   plan(name, body, plan) {
@@ -93,15 +93,15 @@ export class WritePanel {
     const guard = plan.guard ?? [];
     this.go = button(`Sign and write to ${nameOf(node)}`, { class: "main" }, "good");
     this.go.addEventListener("click", () => this.go.busy(() => this.carry(body)));
-    const no = button("Leave it as it is", { onclick: () => this.clear() });
+    const no = button("Cancel", { onclick: () => this.clear() });
     fill(
       this.result,
       h("h4", {}, changes.length ? `${name}: ${count(changes.length, "change")}` : `${name}: nothing to change`),
       guard.length ? h("ul", { class: "guard" }, guard.map((one) => h("li", {}, chip(one.severity === "error" ? "bad" : "warn", "warn", one.severity ?? "warning"), h("span", {}, one.message, one.hint ? h("span", { class: "hint" }, ` ${one.hint}`) : null)))) : null,
-      changes.length ? this.table(changes, node) : h("p", {}, "The node has this datasheet already."),
+      changes.length ? this.table(changes, node) : h("p", {}, "The node already has this datasheet."),
       changes.length ? h("div", { class: "row" }, this.go, no) : h("div", { class: "row" }, no),
     );
-    say(changes.length ? `${count(changes.length, "change")} to look at.` : "Nothing to change.");
+    say(changes.length ? `${count(changes.length, "change")} to review.` : "Nothing to change.");
     this.paint();
   }
 
