@@ -25,7 +25,7 @@ from teds_provision.protocol.keys import fingerprint
 from teds_provision.station.node_keys import RESTORED
 from teds_provision.station.station import Station
 from teds_provision.store import Store, StoreLock
-from teds_provision.store.home import has_store
+from teds_provision.store.database import has_store
 from teds_provision.store.snapshot import Relation, is_damage, place, relation, set_aside, totals
 from teds_provision.vault import Ask, Vault, asked_first, create_vault, open_vault
 from teds_provision.vault.passphrase import PRODUCT, Costs
@@ -208,19 +208,11 @@ def complete_vault(store: Store, content: Content, ask: Ask, *, keystore: str | 
     return vault
 
 
-def merge_sealed(store: Store, content: Content, vault: Vault, ask: Ask) -> Restored:
-    """Merge, and seal what a backup of version 0.1 brought without seals: that one is signed by this very station.
-
-    A store in which another program changed something gets no seal for anything that came. Raises as :func:`merge`.
-    """
-    station = Station(store, ask)
+def merge_checked(store: Store, content: Content, vault: Vault, ask: Ask) -> Restored:
+    """Merge into a store whose own key and CA are as this station sealed them; raises StoreChanged, and as merge()."""
     with store.transaction():
-        station.adopt(vault)
-        whole = not any(station.seals.all_broken())
-        done = merge(store, content, dry_run=False)
-        if whole:
-            station.seals.seal_what_has_none()
-    return done
+        Station(store, ask).adopt(vault)
+        return merge(store, content, dry_run=False)
 
 
 def merge(store: Store, content: Content, *, dry_run: bool) -> Restored:

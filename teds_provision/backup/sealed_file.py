@@ -25,8 +25,8 @@ from teds_provision.files import open_to_read
 from teds_provision.protocol.handover import jose
 from teds_provision.protocol.handover.strict_json import dump, load_object
 from teds_provision.protocol.keys import SIGNATURE_OCTETS, PrivateKey, fingerprint, verify
+from teds_provision.store.connection import too_old
 from teds_provision.store.dump import load as load_rows
-from teds_provision.store.failures import too_old
 from teds_provision.vault import passphrase as sealing
 
 FORMAT: Final = "teds-backup/2"

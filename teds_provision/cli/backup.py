@@ -185,7 +185,7 @@ def _merge(app: App, store: Store, content: Content, keystore: str | None, *, ye
                     hint="Run it again, and look at the new list.",
                 )
             vault = backup_room.restore.complete_vault(store, content, known, keystore=keystore)
-            return backup_room.restore.merge_sealed(store, content, vault, known)
+            return backup_room.restore.merge_checked(store, content, vault, known)
 
     backup_room.restore.open_vault_of(store, app.ask_secret)
     done = vault_room.asked_first(app.ask_secret, work)

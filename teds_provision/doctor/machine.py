@@ -16,7 +16,7 @@ from teds_provision import vault
 from teds_provision.doctor.registry import Finding, Place, check
 from teds_provision.errors import StoreFailure
 from teds_provision.lazy import install_command
-from teds_provision.store.home import has_store
+from teds_provision.store.database import has_store
 
 _MIN_PYTHON: Final = (3, 11)
 _LIBRARIES: Final = {

@@ -16,7 +16,7 @@ from teds_provision.doctor.registry import Finding, Place, check
 from teds_provision.errors import NoKeyring, NotFound, StoreFailure, VaultFailure
 from teds_provision.files import open_to_read
 from teds_provision.store import Choice, Store
-from teds_provision.store.home import has_store
+from teds_provision.store.database import has_store
 from teds_provision.store.lock import holder_of
 from teds_provision.vault.agent import asking
 

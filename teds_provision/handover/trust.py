@@ -16,7 +16,7 @@ from teds_provision.protocol.handover.strict_json import decode_base64url, dump,
 from teds_provision.protocol.keys import PrivateKey, SoftwareKey, fingerprint, from_pem, station_key_message, verify
 from teds_provision.station.station import Station
 from teds_provision.store import Store, StoreLock, TrustRecord
-from teds_provision.store.home import has_store
+from teds_provision.store.database import has_store
 from teds_provision.store.records import TrustRole
 
 if TYPE_CHECKING:

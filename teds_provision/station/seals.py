@@ -5,8 +5,7 @@ under a key of 32 octets that the vault wraps. A seal binds a row's kind and val
 the station's own facts and the trusted keys are looked at; a pin, or the CA of a node, when it is used; everything by
 ``doctor``. What fails is named and not believed.
 
-Not promised: a row that this station once sealed and removed since can be put back, and a row can be removed. A store
-of version 0.1 has no seals; its rows are taken over once, told in a line and in the audit log.
+Not promised: a row that this station once sealed and removed since can be put back, and a row can be removed.
 """
 
 from __future__ import annotations
@@ -18,7 +17,7 @@ from dataclasses import replace
 from typing import TYPE_CHECKING
 
 from teds_provision.errors import StoreChanged
-from teds_provision.store import Facts, NodeRecord, Shown, Store, TrustRecord, WhitelistEntry, utc_now
+from teds_provision.store import Facts, NodeRecord, Shown, Store, TrustRecord, WhitelistEntry
 
 if TYPE_CHECKING:
     from teds_provision.vault import Vault
@@ -144,19 +143,16 @@ class Seals:
     # -- when the vault opens --------------------------------------------------------------------------------------
 
     def unlocked(self, vault: Vault) -> None:
-        """The vault has opened: look at the station's own facts and at trust, or take over a store of version 0.1.
+        """The vault has opened: look at the station's own facts and at trust.
 
         Raises StoreChanged where the station's own key or CA is not what this station sealed, VaultFailure.
         """
         facts = self._store.facts()
         if facts is None:
             return
-        if facts.seal_key is None:
-            if self._store.frozen is None:
-                self._take_over(facts, vault)
-            return  # a store of version 0.1 on a disk that takes nothing: it is read as that version read it
-        self._keyed = _keyed(vault.unwrap(facts.seal_key, context=self._context()))
-        if not self._holds(facts.mac, "station", _facts(facts)):
+        if facts.seal_key is not None:
+            self._keyed = _keyed(vault.unwrap(facts.seal_key, context=self._context()))
+        if facts.seal_key is None or not self._holds(facts.mac, "station", _facts(facts)):
             raise changed(
                 ["the station's own key or CA"],
                 "Move store.sqlite3 away, then restore a backup: teds-provision restore FILE",
@@ -174,47 +170,6 @@ class Seals:
         strange = [name for name, mac, kind, values in self._decisions() if not self._holds(mac, kind, values)]
         if strange:
             self._tell(f"Another program than this one noted {', '.join(strange[:_SHOWN])}: it does not count.")
-
-    def _take_over(self, facts: Facts, vault: Vault) -> None:
-        key = os.urandom(_KEY_OCTETS)
-        wrapped = vault.wrap(key, context=self._context())
-        self._keyed = _keyed(key)
-        with self._store.transaction():
-            self._store.put_facts(self.facts(replace(facts, seal_key=wrapped, taken_over=utc_now())))
-            counts = self.seal_what_has_none()
-            self._store.audit.append("seal", None, "taken over", counts)
-        names = ", ".join(record.name for record in self._store.trusted()) or "nobody"
-        self._tell(
-            f"This store is of version 0.1: {counts['whitelist']} whitelist entries, {counts['nodes']} keys of nodes"
-            f" and trust in {names} are taken over as they are, and sealed from now on. Look through them once:"
-            " whitelist list, trust list."
-        )
-
-    def seal_what_has_none(self) -> dict[str, int]:
-        """Seal every row without a seal, as it is; returns how many of each kind. For what version 0.1 wrote."""
-        trust = self._seal_trust()
-        entries = [self.entry(entry) for entry in self._store.whitelist() if entry.mac is None]
-        nodes = [node for node in self._store.nodes() if node.point is not None and node.point_mac is None]
-        self._store.put_seals(
-            {entry.uuid: entry.mac for entry in entries},
-            {node.uuid: self._mac("node", (node.uuid, node.point)) for node in nodes},
-        )
-        return {"trust": trust, "whitelist": len(entries), "nodes": len(nodes), "cas": self._seal_cas()}
-
-    def _seal_trust(self) -> int:
-        unsealed = [record for record in self._store.trusted() if record.mac is None]
-        for record in unsealed:
-            self._store.put_trust(self.trust(record))
-        return len(unsealed)
-
-    def _seal_cas(self) -> int:
-        marks = {
-            uuid: replace(mark, ca_mac=self.ca(uuid, mark.ca))
-            for uuid, mark in self._store.all_marks().items()
-            if mark.ca is not None and mark.ca_mac is None
-        }
-        self._store.put_marks(marks)
-        return len(marks)
 
     def rewrap(self, vault: Vault) -> None:
         """Wrap the seal key under the vault's newest master key; the seals stay as they are."""
@@ -253,7 +208,8 @@ def _keyed(key: bytes) -> hmac.HMAC:
 
 
 def _facts(facts: Facts) -> _Values:
-    return (facts.requested, facts.point, facts.ca, facts.signature, facts.taken_over)
+    # The last is the column taken_over, which is no longer written: seals that were made over it go on holding.
+    return (facts.requested, facts.point, facts.ca, facts.signature, None)
 
 
 def _entry(entry: WhitelistEntry) -> _Values:

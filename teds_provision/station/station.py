@@ -38,8 +38,8 @@ from teds_provision.station.pins import Pins
 from teds_provision.station.policy import Policy
 from teds_provision.station.seals import Seals
 from teds_provision.store import AuditLog, NodeTurn, Store, StoreLock
+from teds_provision.store.database import has_store
 from teds_provision.store.dump import dump
-from teds_provision.store.home import has_store
 
 if TYPE_CHECKING:
     from teds_provision.protocol import agreement, keys

@@ -28,7 +28,7 @@ if TYPE_CHECKING:
         utc_now,
     )
     from teds_provision.store.store import Store
-    from teds_provision.store.tables.batches import Batch, pages
+    from teds_provision.store.tables.nodes import Batch, pages
     from teds_provision.store.tables.overview import Known, Search
 else:
     __getattr__ = lazy(
@@ -36,11 +36,11 @@ else:
         {
             "audit": "AuditEntry AuditLog AuditVerdict Choice is_failure",
             "lock": "NodeTurn StoreLock",
-            "records": "DatasheetRecord Draft Facts Group Handed Handover Holder KeyRecord Marks Measurement NodeRecord"
-            " Reading Revocation Shown Tombstone TrustRecord WhitelistEntry utc_now",
+            "records": "DatasheetRecord Draft Facts Group Handed Handover Holder KeyRecord Marks"
+            " Measurement NodeRecord Reading Revocation Shown Tombstone TrustRecord WhitelistEntry utc_now",
             "store": "Store",
-            "tables.batches": "Batch pages",
             "tables.overview": "Known Search",
+            "tables.nodes": "Batch pages",
         },
     )
 

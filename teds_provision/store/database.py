@@ -6,24 +6,90 @@ come later, and a process killed at any instant leaves the last commit. ``secure
 
 from __future__ import annotations
 
+import os
+import shutil
+import stat
+import tempfile
 import time
 from collections.abc import Callable, Iterator, Sequence, Sized
 from contextlib import suppress
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, Any, Final, TypeVar
 
 from teds_provision.errors import StoreFailure, StoreLocked
 from teds_provision.lazy import late
-from teds_provision.store.connection import QUIET_SECONDS, WAITING, Connection
-from teds_provision.store.failures import BUSY_SECONDS, as_store_failure, is_no_place_to_write, too_old
-from teds_provision.store.frozen import open_copy
-from teds_provision.store.home import FILE_NAME, prepare_file, prepare_home
-from teds_provision.store.schema import APPLICATION_ID, OLDEST_SCHEMA, SCHEMA_VERSION, STEPS_TO
+from teds_provision.store.connection import (
+    BUSY_SECONDS,
+    QUIET_SECONDS,
+    WAITING,
+    Connection,
+    as_store_failure,
+    is_no_place_to_write,
+    too_old,
+)
+from teds_provision.store.schema import APPLICATION_ID, OLDEST_SCHEMA, SCHEMA_VERSION, statements
 
 if TYPE_CHECKING:
     import sqlite3
 else:  # loaded with the first store: --help does not wait for it
     sqlite3 = late("sqlite3")
+
+
+# Before SQLite opens anything in the home of a station: who owns it, who may write, and what lies there.
+
+FILE_NAME: Final = "store.sqlite3"
+
+
+def has_store(home: Path) -> bool:
+    """Whether a store lies here, usable or not."""
+    return (home / FILE_NAME).exists()
+
+
+def prepare_home(home: Path, *, create: bool) -> None:
+    """Make the directory with mode 0700; refuse one in which others may write."""
+    if create:
+        home.parent.mkdir(parents=True, exist_ok=True)
+        with suppress(FileExistsError):
+            home.mkdir(mode=0o700)
+            home.chmod(0o700)  # whatever the umask said
+    try:
+        status = home.stat()
+    except FileNotFoundError:
+        raise StoreFailure(f"There is no store in {home}.", hint="Run teds-provision init.") from None
+    if not stat.S_ISDIR(status.st_mode):
+        raise StoreFailure(f"{home} is not a directory.", hint="Choose another --home.")
+    if status.st_uid != os.geteuid():
+        raise StoreFailure(f"{home} belongs to another user.", hint="Run this as its owner, or choose another --home.")
+    private = not status.st_mode & 0o077
+    if create and not private and not any(home.iterdir()):
+        home.chmod(0o700)
+    elif status.st_mode & 0o022:
+        raise StoreFailure(f"Others may write in {home}.", hint=f"Run: chmod 700 {home}, or choose another --home.")
+
+
+def prepare_file(path: Path, *, create: bool) -> None:
+    """Make the file with mode 0600 before SQLite would make it wider; its -wal and -shm follow its mode."""
+    if create:
+        with suppress(FileExistsError):
+            os.close(os.open(path, os.O_CREAT | os.O_EXCL | os.O_RDWR | os.O_NOFOLLOW, 0o600))
+    for file in (path, path.with_name(path.name + "-wal"), path.with_name(path.name + "-shm")):
+        _require_own(file)
+    if not path.exists():
+        raise StoreFailure(f"There is no store in {path.parent}.", hint="Run teds-provision init.")
+    if path.stat().st_mode & 0o077:
+        with suppress(OSError):  # a disk that is read-only: what is read stays as open as it was
+            path.chmod(0o600)
+
+
+def _require_own(file: Path) -> None:
+    """Refuse a link, or another user's file, in the place of the store: somebody put it there."""
+    try:
+        status = file.lstat()
+    except FileNotFoundError:
+        return
+    if not stat.S_ISREG(status.st_mode) or status.st_uid != os.geteuid():
+        what = "a link" if stat.S_ISLNK(status.st_mode) else "not this user's own file"
+        raise StoreFailure(f"{file} is {what}.", hint="Somebody put it there: look at it, and move it away.")
 
 
 PAGE = 500
@@ -173,18 +239,14 @@ class Database(Connection):
             self.execute(f"PRAGMA {pragma}")
         version = self._check_version(create=create)
         if version < SCHEMA_VERSION:
-            try:
-                self._bring_forward()
-            except ValueError as error:  # a value of an old schema that this tool never wrote
-                raise self._damaged() from error
+            self._bring_forward()
 
     def _bring_forward(self) -> None:
         """Make the tables of the present schema out of what is there, or out of nothing, all or none of them."""
         with self.transaction(), self._translated():
             before = self._version()  # another process may have been first
-            for step in range(before + 1, SCHEMA_VERSION + 1):
-                for statement in STEPS_TO[step]:
-                    self.execute(statement)
+            for statement in statements(before):
+                self.execute(statement)
             self.execute(f"PRAGMA application_id={APPLICATION_ID}")
             self.execute(f"PRAGMA user_version={SCHEMA_VERSION}")
 
@@ -214,3 +276,55 @@ class Database(Connection):
                 hint="Use the newer version of teds-provision that made it.",
             )
         return int(version)
+
+
+# A disk that is full or read-only must not hide what is known. SQLite needs a writable folder for the shared memory of
+# a write-ahead log, and without the log the newest entries would be missing. So both files are copied to where there is
+# room (memory first), brought together there, and opened without a name: nothing of the copy is left when the process
+# ends, however it ends.
+
+_LOG = "-wal"
+
+
+def open_copy(path: Path) -> sqlite3.Connection:
+    """Return a connection to a private copy of the database with its log; raises OSError, sqlite3.Error."""
+    last: OSError | None = None
+    for place in _places():
+        try:
+            folder = Path(tempfile.mkdtemp(prefix="teds-provision-", dir=place))
+        except OSError as error:
+            last = error
+            continue
+        try:
+            return _copied(path, folder)
+        except OSError as error:  # not enough room here either
+            last = error
+        finally:
+            shutil.rmtree(folder, ignore_errors=True)
+    raise last or OSError(f"There is no place for a copy of {path}.")
+
+
+def _places() -> Iterator[str]:
+    yield "/dev/shm"
+    runtime = os.environ.get("XDG_RUNTIME_DIR")
+    if runtime:
+        yield runtime
+    with suppress(OSError):
+        yield tempfile.gettempdir()
+
+
+def _copied(path: Path, folder: Path) -> sqlite3.Connection:
+    copy = folder / path.name
+    shutil.copyfile(path, copy)
+    log = path.with_name(path.name + _LOG)
+    with suppress(FileNotFoundError):
+        shutil.copyfile(log, copy.with_name(copy.name + _LOG))
+    connection = sqlite3.connect(copy, isolation_level=None, check_same_thread=False)
+    try:
+        connection.execute("PRAGMA locking_mode=EXCLUSIVE")  # no shared memory, so no third file
+        connection.execute("PRAGMA journal_mode=MEMORY")  # takes what stood in the log into the file
+        connection.execute("SELECT count(*) FROM sqlite_schema").fetchone()
+    except BaseException:
+        connection.close()
+        raise
+    return connection

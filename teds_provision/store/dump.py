@@ -16,9 +16,9 @@ from typing import TYPE_CHECKING, Any, Final, Protocol
 
 from teds_provision.errors import BadData, StoreFailure
 from teds_provision.lazy import late
+from teds_provision.store.connection import too_old
 from teds_provision.store.database import PAGE, places
-from teds_provision.store.failures import too_old
-from teds_provision.store.schema import APPLICATION_ID, OLDEST_SCHEMA, SCHEMA_VERSION, STEPS_TO
+from teds_provision.store.schema import APPLICATION_ID, OLDEST_SCHEMA, SCHEMA_VERSION, statements
 from teds_provision.store.store import Store
 
 if TYPE_CHECKING:
@@ -107,9 +107,8 @@ def _tables(connection: sqlite3.Connection) -> dict[str, list[str]]:
 def _fill(connection: sqlite3.Connection, source: RowSource) -> None:
     version, tables = _head(source)
     connection.execute("BEGIN")
-    for step in range(1, version + 1):
-        for statement in STEPS_TO[step]:
-            connection.execute(statement)
+    for statement in statements(0, version):
+        connection.execute(statement)
     known = _tables(connection)
     for table, columns in tables.items():
         if known.get(table) != columns:

@@ -23,7 +23,7 @@ from types import TracebackType
 from typing import Self
 
 from teds_provision.errors import NodeBusy, StoreLocked
-from teds_provision.store.failures import as_store_failure
+from teds_provision.store.connection import as_store_failure
 from teds_provision.store.records import utc_now
 
 FILE_NAME = "store.lock"

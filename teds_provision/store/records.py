@@ -205,8 +205,7 @@ class Facts:
 
     ``requested`` is the point for which a certificate was asked; ``point``, ``ca`` and ``signature`` come together when
     init is complete. ``master`` is the number of the master key that wraps link keys, ``rewrapping`` the one that they
-    are being wrapped under anew. ``seal_key`` (wrapped by the vault) makes the MACs of rows; ``taken_over`` says when
-    rows of a store of version 1 got theirs.
+    are being wrapped under anew. ``seal_key`` (wrapped by the vault) makes the MACs of rows.
     """
 
     name: str
@@ -219,7 +218,6 @@ class Facts:
     master: int = 1
     rewrapping: int | None = None
     seal_key: bytes | None = field(default=None, repr=False)
-    taken_over: str | None = None
     mac: bytes | None = field(default=None, repr=False, compare=False)
 
 

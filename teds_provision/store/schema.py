@@ -1,7 +1,8 @@
-"""The tables of ``store.sqlite3``, by schema version.
+"""The tables of ``store.sqlite3``.
 
-``PRAGMA application_id`` marks the file as ours, ``PRAGMA user_version`` tells the schema. A store of a newer schema
-is refused, never guessed at; an older one is brought forward one version at a time, in one transaction.
+``PRAGMA application_id`` marks the file as ours, ``PRAGMA user_version`` gives the schema. A store of a newer one, or
+of one before KeyAgreement 2, is refused and never guessed at; one in between is brought forward, version by version, in
+one transaction.
 """
 
 from __future__ import annotations
@@ -13,16 +14,40 @@ SCHEMA_VERSION: Final = 8
 OLDEST_SCHEMA: Final = 7
 """The first of KeyAgreement 2. Link keys of older stores were agreed as no node does any more."""
 
-_VERSION_1: Final = (
+# Schema 7, whole. Columns of MACs (16 octets) are the seals of rows that decide whom the station believes.
+_TABLES: Final = (
     "CREATE TABLE meta(name TEXT PRIMARY KEY, value TEXT NOT NULL) STRICT, WITHOUT ROWID",
+    # -- the station itself: taken_over is no longer written, but backups list it
+    """CREATE TABLE station(
+        one INTEGER PRIMARY KEY CHECK(one = 1), name TEXT NOT NULL CHECK(name <> ''),
+        keystore TEXT NOT NULL CHECK(keystore IN ('keyring', 'file') OR keystore GLOB 'pkcs11:*'),
+        keystore_why TEXT NOT NULL, requested BLOB CHECK(length(requested) = 65),
+        point BLOB CHECK(length(point) = 65), ca BLOB CHECK(length(ca) = 65),
+        signature BLOB CHECK(length(signature) = 64), master INTEGER NOT NULL DEFAULT 1 CHECK(master > 0),
+        rewrapping INTEGER CHECK(rewrapping > 0), seal_key BLOB, taken_over TEXT, mac BLOB CHECK(length(mac) = 16),
+        CHECK((point IS NULL) = (ca IS NULL) AND (point IS NULL) = (signature IS NULL))) STRICT""",
+    """CREATE TABLE certificates(
+        ca TEXT NOT NULL CHECK(length(ca) = 64), station TEXT NOT NULL CHECK(length(station) = 64),
+        signature BLOB NOT NULL CHECK(length(signature) = 64), PRIMARY KEY(ca, station)) STRICT, WITHOUT ROWID""",
+    # -- nodes and their keys
     """CREATE TABLE whitelist(
         uuid BLOB PRIMARY KEY CHECK(length(uuid) = 10), fingerprint TEXT, added TEXT NOT NULL, assurance TEXT NOT NULL,
-        name TEXT) STRICT, WITHOUT ROWID""",
+        name TEXT, mac BLOB CHECK(length(mac) = 16)) STRICT, WITHOUT ROWID""",
+    "CREATE INDEX whitelist_by_name ON whitelist(name) WHERE name IS NOT NULL",
     """CREATE TABLE nodes(
         uuid BLOB PRIMARY KEY CHECK(length(uuid) = 10), point BLOB CHECK(point IS NULL OR length(point) = 65),
         name TEXT, profile TEXT, state INTEGER NOT NULL, epoch INTEGER NOT NULL, sequence INTEGER NOT NULL,
-        can_address INTEGER NOT NULL, groups TEXT NOT NULL, teds_sha256 TEXT, verdict TEXT, last_seen TEXT,
-        channels INTEGER NOT NULL) STRICT, WITHOUT ROWID""",
+        can_address INTEGER NOT NULL, groups TEXT NOT NULL, teds_sha256 TEXT, retired TEXT, last_seen TEXT,
+        channels INTEGER NOT NULL, point_mac BLOB CHECK(length(point_mac) = 16), due TEXT CHECK(length(due) = 10),
+        charging TEXT) STRICT, WITHOUT ROWID""",
+    "CREATE INDEX nodes_by_name ON nodes(name) WHERE name IS NOT NULL",
+    "CREATE INDEX nodes_by_due ON nodes(due) WHERE due IS NOT NULL",
+    """CREATE TABLE marks(
+        uuid BLOB PRIMARY KEY CHECK(length(uuid) = 10), ca BLOB CHECK(length(ca) = 65),
+        ca_mac BLOB CHECK(length(ca_mac) = 16), next_key_id TEXT CHECK(length(next_key_id) = 16),
+        next_ca BLOB CHECK(length(next_ca) = 65), rotation TEXT CHECK(rotation <> ''),
+        former TEXT CHECK(length(former) = 64), CHECK((next_key_id IS NULL) = (next_ca IS NULL)))
+        STRICT, WITHOUT ROWID""",
     """CREATE TABLE keys(
         seq INTEGER PRIMARY KEY AUTOINCREMENT, uuid BLOB NOT NULL CHECK(length(uuid) = 10), epoch INTEGER NOT NULL,
         key_id TEXT NOT NULL CHECK(length(key_id) = 16), state TEXT NOT NULL CHECK(state IN ('pending', 'active')),
@@ -30,21 +55,28 @@ _VERSION_1: Final = (
         UNIQUE(uuid, key_id), UNIQUE(uuid, epoch, slot)) STRICT""",
     "CREATE UNIQUE INDEX one_active_key ON keys(uuid) WHERE state = 'active'",
     "CREATE TABLE key_slots(uuid BLOB PRIMARY KEY, last INTEGER NOT NULL) STRICT, WITHOUT ROWID",
+    # -- what was built for a node, what it was seen with, and the one reading that verdicts are judged from
     """CREATE TABLE drafts(
-        uuid BLOB PRIMARY KEY CHECK(length(uuid) = 10), image TEXT NOT NULL,
+        uuid BLOB PRIMARY KEY CHECK(length(uuid) = 10), blocks BLOB NOT NULL,
         stage TEXT NOT NULL CHECK(stage IN ('built', 'signed')), profile TEXT, created TEXT NOT NULL)
         STRICT, WITHOUT ROWID""",
-    """CREATE TABLE node_images(
-        uuid BLOB PRIMARY KEY CHECK(length(uuid) = 10), image TEXT NOT NULL, seen TEXT NOT NULL)
+    """CREATE TABLE datasheets(
+        row INTEGER PRIMARY KEY, uuid BLOB NOT NULL CHECK(length(uuid) = 10), sequence INTEGER NOT NULL,
+        epoch INTEGER NOT NULL, signed TEXT, profile TEXT, seen TEXT NOT NULL, digest BLOB NOT NULL
+        CHECK(length(digest) = 32), blocks BLOB NOT NULL) STRICT""",
+    "CREATE INDEX datasheets_of_node ON datasheets(uuid)",
+    """CREATE TABLE readings(
+        uuid BLOB PRIMARY KEY CHECK(length(uuid) = 10), at TEXT NOT NULL, by TEXT NOT NULL,
+        c BLOB CHECK(length(c) = 8), whole INTEGER NOT NULL CHECK(whole IN (0, 1)), digests BLOB NOT NULL,
+        node_key BLOB CHECK(length(node_key) = 65), node_key_signature BLOB CHECK(length(node_key_signature) = 64),
+        station_key BLOB CHECK(length(station_key) = 65),
+        station_key_signature BLOB CHECK(length(station_key_signature) = 64), checks TEXT NOT NULL)
         STRICT, WITHOUT ROWID""",
-    """CREATE TABLE steps(
-        row INTEGER PRIMARY KEY AUTOINCREMENT, uuid BLOB, step TEXT NOT NULL, started TEXT NOT NULL, ended TEXT,
-        result TEXT) STRICT""",
-    "CREATE INDEX steps_of_node ON steps(uuid, step)",
+    # -- other stations
     """CREATE TABLE trust(
         name TEXT PRIMARY KEY, role TEXT NOT NULL CHECK(role IN ('station', 'ca')),
         point BLOB NOT NULL CHECK(length(point) = 65), fingerprint TEXT NOT NULL CHECK(length(fingerprint) = 64),
-        added TEXT NOT NULL, UNIQUE(fingerprint, role)) STRICT, WITHOUT ROWID""",
+        added TEXT NOT NULL, mac BLOB CHECK(length(mac) = 16), UNIQUE(fingerprint, role)) STRICT, WITHOUT ROWID""",
     """CREATE TABLE handovers(
         id TEXT NOT NULL, direction TEXT NOT NULL CHECK(direction IN ('out', 'in')),
         mode TEXT NOT NULL CHECK(mode IN ('copy', 'move')), peers TEXT NOT NULL, state TEXT NOT NULL,
@@ -59,9 +91,40 @@ _VERSION_1: Final = (
     """CREATE TABLE revocations(
         uuid BLOB PRIMARY KEY CHECK(length(uuid) = 10), fingerprint TEXT, why TEXT NOT NULL, statement TEXT NOT NULL,
         created TEXT NOT NULL) STRICT, WITHOUT ROWID""",
+    """CREATE TABLE lifted(
+        statement TEXT PRIMARY KEY CHECK(length(statement) = 64), at TEXT NOT NULL,
+        mac BLOB CHECK(length(mac) = 16)) STRICT, WITHOUT ROWID""",
+    """CREATE TABLE ended_cas(
+        ca TEXT PRIMARY KEY CHECK(length(ca) = 64), at TEXT NOT NULL, mac BLOB CHECK(length(mac) = 16))
+        STRICT, WITHOUT ROWID""",
+    # -- measuring
+    """CREATE TABLE groups(
+        name TEXT PRIMARY KEY CHECK(length(name) BETWEEN 1 AND 100), created TEXT NOT NULL) STRICT, WITHOUT ROWID""",
+    """CREATE TABLE group_members(
+        name TEXT NOT NULL REFERENCES groups(name) ON DELETE CASCADE, uuid BLOB NOT NULL CHECK(length(uuid) = 10),
+        PRIMARY KEY(name, uuid)) STRICT, WITHOUT ROWID""",
+    """CREATE TABLE measurements(
+        id TEXT PRIMARY KEY CHECK(id <> ''), group_name TEXT REFERENCES groups(name) ON DELETE CASCADE,
+        uuids TEXT NOT NULL, channels TEXT NOT NULL, rate REAL CHECK(rate > 0),
+        kind TEXT CHECK(kind IN ('periodic', 'event', 'free')), trigger INTEGER NOT NULL CHECK(trigger IN (0, 1)),
+        actuators INTEGER NOT NULL CHECK(actuators IN (0, 1)),
+        dead_man INTEGER NOT NULL CHECK(dead_man BETWEEN 20 AND 10000),
+        scalar_rate REAL NOT NULL CHECK(scalar_rate BETWEEN 0 AND 1000), sinks TEXT NOT NULL,
+        lasting INTEGER NOT NULL CHECK(lasting IN (0, 1)), ends REAL, created TEXT NOT NULL,
+        test_pattern INTEGER NOT NULL DEFAULT 0 CHECK(test_pattern IN (0, 1)),
+        unsigned INTEGER NOT NULL DEFAULT 0 CHECK(unsigned IN (0, 1)), require TEXT NOT NULL DEFAULT '',
+        CHECK((group_name IS NULL) <> (uuids = '[]'))) STRICT, WITHOUT ROWID""",
+    """CREATE TABLE topics(
+        uuid BLOB NOT NULL CHECK(length(uuid) = 10), channel INTEGER NOT NULL CHECK(channel BETWEEN 0 AND 255),
+        name TEXT NOT NULL UNIQUE CHECK(name <> ''), PRIMARY KEY(uuid, channel)) STRICT, WITHOUT ROWID""",
+    """CREATE TABLE detection(
+        one INTEGER PRIMARY KEY CHECK(one = 1),
+        mode TEXT NOT NULL CHECK(mode IN ('transparent', 'whitelist'))) STRICT""",
+    # -- the audit log, which only grows
     """CREATE TABLE audit(
         seq INTEGER PRIMARY KEY, at TEXT NOT NULL, who TEXT NOT NULL, act TEXT NOT NULL, uuid BLOB,
         outcome TEXT NOT NULL, detail TEXT NOT NULL, hash BLOB NOT NULL CHECK(length(hash) = 32)) STRICT""",
+    "CREATE INDEX audit_of_node ON audit(uuid) WHERE uuid IS NOT NULL",
     """CREATE TRIGGER audit_is_never_changed BEFORE UPDATE ON audit
         BEGIN SELECT RAISE(ABORT, 'the audit log is append-only'); END""",
     """CREATE TRIGGER audit_is_never_shortened BEFORE DELETE ON audit
@@ -71,129 +134,13 @@ _VERSION_1: Final = (
         BEGIN SELECT RAISE(ABORT, 'the audit log is append-only'); END""",
 )
 
-# What came with version 2: the settings by name became tables, images lie as octets and once, rows that decide whom the
-# station believes carry a MAC.
-_VERSION_2: Final = (
-    "DROP TABLE steps",
-    "DROP TABLE node_images",
-    "DROP TABLE drafts",
-    "DELETE FROM meta WHERE name GLOB 'setting:*'",
-    """CREATE TABLE station(
-        one INTEGER PRIMARY KEY CHECK(one = 1), name TEXT NOT NULL CHECK(name <> ''),
-        keystore TEXT NOT NULL CHECK(keystore IN ('keyring', 'file') OR keystore GLOB 'pkcs11:*'),
-        keystore_why TEXT NOT NULL, requested BLOB CHECK(length(requested) = 65),
-        point BLOB CHECK(length(point) = 65), ca BLOB CHECK(length(ca) = 65),
-        signature BLOB CHECK(length(signature) = 64), master INTEGER NOT NULL DEFAULT 1 CHECK(master > 0),
-        rewrapping INTEGER CHECK(rewrapping > 0), seal_key BLOB, taken_over TEXT, mac BLOB CHECK(length(mac) = 16),
-        CHECK((point IS NULL) = (ca IS NULL) AND (point IS NULL) = (signature IS NULL))) STRICT""",
-    """CREATE TABLE certificates(
-        ca TEXT NOT NULL CHECK(length(ca) = 64), station TEXT NOT NULL CHECK(length(station) = 64),
-        signature BLOB NOT NULL CHECK(length(signature) = 64), PRIMARY KEY(ca, station)) STRICT, WITHOUT ROWID""",
-    """CREATE TABLE marks(
-        uuid BLOB PRIMARY KEY CHECK(length(uuid) = 10), ca BLOB CHECK(length(ca) = 65),
-        ca_mac BLOB CHECK(length(ca_mac) = 16), next_key_id TEXT CHECK(length(next_key_id) = 16),
-        next_ca BLOB CHECK(length(next_ca) = 65), rotation TEXT CHECK(rotation <> ''),
-        former TEXT CHECK(length(former) = 64), CHECK((next_key_id IS NULL) = (next_ca IS NULL)))
-        STRICT, WITHOUT ROWID""",
-    """CREATE TABLE drafts(
-        uuid BLOB PRIMARY KEY CHECK(length(uuid) = 10), blocks BLOB NOT NULL,
-        stage TEXT NOT NULL CHECK(stage IN ('built', 'signed')), profile TEXT, created TEXT NOT NULL)
-        STRICT, WITHOUT ROWID""",
-    """CREATE TABLE datasheets(
-        row INTEGER PRIMARY KEY, uuid BLOB NOT NULL CHECK(length(uuid) = 10), sequence INTEGER NOT NULL,
-        epoch INTEGER NOT NULL, signed TEXT, profile TEXT, seen TEXT NOT NULL, digest BLOB NOT NULL
-        CHECK(length(digest) = 32), blocks BLOB NOT NULL) STRICT""",
-    "CREATE INDEX datasheets_of_node ON datasheets(uuid)",
-    "ALTER TABLE nodes ADD COLUMN point_mac BLOB CHECK(length(point_mac) = 16)",
-    "ALTER TABLE nodes ADD COLUMN due TEXT CHECK(length(due) = 10)",
-    "CREATE INDEX nodes_by_name ON nodes(name) WHERE name IS NOT NULL",
-    "CREATE INDEX nodes_by_due ON nodes(due) WHERE due IS NOT NULL",
-    "ALTER TABLE whitelist ADD COLUMN mac BLOB CHECK(length(mac) = 16)",
-    "CREATE INDEX whitelist_by_name ON whitelist(name) WHERE name IS NOT NULL",
-    "ALTER TABLE trust ADD COLUMN mac BLOB CHECK(length(mac) = 16)",
-    "CREATE INDEX audit_of_node ON audit(uuid) WHERE uuid IS NOT NULL",
-    """CREATE TABLE lifted(
-        statement TEXT PRIMARY KEY CHECK(length(statement) = 64), at TEXT NOT NULL) STRICT, WITHOUT ROWID""",
-    """CREATE TABLE ended_cas(
-        ca TEXT PRIMARY KEY CHECK(length(ca) = 64), at TEXT NOT NULL) STRICT, WITHOUT ROWID""",
-    """CREATE TABLE groups(
-        name TEXT PRIMARY KEY CHECK(length(name) BETWEEN 1 AND 100), created TEXT NOT NULL) STRICT, WITHOUT ROWID""",
-    """CREATE TABLE group_members(
-        name TEXT NOT NULL REFERENCES groups(name) ON DELETE CASCADE, uuid BLOB NOT NULL CHECK(length(uuid) = 10),
-        PRIMARY KEY(name, uuid)) STRICT, WITHOUT ROWID""",
-    """CREATE TABLE measurements(
-        id TEXT PRIMARY KEY CHECK(id <> ''), group_name TEXT REFERENCES groups(name) ON DELETE CASCADE,
-        uuids TEXT NOT NULL, rate REAL CHECK(rate > 0), kind TEXT NOT NULL CHECK(kind IN ('periodic', 'event', 'free')),
-        trigger INTEGER NOT NULL CHECK(trigger IN (0, 1)), sinks TEXT NOT NULL, created TEXT NOT NULL,
-        CHECK((group_name IS NULL) <> (uuids = '[]'))) STRICT, WITHOUT ROWID""",
-)
-
-# What came with version 3: measurements that name channels and may be without a kind (as each channel is), which of
-# them last beyond their own end, names of topics, and how nodes are detected. SQLite cannot loosen a CHECK: made anew.
-_VERSION_3: Final = (
-    "ALTER TABLE measurements RENAME TO measurements_2",
-    """CREATE TABLE measurements(
-        id TEXT PRIMARY KEY CHECK(id <> ''), group_name TEXT REFERENCES groups(name) ON DELETE CASCADE,
-        uuids TEXT NOT NULL, channels TEXT NOT NULL, rate REAL CHECK(rate > 0),
-        kind TEXT CHECK(kind IN ('periodic', 'event', 'free')), trigger INTEGER NOT NULL CHECK(trigger IN (0, 1)),
-        actuators INTEGER NOT NULL CHECK(actuators IN (0, 1)),
-        dead_man INTEGER NOT NULL CHECK(dead_man BETWEEN 20 AND 10000),
-        scalar_rate REAL NOT NULL CHECK(scalar_rate BETWEEN 0 AND 1000), sinks TEXT NOT NULL,
-        lasting INTEGER NOT NULL CHECK(lasting IN (0, 1)), ends REAL, created TEXT NOT NULL,
-        CHECK((group_name IS NULL) <> (uuids = '[]'))) STRICT, WITHOUT ROWID""",
-    """INSERT INTO measurements SELECT id, group_name, uuids, '[]', rate, kind, trigger, 0, 1000, 10.0, sinks, 1, NULL,
-        created FROM measurements_2""",
-    "DROP TABLE measurements_2",
-    """CREATE TABLE topics(
-        uuid BLOB NOT NULL CHECK(length(uuid) = 10), channel INTEGER NOT NULL CHECK(channel BETWEEN 0 AND 255),
-        name TEXT NOT NULL UNIQUE CHECK(name <> ''), PRIMARY KEY(uuid, channel)) STRICT, WITHOUT ROWID""",
-    """CREATE TABLE detection(
-        one INTEGER PRIMARY KEY CHECK(one = 1),
-        mode TEXT NOT NULL CHECK(mode IN ('transparent', 'whitelist'))) STRICT""",
-)
-
-# What came with version 4: a person's "lifted" and the end of trust in a CA carry seals like pins and trust. Rows that
-# an earlier state of this development made have none, are named by doctor and do not count.
-_VERSION_4: Final = (
-    "ALTER TABLE lifted ADD COLUMN mac BLOB CHECK(length(mac) = 16)",
-    "ALTER TABLE ended_cas ADD COLUMN mac BLOB CHECK(length(mac) = 16)",
-)
-
-# What came with version 5: what a node last said of its charge (JSON with its time), a hint that nobody authenticated.
-_VERSION_5: Final = ("ALTER TABLE nodes ADD COLUMN charging TEXT",)
-
-# What came with version 6: what was asked beside of a measurement, so that one that is carried on is the same one.
-_VERSION_6: Final = (
-    "ALTER TABLE measurements ADD COLUMN test_pattern INTEGER NOT NULL DEFAULT 0 CHECK(test_pattern IN (0, 1))",
-    "ALTER TABLE measurements ADD COLUMN unsigned INTEGER NOT NULL DEFAULT 0 CHECK(unsigned IN (0, 1))",
-    "ALTER TABLE measurements ADD COLUMN require TEXT NOT NULL DEFAULT ''",
-)
-
-# What came with version 7: the one row of reading of each node. What stood as a verdict was not judged from one: a
-# person's word is left there that a node is out of service.
-_VERSION_7: Final = (
-    """CREATE TABLE readings(
-        uuid BLOB PRIMARY KEY CHECK(length(uuid) = 10), at TEXT NOT NULL, by TEXT NOT NULL,
-        c BLOB CHECK(length(c) = 8), whole INTEGER NOT NULL CHECK(whole IN (0, 1)), digests BLOB NOT NULL,
-        node_key BLOB CHECK(length(node_key) = 65), node_key_signature BLOB CHECK(length(node_key_signature) = 64),
-        station_key BLOB CHECK(length(station_key) = 65),
-        station_key_signature BLOB CHECK(length(station_key_signature) = 64), checks TEXT NOT NULL)
-        STRICT, WITHOUT ROWID""",
-    "ALTER TABLE nodes RENAME COLUMN verdict TO retired",
-    "UPDATE nodes SET retired = NULL WHERE NOT (retired GLOB 'decommissioned*' OR retired GLOB 'replaced by*')",
-)
-
-# What came with version 8: what the profile said that a node's datasheet was made of.
-_VERSION_8: Final = ("ALTER TABLE nodes ADD COLUMN profile_digest TEXT",)
-
-# STEPS_TO[n] are the statements that bring a store of version n - 1 to version n.
-STEPS_TO: Final[dict[int, tuple[str, ...]]] = {
-    1: _VERSION_1,
-    2: _VERSION_2,
-    3: _VERSION_3,
-    4: _VERSION_4,
-    5: _VERSION_5,
-    6: _VERSION_6,
-    7: _VERSION_7,
-    8: _VERSION_8,
+_STEPS_TO: Final[dict[int, tuple[str, ...]]] = {
+    # what the profile said that a node's datasheet was made of
+    8: ("ALTER TABLE nodes ADD COLUMN profile_digest TEXT",),
 }
+
+
+def statements(before: int, to: int = SCHEMA_VERSION) -> list[str]:
+    """What brings a store of schema ``before`` (0: an empty file, else at least OLDEST_SCHEMA) to schema ``to``."""
+    made = [] if before else list(_TABLES)
+    return made + [each for step in range(max(before, OLDEST_SCHEMA) + 1, to + 1) for each in _STEPS_TO[step]]

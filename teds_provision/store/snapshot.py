@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING, Final
 from teds_provision.errors import StoreFailure
 from teds_provision.files import whole_draft
 from teds_provision.lazy import late
-from teds_provision.store.failures import as_store_failure
-from teds_provision.store.home import FILE_NAME
+from teds_provision.store.connection import as_store_failure
+from teds_provision.store.database import FILE_NAME
 from teds_provision.store.store import Store
 
 if TYPE_CHECKING:

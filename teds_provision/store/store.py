@@ -11,15 +11,13 @@ from typing import TYPE_CHECKING, Literal
 
 from teds_provision.errors import BadData, StoreFailure
 from teds_provision.store.audit import AuditLog
-from teds_provision.store.database import Database
-from teds_provision.store.home import FILE_NAME
-from teds_provision.store.tables.batches import BulkTables
+from teds_provision.store.database import FILE_NAME, Database
 from teds_provision.store.tables.datasheets import DatasheetTables
 from teds_provision.store.tables.facts import FactTables
 from teds_provision.store.tables.handovers import HandoverTables
 from teds_provision.store.tables.keys import KeyTables
 from teds_provision.store.tables.measurements import MeasurementTables
-from teds_provision.store.tables.nodes import NodeTables
+from teds_provision.store.tables.nodes import BulkTables, NodeTables
 from teds_provision.store.tables.overview import OverviewTables
 
 if TYPE_CHECKING:

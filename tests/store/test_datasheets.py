@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from teds_provision.store import Draft, NodeRecord, Store
-from teds_provision.store.packing import packed, unpacked
+from teds_provision.store.tables.datasheets import packed, unpacked
 from teds_provision.teds.image import Image
 from teds_provision.teds.profile import load_profile
 

@@ -12,7 +12,7 @@ import pytest
 
 from teds_provision.errors import StoreFailure
 from teds_provision.store import NodeRecord, Store
-from teds_provision.store.frozen import open_copy
+from teds_provision.store.database import open_copy
 
 ONE, TWO = bytes(range(10)), bytes(range(1, 11))
 READ_ONLY = 'mount --bind "$0" "$0" && mount -o remount,ro,bind "$0" && exec "$@"'

@@ -10,7 +10,7 @@ import pytest
 
 from teds_provision.errors import StoreFailure
 from teds_provision.store import Store
-from teds_provision.store.schema import OLDEST_SCHEMA, SCHEMA_VERSION
+from teds_provision.store.schema import APPLICATION_ID, OLDEST_SCHEMA, SCHEMA_VERSION, statements
 from tests.bench import make_station
 
 
@@ -40,3 +40,32 @@ def test_a_store_of_a_later_schema_is_refused(tmp_path: Path) -> None:
     stamped(home, SCHEMA_VERSION + 1)
     with pytest.raises(StoreFailure, match="knows up to"):
         Store.open(home)
+
+
+def tables(path: Path) -> dict[str, list[tuple[object, ...]]]:
+    """Columns of every table, and the statements of every index and trigger."""
+    with closing(sqlite3.connect(path)) as connection:
+        names = connection.execute("SELECT name FROM sqlite_schema WHERE type = 'table'").fetchall()
+        found = {name: connection.execute(f"PRAGMA table_info({name})").fetchall() for (name,) in names}
+        rest = connection.execute("SELECT name, sql FROM sqlite_schema WHERE type <> 'table' ORDER BY name").fetchall()
+        return {**found, "": rest}
+
+
+@pytest.mark.parametrize("version", range(OLDEST_SCHEMA, SCHEMA_VERSION))
+def test_a_store_of_an_earlier_schema_becomes_one_of_today_s(tmp_path: Path, version: int) -> None:
+    home, fresh = tmp_path / "home", tmp_path / "fresh"
+    for folder in (home, fresh):
+        folder.mkdir(mode=0o700)
+    with closing(sqlite3.connect(home / "store.sqlite3")) as connection:
+        for statement in statements(0, version):
+            connection.execute(statement)
+        connection.execute("INSERT INTO meta VALUES('id', 'ab')")
+        connection.execute("INSERT INTO topics VALUES(?, 1, 'grip')", (bytes(10),))
+        connection.execute(f"PRAGMA application_id={APPLICATION_ID}")
+        connection.execute(f"PRAGMA user_version={version}")
+        connection.commit()
+    Store.open(home).close()
+    Store.open(fresh, create=True).close()
+    assert tables(home / "store.sqlite3") == tables(fresh / "store.sqlite3")
+    with closing(sqlite3.connect(home / "store.sqlite3")) as connection:
+        assert connection.execute("SELECT name FROM topics").fetchall() == [("grip",)]
