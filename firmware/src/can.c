@@ -6,6 +6,7 @@
 #define FUNCTIONAL 0x18DBFF00u
 #define ANNOUNCE 0x1CFF0000u
 #define TRIGGER 0x18FF0000u
+#define DRIVE 0x18EF0000u
 #define FIRST_STATION 0xF1u
 #define LAST_STATION 0xF7u
 #define CR_NS TEDS_SECOND
@@ -400,6 +401,8 @@ void teds_can_rx(teds_node *node, const teds_can_frame *frame, uint64_t tick)
 #if TEDS_OPERATION
     else if ((frame->identifier & 0x1FFFFF00u) == (TRIGGER) && frame->length == 8) {
         teds_trigger(node, source, frame->data, tick);
+    } else if ((frame->identifier & 0x1FFF0000u) == DRIVE && (uint8_t)(frame->identifier >> 8) == node->can.address) {
+        teds_drive_frame(node, source, frame->data, frame->length);
     }
 #endif
 }

@@ -213,6 +213,14 @@ bool teds_value(const teds_node *node, int place, uint64_t tick, uint8_t *out);
 int teds_channel_fits(const teds_node *node, int place, uint64_t *period);
 int teds_channel_list(const uint8_t *octets, size_t length, size_t most);
 
+int teds_apply(teds_node *node, const uint8_t *pairs, size_t length);
+bool teds_is_claimed(const teds_node *node, const teds_origin *origin, int place);
+int teds_run_key(const teds_node *node, const teds_session *session, const char *label, size_t length, uint8_t out[16]);
+
+int teds_drive(teds_node *node, const teds_command *command, const teds_origin *origin, uint8_t *out);
+void teds_drive_frame(teds_node *node, teds_link link, const uint8_t *octets, size_t length);
+void teds_drive_end(teds_node *node, int8_t session, uint32_t places);
+
 int teds_subscribe(teds_node *node, const teds_command *command, const teds_origin *origin, uint8_t *out);
 int teds_stop(teds_node *node, const teds_command *command, const teds_origin *origin, uint8_t *out);
 int teds_arm(teds_node *node, const teds_command *command, const teds_origin *origin);

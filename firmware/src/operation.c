@@ -225,6 +225,7 @@ void teds_claims_end(teds_node *node, int8_t session, uint32_t places, bool stop
     }
     node->sessions[session].claims &= ~going;
     teds_streams_end(node, session, going);
+    teds_drive_end(node, session, going);
     if (node->sessions[session].claims == 0) {
         memset(node->sessions[session].arms, 0, sizeof node->sessions[session].arms);
     }
@@ -434,7 +435,7 @@ int teds_channel_list(const uint8_t *octets, size_t length, size_t most)
     return 0;
 }
 
-static bool is_claimed(const teds_node *node, const teds_origin *origin, int place)
+bool teds_is_claimed(const teds_node *node, const teds_origin *origin, int place)
 {
     return place >= 0 && (teds_claims_of(node, origin->session) >> place & 1) != 0;
 }
@@ -448,7 +449,7 @@ static int read_data_set(const teds_node *node, const teds_command *command, con
     if (command->length != 4) {
         return -TEDS_BAD_FORM;
     }
-    if (!is_claimed(node, origin, place)) {
+    if (!teds_is_claimed(node, origin, place)) {
         return -TEDS_WRONG_STATE;
     }
     if (teds_get32(command->payload) != 0) {
@@ -475,7 +476,7 @@ static int sample(const teds_node *node, const teds_command *command, const teds
     memcpy(channels, command->payload, count);
     for (size_t i = 0; i < count; i++) {
         int place = teds_place_of(node, channels[i]);
-        if (!is_claimed(node, origin, place)) {
+        if (!teds_is_claimed(node, origin, place)) {
             return -TEDS_WRONG_STATE;
         }
         length += facts(node, place)->octets;
@@ -501,7 +502,7 @@ static int sample(const teds_node *node, const teds_command *command, const teds
 }
 
 /* Give actuators their values: `pairs` of channel and data set, checked to be claimed here. */
-static int apply(teds_node *node, const uint8_t *pairs, size_t length)
+int teds_apply(teds_node *node, const uint8_t *pairs, size_t length)
 {
     const teds_port *port = node->port;
     uint64_t now = teds_now(node);
@@ -537,7 +538,7 @@ static int write_data_set(teds_node *node, const teds_command *command, const te
     if (command->length != 4u + facts(node, place)->octets) {
         return -TEDS_BAD_FORM;
     }
-    if (!is_claimed(node, origin, place)) {
+    if (!teds_is_claimed(node, origin, place)) {
         return -TEDS_WRONG_STATE;
     }
     if (!is_actuator(node, place)) {
@@ -548,7 +549,7 @@ static int write_data_set(teds_node *node, const teds_command *command, const te
     }
     pair[0] = (uint8_t)command->channel;
     memcpy(pair + 1, command->payload + 4, command->length - 4);
-    return apply(node, pair, command->length - 3);
+    return teds_apply(node, pair, command->length - 3);
 }
 
 static int set(teds_node *node, const teds_command *command, const teds_origin *origin)
@@ -582,7 +583,7 @@ static int set(teds_node *node, const teds_command *command, const teds_origin *
             return -TEDS_NOT_PERMITTED;
         }
     }
-    return apply(node, pairs, command->length);
+    return teds_apply(node, pairs, command->length);
 }
 
 static int self_test(teds_node *node, const teds_command *command, const teds_origin *origin)
@@ -627,39 +628,17 @@ static int power(const teds_node *node, const teds_command *command, uint8_t *ou
 
 static int clock_of(const teds_node *node, const teds_command *command, const teds_origin *origin, uint8_t *out)
 {
+    const teds_session *session = &node->sessions[origin->session];
     if (command->length != 0) {
         return -TEDS_BAD_FORM;
     }
     teds_put64(out, origin->arrival->tick);
-    teds_put64(out + 16, node->sessions[origin->session].mark);
+    teds_put64(out + 16, session->mark);
     teds_put32(out + 24, node->port->step);
     teds_put16(out + 28, node->port->drift);
-    teds_put32(out + 30, UINT32_MAX);
+    teds_put32(out + 30, session->drive.used && session->drive.seen ? session->drive.last : UINT32_MAX);
     teds_put64(out + 8, teds_now(node));
     return 34;
-}
-
-/* Drive: its channels are checked; a build without it has no room for one. */
-static int drive(const teds_node *node, const teds_command *command, const teds_origin *origin)
-{
-    int refused = teds_channel_list(command->payload, command->length, 16);
-    if (refused) {
-        return refused;
-    }
-    if (origin->arrival->kind == TEDS_AT_NFC) {
-        return -TEDS_DOES_NOT_FIT;
-    }
-    for (size_t i = 0; i < command->length; i++) {
-        if (!is_claimed(node, origin, teds_place_of(node, command->payload[i]))) {
-            return -TEDS_WRONG_STATE;
-        }
-    }
-    for (size_t i = 0; i < command->length; i++) {
-        if (!is_actuator(node, teds_place_of(node, command->payload[i]))) {
-            return -TEDS_NOT_PERMITTED;
-        }
-    }
-    return -TEDS_NO_ROOM;
 }
 
 int teds_operation_run(teds_node *node, const teds_command *command, teds_origin *origin, uint8_t *out)
@@ -684,7 +663,7 @@ int teds_operation_run(teds_node *node, const teds_command *command, teds_origin
     case TEDS_ARM: return teds_arm(node, command, origin);
     case TEDS_POWER: return power(node, command, out);
     case TEDS_OPERATION_STATE: return operation(node, command, origin, out);
-    default: return drive(node, command, origin);
+    default: return teds_drive(node, command, origin, out);
     }
 }
 

@@ -196,11 +196,11 @@ static teds_stream *room_for(teds_node *node, teds_stream *old)
     return NULL;
 }
 
-/* Key of a run: HKDF-Expand(k_m, "TEDS1 stream", 00, run, 16). */
-static int key_of(const teds_node *node, const teds_session *session, uint8_t out[16])
+/* Key of a run: HKDF-Expand(k_m, label, run, 16); the label ends in 00. */
+int teds_run_key(const teds_node *node, const teds_session *session, const char *label, size_t length, uint8_t out[16])
 {
     uint8_t run[2];
-    const teds_part info[] = {{(const uint8_t *)"TEDS1 stream", 13}, {run, 2}};
+    const teds_part info[] = {{(const uint8_t *)label, length}, {run, 2}};
     teds_put16(run, session->run);
     return teds_hkdf_expand(node, session->keys.messages, info, 2, out, 16);
 }
@@ -245,7 +245,7 @@ int teds_subscribe(teds_node *node, const teds_command *command, const teds_orig
         return -TEDS_NO_ROOM;
     }
     session->run++;
-    if (key_of(node, session, key) != 0) {
+    if (teds_run_key(node, session, "TEDS1 stream", 13, key) != 0) {
         return -TEDS_FAILURE;
     }
     if (old != NULL) {
@@ -380,8 +380,56 @@ static void sample_stream(teds_node *node, teds_stream *stream, uint64_t now)
     }
 }
 
+/* What comes sooner than the period after the last that was sent is dropped, its counter too. */
+static void event(teds_stream *stream, uint64_t tick, const uint8_t *octets, bool valid)
+{
+    if (stream->had_event && tick - stream->last_event < stream->period) {
+        count(stream);
+        return;
+    }
+    stream->had_event = true;
+    stream->last_event = tick;
+    stream->flags = valid ? 0 : 1;
+    teds_put64(stream->filling, tick);
+    memcpy(stream->filling + 8, octets, stream->octets);
+    stream->fill = (uint16_t)(8 + stream->octets);
+    full(stream);
+}
+
+void teds_sensor_event(teds_node *node, uint8_t channel, uint64_t tick, const uint8_t *octets, bool valid)
+{
+    teds_events *events = &node->events;
+    uint8_t next = (uint8_t)((events->in + 1) % (TEDS_EVENTS + 1));
+    int place = teds_place_of(node, channel);
+    if (place < 0 || next == events->out || node->port->channels[place].octets > TEDS_EVENT_OCTETS) {
+        return;
+    }
+    events->ring[events->in].channel = channel;
+    events->ring[events->in].tick = tick;
+    events->ring[events->in].valid = valid;
+    memcpy(events->ring[events->in].octets, octets, node->port->channels[place].octets);
+    events->in = next;
+}
+
+static void take_events(teds_node *node)
+{
+    teds_events *events = &node->events;
+    for (; events->out != events->in; events->out = (uint8_t)((events->out + 1) % (TEDS_EVENTS + 1))) {
+        for (size_t i = 0; i < TEDS_STREAMS; i++) {
+            teds_stream *each = &node->streams[i];
+            uint64_t tick = events->ring[events->out].tick;
+            if (each->used && each->kind == EVENT && each->pattern == 0 && !each->waits && !each->ended &&
+                node->port->channels[each->channels[0]].number == events->ring[events->out].channel &&
+                tick >= each->start) {
+                event(each, tick, events->ring[events->out].octets, events->ring[events->out].valid);
+            }
+        }
+    }
+}
+
 void teds_streams_sample(teds_node *node, uint64_t now)
 {
+    take_events(node);
     for (size_t i = 0; i < TEDS_STREAMS; i++) {
         teds_stream *each = &node->streams[i];
         if (each->used) {

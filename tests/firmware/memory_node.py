@@ -216,6 +216,19 @@ class MemoryNode:
         length = self._library.memory_can_tx(self._board, ctypes.byref(identifier), data, ctypes.byref(fd))
         return None if length < 0 else (identifier.value, data.raw[:length], fd.value)
 
+    def event(self, channel: int, tick: int, octets: bytes, *, valid: bool = True) -> None:
+        """An event sensor has seen something."""
+        self._library.memory_event(
+            self._board, ctypes.c_uint8(channel), ctypes.c_uint64(tick), octets, ctypes.c_bool(valid)
+        )
+        self.poll()
+
+    def set_point(self, channel: int, octets: int) -> bytes:
+        """What an actuator does."""
+        out = ctypes.create_string_buffer(octets)
+        self._library.memory_set_point(self._board, ctypes.c_uint8(channel), out)
+        return out.raw
+
     def add_channel(self, number: int, kind: int, octets: int, *, model: int = 0, shortest: int = 1) -> None:
         """One more channel, before the start."""
         self._library.memory_channel(

@@ -17,8 +17,12 @@ from teds_provision.protocol.agreement import StationAgreement
 from teds_provision.protocol.flash import Flash
 from teds_provision.protocol.keys import GROUP_ORDER, SoftwareKey, fingerprint, node_key_message, station_key_message
 from teds_provision.protocol.messages.frames import Command, Function, decode_reply, security_command
+from teds_provision.protocol.operation.can_frames import cut
 from teds_provision.protocol.operation.commands import Power
+from teds_provision.protocol.operation.datagram import Layout, Sealer, drive_key
 from teds_provision.protocol.operation.hardware import ChannelHardware, Reading
+from teds_provision.protocol.operation.stream_commands import Action, Driven
+from teds_provision.protocol.operation.timing import Token
 from teds_provision.protocol.session import StationSession
 from teds_provision.protocol.tim import Tim
 from teds_provision.teds.image import SECURITY
@@ -34,12 +38,15 @@ CHANNELS = {
     1: ChannelHardware(Kind.SENSOR, 2, shortest=100_000),
     2: ChannelHardware(Kind.SENSOR, 3, shortest=1_000_000),
     7: ChannelHardware(Kind.ACTUATOR, 2, halt=0),
+    8: ChannelHardware(Kind.ACTUATOR, 5, halt=0),
+    9: ChannelHardware(Kind.EVENT_SENSOR, 2),
 }
 SHEET = {(0, 1): META, (1, 12): NAME} | {
     (number, 3): channel_teds(facts, period=0.001 if number == 2 else None) for number, facts in CHANNELS.items()
 }
 LINKS = ("nfc", "can:f1", "can:f2")
 MS = 1_000_000
+TOKEN = bytes(range(8))
 
 
 @dataclass
@@ -99,9 +106,7 @@ class Twins:
             lambda kind, size: NODE.secret() if kind == "i" else self._draw("c", kind, size), self.now, uuid=UUID
         )
         for number, facts in CHANNELS.items():
-            self.c.add_channel(
-                number, {Kind.SENSOR: 0, Kind.ACTUATOR: 1}[facts.kind], facts.octets, shortest=facts.shortest
-            )
+            self.c.add_channel(number, int(facts.kind), facts.octets, shortest=facts.shortest)
         self.said = 0
         self.restart()
 
@@ -167,6 +172,29 @@ class Twins:
             self.c.poll()
             self.frames()
 
+    def drive(self, link: str, data: bytes, *, fd: bool = False) -> None:
+        """A Drive frame of a station; both actuators do the same afterwards."""
+        self.py.drive(link, data)
+        self.c.take_frame(0x18EF0000 | 192 << 8 | int(link[4:], 16), data, fd=fd)
+        self.hold()
+
+    def trigger(self, link: str, token: bytes) -> None:
+        """A trigger frame."""
+        self.py.trigger(link, token, self.hardware.tick)
+        self.c.take_frame(0x18FF0000 | int(link[4:], 16), token)
+
+    def event(self, octets: bytes, *, valid: bool) -> None:
+        """The event sensor has seen something."""
+        self.py.poll()
+        self.py.event(9, self.hardware.tick, octets, valid=valid)
+        self.c.event(9, self.hardware.tick, octets, valid=valid)
+        self.frames()
+
+    def hold(self) -> None:
+        """What the actuators do."""
+        for channel, point in self.hardware.points.items():
+            assert self.c.set_point(channel, len(point)) == point
+
     def frames(self) -> None:
         """Data frames that may leave now."""
         while True:
@@ -184,15 +212,31 @@ class Station:
     def __init__(self, twins: Twins, seed: int) -> None:
         self.twins, self.dice = twins, random.Random(seed)
         self.key = b""
+        self.counter = 0
+        self.driven: dict[str, tuple[Layout, Sealer]] = {}
         self.sessions: dict[str, StationSession] = {}
         self.desk = Desk.__new__(Desk)
         self.desk.memory = twins.memory
+
+    def begin_measuring(self) -> None:
+        """A node that is provisioned, its channels claimed: where most moves are refused otherwise."""
+        self.agree("nfc", good=True)
+        self.open("can:f1", good=True)
+        self.write("can:f1", good=True)
+        self.open("can:f1", good=True)
+        digest = Operation.digest(self.twins.flash)
+        assert self.sealed(Command(0, 4, 1, digest + b"\x3c"), "can:f1")[0]
+        for channel in (7, 8):
+            assert self.sealed(Command(channel, 4, 1, digest + b"\x3c" + (5000).to_bytes(2, "big")), "can:f1")[0]
+        self.measure(security_command(Function.DRIVE, b"\x07\x08"), "can:f1")
+        assert "can:f1" in self.driven
 
     # -- moves -----------------------------------------------------------------------------------------------------
 
     def move(self) -> None:
         moves = [self.plain, self.agree, self.open, self.inner, self.inner, self.inner, self.write, self.measure]
-        moves += [self.measure, self.disturb, self.nonsense, self.wait]
+        moves += [self.measure, self.measure, self.drive, self.trigger, self.event]
+        moves += [self.disturb, self.nonsense, self.wait]
         self.dice.choice(moves)()
 
     def send(self, command: Command, link: str) -> tuple[bool, bytes]:
@@ -225,11 +269,11 @@ class Station:
         channel = self.dice.choice([0, 0, 0, 1, 255, 256, 65535])
         self.send(Command(channel, self.dice.choice([1, 1, 128, 128, 3, 4, 77]), function, payload), self.link())
 
-    def agree(self) -> None:
-        link = self.link()
+    def agree(self, link: str = "", *, good: bool = False) -> None:
+        link = link or self.link()
         flash = self.twins.flash
         credentials = CREDENTIALS
-        if self.dice.random() < 0.2:
+        if not good and self.dice.random() < 0.2:
             other = SoftwareKey(11)
             credentials = type(CREDENTIALS)(
                 CREDENTIALS.key, other.sign(station_key_message(CREDENTIALS.key.point)), other.point
@@ -241,14 +285,14 @@ class Station:
             return
         epoch = flash.epoch
         agreed = agreement.accept(payload, flash.security_teds(), pinned=fingerprint(NODE.point), epoch=epoch)
-        if self.dice.random() < 0.15:
+        if not good and self.dice.random() < 0.15:
             self.send(security_command(Function.CONFIRM, self.dice.randbytes(16)), link)
-        if self.send(agreed.confirm, self.dice.choice([link, link, self.link()]))[0]:
+        if self.send(agreed.confirm, link if good else self.dice.choice([link, link, self.link()]))[0]:
             self.key = agreed.key
             self.sessions.clear()
 
-    def open(self) -> None:
-        link = self.link()
+    def open(self, link: str = "", *, good: bool = False) -> None:
+        link = link or self.link()
         if not self.key:
             return
         session = StationSession(self.key, UUID, one_time=SoftwareKey(self.dice.randrange(1, 1 << 200)))
@@ -256,7 +300,7 @@ class Station:
         if not ok:
             return
         command = session.open(counter)
-        if self.dice.random() < 0.2:
+        if not good and self.dice.random() < 0.2:
             spoilt = bytearray(command.payload)
             spoilt[self.dice.randrange(len(spoilt))] ^= 1 << self.dice.randrange(8)
             self.send(security_command(Function.OPEN, bytes(spoilt)), link)
@@ -278,15 +322,15 @@ class Station:
         group = self.dice.choice([1, 128, 128, 3, 4, 5])
         self.sealed(Command(channel, group, function, payload), link)
 
-    def write(self) -> None:
+    def write(self, link: str | None = None, *, good: bool = False) -> None:
         """A datasheet, good or with one thing wrong."""
-        link = self.opened()
+        link = link or self.opened()
         if link is None:
             return
         blocks = dict(SHEET)
-        if self.dice.random() < 0.3:
+        if not good and self.dice.random() < 0.3:
             blocks.pop(self.dice.choice(list(blocks)))
-        wrong = self.dice.random() < 0.3
+        wrong = not good and self.dice.random() < 0.3
         changes: dict[str, object] = {}
         if wrong:
             changes = self.dice.choice([{"sequence": 0}, {"key_epoch": 77}, {"sequence": 1 << 31}, {}])
@@ -302,19 +346,21 @@ class Station:
         if self.dice.random() < 0.5:
             self.sealed(Command(0, 1, 4, b"\x01"), link)
         self.sealed(Command(0, 1, 4, b"\x80"), link)
-        if link in self.sessions and self.dice.random() < 0.7:
+        if link in self.sessions and (good or self.dice.random() < 0.7):
             self.sealed(security_command(Function.CLOSE), link)
             del self.sessions[link]
 
-    def measure(self) -> None:
-        link = self.opened()
+    def measure(self, asked: Command | None = None, link: str | None = None) -> None:
+        link = link or self.opened()
         if link is None:
             return
         digest = Operation.digest(self.twins.flash)
-        channels = self.dice.choice([b"\x01", b"\x02", b"\x01\x02", b"\x07", b"\x01\x01", b"\x09", b""])
+        channels = self.dice.choice([b"\x01", b"\x02", b"\x01\x02", b"\x07", b"\x01\x01", b"\x09", b"\x0a", b""])
         period = self.dice.choice([1, 3]) * MS * self.dice.choice([1, 1, 5])
-        subscribe = bytes([self.dice.randrange(5), self.dice.choice([0, 0x80, 2, 0x82, 1, 3]), self.dice.randrange(12)])
-        subscribe += self.dice.choice([0, 100]).to_bytes(2, "big") + period.to_bytes(8, "big") + bytes(8) + channels
+        subscribe = bytes([self.dice.randrange(5), self.dice.choice([0, 0x80, 2, 0x82, 1, 0x81, 3])])
+        subscribe += bytes([1 if channels == b"\x09" else self.dice.randrange(12)])
+        subscribe += self.dice.choice([0, 100]).to_bytes(2, "big") + period.to_bytes(8, "big")
+        subscribe += self.dice.choice([bytes(8), bytes(8), b"\xff" * 8]) + channels
         commands = [
             Command(self.dice.choice([0, 0, 1, 2, 9]), 4, 1, digest + bytes([self.dice.choice([0, 1, 10, 60, 61])])),
             Command(0, 4, 1, digest + b"\x0a"),
@@ -330,9 +376,46 @@ class Station:
             security_command(Function.CLOCK),
             security_command(Function.OPERATION),
             security_command(Function.POWER),
-            security_command(Function.ARM, self.dice.randbytes(16) + bytes([self.dice.choice([0, 5, 61]), 1])),
+            Command(8, 4, 1, digest + b"\x0a" + (2000).to_bytes(2, "big")),
+            Token(TOKEN).arm(self.dice.choice(list(Action)), self.dice.choice([0, 5, 60])).command(),
+            security_command(Function.ARM, self.dice.randbytes(16) + bytes([61, 1])),
+            security_command(Function.DRIVE, self.dice.choice([b"\x07", b"\x07\x08", b"\x08", b"\x01", b""])),
         ]
-        self.sealed(self.dice.choice(commands), link)
+        asked = asked or self.dice.choice(commands)
+        ok, payload = self.sealed(asked, link)
+        self.twins.hold()
+        if ok and asked.function == Function.DRIVE and asked.command_class == 128:
+            layout = Layout(tuple(asked.payload), tuple(CHANNELS[number].octets for number in asked.payload))
+            key = drive_key(self.sessions[link].message_key, Driven.decode(payload).run)
+            self.driven[link] = (layout, Sealer(key))
+            self.counter = 0
+
+    def drive(self) -> None:
+        """Messages in time and not, in order and not, whole and not."""
+        link = self.dice.choice(["can:f1", "can:f2"])
+        if link not in self.driven:
+            return
+        layout, sealer = self.driven[link]
+        ahead = self.dice.choice([0, 10_000, 19_000, 3_000_000, -1000])
+        until = (self.twins.hardware.tick // 1000 + ahead) % (1 << 32)
+        plain = until.to_bytes(4, "big") + bytes(self.dice.choice([0x11, 0x22, 0xF1]) for _ in range(layout.octets))
+        self.counter += self.dice.choice([0, 1, 1, 1, 5])
+        message = bytearray(sealer.seal(self.counter, plain))
+        if self.dice.random() < 0.1:
+            message[-1] ^= 1
+        pieces = [piece.data for piece in cut(bytes(message), fd=False, drive=True)]
+        if self.dice.random() < 0.2:
+            self.dice.shuffle(pieces)
+        for piece in pieces:
+            self.twins.drive(link, piece)
+
+    def trigger(self) -> None:
+        """The token that was armed, or another."""
+        link = self.dice.choice(["can:f1", "can:f2"])
+        self.twins.trigger(link, self.dice.choice([TOKEN, TOKEN, bytes(8)]))
+
+    def event(self) -> None:
+        self.twins.event(self.dice.randbytes(2), valid=self.dice.random() < 0.8)
 
     def disturb(self) -> None:
         """A link goes, power fails."""
@@ -374,9 +457,11 @@ class Operation:
 def test_both_nodes_answer_the_same(seed: int) -> None:
     twins = Twins(seed)
     station = Station(twins, 1000 + seed)
+    if seed % 2:
+        station.begin_measuring()
     for _ in range(150):
         station.move()
-    assert twins.said > 100
+    assert twins.said > 50
     assert not twins.c.misused
     blocks = {**twins.flash.blocks, SECURITY: twins.flash.security_teds()}
     assert twins.c.blocks() == blocks

@@ -12,6 +12,7 @@ from tests.e2e.desk import ANGLE, Desk, Station, results
 from tests.firmware import builds
 from tests.firmware.conftest import CNode
 from tests.handover.desk import Pair
+from tests.pace import until
 
 pytestmark = pytest.mark.system
 
@@ -73,6 +74,31 @@ def test_its_stream_loses_nothing(desk: Desk, station: Station, node: CNode, kin
     assert values >= 900
     assert messages >= 20
     assert (lost, late, bad) == (0, 0, 0)
+
+
+def test_an_actuator_is_set_held_and_goes_safe(desk: Desk, station: Station, node: CNode) -> None:
+    node.channels = "1 actuator 0 2 1000000 3\n2 sensor 0 2 1000000 0 12\n3 sensor 0 2 1000000 0 12\n"
+    node.start()
+    links = desk.links.over("can")
+    calibration = desk.folder / "gripper.toml"
+    calibration.write_text(
+        "".join(
+            f"[[calibration]]\nchannel = {channel}\ndate = 2026-11-01\nslope = {slope}\nintercept = 0\n"
+            for channel, slope in ((1, 37.0), (2, 0.0268), (3, 0.0341))
+        )
+    )
+    done = station.provision("can", "--profile", "gripper", "--calibration", calibration)
+    assert done["verdict"] == "authentic"
+    held = station.start("set", node.uuid, "1", "20", "--unit", "mm", "--dead-man", "500", "--hold", "60", *links)
+    rival = [*links[:-1], f"{links[-1]}&source=0xf2"]
+
+    def state() -> set[str]:
+        return set(station.ask("mode", node.uuid, *rival)["channels"][0]["state"])
+
+    until(lambda: state() == {"actuator", "claimed by other"}, seconds=30)
+    held.process.kill()  # nobody goes on: the dead-man runs out
+    held.end()
+    until(lambda: state() == {"actuator", "safe", "stopped"}, seconds=30)
 
 
 def test_its_identity_key_may_lie_in_psa_and_never_leave_it(desk: Desk, station: Station, node: CNode) -> None:

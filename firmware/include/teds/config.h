@@ -59,6 +59,19 @@
 #define TEDS_STREAMS 2
 #endif
 
+/* Data sets of all channels of one Drive, octets. */
+#ifndef TEDS_DRIVE_OCTETS
+#define TEDS_DRIVE_OCTETS 32
+#endif
+
+/* Events that wait for the main loop, and the longest data set of an event sensor. */
+#ifndef TEDS_EVENTS
+#define TEDS_EVENTS 4
+#endif
+#ifndef TEDS_EVENT_OCTETS
+#define TEDS_EVENT_OCTETS 8
+#endif
+
 /* Octets of the port's running SHA-256 (br_sha256_context 112, psa_hash_operation_t of Mbed TLS 2.28 232). */
 #ifndef TEDS_SHA256_OCTETS
 #define TEDS_SHA256_OCTETS 112
@@ -71,6 +84,9 @@
 
 #if TEDS_MAX_MESSAGE < 512 || TEDS_MAX_MESSAGE > 4094
 #error "TEDS_MAX_MESSAGE is 512 to 4094"
+#endif
+#if TEDS_DRIVE_OCTETS > 200
+#error "TEDS_DRIVE_OCTETS is at most 200"
 #endif
 #if TEDS_SESSIONS < 2 || TEDS_REPLIES <= TEDS_SESSIONS
 #error "two sessions at least, and a stored reply more than sessions"

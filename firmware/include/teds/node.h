@@ -83,6 +83,15 @@ typedef struct teds_session {
         uint64_t until;
         uint8_t commitment[16];
     } arms[3];
+    struct {
+        bool used, fd, seen, begun;
+        uint8_t count, segment, octets;
+        uint8_t places[16];
+        uint8_t key[16];
+        uint8_t at;
+        uint32_t last; /* highest counter with a good tag */
+        uint8_t message[16 + TEDS_DRIVE_OCTETS];
+    } drive;
 #endif
 } teds_session;
 
@@ -128,10 +137,24 @@ typedef struct teds_stream {
     uint8_t held;
     uint16_t gap, run, length, fill;
     uint32_t counter, full_counter;
-    uint64_t period, start, missed;
+    uint64_t period, start, missed, last_event;
+    bool had_event;
     uint8_t key[16];
     uint8_t filling[TEDS_MESSAGE - 12], waiting[TEDS_MESSAGE - 12];
 } teds_stream;
+#endif
+
+#if TEDS_OPERATION
+/* From an interrupt to the main loop: one side writes `in`, the other `out`. */
+typedef struct teds_events {
+    volatile uint8_t in, out;
+    struct {
+        uint8_t channel;
+        bool valid;
+        uint64_t tick;
+        uint8_t octets[TEDS_EVENT_OCTETS];
+    } ring[TEDS_EVENTS + 1];
+} teds_events;
 #endif
 
 typedef struct teds_line {
@@ -212,6 +235,7 @@ typedef struct teds_node {
     teds_can can;
 #if TEDS_OPERATION
     teds_stream streams[TEDS_STREAMS];
+    teds_events events;
 #endif
     teds_stored_reply replies[TEDS_REPLIES];
     uint8_t staging[TEDS_STAGING];
@@ -256,6 +280,10 @@ void teds_can_rx(teds_node *node, const teds_can_frame *frame, uint64_t tick);
 /* The next frame that may leave now; false: none. Ask when the controller is free for one: commands and replies go
  * before data, and what is still here can be taken back. */
 bool teds_can_tx(teds_node *node, teds_can_frame *frame, uint64_t now);
+
+/* An event sensor has seen something at `tick`: the one function that an interrupt may call. `octets` is a data set.
+ * Where the ring is full the event is lost. */
+void teds_sensor_event(teds_node *node, uint8_t channel, uint64_t tick, const uint8_t *octets, bool valid);
 
 /* Data messages that could not leave in time, since the start. */
 uint64_t teds_node_missed(const teds_node *node);

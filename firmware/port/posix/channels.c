@@ -19,7 +19,7 @@ int host_channels_read(host_channels *channels, const char *path)
 {
     FILE *file = fopen(path, "r");
     char line[160], word[16];
-    unsigned number, model, octets, halt;
+    unsigned number, model, octets, halt, bits;
     unsigned long shortest;
     if (file == NULL) {
         (void)fprintf(stderr, "%s cannot be read.\n", path);
@@ -32,8 +32,9 @@ int host_channels_read(host_channels *channels, const char *path)
             continue;
         }
         halt = 0;
-        read = sscanf(line, "%u %15s %u %u %lu %u", &number, word, &model, &octets, &shortest, &halt);
-        if (read < 5 || kind_of(word) < 0 || number < 1 || number > 255 || octets < 1 || octets > 8 ||
+        bits = 0;
+        read = sscanf(line, "%u %15s %u %u %lu %u %u", &number, word, &model, &octets, &shortest, &halt, &bits);
+        if (read < 5 || kind_of(word) < 0 || number < 1 || number > 255 || octets < 1 || octets > 8 || bits > 8 * octets ||
             channels->count == TEDS_CHANNELS) {
             (void)fprintf(stderr, "%s: not a channel: %s", path, line);
             (void)fclose(file);
@@ -45,6 +46,7 @@ int host_channels_read(host_channels *channels, const char *path)
         own->octets = (uint8_t)octets;
         own->halt = (uint8_t)halt;
         own->shortest = (uint32_t)shortest;
+        channels->bits[channels->count] = (uint8_t)(bits > 0 ? bits : 8 * octets);
         channels->count++;
     }
     (void)fclose(file);
@@ -85,7 +87,7 @@ bool host_sample(host_channels *channels, uint8_t channel, uint64_t tick, uint8_
 {
     for (size_t i = 0; i < channels->count; i++) {
         const teds_channel *own = &channels->table[i];
-        double most = ldexp(1.0, 8 * own->octets - 1) - 1;
+        double most = ldexp(1.0, channels->bits[i] < 53 ? channels->bits[i] : 53) - 1;
         uint64_t value;
         if (own->number != channel) {
             continue;

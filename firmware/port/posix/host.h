@@ -60,6 +60,7 @@ int socketcand_send(host_bus *bus, const teds_can_frame *frame);
 
 typedef struct host_channels {
     teds_channel table[TEDS_CHANNELS];
+    uint8_t bits[TEDS_CHANNELS]; /* of a sensor's value that are used */
     size_t count;
     char source; /* n noise, s sine, r ramp */
     double seconds;
@@ -67,7 +68,7 @@ typedef struct host_channels {
     uint8_t set_points[TEDS_CHANNELS][8];
 } host_channels;
 
-/* Read a file of channels: `number kind model octets shortest-ns [halt]`, a line each; -1 after words on stderr. */
+/* Read a file of channels: `number kind model octets shortest-ns [halt [bits]]`, a line each; -1 after words on stderr. */
 int host_channels_read(host_channels *channels, const char *path);
 int host_source(host_channels *channels, const char *source);
 bool host_sample(host_channels *channels, uint8_t channel, uint64_t tick, uint8_t *out);

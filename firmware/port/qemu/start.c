@@ -10,6 +10,8 @@ int main(void);
 #define SYSTICK_CONTROL REGISTER(0xE000E010u)
 #define SYSTICK_RELOAD REGISTER(0xE000E014u)
 #define SYSTICK_VALUE REGISTER(0xE000E018u)
+#define PENDING REGISTER(0xE000ED04u)
+#define SYSTICK_PENDS (1u << 26)
 #define RELOAD 0xFFFFFFu
 
 static volatile uint32_t wraps;
@@ -56,11 +58,15 @@ __attribute__((section(".vectors"), used)) static const void *const vectors[16] 
 
 uint64_t image_ticks(void)
 {
-    uint32_t before, value;
+    uint32_t before, value, pends;
     do {
         before = wraps;
         value = SYSTICK_VALUE;
+        pends = PENDING & SYSTICK_PENDS;
     } while (before != wraps);
+    /* It has run over and its interrupt has not been taken yet: without this the clock would go back by 0.7 s, and a
+     * session would seem to be older than the node. */
+    before += pends != 0 && value > RELOAD / 2 ? 1u : 0u;
     return (uint64_t)before * (RELOAD + 1u) + (RELOAD - value);
 }
 

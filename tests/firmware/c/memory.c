@@ -348,6 +348,17 @@ int memory_can_tx(memory_board *board, uint32_t *identifier, uint8_t *data, bool
     return frame.length;
 }
 
+void memory_event(memory_board *board, uint8_t channel, uint64_t tick, const uint8_t *octets_of_it, bool valid)
+{
+    teds_sensor_event(&board->node, channel, tick, octets_of_it, valid);
+}
+
+void memory_set_point(const memory_board *board, uint8_t channel, uint8_t *out)
+{
+    size_t place = place_of(board, channel);
+    memcpy(out, board->values[place], board->channels[place].octets);
+}
+
 size_t memory_node_octets(void)
 {
     return sizeof(teds_node);

@@ -59,6 +59,9 @@ int memory_by_hand(memory_board *board);
 void memory_can_rx(memory_board *board, uint32_t identifier, const uint8_t *data, uint8_t length, bool fd);
 /* Length of the frame, -1: none. */
 int memory_can_tx(memory_board *board, uint32_t *identifier, uint8_t *data, bool *fd);
+void memory_event(memory_board *board, uint8_t channel, uint64_t tick, const uint8_t *octets, bool valid);
+/* What an actuator does. */
+void memory_set_point(const memory_board *board, uint8_t channel, uint8_t *out);
 size_t memory_node_octets(void);
 
 #endif

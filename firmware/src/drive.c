@@ -1,0 +1,158 @@
+/* Drive (operation.md, 4 and 6): values for actuators by message, without a reply. Whatever is wrong with a message, it is
+ * dropped without a word; a good tag uses its counter up all the same. */
+#include "inside.h"
+
+#if TEDS_OPERATION
+
+#define HEAD 16u /* counter, until, tag */
+#define MICRO 1000u
+
+static uint32_t length_of(const teds_session *session)
+{
+    return HEAD + session->drive.octets;
+}
+
+int teds_drive(teds_node *node, const teds_command *command, const teds_origin *origin, uint8_t *out)
+{
+    teds_session *session = &node->sessions[origin->session];
+    uint8_t places[16], key[16];
+    uint32_t octets = 0;
+    const size_t count = command->length;
+    int refused = teds_channel_list(command->payload, count, 16);
+    if (refused) {
+        return refused;
+    }
+    if (origin->arrival->kind == TEDS_AT_NFC) {
+        return -TEDS_DOES_NOT_FIT;
+    }
+    for (size_t i = 0; i < count; i++) {
+        int place = teds_place_of(node, command->payload[i]);
+        if (!teds_is_claimed(node, origin, place)) {
+            return -TEDS_WRONG_STATE;
+        }
+        places[i] = (uint8_t)place;
+        octets += node->port->channels[place].octets;
+    }
+    for (size_t i = 0; i < count; i++) {
+        if (node->port->channels[places[i]].kind != TEDS_ACTUATOR) {
+            return -TEDS_NOT_PERMITTED;
+        }
+    }
+    if (session->run == UINT16_MAX || octets > TEDS_DRIVE_OCTETS) {
+        return -TEDS_NO_ROOM;
+    }
+    session->run++;
+    if (teds_run_key(node, session, "TEDS1 drive", 12, key) != 0) {
+        return -TEDS_FAILURE;
+    }
+    teds_wipe(&session->drive, sizeof session->drive);
+    session->drive.used = true;
+    session->drive.fd = origin->arrival->fd && TEDS_CAN_FD;
+    session->drive.count = (uint8_t)count;
+    session->drive.octets = (uint8_t)octets;
+    memcpy(session->drive.places, places, count);
+    memcpy(session->drive.key, key, sizeof key);
+    teds_wipe(key, sizeof key);
+    teds_put16(out, session->run);
+    teds_put16(out + 2, (uint16_t)length_of(session));
+    return 4;
+}
+
+void teds_drive_end(teds_node *node, int8_t session, uint32_t places)
+{
+    teds_session *own = &node->sessions[session];
+    for (size_t i = 0; own->drive.used && i < own->drive.count; i++) {
+        if ((places >> own->drive.places[i] & 1) != 0) {
+            teds_wipe(&own->drive, sizeof own->drive);
+        }
+    }
+}
+
+/* Neither past (which shows as far ahead, mod 2^32) nor further ahead than the shortest dead-man. */
+static bool in_time(const teds_node *node, const teds_session *session, uint32_t until)
+{
+    uint32_t ahead = until - (uint32_t)(teds_now(node) / MICRO);
+    for (size_t i = 0; i < session->drive.count; i++) {
+        if (ahead > node->dead_man[session->drive.places[i]] * MICRO) {
+            return false;
+        }
+    }
+    return true;
+}
+
+static void message(teds_node *node, teds_session *session)
+{
+    uint8_t plain[4 + TEDS_DRIVE_OCTETS], pairs[16 + TEDS_DRIVE_OCTETS], nonce[13] = {0};
+    uint32_t counter = teds_get32(session->drive.message);
+    size_t at = 4, length = 0;
+    if (session->drive.seen && counter <= session->drive.last) {
+        return;
+    }
+    teds_put32(nonce + 9, counter);
+    if (!node->port->ccm_open(node->port->user, session->drive.key, nonce, session->drive.message + 4,
+                              4u + session->drive.octets, plain, 8)) {
+        return;
+    }
+    session->drive.seen = true;
+    session->drive.last = counter;
+    for (size_t i = 0; i < session->drive.count; i++) {
+        const teds_channel *own = &node->port->channels[session->drive.places[i]];
+        pairs[length] = own->number;
+        memcpy(pairs + length + 1, plain + at, own->octets);
+        length += 1u + own->octets;
+        at += own->octets;
+    }
+    if (in_time(node, session, teds_get32(plain))) {
+        (void)teds_apply(node, pairs, length);
+    }
+}
+
+/* The length of a CAN FD frame that holds so many octets. */
+static size_t fd_length(size_t octets)
+{
+    teds_can_frame frame;
+    if (octets <= 8) {
+        return octets;
+    }
+    teds_can_pad(&frame, octets);
+    return frame.length;
+}
+
+void teds_drive_frame(teds_node *node, teds_link link, const uint8_t *octets, size_t length)
+{
+    int8_t number = teds_session_on(node, link);
+    teds_session *session;
+    size_t room, due;
+    if (number < 0 || length < 1 || octets[0] > 7) {
+        return;
+    }
+    (void)teds_operation_poll(node, teds_now(node)); /* a dead-man that ran out before this frame is over */
+    session = &node->sessions[number];
+    if (!session->drive.used) {
+        return;
+    }
+    if (octets[0] == 0) {
+        session->drive.begun = true;
+        session->drive.at = 0;
+    } else if (!session->drive.begun || octets[0] != session->drive.segment) {
+        session->drive.begun = false;
+        return;
+    }
+    room = session->drive.fd ? 63 : 7;
+    due = length_of(session) - session->drive.at < room ? length_of(session) - session->drive.at : room;
+    if (length - 1 != (session->drive.fd ? fd_length(due + 1) - 1 : due)) {
+        session->drive.begun = false;
+        return;
+    }
+    memcpy(session->drive.message + session->drive.at, octets + 1, due);
+    session->drive.at = (uint8_t)(session->drive.at + due);
+    session->drive.segment = (uint8_t)(octets[0] % 7 + 1);
+    if (session->drive.at == length_of(session)) {
+        session->drive.begun = false;
+        message(node, session);
+    }
+}
+
+#else
+typedef int teds_drive_is_left_out;
+#endif
