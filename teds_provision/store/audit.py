@@ -76,7 +76,7 @@ FAILED = (
     "failed", "refused", "error", "unproven", "unsigned", "other key", "read-back differs", "interrupted", "skipped",
     "lost", "declined",
     "not-", "not ", "no-", "node-", "other-key", "address-conflict", "frozen", "garbled", "link", "store", "vault",
-    "wrong-passphrase", "usage", "bad-data", "bug",
+    "wrong-", "calibration-misfit", "usage", "bad-data", "bug",
 )  # fmt: skip
 """How the outcome of an act begins that did not do what it should: words, and the codes of the errors that end one."""
 

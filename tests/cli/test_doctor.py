@@ -72,7 +72,7 @@ def test_values_that_no_command_takes_and_profiles_that_cannot_be_read_are_told(
     assert (checks["config"]["result"], "provision.timeout = -3" in checks["config"]["why"]) == ("failed", True)
     assert (checks["profiles"]["result"], "profile mine" in checks["profiles"]["why"]) == ("failed", True)
     (home / "config.toml").write_bytes(b"\xff\xfe=")
-    assert call(home, "--json", "nodes").json["error"]["message"].endswith("is not valid TOML: it is no UTF-8 text.")
+    assert call(home, "--json", "nodes").json["error"]["message"].endswith("config.toml:1: the text is not UTF-8.")
     (home / "profiles" / "mine.toml").write_text('extends = "load-cell"\ntitle = "mine"\n')
     (home / "config.toml").write_text("[provision]\ntimeout = 3\n")
     assert call(home, "--json", "doctor").json["failed"] == 0
