@@ -30,7 +30,8 @@ from teds_provision.measure.blocks import Block, ChannelFacts, NodeReport, Stati
 from teds_provision.measure.sinks import open_sink
 from teds_provision.measure.sinks.mcap.recording import SAMPLES, TYPE, McapSink
 from teds_provision.measure.sinks.mcap.recover import recover
-from tests.cli.shell import call
+from tests.cli.shell import call, unmeasured_environment
+from tests.faults.disk import build_library, put_back
 from tests.measure.sinks.parts import ANGLE, ARM, FORCE, HAND, STATION, block, blocks, fill
 from tests.pace import best_of, until
 
@@ -408,7 +409,8 @@ import sys, time, resource
 sys.path.insert(0, {root!r})
 from dataclasses import replace
 from pathlib import Path
-from tests.cli.shell import call
+from tests.cli.shell import call, unmeasured_environment
+from tests.faults.disk import build_library, put_back
 from tests.measure.sinks.parts import ANGLE, STATION, block
 from teds_provision.measure.sinks import open_sink
 if {limit}: resource.setrlimit(resource.RLIMIT_FSIZE, ({limit}, {limit}))
@@ -465,6 +467,58 @@ def test_a_full_disk_ends_the_recording_with_an_error_and_whole_lines(tmp_path: 
     for line in (tmp_path / "run.jsonl").read_text().splitlines():
         json.loads(line)
     recover(tmp_path / "run.mcap")
+
+
+PARTS = """
+import sys, time
+sys.path.insert(0, {root!r})
+from tests.measure.sinks.parts import ANGLE, STATION, block
+from teds_provision.measure.blocks import ClockSet
+from teds_provision.measure.sinks import open_sink
+sinks = [open_sink({folder!r} + "/run." + suffix) for suffix in ("csv", "jsonl", "mcap")]
+for sink in sinks:
+    sink.open([ANGLE], STATION)
+    sink.write(block())
+    sink.clock_set(ClockSet(STATION.started, 1.0))
+    sink.write(block(index=3))
+while sum(len(sink.files) == 2 and sink.stats.written == 6 for sink in sinks) < 3: time.sleep(0.05)
+time.sleep(2.5)
+print("there", flush=True)
+time.sleep(600)
+"""
+
+
+def test_a_part_that_began_a_moment_ago_outlives_a_loss_of_power(tmp_path: Path) -> None:
+    """A file whose folder was never brought to the disk is gone with the power, however often it was synced itself.
+
+    The shadow of the fault bench is the disk as it was at the last fsync of each file and folder.
+    """
+    root, shadow = tmp_path.resolve() / "kept", tmp_path.resolve() / "shadow"
+    root.mkdir()
+    shadow.mkdir()
+    faults = {
+        "LD_PRELOAD": str(build_library(tmp_path)),
+        "FAULT_ROOTS": str(root),
+        "FAULT_SHADOW": str(shadow),
+        "FAULT_AT": "1000000",
+        "FAULT_HOW": "kill",
+        "FAULT_COUNT": str(tmp_path / "count"),
+    }
+    code = PARTS.format(root=ROOT, folder=str(root))
+    environment = unmeasured_environment() | faults
+    with subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, text=True, env=environment) as child:
+        assert child.stdout is not None
+        assert child.stdout.readline() == "there\n"
+        os.kill(child.pid, signal.SIGKILL)
+    put_back(shadow, root)
+    for suffix in ("csv", "jsonl", "mcap"):
+        assert (root / f"run.{suffix}").exists(), "the first part"
+        assert (root / f"run.2.{suffix}").exists(), "the second"
+    recover(root / "run.2.mcap")
+    for name in ("run.mcap", "run.2.mcap"):
+        assert len(samples(root / name)) == 3, name
+    for name in ("run.csv", "run.2.csv"):
+        assert len(rows((root / name).read_text())) == 3, name
 
 
 def test_writing_never_waits_for_the_disk(tmp_path: Path) -> None:
