@@ -200,14 +200,21 @@ class Client:
         return found
 
     def write_teds(
-        self, node: str, content: str, *, accept_calibration: str | None = None, dry_run: bool = False
+        self,
+        node: str,
+        content: str,
+        *,
+        accept_calibration: str | None = None,
+        retype: bool = False,
+        dry_run: bool = False,
     ) -> SheetPlan:
         """Write a datasheet (XML, JSON, hex); ``dry_run``: only show what that would change.
 
-        ``accept_calibration``: why a calibration that the guard refuses is right.
+        ``accept_calibration``: why a calibration that the guard refuses is right. ``retype``: the board may become one
+        of another type than it says it is (else ApiError, ``wrong-board``).
         """
         query = "?dry_run=1" if dry_run else ""
-        body = {"content": content, "accept_calibration": accept_calibration}
+        body = {"content": content, "accept_calibration": accept_calibration, "retype": retype}
         found: SheetPlan = self.request("PUT", f"/nodes/{quote(node, safe='')}/teds{query}", body)
         return found
 

@@ -277,7 +277,7 @@ class Curve(TypedDict):
     name: str
     x_unit: str
     y_unit: str
-    points: list[list[float]]
+    points: Annotated[list[list[float | None]], Meta(description="raw, value; null: an angle goes on at its other end")]
 
 
 class Sheet(_Origin):

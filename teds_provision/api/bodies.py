@@ -48,6 +48,7 @@ class SheetText:
     accept_calibration: Annotated[str, Meta(description="why a calibration that the guard refuses is right")] | None = (
         None
     )
+    retype: Annotated[bool, Meta(description="whether the board may become one of another type")] | None = None
 
 
 @dataclass(frozen=True)

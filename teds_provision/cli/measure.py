@@ -236,7 +236,7 @@ def _recover(app: App, files: Sequence[str], output: Path | None) -> None:
 
 
 def _damage(file: str, done: Recovered) -> BadData:
-    named = [f"a {one.what} at octet {one.offset} ({one.octets} octets)" for one in done.damaged[:MOST_NAMED]]
+    named = [f"{one.what} at octet {one.offset} ({one.octets} octets)" for one in done.damaged[:MOST_NAMED]]
     more = len(done.damaged) - len(named)
     return BadData(
         f"{file} is damaged inside: {', '.join(named)}{f' and {more} more' if more else ''}.",

@@ -73,12 +73,17 @@ def trusted_node(app: App, station: Station, links: LinkSettings, uuid: bytes, *
 @link_options
 @pass_app
 def sample(app: App, node: str, channels: Sequence[int], links: LinkSettings) -> None:
-    """Take one reading now: datasheet verified, values calibrated. Without channels every sensor is read."""
+    """Take one reading now: datasheet verified, values calibrated. Without channels every sensor is read.
+
+    Where the node has started since its datasheet was read, the Security TEDS alone is read anew ("from": "kept" with
+    --json); values come from the signed copy. verify UUID reads all of it.
+    """
     station = app.station()
     uuid = station.nodes.resolve(node)
     with trusted_node(app, station, links, uuid, by="sample") as trusted:
         samples = measure.sampling.take_samples(trusted, channels)
-    result = {"uuid": uuid.hex(), "samples": [one.as_json() for one in samples]}
+    origin = "kept" if trusted.kept else "session"
+    result = {"uuid": uuid.hex(), "from": origin, "samples": [one.as_json() for one in samples]}
     app.emit(result, lambda console: _samples(console, samples))
 
 

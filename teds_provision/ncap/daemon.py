@@ -57,7 +57,7 @@ class Daemon:
             station, self.roster, self.live, self.turns, self.buses, sinks, self._admits, dead_man=settings.dead_man
         )
         self._takes_set_points = sinks.take_set_points
-        self.names = Names(station, self.roster, self.live, self.measuring.is_measured)
+        self.names = Names(station, self.roster, self.live, self.measuring.is_measured, self.measuring.facts_of)
         self.sheets = Sheets(station, self.roster, self.desk, self.measuring.sheet)
         self.provisioning = Provisioning(station, self.roster, self.live, self.desk)
         self.holding = Holding(

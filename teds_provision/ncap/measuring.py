@@ -14,7 +14,7 @@ from dataclasses import asdict, dataclass, field
 from typing import Any, Final
 
 from teds_provision.errors import NodeBusy, NotFound, TedsProvisionError, UsageFailure
-from teds_provision.measure.blocks import ChannelFacts, Command, NodeReport
+from teds_provision.measure.blocks import ChannelFacts, Command, NodeReport, StationFacts
 from teds_provision.measure.finding.buses import Buses
 from teds_provision.measure.planning import period_of, sensors_of
 from teds_provision.measure.runner import Watcher
@@ -188,6 +188,12 @@ class Measuring:
         """Whether a node is in a session of a measurement now."""
         job = self._job_of(uuid)
         return job is not None and job.measurement is not None and self._turns.holder(uuid) is not None
+
+    def facts_of(self, uuid: str) -> StationFacts | None:
+        """What the sinks of the running measurement of a node were told of the station's names; None: none runs."""
+        job = self._job_of(uuid)
+        measurement = job.measurement if job is not None else None
+        return measurement.facts if measurement is not None else None
 
     def group_is_measured(self, name: str) -> bool:
         """Whether a measurement of this group runs."""
@@ -369,4 +375,7 @@ def _state_of(one: Running, job: Job) -> tuple[str, str]:
         return "running", f"{len(lacking)} of {len(one.uuids)} nodes are missing" if lacking else ""
     if job.error is not None:
         return "waiting", job.error.message
+    refused = sum(report["state"] == "refused" for report in one.reports.values())
+    if refused:
+        return "waiting", f"{refused} of {len(one.uuids)} nodes are refused"
     return ("waiting", "no node has answered yet") if states else ("starting", "")

@@ -7,7 +7,7 @@ from collections.abc import Callable
 from typing import Any
 
 from teds_provision.errors import Frozen, UsageFailure
-from teds_provision.measure.blocks import ChannelFacts
+from teds_provision.measure.blocks import ChannelFacts, StationFacts
 from teds_provision.measure.running.job import station_facts
 from teds_provision.measure.sinks.names import Topics, is_topic
 from teds_provision.ncap.live import Live
@@ -16,10 +16,23 @@ from teds_provision.station.station import Station
 
 
 class Names:
-    """The names of one station, as sinks make them; ``is_measured`` freezes those of a node."""
+    """The names of one station, as sinks make them; ``is_measured`` freezes those of a node.
 
-    def __init__(self, station: Station, roster: Roster, live: Live, is_measured: Callable[[str], bool]) -> None:
+    ``in_use`` gives what the sinks of its running measurement were told of the station: a node of the same name that
+    came since changes what is made for the next one, not what is published.
+    """
+
+    def __init__(
+        self,
+        station: Station,
+        roster: Roster,
+        live: Live,
+        is_measured: Callable[[str], bool],
+        in_use: Callable[[str], StationFacts | None],
+    ) -> None:
         self._station, self._roster, self._live, self._is_measured = station, roster, live, is_measured
+        self._in_use = in_use
+        self._of_running: tuple[StationFacts, int, Topics] | None = None
         self._guard = threading.Lock()
         self._topics: Topics | None = None
         self._made_of = -1  # the roster's count of changes
@@ -32,13 +45,14 @@ class Names:
 
     def topic(self, uuid: str, channel: int) -> str:
         """Whole topic of a channel."""
-        return self._now().channel(uuid, channel)
+        return self._topics_of(uuid, self._now()).channel(uuid, channel)
 
     def all(self) -> list[dict[str, Any]]:
         """Every channel with its topic, and what was chosen for it; channel 0 is the node's part."""
-        topics, chosen = self._now(), self._station.measurements.names
+        now, chosen = self._now(), self._station.measurements.names
         found = []
         for uuid in self._roster.uuids():
+            topics = self._topics_of(uuid, now)
             raw = bytes.fromhex(uuid)
             found.append({"uuid": uuid, "channel": 0, "name": chosen.get((raw, 0)), "topic": topics.node(uuid)})
             for number, _ in self._roster.channel_names(uuid):
@@ -55,6 +69,9 @@ class Names:
             )
         if name is not None:
             self._now().require_free(uuid, channel, name)
+            meant = name.strip("/") if not channel else f"/{name.strip('/')}"
+            if any(row["topic"] == meant for row in self.all() if (row["uuid"], row["channel"]) != (uuid, channel)):
+                raise UsageFailure(f"{name!r} is published already.", hint="Choose another name.")
         raw = bytes.fromhex(uuid)
         if self._is_measured(uuid) or self._station.measurements.is_running(raw):
             raise Frozen(f"Node {uuid} is being measured: its names stay.", hint="End that measurement first.")
@@ -70,13 +87,26 @@ class Names:
             topics = self._topics if self._made_of == changes else None
         if topics is not None:
             return topics
-        topics = Topics(station_facts(self._station))
-        facts = [
-            ChannelFacts(uuid, self._roster.name(uuid), number, name)
-            for uuid in self._roster.uuids()
-            for number, name in self._roster.channel_names(uuid)
-        ]
-        topics.learn(facts)
+        topics = self._made(station_facts(self._station))
         with self._guard:
             self._topics, self._made_of = topics, changes
         return topics
+
+    def _made(self, station: StationFacts) -> Topics:
+        topics = Topics(station)
+        topics.learn(
+            ChannelFacts(uuid, self._roster.name(uuid), number, name)
+            for uuid in self._roster.uuids()
+            for number, name in self._roster.channel_names(uuid)
+        )
+        return topics
+
+    def _topics_of(self, uuid: str, now: Topics) -> Topics:
+        """As its running measurement publishes them, else as the next one will."""
+        facts = self._in_use(uuid)
+        if facts is None:
+            return now
+        changes, made = self._roster.changes, self._of_running
+        if made is None or made[0] is not facts or made[1] != changes:
+            made = self._of_running = (facts, changes, self._made(facts))
+        return made[2]

@@ -1,6 +1,6 @@
 """Repetition on a link: an octet-equal request gets its stored reply, nothing is run twice (profile.md, "Repetition").
 
-The node keeps, for each link, the last request and its reply for 20 s. Commands that change nothing (Identify, Prove,
+The node keeps, for each link, the last request and its reply for 20 s from the reply's end. Commands that change nothing (Identify, Prove,
 List, Query, Read, outside Sealed) are always run anew.
 """
 
@@ -35,6 +35,10 @@ class Repetition:
             reply = run(frame)
         self._request, self._reply, self._at = (transaction, frame), reply, now
         return reply
+
+    def left(self, now: float) -> None:
+        """The reply has left: it is kept from here on. A commit, or a long reply, may take seconds."""
+        self._at = now
 
     def forget(self) -> None:
         """Loss of the field or link, bus-off or restart."""

@@ -144,6 +144,12 @@ def settle(existing: Material | None, restored: str | None) -> Material:
     if existing is None:
         return material
     here, there = existing.masters.keys, material.masters.keys
-    if existing.identity != material.identity or any(here[number] != there[number] for number in here.keys() & there):
+    if existing.identity != material.identity:
         raise VaultFailure("The vault holds the keys of another station.", hint="Restore into another --home.")
+    if any(here[number] != there[number] for number in here.keys() & there):
+        raise VaultFailure(
+            "The vault holds keys of another life of this station: it was restored from another backup and its master "
+            "key was made anew there.",
+            hint="Restore into another --home.",
+        )
     return Material(existing.identity, existing.ca or material.ca, MasterKeys({**there, **here}))

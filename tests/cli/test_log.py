@@ -16,6 +16,7 @@ from zoneinfo import ZoneInfo
 import pytest
 
 from teds_provision.errors import TedsProvisionError
+from teds_provision.steps.board_type import WrongBoard
 from teds_provision.steps.build import NotNamed
 from teds_provision.steps.many.board import Declined
 from teds_provision.store import Store
@@ -139,7 +140,7 @@ def errors(kind: type[TedsProvisionError] = TedsProvisionError) -> set[str]:
 
 def test_what_ended_with_an_error_of_any_kind_is_among_the_failed(home: Path) -> None:
     """A "no" at the question, a board of another owner, one that fell silent: they were left out."""
-    codes = errors() | {NotNamed.code, Declined.code}
+    codes = errors() | {NotNamed.code, Declined.code, WrongBoard.code}
     assert {"declined", "not-named", "node-refused", "node-silent", "not-whitelisted", "bad-data"} <= codes
     with Store.open(home) as store:
         for code in sorted(codes):

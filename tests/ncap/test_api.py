@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -11,6 +12,9 @@ from typing import Any
 import pytest
 
 from teds_provision.client import ApiError, Client
+from teds_provision.ncap.nodes.sheets import curves
+from teds_provision.teds.calibration import read_calibrations
+from teds_provision.teds.profile import load_profile
 from tests.e2e.desk import ANGLE
 from tests.ncap.service import Service, verdict, verified, virtual
 from tests.pace import best_of, succeeds, until
@@ -61,7 +65,8 @@ def measured(asked: Client, uuid: str) -> dict[str, Any]:
     def fresh() -> dict[str, Any] | None:
         node = asked.node(uuid)
         last = node["channels"][1]["last"]
-        return node if last and last["age"] < 2 else None
+        running = (node["measuring"] or {}).get("state") == "running"  # else it is the last one's value
+        return node if running and last and last["age"] < 2 else None
 
     return dict(until(fresh))
 
@@ -118,6 +123,53 @@ def test_a_datasheet_is_written_after_its_diff_was_shown(asked: Client, hand: st
     assert (asked.node(hand)["sequence"], asked.node(hand)["name"]) == (before + 1, "left hand")
     back = asked.request("PUT", f"/nodes/{hand}/teds", {"content": document})
     assert back["verdict"] == "authentic"
+
+
+def test_a_datasheet_of_another_type_makes_no_board_another_one_unless_it_is_said(
+    service: Service, asked: Client, hand: str
+) -> None:
+    virtual(service, ANGLE, "elbow")
+    document = asked.request("GET", "/nodes/elbow/teds?format=json")
+    path, body = f"/nodes/{hand}/teds", {"content": json.dumps(document).replace(asked.node("elbow")["uuid"], hand)}
+    before = asked.node(hand)["sequence"]
+    for where in (path, f"{path}?dry_run=1"):
+        assert "of another type" in refused(asked, 422, "wrong-board", "PUT", where, body)
+    assert asked.node(hand)["sequence"] == before
+    assert asked.request("PUT", f"{path}?dry_run=1", {**body, "retype": True})["changes"]
+    [noted] = asked.request("GET", f"/log?act=api&failed=1&uuid={hand}&limit=1")["entries"]
+    assert (noted["outcome"], noted["facts"]["method"]) == ("wrong-board", "PUT")
+
+
+def test_a_refused_change_stands_in_the_log_with_who_asked_for_what_and_why(
+    service: Service, asked: Client, hand: str
+) -> None:
+    asked.request("POST", "/groups", {"name": "robot", "uuids": [hand]})
+    asked.request("POST", "/measurements", {"group": "robot", "rate": 50})
+    measured(asked, hand)
+    headers: dict[str, str | None] = {"Content-Type": "application/json"}
+    headers["Authorization"] = f"Bearer {service.token('robot 8')}"
+    body = json.dumps({"uuid": hand, "channel": 2, "name": "other"})
+    assert service.raw("PUT", "/api/v1/names", headers, body).status == 409
+    assert service.raw("PUT", "/api/v1/names", headers, '{"no such": 1}').status == 422, "no request, no entry"
+    [noted] = asked.request("GET", "/log?act=api&limit=1")["entries"]
+    assert (noted["actor"], noted["outcome"], noted["failed"]) == ("robot 8", "frozen", True)
+    facts = noted["facts"]
+    assert (facts["path"], facts["name"], facts["channel"]) == ("/api/v1/names", "other", 2)
+    assert "frozen" in facts["why"] or "measured" in facts["why"]
+
+
+def test_the_curve_of_an_angle_is_drawn_as_it_is_measured_within_its_turn() -> None:
+    profile = load_profile(ANGLE)
+    text = "# zero-offset: 90\nraw,value [degree]\n0,0\n65536,360\n"
+    made = read_calibrations(text, "angle.csv", profile)
+    (curve,) = curves(profile.build(bytes(10), calibration=made).blocks)
+    values = [y for _, y in curve["points"] if y is not None]
+    turn = 360 if curve["y_unit"] == "°" else 2 * math.pi
+    assert 0 <= min(values) < max(values) <= turn * 1.000001
+    assert values[0] == pytest.approx(turn / 4)
+    [gap] = [at for at, (_, y) in enumerate(curve["points"]) if y is None]
+    (before, top), _, (after, bottom) = curve["points"][gap - 1 : gap + 2]
+    assert (before, after, top, bottom) == pytest.approx((49152, 49152, turn, 0), abs=1), "no line across"
 
 
 def test_a_datasheet_that_is_damaged_of_another_node_or_none_is_refused(asked: Client, hand: str) -> None:
@@ -339,3 +391,32 @@ def test_more_than_a_thousand_nodes_come_in_pages(service: Service, asked: Clien
     assert {*many, hand} <= set(uuids)
     few = asked.request("GET", f"/nodes?offset={answer['total'] - 1}&limit=5")
     assert [one["uuid"] for one in few["nodes"]] == uuids[-1:]
+
+
+def test_a_namesake_that_comes_changes_no_name_that_is_being_published(
+    service: Service, asked: Client, hand: str
+) -> None:
+    """/names told of the topics that the next measurement would have, while the running one published under others."""
+
+    def topics() -> dict[str, set[str]]:
+        found: dict[str, set[str]] = {}
+        for row in asked.request("GET", "/names")["names"]:
+            found.setdefault(row["uuid"], set()).add(row["topic"])
+        return found
+
+    made = asked.request("POST", "/measurements", {"uuids": [hand], "rate": 50})
+    measured(asked, hand)
+    before = topics()[hand]
+    other = virtual(service, name="hand.")
+    during = topics()
+    assert (
+        during[hand]
+        == before
+        == {"hand", *(f"/bench/hand/{name}" for name in ("opening_set_point", "opening", "grip_force"))}
+    )
+    assert not during[other] & during[hand]
+    assert asked.node(hand)["channels"][1]["topic"] == "/bench/hand/opening"
+    row = {"uuid": other, "channel": 2, "name": "bench/hand/opening"}
+    refused(asked, 422, "usage", "PUT", "/names", row)
+    asked.end_measurement(made["id"])
+    assert f"/bench/hand_{hand[:8]}/opening" in topics()[hand], "the next one tells them apart"

@@ -5,6 +5,9 @@ from __future__ import annotations
 import re
 import signal
 import time
+import urllib.error
+import urllib.request
+from contextlib import suppress
 from typing import TYPE_CHECKING
 
 import pytest
@@ -14,7 +17,7 @@ from tests.e2e.desk import ANGLE
 from .lab import Lab, opened
 
 if TYPE_CHECKING:
-    from playwright.sync_api import Browser
+    from playwright.sync_api import Browser, Route
 
 pytestmark = pytest.mark.system
 
@@ -105,6 +108,62 @@ def test_a_browser_whose_token_was_removed_is_told_how_to_sign_in(browser: Brows
         page.get_by_role("alert").get_by_text("teds-provision ncap open").wait_for()
         page.goto(fresh.login())
         page.locator("#connection", has_text="Live").wait_for()
+
+
+def test_a_browser_whose_token_was_removed_stops_asking_also_where_others_guess_tokens(
+    browser: Browser, fresh: Lab
+) -> None:
+    """After ten wrong tokens of anybody the page was told 429 in place of 401, and tried again for ever."""
+    fresh.run()
+    with opened(browser, fresh) as page:
+        for _ in range(11):
+            request = urllib.request.Request(f"{fresh.url}/api/v1/status", headers={"Authorization": "Bearer wrong"})
+            with suppress(urllib.error.HTTPError):
+                urllib.request.urlopen(request, timeout=60).close()
+        sockets: list[str] = []
+        page.on("websocket", lambda socket: sockets.append(socket.url))
+        fresh.ask("ncap", "token", "remove", "browser")
+        page.locator("#connection", has_text="Signed out").wait_for()
+        page.wait_for_timeout(4000)  # longer than it waits between two tries
+        assert (sockets, page.locator("#connection").inner_text()) == ([], "Signed out")
+
+
+def test_a_verdict_that_rests_on_what_was_read_before_says_so_and_what_no_session_said_stands_beside_it(
+    browser: Browser, lab: Lab
+) -> None:
+    uuid = lab.nodes["hand"].uuid
+    changed = {
+        "verdict": {"verdict": "authentic", "checks": [], "from": "kept", "at": "2026-11-22T10:00:00Z", "by": "ncap"},
+        "heard": {
+            "verdict": "not authentic",
+            "checks": [],
+            "from": "plain",
+            "at": "2026-11-22T10:00:00Z",
+            "by": "ncap",
+        },
+    }
+
+    def told(route: Route) -> None:
+        answer = route.fetch()
+        found = answer.json()
+        for node in found.get("nodes", [found]):
+            if node.get("uuid") == uuid:
+                node.update(changed)
+        route.fulfill(response=answer, json=found)
+
+    with opened(browser, lab) as page:
+        page.route("**/api/v1/nodes*", told)
+        page.route(f"**/api/v1/nodes/{uuid}", told)
+        page.goto(f"{lab.url}/#/nodes/{uuid}")
+        page.reload()
+        head = page.locator(".node-head")
+        head.get_by_text("Kept", exact=True).wait_for()
+        head.get_by_text("Authentic", exact=True).wait_for()  # what no session said replaces nothing
+        head.get_by_text("Heard in no session: not authentic").wait_for()
+        page.unroute_all()
+        page.reload()
+        head.get_by_text("Authentic", exact=True).wait_for()
+        assert head.get_by_text("Kept", exact=True).count() == head.get_by_text("Heard in no session").count() == 0
 
 
 @pytest.mark.realtime

@@ -11,10 +11,11 @@ import pytest
 from teds_provision.errors import CalibrationMisfit
 from teds_provision.handover.life import plan_takeover, take_over
 from teds_provision.station.station import Station
+from teds_provision.steps.board_type import WrongBoard
 from teds_provision.steps.build import build
 from teds_provision.steps.build_order import BuildOrder
 from teds_provision.steps.provision import Provisioned, provision
-from teds_provision.steps.visits.sheet_file import write_sheet
+from teds_provision.steps.visits.sheet_file import plan_sheet, write_sheet
 from teds_provision.talk.progress import Silent
 from teds_provision.teds.calibration import Calibration, read_calibrations
 from teds_provision.teds.calibration.samples import SampleForm
@@ -99,8 +100,15 @@ def test_a_datasheet_by_document_does_not_carry_a_calibration_to_another_unit(
     with talk(board) as node:
         blocks = dict(station.nodes.datasheet(board.uuid).unsigned_blocks())  # type: ignore[union-attr]
         blocks[1, AccessCode.CHANNEL] = load_profile("load-cell").build(board.uuid).blocks[1, AccessCode.CHANNEL]
-        with pytest.raises(CalibrationMisfit):
+        with pytest.raises(WrongBoard, match="in rad, not in N"):
             write_sheet(station, node, blocks, Silent())
+        with pytest.raises(CalibrationMisfit):
+            write_sheet(station, node, blocks, Silent(), retype=True)
+        del blocks[1, AccessCode.CALIBRATION]
+        with pytest.raises(WrongBoard):
+            plan_sheet(station, node, blocks)
+        assert plan_sheet(station, node, blocks, retype=True).changes
+    assert station.nodes.draft(board.uuid) is None, "nothing was begun"
 
 
 def angle() -> tuple[Calibration, Channel]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Final
 
@@ -23,6 +23,7 @@ from teds_provision.store import utc_now
 from teds_provision.talk.conversation import Conversation
 from teds_provision.talk.progress import Silent, StepResult
 from teds_provision.teds.calibration.model import is_finite
+from teds_provision.teds.channel import TURN
 from teds_provision.teds.formats import Block, placed, write_blocks
 from teds_provision.teds.image import BlockId, Image
 from teds_provision.teds.sheet import Sheet
@@ -35,6 +36,7 @@ else:  # numpy
 
 FORMATS: Final = {"json": "application/json", "xml": "application/xml", "hex": "text/plain; charset=utf-8"}
 _POINTS: Final = 200
+_MOST_TURNS: Final = 100
 MeasuredSheet = Callable[[str], Image | None]
 
 
@@ -113,23 +115,23 @@ class Sheets:
 
     # -- writing -----------------------------------------------------------------------------------------------------
 
-    def plan(self, uuid: str, content: str, *, accept: str | None = None) -> dict[str, Any]:
+    def plan(self, uuid: str, content: str, *, accept: str | None = None, retype: bool = False) -> dict[str, Any]:
         """What writing this document would change; nothing is changed."""
         blocks = parsed(content)
         plan = self._desk.with_node(
             uuid,
             "a datasheet is compared",
-            lambda node: plan_sheet(self._station, node, blocks, accept_calibration=accept),
+            lambda node: plan_sheet(self._station, node, blocks, accept_calibration=accept, retype=retype),
         )
         return {"uuid": uuid, "dry_run": True, **_plan_json(plan), "steps": [], "verdict": None}
 
-    def write(self, uuid: str, content: str, *, accept: str | None = None) -> dict[str, Any]:
+    def write(self, uuid: str, content: str, *, accept: str | None = None, retype: bool = False) -> dict[str, Any]:
         """Write it: built, guarded, diffed, signed, written, verified."""
         blocks = parsed(content)
 
         def work(node: Conversation) -> dict[str, Any]:
             with self._station.turn(node.uuid):
-                done = write_sheet(self._station, node, blocks, Silent(), accept_calibration=accept)
+                done = write_sheet(self._station, node, blocks, Silent(), accept_calibration=accept, retype=retype)
             steps = [_step(one) for one in done.steps]
             return {**_plan_json(done.plan), "steps": steps, "verdict": done.verified.verdict}
 
@@ -171,7 +173,11 @@ def _step(one: StepResult) -> dict[str, Any]:
 
 
 def curves(blocks: Mapping[BlockId, bytes]) -> list[dict[str, Any]]:
-    """Every calibration of one input that can be drawn: points of (raw value, value in ``y_unit``), at most 200."""
+    """Every calibration of one input that can be drawn: points of (raw value, value in ``y_unit``), at most 200.
+
+    An angle over a full turn is drawn as it is measured: within its limits, with a gap (the value None) where it goes
+    on at the other end.
+    """
     sheet = Sheet.of_blocks(blocks)
     found = []
     for number, calibration in sheet.calibrations.items():
@@ -185,8 +191,25 @@ def curves(blocks: Mapping[BlockId, bytes]) -> list[dict[str, Any]]:
         raws, values = curve.axes[0].tolist(), curve.result.tolist()
         step = max(1, math.ceil(len(raws) / _POINTS))
         kept = sorted({*range(0, len(raws), step), len(raws) - 1})
-        points = [[raws[at], channel.unit.from_si(values[at])] for at in kept if math.isfinite(values[at])]
+        drawn = [(float(raws[at]), values[at]) for at in kept if math.isfinite(values[at])]
+        line = within_a_turn(drawn, min(own.low, own.high)) if own.full_turn else drawn
+        points = [[raw, None if value is None else channel.unit.from_si(value)] for raw, value in line]
         found.append(
             {"channel": number, "name": channel.name, "x_unit": "raw", "y_unit": channel.unit.text, "points": points}
         )
+    return found
+
+
+def within_a_turn(points: Sequence[tuple[float, float]], low: float) -> list[tuple[float, float | None]]:
+    """A line of (raw value, angle in rad) within [low, low + 2π], with None where it goes on at the other end."""
+    found: list[tuple[float, float | None]] = []
+    for (x0, y0), (x1, y1) in zip(points, [*points[1:], *points[-1:]], strict=True):
+        turn, last = (math.floor((y - low) / TURN) for y in (y0, y1))
+        found.append((x0, y0 - turn * TURN))
+        while turn != last and abs(turn - last) <= _MOST_TURNS:
+            up = last > turn
+            edge = low + (turn + up) * TURN
+            x = x0 + (x1 - x0) * (edge - y0) / (y1 - y0)
+            found += [(x, low + up * TURN), (x, None), (x, low + (not up) * TURN)]
+            turn += 1 if up else -1
     return found

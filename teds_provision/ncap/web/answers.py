@@ -44,6 +44,9 @@ _STATUS: Final[tuple[tuple[type[TedsProvisionError], int], ...]] = (
     (LinkFailure, 503),
     (StoreFailure, 503),
 )
+ASKED: Final = "teds.asked"
+"""Where in a request's scope the short members of its body stand, for the audit log."""
+_LONGEST_IN_LOG: Final = 200
 _OTHERS: Final = 422  # guard, limits, bad data, policy: the request is understood and not done
 
 
@@ -77,9 +80,16 @@ def answer_bug(_request: Request, error: Exception) -> Response:
 async def body_of(request: Request, shape: type[Shape]) -> Shape:
     """The body of a request as its type; raises Refusal (422 bad-request) where the description forbids it."""
     try:
-        return schema.read(shape, await request.body())
+        found = schema.read(shape, await request.body())
     except schema.BadRequest as error:
         raise Refusal(422, "bad-request", error.message, error.hint) from error
+    request.scope[ASKED] = {name: one for name, one in vars(found).items() if _is_short(one)}
+    return found
+
+
+def _is_short(one: object) -> bool:
+    """Whether a member is named in the log: no datasheet, no calibration."""
+    return isinstance(one, bool | int | float) or (isinstance(one, str) and len(one) <= _LONGEST_IN_LOG)
 
 
 async def reading(work: Callable[_Words, _Found], *words: _Words.args, **more: _Words.kwargs) -> _Found:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import re
 from collections.abc import Awaitable, Callable
 from contextlib import suppress
 from pathlib import Path
@@ -17,13 +18,13 @@ from starlette.types import Scope
 from starlette.websockets import WebSocket, WebSocketDisconnect
 
 from teds_provision.api.operations import API
-from teds_provision.errors import NotFound, StoreFailure, TedsProvisionError
+from teds_provision.errors import NotFound, StoreFailure, TedsProvisionError, UsageFailure
 from teds_provision.ncap.daemon import Daemon
 from teds_provision.ncap.live import Listener
 from teds_provision.ncap.web import metrics
-from teds_provision.ncap.web.answers import answer_bug, answer_error, answer_refusal
+from teds_provision.ncap.web.answers import ASKED, answer_bug, answer_error, answer_refusal, changing
 from teds_provision.ncap.web.clause12 import Clause12
-from teds_provision.ncap.web.guard import CALLER, Caller, Refusal
+from teds_provision.ncap.web.guard import CALLER, SAFE, Caller, Refusal
 from teds_provision.ncap.web.resources import Resources
 from teds_provision.ncap.web.tokens import Tokens
 
@@ -34,6 +35,9 @@ OF_ONE_TOKEN: Final = 100
 LOOK_AT_TOKEN: Final = 1.0
 """Seconds until it is noticed that a token was removed, or is over."""
 _FULL, _NOT_GOOD = 1013, 1008
+_UUID: Final = re.compile(r"[0-9a-f]{20}")
+_LONGEST_PATH: Final = 200
+_OF_AN_ENTRY: Final = frozenset({"act", "uuid", "outcome"})
 
 
 def build(daemon: Daemon) -> Starlette:
@@ -55,13 +59,38 @@ def build(daemon: Daemon) -> Starlette:
     if PAGE.is_dir():
         routes.append(Mount("/", _Page(directory=PAGE, html=True)))
     handlers: dict[Any, Any] = {
-        TedsProvisionError: answer_error,
+        TedsProvisionError: _noted(daemon),
         Refusal: answer_refusal,
         404: _no_page,
         405: _no_method,
         Exception: answer_bug,
     }
     return Starlette(routes=routes, exception_handlers=handlers)
+
+
+def _noted(daemon: Daemon) -> Callable[[Request, Exception], Awaitable[Response]]:
+    """Errors as answers; who was refused a change, and why, stands in the audit log.
+
+    A request that is none (a wrong body, a node that is not there) changes no log. A set point tells of itself.
+    """
+
+    def note(request: Request, error: TedsProvisionError) -> None:
+        members = request.scope.get(ASKED, {})
+        asked = {name: one for name, one in members.items() if name not in _OF_AN_ENTRY}
+        node = str(request.path_params.get("uuid") or members.get("uuid", ""))
+        uuid = bytes.fromhex(node) if _UUID.fullmatch(node) else None
+        facts = {"method": request.method, "path": request.url.path[:_LONGEST_PATH], "why": error.message}
+        with suppress(StoreFailure):
+            daemon.station.audit("api", uuid, error.code, **{**asked, **facts})
+
+    async def answer(request: Request, error: Exception) -> Response:
+        assert isinstance(error, TedsProvisionError)
+        told = not isinstance(error, UsageFailure | NotFound | StoreFailure) and "number" not in request.path_params
+        if request.method not in SAFE and told:
+            await changing(note, request, error)
+        return answer_error(request, error)
+
+    return answer
 
 
 class _Page(StaticFiles):

@@ -33,7 +33,7 @@ _WRONG_TOKENS: Final = 10
 _WRONG_WITHIN: Final = 60.0
 _SLOWED: Final = 1.0
 _MOST_SLOWED: Final = 50  # at once; each of them holds one of the places that all requests share
-_SAFE: Final = frozenset({"GET", "HEAD", "OPTIONS"})
+SAFE: Final = frozenset({"GET", "HEAD", "OPTIONS"})
 _CSP: Final = (
     "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' data:; connect-src 'self'; "
     "font-src 'self'; manifest-src 'self'; form-action 'self'; frame-ancestors 'none'; base-uri 'none'"
@@ -223,7 +223,7 @@ def _require_form(scope: Scope, headers: Mapping[str, str], caller: Caller) -> N
     length = headers.get("content-length", "")
     if length.isdecimal() and int(length) > LARGEST_BODY:
         raise Refusal(413, "too-large", f"At most {LARGEST_BODY} octets are taken.")
-    if scope["method"] in _SAFE:
+    if scope["method"] in SAFE:
         return
     if caller.read_only:
         raise Refusal(403, "read-only", f"The token {caller.name!r} may only read.", "Use one without --read-only.")

@@ -196,7 +196,8 @@ class Resources:
             return Response(text, media_type=kind, headers={"content-disposition": disposition})
         dry = request.query_params.get("dry_run", "0") not in ("0", "", "false")
         step = sheets.plan if dry else sheets.write
-        return JSONResponse(await changing(lambda: step(uuid, body.content, accept=body.accept_calibration)))
+        accept, retype = body.accept_calibration, bool(body.retype)
+        return JSONResponse(await changing(lambda: step(uuid, body.content, accept=accept, retype=retype)))
 
     async def provision(self, request: Request) -> Response:
         """GET, POST /nodes/UUID/provision; UUID ``next``: whichever node is tapped next."""

@@ -252,6 +252,7 @@ class Peripheral:
             sent = asyncio.run_coroutine_threadsafe(self._reply(line, received.transaction, reply), loop)
             with suppress(Exception):  # the connection is gone
                 sent.result()
+            line.repetition.left(time.monotonic())
             self._node.reply_left(line.name)
 
         return job

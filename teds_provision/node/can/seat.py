@@ -64,6 +64,11 @@ class Line:
         self._repetition.forget()
         self.seat.handler.lost(self.name)
 
+    def reply_left(self) -> None:
+        """The reply is through, or was given up: from now on it is kept for who asks again."""
+        self.replying = None
+        self._repetition.left(time.monotonic())
+
     def answer(self, request: Request) -> bytes:
         """Run a request and return transaction ‖ reply; raises what the node raises."""
         seat, body = self.seat, request.body
@@ -122,7 +127,7 @@ class Seat:
 
     def reply_left(self, line: Line) -> None:
         """The reply that left this line is through, or was given up: data may follow."""
-        line.replying = None
+        line.reply_left()
         if self.measuring is not None:
             self.measuring.reply_left(line.name)
 

@@ -206,9 +206,11 @@ class TnepTag:
         return message.encode([tnep.status(tnep.SUCCESS), tnep.payload_record(piece.encode())])
 
     def _run(self, transaction: int, frame: bytes) -> bytes:
-        return self._repetition.answer(
+        reply = self._repetition.answer(
             transaction, frame, lambda whole: self._handler.request(LINE, whole, tapped=True), now=time.monotonic()
         )
+        self._repetition.left(time.monotonic())
+        return reply
 
     def _renew(self) -> None:
         initial = self._initial_message()

@@ -13,6 +13,7 @@ from teds_provision.errors import BadData
 from teds_provision.protocol.datasheet import can_be_stored, passes_own_check
 from teds_provision.station.station import Station
 from teds_provision.steps.agree import require_session
+from teds_provision.steps.board_type import differences, refuse
 from teds_provision.steps.build_order import guard, own_name, require_fit, teds_calibrations
 from teds_provision.steps.read import Survey, survey
 from teds_provision.steps.sign import known_node_keys, sign
@@ -52,11 +53,13 @@ def plan_sheet(
     blocks: Mapping[BlockId, bytes],
     *,
     accept_calibration: str | None = None,
+    retype: bool = False,
     record: bool = False,
 ) -> SheetPlan:
     """What writing these TEDS would change, in a session of the node; changes nothing.
 
-    Raises NotWhitelisted, PolicyRefused (no key, the guard), BadData (damaged TEDS, another node's).
+    Raises NotWhitelisted, PolicyRefused (no key, the guard), BadData (damaged TEDS, another node's), WrongBoard where
+    the board says that it is of another type, unless ``retype``: no document names the type that it was given before.
     """
     station.policy.require_whitelisted(node.uuid)
     for (channel, code), teds in blocks.items():
@@ -73,6 +76,9 @@ def plan_sheet(
     present = survey(node)
     keep = {block: present.image.blocks[block] for block in present.read_only}
     image = Image(node.uuid, {**keep, **under(blocks, node.uuid)})
+    told = () if retype else differences(present.image.blocks, image)
+    if told:
+        refuse(node.uuid, told)
     same = {
         number: one
         for number, one in teds_calibrations(present.image).items()
@@ -91,11 +97,12 @@ def write_sheet(
     reporter: Reporter,
     *,
     accept_calibration: str | None = None,
+    retype: bool = False,
 ) -> SheetWritten:
     """Plan, sign, write, read back and verify; raises as the steps do, and NotAuthentic where the end is not good."""
     steps = Steps(reporter)
     with steps.step("build") as step:
-        plan = plan_sheet(station, node, blocks, accept_calibration=accept_calibration, record=True)
+        plan = plan_sheet(station, node, blocks, accept_calibration=accept_calibration, retype=retype, record=True)
         step.result = DONE if plan.changes else NOTHING
         step.detail = f"{len(plan.image.blocks)} TEDS"
     present = plan.present

@@ -4,6 +4,7 @@ import { get, liveAddress } from "./api.js";
 
 const SILENCE = 1500; // ms without a beat (two a second): the connection is lost, whatever the socket believes
 const LOOK = 200; // ms between looks
+const NOT_GOOD = 1008; // the station closed it: this browser's token is not good any more
 const WAIT = [300, 600, 1000, 2000, 3000]; // ms before the next try
 
 /** Connects, watches, connects again. `on.state(state, error)`: "live", "lost", "signed out". `on.event(event)`. */
@@ -28,7 +29,12 @@ export class Live {
       this.on.state("live");
       this.on.event(JSON.parse(message.data));
     };
-    socket.onclose = () => socket === this.socket && this.lost();
+    socket.onclose = (event) => {
+      if (socket !== this.socket) return;
+      if (event.code !== NOT_GOOD) return this.lost();
+      this.socket = null;
+      this.on.state("signed out");
+    };
   }
 
   look() {
@@ -48,7 +54,8 @@ export class Live {
     try {
       await get("status", { signal: AbortSignal.timeout(2000) });
     } catch (error) {
-      if (error.status === 401) return this.on.state("signed out", error);
+      // 429: a good token is never slowed down, so this one is none.
+      if (error.status === 401 || error.status === 429) return this.on.state("signed out", error);
     }
     return this.connect();
   }

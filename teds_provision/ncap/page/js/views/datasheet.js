@@ -88,7 +88,8 @@ function findingLine(finding) {
 }
 
 function figure(curve) {
-  const [first, last] = [curve.points[0], curve.points.at(-1)];
+  const drawn = curve.points.filter(([, y]) => y !== null); // null: where an angle goes on at the other end of its turn
+  const [first, last] = [drawn[0], drawn.at(-1)];
   const words = `Calibration of ${curve.name}: from ${first?.join(" to ")} up to ${last?.join(" to ")}`;
   return h("figure", {}, h("figcaption", {}, `Calibration of ${curve.name}`), curvePlot(words, curve.x_unit, curve.y_unit, curve.points));
 }

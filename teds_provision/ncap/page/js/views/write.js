@@ -75,8 +75,16 @@ export class WritePanel {
     } catch (error) {
       if (error.name === "AbortError") return;
       if (error.hint.includes("--accept-calibration")) this.unlikely(name, body, error);
+      else if (error.code === "wrong-board") this.otherType(name, body, error);
       else fill(this.result, trouble(error));
     }
+  }
+
+  /** A board of another type than the datasheet's becomes one only where a person says so. */
+  otherType(name, body, error) {
+    const again = button("Make it one of the new type: compare", {}, "ask");
+    again.addEventListener("click", () => this.compare(name, { ...body, retype: true }));
+    fill(this.result, trouble({ message: error.message, hint: "Choose the datasheet of this board, or connect the right board." }), h("div", { class: "row" }, again));
   }
 
   /** A calibration that looks wrong is written only with a reason, which goes into the log. */
