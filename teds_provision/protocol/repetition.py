@@ -1,7 +1,7 @@
 """Repetition on a link: an octet-equal request gets its stored reply, nothing is run twice (profile.md, "Repetition").
 
-The node keeps, for each link, the last request and its reply for 20 s from the reply's end. Commands that change nothing (Identify, Prove,
-List, Query, Read, outside Sealed) are always run anew.
+The node keeps, for each link, the last request and its reply for 20 s from the reply's end. Commands that change
+nothing (Identify, Prove, List, Query, Read, outside Sealed) are always run anew.
 """
 
 from __future__ import annotations

@@ -133,3 +133,12 @@ def _text(octets: bytes) -> str:
 
 def _octets(text: str) -> bytes:
     return base64.b64decode(text, validate=True)
+
+
+def another_life() -> VaultFailure:
+    """The error where two backups of one station gave one number to different master keys."""
+    return VaultFailure(
+        "The vault and the backup are of one station, but each has another master key of the same number: "
+        "the vault was restored from an older backup, and vault rewrap was run there since.",
+        hint="Restore the backup into another --home.",
+    )

@@ -21,7 +21,7 @@ from teds_provision.errors import BadData, NotFound, VaultChanged, VaultFailure
 from teds_provision.files import read_limited, write_new, write_whole
 from teds_provision.protocol.keys import PrivateKey, SoftwareKey, fingerprint, verify
 from teds_provision.vault.base import Ask
-from teds_provision.vault.master import MasterKeys
+from teds_provision.vault.master import MasterKeys, another_life
 from teds_provision.vault.pkcs11_lock import exclusive
 from teds_provision.vault.pkcs11_token import TokenKey, TokenSession, ask_pin, find_token, log_in
 from teds_provision.vault.pkcs11_uri import Pkcs11Uri
@@ -193,10 +193,10 @@ class Pkcs11Vault:
         """Take in the master keys of a backup of this station; raises VaultFailure if it is of another."""
         self.refresh()
         here, there = self._content.masters.keys, other.masters.keys
-        if other.station.point != self._content.station.point or any(
-            here[number] != there[number] for number in here.keys() & there
-        ):
+        if other.station.point != self._content.station.point:
             raise VaultFailure("The vault holds the keys of another station.", hint="Restore into another --home.")
+        if any(here[number] != there[number] for number in here.keys() & there):
+            raise another_life()
         if there.keys() - here.keys():
             self._replace(replace(self._content, masters=MasterKeys({**there, **here})))
 

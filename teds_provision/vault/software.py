@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 from teds_provision.errors import VaultFailure
 from teds_provision.lazy import late
 from teds_provision.protocol.keys import PrivateKey, SoftwareKey, fingerprint
-from teds_provision.vault.master import MasterKeys, Material
+from teds_provision.vault.master import MasterKeys, Material, another_life
 
 if TYPE_CHECKING:
     from teds_provision.vault import ca_file
@@ -147,9 +147,5 @@ def settle(existing: Material | None, restored: str | None) -> Material:
     if existing.identity != material.identity:
         raise VaultFailure("The vault holds the keys of another station.", hint="Restore into another --home.")
     if any(here[number] != there[number] for number in here.keys() & there):
-        raise VaultFailure(
-            "The vault holds keys of another life of this station: it was restored from another backup and its master "
-            "key was made anew there.",
-            hint="Restore into another --home.",
-        )
+        raise another_life()
     return Material(existing.identity, existing.ca or material.ca, MasterKeys({**there, **here}))

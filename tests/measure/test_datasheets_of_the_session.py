@@ -85,6 +85,21 @@ def test_raw_values_of_an_unsigned_datasheet_come_only_where_asked_for_and_are_m
     assert all("unsigned" not in line and None not in line["value"] for line in signed)
 
 
+def test_a_restart_of_the_node_is_told_by_c_and_sample_says_what_its_values_rest_on(hall: Hall) -> None:
+    """Two processes: c of Open goes on within a power-up, whoever asks, and is another one after it."""
+    node = hall.nodes["a"]
+    hall.ask("verify", "a", "--via", "can")
+    assert [hall.ask("sample", "a")["from"] for _ in range(3)] == ["session"] * 3, "no restart"
+    for _ in range(2):
+        node.kill()
+        node.start()
+        assert [hall.ask("sample", "a")["from"] for _ in range(2)] == ["kept"] * 2, "nobody has read the rest since"
+        (listed,) = hall.station.ask("nodes", node.uuid)["nodes"]
+        assert (listed["verdict"], listed["reading"]["from"]) == ("authentic", "kept")
+        hall.ask("verify", "a", "--via", "can")
+        assert hall.ask("sample", "a")["from"] == "session"
+
+
 def test_a_teds_that_was_changed_in_flash_ends_the_measurement_that_began_by_the_kept_copy(
     hall: Hall, tmp_path: Path
 ) -> None:

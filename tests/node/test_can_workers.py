@@ -5,10 +5,13 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Callable
+from types import SimpleNamespace
 
 import pytest
 
+from teds_provision.node.can import seat
 from teds_provision.node.handler import Crew
+from teds_provision.protocol.repetition import KEEP_SECONDS
 
 _SECONDS = 30.0
 
@@ -102,3 +105,28 @@ def test_the_end_waits_for_what_runs_and_drops_the_rest() -> None:
     assert not over.is_alive()
     crew.turns().put(lambda: ended.append("after the end"))
     assert ended == ["slow"]
+
+
+def test_a_stored_reply_is_kept_from_its_end_however_long_the_command_ran(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A commit takes seconds: counted from the request's arrival the repetition of a slow one was run again."""
+    now = [100.0]
+    monkeypatch.setattr(seat, "time", SimpleNamespace(monotonic=lambda: now[0]))
+    ran = []
+
+    def slow(_link: str, frame: bytes, *, tapped: bool) -> bytes:
+        ran.append(frame)
+        now[0] += 8
+        return b"\x80"
+
+    handler = SimpleNamespace(request=slow)
+    node = SimpleNamespace(measuring=None, handler=handler, counts_as_tapped=lambda: False)
+    line = seat.Line(node, 0xF1, SimpleNamespace(put=lambda job: job()))  # type: ignore[arg-type]
+    request = seat.Request(bytes.fromhex("01 8010 0000".replace(" ", "")), fd=False, received=0)
+    first = line.answer(request)
+    now[0] += 4  # its last frame is taken
+    line.reply_left()
+    now[0] += KEEP_SECONDS - 0.1
+    assert (line.answer(request), len(ran)) == (first, 1)
+    now[0] += KEEP_SECONDS
+    line.answer(request)
+    assert len(ran) == 2

@@ -266,6 +266,22 @@ def test_a_backup_of_another_station_replaces_nothing(tmp_path: Path, vault: Fil
     assert FileVault.open(tmp_path, STORE, Person()).identity().point == vault.identity().point
 
 
+def test_two_lives_of_one_station_are_not_called_two_stations(tmp_path: Path, vault: FileVault) -> None:
+    """An old backup restored, its master key made anew, then a newer backup, whose second master key is another one."""
+    old = vault.secret_material()
+    vault.add_master()
+    newer = vault.secret_material()
+    (tmp_path / "elsewhere").mkdir()
+    restored, _ = create_vault(tmp_path / "elsewhere", STORE, "file", Person(), costs=THROWAWAY, restored=old)
+    assert isinstance(restored, FileVault)
+    restored.add_master()
+    before = restored.secret_material()
+    with pytest.raises(VaultFailure, match="are of one station, but each has another master key") as error:
+        restored.join(newer)
+    assert "another --home" in error.value.hint
+    assert restored.secret_material() == before
+
+
 def test_an_older_backup_brings_back_old_master_keys_without_losing_the_new(tmp_path: Path, vault: FileVault) -> None:
     backup = vault.secret_material()
     old = vault.wrap(b"o" * 16, context=b"c")
